@@ -106,7 +106,7 @@ class Peer:
             pixel_mm=PIXEL_MM,
             voxel_mm=VOXEL_MM,
         )
-        script = str(Path(__file__).with_name("rtk_rays_peer.py"))
+        script = str(Path(__file__).with_name("rtk_peer.py"))
         pipe = subprocess.PIPE
         self.folder = folder
         self.process = subprocess.Popen([python, script, str(folder)], stdin=pipe, stdout=pipe, text=True)

@@ -18,17 +18,12 @@ from phyradgs_cl.simulation import volume_scene
 RAPID = PROTOCOLS["rapid"]
 
 
-def make_scan(
-    rt: Runtime, path: Path, size: int, seed: int, protocol: Protocol = RAPID, away: float = 1.0, aside: float = 0.0
-) -> Scan:
+def make_scan(rt: Runtime, path: Path, size: int, seed: int, protocol: Protocol = RAPID) -> Scan:
     """Returns the scan of a volume file as benchmarks/tables makes it: R2-Gaussian's scanner, TIGRE's noise (1e4, σ 10).
 
-    size: the reference's voxels per side, half the detector's pixels. away: factor of the distances of source and detector,
-    which keeps the magnification. aside: moves the panel along u by this fraction of its width."""
+    size: the reference's voxels per side, half the detector's pixels."""
     detector = 2 * size
-    geometry = ConeGeometry(
-        5.0 * away, 7.0 * away, (detector, detector), (4.0 / detector,) * 2, (0.0, 4.0 * aside)
-    )
+    geometry = ConeGeometry(5.0, 7.0, (detector, detector), (4.0 / detector,) * 2)
     scene = volume_scene(rt, load_attenuation(path), f"volume {path}", geometry, Grid.cube(size, 2.0), size, "rows")
     return SyntheticCase(rt, scene, geometry, protocol, "rows", seed).scan(FLY)
 

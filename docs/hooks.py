@@ -12,7 +12,6 @@ from markdown.preprocessors import Preprocessor
 
 _BLOCK = re.compile(r"\$\$(.+?)\$\$", re.DOTALL)
 _INLINE = r"(?<![\\$])\$(?!\$)([^$\n]+(?:\n[^$\n]+)?)\$(?!\$)"
-_FENCE = re.compile(r"^(```|~~~)")
 
 
 def on_config(config: Any) -> Any:

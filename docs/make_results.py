@@ -8,7 +8,7 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache, partial
+from functools import cache
 from operator import itemgetter
 from pathlib import Path
 from statistics import mean, stdev
@@ -184,17 +184,6 @@ def centres_object() -> str:
     return markdown(["protocol", *ONE_FRAME.values()], text)
 
 
-def splat_starts() -> str:
-    """Returns PSNR and SSIM of phyradgs from two starts, volume by volume, and the mean processor time."""
-    lines, text = lines_of("splat_starts.jsonl"), []
-    for start in dict.fromkeys(line["start"] for line in lines):
-        runs = [line for line in lines if line["start"] == start]
-        names = [f"{run['volume']}, {run['size']}³" for run in runs]
-        quality = [f"{run['psnr_db']:.2f} / {run['ssim']:.3f}" for run in runs]
-        text.append([start, *quality, f"{mean(run['processor_s'] for run in runs):.0f}"])
-    return markdown(["start", *names, "processor, s"], text)
-
-
 def detector_models() -> str:
     """Returns the gain of each method from modelling a detector's effect: modelled PSNR, and its excess over ignoring it."""
     lines = lines_of("detector_models.jsonl")
@@ -247,24 +236,24 @@ def prior_runs() -> dict[tuple[Any, ...], dict[tuple[str, int], dict[str, Scores
     return scans
 
 
-def beside_dct(other: str) -> str:
-    """Returns PSNR and SSIM with the priors dct and ``other``. ±: standard deviation over seeds of the mean gain."""
+def ridge() -> str:
+    """Returns PSNR and SSIM with the priors dct and ridge. ±: standard deviation over seeds of the mean gain."""
     text = []
     for (kind, of, views, dose, size), runs in sorted(prior_runs().items(), reverse=True):
-        pairs = {key: by for key, by in runs.items() if {"dct", other} <= set(by)}
+        pairs = {key: by for key, by in runs.items() if {"dct", "ridge"} <= set(by)}
         if not pairs:
             continue
         names = sorted({name.partition("_")[0] for name, _ in pairs})
         objects = of if of == "spheres" else f"{len(names)} volumes" if len(names) > 3 else ", ".join(names)
         cells = [f"{kind}, {objects}", str(views), str(dose), f"{size}³"]
-        for prior in ("dct", other):
+        for prior in ("dct", "ridge"):
             psnr, ssim = (mean(by[prior][metric] for by in pairs.values()) for metric in ("psnr_db", "ssim"))
             cells.append(f"{psnr:.2f} / {ssim:.4f}")
-        gains = {key: by[other]["psnr_db"] - by["dct"]["psnr_db"] for key, by in pairs.items()}
+        gains = {key: by["ridge"]["psnr_db"] - by["dct"]["psnr_db"] for key, by in pairs.items()}
         by_seed = [mean(gain for (_, of), gain in gains.items() if of == seed) for seed in {seed for _, seed in gains}]
         spread = f" ± {stdev(by_seed):.2f}, {len(by_seed)} seeds" if len(by_seed) > 1 else ""
         text.append([*cells, f"{mean(gains.values()):+.2f}{spread}", f"{min(gains.values()):+.2f}"])
-    return markdown(["scan", "views", "photons", "voxels", "`dct`", f"`{other}`", "mean gain", "least"], text)
+    return markdown(["scan", "views", "photons", "voxels", "`dct`", "`ridge`", "mean gain", "least"], text)
 
 
 def beside_rtk() -> str:
@@ -297,16 +286,6 @@ def ray_motions() -> str:
                 cells.append(f"{passes:.1f}")
         text.append(cells)
     return markdown(["motion", "EPYC: forward", "adjoint", "Xeon: forward", "adjoint"], text)
-
-
-def whole_runs() -> str:
-    """Returns processor time and PSNR of methods, and an iteration of splats."""
-    text = []
-    for x in lines_of("before_after_intel.jsonl"):
-        (kind,) = {key for key in x["before"] if key != "psnr_db"}
-        time = f"{x['after'][kind]:.1f} " + ("ms an iteration" if kind == "iteration_ms" else "s")
-        text.append([x["case"], time, f"{x['after']['psnr_db']:.2f}" if "psnr_db" in x["after"] else ""])
-    return markdown(["run", "processor time", "PSNR, dB"], text)
 
 
 def estimates() -> str:
@@ -593,16 +572,13 @@ TABLES: dict[str, Callable[[], str]] = {
     "motion_models": motion_models,
     "centres_distance": centres_distance,
     "centres_object": centres_object,
-    "splat_starts": splat_starts,
     "detector_models": detector_models,
     "prior_weight": lambda: sweep("prior_weight.jsonl", held_out=False),
     "passes": lambda: sweep("passes.jsonl", held_out=True),
-    "curves": partial(beside_dct, "curves"),
-    "ridge": partial(beside_dct, "ridge"),
+    "ridge": ridge,
     "beside_rtk": beside_rtk,
     "ray_motions": ray_motions,
     "times_per_exposure": times_per_exposure,
-    "whole_runs": whole_runs,
     "estimates": estimates,
     "prepare": prepared,
     "prepare_clean": clean_scans,

@@ -14,8 +14,8 @@ from phyradgs_cl import reconstructors as methods
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.importers import load_volume
 from phyradgs_cl.io import read_deformation, sha256_of
+from phyradgs_cl.io.attenuation import attenuation_of, words_of_hu
 from phyradgs_cl.io.tables import read_toml
-from phyradgs_cl.io.volume import attenuation_of, words_of_hu
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.runtime import Runtime, bytes_of

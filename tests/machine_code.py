@@ -44,7 +44,6 @@ def built(target: str, library: str, lanes: int, tmp_path: Path, *checks: str) -
     return [(path.parent.parent.name, path) for path in (tmp_path / "cache").rglob("*.so")]
 
 
-
 def copy_of_pocl(site: Path, library: str, tmp_path: Path) -> Path:
     """The folder of a vendor file that names PoCL in a tree of links where each library of built-ins is ``library``."""
     (own,) = (site / "pyopencl" / ".libs").glob("libpocl-*.so")

@@ -7,7 +7,6 @@ Relative errors of images are to the peak of the image, of gradients the norm of
 FLOAT64 = 1e-9  # two float64 ways to one number of order 1, or its relative error
 SUMS = 1e-12  # sums of float32 products in float64, or in pairs of float32, over the norms (5e-14)
 FLOAT32 = 1e-5  # the same where one way ends, or runs through a few operations, in float32
-LIKENESS = 0.5 / 255 + FLOAT32  # kept in bytes; half-way between two float32 may round the other way (4e-8)
 
 # --- float64 oracles -----------------------------------------------------------------------------------------
 # closed form against Gauss–Legendre along the ray: q = κ − b²/a loses κ = (distance / scale)² ≈ 1e4 last places

@@ -8,9 +8,8 @@ Nothing here imports phyradgs_cl. RTK computes line integrals at moments 0.6 deg
 flats and darks; h5py writes docs/formats.md by the letter. A few scans are TIFF folders or RTK's files, which
 `phyradgs import` reads; the folders stay in OUT/source. DIR holds NAME_128.h5 with a dataset `volume` (z, y, x).
 
-OUT/good and OUT/fault get the scans, OUT/truth gets the attenuation (z, y, x) of each in 1/mm. OUT/manifest.jsonl has one
-line for each: file, group, kind, object and planted fault; the questions that should alarm, the words of `consistency`, and
-why a fault cannot be decided. A scan that is in the manifest is not made again."""
+OUT/good and OUT/fault get the scans. OUT/manifest.jsonl has one line for each: file, group, kind, object and planted fault,
+the questions that should alarm, and why a fault cannot be decided. A scan that is in the manifest is not made again."""
 
 import argparse
 import json
@@ -24,18 +23,16 @@ from pathlib import Path
 import numpy as np
 from files import imported, write_nxtomo, write_rtk, write_tiffs
 from kinds import FAULTS, GOOD, Kind
-from objects import VOXEL_MM, another, density
-from recording import SHEPP_LOGAN, counted, shepp_logan, transmissions
+from objects import another, density
+from recording import SHEPP_LOGAN, counted, transmissions
 
 
 def make(kind: Kind, group: str, out: Path, volumes: Path, command: list[str], seed: int) -> dict[str, object]:
-    """Makes one scan and its truth; returns the manifest's line. ``seed``: of noise; if not 0, other volumes are taken
-    too."""
+    """Makes one scan; returns the manifest's line. ``seed``: of noise; if not 0, other volumes are taken too."""
     setup, panel = kind.setup, kind.counting
     scanned = another(kind.scanned, seed)
     shape = None if scanned == SHEPP_LOGAN else density(scanned, volumes)
-    passed, scale = transmissions(setup, shape, panel.peak)
-    truth = scale * (shepp_logan() if shape is None else shape)
+    passed = transmissions(setup, shape, panel.peak)
     name = f"{group}/{kind.name}.h5"
     target, source = out / name, out / "source" / kind.name
     part = target.with_suffix(".part.h5")
@@ -55,7 +52,6 @@ def make(kind: Kind, group: str, out: Path, volumes: Path, command: list[str], s
             imported(command, source, part, ["--detector-model", setup.model])
         else:
             write_nxtomo(part, kind.name, kind.statement, recorded, **kind.writing)
-    np.save(out / "truth" / f"{kind.name}.npy", truth.astype(np.float32))
     os.replace(part, target)
     return {
         "file": name,
@@ -64,10 +60,7 @@ def make(kind: Kind, group: str, out: Path, volumes: Path, command: list[str], s
         "object": scanned,
         "planted": kind.planted,
         "right": kind.right,
-        "names": kind.names,
         "undecidable": kind.undecidable,
-        "truth": f"truth/{kind.name}.npy",
-        "voxel_mm": VOXEL_MM,
     }
 
 
@@ -81,7 +74,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="other noise, and stored volumes in each other's place")
     parser.add_argument("--phyradgs", default="phyradgs", help="the command that imports")
     options = parser.parse_args()
-    for folder in ("good", "fault", "truth", "source"):
+    for folder in ("good", "fault", "source"):
         (options.out / folder).mkdir(parents=True, exist_ok=True)
     manifest = options.out / "manifest.jsonl"
     lines = manifest.read_text("utf-8").splitlines() if manifest.exists() else []

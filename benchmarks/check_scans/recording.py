@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import itk
 import numpy as np
 from itk import RTK as rtk
-from objects import SIDE_MM, SIZE, VOXEL_MM
+from objects import SIZE, VOXEL_MM
 
 IMAGE = itk.Image[itk.F, 3]
 NODE_DEG = 0.6  # largest turn of the gantry from one rendered moment to the next
@@ -135,16 +135,6 @@ def line_integrals(setup: Setup, angles_deg: np.ndarray, density: np.ndarray | N
     return itk.array_from_image(project.GetOutput())
 
 
-def shepp_logan() -> np.ndarray:
-    """Returns RTK's Shepp-Logan phantom on the grid (z, y, x)."""
-    corner = -(SIZE - 1) / 2 * VOXEL_MM
-    draw = rtk.DrawSheppLoganFilter[IMAGE, IMAGE].New()
-    draw.SetInput(_image(np.zeros((SIZE,) * 3), (VOXEL_MM,) * 3, (corner,) * 3))
-    draw.SetPhantomScale(SHEPP_LOGAN_SCALE_MM)
-    draw.Update()
-    return itk.array_from_image(draw.GetOutput()).transpose(1, 2, 0)
-
-
 def window_weights(setup: Setup, nodes_s: np.ndarray) -> np.ndarray:
     """Returns weights (lines, T) of values at nodes: the mean over a line's exposure of their linear interpolation."""
     if setup.exposure_s == 0:
@@ -160,8 +150,8 @@ def window_weights(setup: Setup, nodes_s: np.ndarray) -> np.ndarray:
     return (area(opening + setup.exposure_s) - area(opening)) / setup.exposure_s
 
 
-def transmissions(setup: Setup, density: np.ndarray | None, peak: float) -> tuple[np.ndarray, float]:
-    """Returns mean transmissions (F, v, u) of the frames, and the attenuation (1/mm) of density 1.
+def transmissions(setup: Setup, density: np.ndarray | None, peak: float) -> np.ndarray:
+    """Returns mean transmissions (F, v, u) of the frames of a density, scaled so that the largest line integral is ``peak``.
 
     A frame averages intensities, or line integrals with the model "log". At rest it has one moment."""
     count = 1
@@ -170,15 +160,14 @@ def transmissions(setup: Setup, density: np.ndarray | None, peak: float) -> tupl
     nodes_s = np.linspace(0.0, setup.span_s, max(count, 2)) if setup.moving else np.zeros(1)
     angles = setup.angle_deg(setup.starts_s[:, None] + nodes_s)
     integrals = line_integrals(setup, angles.ravel(), density)
-    scale = peak / float(integrals.max())
-    values = (scale * integrals).reshape(setup.views, len(nodes_s), setup.rows, setup.columns)
+    values = (peak / float(integrals.max()) * integrals).reshape(setup.views, len(nodes_s), setup.rows, setup.columns)
     if not setup.moving:
-        return np.exp(-values[:, 0]), scale
+        return np.exp(-values[:, 0])
     form = "lt,ftlu->flu" if setup.axis == "rows" else "lt,ftvl->fvl"
     weights = window_weights(setup, nodes_s)
     if setup.model == "log":
-        return np.exp(-np.einsum(form, weights, values)), scale
-    return np.einsum(form, weights, np.exp(-values)), scale
+        return np.exp(-np.einsum(form, weights, values))
+    return np.einsum(form, weights, np.exp(-values))
 
 
 def counted(panel: Panel, transmission: np.ndarray, gain: np.ndarray, rng: np.random.Generator) -> Recorded:
@@ -196,6 +185,3 @@ def counted(panel: Panel, transmission: np.ndarray, gain: np.ndarray, rng: np.ra
         read(np.broadcast_to(pattern, (panel.flats, *shape))),
         read(np.zeros((panel.darks, *shape))),
     )
-
-
-__all__ = ["SIDE_MM", "Panel", "Recorded", "Setup", "counted", "geometry", "shepp_logan", "transmissions"]

@@ -26,7 +26,7 @@ from phyradgs_cl.io import (
     write_scan,
     write_volume,
 )
-from phyradgs_cl.io.volume import attenuation_of, words_of_hu
+from phyradgs_cl.io.attenuation import attenuation_of, words_of_hu
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.prepare import DEFAULT_STEPS
 from phyradgs_cl.prepare.light import read_corrected

@@ -172,8 +172,7 @@ def _pixels(
     if unusable.shape not in (panel, values.shape):
         raise InputError("mask", f"shape {unusable.shape}", f"{panel} or {values.shape}")
     if unusable.all():
-        expected = "non-zero where a pixel must not be used"
-        raise InputError("mask", "every pixel masked", expected, "turn it round")
+        raise InputError("mask", "every pixel masked", "non-zero where a pixel must not be used", "turn it round")
     return replace(integrals, mask=unusable if integrals.mask is None else unusable | integrals.mask)
 
 

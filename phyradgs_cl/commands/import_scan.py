@@ -117,5 +117,4 @@ def _refuse_overwriting(source: Path, output: Path) -> None:
     with suppress(InputError):
         if file_kind(output) == "scan":
             return
-    found = f"{output}, which lies with the input and is no scan file"
-    raise InputError("--output", found, "another file to write")
+    raise InputError("--output", f"{output}, which lies with the input and is no scan file", "another file to write")

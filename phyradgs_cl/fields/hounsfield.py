@@ -57,8 +57,7 @@ class Hounsfield:
             for z, plane in enumerate(per_mm):  # by planes: no second volume in float64
                 hu[z] = factor * (plane.astype(np.float64) - self.water_per_mm)
         if not np.isfinite(hu).all():
-            found = f"{self.water_per_mm:g}"
-            raise InputError("--mu-water-per-mm", found, "water's attenuation in 1/mm, near 0.02")
+            raise InputError("--mu-water-per-mm", f"{self.water_per_mm:g}", "water's attenuation in 1/mm, near 0.02")
         return hu
 
     def per_mm(self, hu: np.ndarray) -> np.ndarray:
@@ -122,8 +121,7 @@ def fitted(
     low, of_low = _mean("air", of_air, air is None)
     high, of_high = _mean("water" if insert_hu == 0 else f"insert of {insert_hu:g} HU", of_water, water is None)
     if not low < high:
-        found = f"{of_low}, {of_high}"
-        raise InputError("Hounsfield units", found, "air below water", "exchange or move the boxes")
+        raise InputError("Hounsfield units", f"{of_low}, {of_high}", "air below water", "exchange or move the boxes")
     per_mm = (high + insert_hu / 1000 * low) / (1 + insert_hu / 1000)
     if air is None and low > _AIR_BELOW * per_mm:
         found = f"a lowest peak at {low:.3g}, water at {per_mm:.3g} 1/mm"

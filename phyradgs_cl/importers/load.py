@@ -19,16 +19,9 @@ from phyradgs_cl.importers.reading import tiff
 from phyradgs_cl.importers.reading.files import SafeFolder, read_json, read_npy
 from phyradgs_cl.importers.reading.images import image_times_s, read_image_volume
 from phyradgs_cl.importers.reading.ome_zarr import read_zarr
+from phyradgs_cl.io.attenuation import VALUES, check_attenuation, in_per_mm
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
-from phyradgs_cl.io.volume import (
-    VALUES,
-    Volume,
-    check_attenuation,
-    finite_float32,
-    in_per_mm,
-    read_volume,
-    shares_of_maximum,
-)
+from phyradgs_cl.io.volume import Volume, finite_float32, read_volume, shares_of_maximum
 from phyradgs_cl.phantoms import Cylinder, Ellipsoid, EllipsoidPhantom
 
 _TO_TIFF = "convert them to 16-bit TIFF, as in Fiji: File > Import > Image Sequence, then Save As > Image Sequence"

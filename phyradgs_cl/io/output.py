@@ -51,8 +51,7 @@ def make_folder(folder: Path, subject: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        found = error.strerror or str(error)
-        raise OutputError(str(subject), found, "a folder that can be written") from error
+        raise OutputError(str(subject), error.strerror or str(error), "a folder that can be written") from error
 
 
 def lock_path(output: str | Path) -> Path:
@@ -126,11 +125,9 @@ def _target(path: str | Path) -> Path:
     if mode is not None and not stat.S_ISREG(mode):
         raise OutputError(shown, "something that is not a regular file", "a file name")
     if mode is not None and not os.access(target, os.W_OK):
-        expected = "a file that may be replaced"
-        raise OutputError(shown, "a write-protected file", expected, "choose another name")
+        raise OutputError(shown, "a write-protected file", "a file that may be replaced", "choose another name")
     if not target.parent.is_dir():
-        expected = "an existing folder"
-        raise OutputError(shown, f"no folder {target.parent}", expected, "create the folder first")
+        raise OutputError(shown, f"no folder {target.parent}", "an existing folder", "create the folder first")
     return target
 
 

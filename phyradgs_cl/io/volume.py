@@ -14,7 +14,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import HOUNSFIELD, Deformation, Gaussians, Grid, Hounsfield, States, deformed, triple
-from phyradgs_cl.fields.hounsfield import Box, fitted, of_facts, of_note
+from phyradgs_cl.fields.hounsfield import Box, fitted, of_facts
 from phyradgs_cl.io.deformation import DEFORMATION, read_deformation_group, write_deformation_group
 from phyradgs_cl.io.files import sha256_of
 from phyradgs_cl.io.hdf5 import datasets as h5
@@ -30,12 +30,6 @@ _VOLUME, _BARE = f"{_DATA}/volume", "/volume"
 _AXES = ("z", "y", "x")
 _GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/time_series"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
-_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # limits of attenuation in 1/mm: below is no noise, above not even gold
-_USUAL_PER_MM = 10.0  # values of a larger size are HU, not 1/mm, where the user states water's attenuation
-VALUES = "values"
-"""The provenance's key of the note on its values that a file of another format holds."""
-FROM_HU = "1/mm, from HU"
-"""The note on the values of a volume that ``in_per_mm`` has converted."""
 _AXIS_TOLERANCE = 1e-3  # largest deviation of a voxel's centre from even spacing, in voxels: axes may be stored in float32
 log = logging.getLogger(__name__)
 
@@ -159,65 +153,6 @@ def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
         except InputError as error:
             log.warning("%s", error)
             return None
-
-
-def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Volume:
-    """Returns ``volume``, which is to be projected. Raises InputError about ``subject`` for values beyond 1e9, and where
-    the negative values sum to at least the positive ones in size, as in Hounsfield units. Warns where they sum to more
-    than a tenth, unless ``warn`` is False."""
-    values = volume.values
-    if (size := float(np.abs(values).max())) > h5.ATTENUATION.largest:
-        expected = f"attenuation of at most {h5.ATTENUATION.largest:g} 1/mm"
-        raise InputError(subject, f"a value of size {size:.3g}", expected, "correct the value or its unit")
-    positive = float(np.sum(values, where=values > 0, dtype=np.float64))
-    negative = float(-np.sum(values, where=values < 0, dtype=np.float64))
-    found = f"values from {values.min():g} to {values.max():g}"
-    expected = "attenuation: 0 in air, above 0 in matter"
-    remedy = "of Hounsfield units it is µ(water) (1 + HU / 1000)"
-    if positive <= negative:
-        raise InputError(subject, found, expected, remedy)
-    if warn and negative > 0.1 * positive:
-        share = f"{100 * negative / positive:.0f} % as much below 0 as above"
-        log.warning("%s: %s, %s; expected %s; %s", subject, found, share, expected, remedy)
-    return volume
-
-
-def in_per_mm(subject: str, volume: Volume, mu_water_per_mm: float | None = None) -> Volume:
-    """Returns a volume in 1/mm, with the scale of converted Hounsfield units. Values that the file's note calls
-    Hounsfield units are converted by the note's scale, else by ``mu_water_per_mm``. Values beyond 10 without a note are
-    converted by ``mu_water_per_mm``, if given. Raises InputError about ``subject`` for noted Hounsfield units without
-    either scale."""
-    stated = None if mu_water_per_mm is None else Hounsfield(mu_water_per_mm)
-    is_hu, scale = of_note(str(volume.provenance.get(VALUES, "")))
-    if scale is None and (is_hu or float(np.abs(volume.values).max()) > _USUAL_PER_MM):
-        scale = stated
-    if scale is not None:
-        facts = {**volume.provenance, HOUNSFIELD: scale.facts(), VALUES: FROM_HU}
-        return replace(volume, values=scale.per_mm(volume.values), provenance=facts)
-    if is_hu:
-        raise InputError(subject, "Hounsfield units", "1/mm", "say --mu-water-per-mm, near 0.02, to convert them")
-    return volume
-
-
-def words_of_hu(volumes: Mapping[Path, Volume], mu_water_per_mm: float | None = None) -> str:
-    """Returns the names and scales of volumes that ``in_per_mm`` has converted, to append to a line of output. Raises
-    InputError for water's attenuation that none of them needed."""
-    scales = {path: one.scale for path, one in volumes.items() if one.provenance.get(VALUES) == FROM_HU}
-    if mu_water_per_mm is not None and Hounsfield(mu_water_per_mm) not in scales.values():
-        found = f"{mu_water_per_mm:g} for {' and '.join(map(str, volumes))}"
-        expected = "a volume in Hounsfield units that does not state its scale"
-        raise InputError("--mu-water-per-mm", found, expected, "leave it out")
-    return "".join(f", {plain_text(path.name)} from HU ({scale.line})" for path, scale in scales.items() if scale)
-
-
-def attenuation_of(subject: str, volume: Volume) -> Volume:
-    """Returns the volume. Raises InputError about ``subject`` for values that are no attenuation in 1/mm, such as Hounsfield
-    units and counts."""
-    lowest, highest = float(volume.values.min()), float(volume.values.max())
-    if lowest < _LOWEST_PER_MM or highest > _HIGHEST_PER_MM:
-        found = f"values from {lowest:g} to {highest:g}, as of Hounsfield units"
-        raise InputError(subject, found, "attenuation in 1/mm", "say --mu-water-per-mm, near 0.02, to convert them")
-    return volume
 
 
 def volume_summary(path: str | Path) -> dict[str, Any]:

@@ -75,7 +75,7 @@ def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
         if not isinstance(values, np.ndarray):
             remedy = "of a result or scan: its .volume or .reference"
             raise InputError(name, f"a {type(values).__name__}", "an array (z, y, x)", remedy)
-    peak = float(reference.max())
+    peak = float(reference.max(initial=0.0))
     if peak <= 0:
         raise InputError("reference", f"a maximum of {peak:g}", "a volume with something in it")
     return {"psnr_db": psnr(volume, reference, peak), "ssim": ssim(volume, reference, peak), "data_range": peak}

@@ -105,8 +105,7 @@ class NeuralOptions:
             found = f"{self.times} of {count} times in the intensity model"
             raise InputError("option times", found, f"0, or {count} and more: a subset is biased")
         if self.times == 1 and count > 1:
-            expected = "0, or 2 and more: a single one is biased"
-            raise InputError("option times", f"1 of {count} times", expected)
+            raise InputError("option times", f"1 of {count} times", "0, or 2 and more: a single one is biased")
         return min(self.times, count)
 
 

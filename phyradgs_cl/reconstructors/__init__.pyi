@@ -4,7 +4,6 @@ from .method import METHODS as METHODS
 from .method import Method as Method
 from .method import method_name as method_name
 from .method import method_of as method_of
-from .method import usual_preset as usual_preset
 from .plan import InitialVolume as InitialVolume
 from .plan import ObjectMotion as ObjectMotion
 from .plan import RunPlan as RunPlan

@@ -191,8 +191,3 @@ def method_of(method: object) -> Method:
     if name in METHODS:
         return METHODS[name]
     return own_method(name, imported(name) if isinstance(method, str) else method)
-
-
-def usual_preset(method: object) -> str:
-    """Returns the name of a method's default preset."""
-    return next(iter(method_of(method).presets))

@@ -19,9 +19,9 @@ from phyradgs_cl.io import (
     scan_summary,
     volume_summary,
 )
+from phyradgs_cl.io.attenuation import FROM_HU, VALUES
 from phyradgs_cl.io.hdf5.source import open_hdf5
 from phyradgs_cl.io.output import refuse_overwriting
-from phyradgs_cl.io.volume import FROM_HU, VALUES
 from phyradgs_cl.prepare.light import read_corrected
 
 _KINDS = {
@@ -104,8 +104,7 @@ def load_reference(path: Path, mu_water_per_mm: float | None = None) -> tuple[Vo
     if importers.foreign_volume(path) is None and file_kind(path) == "scan":
         scan = load_scan(path)
         if scan.reference is None:
-            expected = "a scan with a known truth"
-            raise InputError(f"{path}:/entry/phyradgs/reference/volume", "no reference", expected)
+            raise InputError(f"{path}:/entry/phyradgs/reference/volume", "no reference", "a scan with a known truth")
         return Volume(scan.reference, scan.grid), scan.moving_truth
     return load_result(path, mu_water_per_mm), None
 

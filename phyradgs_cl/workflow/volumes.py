@@ -10,7 +10,8 @@ from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.fields import Grid, MovingTruth, triple
 from phyradgs_cl.fields.grid_choice import voxel_sides_mm
 from phyradgs_cl.io import Volume, read_deformation, written_beside
-from phyradgs_cl.io.volume import attenuation_of, interruption, words_of_hu
+from phyradgs_cl.io.attenuation import attenuation_of, words_of_hu
+from phyradgs_cl.io.volume import interruption
 from phyradgs_cl.metrics import (
     METRICS,
     VOXEL_BY_VOXEL,

@@ -5,11 +5,10 @@ import re
 
 import numpy as np
 import pytest
-from refusals import assert_refused
 
 from phyradgs_cl.acquisition import make_protocol
 from phyradgs_cl.acquisition.readout import FIRST_LINES
-from phyradgs_cl.api import ConeGeometry, Grid, fly_scan, simulate, static_scan
+from phyradgs_cl.api import ConeGeometry, fly_scan, simulate, static_scan
 from phyradgs_cl.simulation import scanner_for, scanner_options
 
 CONE = ConeGeometry(500.0, 800.0, (6, 8), (0.4, 0.4))
@@ -43,52 +42,6 @@ def test_a_simulation_takes_a_data_sheet() -> None:
     assert (shutter.exposure_s, shutter.readout_s) == pytest.approx((1 / 15, 0.062)) and shutter.first == "left"
     assert np.allclose(np.diff(options.protocol.frame_start_s()), 1 / 15)
     assert options.protocol.angle_start_rad()[1] == make_protocol("rapid").angle_start_rad()[1]
-
-
-def test_words_that_contradict_each_other_are_refused_in_one_line() -> None:
-    scanner = scanner_for("r2", 16)
-
-    def fly(**how: object):
-        return lambda: fly_scan(FRAMES, CONE, TURN_DEG, **{"exposure_deg": 30.0, **how})
-
-    def options(**how: object):
-        return lambda: scanner_options(scanner, "rapid", **how)
-
-    assert_refused({
-        "^first: found a word of an earlier version; say readout and": fly(first="left"),
-        "^fps: found a word of an earlier version; say exposure_deg": fly(fps=15),
-        "^readout_ms: found a word of an earlier version; say readout_ratio": fly(readout_ms=62),
-        "^exposure_deg: found None": fly(exposure_deg=None),
-        "^--first: found 'left' with --readout 'rows'": options(first="left", readout_axis="rows"),
-        "^--readout-ms: found 62 with --readout-ratio": options(fps=15, readout_ms=62, readout_ratio=0.9),
-        "^--readout-ms: found 62 without .*--fps": options(readout_ms=62),
-        "^first: found 'left' with readout_axis 'rows'": lambda: simulate(first="left", readout_axis="rows"),
-        "^exposure_deg: found 5000": lambda: simulate(exposure_deg=5000.0),
-        "^--readout-ms: found 62000; expected at most the 66.67 ms": options(fps=15, readout_ms=62000),
-    })  # fmt: skip
-
-
-def test_numbers_that_no_scanner_has_are_refused() -> None:
-    wide = ConeGeometry(300.0, 800.0, (6, 8), (1560.0, 1560.0))
-    in_metres = ConeGeometry(0.5, 0.8, (6, 8), (0.4, 0.4))
-    assert_refused({
-        "^pixel_size_mm: found pixels of 1560 × 1560 mm.*µm": lambda: static_scan(FRAMES, wide, TURN_DEG),
-        "^geometry.source_to_axis_mm, geometry.source_to_detector_mm: found 0.5 and 0.8 mm, .*not in m": lambda: static_scan(
-            FRAMES, in_metres, TURN_DEG
-        ),
-        "^quantity: found line integrals of up to 3e.04, most above 50; .*say counts, with flats": lambda: static_scan(
-            np.full_like(FRAMES, 30_000.0), CONE, TURN_DEG, quantity="attenuation"
-        ),
-        "^grid: found 1×1×1 voxels of 585 mm; expected voxels of about 0.25": lambda: static_scan(
-            FRAMES, CONE, TURN_DEG, grid=Grid((1, 1, 1), (585.0,) * 3)
-        ),
-        "^readout_ratio: found readout of 50 s, 750 times the 0.0667 s from frame to frame": lambda: fly_scan(
-            FRAMES, CONE, TURN_DEG, **SHEET, readout_ratio=50 / 0.06
-        ),
-        "^exposure_deg: found exposure of 1 s, 1.33 times the 0.75 s from frame to frame": lambda: fly_scan(
-            FRAMES, CONE, TURN_DEG, exposure_deg=40.0
-        ),
-    })  # fmt: skip
 
 
 def _tall() -> tuple[np.ndarray, ConeGeometry]:

@@ -107,7 +107,7 @@ def fly(
     return fly_scan(frames, geometry, angles, exposure_deg=exposure_deg, **more)
 
 
-GOOD = fly()
+GOOD, STILL = fly(), static_scan(FRAMES, CONE, ANGLES)
 BACKWARDS = replace(GOOD, trajectory=PoseTable([0.0, 9.0], EXCHANGED))
 FLAT = np.zeros((11, 2))
 
@@ -143,12 +143,16 @@ ELSEWHERE = Reconstruction(VOLUME.volume, replace(VOLUME.grid, offset_mm=(0.0, 9
 # fmt: off
 ARGUMENTS: list[tuple[str, Callable[..., object], dict[str, list[Any]]]] = [
     ("fly_scan", fly, {
-        "mask": [np.ones((6, 8)), np.ones((8, 6))], "geometry": [(5.0, 7.0)], "exposure_deg": [0.0, -10.0, "14"],
-        "readout": ["lines"], "readout_ratio": [-1], "exposure_s": [0.0], "quantity": ["photons"],
+        "mask": [np.ones((6, 8)), np.ones((8, 6))], "geometry": [(5.0, 7.0)], "exposure_deg": [0.0, -10.0, "14", 40.0, None],
+        "readout": ["lines"], "readout_ratio": [-1, 50 / 0.06], "exposure_s": [0.0], "quantity": ["photons"],
+        "first": ["left"], "fps": [15], "readout_ms": [62],
         "flats": [FRAMES[:, :3]], "detektor_model": ["log"], "readout_s": [62], "detector_model": ["linear"],
         "grid": [16], "pixel_mask": [FRAMES[0]],
     }),
-    ("static_scan", partial(static_scan, FRAMES, CONE, ANGLES), {"exposure_deg": [3.0], "flat": [1], "lag": [2.0]}),
+    ("static_scan", partial(static_scan, FRAMES, CONE, ANGLES), {
+        "exposure_deg": [3.0], "flat": [1], "lag": [2.0], "grid": [Grid((1, 1, 1), (585.0,) * 3)],
+    }),
+    ("static_scan", partial(static_scan, FRAMES + 3e4, CONE, ANGLES), {"quantity": ["attenuation"]}),
     ("Scan", partial(replace, GOOD), {
         "projections": [NAN, [[1], [1, 2]]], "trajectory": [3], "shutter": [1.0], "frame_start_s": [[0.0]],
         "pixel_mask": [np.ones(6)], "title": [3], "reference": [np.ones((2, 2, 2))], "lag": [-0.001, 0.901, np.nan],
@@ -163,15 +167,19 @@ ARGUMENTS: list[tuple[str, Callable[..., object], dict[str, list[Any]]]] = [
     ("LineMiddles", partial(reconstruct, GOOD, "sirt"), {"motion": [api.LineMiddles()]}),
     ("Static", partial(reconstruct, GOOD, "sirt"), {"motion": [api.Static]}),
     ("Reconstruction", partial(VOLUME.plot, GOOD), {"frame": [9], "device": ["no such device"]}),
-    ("calibrate", partial(api.calibrate, GOOD, "roll"), {"splines": [6], "others": [GOOD, [1]]}),
+    ("calibrate", partial(api.calibrate, GOOD, "roll"), {"splines": [6, 3, 16], "others": [GOOD, [1]]}),
     ("prepare", partial(api.prepare, GOOD, "rings"), {"holdout": [5]}),
     ("reconstruct", partial(reconstruct, GOOD, "sirt"), {
-        "initial": ["volume.h5", np.zeros((2, 3)), ELSEWHERE], "roi_mm": [(0, 1)],
+        "initial": ["volume.h5", np.zeros((2, 3)), ELSEWHERE], "margin_mm": [-1, (1, 2)],
+        "size": [0, -4, 2.5, True, (4, 5), "large", 10**400, 1e6, np.nan], "voxel_mm": [0, (1, -1, 1), np.inf, 1e-8, 100],
+        "roi_mm": [(0, 1), -3, (1, -1, -1, 1, -1, 1), (0, 0, -1, 1, -1, 1), (-1e12, 1, -1, 1, -1, 1), (-1e6, 1e6) * 3],
         "grid": [ELSEWHERE.grid, (8, 8, 8)], "report": [3], "on_interrupt": ["stop"], "resume": [VOLUME],
         "seed": [-1], "device": ["no such device"],
     }),
     ("reconstruct", partial(reconstruct, GOOD, "fdk"), {"initial": [VOLUME], "preset": ["quick"]}),
-    ("reconstruct", partial(reconstruct, GOOD, "phyradgs"), {"iterations": [-1]}),
+    ("reconstruct", partial(reconstruct, GOOD, "phyradgs"), {
+        "iterations": [-1], "strips": [2.5, True, [2], "two"], "preset": [["default"], 3, {"a": 1}, True, ""],
+    }),
     ("reconstruct", partial(reconstruct, GOOD, "fista"), {
         "prior": ["math:pi", lambda volume, noise: volume[1:],
         lambda volume, noise: volume * np.nan, lambda volume, noise: "cleaned", lambda volume: volume],
@@ -227,6 +235,8 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("source_to_axis_mm", lambda: ConeGeometry("5", 7.0, (6, 8), (1.0, 1.0))),
         ("source_to_detector_mm", lambda: ConeGeometry(7.0, 5.0, (6, 8), (1.0, 1.0))),
         ("detector_shape", lambda: ConeGeometry(5.0, 7.0, 6, (1.0, 1.0))),
+        ("pixel_size_mm", lambda: static_scan(FRAMES, ConeGeometry(300.0, 800.0, (6, 8), (1560.0, 1560.0)), ANGLES)),
+        ("geometry.source_to_axis_mm", lambda: static_scan(FRAMES, ConeGeometry(0.5, 0.8, (6, 8), (0.4, 0.4)), ANGLES)),
         ("detector_shape", lambda: ConeGeometry(5.0, 7.0, (6, 8.5), (1.0, 1.0))),
     ],
     "ParallelGeometry": [
@@ -323,6 +333,7 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     "Reconstruction": [
         ("volume", lambda: Reconstruction(np.zeros((2, 2, 2)), VOLUME.grid)),
         ("grid", lambda: Reconstruction(np.zeros((2, 2, 2)), 2.0)), ("scan", lambda: VOLUME.plot("scan.h5")),
+        ("states", lambda: replace(VOLUME, states=api.States([1.0], np.zeros((1, 3, 3, 3))))),
     ],
     "calibrate": [
         ("scan", lambda: api.calibrate("scan.h5")), ("what", lambda: api.calibrate(GOOD, "rol")),
@@ -357,6 +368,8 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("jitter_deg", lambda: api.simulate("foot", size=8, detector=8, jitter_deg=-1)),
         ("noise", lambda: api.simulate("foot", size=8, noise="loud")),
         ("peak", lambda: api.simulate("foot", size=8, peak=-1.0)),
+        ("first", lambda: api.simulate("foot", first="left", readout_axis="rows")),
+        ("exposure_deg", lambda: api.simulate("foot", exposure_deg=5000.0)),
     ],
     "load_scan": [("nowhere.h5", lambda: api.load_scan("nowhere.h5")), ("path", lambda: api.load_scan(3))],
     "load_volume": [("nowhere.h5", lambda: api.load_volume("nowhere.h5"))],
@@ -374,6 +387,10 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     "compare": [
         ("result", lambda: api.compare(np.ones((2, 2, 2)), np.ones((3, 3, 3)))),
         ("reference", lambda: api.compare(VOLUME.volume, GOOD)),
+        ("reference", lambda: api.compare(np.ones((4, 4)), np.ones((4, 4)))),
+        ("reference", lambda: api.compare(VOLUME.volume + 1, VOLUME.volume)),
+        ("result", lambda: api.compare(np.full((4, 4, 4), np.nan), VOLUME.volume + 1)),
+        ("reference", lambda: api.compare(np.zeros((0, 2, 2)), np.zeros((0, 2, 2)))),
     ],
     "ray_operator": [
         ("motion", lambda: ray_operator(GOOD, "exact")), ("scan", lambda: ray_operator("scan.h5")),
@@ -428,7 +445,9 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("scan", lambda: api.sum_frames(FRAMES, 2)), ("count", lambda: api.sum_frames(GOOD, 0)),
         ("count", lambda: api.sum_frames(GOOD, "2")), ("readout", lambda: api.sum_frames(GOOD, 2, readout="left")),
         ("readout", lambda: api.sum_frames(GOOD, 2, 0.5, readout_direction=0)),
-        ("lag", lambda: api.sum_frames(replace(GOOD, lag=0.1), 2)),
+        ("lag", lambda: api.sum_frames(replace(GOOD, lag=0.1), 2)), ("count", lambda: api.sum_frames(STILL, 5)),
+        ("readout", lambda: api.sum_frames(STILL, 2, -1.0)), ("scan", lambda: api.sum_frames(fly(readout_ratio=0.5), 2)),
+        ("frame_start_s", lambda: api.sum_frames(replace(STILL, frame_start_s=np.arange(4.0) ** 2), 2)),
     ],
     "as_torch": [("", lambda: api.as_torch(3))],
 }

@@ -31,11 +31,6 @@ pytestmark = pytest.mark.slow
 
 TINY = BenchSize("T", 12, 16, 8)
 ROWS = ["FDK", "PhyRadGS w/o ST", "PhyRadGS"]
-RUNS = 2 * 5  # of either volume three on the fly-scan, two on the stop-and-shoot scan
-
-
-def no_runtime() -> Runtime:
-    raise AssertionError("a device was asked for")
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import AGREES, CORRECTED, Calibration, calibrate
 from phyradgs_cl.calibrate.per_view import SPLINES, MotionParameters, WobbleParameters, estimate_views
 from phyradgs_cl.calibrate.stages import PassCounter, Stage
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import write_scan
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
@@ -179,9 +178,3 @@ def test_gauges_of_views_are_what_another_object_looks_like(right) -> None:
     offset = np.zeros((15, 3))
     offset[:, 2] = 0.2  # the panel's, which shows
     np.testing.assert_allclose(WobbleParameters.of(right).without_gauges(offset), offset, atol=1e-12)
-
-
-def test_splines_are_of_a_wobble(rt, right) -> None:
-    for what, splines, said in (("roll", 6, "with --what wobble"), ("wobble", 3, "from 4"), ("wobble", 16, "to 15")):
-        with pytest.raises(InputError, match=f"--splines: found {splines}; expected .*{said}"):
-            calibrate(right, rt, what, splines=splines)

@@ -4,13 +4,12 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import SimpleITK as sitk
 
 from phyradgs_cl.api import load_volume, save_volume
-from phyradgs_cl.fields import Grid, States, deformed
+from phyradgs_cl.fields import deformed
 from phyradgs_cl.io import Volume, read_deformation, read_volume, write_deformation, write_volume
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.workflow import load_scan
@@ -128,25 +127,6 @@ def test_an_object_that_changes_from_the_scan_to_its_states(cli, capsys, folder,
         assert cli.run(line.split()) == 2 and "--object-motion" in capsys.readouterr().err
     line = f"reconstruct {scan} -o {tmp_path}/no.h5 --method changing --memory 40KiB"
     assert cli.run(line.split()) == 6 and "--set states=N" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [("time_s", [3.0, 2.0]), ("time_s", None), ("volume", None), ("volume", np.zeros((3, 4, 4, 4)))],
-)
-def test_damaged_states_are_refused(cli, capsys, tmp_path, name, values) -> None:
-    path, volumes = tmp_path / "states.h5", np.ones((2, 4, 4, 4), np.float32)
-    write_volume(path, volumes[0], Grid.cube(4, 2.0), {}, states=States(np.array([1.0, 2.0]), volumes))
-    with h5py.File(path, "r+") as file:
-        units = file[f"entry/time_series/{name}"].attrs["units"]
-        del file[f"entry/time_series/{name}"]
-        if values is not None:
-            file[f"entry/time_series/{name}"] = values
-            file[f"entry/time_series/{name}"].attrs["units"] = units
-    for command in (f"info {path}", f"evaluate {path} --reference {path}", f"export {path} --states 2 -o {tmp_path}/s.npy"):
-        assert cli.run(command.split()) == 2
-        error = capsys.readouterr().err
-        assert f"time_series/{name}" in error and error.count("\n") == 1
 
 
 def test_evaluate_names_the_field_that_a_volume_was_reconstructed_with(cli, caplog, folder, tmp_path) -> None:

@@ -1,7 +1,6 @@
 """Volumes and scans in other programs' formats at the commands that read them."""
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -239,16 +238,3 @@ def test_an_export_is_scanned_like_the_volume_itself(cli, files, tmp_path, capsy
     assert cli.run(["info", str(export_volume(files[1], "nii"))]) == 0
     told = capsys.readouterr().out
     assert "volume (NIfTI)" in told and "(12, 12, 12)" in told and "voxel size mm" in told
-
-
-def test_what_is_of_another_kind_is_refused(refused, files, tmp_path) -> None:
-    nxtomo = shutil.copy(files[0], tmp_path / "other.nxs")
-    with h5py.File(nxtomo, "r+") as file:
-        del file["entry/instrument/detector/data"].attrs["quantity"]
-    with h5py.File(tmp_path / "aps.h5", "w") as file:
-        file["exchange/data"] = np.ones((3, 4, 5), np.uint16)
-    (tmp_path / "geometry.xml").write_text("<?xml version='1.0'?><RTKThreeDCircularGeometry/>")
-    for words, more in ((["info"], []), (["reconstruct"], ["-o", tmp_path / "new.h5"])):
-        for path in (nxtomo, tmp_path / "aps.h5", tmp_path / "geometry.xml"):
-            refused([*words, path, *more], f"phyradgs import {path} -o scan.h5")
-        assert "phyradgs import" not in refused([*words, tmp_path / "none.h5", *more])

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from phyradgs_cl.commands.options import with_run_options
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors import RunPlan, method_options
+from phyradgs_cl.reconstructors import RunPlan
 from phyradgs_cl.settings import Settings, read_settings
 
 
@@ -98,13 +98,6 @@ def test_a_prior_is_for_methods_that_have_one() -> None:
     assert plan_of(None, {"prior": "tv"}, ["prior=dct"]).options.prior == "tv"
     with pytest.raises(InputError, match="^--prior: found no such option of --method sirt.*fista or moving has it$"):
         plan_of(None, {"prior": "tv", "method": "sirt"})
-
-
-def test_a_method_offers_only_what_it_has() -> None:
-    for method, offered in (("fdk", "window, extrapolate, motion"), ("sart", "motion, strips, sub_intervals")):
-        with pytest.raises(InputError) as caught:
-            method_options(method, None, {"length": 1})
-        assert caught.value.expected.endswith(offered)
 
 
 # --- the options of a reconstruction, as commands get them -------------------------------------------------------------

@@ -17,7 +17,7 @@ from phyradgs_cl.exporters.ome_zarr import write_zarr
 from phyradgs_cl.fields import Grid, Hounsfield
 from phyradgs_cl.importers import load_volume
 from phyradgs_cl.io import Volume, sha256_of
-from phyradgs_cl.io.volume import attenuation_of
+from phyradgs_cl.io.attenuation import attenuation_of
 
 pytestmark = pytest.mark.slow
 

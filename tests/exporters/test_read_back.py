@@ -2,7 +2,6 @@
 
 import gzip
 import json
-import random
 import re
 import shutil
 
@@ -120,39 +119,32 @@ def field(offset: int, kind: str, value: float):
 
 
 WRONG = {
-    "a cut file": ("v.mha", lambda data: data[:-1], "DimSize|bytes"),
-    "too many voxels": ("v.mha", replaced("DimSize = 7", "DimSize = 70000000"), "bytes of data"),
-    "an oblique image": (
-        "v.mha", replaced("Matrix = 1 0 0 0 1 0", "Matrix = 0.8 0.6 0 -0.6 0.8 0"), "along the world's",
-    ),
-    "no length of a voxel": (
-        "v.mha", replaced("ElementSpacing = 1.25", "ElementSpacing = 0"), "v.mha",
-    ),
-    "a place in another galaxy": ("v.mha", replaced("Offset = -?[0-9.]+", "Offset = 1e11"), "origin"),
-    "no NIfTI": ("v.nii", lambda data: b"\0" * 400, "NIFTI"),
-    "a cut NIfTI": ("v.nii", lambda data: data[:-4], "bytes"),
-    "a huge NIfTI": ("v.nii", field(42, "<i2", 32000), "bytes of data"),
-    "four axes": ("v.nii", lambda data: field(48, "<i2", 9)(field(40, "<i2", 4)(data)), "three axes"),
-    "colours": ("v.nii", field(70, "<i2", 128), "vector"),
-    "steps that are no numbers": ("v.nii", field(280, "<f4", np.nan), "v.nii"),
-    "a cut stream": ("v.nii.gz", lambda data: data[: len(data) // 2], "v.nii.gz"),
-    "another encoding": ("v.nrrd", replaced("encoding: raw", "encoding: bzip2"), "v.nrrd"),
-    "data elsewhere": ("v.nrrd", replaced("endian: little", "data file: /etc/passwd"), "v.nrrd"),
-    "another space": ("v.nrrd", replaced("left-posterior-superior", "scanner-xyz"), "space"),
-    "a NRRD in furlongs": ("v.nrrd", replaced("endian:", 'space units: "furlong"\nendian:'), "v.nrrd"),
-    "a huge NRRD": ("v.nrrd", replaced("sizes: 7", "sizes: 7000000"), "v.nrrd"),
-    "a NaN": ("v.nrrd", lambda data: data[:-4] + np.float32(np.nan).tobytes(), "NaN"),
-    "no array": ("v.npy", lambda data: b"\x80\x04K\x01.", r"\.npy"),
+    "v.mha": [
+        replaced("DimSize = 7", "DimSize = 70000000"), replaced("Matrix = 1 0 0 0 1 0", "Matrix = 0.8 0.6 0 -0.6 0.8 0"),
+        replaced("ElementSpacing = 1.25", "ElementSpacing = 0"), replaced("Offset = -?[0-9.]+", "Offset = 1e11"),
+    ],
+    "v.nii": [
+        field(42, "<i2", 32000), lambda data: field(48, "<i2", 9)(field(40, "<i2", 4)(data)), field(70, "<i2", 128),
+        field(280, "<f4", np.nan),
+    ],
+    "v.nrrd": [
+        replaced("encoding: raw", "encoding: bzip2"), replaced("endian: little", "data file: /etc/passwd"),
+        replaced("left-posterior-superior", "scanner-xyz"), replaced("endian:", 'space units: "furlong"\nendian:'),
+        replaced("sizes: 7", "sizes: 7000000"), lambda data: data[:-4] + np.float32(np.nan).tobytes(),
+    ],
+    "v.npy": [lambda data: b"\x80\x04K\x01."],
 }
 
 
-def test_a_wrong_file_is_one_line(exported) -> None:
-    for case, (name, damage, words) in WRONG.items():
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_file_is_one_line(exported, name) -> None:
+    """Counts, axes, directions, units and types that no reader may take; cut files: tests/importers/test_fuzz.py."""
+    for number, damage in enumerate(WRONG[name]):
         path = exported(name)
         path.write_bytes(damage(path.read_bytes()))
-        with pytest.raises(InputError, match=words) as caught:
+        with pytest.raises(InputError) as caught:
             load_volume(path)
-        assert "\n" not in str(caught.value), case
+        assert name in str(caught.value) and "\n" not in str(caught.value), number
 
 
 def test_a_grid_beside_an_array_must_be_its_own(exported) -> None:
@@ -162,24 +154,3 @@ def test_a_grid_beside_an_array_must_be_its_own(exported) -> None:
         path.with_suffix(".json").write_text(json.dumps({**good, key: value}))
         with pytest.raises(InputError, match=rf"json.*{'shape' if key == 'shape' else key}"):
             load_volume(path)
-
-
-@pytest.mark.filterwarnings("ignore")  # of NumPy about casts of absurd numbers
-@pytest.mark.parametrize("name", NAMES)
-def test_random_damage_is_a_volume_or_one_line(exported, name) -> None:
-    path, rng = exported(name), random.Random(len(name))
-    files = sorted(one for one in path.rglob("*") if one.is_file()) or [path]  # an OME-Zarr is a folder
-    good, refused = {one: one.read_bytes() for one in files}, 0
-    for turn in range(60):
-        file = files[turn % len(files)]
-        data = bytearray(good[file])
-        for _ in range(rng.choice((1, 2, 8))):
-            data[rng.randrange(min(len(data), 600))] = rng.randrange(256)
-        file.write_bytes(data[: rng.choice((len(data), rng.randrange(len(data))))])
-        try:
-            load_volume(path)
-        except InputError as error:
-            refused += 1
-            assert "\n" not in str(error)
-        file.write_bytes(good[file])
-    assert refused > 20

@@ -60,31 +60,6 @@ def test_what_is_chosen(choice, shape, voxel_mm, offset_mm) -> None:
     assert again.shape == shape and again.offset_mm == pytest.approx(found.offset_mm, abs=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("choice", "error"),
-    [
-        ({"size": 0}, "--size: found 0"), ({"size": -4}, "--size"), ({"size": 2.5}, "--size: found 2.5"),
-        ({"size": True}, "--size: found True"), ({"size": (4, 5)}, "--size: found .*three"),
-        ({"size": "large"}, "--size: found 'large'"), ({"size": 10**400}, "--size"),
-        ({"size": 1e6}, "--size: found a grid of"), ({"size": float("nan")}, "--size: found nan"),
-        ({"voxel_mm": 0}, "--voxel-mm: found 0.0"), ({"voxel_mm": (1, -1, 1)}, "--voxel-mm: found -1.0"),
-        ({"voxel_mm": float("inf")}, "--voxel-mm: found inf"),
-        ({"voxel_mm": 1e-8}, "--voxel-mm: found a grid of"),
-        ({"roi_mm": BOX[:5]}, "--roi-mm: found .*6 finite numbers"), ({"roi_mm": -3}, "--roi-mm: found -3.0"),
-        ({"voxel_mm": 100}, r"--voxel-mm: .*several voxels in the box of 10 × 20 × 80 mm"),
-        ({"roi_mm": (2, -2, -4, 4, 0, 4)}, "--roi-mm: found .*Z0 below Z1"),
-        ({"roi_mm": (0, 0, -4, 4, 0, 4)}, "--roi-mm"),
-        ({"roi_mm": (-1e12, 2, -4, 4, 0, 4)}, "--roi-mm: found -1000000000000.0"),
-        ({"roi_mm": (-1e6, 1e6, -1e6, 1e6, 0, 4)}, "--roi-mm: found a grid of"),
-        ({"roi_mm": BOX, "size": 4, "voxel_mm": 1}, "--size: found all three"),
-        ({"margin_mm": -1}, "--margin-mm: found -1.0"), ({"margin_mm": (1, 2)}, "--margin-mm: found .*three"),
-    ],
-)
-def test_what_is_refused(choice, error) -> None:
-    with pytest.raises(InputError, match=error):
-        GridChoice(**choice).of(GRID)
-
-
 def test_a_part_of_a_grid_knows_its_place() -> None:
     part = GRID.part((1, 2, 3), (4, 5, 6))
     assert part.slices_in(GRID) == (slice(1, 5), slice(2, 7), slice(3, 9))

@@ -114,7 +114,6 @@ def write_flexray(folder: Path, truth: Any, **lines: object) -> Path:
     return folder
 
 
-
 SECTOR, MINI, CUTOFF = 512, 64, 4096
 FREE, END, FAT = 0xFFFFFFFF, 0xFFFFFFFE, 0xFFFFFFFD
 

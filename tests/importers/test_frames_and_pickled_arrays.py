@@ -82,6 +82,7 @@ def test_frames_are_turned_to_row_0_below_and_column_0_left() -> None:
     np.testing.assert_array_equal(oriented(frames, ImportOptions(row_0="bottom"), "top"), frames)
     np.testing.assert_array_equal(oriented(frames, ImportOptions(), "bottom", "right"), frames[..., ::-1])
 
+
 CONTENT = {
     "rows": np.arange(6.0).reshape(2, 3),
     "columns": np.asfortranarray(np.arange(6, dtype=">i4").reshape(2, 3)),

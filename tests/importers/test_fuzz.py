@@ -19,10 +19,11 @@ import writers_of_importers as w
 from damage import changed, put, removed, value
 
 from phyradgs_cl.errors import PhyradgsError
+from phyradgs_cl.exporters.ome_zarr import write_zarr
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.importers import ImportOptions, import_scan, load_beads, load_volume
 from phyradgs_cl.importers.reading.text import read_angles_rad
-from phyradgs_cl.io import load_scanner, write_scan, write_volume
+from phyradgs_cl.io import Volume, load_scanner, write_scan, write_volume
 from phyradgs_cl.settings import read_config
 from phyradgs_cl.workflow import load_scan
 
@@ -55,6 +56,7 @@ WRITERS: dict[str, tuple[Callable[[Path, Any], object], Callable[[Path], object]
     "v.tif": (lambda path, _: tifffile.imwrite(path, VALUES, imagej=True, metadata={"axes": "ZYX"}), load_volume),
     "packed.tif": (lambda path, _: tifffile.imwrite(path, VALUES, compression="zlib"), load_volume),
     "v.npy": (lambda path, _: np.save(path, VALUES), load_volume),
+    "v.ome.zarr": (lambda path, _: write_zarr(path, Volume(VALUES, GRID), None), load_volume),
     "scanner.toml": (lambda path, _: path.write_bytes(CARM.read_bytes()), lambda path: load_scanner(path, Path("/nowhere"))),
     "configuration.toml": (lambda path, _: path.write_text(CONFIG), read_config),
     "beads.toml": (lambda path, _: path.write_text(BEADS), load_beads),
@@ -87,8 +89,8 @@ def good(name: str, folder: Path, make_truth: Any) -> tuple[list[Path], Callable
         one_of_a_kind = {(file.suffix, file.name[:4]): file for file in files}
         return list(one_of_a_kind.values()), partial(import_scan, path, OPTIONS.get(name), name)
     write, read = WRITERS[name]
-    write(folder / name, make_truth)
-    return [folder / name], partial(read, folder / name)
+    write(path := folder / name, make_truth)
+    return [file for file in sorted(path.rglob("*")) if file.is_file()] or [path], partial(read, path)
 
 
 def answered(read: Callable[[], object], told: object) -> bool:

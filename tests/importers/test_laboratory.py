@@ -8,7 +8,7 @@ from typing import Any
 import laboratory_of_importers as lab
 import numpy as np
 import pytest
-from conftest_of_importers import WORLD_POINTS, Truth, pose_at, projected
+from conftest_of_importers import WORLD_POINTS, pose_at, projected
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, PoseTable
 from phyradgs_cl.api import reconstruct
@@ -174,28 +174,31 @@ def test_a_zeiss_file_with_images_in_two_folders_and_in_float(tmp_path, make_tru
     np.testing.assert_array_equal(scan.projections[:, 3, 4], np.arange(102) / 16)
 
 
-def refused(form: str, path: Path, truth: Truth, line: str, value: object, *texts: str) -> None:
+WRONG = {
+    "nikon": [
+        ("AngularStep", 0), ("AngularStep", 360), ("Units", "cm"), ("ObjectOffsetX", 100), ("WhiteLevel", 100),
+        ("DetectorPixelsX", 50), ("SrcToDetector", 7), ("DetectorPixelSizeX", 8330), ("WhiteLevel", "6e4\nWhiteLevel=5e4"),
+    ],
+    "skyscan": [
+        ("Rotation Step (deg)", 0), ("Rotation Direction", "XX"), ("Exposure (ms)", -3), ("Exposure (ms)", 0),
+        ("Frame Averaging", "ON (x)"), ("Optical Axis (line)", 4000), ("Reference Intensity", 900),
+        ("Number Of Rows", 99), ("Camera to Source (mm)", 3),
+    ],
+    "flexray": [("SDD", 3), ("Last angle", 10.0), ("Binned pixel size", 8330)],
+    "zeiss": [
+        ("ImageInfo/Angles", np.zeros(6, np.float32)), ("ImageInfo/PixelSize", np.float32(9e5)),
+        ("ImageInfo/ExpTimes", np.float32([-3] * 6)),
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("form", "line", "value"), [(form, *one) for form, some in WRONG.items() for one in some])
+def test_wrong_fields_are_named_as_the_file_names_them(tmp_path, make_truth, form, line, value) -> None:
+    """Not as options that nobody gave."""
+    writer, geometry = WRITERS[form]
     with pytest.raises(InputError) as caught:
-        import_scan(WRITERS[form][0](path, truth, **{line: value}))
-    for text in texts:
-        assert text in str(caught.value)
-    assert str(caught.value).startswith(str(path))
-
-
-@pytest.mark.parametrize(("line", "value", "texts"), [
-    ("AngularStep", 0, ("AngularStep: found 6 views at one angle",)),
-    ("AngularStep", 360, ("AngularStep: found 6 views at one angle",)),
-    ("Units", "cm", ("Units: found 'cm'; expected mm",)),
-    ("ObjectOffsetX", 100, ("ObjectOffsetX: found 100 mm, 160 mm", "35 mm")),
-    ("WhiteLevel", 100, ("WhiteLevel: found 100 counts", "say flat_value")),
-    ("DetectorPixelsX", 50, ("6 × 10 × 50; see", "xtekct: DetectorPixelsX")),
-    ("SrcToDetector", 7, ("xtekct: SrcToDetector: found 7; expected more than", "xtekct: SrcToObject (500)")),
-    ("DetectorPixelSizeX", 8330, ("xtekct: DetectorPixelSizeX, DetectorPixelSizeY: found",)),
-    ("ObjectRoll", "0\nWhiteLevel=50000", ("WhiteLevel: found '60000.0' and '50000'; expected one value",)),
-])  # fmt: skip
-def test_nikon_s_wrong_fields_are_named(tmp_path, make_truth, line, value, texts) -> None:
-    """By their names in the file, not by those of options that nobody gave."""
-    refused("nikon", tmp_path / "scan", make_truth(geometry=CENTRED), line, value, *texts)
+        import_scan(writer(tmp_path / "scan", make_truth(geometry=geometry), **{line: value}))
+    assert str(caught.value).startswith(str(tmp_path)) and line.lower() in str(caught.value).lower()
 
 
 @pytest.mark.parametrize("content", [b"", b"\0\xff" * 400])
@@ -204,21 +207,6 @@ def test_a_description_without_a_line_is_refused_as_a_whole(tmp_path, make_truth
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"scan\.xtekct: found nothing of a description: no line NAME = VALUE"):
         import_scan(path)
-
-
-@pytest.mark.parametrize(("line", "value", "texts"), [
-    ("Rotation Step (deg)", 0, ("Rotation Step (deg): found 6 views at one angle",)),
-    ("Rotation Direction", "XX", ("Rotation Direction: found 'XX'; expected CC or CW",)),
-    ("Exposure (ms)", -3, ("Exposure (ms): found -3",)),
-    ("Exposure (ms)", 0, ("Exposure (ms): found 0",)),
-    ("Frame Averaging", "ON (x)", ("Frame Averaging: found 'ON (x)'",)),
-    ("Optical Axis (line)", 4000, ("Optical Axis (line): found 4000; expected", "at most 20")),
-    ("Reference Intensity", 900, ("Reference Intensity: found 900 counts", "say flat_value")),
-    ("Number Of Rows", 99, ("6 × 99 × 14; see", "log: Number of Rows")),
-    ("Camera to Source (mm)", 3, ("log: Camera to Source (mm): found 3; expected more than",)),
-])  # fmt: skip
-def test_skyscan_s_wrong_fields_are_named(tmp_path, make_truth, line, value, texts) -> None:
-    refused("skyscan", tmp_path / "scan", make_truth(geometry=WRITERS["skyscan"][1]), line, value, *texts)
 
 
 def test_skyscan_s_random_movement_and_missing_lines_are_said(tmp_path, make_truth, caplog) -> None:
@@ -230,18 +218,6 @@ def test_skyscan_s_random_movement_and_missing_lines_are_said(tmp_path, make_tru
     lines = {"Random Movement": "OFF (30)", "Frame Averaging": "OFF (4)"}
     import_scan(lab.write_skyscan(tmp_path / "off", make_truth(geometry=WRITERS["skyscan"][1]), **lines))
     assert "Random Movement" not in caplog.text and "Frame Averaging" not in caplog.text
-
-
-@pytest.mark.parametrize(("form", "line", "value", "texts"), [
-    ("flexray", "SDD", 3, ("settings.txt: SDD: found 3; expected more than",)),
-    ("flexray", "Last angle", 10.0, ("Last angle: found 6 views at one angle",)),
-    ("flexray", "Binned pixel size", 8330, ("settings.txt: Binned pixel size: found",)),
-    ("zeiss", "ImageInfo/Angles", np.zeros(6, np.float32), ("ImageInfo/Angles: found 6 views at one angle",)),
-    ("zeiss", "ImageInfo/PixelSize", np.float32(9e5), ("ImageInfo/PixelSize: found",)),
-    ("zeiss", "ImageInfo/ExpTimes", np.float32([-3] * 6), ("ImageInfo/ExpTimes: found -3",)),
-])  # fmt: skip
-def test_other_scanners_wrong_fields_are_named(tmp_path, make_truth, form, line, value, texts) -> None:
-    refused(form, tmp_path / "scan", make_truth(geometry=WRITERS[form][1]), line, value, *texts)
 
 
 def test_the_readers_of_scanners_and_toolkits_stay_small() -> None:

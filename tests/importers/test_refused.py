@@ -177,7 +177,6 @@ MISTAKES: dict[str, dict[str, Damage]] = {  # by format: the field, or what a me
         "no .npy and no TIFF": gone("g.npy"),
     },
 }  # fmt: skip
-CASES = [(form, said) for form, mistakes in MISTAKES.items() for said in mistakes]
 
 
 @contextmanager

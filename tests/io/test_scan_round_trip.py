@@ -103,25 +103,6 @@ def test_a_signal_or_a_phase_of_each_frame_comes_back(path, make_scan, is_phase)
         again_of(path)
 
 
-def test_gating_that_is_damaged_is_named(path, make_scan) -> None:
-    scan = make_scan()
-    middle_s = np.asarray(scan.frame_start_s) + scan.shutter.span_s / 2
-    for values, words in (
-        (np.full(scan.frames, np.nan), "NaN"), (np.zeros(scan.frames + 1), "shape"),
-        (np.zeros(scan.frames, "S4"), "numbers"),
-    ):  # fmt: skip
-        write_scan(path, replace(scan, gating=Gating(middle_s, np.arange(scan.frames))))
-        with h5py.File(path, "r+") as file:
-            del file["entry/phyradgs/gating/signal"]
-            file["entry/phyradgs/gating/signal"] = values
-        with pytest.raises(InputError, match=f"phyradgs/gating/signal.*{words}"):
-            again_of(path)
-    with h5py.File(path, "r+") as file:
-        file.move("entry/phyradgs/gating/signal", "entry/phyradgs/gating/phases")
-    with pytest.raises(InputError, match="rename 'phases' to 'phase'"):
-        again_of(path)
-
-
 WANDER = np.cumsum(np.random.default_rng(1).uniform(0, 0.02, 60))
 KINEMATICS = {
     "constant": ConstantSpeed(0.3, 0.1), "backwards": ConstantSpeed(0.3, -0.1),

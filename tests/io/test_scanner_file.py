@@ -77,10 +77,6 @@ def test_a_parallel_beam_has_no_distance(write) -> None:
     scanner = load_scanner(write(GOOD.replace(distances, parallel)), DATA)
     assert scanner.geometry == ParallelGeometry((40, 60), (2.0, 1.0), (0.0, 3.5))
     assert load_scanner(write(GOOD.replace("[source]", '[source]\nbeam = "cone"')), DATA).geometry.source_to_axis_mm == 500
-    both = r"\[source\] to_axis_mm: found 500; expected no distance: beam is 'parallel'"
-    for text, words in ((f"{parallel}\n{distances}", both), ('beam = "fan"', r"\[source\] beam: found 'fan'")):
-        with pytest.raises(InputError, match=words):
-            load_scanner(write(GOOD.replace(distances, text)), DATA)
 
 
 def test_pulse_and_lag_of_a_scanner(write) -> None:
@@ -89,51 +85,41 @@ def test_pulse_and_lag_of_a_scanner(write) -> None:
     panel = GOOD.replace("columns = 60", "columns = 60\nlag = 0.03")
     scanner = load_scanner(write(panel + "[beam]\npulse_start = 0.5\npulse_length = 0.25\n"), DATA)
     assert scanner.pulse == (0.5, 0.25) and scanner.lag == 0.03
-    for line, key in (("pulse_start = 0.5", "pulse_length"), ("pulse_start = 0\npulse_length = 0", "length")):
-        with pytest.raises(InputError, match=rf"\[beam\] .*{key}"):
-            load_scanner(write(f"{GOOD}[beam]\n{line}\n"), DATA)
-    with pytest.raises(InputError, match=r"\[detector\] lag"):
-        load_scanner(write(GOOD.replace("columns = 60", "columns = 60\nlag = 1.0")), DATA)
 
 
-WRONG = {
-    "unknown key": ("rows = 40", "rows = 40\ncolums = 60", "[detector] colums", "did you mean 'columns'"),
-    "unknown table": ("[volume]", "[volumes]", "volumes", "did you mean 'volume'"),
-    "missing key": ("to_axis_mm = 500", "", "[source] to_axis_mm", "nothing"),
-    "text for a number": ("to_axis_mm = 500", 'to_axis_mm = "500"', "[source] to_axis_mm", "'500'"),
-    "negative": ("pixel_size_v_mm = 2.0", "pixel_size_v_mm = -2.0", "[detector] pixel_size_v_mm", "above 0"),
-    "infinite": ("pixel_size_v_mm = 2.0", "pixel_size_v_mm = inf", "[detector] pixel_size_v_mm", "finite"),
-    "not a number": ("offset_u_mm = 3.5", "offset_u_mm = nan", "[detector] offset_u_mm", "finite"),
-    "boundless": ("rows = 40", "rows = 1" + "0" * 400, "[detector] rows", "finite"),
-    "half a row": ("rows = 40", "rows = 40.5", "[detector] rows", "whole"),
-    "true": ("rows = 40", "rows = true", "[detector] rows", "True"),
-    "detector before axis": (
-        "to_detector_mm = 1000.0", "to_detector_mm = 400", "[source] to_detector_mm", "500",
-    ),
-    "two counts": ("shape = [10, 20, 40]", "shape = [10, 20]", "[volume] shape", "three"),
-    "no list": ("shape = [10, 20, 40]", "shape = 10", "[volume] shape", "three"),
-    "zero voxels": ("shape = [10, 20, 40]", "shape = [10, 0, 40]", "[volume] shape", "at least 1"),
-    "flat volume": ("[10.0, 20.0, 80.0]", "[10.0, 0, 80.0]", "[volume] size_mm", "above 0"),
-    "axis": ('axis = "columns"', 'axis = "cols"', "[readout] axis", "'rows'"),
-    "direction": ("direction = -1", "direction = 0", "[readout] direction", "-1"),
-    "direction in words": (
-        "direction = -1", 'direction = "top"', "[readout] direction: found 'top'", "expected 1 (index 0 first) or -1",
-    ),
-    "direction true": ("direction = -1", "direction = true", "[readout] direction", "True"),
-    "ratio": ("ratio = 0.5", "ratio = -0.5", "[readout] ratio", "at least 0"),
-    "not TOML": ("[source]", "[source", "", "not TOML"),
-    "table as a number": ("[readout]", "[[readout]]", "[readout]", "a table"),
-}
+WRONG = {  # by the place that a message names: what is there in a good file, and instead of it
+    "volumes": [("[volume]", "[volumes]")], "": [("[source]", "[source")], "[readout]": [("[readout]", "[[readout]]")],
+    "[source] beam": [("to_axis_mm = 500", 'beam = "fan"')],
+    "[source] to_axis_mm": [
+        ("to_axis_mm = 500", ""), ("to_axis_mm = 500", 'to_axis_mm = "500"'), ("[source]", '[source]\nbeam = "parallel"'),
+    ],
+    "[source] to_detector_mm": [("to_detector_mm = 1000.0", "to_detector_mm = 400")],
+    "[detector] colums": [("rows = 40", "rows = 40\ncolums = 60")],
+    "[detector] rows": [("rows = 40", f"rows = {rows}") for rows in (10**400, 40.5, "true")],
+    "[detector] pixel_size_v_mm": [("pixel_size_v_mm = 2.0", f"pixel_size_v_mm = {size}") for size in (-2.0, "inf")],
+    "[detector] offset_u_mm": [("offset_u_mm = 3.5", "offset_u_mm = nan")],
+    "[detector] lag": [("columns = 60", "columns = 60\nlag = 1.0")],
+    "[volume] shape": [("shape = [10, 20, 40]", f"shape = {shape}") for shape in ([10, 20], 10, [10, 0, 40])],
+    "[volume] size_mm": [("[10.0, 20.0, 80.0]", "[10.0, 0, 80.0]")],
+    "[readout] axis": [('axis = "columns"', 'axis = "cols"')],
+    "[readout] direction": [("direction = -1", f"direction = {value}") for value in (0, '"top"', "true")],
+    "[readout] ratio": [("ratio = 0.5", "ratio = -0.5")],
+    "[readout] first": [("direction = -1", 'first = "top"')],
+    "[readout] readout_ms": [("direction = -1", "readout_ms = 62")],
+    "[readout] fps": [("direction = -1", "fps = 0")],
+    "[beam] pulse_length": [("[volume]", "[beam]\npulse_start = 0.5\n[volume]")],
+}  # fmt: skip
 
 
 def test_errors_name_table_and_key(write, tmp_path) -> None:
-    for old, new, where, word in WRONG.values():
-        assert old in GOOD
-        path = write(GOOD.replace(old, new, 1))
-        with pytest.raises(InputError) as caught:
-            load_scanner(path, DATA)
-        text = str(caught.value)
-        assert text.startswith(f"{path} {where}".strip()) and word in text and "\n" not in text, text
+    for where, changes in WRONG.items():
+        for old, new in changes:
+            assert old in GOOD
+            path = write(GOOD.replace(old, new, 1))
+            with pytest.raises(InputError) as caught:
+                load_scanner(path, DATA)
+            text = str(caught.value)
+            assert text.startswith(f"{path} {where}".strip()) and "\n" not in text, text
     for name, words in (("carmm", r"did you mean 'carm'"), (tmp_path / "none.toml", "no such file")):
         with pytest.raises(InputError, match=words):
             load_scanner(name, DATA)
@@ -161,10 +147,3 @@ def test_a_data_sheet_s_words(write) -> None:
     slow = load_scanner(write(f"{plain}[readout]\nreadout_ms = 62\n"), DATA)
     with pytest.raises(InputError, match=r"^mine \[readout\] readout_ms: found 62 without a frame rate"):
         scanner_options(slow, "rapid")
-    for lines, words in {
-        'first = "top"\naxis = "columns"': r"\[readout\] first: found 'top' with axis 'columns'; expected 'rows'",
-        "readout_ms = 62\nratio = 0.5": r"\[readout\] readout_ms: found 62 with ratio",
-        "fps = 0": r"\[readout\] fps: found 0",
-    }.items():
-        with pytest.raises(InputError, match=words):
-            load_scanner(write(f"{plain}[readout]\n{lines}\n"), DATA)

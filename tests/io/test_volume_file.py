@@ -5,11 +5,11 @@ import hashlib
 import h5py
 import numpy as np
 import pytest
-from damage import on, value
+from damage import on, removed, value
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Gaussians, Grid
-from phyradgs_cl.io import file_kind, read_volume, sha256_of, volume_summary, write_volume
+from phyradgs_cl.fields import Gaussians, Grid, States
+from phyradgs_cl.io import file_kind, read_states, read_volume, sha256_of, volume_summary, write_volume
 
 GRID = Grid((2, 3, 4), (1.5, 1.25, 1.0), (0.1, -0.2, 0.3))
 PROVENANCE = {"method": "fdk", "seed": 7, "options": {"filter": "ram-lak", "M": [1, 2]}, "loss": float("inf")}
@@ -72,24 +72,27 @@ def test_volumes_that_do_not_fit_are_refused(tmp_path) -> None:
 
 
 VOLUME = "entry/reconstruction/volume"
-DAMAGE = {
-    "other shape": (VOLUME, np.zeros((3, 3, 4))),
-    "NaN in it": (VOLUME, np.full(GRID.shape, np.nan)),
-    "voxels": ("entry/grid/voxel_size", [1.0, 0.0, 1.0]),
-    "facts a list": ("entry/provenance/json", "[1]"),
-    "a negative scale": ("entry/gaussians/scale", -np.ones((5, 3))),
-}
+DAMAGE = [
+    (VOLUME, value(np.zeros((3, 3, 4)))), (VOLUME, value(np.full(GRID.shape, np.nan))),
+    ("entry/grid/voxel_size", value([1.0, 0.0, 1.0])), ("entry/provenance/json", value("[1]")),
+    ("entry/gaussians/scale", value(-np.ones((5, 3)))),
+    ("entry/time_series/time_s", value([3.0, 2.0])), ("entry/time_series/time_s", removed),
+    ("entry/time_series/volume", value(np.zeros((3, *GRID.shape)))), ("entry/time_series/volume", removed),
+]
 
 
 def test_damage_is_named(stored) -> None:
-    path, _, _ = stored
+    path, volume, gaussians = stored
+    states = States(np.array([1.0, 2.0]), np.stack([volume, volume]))
+    write_volume(path, volume, GRID, PROVENANCE, gaussians, states=states)
     content = path.read_bytes()
-    for address, values in DAMAGE.values():
+    for address, damage in DAMAGE:
         path.write_bytes(content)
-        on(address, value(values))(path)
-        with pytest.raises(InputError) as caught:
-            read_volume(path)
-        assert caught.value.subject == f"{path}:/{address}"
+        on(address, damage)(path)
+        for read in (read_volume, read_states, volume_summary) if "time" in address else (read_volume,):
+            with pytest.raises(InputError) as caught:
+                read(path)
+            assert caught.value.subject == f"{path}:/{address}"
 
 
 def test_kinds(tmp_path, stored) -> None:

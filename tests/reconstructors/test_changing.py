@@ -9,7 +9,6 @@ from ray_tables import noise
 from tolerances import ADJOINT, RAYS
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, PerRow, Scan, Shutter
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, States
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.operators import IntensityOperator, RayOperator
@@ -180,14 +179,3 @@ def test_part_of_a_result_and_times_between_states() -> None:
     np.testing.assert_array_equal(truth.at(-3.0), truth.volumes[0])
     np.testing.assert_array_equal(truth.at(99.0), truth.volumes[-1])
     assert truth.span_s == (0.0, 80.0)
-
-
-def test_states_that_do_not_fit_are_refused() -> None:
-    volumes = changing_object().volumes
-    with pytest.raises(InputError, match="states"):
-        States(STATE_TIMES_S[:3], volumes)
-    for times_s in (np.zeros(0), STATE_TIMES_S[::-1]):
-        with pytest.raises(InputError, match="at least one time, rising"):
-            States(times_s, volumes[: len(times_s)])
-    with pytest.raises(InputError, match="states"):
-        Reconstruction(volumes[0, :5], Grid((5, 20, 20), GRID.voxel_size_mm), states=States(STATE_TIMES_S, volumes))

@@ -1,6 +1,5 @@
 """States of checkpoints are taken only as a run has written them."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -8,36 +7,10 @@ import pytest
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import Progress, plan_run, reconstruct
-from phyradgs_cl.reconstructors.checkpoint import with_identity, without_identity
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import load_scan
 
 pytestmark = pytest.mark.slow
-
-
-def state() -> dict[str, np.ndarray]:
-    record = [{"iteration": 1, "loss": 0.5}, {"iteration": 2, "loss": 0.25}]
-    rng = np.random.default_rng(4).bit_generator.state
-    arrays = {"record": json.dumps(record), "seconds": 1.5, "iteration": np.int64(7), "rng": json.dumps(rng)}
-    return {name: np.array(value) for name, value in arrays.items()}
-
-
-def test_a_state_of_another_run_is_refused_with_what_differs() -> None:
-    now = {"iterations": 40, "rates": {"position": 1.0}, "scan": "a", "seed": 0}
-    mine = with_identity(state(), now)
-    assert set(without_identity(mine, now)) == set(state())
-    with pytest.raises(InputError) as caught:
-        without_identity(mine, {**now, "iterations": 60, "rates": {"position": 2.0}})
-    assert (caught.value.subject, caught.value.found) == (
-        "--resume", "a run with other iterations (40, now 60); rates.position (1.0, now 2.0)"
-    )  # fmt: skip
-    with pytest.raises(InputError, match="; and more"):
-        without_identity(mine, {name: 7 for name in "abcdef"})
-    for damaged in ("0" * 64, '"text"', np.array(str(mine["run"])).reshape(1)):
-        with pytest.raises(InputError, match="checkpoint: found arrays that do not match their checksum"):
-            without_identity({**mine, "run": np.array(damaged)}, now)
-    with pytest.raises(InputError, match="checkpoint"):
-        without_identity(state(), now)
 
 
 def wrong_arrays(array: np.ndarray) -> dict[str, np.ndarray | None]:

@@ -11,7 +11,6 @@ from phyradgs_cl.acquisition import (
     CircularOrbit,
     ConeGeometry,
     FrameSweeps,
-    MicroViews,
     Scan,
     Shutter,
     Static,
@@ -93,8 +92,6 @@ def test_scan_and_volume_agree(rt) -> None:
     expected = fdk_volume(rt, frames, geometry.pose(first), grid)
     np.testing.assert_allclose(begun.volume, expected, rtol=0, atol=FLOAT32)
     assert np.abs(begun.volume - result.volume).max() > 1e-3
-    with pytest.raises(InputError, match="MicroViews"):
-        FdkOptions(motion=MicroViews())
 
 
 def test_frames_that_are_masked_whole_are_as_if_they_were_not_there(rt) -> None:

@@ -8,7 +8,7 @@ from phyradgs_cl import neural
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.api import save_scan, simulate
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.reconstructors import method_options, plan_run, reconstruct
+from phyradgs_cl.reconstructors import plan_run, reconstruct
 
 NEURAL = ("naf", "sax-nerf")
 
@@ -30,13 +30,6 @@ def test_a_run_says_in_one_line_what_to_install(rt, method, tmp_path, capsys) ->
     said = [line for line in capsys.readouterr().err.splitlines() if "PyTorch" in line]
     assert len(said) == 1 and 'pip install "phyradgs-cl[neural]"' in said[0]
     assert not (tmp_path / "out.h5").exists()
-
-
-@pytest.mark.usefixtures("without_pytorch")
-def test_options_are_checked_all_the_same() -> None:
-    assert method_options("naf", None, {"motion": "per-row"}).motion.name == "per-row"
-    with pytest.raises(InputError, match="--motion"):
-        method_options("naf", None, {"motion": "exact"})
 
 
 def test_pytorch_is_there_where_it_is_found() -> None:

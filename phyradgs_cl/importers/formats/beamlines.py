@@ -68,8 +68,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         places = hdf5.places_of(options, source)
         entry = find_entry(source, options.entry) if "projections" not in places.stated or options.entry else _NOWHERE
         if source.find(extra := f"{entry}/{schema.EXTRA}") is not None:  # an import would lose a part of it
-            found, expected = "a scan file of this package", "a file of another program"
-            raise source.error(extra, found, expected, "use it as it is")
+            raise source.error(extra, "a scan file of this package", "a file of another program", "use it as it is")
         detector = f"{entry}/{schema.DETECTOR}"
         keys = [f"{detector}/{name}" for name in ("image_key_control", "image_key")]
         stacks = places.stacks(f"{detector}/data", key=keys, mask=[f"{detector}/pixel_mask"])

@@ -153,8 +153,7 @@ def _line_integrals(
     if mask is None:
         return integrals
     if mask.shape not in (stack.shape, (1, *stack.shape[1:])):
-        expected = f"one image of {stack.shape[1:]}, or one per frame"
-        raise frames.error("mask", f"shape {mask.shape}", expected)
+        raise frames.error("mask", f"shape {mask.shape}", f"one image of {stack.shape[1:]}, or one per frame")
     return replace(integrals, mask=united(integrals.mask, (mask if mask.shape == stack.shape else mask[0]) != 0))
 
 

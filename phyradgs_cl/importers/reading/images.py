@@ -17,9 +17,10 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.importers.reading.files import SafeFolder, check_room
+from phyradgs_cl.io.attenuation import VALUES
 from phyradgs_cl.io.files import regular_file
 from phyradgs_cl.io.hdf5.datasets import LENGTH
-from phyradgs_cl.io.volume import VALUES, Volume, finite_float32, shares_of_maximum
+from phyradgs_cl.io.volume import Volume, finite_float32, shares_of_maximum
 
 STACKS = (".mha", ".mhd")
 _SPACES = ("left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las", "")

@@ -34,8 +34,7 @@ def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
         raise InputError(f"{subject} @quantity", "no attribute", expected, "add the attribute to the dataset")
     checks.one_of(f"{subject} @quantity", quantity, schema.QUANTITIES)
     if quantity != "counts" and data.dtype.kind == "u":
-        found = f"{quantity} as {data.dtype}"
-        raise InputError(subject, found, "float32", "store float32, or counts as uint16")
+        raise InputError(subject, f"{quantity} as {data.dtype}", "float32", "store float32, or counts as uint16")
     return data, quantity
 
 
@@ -46,8 +45,7 @@ def read_image_key(source: Hdf5Source, entry: str, frames: int) -> np.ndarray:
     wrong = ~np.isin(image_key, (schema.PROJECTION, schema.FLAT, schema.DARK, schema.INVALID))
     if wrong.any():
         at = int(np.argmax(wrong))
-        expected = "0 projection, 1 flat, 2 dark or 3 invalid"
-        raise source.error(address, f"{image_key[at]} at index {at}", expected)
+        raise source.error(address, f"{image_key[at]} at index {at}", "0 projection, 1 flat, 2 dark or 3 invalid")
     if not np.any(image_key == schema.PROJECTION):
         raise source.error(address, "no projection", "at least one 0", "mark the projections with 0")
     return image_key
@@ -132,8 +130,7 @@ def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bo
         raise InputError(subject, f"{values.min():.6g} s", "a time of at least 0 s", "correct the value")
     usual_s = float(np.median(values))
     if np.abs(values - usual_s).max() > _JITTER * usual_s:
-        expected = "one time for all projections"
-        raise InputError(subject, f"{values.min():.6g} to {values.max():.6g} s", expected)
+        raise InputError(subject, f"{values.min():.6g} to {values.max():.6g} s", "one time for all projections")
     return usual_s
 
 
@@ -155,8 +152,7 @@ def check_mask(source: Hdf5Source, entry: str, data_shape: tuple[int, ...]) -> t
     if mask is None:
         return None
     if mask.shape not in (data_shape, data_shape[1:]):
-        expected = f"{data_shape[1:]} (v, u) or {data_shape} (frame, v, u)"
-        raise source.error(address, f"shape {mask.shape}", expected)
+        raise source.error(address, f"shape {mask.shape}", f"{data_shape[1:]} (v, u) or {data_shape} (frame, v, u)")
     if mask.dtype.kind not in "biu":
         raise source.error(address, f"type {mask.dtype}", "whole numbers", "non-zero marks a bad pixel")
     return mask.shape

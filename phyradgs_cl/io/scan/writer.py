@@ -58,8 +58,7 @@ def _checked_frames(
     checks.one_of("quantity", quantity, schema.QUANTITIES)
     if data is None:
         if quantity != "attenuation" or image_key is not None:
-            expected = "raw frames with an image_key"
-            raise InputError("data", "None", expected, "pass the frames of this quantity")
+            raise InputError("data", "None", "raw frames with an image_key", "pass the frames of this quantity")
         data = scan.projections
     key = np.zeros(len(data), np.int64) if image_key is None else np.asarray(image_key)
     frames = data if data.dtype == np.uint16 else data.astype(np.float32, copy=False)
