@@ -110,18 +110,20 @@ def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, bl
         return {term: height * value for term, value in kernel.items()}
 
     fitted = rest(1.0)
-    height, least = 1.0, fitted
+    height, best, least = 1.0, 1.0, fitted
     for _ in range(_MOST_STEPS):
-        higher = rest(_HEIGHT_STEP * height)
-        if higher > _AS_WELL * least:
+        height *= _HEIGHT_STEP
+        higher = rest(height)
+        if higher < least:
+            best, least = height, higher
+        elif higher > _AS_WELL * least:
             break
-        height, least = _HEIGHT_STEP * height, min(least, higher)
     if least >= _BETTER * fitted:
         return kernel
     # the minimum lies between the neighbours of the best height tried
-    bounds = height / _HEIGHT_STEP, height * _HEIGHT_STEP
-    best = scipy.optimize.minimize_scalar(rest, bounds=bounds, method="bounded", options={"maxiter": _TRIALS})
-    return times(float(best.x))
+    bounds = best / _HEIGHT_STEP, best * _HEIGHT_STEP
+    found = scipy.optimize.minimize_scalar(rest, bounds=bounds, method="bounded", options={"maxiter": _TRIALS})
+    return times(float(found.x))
 
 
 def _height_for(frames: np.ndarray, to_primary: float, reach: float) -> float:
