@@ -155,7 +155,7 @@ def _peaks(values: np.ndarray) -> tuple[Window, Window]:
     """Returns the windows of air and of water in the histogram. Metal is so dense that both may lie in a few bins, so the
     histogram is shortened until it shows two peaks, and once more to end beyond water."""
     lowest, highest = (float(v) for v in np.percentile(values, (0.1, 99.9)))
-    for _ in range(_SHORTENED):
+    for _ in range(_SHORTENED + 1):
         if len(windows := _windows(values, lowest, highest)) > 1:
             break
         highest = lowest + (highest - lowest) / 4
