@@ -5,6 +5,7 @@ import json
 import random
 import re
 import shutil
+from importlib.util import find_spec
 
 import nibabel
 import numpy as np
@@ -21,7 +22,7 @@ from phyradgs_cl.io import read_volume
 pytestmark = pytest.mark.slow
 
 NAMES = {"v.mha": "mha", "v.nii": "nii", "v.nii.gz": "nii", "v.nrrd": "nrrd", "v.npy": "npy", "v.tif": "tiff"}
-NAMES["v.ome.zarr"] = "zarr"
+NAMES |= {"v.ome.zarr": "zarr"} if find_spec("ome_zarr") else {}
 
 
 @pytest.fixture
