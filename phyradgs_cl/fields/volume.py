@@ -3,15 +3,12 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-
-if TYPE_CHECKING:
-    from xarray import DataArray
 
 MOST_VOXELS = 2**38
 """The most voxels of a grid: a terabyte of float32. Larger requests come from damaged files."""
@@ -83,16 +80,6 @@ class Grid:
         sides = zip(self.first_centre_mm, self.shape, self.voxel_size_mm, strict=True)
         return triple(first + np.arange(n) * d for first, n, d in sides)
 
-    def data_array(self, values: np.ndarray, unit: str, times_s: np.ndarray | None = None) -> "DataArray":
-        """Returns values (nz, ny, nx), or (K, nz, ny, nx) at ``times_s`` (K,), as xarray's DataArray with coordinates in mm
-        and s. ``unit``: of the values. InputError where xarray is not installed."""
-        xarray = checks.package("xarray", "the package of labelled arrays", "xarray")
-        axes = {name: (name, axis, {"units": "mm"}) for name, axis in zip("zyx", self.axes_mm(), strict=True)}
-        if times_s is not None:
-            axes = {"time": ("time", times_s, {"units": "s"}), **axes}
-        facts = {"units": unit, "long_name": "CT number" if unit == "HU" else "attenuation"}
-        return xarray.DataArray(values, axes, list(axes), facts["long_name"], facts)
-
     def is_close(self, other: "Grid") -> bool:
         """Returns whether two grids are equal up to the rounding of files."""
         near_mm = 1e-5 * max(self.size_mm)
@@ -125,3 +112,14 @@ class Grid:
     def scaled(self, factor: float) -> "Grid":
         """Returns the grid with every length multiplied by ``factor``."""
         return Grid(self.shape, triple(d * factor for d in self.voxel_size_mm), triple(o * factor for o in self.offset_mm))
+
+
+@dataclass(frozen=True, eq=False)
+class Metal:
+    """Attenuation (nz, ny, nx) float32 in 1/mm of the metal on ``grid``, 0 elsewhere. InputError for another shape."""
+
+    values: np.ndarray
+    grid: Grid
+
+    def __post_init__(self) -> None:
+        checks.shape("metal", self.values, self.grid.shape)

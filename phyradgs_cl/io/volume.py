@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import HOUNSFIELD, Deformation, Gaussians, Grid, Hounsfield, States, deformed, triple
+from phyradgs_cl.fields import Deformation, Gaussians, Grid, Hounsfield, States, deformed, triple
 from phyradgs_cl.fields.hounsfield import Box, fitted, of_facts, of_note
 from phyradgs_cl.io.deformation import DEFORMATION, read_deformation_group, write_deformation_group
 from phyradgs_cl.io.files import sha256_of
@@ -21,9 +21,6 @@ from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.tables import PROVENANCE, read_facts
 from phyradgs_cl.text import plain_text
-
-if TYPE_CHECKING:
-    from xarray import DataArray
 
 _DATA = "/entry/reconstruction"
 _VOLUME, _BARE = f"{_DATA}/volume", "/volume"
@@ -77,11 +74,7 @@ class Volume:
     def hounsfield(self, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0) -> "Volume":
         """Returns the volume, still in 1/mm, with a scale of Hounsfield units. See ``hounsfield.fitted``."""
         scale = fitted(self.values, self.required_grid, air, water, insert_hu)
-        return replace(self, provenance={**self.provenance, HOUNSFIELD: scale.facts()})
-
-    def to_xarray(self) -> "DataArray":
-        """Returns the values in 1/mm as xarray's DataArray with coordinates in mm. See ``Grid.data_array``."""
-        return self.required_grid.data_array(self.values, "1/mm")
+        return replace(self, provenance={**self.provenance, **scale.facts()})
 
     @property
     def required_grid(self) -> Grid:
@@ -189,7 +182,7 @@ def in_per_mm(subject: str, volume: Volume, mu_water_per_mm: float | None = None
     if scale is None and (is_hu or float(np.abs(volume.values).max()) > _USUAL_PER_MM):
         scale = stated
     if scale is not None:
-        facts = {**volume.provenance, HOUNSFIELD: scale.facts(), VALUES: FROM_HU}
+        facts = {**volume.provenance, **scale.facts(), VALUES: FROM_HU}
         return replace(volume, values=scale.per_mm(volume.values), provenance=facts)
     if is_hu:
         raise InputError(subject, "Hounsfield units", "1/mm", "say --mu-water-per-mm, near 0.02, to convert them")

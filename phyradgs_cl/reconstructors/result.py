@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError, naming_arguments
-from phyradgs_cl.fields import HOUNSFIELD, Deformation, Gaussians, Grid, Hounsfield, States
+from phyradgs_cl.fields import Deformation, Gaussians, Grid, Hounsfield, States
 from phyradgs_cl.fields.hounsfield import Box, fitted, of_facts
 from phyradgs_cl.reconstructors.checkpoint import State
 
@@ -112,25 +112,22 @@ class Reconstruction:
 
         Raises InputError for less than 100 voxels, air that is not below water, and peaks that are not theirs."""
         scale = fitted(self.volume, self.grid, air, water, insert_hu)
-        return replace(self, facts={**self.facts, HOUNSFIELD: scale.facts()})
+        return replace(self, facts={**self.facts, **scale.facts()})
 
     @naming_arguments()
-    def to_xarray(self, *, hu: bool = False, states: bool = False) -> "DataArray":
-        """Returns the volume as xarray's DataArray (z, y, x) with coordinates in mm; nothing is copied.
+    def to_xarray(self, *, states: bool = False) -> "DataArray":
+        """Returns the volume as xarray's DataArray (z, y, x) in 1/mm with coordinates in mm; nothing is copied.
 
-        hu: in Hounsfield units of ``scale``, a copy, in place of 1/mm. states: the states (time, z, y, x) of a result that
-        has them, with times in s.
-
-        Raises InputError for a scale or states that the result does not have, and where xarray is not installed."""
-        scale, of_times = self.scale, self.states
-        if hu and scale is None:
-            raise InputError("hu", "a result without a scale", "one", "result.hounsfield(air, water) fits one")
-        if states and of_times is None:
+        states: the object at its times in s, (time, z, y, x), of a result that has states. Raises InputError for a result
+        that has none, and where xarray is not installed."""
+        xarray = checks.package("xarray", "the package of labelled arrays", "xarray")
+        axes = {name: (name, axis, {"units": "mm"}) for name, axis in zip("zyx", self.grid.axes_mm(), strict=True)}
+        values = self.volume
+        if states and self.states is None:
             raise InputError("states", "a result without states", "one of method changing", "leave it out")
-        values = self.volume if not states or of_times is None else of_times.volumes
-        if hu and scale is not None:
-            values = scale.of(values)
-        return self.grid.data_array(values, "HU" if hu else "1/mm", of_times.times_s if states and of_times else None)
+        if states and self.states is not None:
+            values, axes = self.states.volumes, {"time": ("time", self.states.times_s, {"units": "s"}), **axes}
+        return xarray.DataArray(values, axes, list(axes), "attenuation", {"units": "1/mm", "long_name": "attenuation"})
 
     @naming_arguments()
     def plot(self, scan: "Scan | None" = None, *, frame: int = 0, device: "str | Runtime | None" = None) -> "Figure":

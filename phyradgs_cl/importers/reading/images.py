@@ -16,6 +16,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
+from phyradgs_cl.fields.hounsfield import of_note
 from phyradgs_cl.importers.reading.files import SafeFolder, check_room
 from phyradgs_cl.io.files import regular_file
 from phyradgs_cl.io.hdf5.datasets import LENGTH
@@ -24,7 +25,6 @@ from phyradgs_cl.io.volume import VALUES, Volume, finite_float32, shares_of_maxi
 STACKS = (".mha", ".mhd")
 _SPACES = ("left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las", "")
 _HEAD_BYTES, _VOXEL_BYTES = 1 << 16, 8
-_IN_HU, _NOTE_BYTES = b"values in HU", 79
 _READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", ".nrrd": "Nrrd"}
 _DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$", re.M)
 _OBLIQUE = 1e-3  # largest sine of an angle between an axis and the world's
@@ -82,7 +82,7 @@ def read_image(path: Path, state: int | None = None) -> Any:
 def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
     """Returns how many bytes of voxels a file holds, unpacked: SimpleITK fills those that are missing in NIfTI, and damaged
     in packed MetaImages, without an error. None where it refuses them. InputError: data elsewhere."""
-    with _unpacked(path) as file:
+    with gzip.open(path) if path.suffix.lower() == ".gz" else open(path, "rb") as file:
         head = file.read(_HEAD_BYTES)
         if reader.HasMetaDataKey("bitpix"):  # NIfTI, in which scaled integers come out as floats
             stored = file.seek(0, os.SEEK_END) - int(float(reader.GetMetaData("vox_offset")))
@@ -101,21 +101,11 @@ def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
     return len(zlib.decompress(path.read_bytes()[start:]))
 
 
-def _unpacked(path: Path) -> Any:
-    return gzip.open(path) if path.suffix.lower() == ".gz" else open(path, "rb")
-
-
-def _noted(path: Path) -> dict[str, object]:
-    """Returns what the file of an image in Hounsfield units notes of its values, for a volume's provenance."""
-    with _unpacked(path) as file:
-        head = file.read(_HEAD_BYTES)
-    return {VALUES: head[place : place + _NOTE_BYTES].decode("latin-1")} if (place := head.find(_IN_HU)) >= 0 else {}
-
-
 def read_image_volume(path: Path, state: int | None = None) -> Volume:
     """Reads a volume with its axes turned to rise with the world's, which are LPS. A NRRD file without voxel sizes has no
     grid; its integers are divided by the maximum of their type. ``state``, InputError: see ``read_image``; oblique axes."""
     subject, image = str(path), read_image(path, state)
+    note = " ".join(image.GetMetaData(key) for key in image.GetMetaDataKeys())
     sitk = checks.package("SimpleITK", "the package that reads this file", "phyradgs-cl[formats]")
     header = _nrrd_header(path) if path.suffix.lower() == ".nrrd" else {}
     if header and not {"space directions", "spacings"} & set(header):
@@ -138,7 +128,7 @@ def read_image_volume(path: Path, state: int | None = None) -> Volume:
         raise InputError(f"{subject}: origin", str(list(image.GetOrigin()))[:80], "three lengths in mm")
     values = finite_float32(subject, sitk.GetArrayFromImage(image))
     grid = Grid(triple(values.shape), triple(size_mm[::-1].tolist()), triple(centre_mm[::-1].tolist()))
-    return Volume(values, grid, _noted(path))
+    return Volume(values, grid, {VALUES: note} if of_note(note)[0] else {})
 
 
 def _nrrd_header(path: Path) -> dict[str, str]:
