@@ -97,7 +97,7 @@ def test_what_is_lost_or_no_volume_is_said(volume_file, stored, tmp_path, caplog
     (tmp_path / "empty.zarr").mkdir()
     write_image(np.ones((2, 4, 5, 6), np.float32), str(tmp_path / "times.zarr"), axes="tzyx")
     write_image(np.ones((4, 5), np.float32), str(tmp_path / "flat.zarr"), axes="yx")
-    found = {"empty": "KeyError", "flat": "ValueError: 'z' is not", "none": "FileNotFoundError", "damaged": "RuntimeError"}
-    for name, words in {**found, "times": "ValueError: axes t, z, y, x"}.items():
-        with pytest.raises(InputError, match=f"{name}.zarr: found {words}"):
+    for name in ("empty", "flat", "none", "damaged", "times"):
+        words = "axes t, z, y, x of" if name == "times" else ""
+        with pytest.raises(InputError, match=f"{name}.zarr: found .*{words}.*; expected an OME-Zarr with real numbers"):
             load_volume(Path(tmp_path / f"{name}.zarr"))

@@ -25,6 +25,7 @@ from phyradgs_cl.io.volume import VALUES, Volume, finite_float32, shares_of_maxi
 STACKS = (".mha", ".mhd")
 _SPACES = ("left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las", "")
 _HEAD_BYTES, _VOXEL_BYTES = 1 << 16, 8
+_NOTE = "ITK_FileNotes"  # of NIfTI the field descrip
 _READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", ".nrrd": "Nrrd"}
 _DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$", re.M)
 _OBLIQUE = 1e-3  # largest sine of an angle between an axis and the world's
@@ -105,7 +106,7 @@ def read_image_volume(path: Path, state: int | None = None) -> Volume:
     """Reads a volume with its axes turned to rise with the world's, which are LPS. A NRRD file without voxel sizes has no
     grid; its integers are divided by the maximum of their type. ``state``, InputError: see ``read_image``; oblique axes."""
     subject, image = str(path), read_image(path, state)
-    note = " ".join(image.GetMetaData(key) for key in image.GetMetaDataKeys())
+    note = image.GetMetaData(_NOTE) if image.HasMetaDataKey(_NOTE) else ""
     sitk = checks.package("SimpleITK", "the package that reads this file", "phyradgs-cl[formats]")
     header = _nrrd_header(path) if path.suffix.lower() == ".nrrd" else {}
     if header and not {"space directions", "spacings"} & set(header):
