@@ -1,6 +1,6 @@
-"""Metal in a polychromatic beam: two steel beads in water or in a volume, with and without `prepare --steps metal`.
+"""Metal in a polychromatic beam: two beads in water or in a volume, with and without `prepare --steps metal`.
 
-    python benchmarks/metal.py [VOLUME.h5 ...] [--views 120]
+    python benchmarks/metal.py [VOLUME.h5 ...] [--metals steel,titanium] [--views 120]
 
 The beam is SpekPy's at 120 kV behind 5 mm of aluminium, with 2·10⁵ photons. Streak energy: mean square of the difference to
 the volume of the same scan without beads, 10⁻⁶/mm². It and the PSNR count voxels more than two away from the metal."""
@@ -19,12 +19,15 @@ from phyradgs_cl.detector.attenuation import _BONE, _WATER, _at
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
 SIDE, GRID, PHOTONS = 64, api.Grid.cube(64, 120.0), 2e5
+BONE_G_PER_CM3 = 1.92
 IRON = ((10, 170.6), (20, 25.68), (30, 8.176), (40, 3.629), (60, 1.205), (80, 0.5952), (100, 0.3717), (150, 0.1964))
-BONE_G_PER_CM3, IRON_G_PER_CM3 = 1.92, 7.87
+TITANIUM = ((10, 110.7), (20, 15.85), (30, 4.972), (40, 2.214), (60, 0.7661), (80, 0.4052), (100, 0.2721), (150, 0.1649))
+METALS = {"steel": (7.87, IRON), "titanium": (4.51, TITANIUM)}
+"""g/cm³, and cm²/g at energies in keV (NIST)."""
 
 
 def beads() -> tuple[np.ndarray, ...]:
-    """Shares (z, y, x) of water, bone and steel: an ellipsoid with a rod, a dent and two beads of 8 mm."""
+    """Shares (z, y, x) of water, bone and metal: an ellipsoid with a rod, a dent and two beads of 8 mm."""
     places = {
         "body": ((0, 0, 0), (45, 35, 48)), "rod": ((0, 18, 0), (7, 7, 40)), "dent": ((-15, -8, 5), (8, 8, 8)),
         "left": ((22, -5, 0), (4, 4, 4)), "right": ((-20, 8, 0), (4, 4, 4)),
@@ -46,43 +49,47 @@ def of_volume(path: Path) -> tuple[np.ndarray, ...]:
     inner = inner[np.argsort(np.abs(inner[:, 0] - SIDE // 2), kind="stable")[:800]]
     ends = (inner[np.argmin(inner[:, 2])], inner[np.argmax(inner[:, 2])])
     places = np.moveaxis(np.indices(values.shape), 0, -1)
-    steel = np.max([np.sum((places - end) ** 2, -1) <= 2.1**2 for end in ends], axis=0).astype(np.float32)
-    return 0.9 * np.minimum(values, 1.4) * (1 - steel), 0.4 * np.clip(values - 1.4, 0, None) * (1 - steel), steel
+    metal = np.max([np.sum((places - end) ** 2, -1) <= 2.1**2 for end in ends], axis=0).astype(np.float32)
+    return 0.9 * np.minimum(values, 1.4) * (1 - metal), 0.4 * np.clip(values - 1.4, 0, None) * (1 - metal), metal
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("volumes", nargs="*", type=Path)
+    parser.add_argument("--metals", default="steel")
     parser.add_argument("--views", type=int, default=120)
     words = parser.parse_args()
     cone = api.ConeGeometry(785.0, 1200.0, (72, 72), 2.95)
-    empty = api.static_scan(
-        np.zeros((words.views, 72, 72), np.float32), cone, np.arange(words.views) * 360 / words.views, grid=GRID
-    )
+    angles_deg = np.arange(words.views) * 360 / words.views
+    empty = api.static_scan(np.zeros((words.views, 72, 72), np.float32), cone, angles_deg, grid=GRID)
+    objects = [(path.stem, of_volume(path)) for path in words.volumes] or [("water", beads())]
+    for name, parts in objects:
+        for metal in words.metals.split(","):
+            compare(empty, f"{name} | {metal}", parts, *METALS[metal])
+
+
+def compare(empty: api.Scan, name: str, parts: tuple[np.ndarray, ...], g_per_cm3: float, table: tuple) -> None:
+    """Prints a row for each method: PSNR without metal, with it and with the step; streaks; does a clean scan stay?"""
     project, spectrum = api.ray_operator(empty), tube_spectrum(120.0, 5.0, 12.0)
-    energies, iron = np.log(np.array(IRON).T)
-    steel = np.exp(np.interp(np.log(spectrum.energy_kev), energies, iron)) * IRON_G_PER_CM3
-    per_mm = np.stack([_at(spectrum.energy_kev, _WATER), _at(spectrum.energy_kev, _BONE) * BONE_G_PER_CM3, steel]) / 10
-    for name, parts in (("two beads", beads()), *((path.stem, of_volume(path)) for path in words.volumes)):
-        paths = np.stack([project(part.astype(np.float32)) for part in parts])
-        scans = []
-        for has_steel in (False, True):
-            paths_mm = paths * np.array([1, 1, has_steel])[:, None, None, None]
-            light = sum(w * np.exp(-np.tensordot(mu, paths_mm, 1)) for w, mu in zip(spectrum.weight, per_mm.T, strict=True))
-            counts = np.maximum(np.random.default_rng(0).poisson(PHOTONS * light), 1)
-            scans.append(replace(empty, projections=-np.log(counts / PHOTONS).astype(np.float32)))
-        scans.append(api.prepare(scans[1], "metal"))
-        stays = api.prepare(scans[0], "metal").projections is scans[0].projections
-        truth = parts[0] * float(spectrum.weight @ per_mm[0]) + parts[1] * float(spectrum.weight @ per_mm[1])
-        far = ~ndimage.binary_dilation(parts[2] > 0.02, iterations=2)
-        for method, options in (("fdk", {}), ("fista", {"iterations": 15})):
-            volumes = [api.reconstruct(scan, method, report=False, **options).volume[far] for scan in scans]
-            db = [20 * np.log10(truth[far].max() / np.sqrt(np.mean((volume - truth[far]) ** 2))) for volume in volumes]
-            streaks = [1e6 * float(np.mean((volume - volumes[0]) ** 2)) for volume in volumes[1:]]
-            print(
-                f"| {name} | {method} | {db[0]:.2f} | {db[1]:.2f} | {db[2]:.2f} | {streaks[0]:.3f} | {streaks[1]:.3f} "
-                f"| {'yes' if stays else 'no'} |", flush=True,
-            )  # fmt: skip
+    energies, cm2_per_g = np.log(np.array(table).T)
+    metal = np.exp(np.interp(np.log(spectrum.energy_kev), energies, cm2_per_g)) * g_per_cm3
+    per_mm = np.stack([_at(spectrum.energy_kev, _WATER), _at(spectrum.energy_kev, _BONE) * BONE_G_PER_CM3, metal]) / 10
+    paths, scans = np.stack([project(part.astype(np.float32)) for part in parts]), []
+    for has_metal in (False, True):
+        paths_mm = paths * np.array([1, 1, has_metal])[:, None, None, None]
+        light = sum(w * np.exp(-np.tensordot(mu, paths_mm, 1)) for w, mu in zip(spectrum.weight, per_mm.T, strict=True))
+        counts = np.maximum(np.random.default_rng(0).poisson(PHOTONS * light), 1)
+        scans.append(replace(empty, projections=-np.log(counts / PHOTONS).astype(np.float32)))
+    scans.append(api.prepare(scans[1], "metal"))
+    stays = api.prepare(scans[0], "metal").projections is scans[0].projections
+    truth = parts[0] * float(spectrum.weight @ per_mm[0]) + parts[1] * float(spectrum.weight @ per_mm[1])
+    far = ~ndimage.binary_dilation(parts[2] > 0.02, iterations=2)
+    for method, options in (("fdk", {}), ("fista", {"iterations": 15})):
+        volumes = [api.reconstruct(scan, method, report=False, **options).volume[far] for scan in scans]
+        db = [20 * np.log10(truth[far].max() / np.sqrt(np.mean((volume - truth[far]) ** 2))) for volume in volumes]
+        streaks = [1e6 * float(np.mean((volume - volumes[0]) ** 2)) for volume in volumes[1:]]
+        numbers = " | ".join([*(f"{one:.2f}" for one in db), *(f"{one:.3f}" for one in streaks)])
+        print(f"| {name} | {method} | {numbers} | {'yes' if stays else 'no'} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ _BINS, _SMOOTH_BINS = 512, 2.0
 _PROMINENT, _CERTAIN = 0.1, 3.0  # of a peak's own height, and of its root: eight times the noise of smooth counts
 _ZOOM = 2.5  # times water
 _SHORTENED = 5  # times, to a quarter each: metal may be a thousand times denser than water
-_NUMBER = r"-?[\d.]+(?:e[-+]\d+)?"
+_NUMBER = r"-?\d+\.?\d*(?:e[-+]\d+)?"
 _NOTE = re.compile(rf"values in HU(?:, water ({_NUMBER}), air ({_NUMBER}) 1/mm)?")
 
 

@@ -1,5 +1,6 @@
 """Runs a plan on a scan: preprocessing, first volume, margin, held-out pixels, and the method."""
 
+import logging
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -39,6 +40,7 @@ from phyradgs_cl.reconstructors.result import (
 )
 from phyradgs_cl.runtime import Runtime
 
+log = logging.getLogger(__name__)
 # Volumes that voxel methods hold at one time at most (docs/large.md), with two of the intensity model; they hold stacks of
 # all frames too, and one buffer of three volumes.
 _HELD = {"sirt": 8, "sart": 28, "os-sart": 28, "cgls": 11, "asd-pocs": 32, "fista-tv": 16}
@@ -90,6 +92,8 @@ class _Prepared:
         if self.deformation is not None:
             check_object_motion(self.deformation, self.scan)
             self.arguments["deformation"] = self.deformation
+        if self.scan.metal is not None and (self.deformation is not None or plan.method_name == "moving"):
+            log.warning("metal: found and masked as in an object at rest, and this one moves: do not trust what is near it")
         self.options = plan.options
         if hasattr(self.options, "motion") and plan.method_name != "moving":  # which finds the object's speed itself
             motion = with_times(self.options.motion, self.scan, self.deformation)

@@ -117,7 +117,41 @@ def test_a_threshold_is_believed_or_refused(rt, beads) -> None:
     spoilt = beads(True)
     stated = api.prepare(spoilt, "metal", metal={"above_per_mm": 0.2}, device=rt)
     assert stated.provenance["prepared"][-1]["above_per_mm"] == 0.2
+    high = api.prepare(spoilt, "metal", metal={"above_per_mm": 50.0}, device=rt)
+    assert high.projections is spoilt.projections and high.provenance["prepared"][-1]["result"] == "nothing to do"
     with pytest.raises(InputError, match="whose shadow covers .* % of the object"):
         api.prepare(spoilt, "metal", metal={"above_per_mm": 0.005}, device=rt)
     with pytest.raises(InputError, match="metal.above_per_mm"):
         api.prepare(spoilt, "metal", metal={"above_per_mm": -1.0}, device=rt)
+
+
+@pytest.mark.parametrize("method", ["fista", "phyradgs", "changing", "moving"])
+def test_what_fills_the_shadow_does_not_reach_iterative_methods_and_they_resume(rt, tmp_path, caplog, method) -> None:
+    """Splats too, whose first cloud is of FDK: here both start from one volume."""
+    bead = "{centre_mm = [0.5, 0.1, 0.1], radius_mm = 0.15, attenuation_per_mm = 4.0}"
+    body = "{centre_mm = [0.0, 0.0, 0.0], radius_mm = 0.9, attenuation_per_mm = 0.2}"
+    (tmp_path / "bead.toml").write_text(f"bead = [{body}, {bead}]\n")
+    scan = api.simulate(tmp_path / "bead.toml", size=16, detector=24, views=30, exposure_deg=6.0, device=rt)
+    mended = api.prepare(scan, "metal", device=rt)
+    refilled = np.where(mended.valid, mended.projections, mended.projections + np.float32(0.5))
+    options = {"iterations": 4, "holdout": 5.0, "device": rt}
+    if method == "phyradgs":
+        options |= {"iterations": 20, "initial": api.reconstruct(mended, "fdk", device=rt)}
+    whole, other = (api.reconstruct(s, method, report=False, **options) for s in (mended, replace(mended, projections=refilled)))
+    np.testing.assert_array_equal(whole.volume, other.volume)
+    is_metal = mended.metal.values > 0
+    assert (whole.volume[is_metal] == mended.metal.values[is_metal]).all() and "held_out" in whole.facts
+    assert ("as in an object at rest" in caplog.text) == (method == "moving")
+    if whole.states is not None:
+        assert (whole.states.volumes[:, is_metal] == mended.metal.values[is_metal]).all()
+    if method != "fista":
+        return
+
+    def stop(progress: api.Progress) -> None:
+        if progress.iteration < options["iterations"]:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as ended:
+        api.reconstruct(mended, method, report=stop, **options)
+    resumed = api.reconstruct(mended, method, report=False, resume=ended.value.partial, **options)
+    np.testing.assert_array_equal(resumed.volume, whole.volume)
