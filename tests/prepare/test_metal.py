@@ -137,7 +137,8 @@ def test_what_fills_the_shadow_does_not_reach_iterative_methods_and_they_resume(
     options = {"iterations": 4, "holdout": 5.0, "device": rt}
     if method == "phyradgs":
         options |= {"iterations": 20, "initial": api.reconstruct(mended, "fdk", device=rt)}
-    whole, other = (api.reconstruct(s, method, report=False, **options) for s in (mended, replace(mended, projections=refilled)))
+    scans = mended, replace(mended, projections=refilled)
+    whole, other = (api.reconstruct(one, method, report=False, **options) for one in scans)
     np.testing.assert_array_equal(whole.volume, other.volume)
     is_metal = mended.metal.values > 0
     assert (whole.volume[is_metal] == mended.metal.values[is_metal]).all() and "held_out" in whole.facts
