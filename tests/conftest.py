@@ -6,6 +6,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 
@@ -27,6 +28,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells  # noqa: E402
 from phyradgs_cl.api import save_scan, simulate  # noqa: E402
 from phyradgs_cl.runtime import Runtime  # noqa: E402
 
+collect_ignore = [] if find_spec("cil") else ["test_cil.py"]
 Cloud = Callable[..., np.ndarray]
 
 

@@ -29,7 +29,7 @@ from phyradgs_cl.acquisition.trajectory import (
     is_parallel,
 )
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Gating, Grid, GridChoice, MovingTruth
+from phyradgs_cl.fields import Gating, Grid, GridChoice, Metal, MovingTruth
 
 log = logging.getLogger(__name__)
 DETECTOR_MODELS = ("log", "intensity")
@@ -61,6 +61,7 @@ class Scan:
     - reference (nz, ny, nx): the true volume in 1/mm on ``grid``. moving_truth: the true states on ``grid`` and the
       deformation of a simulated object that moves.
     - gating: a signal or phase of a moving object, recorded with the frames.
+    - metal: the metal that is put back into volumes. The mask hides its shadow (docs/prepare.md).
     - lag: the share λ of the recorded intensity that stems from earlier frames (detector/effects.py). The projections
       still contain it.
     - saturation: None where raw counts were not examined. title and provenance are stored in files.
@@ -83,6 +84,7 @@ class Scan:
     saturation: Saturation | None = None
     moving_truth: MovingTruth | None = None
     gating: Gating | None = None
+    metal: Metal | None = None
     _checked: np.ndarray | None = field(default=None, kw_only=True)
     """The projections that are known to be finite: ``replace`` with the same array does not look at them again."""
 

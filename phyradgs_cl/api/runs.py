@@ -74,7 +74,7 @@ def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Recon
         if volume.grid is None:
             raise InputError(str(file), "values without voxel sizes", "a volume with its grid in mm")
         words_of_hu({file: volume}, mu_water_per_mm)
-        return Reconstruction(volume.values, volume.grid, facts=volume.provenance)
+        return Reconstruction(volume.values, volume.grid, facts={} if volume.scale is None else volume.scale.facts())
     if mu_water_per_mm is not None:
         raise InputError("--mu-water-per-mm", f"given for {file}, which is in 1/mm", "a file in Hounsfield units")
     stored = read_volume(file)

@@ -43,9 +43,9 @@ _OUTPUT = "File to write, or for dicom and zarr a new folder; nii.gz is compress
 _TO = "nii, mha, nrrd, tiff, npy, zarr and dicom (folders): the voxels; ply, npz: the Gaussians."
 _WATER = "Attenuation of water in 1/mm; the values are then Hounsfield units, with air at 0."
 _HU = "Hounsfield units by the volume's own scale, else fitted to air and water. An output .h5 keeps 1/mm and the scale."
-_AIR = "Box of air for --hu."
-_WATER_BOX = "Box of water, or of the insert, for --hu."
-_INSERT = "HU of the second point of --hu, where it is not water."
+_AIR = "Box of air, for Hounsfield units."
+_WATER_BOX = "Box of water, or of the insert, for Hounsfield units."
+_INSERT = "HU of the second point, where it is not water."
 
 
 def info_command(
@@ -90,9 +90,7 @@ def export_command(
     form, labels = to or format_of(output), DicomLabels(patient, title, description, date)
     moves = object_motion is not None or states is not None or during is not None
     scales: list[Hounsfield | None] = []
-    for name, value in (("--air-mm", air_mm), ("--water-mm", water_mm), ("--insert-hu", insert_hu or None)):
-        if value is not None and not hu:
-            raise InputError(name, "given without --hu", "both, or neither", "add --hu")
+    hu = hu or air_mm is not None or water_mm is not None or insert_hu != 0
 
     def scale_of(stored: Volume) -> Hounsfield | None:
         scales.append(hu_scale(stored, air_mm, water_mm, insert_hu))

@@ -11,7 +11,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import writers
 from phyradgs_cl.exporters.dicom import DicomLabels, write_dicom
 from phyradgs_cl.exporters.ome_zarr import write_zarr
-from phyradgs_cl.fields import HOUNSFIELD, Deformation, Hounsfield, States
+from phyradgs_cl.fields import Deformation, Hounsfield, States
 from phyradgs_cl.fields.hounsfield import Box
 from phyradgs_cl.io import Volume, read_state, read_volume, refuse_overwriting, write_volume
 
@@ -173,7 +173,7 @@ def export_stored(
 
 def _write_own(target: Path, volume: Volume, path: str, scale: Hounsfield | None) -> None:
     """Writes all that the volume file ``path`` holds to another volume file, with the scale of Hounsfield units."""
-    facts = volume.provenance if scale is None else {**volume.provenance, HOUNSFIELD: scale.facts()}
+    facts = volume.provenance if scale is None else {**volume.provenance, **scale.facts()}
     parts = volume.gaussians, volume.metrics, read_state(path), volume.deformation, volume.states
     write_volume(target, volume.values, volume.required_grid, facts, *parts)
 

@@ -30,7 +30,8 @@ _PROMINENT = 0.1  # least prominence of a peak, as a fraction of its smoothed co
 _CERTAIN = 3.0  # least prominence of a peak over the root of its smoothed count: eight times the noise of smoothed counts
 _ZOOM = 2.5  # largest ratio of the last histogram's upper end to that of water's peak
 _SHORTENED = 5  # most times that the histogram's range is cut to a quarter: metal may be a thousand times denser than water
-_NOTE = re.compile(r"values in HU(?:, water ([-+.\de]+), air ([-+.\de]+) 1/mm)?")
+_NUMBER = r"-?\d+\.?\d*(?:e[-+]\d+)?"
+_NOTE = re.compile(rf"values in HU(?:, water ({_NUMBER}), air ({_NUMBER}) 1/mm)?")
 
 
 @dataclass(frozen=True)
@@ -51,21 +52,16 @@ class Hounsfield:
 
     def of(self, per_mm: np.ndarray) -> np.ndarray:
         """Returns attenuation (z, y, x) in 1/mm as float32 in HU. Raises InputError where float32 does not hold them."""
-        factor = 1000.0 / (self.water_per_mm - self.air_per_mm)
-        hu = np.empty(per_mm.shape, np.float32)
+        hu = np.subtract(per_mm, self.water_per_mm, dtype=np.float32)
         with np.errstate(over="ignore"):
-            for z, plane in enumerate(per_mm):  # by planes: no second volume in float64
-                hu[z] = factor * (plane.astype(np.float64) - self.water_per_mm)
-        if not np.isfinite(hu).all():
-            raise InputError("--mu-water-per-mm", f"{self.water_per_mm:g}", "water's attenuation in 1/mm, near 0.02")
+            hu *= 1000.0 / (self.water_per_mm - self.air_per_mm)
+        checks.finite("volume in Hounsfield units", hu)
         return hu
 
     def per_mm(self, hu: np.ndarray) -> np.ndarray:
         """Returns values (z, y, x) in HU as float32 in 1/mm."""
-        step = (self.water_per_mm - self.air_per_mm) / 1000
-        values = np.empty(hu.shape, np.float32)
-        for z, plane in enumerate(hu):
-            values[z] = self.water_per_mm + step * plane.astype(np.float64)
+        values = np.multiply(hu, (self.water_per_mm - self.air_per_mm) / 1000, dtype=np.float32)
+        values += np.float32(self.water_per_mm)
         return values
 
     @property
@@ -75,21 +71,23 @@ class Hounsfield:
 
     @property
     def line(self) -> str:
+        """What the scale was fitted to, for one line."""
         return self.fitted or f"water {self.water_per_mm:.4g}, air {self.air_per_mm:.4g} 1/mm"
 
     def facts(self) -> dict[str, object]:
-        return asdict(self)
+        """Returns what a volume's provenance holds of the scale."""
+        return {HOUNSFIELD: asdict(self)}
 
 
 def of_facts(facts: Mapping[str, object]) -> Hounsfield | None:
     """Returns the scale in a volume's provenance; None without a scale. Raises InputError for a damaged one."""
-    stored = facts.get(HOUNSFIELD)
-    if stored is None:
+    if (stored := facts.get(HOUNSFIELD)) is None:
         return None
-    if not isinstance(stored, Mapping) or not {"water_per_mm", "air_per_mm"} <= set(stored):
-        expected = "a table of water_per_mm and air_per_mm"
-        raise InputError(f"provenance {HOUNSFIELD}", checks.short_repr(stored), expected)
-    return Hounsfield(stored["water_per_mm"], stored["air_per_mm"], str(stored.get("fitted", "")))
+    try:
+        return Hounsfield(**stored)  # type: ignore[arg-type]
+    except TypeError as error:
+        expected = "a table of water_per_mm, air_per_mm and fitted"
+        raise InputError(f"provenance {HOUNSFIELD}", checks.short_repr(stored), expected) from error
 
 
 def of_note(text: str) -> tuple[bool, Hounsfield | None]:
@@ -97,10 +95,7 @@ def of_note(text: str) -> tuple[bool, Hounsfield | None]:
     found = _NOTE.search(text)
     if found is None or found[1] is None:
         return found is not None, None
-    try:
-        return True, Hounsfield(float(found[1]), float(found[2]))
-    except ValueError:
-        return True, None
+    return True, Hounsfield(float(found[1]), float(found[2]))
 
 
 def fitted(

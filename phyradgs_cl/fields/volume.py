@@ -126,3 +126,15 @@ class Grid:
     def scaled(self, factor: float) -> "Grid":
         """Returns the grid with every length multiplied by ``factor``."""
         return Grid(self.shape, triple(d * factor for d in self.voxel_size_mm), triple(o * factor for o in self.offset_mm))
+
+
+@dataclass(frozen=True, eq=False)
+class Metal:
+    """Attenuation (nz, ny, nx) float32 in 1/mm of the metal on ``grid``, 0 elsewhere. Raises InputError for another
+    shape."""
+
+    values: np.ndarray
+    grid: Grid
+
+    def __post_init__(self) -> None:
+        checks.shape("metal", self.values, self.grid.shape)

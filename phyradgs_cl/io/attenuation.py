@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import HOUNSFIELD, Hounsfield
+from phyradgs_cl.fields import Hounsfield
 from phyradgs_cl.fields.hounsfield import of_note
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.volume import Volume
@@ -54,7 +54,7 @@ def in_per_mm(subject: str, volume: Volume, mu_water_per_mm: float | None = None
     if scale is None and (is_hu or float(np.abs(volume.values).max()) > _USUAL_PER_MM):
         scale = stated
     if scale is not None:
-        facts = {**volume.provenance, HOUNSFIELD: scale.facts(), VALUES: FROM_HU}
+        facts = {**volume.provenance, **scale.facts(), VALUES: FROM_HU}
         return replace(volume, values=scale.per_mm(volume.values), provenance=facts)
     if is_hu:
         raise InputError(subject, "Hounsfield units", "1/mm", "say --mu-water-per-mm, near 0.02, to convert them")

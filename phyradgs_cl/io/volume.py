@@ -13,7 +13,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import HOUNSFIELD, Deformation, Gaussians, Grid, Hounsfield, States, deformed, triple
+from phyradgs_cl.fields import Deformation, Gaussians, Grid, Hounsfield, States, deformed, triple
 from phyradgs_cl.fields.hounsfield import Box, fitted, of_facts
 from phyradgs_cl.io.deformation import DEFORMATION, read_deformation_group, write_deformation_group
 from phyradgs_cl.io.files import sha256_of
@@ -73,7 +73,7 @@ class Volume:
     def hounsfield(self, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0) -> "Volume":
         """Returns the volume, still in 1/mm, with a scale of Hounsfield units. See ``hounsfield.fitted``."""
         scale = fitted(self.values, self.required_grid, air, water, insert_hu)
-        return replace(self, provenance={**self.provenance, HOUNSFIELD: scale.facts()})
+        return replace(self, provenance={**self.provenance, **scale.facts()})
 
     def to_xarray(self) -> "DataArray":
         """Returns the values in 1/mm as xarray's DataArray with coordinates in mm. See ``Grid.data_array``."""

@@ -11,6 +11,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.bad_pixels import DeadOptions, SparkOptions, mask_dead, mask_sparks
 from phyradgs_cl.prepare.hardening import HardeningOptions, correct_hardening
 from phyradgs_cl.prepare.light import WAYS, AirOptions, normalise_air
+from phyradgs_cl.prepare.metal import MetalOptions, mask_metal
 from phyradgs_cl.prepare.phase import PhaseOptions, retrieve
 from phyradgs_cl.prepare.rings import RingOptions, remove_rings
 from phyradgs_cl.prepare.scatter import ScatterOptions, subtract_scatter
@@ -28,6 +29,7 @@ STEPS: Mapping[str, Step] = {
     "hardening": correct_hardening,
     "rings": remove_rings,
     "stripes": correct_stripes,
+    "metal": mask_metal,
     "phase": retrieve,
 }
 """The steps by name, in the order in which they run, in whatever order the user names them."""
@@ -50,6 +52,7 @@ class PrepareOptions:
     hardening: HardeningOptions = HardeningOptions()
     rings: RingOptions = RingOptions()
     stripes: StripeOptions = StripeOptions()
+    metal: MetalOptions = MetalOptions()
     phase: PhaseOptions = PhaseOptions()
 
     def __post_init__(self) -> None:

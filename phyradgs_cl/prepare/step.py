@@ -22,11 +22,13 @@ class Model:
     """A scan's reconstruction and forward projection on its grid, for steps that need the object.
 
     volume: reconstructs frames (F, v, u) to a volume (z, y, x) in 1/mm. frames: projects a volume to frames. regularised:
-    reconstructs more slowly, with a weak total-variation prior."""
+    reconstructs more slowly, with a weak total-variation prior. shadow: returns the pixels (F, v, u) whose rays meet the
+    true voxels (z, y, x) at any time of the exposure."""
 
     volume: Callable[[np.ndarray], np.ndarray]
     frames: Callable[[np.ndarray], np.ndarray]
     regularised: Callable[[np.ndarray], np.ndarray]
+    shadow: Callable[[np.ndarray], np.ndarray]
 
 
 MakeModel = Callable[[Scan], Model]
@@ -34,8 +36,9 @@ Step = Callable[[Scan, Any, MakeModel], tuple[Scan, Facts]]  # (scan, the step's
 
 
 def unmasked_frames(scan: Scan) -> np.ndarray:
-    """Returns the scan's line integrals (F, v, u) with masked pixels interpolated."""
-    return scan.projections if scan.pixel_mask is None else fill_masked(scan.projections, ~scan.valid)
+    """Returns the scan's line integrals (F, v, u) with masked pixels interpolated, unless the step metal has filled them."""
+    is_filled = scan.pixel_mask is None or scan.metal is not None
+    return scan.projections if is_filled else fill_masked(scan.projections, ~scan.valid)
 
 
 def fill_masked(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -67,7 +70,8 @@ def with_masked(scan: Scan, bad: np.ndarray) -> Scan:
     if not bad.any():
         return scan
     mask = bad if scan.pixel_mask is None else (np.asarray(scan.pixel_mask) != 0) | bad
-    filled = fill_masked(scan.projections, np.broadcast_to(mask, scan.projections.shape))
+    unfilled = mask if scan.metal is None else bad
+    filled = fill_masked(scan.projections, np.broadcast_to(unfilled, scan.projections.shape))
     return replace(scan, pixel_mask=mask, projections=filled)
 
 

@@ -5,9 +5,11 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 import numpy as np
+import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import LineMiddles, PerRow, Scan
+from phyradgs_cl.acquisition.motion import with_times
 from phyradgs_cl.detector import without_lag
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
@@ -86,7 +88,14 @@ def reprojection(rt: Runtime | None, scan: Scan) -> Model:
     def of(frames: np.ndarray) -> Scan:
         return replace(scan, projections=np.asarray(frames, np.float32))
 
+    def shadow(inside: np.ndarray) -> np.ndarray:
+        moving = with_times(PerRow(), scan)
+        cells = [moving.cells(scan, frame) for frame in range(scan.frames)]
+        whole = RayOperator(rt, scan.grid, scan.geometry.detector_shape, cells, subrays=subrays_of(scan.grid, cells))
+        near = scipy.ndimage.binary_dilation(inside)  # a voxel's edge, and the way between two times
+        return whole.forward(near.astype(np.float32)) > 0
+
     return Model(
-        volume=lambda frames: fdk(of(frames), fdk_options, rt).volume, frames=operator.forward,
+        shadow=shadow, volume=lambda frames: fdk(of(frames), fdk_options, rt).volume, frames=operator.forward,
         regularised=lambda frames: fista_tv.METHOD.run(of(frames), tv_options, rt).complete().volume,
     )

@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError, naming_arguments
-from phyradgs_cl.fields import HOUNSFIELD, Deformation, Gaussians, Grid, Hounsfield, States
+from phyradgs_cl.fields import Deformation, Gaussians, Grid, Hounsfield, States
 from phyradgs_cl.fields.hounsfield import Box, fitted, of_facts
 from phyradgs_cl.reconstructors.checkpoint import State
 
@@ -112,7 +112,7 @@ class Reconstruction:
 
         Raises InputError for less than 100 voxels, air that is not below water, and peaks that are not theirs."""
         scale = fitted(self.volume, self.grid, air, water, insert_hu)
-        return replace(self, facts={**self.facts, HOUNSFIELD: scale.facts()})
+        return replace(self, facts={**self.facts, **scale.facts()})
 
     @naming_arguments()
     def to_xarray(self, *, hu: bool = False, states: bool = False) -> "DataArray":

@@ -1,5 +1,6 @@
 """Runs a plan on a scan: preprocessing, first volume, margin, held-out pixels, and the method."""
 
+import logging
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,7 +13,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.motion import check_own_motion, with_times
 from phyradgs_cl.errors import InputError, OutOfMemoryError, naming_host_memory
-from phyradgs_cl.fields import Grid, triple
+from phyradgs_cl.fields import Grid, Metal, triple
 from phyradgs_cl.io.files import HOST_SHARE, free_bytes, host_bytes
 from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
@@ -39,6 +40,7 @@ from phyradgs_cl.reconstructors.result import (
 )
 from phyradgs_cl.runtime import Runtime
 
+log = logging.getLogger(__name__)
 # Volumes that voxel methods hold at one time at most (docs/large.md), with two of the intensity model; they hold stacks of
 # all frames too, and one buffer of three volumes.
 _HELD = {"sirt": 8, "sart": 28, "os-sart": 28, "cgls": 11, "asd-pocs": 32, "fista-tv": 16}
@@ -90,6 +92,8 @@ class _Prepared:
         if self.deformation is not None:
             check_object_motion(self.deformation, self.scan)
             self.arguments["deformation"] = self.deformation
+        if self.scan.metal is not None and (self.deformation is not None or plan.method_name == "moving"):
+            log.warning("metal: found and masked as in an object at rest, and this one moves: do not trust what is near it")
         self.options = plan.options
         if hasattr(self.options, "motion") and plan.method_name != "moving":  # which finds the object's speed itself
             motion = with_times(self.options.motion, self.scan, self.deformation)
@@ -119,6 +123,8 @@ class _Prepared:
         if self.hidden is not None and self.rt.ranks.rank == 0:
             pairs = self.rt, self.scan, self.hidden, result.volume, result.grid
             result.facts[HELD_OUT] = holdout_errors(*pairs, result.moves or self.deformation)
+        if self.scan.metal is not None:
+            result = _with_metal(result, self.scan.metal)
         if PREPARED_KEY in self.scan.provenance:
             result.facts[PREPARED_KEY] = self.scan.provenance[PREPARED_KEY]
         if self.box is None:
@@ -146,6 +152,17 @@ def _initial(plan: RunPlan, initial: InitialVolume, grid: Grid) -> np.ndarray:
         box_mm = np.round(initial.grid.box_mm, 3).tolist()
         raise InputError("--initial", f"a volume in {box_mm} mm (z, y, x)", "one that meets the scan's grid")
     return volume
+
+
+def _with_metal(result: Reconstruction, metal: Metal) -> Reconstruction:
+    """Returns the result with the metal of the scan's first volume in its volume and states; Gaussians have none."""
+    amount, _ = resampled((metal.values != 0).astype(np.float32), metal.grid, result.grid)
+    values, _ = resampled(metal.values, metal.grid, result.grid)
+    inside = amount >= 0.5
+    of_metal = values[inside] / amount[inside]
+    for volume in (result.volume, *(() if result.states is None else result.states.volumes)):
+        volume[inside] = of_metal
+    return result
 
 
 def _check_margin(plan: RunPlan) -> None:

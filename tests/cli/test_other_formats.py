@@ -106,7 +106,7 @@ def test_export_fits_hounsfield_units_and_says_so(cli, refused, files, tmp_path,
     np.testing.assert_allclose([hu.min(), hu.max()], [-1000, 0], atol=0.01)
     refused([*words, tmp_path / "x.ply"], "--hu: found with --to ply")
     refused([*words, tmp_path / "x.nii", "--mu-water-per-mm", "0.02"], "one of the two")
-    refused(["export", volume, "-o", tmp_path / "x.nii", "--insert-hu", "40"], "--insert-hu: found given without --hu")
+    refused(["export", volume, "-o", tmp_path / "x.ply", "--insert-hu", "40"], "--hu: found with --to ply")
     refused([*words, tmp_path / "x.nii", "--air-mm", "1,2"], "--air-mm: found shape (2,)")
     assert not (tmp_path / "x.nii").exists()
 

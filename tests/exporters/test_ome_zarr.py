@@ -82,7 +82,7 @@ def test_other_programs_versions_units_axes_and_types(tmp_path) -> None:
 
 def test_a_folder_without_units_has_no_scale(tmp_path, caplog) -> None:
     write_image(np.ones((4, 5, 6), np.float32), str(tmp_path / "bare.zarr"), axes="zyx")
-    assert load_volume(tmp_path / "bare.zarr").grid is None and "the scale is left out" in caplog.text
+    assert load_volume(tmp_path / "bare.zarr").grid is None and "no sizes in a unit of length" in caplog.text
 
 
 def test_what_is_lost_or_no_volume_is_said(volume_file, stored, tmp_path, caplog) -> None:
@@ -97,7 +97,7 @@ def test_what_is_lost_or_no_volume_is_said(volume_file, stored, tmp_path, caplog
     (tmp_path / "empty.zarr").mkdir()
     write_image(np.ones((2, 4, 5, 6), np.float32), str(tmp_path / "times.zarr"), axes="tzyx")
     write_image(np.ones((4, 5), np.float32), str(tmp_path / "flat.zarr"), axes="yx")
-    found = dict.fromkeys(("empty", "flat", "none"), "no OME-Zarr")
-    for name, words in {**found, "damaged": "a damaged chunk", "times": "axes t, z, y, x"}.items():
-        with pytest.raises(InputError, match=f"{name}.zarr: found {words}"):
+    for name in ("empty", "flat", "none", "damaged", "times"):
+        words = "axes t, z, y, x of" if name == "times" else ""
+        with pytest.raises(InputError, match=f"{name}.zarr: found .*{words}.*; expected an OME-Zarr with real numbers"):
             load_volume(Path(tmp_path / f"{name}.zarr"))

@@ -4,6 +4,7 @@ import gzip
 import json
 import re
 import shutil
+from importlib.util import find_spec
 
 import nibabel
 import numpy as np
@@ -20,7 +21,7 @@ from phyradgs_cl.io import read_volume
 pytestmark = pytest.mark.slow
 
 NAMES = {"v.mha": "mha", "v.nii": "nii", "v.nii.gz": "nii", "v.nrrd": "nrrd", "v.npy": "npy", "v.tif": "tiff"}
-NAMES["v.ome.zarr"] = "zarr"
+NAMES |= {"v.ome.zarr": "zarr"} if find_spec("ome_zarr") else {}
 
 
 @pytest.fixture

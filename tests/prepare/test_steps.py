@@ -95,7 +95,7 @@ def _exact_model(shape: tuple[int, int, int], rays: tuple[int, int, int]) -> Mod
     def volume(frames: np.ndarray) -> np.ndarray:
         return (back @ frames.ravel()).reshape(shape).astype(np.float32)
 
-    return Model(volume, lambda v: (along @ v.ravel()).reshape(rays).astype(np.float32), volume)
+    return Model(volume, lambda v: (along @ v.ravel()).reshape(rays).astype(np.float32), volume, lambda inside: inside)
 
 
 def test_a_kernel_is_raised_to_what_frames_say() -> None:

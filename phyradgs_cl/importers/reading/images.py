@@ -16,6 +16,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
+from phyradgs_cl.fields.hounsfield import of_note
 from phyradgs_cl.importers.reading.files import SafeFolder, check_room
 from phyradgs_cl.io.attenuation import VALUES
 from phyradgs_cl.io.files import regular_file
@@ -26,7 +27,7 @@ STACKS = (".mha", ".mhd")
 _SPACES = ("left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las", "")
 _HEAD_BYTES = 1 << 16  # bytes at a file's beginning that are searched for its header
 _VOXEL_BYTES = 8  # bytes of memory per voxel that reading takes
-_IN_HU, _NOTE_BYTES = b"values in HU", 79
+_NOTE = "ITK_FileNotes"  # SimpleITK's key of a file's note, in NIfTI the field descrip
 _READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", ".nrrd": "Nrrd"}
 _DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$", re.M)
 _OBLIQUE = 1e-3  # largest accepted sine of the angle between an axis of the image and the world's
@@ -86,7 +87,7 @@ def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
     """Returns how many bytes of voxels a file holds, unpacked: SimpleITK fills missing voxels of NIfTI, and damaged ones
     of packed MetaImages, without an error. None for NRRD, which SimpleITK checks. Raises InputError for data outside the
     folder or in several files."""
-    with _unpacked(path) as file:
+    with gzip.open(path) if path.suffix.lower() == ".gz" else open(path, "rb") as file:
         head = file.read(_HEAD_BYTES)
         if reader.HasMetaDataKey("bitpix"):  # NIfTI, in which scaled integers come out as floats
             stored = file.seek(0, os.SEEK_END) - int(float(reader.GetMetaData("vox_offset")))
@@ -105,22 +106,12 @@ def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
     return len(zlib.decompress(path.read_bytes()[start:]))
 
 
-def _unpacked(path: Path) -> Any:
-    return gzip.open(path) if path.suffix.lower() == ".gz" else open(path, "rb")
-
-
-def _noted(path: Path) -> dict[str, object]:
-    """Returns the note "values in HU …" of an image's file as a volume's provenance; {} for a file without it."""
-    with _unpacked(path) as file:
-        head = file.read(_HEAD_BYTES)
-    return {VALUES: head[place : place + _NOTE_BYTES].decode("latin-1")} if (place := head.find(_IN_HU)) >= 0 else {}
-
-
 def read_image_volume(path: Path, state: int | None = None) -> Volume:
     """Reads a volume (z, y, x) float32 with axes that rise with the world's, LPS. A NRRD file without voxel sizes has no
     grid, and its integers are divided by the maximum of their type. ``state``: see ``read_image``. Raises InputError as
     there, and for oblique axes, unknown units and impossible sizes."""
     subject, image = str(path), read_image(path, state)
+    note = image.GetMetaData(_NOTE) if image.HasMetaDataKey(_NOTE) else ""
     sitk = checks.package("SimpleITK", "the package that reads this file", "phyradgs-cl[formats]")
     header = _nrrd_header(path) if path.suffix.lower() == ".nrrd" else {}
     if header and not {"space directions", "spacings"} & set(header):
@@ -143,7 +134,7 @@ def read_image_volume(path: Path, state: int | None = None) -> Volume:
         raise InputError(f"{subject}: origin", str(list(image.GetOrigin()))[:80], "three lengths in mm")
     values = finite_float32(subject, sitk.GetArrayFromImage(image))
     grid = Grid(triple(values.shape), triple(size_mm[::-1].tolist()), triple(centre_mm[::-1].tolist()))
-    return Volume(values, grid, _noted(path))
+    return Volume(values, grid, {VALUES: note} if of_note(note)[0] else {})
 
 
 def _nrrd_header(path: Path) -> dict[str, str]:

@@ -26,32 +26,26 @@ def read_zarr(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | N
         group = zarr.open_group(subject, mode="r")
         facts: Any = group.attrs.get("ome", group.attrs)["multiscales"][0]
         array = group[facts["datasets"][0]["path"]]
-        axes = {axis["name"]: axis.get("unit") for axis in facts["axes"]}
-        sizes, first = _sizes_and_first(facts, len(axes))
+        units = {axis["name"]: LENGTH.factor(str(axis.get("unit"))) for axis in facts["axes"]}
+        order = [list(units).index(name) for name in "zyx"]
+        sizes, first = _sizes_and_first(facts, array.ndim)
+        shape = [array.shape[axis] for axis in order]
+        if array.dtype.kind not in "iuf" or len(units) != array.ndim or not 0 < math.prod(shape) == array.size:
+            raise ValueError(f"axes {', '.join(units)} of {array.shape} voxels, {array.dtype}")
+        check_room(subject, max(array.size, math.prod(array.chunks)) * max(array.dtype.itemsize, 4))
+        if missing := math.prod(array.cdata_shape) - array.nchunks_initialized:
+            log.warning("%s: %d chunks are missing and read as %s: were they lost?", path, missing, array.fill_value)
+        values = np.moveaxis(np.asarray(array[...]), order, (-3, -2, -1)).reshape(shape)
         note = str((facts.get("metadata") or {}).get("values", ""))
-        missing = math.prod(array.cdata_shape) - array.nchunks_initialized
-        long = [name for name, count in zip(axes, array.shape, strict=True) if name not in "zyx" and count > 1]
-        order = [list(axes).index(name) for name in "zyx"]
-    except Exception as error:  # zarr and its stores raise exceptions of every kind
-        found = f"no OME-Zarr ({type(error).__name__}: {str(error)[:100]})"
-        raise InputError(subject, found, "a folder with multiscales, axes z, y and x") from error
-    if array.dtype.kind not in "iuf" or long or 0 in array.shape:
-        found = f"axes {', '.join(axes)} of {array.shape} voxels, {array.dtype}"
-        raise InputError(subject, found, "real numbers of one volume, one time and channel", "save one of them")
-    check_room(subject, max(math.prod(array.shape), math.prod(array.chunks)) * max(array.dtype.itemsize, 4))
-    if missing:
-        log.warning("%s: %d chunks are missing and read as %s: were they lost?", path, missing, array.fill_value)
-    try:
-        values = np.asarray(array[...])
-    except Exception as error:
-        raise InputError(subject, f"a damaged chunk ({str(error)[:100]})", "a complete OME-Zarr", "copy it again") from error
-    values = np.moveaxis(values, order, (-3, -2, -1)).reshape([array.shape[i] for i in order])
-    units = [axes[name] for name in "zyx"]
-    in_mm = np.array([LENGTH.factor(str(unit)) for unit in units], np.float64)
+    except InputError:
+        raise
+    except Exception as error:  # zarr and its stores pass on errors of every kind
+        found = f"{type(error).__name__}: {str(error)[:150]}"
+        raise InputError(subject, found, "an OME-Zarr with real numbers of one volume along z, y and x") from error
+    in_mm = np.array([units[name] for name in "zyx"], np.float64)  # None becomes NaN
     size_mm, first_mm = sizes[order] * in_mm, first[order] * in_mm
-    if not (np.isfinite(size_mm).all() and np.isfinite(first_mm).all() and size_mm.min() > 0):
-        text = "%s: no voxel sizes can be made of %s in units %s: the scale is left out"
-        log.warning(text, path, sizes[order].tolist(), units)
+    if not (np.isfinite([size_mm, first_mm]).all() and size_mm.min() > 0):
+        log.warning("%s: its axes have no sizes in a unit of length: the scale is left out", path)
         return values, None, None, note
     return values, size_mm, first_mm, note
 
@@ -60,11 +54,8 @@ def _sizes_and_first(facts: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns a voxel's sizes and the first voxel's centre, each (count,), at full resolution, in the axes' units."""
     sizes, first = np.ones(count), np.zeros(count)
     for change in (*facts["datasets"][0]["coordinateTransformations"], *facts.get("coordinateTransformations", ())):
-        by = np.asarray(change[change["type"]], np.float64)
-        if change["type"] == "scale":
-            sizes, first = sizes * by, first * by
-        elif change["type"] == "translation":
-            first = first + by
-        else:
+        if change["type"] not in ("scale", "translation"):
             raise ValueError(f"transformation {change['type']}")
+        by = np.asarray(change[change["type"]], np.float64)
+        sizes, first = (sizes * by, first * by) if change["type"] == "scale" else (sizes, first + by)
     return sizes, first

@@ -13,6 +13,7 @@ REFERENCE = f"{EXTRA}/reference"
 TRUTH = f"{REFERENCE}/volume"
 STATES, STATE_TIMES = f"{REFERENCE}/states", f"{REFERENCE}/state_times"
 DEFORMATION = f"{REFERENCE}/deformation"
+METAL = f"{EXTRA}/metal"
 GATING = f"{EXTRA}/gating"
 SIGNAL, PHASE = f"{GATING}/signal", f"{GATING}/phase"
 

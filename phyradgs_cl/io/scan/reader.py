@@ -12,10 +12,11 @@ from phyradgs_cl.acquisition.plausible import blur_facts
 from phyradgs_cl.acquisition.scan import APPLIED, applied_facts
 from phyradgs_cl.acquisition.slabs import slab
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Metal
 from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.deformation import read_moving_truth, read_reference
 from phyradgs_cl.io.files import sha256_of
-from phyradgs_cl.io.hdf5.datasets import read_values
+from phyradgs_cl.io.hdf5.datasets import ATTENUATION, read_array, read_grid, read_values
 from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.scan.header import ScanHeader, read_header
 
@@ -51,6 +52,7 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, 
         reference = read_reference(source, header.entry) if header.has_reference else None
         has_states = header.states > 0 and rows is None  # slabs are compared with the reference alone
         moving = read_moving_truth(source, header.entry) if has_states else None
+        metal = _read_metal(source, f"{header.entry}/{schema.METAL}")
         data = _read_frames(source, header, mask, lines)
     projections, bad = _convert(source.name(f"{header.entry}/{schema.DATA}"), header, data, to_attenuation)
     used = header.image_key == schema.PROJECTION
@@ -61,7 +63,15 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, 
         provenance = {**provenance, **applied_facts(*stored)}
     mask = united(stored_mask, bad)
     scan = replace(header.scan, projections=projections, pixel_mask=mask, provenance=provenance)
-    return replace(scan, reference=reference, moving_truth=moving)
+    return replace(scan, reference=reference, moving_truth=moving, metal=metal)
+
+
+def _read_metal(source: Hdf5Source, address: str) -> Metal | None:
+    """Reads the metal that is put back into volumes; None where there is none."""
+    if source.optional_group(address) is None:
+        return None
+    grid = read_grid(source, f"{address}/grid")
+    return Metal(read_array(source, f"{address}/volume", grid.shape, ATTENUATION).astype(np.float32), grid)
 
 
 def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, object]:

@@ -128,6 +128,11 @@ def _write_extra(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
         extra["provenance"] = json.dumps(scan.provenance, default=str)
     h5.write_grid(extra, scan.grid)
     write_truth(extra, scan)
+    if scan.metal is not None:
+        group = h5.new_group(extra, "metal", "NXcollection")
+        h5.write_grid(group, scan.metal.grid)
+        packed = group.create_dataset("volume", data=scan.metal.values, compression="gzip", shuffle=True)
+        packed.attrs["units"] = "1/mm"
     if scan.gating is not None:
         write_gating(extra, scan.gating, (np.asarray(scan.frame_start_s) + scan.shutter.span_s / 2)[frame_of])
 

@@ -1,0 +1,71 @@
+"""Metal: rays through it are masked for iterative methods and interpolated for FDK; its voxels are put back into the volume
+(Kalender, Hebel and Ebersberger, Radiology 164 (1987) 576)."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from phyradgs_cl import checks
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Metal
+from phyradgs_cl.prepare import step
+from phyradgs_cl.prepare.step import Facts, MakeModel
+
+_DENSER = 6.0  # times the object's main material: bone and enamel have up to 5 times water's attenuation, titanium 7 or more
+_FEWEST = 4  # voxels that touch: fewer are noise
+_VOXELS = 128  # along the longest side of the volume that fills the shadow
+_MOST, _OBJECT = 0.5, 0.02  # of the object's pixels, which are those with so much of the largest line integral
+
+
+@dataclass(frozen=True)
+class MetalOptions:
+    """above_per_mm: attenuation of a first volume from which a voxel is metal; 0: found."""
+
+    above_per_mm: float = checks.ranged(0.0, 0, 1e3)
+
+    def __post_init__(self) -> None:
+        checks.fields_within("metal.", self)
+
+
+def mask_metal(scan: Scan, options: MetalOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
+    """Returns the scan with the shadow of its metal masked and interpolated, and the metal of the first volume; the scan
+    itself where there is none. InputError where the shadow covers most of the object."""
+    model = make_model(scan)
+    frames = step.unmasked_frames(scan)
+    volume = model.volume(frames)
+    above = options.above_per_mm or _DENSER * _main_level(volume)
+    labels, _ = scipy.ndimage.label(volume >= above)
+    is_metal = (np.bincount(labels.ravel()) >= _FEWEST)[labels] & (labels > 0)
+    facts: Facts = {"above_per_mm": above, "voxels": int(is_metal.sum())}
+    if not is_metal.any():
+        return scan, {**facts, "result": "nothing to do"}
+    shadow = model.shadow(is_metal)
+    facts["shadow_share"] = share = float(shadow[frames > _OBJECT * frames.max()].mean())
+    if share > _MOST:
+        found = f"{is_metal.sum()} voxels from {above:.4g} 1/mm on, whose shadow covers {100 * share:.0f} % of the object"
+        remedy = "state a larger --set metal.above_per_mm, or leave the step out"
+        raise InputError("--steps metal", found, f"at most {100 * _MOST:.0f} %", remedy)
+    metal = Metal(np.where(is_metal, volume, 0).astype(np.float32), scan.grid)
+    masked = step.with_masked(scan, shadow)
+    return replace(masked, projections=_completed(masked, shadow, make_model), metal=metal), facts
+
+
+def _completed(masked: Scan, shadow: np.ndarray, make_model: MakeModel) -> np.ndarray:
+    """Returns the frames (F, v, u) with the shadow as a volume of the other pixels projects into it. What the projection
+    misses beside the shadow is interpolated across it, so that no edge is left."""
+    model, _ = step.coarse_model(masked, make_model, _VOXELS)
+    computed = model.frames(model.regularised(masked.projections))
+    missed = step.fill_masked(masked.projections - computed, shadow)
+    return np.where(shadow, computed + missed, masked.projections).astype(np.float32)
+
+
+def _main_level(volume: np.ndarray) -> float:
+    """Returns the attenuation above which half of a volume's total attenuation (z, y, x) lies: that of the material that
+    there is most of, whatever surrounds it. Infinity for a volume of nothing."""
+    rising = np.sort(volume[volume > 0])
+    if rising.size == 0:
+        return float("inf")
+    total = np.cumsum(rising, dtype=np.float64)
+    return float(rising[np.searchsorted(total, total[-1] / 2)])
