@@ -19,7 +19,8 @@ from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.runtime import Runtime
 
 TIMES_PER_LINE = 16  # samples of a line's exposure, whose error is far below the noise
-_HOLDOUT_SEED, _HOLDOUT_FRAMES = 20, 8  # frames that are projected at one time
+_HOLDOUT_SEED = 20
+FRAMES_AT_A_TIME = 8  # that are projected
 Image = NDArray[np.float32]
 
 
@@ -102,8 +103,8 @@ def holdout_errors(
 
     No reconstruction can have a smaller true error than the noise. Both are dimensionless, as line integrals are."""
     squares = 0.0
-    for first in range(0, scan.frames, _HOLDOUT_FRAMES):
-        frames = range(first, min(first + _HOLDOUT_FRAMES, scan.frames))
+    for first in range(0, scan.frames, FRAMES_AT_A_TIME):
+        frames = range(first, min(first + FRAMES_AT_A_TIME, scan.frames))
         for pair in frame_pairs(rt, scan, volume, grid, frames, moves):
             squares += float(np.sum(np.square(pair.residual[held[pair.frame]], dtype=np.float64)))
     count = int(held.sum())
