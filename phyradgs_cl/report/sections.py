@@ -9,7 +9,7 @@ from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.reconstructors.projected import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report import images
-from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, views_chart
+from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, profile_chart, views_chart
 from phyradgs_cl.report.interactive.atlas import has_depth, space
 from phyradgs_cl.report.interactive.motion import frame_in_motion, object_in_motion
 from phyradgs_cl.report.interactive.viewer import stills, viewer
@@ -27,8 +27,8 @@ _ABSURD = 1e9  # no parameter of our files is larger
 def slices_section(run: Run) -> Markup:
     """Shows the volume, together with the truth where the scan has one."""
     stored, grid = run.stored, run.stored.required_grid
-    windows = images.windows_of(stored.values, run.reference)
-    planes = images.planes_of(stored.values, run.reference, grid, windows)
+    windows = images.windows_of(stored.values, run.reference, stored.doubt)
+    planes = images.planes_of(stored.values, run.reference, grid, windows, stored.doubt)
     size = " × ".join(number(side) for side in grid.size_mm)
     words = f"{' × '.join(map(str, grid.shape))} voxels (z, y, x), {size} mm"
     if any(len(plane.indices) < plane.count for plane in planes):
@@ -36,6 +36,23 @@ def slices_section(run: Run) -> Markup:
     if not has_depth(stored.values):
         words += "; there is no picture in 3D of a volume one voxel thick"
     return section("slices", "Slices", note(words + "."), viewer(planes, windows))
+
+
+def doubt_section(run: Run) -> Markup | None:
+    """Shows a profile through the middle of the volume with its error bars, and the truth where the scan has one."""
+    stored = run.stored
+    if stored.doubt is None:
+        return None
+    z, y = (n // 2 for n in stored.values.shape[:2])
+    lines = [None if a is None else a[z, y] for a in (stored.values, stored.doubt, run.reference)]
+    z_mm, y_mm, x_mm = stored.required_grid.axes_mm()
+    caption = f"Along x at z {number(float(z_mm[z]))} mm, y {number(float(y_mm[y]))} mm, with a band of one σ"
+    caption += "; dashed, the truth." if run.reference is not None else "."
+    words = "σ holds the truth for about 68 % of the object's voxels. It holds over a volume, not for one strange detail, and "
+    words += "what no ray sees is the prior's belief. Among the slices it is the layer Error bar."
+    facts = stored.provenance.get("doubt")
+    table = facts_table(facts) if isinstance(facts, Mapping) else None
+    return section("doubt", "Error bars", note(words), _charts([(caption, profile_chart(x_mm, *lines))]), table)
 
 
 def states_section(run: Run) -> Markup | None:

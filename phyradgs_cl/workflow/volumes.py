@@ -1,6 +1,7 @@
 """Two volumes to numbers and a picture."""
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,12 @@ from phyradgs_cl.metrics import (
     Aligned,
     aligned,
     compare,
+    coverage,
     edge_points_mm,
     in_words,
     motion_error_mm,
     overlap,
+    reliability_png,
     slices_png,
 )
 from phyradgs_cl.signals import finish_despite_interrupt
@@ -28,6 +31,7 @@ from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_picture, load_reference, load_result
 
 log = logging.getLogger(__name__)
+_NORMAL_95 = 1.96
 _LITTLE = 0.5 - 1e-6  # of either box: less in common is most often a wrong size or offset
 
 
@@ -37,7 +41,7 @@ def run_evaluation(
     object_motion: Path | None = None, reference_of_rtk: bool = False, mu_water_per_mm: float | None = None,
 ) -> dict[str, object]:
     """Compares a volume with a scan's reference or another volume, by the rule of ``metrics.aligned``, and writes the
-    picture of slices. A volume without a scale is compared voxel by voxel. ``reference_voxel_mm``: sides of the voxels of a
+    picture of slices. Error bars get their coverage and a curve. A volume without a scale is compared voxel by voxel. ``reference_voxel_mm``: sides of the voxels of a
     reference without a scale, one length or (z, y, x). ``object_motion``: the file of a deformation, which shows the volume
     at each true state of a scan; None takes the volume's own, if it has one. ``reference_of_rtk``: the
     reference has RTK's axes. ``mu_water_per_mm``: of files in Hounsfield units that do not state their scale. InputError: no
@@ -64,7 +68,13 @@ def run_evaluation(
         volume, reference, how, share = pair.volume, pair.reference, pair.how, pair.share
     if reference.shape != volume.shape:
         raise InputError(str(reference_path), f"shape {reference.shape}", f"shape {volume.shape} of {volume_path}")
-    metrics = compare(volume, reference)
+    metrics: dict[str, object] = {**compare(volume, reference)}
+    curve = picture.with_name(f"{picture.stem}.doubt.png")
+    if result.doubt is not None and grid is not None:
+        bar = _on_one_grid(volume_path, reference_path, (result.doubt, grid), truth).volume
+        with finish_despite_interrupt(), written_beside(curve) as temporary:
+            reliability_png(temporary, bar, volume, reference, multiple_95(provenance))
+        metrics |= {**coverage(bar, volume, reference, multiple_95(provenance)), "reliability": str(curve)}
     states = {}
     if moving is not None and grid is not None and stored_grid is not None:
         if result.deformation is None and "object_motion" in provenance:
@@ -81,6 +91,13 @@ def run_evaluation(
     files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
     compared: dict[str, object] = {"compared": how + converted, "share_of_reference_covered": share}
     return {**metrics, **states, **known, **interruption(provenance), **compared, **files}
+
+
+def multiple_95(provenance: Mapping[str, object]) -> float:
+    """Returns how many times σ the 95 % bar of a volume is; that of a normal law where the file does not say it."""
+    facts = provenance.get("doubt")
+    stated = facts.get("multiple_95") if isinstance(facts, Mapping) else None
+    return float(stated) if checks.is_number(stated) and stated > 0 else _NORMAL_95
 
 
 def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dict[str, object]:

@@ -1,0 +1,61 @@
+"""How far error bars of voxels can be believed: which share of the errors they cover, against a truth."""
+
+from pathlib import Path
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from phyradgs_cl.drawing import ACCENT, SOFT, new_figure, style_axes
+from phyradgs_cl.errors import OutputError
+from phyradgs_cl.metrics.quality import Metric
+
+Array = NDArray[np.floating]
+COVERAGE = {
+    "within_doubt": Metric("within σ", "", ".3f"),
+    "within_doubt_95": Metric("within the 95 % bar", "", ".3f"),
+    "doubt_over_error": Metric("mean σ / RMS error", "", ".3f"),
+}
+"""The results of ``coverage``."""
+_OBJECT, _AROUND = 0.01, 2  # of the truth's maximum: above it is the object; voxels around it that count too
+_BINS = 10
+
+
+def object_voxels(truth: Array) -> NDArray[np.bool_]:
+    """Returns the voxels (nz, ny, nx) of the object and two around it."""
+    mask: NDArray[np.bool_] = scipy.ndimage.binary_dilation(truth > _OBJECT * truth.max(), iterations=_AROUND)
+    return mask
+
+
+def coverage(sigma: Array, volume: Array, truth: Array, multiple_95: float) -> dict[str, float]:
+    """Returns the shares of the object's voxels within σ and within ``multiple_95`` σ of the truth, and the mean σ over the
+    RMS error. sigma, volume, truth: (nz, ny, nx) in 1/mm."""
+    inside = object_voxels(truth)
+    size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)
+    rms = float(np.sqrt(np.mean(size**2))) or 1e-30
+    shares = [float(np.mean(size <= k * bar)) for k in (1.0, multiple_95)]
+    return dict(zip(COVERAGE, [*shares, float(bar.mean()) / rms], strict=True))
+
+
+def reliability(sigma: Array, volume: Array, truth: Array) -> Array:
+    """Returns the mean σ, and the 68th and 95th percentiles of the error, of each tenth of the object's voxels by σ (10, 3)."""
+    inside = object_voxels(truth)
+    size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)
+    tenths = [part for part in np.array_split(np.argsort(bar, kind="stable"), _BINS) if part.size]
+    return np.array([[bar[part].mean(), *np.percentile(size[part], (68, 95))] for part in tenths])
+
+
+def reliability_png(path: str | Path, sigma: Array, volume: Array, truth: Array, multiple_95: float) -> None:
+    """Writes the curve of ``reliability``: bars that are right lie on the dashed line. OutputError: it cannot be written."""
+    stated, one, two = reliability(sigma, volume, truth).T
+    figure = new_figure(4.5, 4.0)
+    axes = figure.subplots()
+    axes.plot([0, stated.max()], [0, stated.max()], "--", color=SOFT, label="bars that are right")
+    axes.plot(stated, one, "o-", color=ACCENT, label="68 % of the errors")
+    axes.plot(stated, two / multiple_95, "s:", color=ACCENT, label=f"95 % of the errors / {multiple_95:.3g}")
+    style_axes(axes, "σ, 1/mm", "error, 1/mm")
+    axes.legend(fontsize=8)
+    try:
+        figure.savefig(path, dpi=110, format="png")
+    except OSError as error:
+        raise OutputError(str(path), str(error), "a file that can be written") from error
