@@ -24,6 +24,7 @@ _TOUCHING = 0.5  # fraction of the extreme pixels whose four neighbours are at t
 _SAME = 1e-3  # relative difference between a flat and the projections' ceiling that counts as none
 _MOST_FRAMES, _LONGEST_EDGE = 8, 1024  # number of frames, and their longest side, that are searched for noise
 _ROUNDING, _RELATIVE = 0.5, 2e-5  # noise that counts as none: in counts, and relative to the ceiling
+_ROOT_OF_NORMAL = 0.8222  # mean of √|x| over the root of the standard deviation of a normal x
 _NEAR = 9  # pixels along a side of the place whose noise is one number
 _WHITE = 0.5  # least ratio of two estimates that agree for white noise and differ by far for smooth structure
 
@@ -81,21 +82,20 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
 def noise_map(residual: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Returns the standard deviation of every pixel's noise (v, u) in a residual (v, u), from 9 × 9 pixels about it.
 
-    It is the root mean square of second differences along rows of those along columns: what is smooth in a residual is what
-    the volume does not explain, and no noise. Panels of fewer than three rows have rows alone, those of fewer than three
-    columns the residual itself. Where no pixel about is ``valid`` (v, u) it is that of the frame."""
-    differences, usable, count = residual.astype(np.float64), valid, 0
-    pads = [(0, 0), (0, 0)]
+    It follows from the mean root of |second differences along rows of those along columns|. They leave out what is smooth,
+    which the volume does not explain and is no noise; roots give edges little weight. Panels of fewer than three rows have
+    rows alone, and likewise columns. Where no pixel about is ``valid`` (v, u) the noise is that of the frame."""
+    differences, usable, pads, count = residual.astype(np.float64), valid, [(0, 0), (0, 0)], 0
     for axis, cut in ((1, _along_rows), (0, _along_columns)):
         if residual.shape[axis] >= 3:
             left, middle, right = cut(differences)
             differences, usable, count = middle - 0.5 * (left + right), np.logical_and.reduce(cut(usable)), count + 1
             pads[axis] = (1, 1)
-    squares = np.pad(np.where(usable, differences**2, 0.0), pads)
-    share = scipy.ndimage.uniform_filter(np.pad(usable, pads).astype(np.float64), _NEAR)
-    whole = float(np.mean(differences[usable] ** 2)) if usable.any() else 0.0
-    local = scipy.ndimage.uniform_filter(squares, _NEAR) / np.maximum(share, 0.5 / _NEAR**2)
-    return np.sqrt(np.where(share > 0.5 / _NEAR**2, local, whole)).astype(np.float32) / np.float32(_FILTER_NORM**count)
+    roots = np.where(usable, np.abs(differences) ** 0.5, 0.0)
+    whole = float(np.mean(roots[usable])) if usable.any() else 0.0
+    sums, share = (scipy.ndimage.uniform_filter(np.pad(a, pads), _NEAR) for a in (roots, usable.astype(np.float64)))
+    local = np.where(share > 0.5 / _NEAR**2, sums / np.maximum(share, 0.5 / _NEAR**2), whole)
+    return ((local / _ROOT_OF_NORMAL) ** 2 / _FILTER_NORM**count).astype(np.float32)
 
 
 def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:

@@ -44,8 +44,8 @@ log = logging.getLogger(__name__)
 class Volume:
     """Values (nz, ny, nx) float32 in 1/mm and their grid; None for a bare array. A volume file also holds ``provenance``
     (types as in ``tables.PROVENANCE``), ``gaussians`` float32 in mm and 1/mm, and ``metrics`` by name. deformation: how the
-    object moves whose reference the volume is. states: the object at some times, whose mean the volume is. doubt: σ (nz, ny, nx) float32 in 1/mm of
-    every voxel."""
+    object moves whose reference the volume is. states: the object at some times, whose mean the volume is. doubt: σ in
+    1/mm of the values, in their shape."""
 
     values: np.ndarray
     grid: Grid | None
@@ -101,8 +101,8 @@ def write_volume(
 ) -> None:
     """Writes a volume (nz, ny, nx) in 1/mm, whole or not at all. ``provenance`` and ``metrics`` are stored as JSON, plain
     values also as attributes; ``gaussians`` as float32; ``state``: arrays and texts from which an interrupted run resumes;
-    ``deformation``: how the object moves; ``states``: the object at some times; ``doubt``: σ of every voxel (nz,
-    ny, nx) in 1/mm. InputError: an array that is not finite or does not fit the grid. OutputError: the file cannot be written."""
+    ``deformation``: how the object moves; ``states``: the object at some times; ``doubt``: σ in 1/mm (nz, ny, nx).
+    InputError: an array that is not finite or does not fit the grid. OutputError: the file cannot be written."""
     checks.shape("volume", volume, grid.shape)
     checks.finite("volume", volume)
     arrays = [volume, *(state or {}).values(), *([] if gaussians is None else vars(gaussians).values())]

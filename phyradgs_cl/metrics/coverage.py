@@ -6,7 +6,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from phyradgs_cl.drawing import ACCENT, SOFT, new_figure, style_axes
+from phyradgs_cl.drawing import SOFT, new_figure, style_axes
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.metrics.quality import Metric
 
@@ -18,7 +18,6 @@ COVERAGE = {
 }
 """The results of ``coverage``."""
 _OBJECT, _AROUND = 0.01, 2  # of the truth's maximum: above it is the object; voxels around it that count too
-_BINS = 10
 
 
 def object_voxels(truth: Array) -> NDArray[np.bool_]:
@@ -37,22 +36,19 @@ def coverage(sigma: Array, volume: Array, truth: Array, multiple_95: float) -> d
     return dict(zip(COVERAGE, [*shares, float(bar.mean()) / rms], strict=True))
 
 
-def reliability(sigma: Array, volume: Array, truth: Array) -> Array:
-    """Returns the mean σ, and the 68th and 95th percentiles of the error, of each tenth of the object's voxels by σ (10, 3)."""
+def reliability_png(path: str | Path, sigma: Array, volume: Array, truth: Array, multiple_95: float) -> None:
+    """Writes the curve of reliability: percentiles of the error in each tenth of the object's voxels by σ, over its mean σ.
+    Bars that are right lie on the dashed line. OutputError: the file cannot be written."""
     inside = object_voxels(truth)
     size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)
-    tenths = [part for part in np.array_split(np.argsort(bar, kind="stable"), _BINS) if part.size]
-    return np.array([[bar[part].mean(), *np.percentile(size[part], (68, 95))] for part in tenths])
-
-
-def reliability_png(path: str | Path, sigma: Array, volume: Array, truth: Array, multiple_95: float) -> None:
-    """Writes the curve of ``reliability``: bars that are right lie on the dashed line. OutputError: it cannot be written."""
-    stated, one, two = reliability(sigma, volume, truth).T
+    tenths = [part for part in np.array_split(np.argsort(bar, kind="stable"), 10) if part.size]
+    stated = [bar[part].mean() for part in tenths]
     figure = new_figure(4.5, 4.0)
     axes = figure.subplots()
-    axes.plot([0, stated.max()], [0, stated.max()], "--", color=SOFT, label="bars that are right")
-    axes.plot(stated, one, "o-", color=ACCENT, label="68 % of the errors")
-    axes.plot(stated, two / multiple_95, "s:", color=ACCENT, label=f"95 % of the errors / {multiple_95:.3g}")
+    axes.plot([0, max(stated)], [0, max(stated)], "--", color=SOFT)
+    for share, multiple in ((68, 1.0), (95, multiple_95)):
+        of_tenths = [np.percentile(size[part], share) / multiple for part in tenths]
+        axes.plot(stated, of_tenths, "o-", label=f"{share} % of the errors / {multiple:.3g}")
     style_axes(axes, "σ, 1/mm", "error, 1/mm")
     axes.legend(fontsize=8)
     try:

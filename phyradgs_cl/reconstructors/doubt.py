@@ -7,7 +7,7 @@ Numbers that make it a σ come from procedural volumes (benchmarks/doubt.py), an
 import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
 
@@ -26,46 +26,40 @@ from phyradgs_cl.runtime import Runtime
 
 RUNS = 3
 """Runs of the method: that of the scan, and two of synthesised scans."""
+LEAST = 0.01  # of the RMS of σ: no voxel is certain
 _KEPT = "doubt."  # begins the names of what a state keeps of the runs before
 _PARTS = {"gaussians": Gaussians, "deformation": Deformation, "states": States}
 _CHECKED_FRAMES = 16  # frames whose held-out pixels correct σ
 _WIDEST = 4.0  # times: held-out pixels farther off are no matter of error bars
-_SHARE = 0.68  # of the object's voxels within σ
-_NEAR, _WIDE = 1.0, 3.0  # voxels: standard deviations of the Gaussians that smooth squares of differences
-Array = NDArray[np.floating]
+_SHARE, _NORMAL_95 = 0.68, 1.96  # covered by σ; the 95 % bar of pixels' noise
+Array = NDArray[Any]
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Law:
-    """Numbers of ``spread``, from ``data/doubt.json``. multiple_95: how many times σ the 95 % bar is."""
+    """The numbers of ``spread``, and how many times σ the 95 % bar is."""
 
     shape: float
     noise: float
-    wide: float
-    floor: float
     multiple_95: float
 
 
 @cache
 def fitted_law() -> Law:
-    """Returns the numbers that ``benchmarks/doubt.py fit`` has written."""
-    stored = json.loads((resource("data") / "doubt.json").read_text(encoding="utf-8"))
-    return Law(**{one.name: float(stored[one.name]) for one in fields(Law)})
+    """Returns the law of ``data/doubt.json`` (benchmarks/doubt.py)."""
+    return Law(**json.loads((resource("data") / "doubt.json").read_text(encoding="utf-8"))["law"])
 
 
 def spread(first: Array, second: Array, law: Law) -> Array:
     """Returns σ (nz, ny, nx) of two differences from the first volume (nz, ny, nx).
 
-    What both have in common is what the method does to the object; half of what they have not is noise. Their variances are
-    weighed by ``shape`` and ``noise``, and smoothed over 1 voxel, with the share ``wide`` over 3. ``floor``: of their mean."""
+    What both have in common is what the method does to the object; half of what they have not is noise. Both variances,
+    smoothed over a voxel, are weighed by ``shape`` and ``noise``. σ is at least a hundredth of its RMS."""
     common, own = ((first + sign * second).astype(np.float64) ** 2 / 4 for sign in (1, -1))
-    both = [law.shape**2 * (common - own), 2 * law.noise**2 * own]  # half of the noise is left in what is common
-    variance = sum(
-        np.maximum(share * scipy.ndimage.gaussian_filter(part, width), 0)
-        for part in both for width, share in ((_NEAR, 1 - law.wide), (_WIDE, law.wide))
-    )  # fmt: skip
-    return np.sqrt(variance + law.floor**2 * np.mean(variance)).astype(np.float32)
+    shape, noise = (scipy.ndimage.gaussian_filter(part, 1.0) for part in (common - own, 2 * own))
+    variance = law.shape**2 * np.maximum(shape, 0) + law.noise**2 * noise
+    return np.sqrt(np.maximum(variance, LEAST**2 * np.mean(variance))).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,117 +74,106 @@ class Doubter:
     seed: int
 
     def run(self, once: Callable[..., Reconstruction], report: Report, resume: State | None) -> Reconstruction:
-        """Returns the method's result with its ``doubt``. once: runs the method on a scan, from a state of its own.
-
-        resume: the state of any of the runs."""
+        """Returns the method's result with ``doubt``. once: runs the method on a scan from a state. resume: of any run."""
         arrays = dict(resume or {})
-        kept = {name: arrays.pop(name) for name in list(arrays) if name.startswith(_KEPT)}
-        results = _restored(kept, self.scan.grid) if kept else []
+        results = _restored({name: arrays.pop(name) for name in list(arrays) if name.startswith(_KEPT)}, self.scan.grid)
         while len(results) < RUNS:
-            number, before = len(results), _kept(results)
-            scan = self.synthesised(results[0], number) if results else self.scan
-            with report.through(partial(_counted, number=number, before=before, first=results[0] if results else None)):
+            scan = self.synthesised(results[0], len(results)) if results else self.scan
+            with report.through(partial(_counted, results=results)):
                 result = once(scan, arrays or None)
             if result.state is not None:
-                return _interrupted(result, results, before)
-            results.append(result)
-            arrays = {}
+                return _interrupted(result, results) if results else result
+            results, arrays = [*results, result], {}
         return self.finished(results)
 
     def synthesised(self, result: Reconstruction, number: int) -> Scan:
         """Returns the scan that the result's volume would give, with the noise of this one. ``number`` draws it."""
         frames = np.zeros(self.scan.projections.shape, np.float32)
         if self.rt.ranks.rank == 0:
-            for pair in self._pairs(result):
+            for pair in self._pairs(result, self.whole.frames):
                 rng = np.random.default_rng([self.seed, number, pair.frame])
                 noise = noise_map(pair.residual, pair.valid) * rng.standard_normal(pair.measured.shape, np.float32)
                 frames[pair.frame] = np.where(pair.valid, pair.computed + noise, self.scan.projections[pair.frame])
         return replace(self.scan, projections=self.rt.ranks.bcast(frames))
 
-    def _pairs(self, result: Reconstruction, count: int | None = None) -> Iterator[FramePair]:
-        """Yields all frames, or ``count`` of them, with those of a result."""
-        frames, moves = self.whole.frames, result.moves or self.deformation
-        chosen = spread_frames(frames, frames if count is None else count)
+    def _pairs(self, result: Reconstruction, count: int) -> Iterator[FramePair]:
+        """Yields ``count`` frames with those of a result."""
+        chosen = spread_frames(self.whole.frames, count)
         for at in range(0, len(chosen), FRAMES_AT_A_TIME):
-            some = chosen[at : at + FRAMES_AT_A_TIME]
+            some, moves = chosen[at : at + FRAMES_AT_A_TIME], result.moves or self.deformation
             yield from frame_pairs(self.rt, self.whole, result.volume, result.grid, some, moves)
 
     def finished(self, results: list[Reconstruction]) -> Reconstruction:
         """Returns the first result with σ, its facts, and the seconds of all runs."""
-        first, *others = results
-        law, differences = fitted_law(), [other.volume - first.volume for other in others]
-        sigma = spread(*differences, law)
-        facts: dict[str, object] = {"runs": RUNS, "share": _SHARE, "multiple_95": law.multiple_95, "held_out_factor": 1.0}
+        law, first = fitted_law(), results[0]
+        sigma = spread(results[1].volume - first.volume, results[2].volume - first.volume, law)
+        facts: dict[str, Any] = {"runs": RUNS, "share": _SHARE, "multiple_95": law.multiple_95}
         if self.hidden is not None and self.rt.ranks.size == 1:
-            facts |= self._against_held_out(results, law)
+            facts |= self._against_held_out(results, self.hidden, law)
             sigma *= np.float32(facts["held_out_factor"])
         seconds = sum(float(one.facts["seconds"]) for one in results)
         return replace(first, doubt=sigma, facts={**first.facts, DOUBT: facts, "seconds": seconds})
 
-    def _against_held_out(self, results: list[Reconstruction], law: Law) -> dict[str, object]:
-        """Returns the factor by which σ must grow so that 68 % of the held-out pixels are within what it means for them.
+    def _against_held_out(self, results: list[Reconstruction], hidden: NDArray[np.bool_], law: Law) -> dict[str, float]:
+        """Returns the shares of held-out pixels within their bars, and the factor of σ, at least 1, for which 68 % are.
 
-        At a pixel that is the projected differences, by the same law, and the pixel's noise."""
-        assert self.hidden is not None
+        The bar of a pixel has the projected differences, by the same law, and the pixel's noise."""
         ratios, inside = [], []
-        for pairs in zip(*(self._pairs(one, _CHECKED_FRAMES) for one in results), strict=True):
-            first, *others = pairs
-            held = self.hidden[first.frame]
-            noise = noise_map(first.residual, first.valid)[held]
-            bar = spread(*(other.computed - first.computed for other in others), law)[held]
-            error = np.abs(first.residual[held])
+        for first, one, two in zip(*(self._pairs(result, _CHECKED_FRAMES) for result in results), strict=True):
+            held = hidden[first.frame]
+            noise, error = noise_map(first.residual, first.valid)[held], first.residual[held]
+            bar = spread(one.computed - first.computed, two.computed - first.computed, law)[held]
             ratios.append((error**2 - noise**2) / np.maximum(bar, 1e-30) ** 2)
-            inside.append([error <= k * np.hypot(noise, bar) for k in (1.0, law.multiple_95)])
+            multiples = (1.0, 1.0), (_NORMAL_95, law.multiple_95)
+            inside.append([np.abs(error) <= np.hypot(a * noise, b * bar) for a, b in multiples])
         wanted = float(np.sqrt(max(np.quantile(np.concatenate(ratios), _SHARE), 1.0)))
         if wanted > _WIDEST:
-            text = "held-out pixels are %.3g times farther off than the error bars say: geometry, beam or motion are wrong; "
-            log.warning(text + "the error bars are %g times wider, and may not suffice: run 'phyradgs check'", wanted, _WIDEST)
-        shares = np.mean(np.concatenate(inside, axis=1), axis=1).tolist()
-        return {"held_out_factor": min(wanted, _WIDEST), "held_out_within": shares[0], "held_out_within_95": shares[1]}
+            text = "held-out pixels are %.3g times farther off than the error bars say, which are made %g times wider "
+            text += "and may not suffice: geometry, beam or motion are wrong; see 'phyradgs check'"
+            log.warning(text, wanted, _WIDEST)
+        within, within_95 = np.mean(np.concatenate(inside, axis=1), axis=1).tolist()
+        return {"held_out_within": within, "held_out_within_95": within_95, "held_out_factor": min(wanted, _WIDEST)}
 
 
-def _counted(progress: Progress, number: int, before: State, first: Reconstruction | None) -> Progress:
+def _counted(progress: Progress, results: list[Reconstruction]) -> Progress:
     """Counts the iterations of all runs as those of one, and shows the volume of the first while the others run."""
-    changes: dict[str, Any] = {}
-    if first is not None:
-        changes = {"volume": lambda: (first.volume, first.grid), "deformation": first.deformation}
-        changes["states"] = None if (states := first.states) is None else lambda: states
-        changes["quantity"] = f"{progress.quantity} of run {number + 1} for error bars"
-    done, each = progress.iteration, progress.iterations
-    counted = replace(progress, **changes, iteration=number * each + done, iterations=RUNS * each)
-    return counted.mapped(state=lambda state: {**state, **before})
+    done, each = progress.iteration + len(results) * progress.iterations, RUNS * progress.iterations
+    if not results:
+        return replace(progress, iteration=done, iterations=each)
+    first, words = results[0], f"{progress.quantity} of run {len(results) + 1} for error bars"
+    states = None if (of_first := first.states) is None else lambda: of_first
+    shown = {"volume": lambda: (first.volume, first.grid), "deformation": first.deformation, "states": states}
+    return progress.mapped(
+        state=lambda state: {**state, **_kept(results)}, iteration=done, iterations=each, quantity=words
+    ).mapped(**shown)  # type: ignore[arg-type]
 
 
-def _interrupted(result: Reconstruction, results: list[Reconstruction], before: State) -> Reconstruction:
-    """Returns the first volume, which is whole, with the state of a later run. Of the first run the result itself."""
-    if not results or result.state is None:
-        return result
-    first, run = results[0], f"{len(results) + 1} of {RUNS}"
-    facts = {**first.facts, "interrupted_at": result.facts["interrupted_at"], DOUBT: {"interrupted_in_run": run}}
-    return replace(first, state={**result.state, **before}, facts=facts)
+def _interrupted(result: Reconstruction, results: list[Reconstruction]) -> Reconstruction:
+    """Returns the first volume, which is whole, with the state of a later run."""
+    run = {"interrupted_in_run": f"{len(results) + 1} of {RUNS}"}
+    facts = {**results[0].facts, "interrupted_at": result.facts["interrupted_at"], DOUBT: run}
+    return replace(results[0], state={**(result.state or {}), **_kept(results)}, facts=facts)
 
 
 def _kept(results: list[Reconstruction]) -> State:
-    """Returns what a state keeps of complete runs: all of the first, the volumes and seconds of others."""
-    if not results:
-        return {}
-    first = results[0]
-    notes = {"facts": first.facts, "record": first.record, "seconds": [one.facts["seconds"] for one in results]}
-    arrays = {"notes": np.array(json.dumps(notes)), "volumes": np.stack([one.volume for one in results])}
-    for name in _PARTS:
-        if (part := getattr(first, name)) is not None:
-            arrays |= {f"{name}.{key}": np.asarray(value) for key, value in vars(part).items()}
+    """Returns what a state keeps of complete runs: all of the first, volumes and seconds of the others."""
+    first, seconds = results[0], [one.facts["seconds"] for one in results]
+    notes = json.dumps({"facts": first.facts, "record": first.record, "seconds": seconds}, default=str)
+    arrays = {"notes": np.array(notes), "volumes": np.stack([one.volume for one in results])}
+    parts = {name: part for name in _PARTS if (part := getattr(first, name)) is not None}
+    arrays |= {f"{name}.{key}": np.asarray(value) for name, part in parts.items() for key, value in vars(part).items()}
     return {_KEPT + name: values for name, values in arrays.items()}
 
 
 def _restored(kept: Mapping[str, np.ndarray], grid: Grid) -> list[Reconstruction]:
-    """Returns the complete runs that ``_kept`` has put into a state."""
+    """Returns the complete runs that ``_kept`` has put into a state, none of them from nothing."""
+    if not kept:
+        return []
     arrays = {name.removeprefix(_KEPT): values for name, values in kept.items()}
-    notes = json.loads(str(arrays["notes"]))
-    parts = {
-        name: kind(**{one.name: arrays[f"{name}.{one.name}"] for one in fields(kind)})
-        for name, kind in _PARTS.items() if any(key.startswith(f"{name}.") for key in arrays)
-    }  # fmt: skip
+    notes, parts = json.loads(str(arrays["notes"])), dict[str, Any]()
+    for name, kind in _PARTS.items():
+        if of_part := {key: a for one, a in arrays.items() if (key := one.removeprefix(f"{name}.")) != one}:
+            parts[name] = kind(**of_part)
     first, *others = arrays["volumes"]
     later = [Reconstruction(v, grid, facts={"seconds": s}) for v, s in zip(others, notes["seconds"][1:], strict=True)]
     return [Reconstruction(first, grid, record=notes["record"], facts=notes["facts"], **parts), *later]

@@ -43,8 +43,9 @@ class Reconstruction:
     gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict per report;
     facts: what is needed to make it again (method, options, scales, seconds); state: how to go on, where a run
     was interrupted; deformation: how the object moves, of ``moving``, whose volume is its reference; states: the object at
-    some times, of ``changing``, whose volume is their mean; doubt: σ (nz, ny, nx) in 1/mm, such that about 68 % of the
-    object's voxels are within σ of the truth, where it was asked for (docs/methods.md#error-bars). Raises InputError for arrays that are not the grid's."""
+    some times, of ``changing``, whose volume is their mean; doubt: σ (nz, ny, nx) in 1/mm, which
+    covers the error of about 68 % of the object's voxels (docs/methods.md#error-bars). Raises InputError for arrays that are
+    not the grid's."""
 
     volume: np.ndarray
     grid: Grid

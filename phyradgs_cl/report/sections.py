@@ -44,15 +44,14 @@ def doubt_section(run: Run) -> Markup | None:
     if stored.doubt is None:
         return None
     z, y = (n // 2 for n in stored.values.shape[:2])
-    lines = [None if a is None else a[z, y] for a in (stored.values, stored.doubt, run.reference)]
+    truth = None if run.reference is None else run.reference[z, y]
     z_mm, y_mm, x_mm = stored.required_grid.axes_mm()
     caption = f"Along x at z {number(float(z_mm[z]))} mm, y {number(float(y_mm[y]))} mm, with a band of one σ"
-    caption += "; dashed, the truth." if run.reference is not None else "."
-    words = "σ holds the truth for about 68 % of the object's voxels. It holds over a volume, not for one strange detail, and "
-    words += "what no ray sees is the prior's belief. Among the slices it is the layer Error bar."
-    facts = stored.provenance.get("doubt")
-    table = facts_table(facts) if isinstance(facts, Mapping) else None
-    return section("doubt", "Error bars", note(words), _charts([(caption, profile_chart(x_mm, *lines))]), table)
+    drawing = profile_chart(x_mm, stored.values[z, y], stored.doubt[z, y], truth)
+    words = "About 68 % of the object's voxels are within σ of the truth. This holds over a volume, not for one strange "
+    words += "detail; what no ray sees is the prior's belief. Among the slices σ is the layer Error bar."
+    caption += "." if truth is None else "; dashed, the truth."
+    return section("doubt", "Error bars", note(words), _charts([(caption, drawing)]))
 
 
 def states_section(run: Run) -> Markup | None:

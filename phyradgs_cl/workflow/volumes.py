@@ -41,11 +41,12 @@ def run_evaluation(
     object_motion: Path | None = None, reference_of_rtk: bool = False, mu_water_per_mm: float | None = None,
 ) -> dict[str, object]:
     """Compares a volume with a scan's reference or another volume, by the rule of ``metrics.aligned``, and writes the
-    picture of slices. Error bars get their coverage and a curve. A volume without a scale is compared voxel by voxel. ``reference_voxel_mm``: sides of the voxels of a
-    reference without a scale, one length or (z, y, x). ``object_motion``: the file of a deformation, which shows the volume
-    at each true state of a scan; None takes the volume's own, if it has one. ``reference_of_rtk``: the
-    reference has RTK's axes. ``mu_water_per_mm``: of files in Hounsfield units that do not state their scale. InputError: no
-    such sides; files that do not fit each other; attenuation of water for files that are in 1/mm."""
+    picture of slices. Error bars get their coverage and a curve. A volume without a scale is compared voxel by voxel.
+    ``reference_voxel_mm``: sides of the voxels of a reference without a scale, one length or (z, y, x). ``object_motion``:
+    the file of a deformation, which shows the volume at each true state of a scan; None takes the volume's own, if it has
+    one. ``reference_of_rtk``: the reference has RTK's axes. ``mu_water_per_mm``: of files in Hounsfield units that do not
+    state their scale. InputError: no such sides; files that do not fit each other; attenuation of water for files that are
+    in 1/mm."""
     check_picture("--picture", picture, volume_path, reference_path, object_motion)
     field = None if object_motion is None else read_deformation(object_motion)
     result = attenuation_of(str(volume_path), load_result(volume_path, mu_water_per_mm))
@@ -69,12 +70,14 @@ def run_evaluation(
     if reference.shape != volume.shape:
         raise InputError(str(reference_path), f"shape {reference.shape}", f"shape {volume.shape} of {volume_path}")
     metrics: dict[str, object] = {**compare(volume, reference)}
-    curve = picture.with_name(f"{picture.stem}.doubt.png")
     if result.doubt is not None and grid is not None:
+        facts, curve = provenance.get("doubt"), picture.with_name(f"{picture.stem}.doubt.png")
+        stated = facts.get("multiple_95") if isinstance(facts, Mapping) else None
+        multiple_95 = stated if isinstance(stated, float) else _NORMAL_95
         bar = _on_one_grid(volume_path, reference_path, (result.doubt, grid), truth).volume
         with finish_despite_interrupt(), written_beside(curve) as temporary:
-            reliability_png(temporary, bar, volume, reference, multiple_95(provenance))
-        metrics |= {**coverage(bar, volume, reference, multiple_95(provenance)), "reliability": str(curve)}
+            reliability_png(temporary, bar, volume, reference, multiple_95)
+        metrics |= {**coverage(bar, volume, reference, multiple_95), "reliability": str(curve)}
     states = {}
     if moving is not None and grid is not None and stored_grid is not None:
         if result.deformation is None and "object_motion" in provenance:
@@ -91,13 +94,6 @@ def run_evaluation(
     files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
     compared: dict[str, object] = {"compared": how + converted, "share_of_reference_covered": share}
     return {**metrics, **states, **known, **interruption(provenance), **compared, **files}
-
-
-def multiple_95(provenance: Mapping[str, object]) -> float:
-    """Returns how many times σ the 95 % bar of a volume is; that of a normal law where the file does not say it."""
-    facts = provenance.get("doubt")
-    stated = facts.get("multiple_95") if isinstance(facts, Mapping) else None
-    return float(stated) if checks.is_number(stated) and stated > 0 else _NORMAL_95
 
 
 def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dict[str, object]:
