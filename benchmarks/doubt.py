@@ -13,8 +13,8 @@ continue where they were stopped."""
 import argparse
 import json
 import sys
-import types
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import scipy
@@ -52,8 +52,8 @@ def procedural(folder: Path, kind: str, seed: int) -> Path:
         if kind in ("foot", "jaw"):
             volume = make_phantom(kind, 1.0, DRAWN, seed).voxelise(Grid.cube(DRAWN, 2.0))
         else:
-            sys.modules.setdefault("torch", types.SimpleNamespace(nn=types.SimpleNamespace(Module=object)))  # type: ignore[arg-type]
-            import train_ridge  # whose drawing does not need PyTorch
+            sys.modules.setdefault("torch", MagicMock())  # which drawing does not need
+            import train_ridge
 
             train_ridge.DRAWN = DRAWN
             volume = np.maximum(getattr(train_ridge, kind)(np.random.default_rng(seed)), 0)

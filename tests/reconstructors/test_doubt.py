@@ -9,6 +9,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import reconstruct, simulate
 from phyradgs_cl.detector.noise_level import noise_map
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import read_checkpoint, write_checkpoint
 from phyradgs_cl.metrics import coverage
 from phyradgs_cl.reconstructors import doubt
 from phyradgs_cl.reconstructors.doubt import Doubter, Law, spread
@@ -79,7 +80,7 @@ def test_half_of_what_differences_do_not_share_is_noise() -> None:
     assert spread(one, two, replace(LAW, shape=0.0, noise=2.0))[inner].mean() == pytest.approx(2, rel=0.1)
 
 
-def test_a_run_goes_on_with_the_same_bits_from_each_of_its_three_parts(rt, scan) -> None:
+def test_a_run_goes_on_with_the_same_bits_from_each_of_its_three_parts(rt, scan, tmp_path) -> None:
     whole = reconstruct(scan, device=rt, doubt=True, holdout=3.0, **FEW)
     counts = []
 
@@ -96,6 +97,8 @@ def test_a_run_goes_on_with_the_same_bits_from_each_of_its_three_parts(rt, scan)
         partial = reconstruct(scan, device=rt, **usual)
         assert partial.doubt is None and partial.facts["interrupted_at"] == (iteration - 1) % 4 + 1
         assert partial.facts.get(DOUBT, {}).get("interrupted_in_run") == {2: None, 6: "2 of 3", 11: "3 of 3"}[iteration]
+        write_checkpoint(tmp_path / "state.h5", partial.state)
+        partial = replace(partial, state=read_checkpoint(tmp_path / "state.h5"))
         result = reconstruct(scan, device=rt, doubt=True, holdout=3.0, resume=partial, **FEW)
         np.testing.assert_array_equal(result.volume, whole.volume)
         np.testing.assert_array_equal(result.doubt, whole.doubt)
