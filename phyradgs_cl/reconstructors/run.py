@@ -66,7 +66,8 @@ def reconstruct(
 
     with report.through(run.shown), _naming_size_that_fits(rt, run.scan, plan), naming_host_memory():
         if plan.preprocessing.doubt:
-            doubter = Doubter(rt, run.visible, run.scan, run.hidden, run.deformation, plan.seed)
+            kind = "iterative" if hasattr(run.options, "iterations") else "analytic"
+            doubter = Doubter(rt, run.visible, run.scan, run.hidden, run.deformation, plan.seed, kind)
             result = doubter.run(once, report, state)
         else:
             result = once(run.visible, state)

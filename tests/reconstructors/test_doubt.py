@@ -122,7 +122,7 @@ def test_gaussians_of_the_first_run_are_kept_by_a_state(rt, scan) -> None:
 
 def test_held_out_pixels_widen_bars_that_do_not_reach_them(rt, scan, monkeypatch) -> None:
     right = reconstruct(scan, device=rt, doubt=True, holdout=10.0, **FEW)
-    monkeypatch.setattr(doubt, "fitted_law", lambda: Law(0.02, 0.02, 3.0))
+    monkeypatch.setattr(doubt, "fitted_law", lambda kind: Law(0.02, 0.02, 3.0))
     narrow = reconstruct(scan, device=rt, doubt=True, holdout=10.0, **FEW)
     assert 1 <= right.facts[DOUBT]["held_out_factor"] < narrow.facts[DOUBT]["held_out_factor"] <= 4
     assert right.facts[DOUBT]["held_out_within"] > 0.5
