@@ -136,8 +136,7 @@ def classes(truth: np.ndarray, inside: np.ndarray) -> dict[str, np.ndarray]:
 
 def measured(sigma: np.ndarray, volume: np.ndarray, truth: np.ndarray, multiple: float) -> dict[str, object]:
     """Returns the numbers of a line."""
-    inside = object_voxels(truth)
-    size, bar = np.abs(volume.astype(np.float64) - truth), sigma.astype(np.float64)
+    inside, size, bar = object_voxels(truth), np.abs(volume.astype(np.float64) - truth), sigma.astype(np.float64)
     facts: dict[str, object] = {}
     for name, mask in {"object": inside, **classes(truth, inside)}.items():
         if np.count_nonzero(mask) >= 50:
@@ -181,7 +180,7 @@ def real(output: Path, paths: list[Path], methods: list[str]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     ways = parser.add_subparsers(dest="way", required=True)
-    one, two, three = (ways.add_parser(name) for name in ("fit", "rows", "real"))
+    one, two, three = map(ways.add_parser, ("fit", "rows", "real"))
     one.add_argument("folder", type=Path)
     one.add_argument("output", type=Path)
     one.add_argument("--cases", type=int, default=24)
