@@ -31,6 +31,7 @@ LEAST = 0.01  # of the RMS of σ: no voxel is certain
 _KEPT = "doubt."  # begins the names of what a state keeps of the runs before
 _PARTS = {"gaussians": Gaussians, "deformation": Deformation, "states": States}
 _CHECKED_FRAMES = 16  # frames whose held-out pixels correct σ
+_AROUND = 9  # pixels along a side of the place whose bar is one number: that of two samples alone is rough
 _WIDEST = 4.0  # times: held-out pixels farther off are no matter of error bars
 _SHARE, _NORMAL_95 = 0.68, 1.96  # covered by σ; the 95 % bar of pixels' noise
 Array = NDArray[Any]
@@ -120,12 +121,13 @@ class Doubter:
     def _against_held_out(self, results: list[Reconstruction], hidden: NDArray[np.bool_], law: Law) -> dict[str, float]:
         """Returns the shares of held-out pixels within their bars, and the factor of σ, at least 1, for which 68 % are.
 
-        The bar of a pixel has the projected differences, by the same law, and the pixel's noise."""
+        The bar of a pixel has the projected differences about it, by the same law, and the pixel's noise."""
         ratios, inside = [], []
         for first, one, two in zip(*(self._pairs(result, _CHECKED_FRAMES) for result in results), strict=True):
             held = hidden[first.frame]
             noise, error = noise_map(first.residual, first.valid)[held], first.residual[held]
-            bar = spread(one.computed - first.computed, two.computed - first.computed, law)[held]
+            bar = spread(one.computed - first.computed, two.computed - first.computed, law).astype(np.float64)
+            bar = np.sqrt(scipy.ndimage.uniform_filter(bar**2, _AROUND))[held]
             ratios.append((error**2 - noise**2) / np.maximum(bar, 1e-30) ** 2)
             multiples = (1.0, 1.0), (_NORMAL_95, law.multiple_95)
             inside.append([np.abs(error) <= np.hypot(a * noise, b * bar) for a, b in multiples])
