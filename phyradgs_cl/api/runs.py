@@ -62,8 +62,7 @@ def save_scan(path: str | Path, scan: Scan) -> None:
 
 @naming_arguments()
 def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Reconstruction:
-    """Reads a volume file: volume (nz, ny, nx) in 1/mm, grid, Gaussians, record, facts, state, deformation, states,
-    doubt.
+    """Reads a volume file: volume (nz, ny, nx) in 1/mm, grid, Gaussians, record, facts, state, deformation, states, doubt.
 
     Only an interrupted run has a state.
     path: the HDF5 file, or a file of ``phyradgs export`` (docs/export.md), which has a volume and a grid only.

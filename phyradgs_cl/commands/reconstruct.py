@@ -124,7 +124,8 @@ def reconstruct_command(
         say(profile_report(runtimes[-1], result))
     if result.state is not None:
         at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
-        complain(f"interrupted at iteration {at} of {asked}{_run_of(result)}: repeat the command with --resume to continue")
+        run = f" of run {result.facts[DOUBT]['interrupted_in_run']}" if DOUBT in result.facts else ""
+        complain(f"interrupted at iteration {at} of {asked}{run}: repeat the command with --resume to continue")
         raise typer.Exit(signals.exit_status())
 
 
@@ -134,16 +135,11 @@ def _settings_of(plan: RunPlan, scan: Path) -> dict[str, object]:
     return {**about, "options": option_facts(plan.options)}
 
 
-def _run_of(result: Reconstruction) -> str:
-    """Returns which run for error bars was interrupted, for the middle of a line, or nothing."""
-    return f" of run {result.facts[DOUBT]['interrupted_in_run']}" if DOUBT in result.facts else ""
-
-
 def _finish(page: "report.LivePage", result: Reconstruction, scan: Path, output: Path, rt: Runtime) -> None:
     """Makes the live page of a complete run its report. The frames of a run in slabs may exceed the memory."""
     if result.state is not None:
         at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
-        page.end(f"Interrupted at iteration {at} of {asked}{_run_of(result)}: repeat the command with --resume to continue.")
+        page.end(f"Interrupted at iteration {at} of {asked}: repeat the command with --resume to continue.")
     elif "slabs" in result.facts:
         page.end("The run is complete. 'phyradgs report' makes its report.", is_complete=True)
     else:

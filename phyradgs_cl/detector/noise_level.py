@@ -83,19 +83,15 @@ def noise_map(residual: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
     """Returns the standard deviation of every pixel's noise (v, u) in a residual (v, u), from 9 × 9 pixels about it.
 
     It follows from the mean root of |second differences along rows of those along columns|. They leave out what is smooth,
-    which the volume does not explain and is no noise; roots give edges little weight. Panels of fewer than three rows have
-    rows alone, and likewise columns. Where no pixel about is ``valid`` (v, u) the noise is that of the frame."""
-    differences, usable, pads, count = residual.astype(np.float64), valid, [(0, 0), (0, 0)], 0
-    for axis, cut in ((1, _along_rows), (0, _along_columns)):
-        if residual.shape[axis] >= 3:
-            left, middle, right = cut(differences)
-            differences, usable, count = middle - 0.5 * (left + right), np.logical_and.reduce(cut(usable)), count + 1
-            pads[axis] = (1, 1)
+    which the volume does not explain and is no noise; roots give edges little weight. An axis shorter than three pixels is
+    left out. Where no pixel about is ``valid`` (v, u) the noise is 0."""
+    differences, usable, axes = residual.astype(np.float64), valid, [axis for axis in (0, 1) if residual.shape[axis] >= 3]
+    for axis in axes:
+        differences = scipy.ndimage.correlate1d(differences, (-0.5, 1, -0.5), axis, mode="mirror")
+        usable = scipy.ndimage.binary_erosion(usable, np.ones((3, 1) if axis == 0 else (1, 3)), border_value=1)
     roots = np.where(usable, np.abs(differences) ** 0.5, 0.0)
-    whole = float(np.mean(roots[usable])) if usable.any() else 0.0
-    sums, share = (scipy.ndimage.uniform_filter(np.pad(a, pads), _NEAR) for a in (roots, usable.astype(np.float64)))
-    local = np.where(share > 0.5 / _NEAR**2, sums / np.maximum(share, 0.5 / _NEAR**2), whole)
-    return ((local / _ROOT_OF_NORMAL) ** 2 / _FILTER_NORM**count).astype(np.float32)
+    mean, share = (scipy.ndimage.uniform_filter(values, _NEAR) for values in (roots, usable.astype(np.float64)))
+    return ((mean / np.maximum(share, 1e-9) / _ROOT_OF_NORMAL) ** 2 / _FILTER_NORM ** len(axes)).astype(np.float32)
 
 
 def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:

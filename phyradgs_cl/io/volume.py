@@ -103,14 +103,12 @@ def write_volume(
     values also as attributes; ``gaussians`` as float32; ``state``: arrays and texts from which an interrupted run resumes;
     ``deformation``: how the object moves; ``states``: the object at some times; ``doubt``: σ in 1/mm (nz, ny, nx).
     InputError: an array that is not finite or does not fit the grid. OutputError: the file cannot be written."""
-    checks.shape("volume", volume, grid.shape)
-    checks.finite("volume", volume)
-    arrays = [volume, *(state or {}).values(), *([] if gaussians is None else vars(gaussians).values())]
+    of_grid = {"volume": volume} if doubt is None else {"volume": volume, "doubt": doubt}
+    for name, values in of_grid.items():
+        checks.shape(name, values, grid.shape)
+        checks.finite(name, values)
+    arrays = [*of_grid.values(), *(state or {}).values(), *([] if gaussians is None else vars(gaussians).values())]
     arrays += [] if states is None else [states.volumes]
-    if doubt is not None:
-        checks.shape("doubt", doubt, grid.shape)
-        checks.finite("doubt", doubt)
-        arrays.append(doubt)
     with h5.new_hdf5(path, sum(values.nbytes for values in arrays)) as file:
         entry = h5.new_group(file, "entry", "NXentry")
         entry.attrs["default"] = "reconstruction"

@@ -86,7 +86,7 @@ class Doubter:
             with report.through(partial(_counted, results=results)):
                 result = once(scan, arrays or None)
             if result.state is not None:
-                return _interrupted(result, results) if results else result
+                return _interrupted(result, results)
             results, arrays = [*results, result], {}
         return self.finished(results)
 
@@ -133,9 +133,8 @@ class Doubter:
             inside.append([np.abs(error) <= np.hypot(a * noise, b * bar) for a, b in multiples])
         wanted = float(np.sqrt(max(np.quantile(np.concatenate(ratios), _SHARE), 1.0)))
         if wanted > _WIDEST:
-            text = "held-out pixels are %.3g times farther off than the error bars say, which are made %g times wider "
-            text += "and may not suffice: geometry, beam or motion are wrong; see 'phyradgs check'"
-            log.warning(text, wanted, _WIDEST)
+            text = "held-out pixels are %.3g times farther off than the error bars say: the scan is described wrongly; "
+            log.warning(text + "these get %g times as wide, which may not suffice; see 'phyradgs check'", wanted, _WIDEST)
         within, within_95 = np.mean(np.concatenate(inside, axis=1), axis=1).tolist()
         return {"held_out_within": within, "held_out_within_95": within_95, "held_out_factor": min(wanted, _WIDEST)}
 
@@ -143,25 +142,26 @@ class Doubter:
 def _counted(progress: Progress, results: list[Reconstruction]) -> Progress:
     """Counts the iterations of all runs as those of one, and shows the volume of the first while the others run."""
     done, each = progress.iteration + len(results) * progress.iterations, RUNS * progress.iterations
+    progress = progress.mapped(state=lambda state: {**state, **_kept(results)}, iteration=done, iterations=each)
     if not results:
-        return replace(progress, iteration=done, iterations=each)
+        return progress
     first, words = results[0], f"{progress.quantity} of run {len(results) + 1} for error bars"
     states = None if (of_first := first.states) is None else lambda: of_first
     shown = {"volume": lambda: (first.volume, first.grid), "deformation": first.deformation, "states": states}
-    return progress.mapped(
-        state=lambda state: {**state, **_kept(results)}, iteration=done, iterations=each, quantity=words
-    ).mapped(**shown)  # type: ignore[arg-type]
+    return replace(progress, quantity=words, **shown)  # type: ignore[arg-type]
 
 
 def _interrupted(result: Reconstruction, results: list[Reconstruction]) -> Reconstruction:
-    """Returns the first volume, which is whole, with the state of a later run."""
-    run = {"interrupted_in_run": f"{len(results) + 1} of {RUNS}"}
-    facts = {**results[0].facts, "interrupted_at": result.facts["interrupted_at"], DOUBT: run}
-    return replace(results[0], state={**(result.state or {}), **_kept(results)}, facts=facts)
+    """Returns the first volume with the state of the run that was interrupted."""
+    first, run = (*results, result)[0], {"interrupted_in_run": f"{len(results) + 1} of {RUNS}"}
+    facts = {**first.facts, "interrupted_at": result.facts["interrupted_at"], DOUBT: run}
+    return replace(first, state={**(result.state or {}), **_kept(results)}, facts=facts)
 
 
 def _kept(results: list[Reconstruction]) -> State:
     """Returns what a state keeps of complete runs: all of the first, volumes and seconds of the others."""
+    if not results:
+        return {}
     first, seconds = results[0], [one.facts["seconds"] for one in results]
     notes = json.dumps({"facts": first.facts, "record": first.record, "seconds": seconds}, default=str)
     arrays = {"notes": np.array(notes), "volumes": np.stack([one.volume for one in results])}

@@ -61,8 +61,6 @@ class Reconstruction:
         if not isinstance(self.grid, Grid):
             raise InputError("grid", checks.short_repr(self.grid), "a Grid")
         checks.shape("volume", self.volume, self.grid.shape)
-        if self.doubt is not None:
-            checks.shape("doubt", self.doubt, self.grid.shape)
         if self.states is not None:
             checks.shape("states", self.states.volumes, (None, *self.grid.shape))
 

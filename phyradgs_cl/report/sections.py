@@ -45,12 +45,10 @@ def doubt_section(run: Run) -> Markup | None:
         return None
     z, y = (n // 2 for n in stored.values.shape[:2])
     truth = None if run.reference is None else run.reference[z, y]
-    z_mm, y_mm, x_mm = stored.required_grid.axes_mm()
-    caption = f"Along x at z {number(float(z_mm[z]))} mm, y {number(float(y_mm[y]))} mm, with a band of one σ"
-    drawing = profile_chart(x_mm, stored.values[z, y], stored.doubt[z, y], truth)
+    drawing = profile_chart(stored.required_grid.axes_mm()[2], stored.values[z, y], stored.doubt[z, y], truth)
     words = "About 68 % of the object's voxels are within σ of the truth. This holds over a volume, not for one strange "
     words += "detail; what no ray sees is the prior's belief. Among the slices σ is the layer Error bar."
-    caption += "." if truth is None else "; dashed, the truth."
+    caption = f"Along x through the middle, with a band of one σ{'' if truth is None else '; dashed, the truth'}."
     return section("doubt", "Error bars", note(words), _charts([(caption, drawing)]))
 
 

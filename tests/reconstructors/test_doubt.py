@@ -96,7 +96,7 @@ def test_a_run_goes_on_with_the_same_bits_from_each_of_its_three_parts(rt, scan,
         usual = {**FEW, "report": stop_at(iteration), "on_interrupt": "return", "doubt": True, "holdout": 3.0}
         partial = reconstruct(scan, device=rt, **usual)
         assert partial.doubt is None and partial.facts["interrupted_at"] == (iteration - 1) % 4 + 1
-        assert partial.facts.get(DOUBT, {}).get("interrupted_in_run") == {2: None, 6: "2 of 3", 11: "3 of 3"}[iteration]
+        assert partial.facts.get(DOUBT, {}).get("interrupted_in_run") == {2: "1 of 3", 6: "2 of 3", 11: "3 of 3"}[iteration]
         write_checkpoint(tmp_path / "state.h5", partial.state)
         partial = replace(partial, state=read_checkpoint(tmp_path / "state.h5"))
         result = reconstruct(scan, device=rt, doubt=True, holdout=3.0, resume=partial, **FEW)
