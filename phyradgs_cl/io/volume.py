@@ -152,8 +152,7 @@ def read_volume(path: str | Path) -> Volume:
         provenance, gaussians, metrics = _read_provenance(source), _read_gaussians(source), _read_metrics(source)
         deformation = None if source.find(DEFORMATION) is None else read_deformation_group(source, DEFORMATION)
         states = _read_states(source, grid.shape)
-        sigma = source.optional(_DOUBT)
-        if sigma is not None:
+        if (sigma := source.optional(_DOUBT)) is not None:
             checks.shape(source.name(_DOUBT), sigma, grid.shape)
         doubt = None if sigma is None else _read_attenuation(source, _DOUBT, sigma)
         return Volume(values, grid, provenance, gaussians, metrics, deformation, states, doubt)

@@ -8,7 +8,7 @@ import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,8 +24,7 @@ from phyradgs_cl.reconstructors.projected import FRAMES_AT_A_TIME, FramePair, fr
 from phyradgs_cl.reconstructors.result import DOUBT, Progress, Reconstruction, Report
 from phyradgs_cl.runtime import Runtime
 
-RUNS = 3
-"""Runs of the method: that of the scan, and two of synthesised scans."""
+RUNS = 3  # of the method: that of the scan, and two of synthesised scans
 NEAR = 0.7  # voxels: standard deviation of the Gaussian that smooths squares of differences
 LEAST = 0.01  # of the RMS of σ: no voxel is certain
 _KEPT = "doubt."  # begins the names of what a state keeps of the runs before
@@ -47,7 +46,6 @@ class Law:
     multiple_95: float
 
 
-@cache
 def fitted_law(kind: str) -> Law:
     """Returns the law of ``iterative`` or ``analytic`` methods, from ``data/doubt.json`` (benchmarks/doubt.py)."""
     return Law(**json.loads((resource("data") / "doubt.json").read_text(encoding="utf-8"))[kind]["law"])
@@ -109,14 +107,14 @@ class Doubter:
 
     def finished(self, results: list[Reconstruction]) -> Reconstruction:
         """Returns the first result with σ, its facts, and the seconds of all runs."""
-        law, first = fitted_law(self.kind), results[0]
-        sigma = spread(results[1].volume - first.volume, results[2].volume - first.volume, law)
+        law, (first, one, two) = fitted_law(self.kind), results
+        sigma = spread(one.volume - first.volume, two.volume - first.volume, law)
         facts: dict[str, Any] = {"runs": RUNS, "share": _SHARE, "multiple_95": law.multiple_95}
         if self.hidden is not None and self.rt.ranks.size == 1:
             facts |= self._against_held_out(results, self.hidden, law)
             sigma *= np.float32(facts["held_out_factor"])
-        seconds = sum(float(one.facts["seconds"]) for one in results)
-        return replace(first, doubt=sigma, facts={**first.facts, DOUBT: facts, "seconds": seconds})
+        facts = {DOUBT: facts, "seconds": sum(float(one.facts["seconds"]) for one in results)}
+        return replace(first, doubt=sigma, facts={**first.facts, **facts})
 
     def _against_held_out(self, results: list[Reconstruction], hidden: NDArray[np.bool_], law: Law) -> dict[str, float]:
         """Returns the shares of held-out pixels within their bars, and the factor of σ, at least 1, for which 68 % are.
@@ -129,12 +127,11 @@ class Doubter:
             bar = spread(one.computed - first.computed, two.computed - first.computed, law).astype(np.float64)
             bar = np.sqrt(scipy.ndimage.uniform_filter(bar**2, _AROUND))[held]
             ratios.append((error**2 - noise**2) / np.maximum(bar, 1e-30) ** 2)
-            multiples = (1.0, 1.0), (_NORMAL_95, law.multiple_95)
-            inside.append([np.abs(error) <= np.hypot(a * noise, b * bar) for a, b in multiples])
+            wide = np.hypot(_NORMAL_95 * noise, law.multiple_95 * bar)
+            inside.append([np.abs(error) <= np.hypot(noise, bar), np.abs(error) <= wide])
         wanted = float(np.sqrt(max(np.quantile(np.concatenate(ratios), _SHARE), 1.0)))
         if wanted > _WIDEST:
-            text = "held-out pixels are %.3g times farther off than the error bars say: the scan is described wrongly; "
-            log.warning(text + "these get %g times as wide, which may not suffice; see 'phyradgs check'", wanted, _WIDEST)
+            log.warning("held-out pixels are %.3g times farther off than the error bars: run 'phyradgs check'", wanted)
         within, within_95 = np.mean(np.concatenate(inside, axis=1), axis=1).tolist()
         return {"held_out_within": within, "held_out_within_95": within_95, "held_out_factor": min(wanted, _WIDEST)}
 

@@ -43,9 +43,8 @@ class Reconstruction:
     gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict per report;
     facts: what is needed to make it again (method, options, scales, seconds); state: how to go on, where a run
     was interrupted; deformation: how the object moves, of ``moving``, whose volume is its reference; states: the object at
-    some times, of ``changing``, whose volume is their mean; doubt: σ (nz, ny, nx) in 1/mm, which
-    covers the error of about 68 % of the object's voxels (docs/methods.md#error-bars). Raises InputError for arrays that are
-    not the grid's."""
+    some times, of ``changing``, whose volume is their mean; doubt: σ (nz, ny, nx) in 1/mm of its errors
+    (docs/methods.md#error-bars). Raises InputError for arrays that are not the grid's."""
 
     volume: np.ndarray
     grid: Grid

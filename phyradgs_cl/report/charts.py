@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 MOST_CHARTS = 3  # charts of convergence
 SIZE = 440, 320  # in the picture's own units, in which letters are 13 high
 _STYLE: Any = {"svg.fonttype": "none", "text.parse_math": False, "font.size": 13}
-Values = NDArray[np.floating]
 Chart = tuple[str, Markup]
 """A caption and a drawing."""
 
@@ -122,7 +121,7 @@ def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:
     return chart(draw, "Histogram of line integrals", "Pixels of all frames by line integral, before and after.")
 
 
-def profile_chart(x_mm: Values, line: Values, sigma: Values, truth: Values | None) -> Markup:
+def profile_chart(x_mm: NDArray[Any], line: NDArray[Any], sigma: NDArray[Any], truth: NDArray[Any] | None) -> Markup:
     """Returns a chart of a line (n,) of voxels in 1/mm with a band of ± ``sigma``, and that of the truth."""
 
     def draw(axes: "Axes") -> None:

@@ -31,7 +31,6 @@ from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_picture, load_reference, load_result
 
 log = logging.getLogger(__name__)
-_NORMAL_95 = 1.96
 _LITTLE = 0.5 - 1e-6  # of either box: less in common is most often a wrong size or offset
 
 
@@ -73,7 +72,7 @@ def run_evaluation(
     if result.doubt is not None and grid is not None:
         facts, curve = provenance.get("doubt"), picture.with_name(f"{picture.stem}.doubt.png")
         stated = facts.get("multiple_95") if isinstance(facts, Mapping) else None
-        multiple_95 = stated if isinstance(stated, float) else _NORMAL_95
+        multiple_95 = stated if isinstance(stated, float) else 1.96  # that of a normal law
         bar = _on_one_grid(volume_path, reference_path, (result.doubt, grid), truth).volume
         with finish_despite_interrupt(), written_beside(curve) as temporary:
             reliability_png(temporary, bar, volume, reference, multiple_95)
