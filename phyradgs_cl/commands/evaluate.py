@@ -42,8 +42,8 @@ def evaluate_command(
     words = [f"{title} {value}" for title, value in printed(facts)]
     say("   ".join([*words, str(facts["compared"]), f"picture {facts['picture']}"]))
     if "reliability" in facts:
-        words = "   ".join(f"{title} {value}" for title, value in printed(facts, COVERAGE))
-        say(f"error bars: {words}   picture {facts['reliability']}")
+        shares = "   ".join(f"{title} {value}" for title, value in printed(facts, COVERAGE))
+        say(f"error bars: {shares}   picture {facts['reliability']}")
     states: Any = facts.get("states", [])
     for state in states:
         say("   ".join([f"at {state['time_s']:.4g} s", *(f"{title} {value}" for title, value in printed(state))]))
