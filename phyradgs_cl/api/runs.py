@@ -62,7 +62,7 @@ def save_scan(path: str | Path, scan: Scan) -> None:
 
 @naming_arguments()
 def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Reconstruction:
-    """Reads a volume file: volume (nz, ny, nx) in 1/mm, grid, Gaussians, record, facts, state, deformation, states.
+    """Reads a volume file: volume (nz, ny, nx) in 1/mm, grid, Gaussians, record, facts, state, deformation, states, doubt.
 
     Only an interrupted run has a state.
     path: the HDF5 file, or a file of ``phyradgs export`` (docs/export.md), which has a volume and a grid only.
@@ -80,7 +80,7 @@ def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Recon
     stored = read_volume(file)
     facts = dict(stored.provenance)
     record: Any = facts.pop("record", [])
-    of_file = stored.gaussians, record, facts, read_state(file), stored.deformation, stored.states
+    of_file = stored.gaussians, record, facts, read_state(file), stored.deformation, stored.states, stored.doubt
     return Reconstruction(stored.values, stored.required_grid, *of_file)
 
 
@@ -132,8 +132,8 @@ def save_volume(
         export_stored(stored, form, file, "result", (lambda _: result.scale) if hu else None)
         return
     facts = {**result.facts, "program": f"phyradgs-cl {__version__}", "record": result.record}
-    moves = result.deformation, result.states
-    write_volume(file, result.volume, result.grid, facts, result.gaussians, metrics, result.state, *moves)
+    others = result.deformation, result.states, result.doubt
+    write_volume(file, result.volume, result.grid, facts, result.gaussians, metrics, result.state, *others)
 
 
 @naming_arguments()
@@ -208,6 +208,8 @@ def reconstruct(
     ``margin_mm`` adds a margin that is filled and discarded (docs/methods.md#the-grid).
     holdout: percentage of the pixels that the method does not see; the facts of the result have the error there
     (docs/methods.md#quality-without-a-truth).
+    doubt: True runs the method on two synthesised scans too, for the σ ``doubt`` (nz, ny, nx) in 1/mm of every voxel
+    (docs/methods.md#error-bars).
     seed: of all random numbers; the same seed on the same device gives the same bits.
 
     report: a function that gets every ``Progress``: every iteration of voxels, and every 50 iterations or ten seconds of

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from phyradgs_cl.commands.console import AsJson, file_argument, file_option, numbers, option, say
-from phyradgs_cl.metrics import METRICS, printed
+from phyradgs_cl.metrics import COVERAGE, METRICS, printed
 from phyradgs_cl.workflow import run_evaluation
 
 EXAMPLES = {"evaluate": "Example: phyradgs evaluate volume.h5 --reference scan.h5 --json"}
@@ -41,6 +41,9 @@ def evaluate_command(
         return
     words = [f"{title} {value}" for title, value in printed(facts)]
     say("   ".join([*words, str(facts["compared"]), f"picture {facts['picture']}"]))
+    if "reliability" in facts:
+        shares = "   ".join(f"{title} {value}" for title, value in printed(facts, COVERAGE))
+        say(f"error bars: {shares}   picture {facts['reliability']}")
     states: Any = facts.get("states", [])
     for state in states:
         say("   ".join([f"at {state['time_s']:.4g} s", *(f"{title} {value}" for title, value in printed(state))]))

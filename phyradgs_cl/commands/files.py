@@ -28,7 +28,7 @@ EXAMPLES = {
 }
 GROUPS = {
     "export": {
-        "Basics": ("output", "to"),
+        "Basics": ("output", "to", "doubt"),
         "Hounsfield units": ("hu", "air_mm", "water_mm", "insert_hu", "mu_water_per_mm"),
         "Objects that move": ("object_motion", "states", "during"),
         "DICOM": ("patient", "title", "description", "date")
@@ -45,6 +45,7 @@ _WATER = "Attenuation of water in 1/mm; the values are then Hounsfield units, wi
 _HU = "Hounsfield units by the volume's own scale, else fitted to air and water. An output .h5 keeps 1/mm and the scale."
 _AIR = "Box of air, for Hounsfield units."
 _WATER_BOX = "Box of water, or of the insert, for Hounsfield units."
+_DOUBT = "The error bars σ of 'reconstruct --doubt' in 1/mm, in place of the volume."
 _INSERT = "HU of the second point, where it is not water."
 
 
@@ -68,6 +69,7 @@ def export_command(
         Path | None, file_option(_OUTPUT, "--output", "-o", default="VOLUME with the format's suffix")
     ] = None,
     to: Annotated[Literal[EXPORTS] | None, option(_TO, "by the output's suffix", "--to")] = None,  # type: ignore[valid-type]
+    doubt: Annotated[bool, option(_DOUBT, True, "--doubt")] = False,
     hu: Annotated[bool, option(_HU, True, "--hu")] = False,
     air_mm: Annotated[Any, option(_AIR, _PEAK, parser=numbers, metavar=_BOX)] = None,
     water_mm: Annotated[Any, option(_WATER_BOX, _PEAK, parser=numbers, metavar=_BOX)] = None,
@@ -89,6 +91,8 @@ def export_command(
     """Export a volume, upright and to scale, for 3D Slicer, ITK-SNAP, ImageJ, napari and others."""
     form, labels = to or format_of(output), DicomLabels(patient, title, description, date)
     moves = object_motion is not None or states is not None or during is not None
+    if doubt and moves:
+        raise InputError("--doubt", "given with an object that moves", "one volume", "leave --states and --during out")
     scales: list[Hounsfield | None] = []
     hu = hu or air_mm is not None or water_mm is not None or insert_hu != 0
 
@@ -99,7 +103,7 @@ def export_command(
     scaling = scale_of if hu else None
     with finish_despite_interrupt(), expecting(volume, "volume"):
         if not moves:
-            written: object = export_volume(volume, form, output, mu_water_per_mm, labels, scaling)
+            written: object = export_volume(volume, form, output, mu_water_per_mm, labels, scaling, doubt)
         else:
             has_field = object_motion is not None or holds_deformation(volume)
             field = read_deformation(object_motion or volume) if has_field else None
@@ -112,7 +116,7 @@ def export_command(
     is_hu = form != OWN and (hu or mu_water_per_mm is not None)
     unit = "" if form in CLOUDS else ", HU" if is_hu else ", 1/mm"
     moving = "" if not moves else f", {len(times_s)} states from {times_s[0]:.4g} to {times_s[-1]:.4g} s"
-    say(f"{written}: {form}{unit}{moving}")
+    say(f"{written}: {form}{', error bars' if doubt else ''}{unit}{moving}")
     if scales and scales[0] is not None:
         say(f"Hounsfield units: {scales[0].line}")
 

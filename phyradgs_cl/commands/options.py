@@ -72,7 +72,7 @@ RUN_GROUPS = {
     "Volume": ("voxel_mm", "roi_mm", "margin_mm", "initial", "mu_water_per_mm", "rows", "slab"),
     "Motion": ("object_motion", "strips", "sub_intervals", "segments", "time_error", "detector_model"),
     "Quality": (
-        *("prior", "preset", "assignments", "holdout", "steps", "ignore_lag", "gaussians", "seed"),
+        *("prior", "preset", "assignments", "holdout", "doubt", "steps", "ignore_lag", "gaussians", "seed"),
     ),
     "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
     "Under mpiexec (docs: cluster.md)": ("batch",),
@@ -87,6 +87,7 @@ _PRIOR = "Prior, for fista: ridge, dct, tv, piccs or none; MODULE:NAME: a denois
 _PRESET = "Constants: default, quick, paper (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
 _CONFIG = "TOML file of options, with underscores for dashes (docs: formats.md); the command line wins."
 _SET = "An option of the method by name: --set tv_weight=0.002 (docs: methods.md)."
+_DOUBT = "Run twice more, for an error bar of every voxel: dataset doubt of the volume file (docs: methods.md)."
 _HOLDOUT = "Pixels hidden from the method, to measure its error on them."
 RUN_OPTIONS: dict[str, Any] = {
     "method": _asked(str, _METHOD, DEFAULT_METHOD, metavar=f"{'|'.join(METHODS)}|MODULE:NAME"),
@@ -111,6 +112,7 @@ RUN_OPTIONS: dict[str, Any] = {
     "ignore_lag": IgnoreLag,
     "steps": Steps,
     "holdout": _asked(float, _HOLDOUT, "0", metavar="PERCENT"),
+    "doubt": Annotated[bool, option(_DOUBT, True, "--doubt")],
     "device": Device,
     "memory": Memory,
 }

@@ -26,7 +26,7 @@ from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, Report, RunPlan
 from phyradgs_cl.reconstructors.moving import motion_line
-from phyradgs_cl.reconstructors.result import COMPARED, MOTION_FOUND, option_facts
+from phyradgs_cl.reconstructors.result import COMPARED, DOUBT, MOTION_FOUND, option_facts
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import Settings
 from phyradgs_cl.workflow import load_scan, profile_report, run_reconstruction
@@ -117,11 +117,14 @@ def reconstruct_command(
     if result.states is not None and result.state is None:
         times_s = result.states.times_s
         say(f"states of the object: {len(times_s)}, {times_s[0]:.4g} to {times_s[-1]:.4g} s; the volume is their mean")
+    if result.doubt is not None:
+        say(f"error bars: mean σ {result.doubt.mean():.3g} 1/mm, the 95 % bar is {result.facts[DOUBT]['multiple_95']:.3g} σ")
     if profile:
         say(profile_report(runtimes[-1], result))
     if result.state is not None:
         at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
-        complain(f"interrupted at iteration {at} of {asked}: repeat the command with --resume to continue")
+        run = f" of run {result.facts[DOUBT]['interrupted_in_run']}" if DOUBT in result.facts else ""
+        complain(f"interrupted at iteration {at} of {asked}{run}: repeat the command with --resume to continue")
         raise typer.Exit(signals.exit_status())
 
 

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from phyradgs_cl.acquisition import Saturation
@@ -28,6 +29,8 @@ _RELATIVE = 2e-5  # largest estimate of noise, as a fraction of the ceiling, tha
 # least ratio of two estimates of noise, along both axes and along rows: they agree for white noise and differ by far for
 # smooth structure
 _WHITE = 0.5
+_ROOT_OF_NORMAL = 0.8222  # mean of √|x| over the root of the standard deviation of a normal x
+_NEAR = 9  # side in pixels of the square from which the noise of its middle pixel is estimated
 
 
 def robust_deviation(values: np.ndarray) -> float:
@@ -80,6 +83,21 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
     levels = np.array([np.median(size[tenth == k]) if (tenth == k).any() else 0.0 for k in range(_TENTHS)])
     share = np.bincount(np.digitize(line_integrals[chosen], edges), minlength=_TENTHS) / chosen.sum()
     return float(np.sqrt(share @ levels**2)) / (_MEDIAN_OF_NORMAL * _FILTER_NORM ** len(cuts))
+
+
+def noise_map(residual: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Returns the standard deviation of every pixel's noise (v, u) in a residual (v, u), from 9 × 9 pixels about it.
+
+    It follows from the mean root of |second differences along rows of those along columns|. They leave out what is smooth,
+    which the volume does not explain and is no noise; roots give edges little weight. An axis shorter than three pixels is
+    left out. Where no pixel about is ``valid`` (v, u) the noise is 0."""
+    differences, usable, axes = residual.astype(np.float64), valid, [axis for axis in (0, 1) if residual.shape[axis] >= 3]
+    for axis in axes:
+        differences = scipy.ndimage.correlate1d(differences, (-0.5, 1, -0.5), axis, mode="mirror")
+        usable = scipy.ndimage.binary_erosion(usable, np.ones((3, 1) if axis == 0 else (1, 3)), border_value=1)
+    roots = np.where(usable, np.abs(differences) ** 0.5, 0.0)
+    mean, share = (scipy.ndimage.uniform_filter(values, _NEAR) for values in (roots, usable.astype(np.float64)))
+    return ((mean / np.maximum(share, 1e-9) / _ROOT_OF_NORMAL) ** 2 / _FILTER_NORM ** len(axes)).astype(np.float32)
 
 
 def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:

@@ -37,7 +37,7 @@ _SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": (),
 
 def export_volume(
     path: str | Path, to: str, output: str | Path | None = None, mu_water_per_mm: float | None = None,
-    labels: DicomLabels | None = None, scale_of: ScaleOf | None = None,
+    labels: DicomLabels | None = None, scale_of: ScaleOf | None = None, doubt: bool = False,
 ) -> Path:  # fmt: skip
     """Writes a volume file in another format, whole or not at all, and returns the path of the output.
 
@@ -45,12 +45,19 @@ def export_volume(
     output: a file, or a folder for dicom and zarr; None takes the folder of ``path``.
     mu_water_per_mm: water's attenuation; the values are then written in Hounsfield units.
     scale_of: in place of it, a function from the volume to its scale of Hounsfield units, as ``hu_scale``.
-    labels: patient, study and series, for dicom only.
+    labels: patient, study and series, for dicom only. doubt: whether the voxels are the error bars σ in 1/mm.
 
     Raises InputError for an unknown format, a damaged volume or one without Gaussians, a suffix of another format, and
     labels with another format. Raises OutputError where the output cannot be written."""
     target, scale_of = _checked(Path(path), to, output, mu_water_per_mm, labels, scale_of)
-    export_stored(read_volume(path), to, target, str(path), scale_of, labels)
+    stored = read_volume(path)
+    if doubt:
+        if to in (*CLOUDS, OWN) or scale_of is not None:
+            raise InputError("--doubt", "given with Gaussians, Hounsfield units or .h5", "voxels in 1/mm", "use nii or mha")
+        if stored.doubt is None:
+            raise InputError(str(path), "no error bars", "a volume of 'reconstruct --doubt'", "run it again with --doubt")
+        stored = replace(stored, values=stored.doubt)
+    export_stored(stored, to, target, str(path), scale_of, labels)
     return target
 
 
@@ -174,7 +181,7 @@ def export_stored(
 def _write_own(target: Path, volume: Volume, path: str, scale: Hounsfield | None) -> None:
     """Writes all that the volume file ``path`` holds to another volume file, with the scale of Hounsfield units."""
     facts = volume.provenance if scale is None else {**volume.provenance, **scale.facts()}
-    parts = volume.gaussians, volume.metrics, read_state(path), volume.deformation, volume.states
+    parts = volume.gaussians, volume.metrics, read_state(path), volume.deformation, volume.states, volume.doubt
     write_volume(target, volume.values, volume.required_grid, facts, *parts)
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from xarray import DataArray
 
 _DATA = "/entry/reconstruction"
-_VOLUME, _BARE = f"{_DATA}/volume", "/volume"
+_VOLUME, _DOUBT, _BARE = f"{_DATA}/volume", f"{_DATA}/doubt", "/volume"
 _AXES = ("z", "y", "x")
 _GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/time_series"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
@@ -38,7 +38,8 @@ log = logging.getLogger(__name__)
 class Volume:
     """Values (nz, ny, nx) float32 in 1/mm and their grid, None for a bare array. A volume file also holds ``provenance``
     (types as in ``tables.PROVENANCE``), ``gaussians`` float32 in mm and 1/mm, and ``metrics`` by name. deformation: the
-    object's motion, with the volume as reference. states: the object at several times, with the volume as their mean."""
+    object's motion, with the volume as reference. states: the object at several times, with the volume as their mean.
+    doubt: σ in 1/mm of each value, in their shape."""
 
     values: np.ndarray
     grid: Grid | None
@@ -47,6 +48,7 @@ class Volume:
     metrics: dict[str, object] | None = None
     deformation: Deformation | None = None
     states: States | None = None
+    doubt: np.ndarray | None = None
 
     def at(self, time_s: float) -> np.ndarray:
         """Returns the values (nz, ny, nx) in 1/mm at a time in s; ``values`` where the volume has neither states nor a
@@ -91,19 +93,25 @@ def write_volume(
     path: str | Path, volume: np.ndarray, grid: Grid, provenance: Mapping[str, object],
     gaussians: Gaussians | None = None, metrics: Mapping[str, object] | None = None,
     state: Mapping[str, np.ndarray] | None = None, deformation: Deformation | None = None, states: States | None = None,
+    doubt: np.ndarray | None = None,
 ) -> None:
     """Writes a volume (nz, ny, nx) in 1/mm, whole or not at all. ``provenance`` and ``metrics`` are stored as JSON, plain
     values also as attributes; ``gaussians`` as float32. ``state``: arrays and texts from which an interrupted run resumes.
-    ``deformation``: how the object moves; ``states``: the object at several times. Raises InputError where the volume is
-    not finite or does not fit the grid, OutputError where the file cannot be written."""
-    checks.shape("volume", volume, grid.shape)
-    checks.finite("volume", volume)
-    arrays = [volume, *(state or {}).values(), *([] if gaussians is None else vars(gaussians).values())]
+    ``deformation``: how the object moves; ``states``: the object at several times; ``doubt``: σ in 1/mm (nz, ny, nx). Raises
+    InputError where an array is not finite or does not fit the grid, OutputError where the file cannot be written."""
+    of_grid = {"volume": volume} if doubt is None else {"volume": volume, "doubt": doubt}
+    for name, values in of_grid.items():
+        checks.shape(name, values, grid.shape)
+        checks.finite(name, values)
+    arrays = [*of_grid.values(), *(state or {}).values(), *([] if gaussians is None else vars(gaussians).values())]
     arrays += [] if states is None else [states.volumes]
     with h5.new_hdf5(path, sum(values.nbytes for values in arrays)) as file:
         entry = h5.new_group(file, "entry", "NXentry")
         entry.attrs["default"] = "reconstruction"
         _write_data(entry, np.asarray(volume, np.float32), grid)
+        if doubt is not None:
+            _write_attenuation(entry["reconstruction"], "doubt", doubt, "σ of the attenuation (1/mm)")
+            entry["reconstruction"].attrs["auxiliary_signals"] = ["doubt"]
         h5.write_grid(entry, grid)
         _write_facts(entry, "provenance", provenance)
         if metrics is not None:
@@ -140,7 +148,10 @@ def read_volume(path: str | Path) -> Volume:
         provenance, gaussians, metrics = _read_provenance(source), _read_gaussians(source), _read_metrics(source)
         deformation = None if source.find(DEFORMATION) is None else read_deformation_group(source, DEFORMATION)
         states = _read_states(source, grid.shape)
-        return Volume(values, grid, provenance, gaussians, metrics, deformation, states)
+        if (sigma := source.optional(_DOUBT)) is not None:
+            checks.shape(source.name(_DOUBT), sigma, grid.shape)
+        doubt = None if sigma is None else _read_attenuation(source, _DOUBT, sigma)
+        return Volume(values, grid, provenance, gaussians, metrics, deformation, states, doubt)
 
 
 def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
@@ -226,9 +237,13 @@ def _write_data(entry: h5py.Group, volume: np.ndarray, grid: Grid) -> None:
     group = h5.new_group(entry, "reconstruction", "NXdata")
     group.attrs["signal"], group.attrs["axes"] = "volume", list(_AXES)
     group["title"] = "attenuation (1/mm)"
-    dataset = group.create_dataset("volume", data=volume)
-    dataset.attrs.update(units="1/mm", long_name="attenuation (1/mm)", interpretation="image")
+    _write_attenuation(group, "volume", volume, "attenuation (1/mm)")
     _write_axes(group, grid)
+
+
+def _write_attenuation(group: h5py.Group, name: str, values: np.ndarray, words: str, **how: Any) -> None:
+    dataset = group.create_dataset(name, data=np.asarray(values, np.float32), **how)
+    dataset.attrs.update(units="1/mm", long_name=words, interpretation="image")
 
 
 def _write_axes(group: h5py.Group, grid: Grid) -> None:
@@ -240,8 +255,7 @@ def _write_states(entry: h5py.Group, states: States, grid: Grid) -> None:
     group = h5.new_group(entry, "time_series", "NXdata")
     group.attrs["signal"], group.attrs["axes"] = "volume", ["time_s", *_AXES]
     group["title"] = "attenuation (1/mm) at some times"
-    dataset = group.create_dataset("volume", data=np.asarray(states.volumes, np.float32), chunks=(1, *grid.shape))
-    dataset.attrs.update(units="1/mm", long_name="attenuation (1/mm)", interpretation="image")
+    _write_attenuation(group, "volume", states.volumes, "attenuation (1/mm)", chunks=(1, *grid.shape))
     h5.write_number(group, "time_s", states.times_s, "s", long_name="time (s)")
     _write_axes(group, grid)
 

@@ -10,6 +10,7 @@ from phyradgs_cl.metrics.align import (
     resampled,
     shared_slices,
 )
+from phyradgs_cl.metrics.coverage import COVERAGE, coverage, reliability_png
 from phyradgs_cl.metrics.quality import (
     HELD_OUT,
     METRICS,
@@ -24,7 +25,7 @@ from phyradgs_cl.metrics.quality import (
 )
 
 __all__ = [
-    "HELD_OUT", "METRICS", "VOXEL_BY_VOXEL", "Aligned", "aligned", "compare", "edge_points_mm", "in_words",
-    "motion_error_mm", "overlap", "printed", "psnr", "reference_on", "resampled", "shared_slices", "slices_png", "ssim",
-    "ssim_map",
+    "COVERAGE", "HELD_OUT", "METRICS", "VOXEL_BY_VOXEL", "Aligned", "aligned", "compare", "coverage", "edge_points_mm",
+    "in_words", "motion_error_mm", "overlap", "printed", "psnr", "reference_on", "reliability_png", "resampled",
+    "shared_slices", "slices_png", "ssim", "ssim_map",
 ]  # fmt: skip

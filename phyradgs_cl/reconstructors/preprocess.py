@@ -25,11 +25,13 @@ MOST_HELD_OUT = 50.0
 class Preprocessing(PrepareOptions, GridChoice):
     """size, voxel_mm, roi_mm, margin_mm: the grid, as in ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
 
-    holdout: percentage of the pixels that the method does not use, for a measure of quality. steps and a table for each:
+    holdout: percentage of the pixels that the method does not use, for a measure of quality. doubt: run the method on two
+    synthesised scans too, for error bars of voxels. steps and a table for each:
     as in ``PrepareOptions``."""
 
     ignore_lag: bool = False
     holdout: float = 0.0
+    doubt: bool = False
 
     def __post_init__(self) -> None:
         GridChoice.__post_init__(self)
@@ -38,13 +40,13 @@ class Preprocessing(PrepareOptions, GridChoice):
 
     def facts(self) -> dict[str, object]:
         """Returns the options by name, without those that are not set."""
-        unset = {*STEP_FIELDS, *(() if self.holdout else ("holdout",))}
+        unset = {*STEP_FIELDS, *(name for name in ("holdout", "doubt") if not getattr(self, name))}
         plain = {name: value for name, value in asdict(self).items() if name not in unset and value is not None}
         return {**plain, **self.step_facts()}
 
     def check_written(self) -> None:
         """Raises InputError for options that mean nothing in a scan that is written to a file."""
-        for name in [name for name in ("holdout", "margin_mm") if getattr(self, name)]:
+        for name in [name for name in ("holdout", "margin_mm", "doubt") if getattr(self, name)]:
             found, remedy = f"{getattr(self, name)}, without a method", "give it to the reconstruction"
             raise InputError(f"--{name.replace('_', '-')}", found, "none where a scan is prepared", remedy)
 

@@ -20,7 +20,7 @@ from phyradgs_cl.runtime import Runtime
 
 TIMES_PER_LINE = 16  # number of times of a line's exposure at which it is projected: their error is far below the noise
 _HOLDOUT_SEED = 20  # seed of the random generator that draws held-out pixels
-_HOLDOUT_FRAMES = 8  # most frames that are projected at one time to measure their error
+FRAMES_AT_A_TIME = 8  # most frames that are projected at one time
 Image = NDArray[np.float32]
 
 
@@ -105,8 +105,8 @@ def holdout_errors(
 
     No reconstruction can have a smaller true error than the noise. Both are dimensionless, as line integrals are."""
     squares = 0.0
-    for first in range(0, scan.frames, _HOLDOUT_FRAMES):
-        frames = range(first, min(first + _HOLDOUT_FRAMES, scan.frames))
+    for first in range(0, scan.frames, FRAMES_AT_A_TIME):
+        frames = range(first, min(first + FRAMES_AT_A_TIME, scan.frames))
         for pair in frame_pairs(rt, scan, volume, grid, frames, moves):
             squares += float(np.sum(np.square(pair.residual[held[pair.frame]], dtype=np.float64)))
     count = int(held.sum())

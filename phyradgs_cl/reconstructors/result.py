@@ -32,6 +32,8 @@ MOTION_FOUND = "motion_found"
 """The key of what a method has found about the motion of the object."""
 MARGIN_MM = "margin_mm"
 """The key of the width (z, y, x) of the discarded margin."""
+DOUBT = "doubt"
+"""The key of the facts about the error bars, and of the run in which they were interrupted."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -41,7 +43,8 @@ class Reconstruction:
     gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict per report;
     facts: what is needed to make it again (method, options, scales, seconds); state: how to go on, where a run
     was interrupted; deformation: how the object moves, of ``moving``, whose volume is its reference; states: the object at
-    some times, of ``changing``, whose volume is their mean. Raises InputError for arrays that are not the grid's."""
+    some times, of ``changing``, whose volume is their mean; doubt: σ (nz, ny, nx) in 1/mm of its errors
+    (docs/methods.md#error-bars). Raises InputError for arrays that are not the grid's."""
 
     volume: np.ndarray
     grid: Grid
@@ -51,6 +54,7 @@ class Reconstruction:
     state: State | None = None
     deformation: Deformation | None = None
     states: States | None = None
+    doubt: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.grid, Grid):
@@ -93,7 +97,8 @@ class Reconstruction:
             return self
         of_all = slice(None), *part
         states = self.states and replace(self.states, volumes=self.states.volumes[of_all].copy())
-        return replace(self, volume=self.volume[part].copy(), grid=grid, states=states)
+        doubt = None if self.doubt is None else self.doubt[part].copy()
+        return replace(self, volume=self.volume[part].copy(), grid=grid, states=states, doubt=doubt)
 
     @property
     def scale(self) -> Hounsfield | None:

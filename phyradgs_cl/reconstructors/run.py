@@ -19,6 +19,7 @@ from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import State, with_identity, without_identity
+from phyradgs_cl.reconstructors.doubt import Doubter
 from phyradgs_cl.reconstructors.method import METHODS, method_of
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan, check_object_motion
 from phyradgs_cl.reconstructors.preprocess import prepared
@@ -59,10 +60,19 @@ def reconstruct(
 
     The plan's first volume is resampled onto the scan's grid."""
     run, report = _Prepared(scan, plan, rt, resume), Report.of(report)
+    method, state = method_of(plan.method), run.arguments.pop("resume", None)
+
+    def once(visible: Scan, state: State | None) -> Reconstruction:
+        arguments = run.arguments if state is None else {**run.arguments, "resume": state}
+        return method.run(visible, run.options, rt=rt, seed=plan.seed, report=report, **arguments)
+
     with report.through(run.shown), _naming_size_that_fits(rt, run.scan, plan), naming_host_memory():
-        result = method_of(plan.method).run(
-            run.visible, run.options, rt=rt, seed=plan.seed, report=report, **run.arguments
-        )
+        if plan.preprocessing.doubt:
+            kind = "iterative" if hasattr(run.options, "iterations") else "analytic"
+            doubter = Doubter(rt, run.visible, run.scan, run.hidden, run.deformation, plan.seed, kind)
+            result = doubter.run(once, report, state)
+        else:
+            result = once(run.visible, state)
     return run.finished(result)
 
 

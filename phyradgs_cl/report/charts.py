@@ -122,6 +122,19 @@ def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:
     return chart(draw, "Histogram of line integrals", "Pixels of all frames by line integral, before and after.")
 
 
+def profile_chart(x_mm: NDArray[Any], line: NDArray[Any], sigma: NDArray[Any], truth: NDArray[Any] | None) -> Markup:
+    """Returns a chart of a line (n,) of voxels in 1/mm with a band of ± ``sigma``, and that of the truth."""
+
+    def draw(axes: "Axes") -> None:
+        axes.fill_between(x_mm, line - sigma, line + sigma, color=SOFT, alpha=0.4, lw=0)
+        axes.plot(x_mm, line, color=ACCENT)
+        if truth is not None:
+            axes.plot(x_mm, truth, "--", color=INK, lw=1)
+        style_axes(axes, "x, mm", "1/mm")
+
+    return chart(draw, "Profile with error bars", "The middle line of voxels along x.", (2 * SIZE[0], SIZE[1]))
+
+
 def note(axes: "Axes", words: str, point: Any, shift: tuple[float, float], **style: Any) -> None:
     """Writes words next to a point of a chart. shift: (right, up) in points of the picture, 1/72 inch."""
     style = {"ha": "center", "color": INK, **style}

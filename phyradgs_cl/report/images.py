@@ -132,9 +132,11 @@ class Plane:
         return self.first_mm + self.indices[k] * self.step_mm
 
 
-def windows_of(volume: Volume, reference: Volume | None) -> dict[str, Window]:
+def windows_of(volume: Volume, reference: Volume | None, doubt: Volume | None = None) -> dict[str, Window]:
     """Returns a window by layer ("result", "truth", "difference"). Result and truth have the truth's range, so that a
     wrong gain shows."""
+    if doubt is not None:
+        return {**windows_of(volume, reference), "doubt": Window.of(*grey_range(doubt), doubt)}
     if reference is None or not float(reference.max()) > 0:
         return {"result": Window.of(*grey_range(volume), volume)}
     grey = Window.of(min(0.0, float(reference.min())), float(reference.max()), volume, reference)
@@ -143,11 +145,15 @@ def windows_of(volume: Volume, reference: Volume | None) -> dict[str, Window]:
     return {"result": grey, "truth": grey, "difference": Window.of(-limit, limit, size, -size)}
 
 
-def planes_of(volume: Volume, reference: Volume | None, grid: Grid, windows: Mapping[str, Window]) -> list[Plane]:
+def planes_of(
+    volume: Volume, reference: Volume | None, grid: Grid, windows: Mapping[str, Window], doubt: Volume | None = None
+) -> list[Plane]:
     """Returns the three orientations of a volume (nz, ny, nx) in 1/mm, with a layer for each of the windows."""
     layers: dict[str, Volume] = {"result": volume}
     if reference is not None and "truth" in windows:
         layers |= {"truth": reference, "difference": volume - reference}
+    if doubt is not None:
+        layers["doubt"] = doubt
     counts = _slice_counts(volume.shape, len(layers))
     planes = []
     for (name, axis, letter, right, up), count in zip(PLANES, counts, strict=True):

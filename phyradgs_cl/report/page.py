@@ -60,7 +60,8 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
         "geometry": sections.geometry_section(run.scan), "shutter": sections.shutter_section(run, run.scan),
     }  # fmt: skip
     parts = {
-        "slices": sections.slices_section(run), "metrics": sections.metrics_section(run, views),
+        "slices": sections.slices_section(run), "doubt": sections.doubt_section(run),
+        "metrics": sections.metrics_section(run, views),
         "convergence": sections.convergence_section(run), "motion": sections.motion_section(run),
         "states": sections.states_section(run),
         "volume": sections.volume_section(run), **of_scan,

@@ -9,7 +9,7 @@ from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.reconstructors.projected import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report import images
-from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, views_chart
+from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, profile_chart, views_chart
 from phyradgs_cl.report.interactive.atlas import has_depth, space
 from phyradgs_cl.report.interactive.motion import frame_in_motion, object_in_motion
 from phyradgs_cl.report.interactive.viewer import stills, viewer
@@ -28,8 +28,8 @@ _ABSURD = 1e9  # parameters of this size and more come from damaged files and ar
 def slices_section(run: Run) -> Markup:
     """Shows the volume, together with the truth where the scan has one."""
     stored, grid = run.stored, run.stored.required_grid
-    windows = images.windows_of(stored.values, run.reference)
-    planes = images.planes_of(stored.values, run.reference, grid, windows)
+    windows = images.windows_of(stored.values, run.reference, stored.doubt)
+    planes = images.planes_of(stored.values, run.reference, grid, windows, stored.doubt)
     size = " × ".join(number(side) for side in grid.size_mm)
     words = f"{' × '.join(map(str, grid.shape))} voxels (z, y, x), {size} mm"
     if any(len(plane.indices) < plane.count for plane in planes):
@@ -37,6 +37,20 @@ def slices_section(run: Run) -> Markup:
     if not has_depth(stored.values):
         words += "; there is no picture in 3D of a volume one voxel thick"
     return section("slices", "Slices", note(words + "."), viewer(planes, windows))
+
+
+def doubt_section(run: Run) -> Markup | None:
+    """Shows a profile through the middle of the volume with its error bars, and the truth where the scan has one."""
+    stored = run.stored
+    if stored.doubt is None:
+        return None
+    z, y = (n // 2 for n in stored.values.shape[:2])
+    truth = None if run.reference is None else run.reference[z, y]
+    drawing = profile_chart(stored.required_grid.axes_mm()[2], stored.values[z, y], stored.doubt[z, y], truth)
+    words = "About 68 % of the object's voxels are within σ of the truth. This holds over a volume, not for one strange "
+    words += "detail; what no ray sees is the prior's belief. Among the slices σ is the layer Error bar."
+    caption = f"Along x through the middle, with a band of one σ{'' if truth is None else '; dashed, the truth'}."
+    return section("doubt", "Error bars", note(words), _charts([(caption, drawing)]))
 
 
 def states_section(run: Run) -> Markup | None:

@@ -132,6 +132,8 @@ def _slabs_of(plan: methods.RunPlan, slabs: Slabs, scan: Path, ranks: Communicat
     if parts and (finds or plan.object_motion is not None):
         expected, remedy = "all rows at a time: the object does not rest", "leave --rows and --slab out"
         raise InputError(f"--method {plan.method_name}" if finds else "--object-motion", "slabs of rows", expected, remedy)
+    if parts and plan.preprocessing.doubt:
+        raise InputError("--doubt", "slabs of rows", "all rows at a time", "leave --rows and --slab out, or bin the scan")
     if parts and ranks is not None and ranks.size > 1:
         raise InputError("--rows", f"slabs on {ranks.size} ranks", "one rank", "run a slab of rows on each machine")
     return parts
@@ -179,7 +181,7 @@ def _reconstructed(
                 target = output if result.state is None else partial_path(output)
                 provenance = _provenance(result, scan_hash, plan, path, rt)
                 parts = result.volume, result.grid, provenance, result.gaussians, metrics or None
-                write_volume(target, *parts, deformation=result.deformation, states=result.states)
+                write_volume(target, *parts, deformation=result.deformation, states=result.states, doubt=result.doubt)
                 _keep_checkpoint(output, result)
                 _warn_of_residual(path, scan, result)
     except signals.InterruptedAfterwards:

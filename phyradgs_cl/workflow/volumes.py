@@ -1,6 +1,7 @@
 """Compares a volume with a reference: metrics, and a picture of slices."""
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,12 @@ from phyradgs_cl.metrics import (
     Aligned,
     aligned,
     compare,
+    coverage,
     edge_points_mm,
     in_words,
     motion_error_mm,
     overlap,
+    reliability_png,
     slices_png,
 )
 from phyradgs_cl.signals import finish_despite_interrupt
@@ -38,11 +41,12 @@ def run_evaluation(
     object_motion: Path | None = None, reference_of_rtk: bool = False, mu_water_per_mm: float | None = None,
 ) -> dict[str, object]:
     """Compares a volume with a scan's reference or another volume, by the rule of ``metrics.aligned``, and writes the
-    picture of slices. A volume without a scale is compared voxel by voxel. ``reference_voxel_mm``: sides of the voxels of a
-    reference without a scale, one length or (z, y, x). ``object_motion``: the file of a deformation, by which the volume is
-    moved to the time of each true state of a scan; None takes the volume's own, if it has one. ``reference_of_rtk``: the
-    reference has RTK's axes. ``mu_water_per_mm``: water's attenuation, for files in Hounsfield units without a scale. Raises
-    InputError for wrong sides, files that do not fit each other, and water's attenuation for files in 1/mm."""
+    picture of slices. Error bars get their coverage and a curve. A volume without a scale is compared voxel by voxel.
+    ``reference_voxel_mm``: sides of the voxels of a reference without a scale, one length or (z, y, x).
+    ``object_motion``: the file of a deformation, by which the volume is moved to the time of each true state of a scan;
+    None takes the volume's own, if it has one. ``reference_of_rtk``: the reference has RTK's axes. ``mu_water_per_mm``:
+    water's attenuation, for files in Hounsfield units without a scale. Raises InputError for wrong sides, files that do
+    not fit each other, and water's attenuation for files in 1/mm."""
     check_picture("--picture", picture, volume_path, reference_path, object_motion)
     field = None if object_motion is None else read_deformation(object_motion)
     result = attenuation_of(str(volume_path), load_result(volume_path, mu_water_per_mm))
@@ -65,7 +69,15 @@ def run_evaluation(
         volume, reference, how, share = pair.volume, pair.reference, pair.how, pair.share
     if reference.shape != volume.shape:
         raise InputError(str(reference_path), f"shape {reference.shape}", f"shape {volume.shape} of {volume_path}")
-    metrics = compare(volume, reference)
+    metrics: dict[str, object] = {**compare(volume, reference)}
+    if result.doubt is not None and grid is not None:
+        facts, curve = provenance.get("doubt"), picture.with_name(f"{picture.stem}.doubt.png")
+        stated = facts.get("multiple_95") if isinstance(facts, Mapping) else None
+        multiple_95 = stated if isinstance(stated, float) else 1.96  # that of a normal law
+        bar = _on_one_grid(volume_path, reference_path, (result.doubt, grid), truth).volume
+        with finish_despite_interrupt(), written_beside(curve) as temporary:
+            reliability_png(temporary, bar, volume, reference, multiple_95)
+        metrics |= {**coverage(bar, volume, reference, multiple_95), "reliability": str(curve)}
     states = {}
     if moving is not None and grid is not None and stored_grid is not None:
         if result.deformation is None and "object_motion" in provenance:

@@ -9,7 +9,7 @@ from phyradgs_cl.drawing import round_length
 from phyradgs_cl.report.images import Plane, Window, base64_of, data_uri, diverging, png_bytes
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 
-_LAYER_NAMES = {"result": "Result", "truth": "Truth", "difference": "Difference"}
+_LAYER_NAMES = {"result": "Result", "truth": "Truth", "difference": "Difference", "doubt": "Error bar"}
 _MOST_ZOOM = 8  # largest zoom of a slice
 _BAR = 0.3  # largest length of the scale bar, as a fraction of a picture's width
 _HELP = (

@@ -12,7 +12,7 @@
   let layer = "result", pointed = null, armed = null;
 
   const isGrey = () => layer !== "difference";
-  const kind = () => (isGrey() ? "result" : "difference"); // the truth has the result's window
+  const kind = () => (layer === "truth" ? "result" : layer); // the truth has the result's window
   const valueOf = (step) => windows[layer].least + (step / 255) * (windows[layer].most - windows[layer].least);
 
   function inPerMm(step) {
@@ -90,7 +90,7 @@
   function moveWindow(slider) {
     const [first, last] = ends[kind()], step = Number(slider.value);
     if (!isGrey()) ends.difference = [255 - Math.max(step, 128), Math.max(step, 128)];
-    else ends.result = slider === black ? [Math.min(step, last - 1), last] : [first, Math.max(step, first + 1)];
+    else ends[kind()] = slider === black ? [Math.min(step, last - 1), last] : [first, Math.max(step, first + 1)];
     showWindow();
   }
 

@@ -1,0 +1,49 @@
+"""How far error bars of voxels can be believed: which share of the errors they cover, against a truth."""
+
+from pathlib import Path
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from phyradgs_cl.drawing import SOFT, new_figure, style_axes
+from phyradgs_cl.metrics.quality import Metric
+
+Array = NDArray[np.floating]
+COVERAGE = {
+    "within_doubt": Metric("within σ", "", ".3f"),
+    "within_doubt_95": Metric("within the 95 % bar", "", ".3f"),
+    "doubt_over_error": Metric("mean σ / RMS error", "", ".3f"),
+}
+_OBJECT, _AROUND = 0.01, 2  # of the truth's maximum: above it is the object; voxels around it that count too
+
+
+def object_voxels(truth: Array) -> NDArray[np.bool_]:
+    """Returns the voxels (nz, ny, nx) of the object and two around it."""
+    return np.asarray(scipy.ndimage.binary_dilation(truth > _OBJECT * truth.max(), iterations=_AROUND))
+
+
+def coverage(sigma: Array, volume: Array, truth: Array, multiple_95: float) -> dict[str, float]:
+    """Returns the shares of the object's voxels within σ and within ``multiple_95`` σ of the truth, and the mean σ over the
+    RMS error. sigma, volume, truth: (nz, ny, nx) in 1/mm."""
+    inside = object_voxels(truth)
+    size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)
+    over_error = float(bar.mean() / (np.sqrt(np.mean(size**2)) or 1.0))
+    return dict(zip(COVERAGE, [*(float(np.mean(size <= k * bar)) for k in (1.0, multiple_95)), over_error], strict=True))
+
+
+def reliability_png(path: str | Path, sigma: Array, volume: Array, truth: Array, multiple_95: float) -> None:
+    """Writes the curve of reliability: percentiles of the error in each tenth of the object's voxels by σ, over its mean σ.
+    Bars that are right lie on the dashed line."""
+    inside = object_voxels(truth)
+    size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)
+    tenths = [part for part in np.array_split(np.argsort(bar, kind="stable"), 10) if part.size]
+    stated = [bar[part].mean() for part in tenths]
+    axes = (figure := new_figure(4.5, 4.0)).subplots()
+    axes.plot([0, max(stated)], [0, max(stated)], "--", color=SOFT)
+    for share, multiple in ((68, 1.0), (95, multiple_95)):
+        of_tenths = [np.percentile(size[part], share) / multiple for part in tenths]
+        axes.plot(stated, of_tenths, "o-", label=f"{share} % of the errors / {multiple:.3g}")
+    style_axes(axes, "σ, 1/mm", "error, 1/mm")
+    axes.legend(fontsize=8)
+    figure.savefig(path, dpi=110, format="png")

@@ -1,0 +1,181 @@
+"""Error bars of voxels: the run is repeated on two scans that are synthesised from its own volume, with this scan's noise.
+
+The differences of their volumes from the first hold the noise of the scan, and what the method does to such an object: blur,
+prior, missing views. That is a parametric bootstrap (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, ch. 6).
+Numbers that make it a σ come from procedural volumes (benchmarks/doubt.py), and from held-out pixels where there are any."""
+
+import json
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from phyradgs_cl import resource
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.detector.noise_level import noise_map
+from phyradgs_cl.fields import Deformation, Gaussians, Grid, States
+from phyradgs_cl.reconstructors.checkpoint import State
+from phyradgs_cl.reconstructors.projected import FRAMES_AT_A_TIME, FramePair, frame_pairs, spread_frames
+from phyradgs_cl.reconstructors.result import DOUBT, Progress, Reconstruction, Report
+from phyradgs_cl.runtime import Runtime
+
+RUNS = 3  # of the method: that of the scan, and two of synthesised scans
+NEAR = 0.7  # voxels: standard deviation of the Gaussian that smooths squares of differences
+LEAST = 0.01  # of the RMS of σ: no voxel is certain
+_KEPT = "doubt."  # begins the names of what a state keeps of the runs before
+_PARTS = {"gaussians": Gaussians, "deformation": Deformation, "states": States}
+_CHECKED_FRAMES = 16  # frames whose held-out pixels correct σ
+_AROUND = 9  # pixels along a side of the place whose bar is one number: that of two samples alone is rough
+_WIDEST = 4.0  # times: held-out pixels farther off are no matter of error bars
+_SHARE, _NORMAL_95 = 0.68, 1.96  # covered by σ; the 95 % bar of pixels' noise
+Array = NDArray[Any]
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Law:
+    """The numbers of ``spread``, and how many times σ the 95 % bar is."""
+
+    shape: float
+    noise: float
+    multiple_95: float
+
+
+def fitted_law(kind: str) -> Law:
+    """Returns the law of ``iterative`` or ``analytic`` methods, from ``data/doubt.json`` (benchmarks/doubt.py)."""
+    return Law(**json.loads((resource("data") / "doubt.json").read_text(encoding="utf-8"))[kind]["law"])
+
+
+def spread(first: Array, second: Array, law: Law) -> Array:
+    """Returns σ (nz, ny, nx) of two differences from the first volume (nz, ny, nx).
+
+    What both have in common is what the method does to the object; half of what they have not is noise. Both variances,
+    smoothed over ``NEAR`` voxels, are weighed by ``shape`` and ``noise``. σ is at least a hundredth of its RMS."""
+    common, own = ((first + sign * second).astype(np.float64) ** 2 / 4 for sign in (1, -1))
+    shape, noise = (scipy.ndimage.gaussian_filter(part, NEAR) for part in (common - own, 2 * own))
+    variance = law.shape**2 * np.maximum(shape, 0) + law.noise**2 * noise
+    return np.sqrt(np.maximum(variance, LEAST**2 * np.mean(variance))).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Doubter:
+    """The runs of a method. scan: as the method sees it; whole: with its held-out pixels ``hidden`` (F, v, u).
+    kind: that of the method, as for ``fitted_law``."""
+
+    rt: Runtime
+    scan: Scan
+    whole: Scan
+    hidden: NDArray[np.bool_] | None
+    deformation: Deformation | None
+    seed: int
+    kind: str = "iterative"
+
+    def run(self, once: Callable[..., Reconstruction], report: Report, resume: State | None) -> Reconstruction:
+        """Returns the method's result with ``doubt``. once: runs the method on a scan from a state. resume: of any run."""
+        arrays = dict(resume or {})
+        results = _restored({name: arrays.pop(name) for name in list(arrays) if name.startswith(_KEPT)}, self.scan.grid)
+        while len(results) < RUNS:
+            scan = self.synthesised(results[0], len(results)) if results else self.scan
+            with report.through(partial(_counted, results=results)):
+                result = once(scan, arrays or None)
+            if result.state is not None:
+                return _interrupted(result, results)
+            results, arrays = [*results, result], {}
+        return self.finished(results)
+
+    def synthesised(self, result: Reconstruction, number: int) -> Scan:
+        """Returns the scan that the result's volume would give, with the noise of this one. ``number`` draws it."""
+        frames = np.zeros(self.scan.projections.shape, np.float32)
+        if self.rt.ranks.rank == 0:
+            for pair in self._pairs(result, self.whole.frames):
+                rng = np.random.default_rng([self.seed, number, pair.frame])
+                noise = noise_map(pair.residual, pair.valid) * rng.standard_normal(pair.measured.shape, np.float32)
+                frames[pair.frame] = np.where(pair.valid, pair.computed + noise, self.scan.projections[pair.frame])
+        return replace(self.scan, projections=self.rt.ranks.bcast(frames))
+
+    def _pairs(self, result: Reconstruction, count: int) -> Iterator[FramePair]:
+        """Yields ``count`` frames with those of a result."""
+        chosen = spread_frames(self.whole.frames, count)
+        for at in range(0, len(chosen), FRAMES_AT_A_TIME):
+            some, moves = chosen[at : at + FRAMES_AT_A_TIME], result.moves or self.deformation
+            yield from frame_pairs(self.rt, self.whole, result.volume, result.grid, some, moves)
+
+    def finished(self, results: list[Reconstruction]) -> Reconstruction:
+        """Returns the first result with σ, its facts, and the seconds of all runs."""
+        law, (first, one, two) = fitted_law(self.kind), results
+        sigma = spread(one.volume - first.volume, two.volume - first.volume, law)
+        facts: dict[str, Any] = {"runs": RUNS, "share": _SHARE, "multiple_95": law.multiple_95}
+        if self.hidden is not None and self.rt.ranks.size == 1:
+            facts |= self._against_held_out(results, self.hidden, law)
+            sigma *= np.float32(facts["held_out_factor"])
+        facts = {DOUBT: facts, "seconds": sum(float(one.facts["seconds"]) for one in results)}
+        return replace(first, doubt=sigma, facts={**first.facts, **facts})
+
+    def _against_held_out(self, results: list[Reconstruction], hidden: NDArray[np.bool_], law: Law) -> dict[str, float]:
+        """Returns the shares of held-out pixels within their bars, and the factor of σ, at least 1, for which 68 % are.
+
+        The bar of a pixel has the projected differences about it, by the same law, and the pixel's noise."""
+        ratios, inside = [], []
+        for first, one, two in zip(*(self._pairs(result, _CHECKED_FRAMES) for result in results), strict=True):
+            held = hidden[first.frame]
+            noise, error = noise_map(first.residual, first.valid)[held], first.residual[held]
+            bar = spread(one.computed - first.computed, two.computed - first.computed, law).astype(np.float64)
+            bar = np.sqrt(scipy.ndimage.uniform_filter(bar**2, _AROUND))[held]
+            ratios.append((error**2 - noise**2) / np.maximum(bar, 1e-30) ** 2)
+            wide = np.hypot(_NORMAL_95 * noise, law.multiple_95 * bar)
+            inside.append([np.abs(error) <= np.hypot(noise, bar), np.abs(error) <= wide])
+        wanted = float(np.sqrt(max(np.quantile(np.concatenate(ratios), _SHARE), 1.0)))
+        if wanted > _WIDEST:
+            log.warning("held-out pixels are %.3g times farther off than the error bars: run 'phyradgs check'", wanted)
+        within, within_95 = np.mean(np.concatenate(inside, axis=1), axis=1).tolist()
+        return {"held_out_within": within, "held_out_within_95": within_95, "held_out_factor": min(wanted, _WIDEST)}
+
+
+def _counted(progress: Progress, results: list[Reconstruction]) -> Progress:
+    """Counts the iterations of all runs as those of one, and shows the volume of the first while the others run."""
+    done, each = progress.iteration + len(results) * progress.iterations, RUNS * progress.iterations
+    progress = progress.mapped(state=lambda state: {**state, **_kept(results)}, iteration=done, iterations=each)
+    if not results:
+        return progress
+    first, words = results[0], f"{progress.quantity} of run {len(results) + 1} for error bars"
+    states = None if (of_first := first.states) is None else lambda: of_first
+    shown = {"volume": lambda: (first.volume, first.grid), "deformation": first.deformation, "states": states}
+    return replace(progress, quantity=words, **shown)  # type: ignore[arg-type]
+
+
+def _interrupted(result: Reconstruction, results: list[Reconstruction]) -> Reconstruction:
+    """Returns the first volume with the state of the run that was interrupted."""
+    first, run = (*results, result)[0], {"interrupted_in_run": f"{len(results) + 1} of {RUNS}"}
+    facts = {**first.facts, "interrupted_at": result.facts["interrupted_at"], DOUBT: run}
+    return replace(first, state={**(result.state or {}), **_kept(results)}, facts=facts)
+
+
+def _kept(results: list[Reconstruction]) -> State:
+    """Returns what a state keeps of complete runs: all of the first, volumes and seconds of the others."""
+    if not results:
+        return {}
+    first, seconds = results[0], [one.facts["seconds"] for one in results]
+    notes = json.dumps({"facts": first.facts, "record": first.record, "seconds": seconds}, default=str)
+    arrays = {"notes": np.array(notes), "volumes": np.stack([one.volume for one in results])}
+    parts = {name: part for name in _PARTS if (part := getattr(first, name)) is not None}
+    arrays |= {f"{name}.{key}": np.asarray(value) for name, part in parts.items() for key, value in vars(part).items()}
+    return {_KEPT + name: values for name, values in arrays.items()}
+
+
+def _restored(kept: Mapping[str, np.ndarray], grid: Grid) -> list[Reconstruction]:
+    """Returns the complete runs that ``_kept`` has put into a state, none of them from nothing."""
+    if not kept:
+        return []
+    arrays = {name.removeprefix(_KEPT): values for name, values in kept.items()}
+    notes, parts = json.loads(str(arrays["notes"])), dict[str, Any]()
+    for name, kind in _PARTS.items():
+        if of_part := {key: a for one, a in arrays.items() if (key := one.removeprefix(f"{name}.")) != one}:
+            parts[name] = kind(**of_part)
+    first, *others = arrays["volumes"]
+    later = [Reconstruction(v, grid, facts={"seconds": s}) for v, s in zip(others, notes["seconds"][1:], strict=True)]
+    return [Reconstruction(first, grid, record=notes["record"], facts=notes["facts"], **parts), *later]

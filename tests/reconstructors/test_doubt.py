@@ -1,0 +1,138 @@
+"""Error bars: two more runs on synthesised scans, the same after an interruption, and about as wide as the errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.api import reconstruct, simulate
+from phyradgs_cl.detector.noise_level import noise_map
+from phyradgs_cl.errors import InputError
+from phyradgs_cl.io import read_checkpoint, write_checkpoint
+from phyradgs_cl.metrics import coverage
+from phyradgs_cl.reconstructors import doubt
+from phyradgs_cl.reconstructors.doubt import Doubter, Law, spread
+from phyradgs_cl.reconstructors.projected import held_out
+from phyradgs_cl.reconstructors.result import DOUBT
+
+FEW = {"method": "sirt", "iterations": 4, "report": False}
+LAW = Law(1.0, 1.0, 3.0)
+
+
+@pytest.fixture(scope="module")
+def scan(rt) -> Scan:
+    return simulate("spheres", size=12, detector=24, views=8, noise="tigre", dose=1e4, device=rt)
+
+
+def test_the_volume_has_the_same_bits_with_error_bars_and_these_the_same_for_one_seed(rt, scan) -> None:
+    plain = reconstruct(scan, device=rt, **FEW)
+    one, two, other = (reconstruct(scan, device=rt, doubt=True, seed=seed, **FEW) for seed in (0, 0, 1))
+    assert plain.doubt is None and DOUBT not in plain.facts
+    np.testing.assert_array_equal(one.volume, plain.volume)
+    np.testing.assert_array_equal(one.doubt, two.doubt)
+    assert one.doubt.shape == scan.grid.shape and (one.doubt > 0).all()
+    assert not np.array_equal(one.doubt, other.doubt)
+
+
+def test_error_bars_cover_a_phantom_of_closed_form(rt, scan) -> None:
+    result = reconstruct(scan, "fdk", device=rt, report=False, doubt=True)
+    covered = coverage(result.doubt, result.volume, scan.reference, result.facts[DOUBT]["multiple_95"])
+    assert 0.5 < covered["within_doubt"] < 0.9 < covered["within_doubt_95"]
+    assert 0.5 < covered["doubt_over_error"] < 2
+
+
+def test_a_synthesised_scan_has_the_noise_of_the_scan_its_mask_and_its_hidden_pixels(rt) -> None:
+    usual = {"size": 20, "detector": 40, "views": 8, "device": rt}
+    scan, clean = (simulate("jaw", noise=noise, dose=1e4, **usual) for noise in ("tigre", "none"))
+    mask = np.zeros(scan.projections.shape[1:], bool)
+    mask[3, 4:9] = True
+    whole = replace(scan, pixel_mask=mask)
+    hidden = held_out(whole, 5.0)
+    doubter = Doubter(rt, replace(whole, pixel_mask=mask | hidden), whole, hidden, None, 0)
+    first = reconstruct(scan, "sirt", iterations=12, device=rt, report=False)
+    one, two = (doubter.synthesised(first, number) for number in (1, 2))
+    valid = doubter.scan.valid
+    np.testing.assert_array_equal(one.valid, valid)
+    added = (one.projections - two.projections)[valid].std() / np.sqrt(2)
+    assert added == pytest.approx((scan.projections - clean.projections)[valid].std(), rel=0.25)  # edges raise it
+
+
+def test_noise_is_told_from_what_is_smooth_where_pixels_are_valid() -> None:
+    rows, columns = np.mgrid[:40, :40]
+    residual = (0.1 * np.random.default_rng(0).standard_normal((40, 40)) + 0.02 * rows + 0.03 * columns).astype(np.float32)
+    residual[:, 20:] *= 0.5
+    valid = np.ones((40, 40), bool)
+    residual[10, 10], valid[10, 10] = 1e3, False
+    noise = noise_map(residual, valid)
+    assert noise[:, :12].mean() == pytest.approx(0.1, rel=0.1) and noise[:, 28:].mean() == pytest.approx(0.05, rel=0.1)
+    one_row = np.random.default_rng(1).standard_normal((1, 1000)).astype(np.float32)
+    assert noise_map(one_row, np.ones((1, 1000), bool)).mean() == pytest.approx(1, rel=0.15)
+
+
+def test_half_of_what_differences_do_not_share_is_noise() -> None:
+    random = np.random.default_rng(0)
+    one, two = random.standard_normal((2, 24, 24, 24))
+    inner = np.s_[4:-4, 4:-4, 4:-4]
+    assert np.sqrt(np.mean(spread(one, two, LAW)[inner] ** 2)) == pytest.approx(1, rel=0.1)
+    both = spread(3 + 0 * one, 3 + 0 * one, replace(LAW, noise=0.0))
+    np.testing.assert_allclose(both, 3, rtol=1e-6)
+    assert spread(one, two, replace(LAW, shape=0.0, noise=2.0))[inner].mean() == pytest.approx(2, rel=0.1)
+
+
+def test_a_run_goes_on_with_the_same_bits_from_each_of_its_three_parts(rt, scan, tmp_path) -> None:
+    whole = reconstruct(scan, device=rt, doubt=True, holdout=3.0, **FEW)
+    counts = []
+
+    def stop_at(iteration):
+        def report(progress):
+            counts.append((progress.iteration, progress.iterations))
+            if progress.iteration == iteration:
+                raise KeyboardInterrupt
+
+        return report
+
+    for iteration in (2, 6, 11):
+        usual = {**FEW, "report": stop_at(iteration), "on_interrupt": "return", "doubt": True, "holdout": 3.0}
+        partial = reconstruct(scan, device=rt, **usual)
+        assert partial.doubt is None and partial.facts["interrupted_at"] == (iteration - 1) % 4 + 1
+        assert partial.facts.get(DOUBT, {}).get("interrupted_in_run") == {2: "1 of 3", 6: "2 of 3", 11: "3 of 3"}[iteration]
+        write_checkpoint(tmp_path / "state.h5", partial.state)
+        partial = replace(partial, state=read_checkpoint(tmp_path / "state.h5"))
+        result = reconstruct(scan, device=rt, doubt=True, holdout=3.0, resume=partial, **FEW)
+        np.testing.assert_array_equal(result.volume, whole.volume)
+        np.testing.assert_array_equal(result.doubt, whole.doubt)
+        assert {**result.facts[DOUBT]} == whole.facts[DOUBT] and result.state is None
+    assert counts[-1] == (11, 12)
+
+
+@pytest.mark.slow
+def test_gaussians_of_the_first_run_are_kept_by_a_state(rt, scan) -> None:
+    def report(progress):
+        if progress.iteration > progress.iterations // 3:
+            raise KeyboardInterrupt
+
+    usual = {"method": "r2", "iterations": 60, "gaussians": 30, "device": rt, "doubt": True}
+    partial = reconstruct(scan, report=report, on_interrupt="return", **usual)
+    result = reconstruct(scan, report=False, resume=partial, **usual)
+    for name in ("mean", "scale", "density"):
+        np.testing.assert_array_equal(getattr(result.gaussians, name), getattr(partial.gaussians, name))
+    assert result.doubt is not None
+
+
+def test_held_out_pixels_widen_bars_that_do_not_reach_them(rt, scan, monkeypatch) -> None:
+    right = reconstruct(scan, device=rt, doubt=True, holdout=10.0, **FEW)
+    monkeypatch.setattr(doubt, "fitted_law", lambda kind: Law(0.02, 0.02, 3.0))
+    narrow = reconstruct(scan, device=rt, doubt=True, holdout=10.0, **FEW)
+    assert 1 <= right.facts[DOUBT]["held_out_factor"] < narrow.facts[DOUBT]["held_out_factor"] <= 4
+    assert right.facts[DOUBT]["held_out_within"] > 0.5
+
+
+def test_a_box_has_its_part_of_the_bars_and_a_scan_without_a_method_has_none(rt, scan) -> None:
+    from phyradgs_cl.api import prepare
+
+    result = reconstruct(scan, "fdk", preset="hann", device=rt, report=False, doubt=True)
+    part = scan.grid.part((2, 3, 4), (6, 5, 4))
+    np.testing.assert_array_equal(result.within(part).doubt, result.doubt[2:8, 3:8, 4:8])
+    with pytest.raises(InputError, match="doubt"):
+        prepare(scan, "sparks", device=rt, doubt=True)
