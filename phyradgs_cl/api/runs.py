@@ -94,7 +94,7 @@ def load_deformation(path: str | Path) -> Deformation:
 
 @naming_arguments()
 def save_deformation(path: str | Path, deformation: Deformation) -> None:
-    """Writes how an object moves to a file, whole or not at all.
+    """Writes ``deformation``, how an object moves, to a file, whole or not at all.
 
     path: the HDF5 file; an existing one is replaced. Raises InputError for anything but a Deformation, OutputError where the
     file cannot be written."""

@@ -21,7 +21,7 @@ from phyradgs_cl.operators import (
     voxelise,
 )
 from phyradgs_cl.operators.bricks import cut
-from phyradgs_cl.operators.rays import launches as rays
+from phyradgs_cl.operators.rays import general as rays
 from phyradgs_cl.operators.splats import binning
 from phyradgs_cl.runtime import Room
 

@@ -12,7 +12,7 @@ from tolerances import ADJOINT, FLOAT32, RAYS, RAYS_BACK
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import IntensityOperator, LinearOperator, RayOperator
-from phyradgs_cl.operators.rays import launches as rays
+from phyradgs_cl.operators.rays import general as rays
 from phyradgs_cl.operators.twins.rays import ray_frame, ray_volume
 from phyradgs_cl.runtime import Runtime, context
 
