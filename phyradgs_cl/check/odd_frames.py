@@ -58,7 +58,9 @@ def repeated_frames(scan: Scan) -> list[int]:
     p = scan.projections
     if len(p) < _FEWEST:
         return []
-    steps = np.array([_rms(b - a) for a, b in zip(p[:-1], p[1:], strict=True)])
+    valid = np.broadcast_to(True if scan.pixel_mask is None else np.asarray(scan.pixel_mask) == 0, p.shape)
+    pairs = zip(p[:-1], p[1:], valid[:-1] & valid[1:], strict=True)
+    steps = np.array([_rms((b - a)[seen]) if seen.any() else np.inf for a, b, seen in pairs])
     azimuths_rad = start_azimuths_rad(scan)
     turned_rad = np.abs(wrapped(np.diff(azimuths_rad)))
     alike = np.flatnonzero((turned_rad > 1e-6) & (steps < _REPEATED * np.min(_neighbours(steps), axis=0)))

@@ -118,7 +118,9 @@ def reconstruct_command(
         times_s = result.states.times_s
         say(f"states of the object: {len(times_s)}, {times_s[0]:.4g} to {times_s[-1]:.4g} s; the volume is their mean")
     if result.doubt is not None:
-        say(f"error bars: mean σ {result.doubt.mean():.3g} 1/mm, the 95 % bar is {result.facts[DOUBT]['multiple_95']:.3g} σ")
+        of_bars = result.facts[DOUBT]
+        mean = f"mean σ of the object {of_bars['mean_per_mm']:.3g} 1/mm"
+        say(f"error bars: {mean}, the 95 % bar is {of_bars['multiple_95']:.3g} σ")
     if profile:
         say(profile_report(runtimes[-1], result))
     if result.state is not None:

@@ -53,7 +53,8 @@ def export_volume(
     stored = read_volume(path)
     if doubt:
         if to in (*CLOUDS, OWN) or scale_of is not None:
-            raise InputError("--doubt", "given with Gaussians, Hounsfield units or .h5", "voxels in 1/mm", "use nii or mha")
+            found = f"given with {'Hounsfield units' if scale_of is not None and to != OWN else to}"
+            raise InputError("--doubt", found, "a format of voxels, in 1/mm", "use nii or mha, without --hu")
         if stored.doubt is None:
             raise InputError(str(path), "no error bars", "a volume of 'reconstruct --doubt'", "run it again with --doubt")
         stored = replace(stored, values=stored.doubt)

@@ -24,6 +24,7 @@ _FEWEST = 100  # least number of voxels of air and of water: their mean has a te
 # outwards
 _WATER_PER_MM = (0.009, 0.6)
 _AIR_BELOW = 0.25  # largest ratio of the lowest peak's attenuation to water's: a higher lowest peak is not air, but fat, say
+_ONE_MATERIAL = 0.4  # largest standard deviation of a box's voxels, as a fraction of water minus air, without a warning
 _BINS = 512  # number of bins of the histogram
 _SMOOTH_BINS = 2.0  # standard deviation of the Gaussian that smooths the histogram, in bins
 _PROMINENT = 0.1  # least prominence of a peak, as a fraction of its smoothed count
@@ -124,6 +125,9 @@ def fitted(
     if not _WATER_PER_MM[0] <= per_mm <= _WATER_PER_MM[1]:
         text = "Hounsfield units: water has %.3g 1/mm, and at 10 to 500 keV 0.6 to 0.009: check that lengths are in mm"
         log.warning(text, per_mm)
+    for name, line, voxels in (("--air-mm", of_low, of_air), ("--water-mm", of_high, of_water)):
+        if voxels.std(dtype=np.float64) > _ONE_MATERIAL * (high - low):
+            log.warning("%s: found %s; expected voxels of one material; move the box", name, line)
     so = "" if insert_hu == 0 else f", so water {per_mm:.4g} 1/mm"
     return Hounsfield(per_mm, low, f"{of_low}, {of_high}{so}")
 

@@ -28,7 +28,7 @@ def coverage(sigma: Array, volume: Array, truth: Array, multiple_95: float) -> d
     RMS error. sigma, volume, truth: (nz, ny, nx) in 1/mm."""
     inside = object_voxels(truth)
     size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)
-    over_error = float(bar.mean() / (np.sqrt(np.mean(size**2)) or 1.0))
+    over_error = float(bar.mean() / (np.sqrt(np.mean(size**2)) or np.inf))
     return dict(zip(COVERAGE, [*(float(np.mean(size <= k * bar)) for k in (1.0, multiple_95)), over_error], strict=True))
 
 

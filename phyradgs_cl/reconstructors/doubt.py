@@ -19,11 +19,13 @@ from phyradgs_cl import resource
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector.noise_level import noise_map
 from phyradgs_cl.fields import Deformation, Gaussians, Grid, States
+from phyradgs_cl.metrics.coverage import object_voxels
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.projected import FRAMES_AT_A_TIME, FramePair, frame_pairs, spread_frames
 from phyradgs_cl.reconstructors.result import DOUBT, Progress, Reconstruction, Report
 from phyradgs_cl.runtime import Runtime
 
+FITTED = ("fista", "fista-tv", "fdk", "fbp")  # methods on which benchmarks/doubt.py fits the law, and FDK of parallel beams
 RUNS = 3  # of the method: that of the scan, and two of synthesised scans
 NEAR = 0.7  # voxels: standard deviation of the Gaussian that smooths squares of differences
 LEAST = 0.01  # of the RMS of σ: no voxel is certain
@@ -109,10 +111,16 @@ class Doubter:
         """Returns the first result with σ, its facts, and the seconds of all runs."""
         law, (first, one, two) = fitted_law(self.kind), results
         sigma = spread(one.volume - first.volume, two.volume - first.volume, law)
+        if not sigma.any():
+            log.warning("all three runs have the same volume: there are no error bars; give the method more iterations")
+            return first
+        if self.scan.metal is not None:
+            log.warning("error bars do not hold in metal, whose voxels come from a first volume")
         facts: dict[str, Any] = {"runs": RUNS, "share": _SHARE, "multiple_95": law.multiple_95}
         if self.hidden is not None and self.rt.ranks.size == 1:
             facts |= self._against_held_out(results, self.hidden, law)
             sigma *= np.float32(facts["held_out_factor"])
+        facts["mean_per_mm"] = float(sigma[object_voxels(first.volume)].mean())
         facts = {DOUBT: facts, "seconds": sum(float(one.facts["seconds"]) for one in results)}
         return replace(first, doubt=sigma, facts={**first.facts, **facts})
 

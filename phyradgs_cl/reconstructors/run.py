@@ -19,7 +19,7 @@ from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import State, with_identity, without_identity
-from phyradgs_cl.reconstructors.doubt import Doubter
+from phyradgs_cl.reconstructors.doubt import FITTED, Doubter
 from phyradgs_cl.reconstructors.method import METHODS, method_of
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan, check_object_motion
 from phyradgs_cl.reconstructors.preprocess import prepared
@@ -42,6 +42,7 @@ from phyradgs_cl.reconstructors.result import (
 from phyradgs_cl.runtime import Runtime
 
 log = logging.getLogger(__name__)
+
 # Volumes that voxel methods hold at one time at most (docs/large.md), with two of the intensity model; they hold stacks of
 # all frames too, and one buffer of three volumes.
 _HELD = {"sirt": 8, "sart": 28, "os-sart": 28, "cgls": 11, "asd-pocs": 32, "fista-tv": 16}
@@ -68,12 +69,24 @@ def reconstruct(
 
     with report.through(run.shown), _naming_size_that_fits(rt, run.scan, plan), naming_host_memory():
         if plan.preprocessing.doubt:
+            _check_doubt(plan)
             kind = "iterative" if hasattr(run.options, "iterations") else "analytic"
             doubter = Doubter(rt, run.visible, run.scan, run.hidden, run.deformation, plan.seed, kind)
             result = doubter.run(once, report, state)
         else:
             result = once(run.visible, state)
     return run.finished(result)
+
+
+def _check_doubt(plan: RunPlan) -> None:
+    """Raises InputError for error bars of a run from a first volume, which all three runs would share with its errors. Warns
+    of methods to which the bars were not fitted."""
+    if plan.initial is not None:
+        found, expected = "given with a first volume, whose errors all runs share", "one of both"
+        raise InputError("--doubt", found, expected, "leave --initial out")
+    if plan.method not in FITTED:
+        text = "error bars were fitted to %s: of %s they may be far too narrow; compare held_out_factor of --holdout"
+        log.warning(text, ", ".join(FITTED), plan.method)
 
 
 class _Prepared:

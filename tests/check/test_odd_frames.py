@@ -18,6 +18,7 @@ from phyradgs_cl.acquisition import (
 )
 from phyradgs_cl.check.consistency import check_consistency
 from phyradgs_cl.check.finding import OK, SUSPICIOUS
+from phyradgs_cl.check.odd_frames import repeated_frames
 from phyradgs_cl.check.run import quick_scan
 from phyradgs_cl.fields import Grid
 
@@ -89,3 +90,14 @@ def test_an_odd_frame_of_such_an_arc_is_named_alone(rt, at) -> None:
     frames = scan.projections.copy()
     frames[at] = np.roll(frames[at], 6, axis=1)
     assert answer(rt, replace(scan, projections=frames)) == (SUSPICIOUS, f"frame {at} (from 0) does not fit the others")
+
+
+def test_frames_that_agree_in_masked_pixels_alone_are_not_repeated(arcs) -> None:
+    scan = arcs["cone, full"]
+    p = scan.projections + np.random.default_rng(0).normal(scale=0.01, size=scan.projections.shape).astype(np.float32)
+    mask = np.zeros(p.shape, bool)
+    mask[20:22] = True
+    mask[20:22, :4] = False
+    filled = np.where(mask, p[20], p)
+    assert repeated_frames(replace(scan, projections=filled, pixel_mask=mask)) == []
+    assert repeated_frames(replace(scan, projections=np.where(mask, p[20], p[[*range(20), 20, 20, *range(22, 60)]]))) == [21]

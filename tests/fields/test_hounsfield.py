@@ -84,3 +84,11 @@ def test_a_scale_comes_back_from_its_note_and_facts_and_its_values_once() -> Non
     assert len(scale.note) < 80  # NIfTI's field
     with pytest.raises(InputError, match="a table of water_per_mm"):
         of_facts({"hounsfield": {"water": 1}})
+
+
+def test_a_box_of_two_materials_is_warned_of(caplog) -> None:
+    half_in_air = box(slice(0, 8), slice(15, 19), slice(8, 24))
+    fitted(phantom(0.002), GRID, AIR_BOX, WATER_BOX)
+    assert not caplog.records
+    fitted(phantom(0.002), GRID, AIR_BOX, half_in_air)
+    assert "--water-mm: found water" in caplog.text and "one material" in caplog.text

@@ -136,3 +136,13 @@ def test_a_box_has_its_part_of_the_bars_and_a_scan_without_a_method_has_none(rt,
     np.testing.assert_array_equal(result.within(part).doubt, result.doubt[2:8, 3:8, 4:8])
     with pytest.raises(InputError, match="doubt"):
         prepare(scan, "sparks", device=rt, doubt=True)
+
+
+def test_runs_whose_bars_would_not_hold_have_none_or_a_warning(rt, scan, caplog) -> None:
+    """All runs share a first volume's errors; a volume that never changes has no difference to learn from."""
+    with pytest.raises(InputError) as refused:
+        reconstruct(scan, device=rt, doubt=True, initial=scan.reference, **FEW)
+    assert refused.value.subject == "doubt"
+    caplog.clear()
+    still = reconstruct(scan, lambda scan, options, rt: scan.reference, device=rt, doubt=True, report=False)
+    assert still.doubt is None and "same volume" in caplog.text and "may be far too narrow" in caplog.text
