@@ -97,7 +97,7 @@ def test_frames_that_agree_in_masked_pixels_alone_are_not_repeated(arcs) -> None
     p = scan.projections + np.random.default_rng(0).normal(scale=0.01, size=scan.projections.shape).astype(np.float32)
     mask = np.zeros(p.shape, bool)
     mask[20:22] = True
-    mask[20:22, :4] = False
+    mask[20:22, 12:16, :2] = False
     filled = np.where(mask, p[20], p)
     assert repeated_frames(replace(scan, projections=filled, pixel_mask=mask)) == []
     assert repeated_frames(replace(scan, projections=np.where(mask, p[20], p[[*range(20), 20, 20, *range(22, 60)]]))) == [21]
