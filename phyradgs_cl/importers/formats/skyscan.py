@@ -114,8 +114,7 @@ def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredT
 
 def _white(scan: settings.Settings, frames: np.ndarray, options: ImportOptions) -> float:
     """Returns the counts of air: the option's, else Reference Intensity, else the largest number of Depth (bits). Raises
-    InputError for frames that are not flat-field corrected, unless the option is given, and for frames (F, v, u) much
-    brighter than Reference Intensity."""
+    InputError for frames (F, v, u) without flat-field correction or option, and for frames much brighter than that."""
     remedy = f"say {options.named('flat_value')}"
     if not options.flat_value and scan.word("Flat Field Correction", default="ON").upper() == "OFF":
         raise scan.error("Flat Field Correction", "OFF", "frames that the scanner has corrected", remedy)
