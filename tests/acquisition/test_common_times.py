@@ -97,7 +97,7 @@ def test_a_model_keeps_its_class_with_as_many_times_as_a_scan_needs() -> None:
     class Late(PerRow):
         name: str = field(default="late", init=False, repr=False)
 
-    fly = simulate("spheres", size=16, views=3, exposure_deg=40.0)
+    fly = simulate("spheres", size=16, detector=8, views=3, exposure_deg=40.0)
     timed = with_times(Late(), fly)
     assert type(timed) is Late and timed.sub_intervals == with_times(PerRow(), fly).sub_intervals > 2
     assert type(_few_times(timed)) is Late and _few_times(timed).sub_intervals == 2
