@@ -5,10 +5,10 @@
     python benchmarks/doubt.py real docs/results/doubt_real.jsonl SCAN.h5 ... [--methods fista fbp]
 
 ``fit`` takes procedural volumes alone: it reconstructs them three times each into FOLDER, then writes the law's numbers.
-``rows`` simulates scans of volumes that nothing was fitted to; a line of its file has, for one scan, the coverage at 68 and
-95 % in the object and in air, soft matter, bone and edges apart, the rank correlation of σ with |error|, the mean 95 % bar
-over the constant that covers as much, and the mean σ over the RMS error. ``real`` has the coverage of held-out pixels. All
-continue where they were stopped."""
+``rows`` simulates scans of volumes that nothing was fitted to. A line of its file has the coverage of one scan at 68 and
+95 %: in the object, and in air, soft matter, bone and edges apart. It has the rank correlation of σ with |error|, the mean
+95 % bar over the constant that covers as much, and the mean σ over the RMS error. ``real`` has the coverage of held-out
+pixels. All continue where they were stopped."""
 
 import argparse
 import json

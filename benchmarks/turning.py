@@ -1,10 +1,10 @@
-"""Measures what a person chooses at the scanner, at equal dose: frames, arc of an exposure, and readout.
+"""Measures quality by number of frames, arc of an exposure and readout, at equal dose.
 
     python benchmarks/turning.py VOLUMES RESULTS.jsonl --names bonsai,engine
     python docs/make_results.py      # the table in docs/scanner.md
 
-All scans of a volume are one turn with the same photons in all. There is a line per scan and motion: the PSNR in dB of the
-default method, with the motion known and ignored. ``arcs``: frames with the arc of an exposure in degrees; where frames
+All scans of a volume are one turn with the same photons in all. A line has the PSNR in dB of the default method on one scan,
+with the motion known or ignored. ``arcs``: frames with the arc of an exposure in degrees; where frames
 times arc is less than 360, the beam is pulsed. Runs in the file are not made again."""
 
 from scans import append, files_of, read_lines, runs_parser

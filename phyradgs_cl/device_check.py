@@ -34,9 +34,7 @@ from phyradgs_cl.optim import DeviceAdam, adam_step
 from phyradgs_cl.runtime import DeviceSpace, HostSpace, Runtime
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 
-# Upper limits of the difference from float64 twins, over the largest number: of values, and of gradients. Float32 leaves a
-# tenth of them in tests.
-VALUE, GRADIENT = 1e-4, 1e-3
+VALUE, GRADIENT = 1e-4, 1e-3  # upper limits of the difference from float64 twins, over the largest number
 _GRIDDED = 5e-3  # upper limit of the difference where an inverse is computed from a field's values at voxels
 SHAPE, GRID = (9, 12), Grid((5, 7, 6), (0.3, 0.24, 0.28), (0.1, -0.05, 0.1))
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 9, 4.1 / 12), (0.1, 0.2))
@@ -79,8 +77,7 @@ def check_device(device: str | None = None, **launch_shape: bool | int) -> Verdi
 
 
 def _problem(check: Callable[[Runtime], Iterator[Comparison]], rt: Runtime, agreeing: set[str]) -> str:
-    """Returns the first problem in words, "" without any. Adds to ``agreeing`` the kernels that ran, if all comparisons
-    hold."""
+    """Returns the first problem in words. Without any, returns "" and adds the kernels that ran to ``agreeing``."""
     try:
         for computed, expected, limit in check(rt):
             off = float(np.abs(np.asarray(computed, np.float64) - expected).max() / (np.abs(expected).max() or 1.0))
