@@ -31,7 +31,7 @@ def main() -> None:
                 if not left:
                     continue
                 scan = simulate(
-                    path, views=frames, exposure_deg=arc_deg, readout_ratio=ratio, size=64, noise="tigre",
+                    path, views=frames, exposure_deg=arc_deg, readout_ratio=ratio, size=64, detector=128, noise="tigre",
                     dose=PHOTONS / frames, seed=seed, device=rt,
                 )  # fmt: skip
                 for motion in left:

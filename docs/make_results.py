@@ -1,4 +1,4 @@
-"""Fills the tables of docs/results/*.md from the recorded runs in that folder: python docs/make_results.py [--check]
+"""Fills the tables of docs/results/*.md and docs/scanner.md from recorded runs: python docs/make_results.py [--check]
 
 A table is between ``<!-- table: NAME -->`` and ``<!-- end of table -->``; NAME is a key of ``TABLES``. With ``--check``
 nothing is written, and the exit status is 1 where a page differs from its data."""
@@ -563,6 +563,26 @@ def moving_mace4d() -> str:
     return markdown(["", "mean PSNR, dB", "least PSNR, dB", "mean SSIM", "processor, s"], rows)
 
 
+def turning() -> str:
+    """Returns PSNR by frames, arc of an exposure and readout: means over volumes and seeds, motion known and ignored."""
+    cells: dict[tuple[int, float], dict[tuple[float, str], list[float]]] = {}
+    for one in lines_of("turning.jsonl"):
+        scan = cells.setdefault((one["frames"], one["arc_deg"]), {})
+        scan.setdefault((one["readout_ratio"], one["motion"]), []).append(one["psnr_db"])
+    columns = [(ratio, motion) for ratio in (0, 0.86, 4) for motion in ("per-row", "static")]
+    rows = [
+        [str(frames), f"{arc:g}°", *(f"{mean(by[column]):.2f}" if column in by else "" for column in columns)]
+        for (frames, arc), by in sorted(cells.items())
+    ]
+    gains = [
+        stdev(known - ignored for known, ignored in zip(by[ratio, "per-row"], by[ratio, "static"], strict=True))
+        for by in cells.values() for ratio in (0, 0.86, 4) if (ratio, "static") in by
+    ]  # fmt: skip
+    heads = [f"readout {ratio:g}, {motion}" for ratio in (0, 0.86, 4) for motion in ("known", "ignored")]
+    spread_db = f"The gain of knowing the motion deviates by at most {max(gains):.2f} dB between volumes."
+    return markdown(["frames", "exposure", *heads], rows) + f"\n{spread_db}\n"
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "table1_S_rapid": lambda: quality("table1_S.csv", "rapid", with_seconds=True),
     "table1_S_standard": lambda: quality("table1_S.csv", "standard"),
@@ -595,6 +615,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "moving_unknown": lambda: moving_unknown("breathing", 64),
     "moving_drying": lambda: moving_unknown("drying", 32),
     "moving_mace4d": moving_mace4d,
+    "turning": turning,
 }
 
 
@@ -605,7 +626,7 @@ def filled(text: str) -> str:
 
 def main() -> None:
     differ = []
-    for page in sorted(RESULTS.glob("*.md")):
+    for page in [*sorted(RESULTS.glob("*.md")), RESULTS.parent / "scanner.md"]:
         before = page.read_text(encoding="utf-8")
         after = filled(before)
         if after != before:

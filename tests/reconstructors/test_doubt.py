@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import reconstruct, simulate
@@ -11,13 +12,14 @@ from phyradgs_cl.detector.noise_level import noise_map
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import read_checkpoint, write_checkpoint
 from phyradgs_cl.metrics import coverage
+from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.reconstructors import doubt
-from phyradgs_cl.reconstructors.doubt import Doubter, Law, spread
+from phyradgs_cl.reconstructors.doubt import Doubter, Law, finer, spread
 from phyradgs_cl.reconstructors.projected import held_out
 from phyradgs_cl.reconstructors.result import DOUBT
 
 FEW = {"method": "sirt", "iterations": 4, "report": False}
-LAW = Law(1.0, 1.0, 3.0)
+LAW = Law(1.0, 1.0, 0.0, 3.0)
 
 
 @pytest.fixture(scope="module")
@@ -74,10 +76,32 @@ def test_half_of_what_differences_do_not_share_is_noise() -> None:
     random = np.random.default_rng(0)
     one, two = random.standard_normal((2, 24, 24, 24))
     inner = np.s_[4:-4, 4:-4, 4:-4]
-    assert np.sqrt(np.mean(spread(one, two, LAW)[inner] ** 2)) == pytest.approx(1, rel=0.1)
-    both = spread(3 + 0 * one, 3 + 0 * one, replace(LAW, noise=0.0))
+    assert np.sqrt(np.mean(spread(0 * one, one, two, LAW)[inner] ** 2)) == pytest.approx(1, rel=0.1)
+    both = spread(0 * one, 3 + 0 * one, 3 + 0 * one, replace(LAW, noise=0.0))
     np.testing.assert_allclose(both, 3, rtol=1e-6)
-    assert spread(one, two, replace(LAW, shape=0.0, noise=2.0))[inner].mean() == pytest.approx(2, rel=0.1)
+    assert spread(0 * one, one, two, replace(LAW, shape=0.0, noise=2.0))[inner].mean() == pytest.approx(2, rel=0.1)
+
+
+def test_finer_voxels_keep_the_means_and_come_nearer_to_what_the_voxels_are_means_of(rt) -> None:
+    """The projector blurs by a voxel: error bars counted this as an error, up to twice the true one with many views."""
+    random = np.random.default_rng(2)
+    fine = gaussian_filter(random.random((40, 40, 40)), 2.0).astype(np.float32)
+    coarse = block_means(fine, (2, 2, 2))
+    again = finer(coarse)
+    np.testing.assert_allclose(block_means(again, (2, 2, 2)), coarse, atol=1e-6)
+    inner = np.s_[8:-8, 8:-8, 8:-8]
+    repeats = coarse.repeat(2, 0).repeat(2, 1).repeat(2, 2)
+    assert np.std((again - fine)[inner]) < 0.2 * np.std((repeats - fine)[inner])
+    assert finer(np.ones((1, 3, 2), np.float32)).shape == (2, 6, 4)
+
+
+def test_dense_matter_has_wider_bars_in_proportion_to_its_density() -> None:
+    random = np.random.default_rng(3)
+    volume = np.repeat(np.array([0.0, 1.0, 2.0]), 10)[:, None, None] * np.ones((30, 24, 24))
+    one, two = volume + 0.01 * random.standard_normal((2, *volume.shape))
+    plain, wide = (spread(volume, one, two, replace(LAW, density=k)) for k in (0.0, 1.0))
+    added = np.sqrt(np.mean((wide**2 - plain**2)[:, 4:-4, 4:-4], axis=(1, 2)))
+    assert added[25] == pytest.approx(np.sqrt(2) * added[15], rel=1e-3) and added[4] < 1e-6
 
 
 def test_a_run_goes_on_with_the_same_bits_from_each_of_its_three_parts(rt, scan, tmp_path) -> None:
@@ -122,7 +146,7 @@ def test_gaussians_of_the_first_run_are_kept_by_a_state(rt, scan) -> None:
 
 def test_held_out_pixels_widen_bars_that_do_not_reach_them(rt, scan, monkeypatch) -> None:
     right = reconstruct(scan, device=rt, doubt=True, holdout=10.0, **FEW)
-    monkeypatch.setattr(doubt, "fitted_law", lambda kind: Law(0.02, 0.02, 3.0))
+    monkeypatch.setattr(doubt, "fitted_law", lambda kind: Law(0.02, 0.02, 0.0, 3.0))
     narrow = reconstruct(scan, device=rt, doubt=True, holdout=10.0, **FEW)
     assert 1 <= right.facts[DOUBT]["held_out_factor"] < narrow.facts[DOUBT]["held_out_factor"] <= 4
     assert right.facts[DOUBT]["held_out_within"] > 0.5
