@@ -8,7 +8,8 @@
 ``rows`` simulates scans of volumes that nothing was fitted to. A line of its file has the coverage of one scan at 68 and
 95 %: in the object, and in air, soft matter, bone and edges apart. It has the rank correlation of σ with |error|, the mean
 95 % bar over the constant that covers as much, and the mean σ over the RMS error. Both keep the volumes of all runs in
-FOLDER: a new law needs no new runs. ``real`` has the coverage of held-out pixels. All continue where they were stopped."""
+FOLDER: a new law needs no new runs (``--most 0``). ``real`` has the coverage of held-out pixels. All continue where they
+were stopped."""
 
 import argparse
 import json
@@ -19,7 +20,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import scipy
 from priors import scan_of
-from scans import append, files_of, read_lines
+from scans import append, files_of
 
 from phyradgs_cl.api import load_scan, reconstruct
 from phyradgs_cl.fields import Grid
@@ -110,7 +111,7 @@ def drawn_cases(count: int) -> list[dict[str, object]]:
 
 def three_runs(rt: Runtime, folder: Path, volume: Path, case: dict[str, object]) -> dict[str, np.ndarray]:
     """Returns the volumes of a case's three runs and its truth, (z, y, x), from a file that is written once."""
-    path = folder / ("_".join(str(value) for value in case.values()) + ".npz")
+    path = file_of(folder, case)
     if not path.exists():
         scan, method = scan_of(rt, volume, case), str(case["method"])
         first = reconstruct(scan, method, device=rt, report=False)
@@ -123,6 +124,10 @@ def three_runs(rt: Runtime, folder: Path, volume: Path, case: dict[str, object])
         print(path.name, flush=True)
     with np.load(path) as stored:
         return {name: stored[name].astype(np.float64) for name in stored}
+
+
+def file_of(folder: Path, case: dict[str, object]) -> Path:
+    return folder / ("_".join(str(value) for value in case.values()) + ".npz")
 
 
 def fit(folder: Path, output: Path, cases: int) -> None:
@@ -195,19 +200,25 @@ def cases_of(size: int) -> list[dict[str, object]]:
     cases = [{**USUAL, "volume": name} for name in NAMES]
     cases += [{**USUAL, **change, "volume": v} for k, change in enumerate(CHANGES) for v in PAIRS[k % len(PAIRS)]]
     every = [{**USUAL, **change, "volume": name} for change in CHANGES for name in NAMES]
+    every += [{**USUAL, **change, "method": "fdk", "volume": name} for change in CHANGES for name in NAMES]
+    every = [case for k, case in enumerate(every) if case not in every[:k]]
     cases += [case for case in every if case not in cases]
     return [{**case, "size": size, "seed": 0} for case in cases]
 
 
 def rows(volumes: str, folder: Path, output: Path, size: int, method: str | None, most: int) -> None:
-    rt, files, keys = Runtime(), files_of(volumes, ",".join(NAMES), size), (*USUAL, "volume", "size", "seed")
-    there = {tuple(line[key] for key in keys) for line in read_lines(output)}
+    """Makes at most ``most`` of the runs that are missing, then writes the lines of all runs in the folder."""
+    rt, files = Runtime(), files_of(volumes, ",".join(NAMES), size)
     cases = [case for case in cases_of(size) if method in (None, case["method"])]
-    for case in [case for case in cases if tuple(case[key] for key in keys) not in there][:most]:
-        runs = three_runs(rt, folder, files[str(case["volume"])], case)
+    for case in [case for case in cases if not file_of(folder, case).exists()][:most]:
+        three_runs(rt, folder, files[str(case["volume"])], case)
+    lines = []
+    for case in [case for side in (64, 128) for case in cases_of(side) if file_of(folder, case).exists()]:
+        runs = three_runs(rt, folder, Path(), case)
         law = fitted_law("analytic" if case["method"] == "fdk" else "iterative")
         sigma = spread(runs["x0"], runs["x1"], runs["x2"], law)
-        append(output, {**case, **measured(sigma, runs["x0"], runs["truth"], law.multiple_95)})
+        lines.append(json.dumps({**case, **measured(sigma, runs["x0"], runs["truth"], law.multiple_95)}) + "\n")
+    output.write_text("".join(lines), encoding="utf-8")
 
 
 def real(output: Path, paths: list[Path], methods: list[str]) -> None:

@@ -563,6 +563,31 @@ def moving_mace4d() -> str:
     return markdown(["", "mean PSNR, dB", "least PSNR, dB", "mean SSIM", "processor, s"], rows)
 
 
+def doubt() -> str:
+    """Returns the coverage of error bars by kind of scan and method: means over volumes, with the least and the largest."""
+    scans: dict[tuple[Any, ...], list[Scores]] = {}
+    for one in lines_of("doubt.jsonl"):
+        kind = "fly" if one["kind"] == "fly" else "at rest"
+        scans.setdefault((one["size"], one["method"], kind, one["views"], one["dose"]), []).append(one)
+
+    def span(of: list[Scores], name: str) -> str:
+        values = [one[name] for one in of if name in one]
+        if len(values) < 2:
+            return f"{values[0]:.2f}" if values else "–"
+        return f"{mean(values):.2f} ({min(values):.2f} to {max(values):.2f})"
+
+    places = ("air", "soft", "bone", "edges")
+    rows = [
+        [f"{size}³", f"`{method}`", f"{kind}, {views}, {dose:g}", str(len(of)), span(of, "object_68"), span(of, "object_95")]
+        + [", ".join(f"{mean(x):.2f}" if (x := [one[f"{p}_68"] for one in of if f"{p}_68" in one]) else "–" for p in places)]
+        + [span(of, "rank"), f"{mean(one['bar_over_constant'] for one in of):.2f}"]
+        for (size, method, kind, views, dose), of in scans.items()
+    ]
+    heads = ["voxels", "method", "scan, views, photons", "volumes", "within σ", "within the 95 % bar"]
+    heads += ["air, soft, bone, edges within σ", "rank correlation", "mean 95 % bar over a constant one"]
+    return markdown(heads, rows)
+
+
 def turning() -> str:
     """Returns PSNR by frames, arc of an exposure and readout: means over volumes and seeds, motion known and ignored."""
     cells: dict[tuple[int, float], dict[tuple[float, str], list[float]]] = {}
@@ -616,6 +641,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "moving_drying": lambda: moving_unknown("drying", 32),
     "moving_mace4d": moving_mace4d,
     "turning": turning,
+    "doubt": doubt,
 }
 
 
