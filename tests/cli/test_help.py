@@ -11,7 +11,6 @@ from phyradgs_cl.acquisition import MOTIONS
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.prepare import DEFAULT_STEPS
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, method_options
-from phyradgs_cl.reconstructors.voxels.priors import PRIORS
 
 pytestmark = pytest.mark.slow
 
@@ -52,17 +51,6 @@ def test_help_is_whole_everywhere(cli, told, monkeypatch) -> None:
         assert "--batch" in at_the_end and "--batch" not in usual and "--help" in usual
 
 
-def test_options_that_commands_share_are_declared_once(cli) -> None:
-    """All but what is written, a file or a folder, and a sweep's devices say the same in every command."""
-    commands = typer.main.get_command(cli.app).commands
-    help_of: dict[str, str] = {}
-    for name in ("reconstruct", "estimate", "sweep"):
-        for parameter in commands[name].params:
-            is_own = parameter.name == "output" or (name, parameter.name) == ("sweep", "device")
-            if parameter.param_type_name == "option" and not is_own:
-                assert help_of.setdefault(parameter.name, parameter.help) == parameter.help, f"{name}: {parameter.name}"
-
-
 def test_every_option_has_a_group_and_the_basics_fit_a_screen(cli, told, monkeypatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     commands = typer.main.get_command(cli.app).commands
@@ -94,12 +82,6 @@ def test_a_default_is_that_of_the_command(told) -> None:
     for name, default in {"prepare": DEFAULT_STEPS, "reconstruct": "none"}.items():
         steps = told(name, "-h").split("--steps ")[1].split(" --")[0]
         assert f"[default: ({default})]" in " ".join(steps.split()), steps
-
-
-def test_the_priors_are_named(told) -> None:
-    """In words of its own: what knows their names takes a moment to load."""
-    text = " ".join(told("reconstruct", "-h").split("--prior ")[1].split(" --")[0].split())
-    assert text.split("for fista: ")[1].split(";")[0].replace(" or ", ", ").split(", ") == [*PRIORS], text
 
 
 def test_the_tab_key_in_bash() -> None:
