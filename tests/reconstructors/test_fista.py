@@ -194,10 +194,7 @@ def test_a_first_volume_is_where_the_run_starts(rt, scan, method) -> None:
     assert quality(scan, from_truth) > begun + (0.1 if method in ("phyradgs", "r2") else 1)
 
 
-@pytest.mark.parametrize(
-    ("at", "prior"),
-    [(1, "dct"), (5, "dct"), (3, "ridge"), (2, "tv")],
-)
+@pytest.mark.parametrize(("at", "prior"), [(1, "dct"), (5, "ridge"), (2, "tv")])
 def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) -> None:
     options = method_options("fista", None, {"iterations": 7, "subvoxels": 2, "prior": prior})
 
