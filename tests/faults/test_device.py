@@ -15,7 +15,6 @@ pytestmark = pytest.mark.slow
 MOST = 2 * int(os.environ.get("STRESS", "1"))
 RUNS = {
     "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "5"],
-    "fista-tv": ["--method", "fista-tv", "--iterations", "4"],
     "phyradgs": ["--method", "phyradgs", "--iterations", "60", "--gaussians", "30", "--set", "control.start_iteration=20"],
 }
 
