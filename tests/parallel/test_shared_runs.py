@@ -82,7 +82,7 @@ def test_classical_methods_come_to_the_same_volume(on_ranks, scan, method, model
 
 
 def test_a_stopped_run_goes_on_with_another_number_of_ranks(on_ranks, scan) -> None:
-    options = replace(OPTIONS, iterations=120, control=replace(CONTROL, max_gaussians=400))
+    options = replace(OPTIONS, iterations=80, control=replace(CONTROL, max_gaussians=400))
     whole = reconstruct(scan, RunPlan("phyradgs", options, seed=1), Runtime())
 
     def stop(progress: Progress) -> None:
