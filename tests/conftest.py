@@ -99,6 +99,12 @@ def any_rt(request: pytest.FixtureRequest) -> Runtime:
     return Runtime()
 
 
+@pytest.fixture(scope="session", params=[{}, {"lanes": 1, "pixel_items": True}], ids=["own lanes", "work-items as lanes"])
+def two_rt(request: pytest.FixtureRequest) -> Runtime:
+    """As a CPU is driven and as a GPU is: for what hosts decide, whatever the kernels are built for."""
+    return Runtime(**request.param)
+
+
 @pytest.fixture(scope="session")
 def cli() -> ModuleType:
     """The command line in this process: cli.run([...]) gives the exit status."""

@@ -62,10 +62,3 @@ def test_finite_counts_and_locates() -> None:
     checks.finite("p", [[1, 2], [3, 4]])
     with pytest.raises(InputError, match=r"p: found 2 NaN or infinite values, first at \(0, 1\)"):
         checks.finite("p", [[1.0, np.nan], [np.inf, 0.0]])
-
-
-def test_shape_allows_any_length_where_none() -> None:
-    checks.shape("data", np.zeros((4, 5)), (None, 5))
-    for array in (np.zeros((4, 6)), np.zeros(5), np.zeros((4, 5, 1))):
-        with pytest.raises(InputError, match=r"expected shape \(any, 5\)"):
-            checks.shape("data", array, (None, 5))

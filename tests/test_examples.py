@@ -28,7 +28,7 @@ RUN = [
     for path in EXAMPLES
     if path != SERVICE and not any(f"import {name}\n" in path.read_text(encoding="utf-8") for name in LACKING)
 ]
-MOST_LINES, LONGEST_S = 60, 300  # under a minute on two cores that have nothing else to do
+LONGEST_S = 300  # under a minute on two cores that have nothing else to do
 SAID = {
     "deepinv_physics": r"FISTA of deepinv: (?P<more>2\d\.\d+) dB",
     "own_arrays": r"still: (?P<less>[\d.]+) dB.*\nmoving: (?P<more>[\d.]+) dB",
@@ -91,14 +91,6 @@ def test_the_service_makes_each_scan_once_and_goes_on_when_it_is_killed(tmp_path
     with service(500) as wait_for:
         wait_for(b.exists)
     assert a.stat().st_mtime_ns == made_ns and not list(volumes.glob("*.bak"))  # no run has begun anew
-
-
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_is_in_the_documentation_as_it_is(path) -> None:
-    page = (ROOT / "docs" / "reference" / "examples.md").read_text(encoding="utf-8")
-    text = path.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= MOST_LINES
-    assert text in page, "run docs/make_reference.py"
 
 
 def imports(tree: ast.AST) -> set[str]:

@@ -28,7 +28,10 @@ def scan() -> api.Scan:
     return api.simulate("foot", size=24, detector=48, protocol="rapid", noise="tigre", dose=1e4, seed=0)
 
 
-@pytest.mark.parametrize(("method", "motion"), PSNR_DB)
+RUNS = [pytest.param(*run, marks=pytest.mark.slow if run[0] == "phyradgs" else ()) for run in PSNR_DB]
+
+
+@pytest.mark.parametrize(("method", "motion"), RUNS)
 def test_a_method_is_as_right_as_it_was(scan: api.Scan, method: str, motion: str) -> None:
     options, expected_db, tolerance_db = PSNR_DB[method, motion]
     result = api.reconstruct(scan, method=method, motion=motion, seed=0, report=False, **options)

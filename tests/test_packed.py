@@ -16,7 +16,10 @@ MAY_BE_SCALAR = {
 }
 
 
-@pytest.mark.parametrize("target, library, lanes", HERE)
+TARGETS = [*HERE[:1], *(pytest.param(*row, marks=pytest.mark.slow) for row in HERE[1:])]
+
+
+@pytest.mark.parametrize("target, library, lanes", TARGETS)
 def test_streaming_kernels_are_packed_and_no_access_is_masked_as_one(target, library, lanes, tmp_path) -> None:
     objects = built(target, library, lanes, tmp_path, *CHECKS)
     wrong = {}

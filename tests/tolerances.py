@@ -75,8 +75,6 @@ BACKPROJECTION = 2e-5  # bilinear positions to some 1e-6 pixels in float32, samp
 FDK_MEAN = 0.02  # mean inside a sphere: 90 views, 32³ voxels, a cone of ±10°, samples of the edge
 FDK_PARTIAL = 0.012  # the same at 120 views, displaced and short (0.0075); wrong weights leave 0.024 to 0.4
 FDK_LINES = 1.08  # error of a rolling scan over that of a gantry at rest (0.99 to 1.05)
-FDK_SHEPP_LOGAN = 0.04  # of a brain at 0.2 in a skull at 1, averaged over some voxels near the mid-plane
-FDK_SCALE = 1e-4  # frames are equal to float32 rounding; the ramp filter amplifies it
 RAMP = 1e-5  # float32 result of a float64 FFT
 
 # --- objective -----------------------------------------------------------------------------------------------

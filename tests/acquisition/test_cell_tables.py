@@ -130,13 +130,6 @@ def test_a_line_stays_in_a_segment_that_it_overhangs_by_less_than_a_tenth(reach,
     np.testing.assert_allclose(np.sort(share[share > 0]), expected, rtol=0, atol=FLOAT64)
 
 
-def test_windows_of_no_length_count_as_a_whole_line() -> None:
-    table = exact_cells(ORBIT, Shutter(0.0, 0.6), 0, 3.0, LINES, 3)
-    share = table.line_times[:, 2]
-    assert set(np.unique(share)) == {0.0, 1.0}
-    np.testing.assert_array_equal(share.sum(0), 1.0)
-
-
 def in_plane(pose: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """The panel turned about its normal."""
     u, v = pose[:, 6:9] / 0.5, pose[:, 9:12] / 0.6

@@ -46,18 +46,6 @@ def test_the_nearest_circle_of_a_circle_is_itself() -> None:
             np.testing.assert_allclose(getattr(found, name), expected, atol=TOLERANCE_MM, err_msg=name)
 
 
-def test_middle_pixels_and_many_angles_at_once() -> None:
-    geometry = ConeGeometry(5.0, 7.0, (5, 5), (0.1, 0.2))
-    pose = geometry.pose(0.4)
-    middle = pixel_centres(pose, (5, 5))[2, 2]
-    np.testing.assert_allclose(middle, pose[:3] * (1 - 7 / 5), atol=TOLERANCE_MM)
-    angles = np.array(ANGLES_RAD).reshape(2, 3)
-    poses = GEOMETRY.pose(angles)
-    assert poses.shape == (2, 3, 12)
-    np.testing.assert_array_equal(poses[1, 2], GEOMETRY.pose(7.0))
-    assert pixel_centres(poses, (7, 10)).shape == (2, 3, 7, 10, 3)
-
-
 def test_scaled_and_transposed_poses() -> None:
     np.testing.assert_allclose(GEOMETRY.scaled(0.01).pose(0.7), 0.01 * GEOMETRY.pose(0.7), atol=1e-14)
     assert GEOMETRY.scaled(0.01).magnification == pytest.approx(1200 / 785)

@@ -90,15 +90,6 @@ def test_interpolation_commutes_with_moving_the_whole_machine() -> None:
     np.testing.assert_allclose(ours, expected, atol=RIGID_TOLERANCE_MM)
 
 
-def test_a_table_returns_its_own_samples() -> None:
-    rng = np.random.default_rng(0)
-    table = GEOMETRY.pose(np.linspace(0, 2, 9)) + rng.normal(0, 0.01, (9, 12))
-    poses = PoseTable(np.arange(9.0), table)
-    np.testing.assert_allclose(poses.pose(0, np.arange(9.0)), table, atol=RIGID_TOLERANCE_MM)
-    assert poses.pose(0, np.arange(6.0).reshape(2, 3)).shape == (2, 3, 12)
-    assert poses.pose(0, np.array(2.5)).shape == (12,)
-
-
 def test_an_encoder_table_goes_on_at_the_speed_of_its_ends() -> None:
     table = EncoderTable(np.array([0.0, 1.0, 3.0]), np.array([0.0, 0.1, 0.5]))
     longer = continued(CircularOrbit(GEOMETRY, table), 2.0)

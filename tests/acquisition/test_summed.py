@@ -85,7 +85,7 @@ def test_images_of_the_rim_are_told_from_a_smear(caplog) -> None:
 @pytest.mark.parametrize("readout_ratio", [0.0, 0.5])
 def test_a_sum_is_what_the_known_motion_projects(readout_ratio) -> None:
     """The poses of 8 times in an exposure are those of the 8 projections."""
-    scan = simulate("foot", protocol="static", views=96, size=16, detector=16, detector_model="intensity")
+    scan = simulate("foot", protocol="static", views=48, size=12, detector=12, detector_model="intensity")
     at_rest = ray_operator(scan, "static")
     summed = sum_frames(replace(scan, projections=at_rest(scan.reference)), 8, readout_ratio)
     errors = {}

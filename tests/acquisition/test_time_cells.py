@@ -94,14 +94,6 @@ def test_per_line_cells_sample_each_lines_own_exposure(axis, direction) -> None:
             np.testing.assert_allclose(found_s, middles_s, atol=TIME_TOLERANCE_S)
 
 
-def test_micro_views_of_single_lines_have_nearly_their_own_times() -> None:
-    shutter, lines = Shutter(0.8, 0.3), 200
-    micro = micro_view_cells(ORBIT, shutter, 0, 0.0, lines, lines, 4)
-    exact = per_line_cells(ORBIT, shutter, 0, 0.0, lines, 4)
-    np.testing.assert_array_equal(micro.line_start, exact.line_start)
-    assert np.abs(micro.time_s - exact.time_s).max() <= 0.3 / lines / 2 * (1 + 1e-9)
-
-
 def test_static_cells_stand_mid_window_and_at_the_start() -> None:
     shutter = Shutter(0.8, 0.3)
     middle = static_cells(ORBIT, shutter, 0, START_S, 7)
@@ -110,16 +102,6 @@ def test_static_cells_stand_mid_window_and_at_the_start() -> None:
         assert cells.count == 1 and cells.time_s[0] == pytest.approx(time_s, abs=TIME_TOLERANCE_S)
         assert (cells.line_start[0], cells.line_stop[0], cells.weight[0]) == (0, 7, 1)
         np.testing.assert_allclose(cells.pose[0], GEOMETRY.pose(0.1 + SPEED_RAD_PER_S * time_s), atol=1e-12)
-
-
-@pytest.mark.parametrize("strips, sub_intervals", [(1, 1), (8, 5), (20, 3)])
-def test_without_exposure_and_readout_every_cell_is_the_static_one(strips, sub_intervals) -> None:
-    shutter = Shutter(0.0, 0.0)
-    static = static_cells(ORBIT, shutter, 0, START_S, 7)
-    micro = micro_view_cells(ORBIT, shutter, 0, START_S, 7, strips, sub_intervals)
-    per_line = per_line_cells(ORBIT, shutter, 0, START_S, 7, sub_intervals)
-    for cells in (micro, per_line):
-        np.testing.assert_array_equal(cells.pose, np.broadcast_to(static.pose, cells.pose.shape))
 
 
 def scan(is_fly: bool) -> Scan:

@@ -43,15 +43,3 @@ def test_the_page_names_everything_and_nothing_else() -> None:
     assert not missing
     for name in re.findall(r"from phyradgs_cl\.api import (.*)", TEXT):
         assert set(re.split(r",\s*", name)) <= set(api.__all__)
-
-
-def function(text: str, name: str) -> str:
-    """The source of a function in a text."""
-    found = re.search(rf"^def {name}\(.*?(?=^\S)", text, re.S | re.M)
-    assert found, name
-    return found[0].strip()
-
-
-def test_an_example_stands_in_the_page_as_it_is_in_its_file() -> None:
-    source = (EXAMPLES / "own_sirt.py").read_text(encoding="utf-8")
-    assert function(TEXT, "sirt") == function(source, "sirt")

@@ -68,12 +68,3 @@ def missing(name: str) -> list[str]:
 @pytest.mark.parametrize("name", api.__all__)
 def test_a_name_says_what_it_takes_and_gives(name) -> None:
     assert not missing(name), f"{name} does not say {', '.join(missing(name))}"
-
-
-@pytest.mark.parametrize("name", api.__all__)
-def test_a_signature_is_short_enough_to_read(name) -> None:
-    """``help`` prints it on one line: types by their names, not what those stand for."""
-    own = [(name, getattr(api, name)), *((f"{name}.{member}", value) for member, value in members(name))]
-    for called, thing in own:
-        for parameter in parameters(thing) if callable(thing) else []:
-            assert len(inspect.formatannotation(parameter.annotation)) <= 60, f"{called}: {parameter.name}"

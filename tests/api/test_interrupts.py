@@ -170,11 +170,3 @@ def test_a_line_tells_how_far_it_is(rt, scan, monkeypatch, screen, report, is_to
     if is_told:
         assert screen.text.endswith("\n") and screen.text.count("\n") == 1 and "ETA" in screen.text
         assert ("\x1b[K" in screen.text) == screen.is_terminal
-
-
-def test_a_method_that_ends_by_itself_says_so(rt, scan, monkeypatch) -> None:
-    screen = Screen(True)
-    monkeypatch.setattr(sys, "stderr", screen)
-    result = reconstruct(scan, "cgls", iterations=30, device=rt)
-    words = f"stopped after {result.facts['iterations']} of 30 iterations (residual as small as the noise)"
-    assert screen.text.endswith(f"\x1b[Kcgls, {words}\n") and words in repr(result)

@@ -8,7 +8,6 @@ import pyopencl
 import pyopencl.array
 import pytest
 from scipy.sparse.linalg import LinearOperator as ScipyOperator
-from scipy.sparse.linalg import cg, lsqr
 from tolerances import FLOAT32
 
 from phyradgs_cl.api import (
@@ -155,13 +154,6 @@ def test_linear_operators_keep_scipys_law(rt, scan, cloud, kind) -> None:
     pair = np.stack([x, 2 * x], -1)
     assert np.allclose(matrix @ pair, np.stack([forward, 2 * forward], -1), rtol=1e-5)
     assert np.allclose((matrix.T @ matrix) @ x, matrix.T @ forward, rtol=1e-5)
-
-
-def test_scipy_solves_for_densities(rt, scan, cloud) -> None:
-    splats = splat_operator(scan, device=rt)
-    frames, matrix = splats(cloud), splats.of_densities(cloud)
-    assert np.allclose(lsqr(matrix, frames.ravel(), iter_lim=30)[0], cloud.density, rtol=1e-3)
-    assert np.allclose(cg(matrix.T @ matrix, matrix.T @ frames.ravel())[0], cloud.density, rtol=1e-2)
 
 
 class _Foreign:

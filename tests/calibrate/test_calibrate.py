@@ -10,7 +10,6 @@ from phyradgs_cl.acquisition import CircularOrbit, EncoderTable
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, perturb
 from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
-from phyradgs_cl.calibrate.parameters import in_words
 from phyradgs_cl.calibrate.problem import CoarseProblem
 from phyradgs_cl.calibrate.search import Reduced, Search
 from phyradgs_cl.calibrate.stages import Stage
@@ -156,11 +155,6 @@ def test_a_detector_that_adds_photons(rt, turned) -> None:
     scan = turned(model="intensity")
     (found,) = calibrate(perturb(scan, GeometryCorrection(offset_u_mm=-OFFSET_MM)), rt, "offset-u").parameters
     assert abs(found.found) < 3 * found.deviation < 0.03 and found.verdict == CORRECTED
-
-
-def test_a_combination_in_words() -> None:
-    said = in_words({"offset-u": 0.2, "exposure": -0.9, "readout": 0.8, "roll": 0.01})
-    assert said == "exposure against readout: looks like an object turned about the axis, and smoother or sharper"
 
 
 def few(scan):

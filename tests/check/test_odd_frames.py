@@ -44,8 +44,10 @@ def answer(rt, scan: Scan) -> tuple[str, str]:
     return finding.verdict, finding.text.split(";")[0]
 
 
-@pytest.mark.parametrize("place", ["first", "middle", "last"])
-@pytest.mark.parametrize("arc", ["half a turn", "its end too", "cone, 216°", "cone, full"])
+PLACES = [("half a turn", "first"), ("its end too", "last"), ("cone, 216°", "middle"), ("cone, 216°", "last")]
+
+
+@pytest.mark.parametrize(("arc", "place"), [*PLACES, ("cone, full", "first")])
 def test_one_odd_frame_is_named_wherever_it_is(rt, arcs, arc, place) -> None:
     scan = arcs[arc]
     at = {"first": 0, "middle": scan.frames // 2, "last": scan.frames - 1}[place]
@@ -75,8 +77,9 @@ def strip_scan(views: int, turn_deg: float, columns: int, rows: int = 2) -> Scan
     return Scan(np.array(frames) + noise, geometry, orbit, Shutter(0.0), np.arange(float(views)), grid, False)
 
 
-@pytest.mark.parametrize(("views", "turn_deg", "columns"), [(61, 180.0, 192), (61, 170.0, 192), (91, 180.0, 320)])
-@pytest.mark.parametrize("gain", [0.0, 0.02])
+@pytest.mark.parametrize(
+    ("views", "turn_deg", "columns", "gain"), [(61, 180.0, 192, 0.02), (61, 170.0, 192, 0.0), (91, 180.0, 320, 0.0)]
+)
 def test_the_ends_of_a_right_arc_are_not_odd(rt, views, turn_deg, columns, gain) -> None:
     """Nor are they where the contrast drifts by 2 %."""
     scan = strip_scan(views, turn_deg, columns)
@@ -84,7 +87,7 @@ def test_the_ends_of_a_right_arc_are_not_odd(rt, views, turn_deg, columns, gain)
     assert answer(rt, replace(scan, projections=scan.projections * contrast))[0] == OK
 
 
-@pytest.mark.parametrize("at", [0, 1, 30, 58, 59])
+@pytest.mark.parametrize("at", [0, 1, 58])
 def test_an_odd_frame_of_such_an_arc_is_named_alone(rt, at) -> None:
     scan = strip_scan(60, 180.0, 192)
     frames = scan.projections.copy()

@@ -130,7 +130,6 @@ def elsewhere(p):
         (black, "frame 7 is unlike all others"), (elsewhere, "frame 9 "),
         (lambda p: p[[*range(6), 5, *range(7, 15)]], "frame 6 is frame 5 recorded twice"),
         (lambda p: p[[0, 1, 2, 10, *range(4, 10), 3, *range(11, 15)]], "frames 3 and 10 (from 0) fit if"),
-        (lambda p: p[sorted(range(15), key=str)], "cause not found"),
         (lambda p: p[np.random.default_rng(3).permutation(15)], "cause not found"),
     ],
 )
@@ -141,7 +140,7 @@ def test_frames_that_do_not_fit_together_are_named(rt, clean, change, said) -> N
     assert said in found.suspicious[-1].text and found.suspicious[-1].advice
 
 
-@pytest.mark.parametrize(("factor", "said"), [(np.pi / 180, "radians"), (0.972, "% larger"), (1.03, "% smaller")])
+@pytest.mark.parametrize(("factor", "said"), [(np.pi / 180, "radians"), (0.972, "% larger")])
 def test_a_step_of_the_angles_that_is_stated_wrong(rt, clean, factor, said) -> None:
     sweeps = clean.trajectory.kinematics
     scaled = replace(sweeps, angle_start_rad=factor * sweeps.angle_start_rad, angle_end_rad=factor * sweeps.angle_end_rad)

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,20 +40,6 @@ def reconstructed(cli, tmp_path):
     return reconstruct
 
 
-@pytest.mark.parametrize("options", ["--method fdk", "--iterations 30 --strips 3 --sub-intervals 2"])
-def test_each_method_writes_a_volume_that_evaluates(cli, scan, reconstructed, capsys, options):
-    output = reconstructed(scan, *options.split())
-    capsys.readouterr()
-    assert cli.run(["evaluate", str(output), "--reference", str(scan), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
-    assert np.isfinite(facts["psnr_db"]) and 0 < facts["ssim"] <= 1
-    assert Path(facts["picture"]).stat().st_size > 1000
-    assert cli.run(["info", str(output)]) == 0
-    told = capsys.readouterr().out
-    assert "voxel size mm" in told and re.search(r"^motion +\w", told, re.M)
-    assert ("iterations asked" in told) == ("--iterations" in options)
-
-
 def test_info_has_no_more_digits_than_anybody_stated(cli, scan, tmp_path, capsys):
     loaded = load_scan(scan)
     geometry = replace(loaded.geometry, pixel_size_mm=(3 * 0.1, 3 * 0.1))
@@ -77,14 +62,6 @@ def test_the_error_on_held_out_pixels_is_said_and_kept(scan, reconstructed, caps
     assert facts_of(volume)["input"]["holdout"] == 3
     reconstructed(scan, "--method", "fdk")
     assert "held-out" not in capsys.readouterr().out
-
-
-def test_seconds_of_the_processor_are_printed(scan, reconstructed, capsys):
-    """Those of the process up to then, whatever else the machine does."""
-    before_s = time.process_time()
-    reconstructed(scan, "--method", "fdk")
-    said = re.search(r"fdk, motion per-row, \S+ s \((\S+) s of processor time\), PSNR", capsys.readouterr().out)
-    assert before_s - 0.05 <= float(said[1]) <= time.process_time() + 0.05  # rounded to a tenth
 
 
 def test_a_method_that_ends_by_itself_says_when_and_why(scan, reconstructed, capsys):

@@ -67,7 +67,7 @@ def estimated(rt, scan):
     return estimate_of
 
 
-@pytest.mark.parametrize(("method", "iterations"), [("r2", 7), ("sart", 1), ("phyradgs", 3000), ("sirt", 400)])
+@pytest.mark.parametrize(("method", "iterations"), [("r2", 7), ("phyradgs", 3000), ("sirt", 400)])
 def test_time_is_that_of_a_run_whose_iterations_are_alike(estimated, clock, method, iterations) -> None:
     found = estimated(method, iterations=iterations)
     assert found.seconds == pytest.approx(2.0 + 0.25 * iterations)

@@ -104,13 +104,3 @@ def test_a_run_does_not_go_on_with_another_grid(cli, refused, scan, tmp_path, mo
     refused([*command, "--size", "7", "--resume"], "a run with other input.size (6, now 7)")
     refused([*command, "--size", "6", "--margin-mm", "0.1", "--resume"], "a run with other input.margin_mm")
     assert cli.run([*command, "--size", "6", "--resume"]) == 0
-
-
-def test_an_estimate_is_of_the_grid_that_is_chosen(cli, scan, capsys) -> None:
-    told = []
-    for size in ("8", "24"):
-        assert cli.run(["estimate", str(scan), *SIRT, "--size", size]) == 0
-        told.append(capsys.readouterr().out)
-    assert told[0] != told[1]
-    assert cli.run(["estimate", str(scan), *SIRT, "--roi", INSIDE, "--margin-mm", "0.2"]) == 0
-    assert "time " in capsys.readouterr().out

@@ -14,12 +14,10 @@ from phyradgs_cl.io import checkpoint_path, read_volume
 from phyradgs_cl.io.output import lock_path
 
 TINY = ["--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4", "--time-samples", "2"]
-# every other method goes on from its state in tests/reconstructors/test_iterative.py
+# every other method goes on from its state in tests/reconstructors (test_iterative, test_changing, test_object_motion)
 RUNS = {
     "phyradgs": ["--method", "phyradgs", "--iterations", "400", "--gaussians", "60", "--set", "control.start_iteration=50"],
     "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "300"],
-    "changing": ["--method", "changing", "--iterations", "60", "--set", "states=3"],
-    "known field": ["--method", "fista", "--iterations", "30", "--set", "subvoxels=1"],
 }
 # STRESS=50 is what `make stress` sets
 KILLS = int(os.environ.get("STRESS", "1"))
@@ -28,14 +26,6 @@ KILLS = int(os.environ.get("STRESS", "1"))
 @pytest.fixture(scope="module")
 def scan(simulated) -> Path:
     return simulated(*TINY, "--noise", "tigre")
-
-
-@pytest.fixture(scope="module")
-def moving_scan(simulated, tmp_path_factory) -> Path:
-    """A scan of an object that breathes, and the true field."""
-    motion = tmp_path_factory.mktemp("motion") / "breathing.toml"
-    motion.write_text('kind = "breathing"\nperiod_s = 2.5\n')
-    return simulated(*TINY, "--motion-of-object", str(motion))
 
 
 def command(scan: Path, output: Path, options: list[str]) -> list[str]:
@@ -65,10 +55,8 @@ def kill_in_the_middle(run: list[str], output: Path, after_s: float) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
-def test_killed_runs_end_with_the_bits_of_one_that_was_not(scan, moving_scan, tmp_path, name) -> None:
+def test_killed_runs_end_with_the_bits_of_one_that_was_not(scan, tmp_path, name) -> None:
     whole, killed, options = tmp_path / "whole.h5", tmp_path / "killed.h5", RUNS[name]
-    if name == "known field":
-        scan, options = moving_scan, [*options, "--object-motion", str(moving_scan)]
     subprocess.run(command(scan, whole, options), check=True, capture_output=True)
     assert list(tmp_path.iterdir()) == [whole]
     rng = np.random.default_rng(len(name))

@@ -37,7 +37,7 @@ def test_from_a_simulated_scan_to_its_quality(cli, parallel, tmp_path, fast_pict
     assert psnr_db[""] > 33.5 and psnr_db[""] > psnr_db["--motion static"] + 1
 
 
-@pytest.mark.parametrize("options", ["--phantom foot", "--phantom shepp-logan --noise beer", "--protocol static"])
+@pytest.mark.parametrize("options", ["--phantom shepp-logan --noise beer", "--protocol static"])
 def test_noise_scanner_and_protocol_are_those_of_cones(cli, tmp_path, options) -> None:
     toml, output = tmp_path / "mine.toml", tmp_path / "scan.h5"
     toml.write_text(

@@ -15,17 +15,11 @@ pytestmark = pytest.mark.slow
 GRID = Grid.cube(4, 2.0)
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "--method phyradgs --iterations 60 --gaussians 60",
-        "--method sirt --iterations 3",
-    ],
-)
-def test_a_run_with_pictures_is_the_same_run(cli, scan, tmp_path, words) -> None:
+def test_a_run_with_pictures_is_the_same_run(cli, scan, tmp_path) -> None:
     picture, seen, plain = tmp_path / "now.png", tmp_path / "seen.h5", tmp_path / "plain.h5"
     for output, more in ((seen, ["--preview", str(picture)]), (plain, [])):
-        assert cli.run(["reconstruct", str(scan), "-o", str(output), *words.split(), *more]) == 0
+        words = ["reconstruct", str(scan), "-o", str(output), "--method", "phyradgs", "--iterations", "60", *more]
+        assert cli.run(words) == 0
     np.testing.assert_array_equal(read_volume(seen).values, read_volume(plain).values)
     assert imread(picture).max() > 0 and not (tmp_path / "now.partial.png").exists()
 

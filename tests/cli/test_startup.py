@@ -24,10 +24,8 @@ sys.exit(status)
 @pytest.mark.parametrize(
     ("words", "status", "never"),
     [
-        ("--help", 0, {"h5py"}),
         ("nonsense", 2, {"h5py"}),
         ("reconstruct --help", 0, set()),
-        ("simulate --size many", 2, set()),
         ("info v.h5", 0, REGISTRY),
         ("export v.h5 --to npy", 0, REGISTRY),
     ],

@@ -14,7 +14,7 @@ from PIL import Image
 
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers import ImportOptions, import_scan, load_volume
+from phyradgs_cl.importers import ImportOptions, import_scan
 from phyradgs_cl.importers.reading.series import flat_places, series_of
 from phyradgs_cl.importers.reading.text import number_at_start, read_angles_rad
 
@@ -296,16 +296,3 @@ def test_packed_tiffs_are_read(tmp_path, way) -> None:
         path = folder / f"p_{i:03d}.tif"
         packed_12_bit(path, image) if way == "12 bits" else Image.fromarray(image).save(path, compression=way)
     np.testing.assert_allclose(np.exp(-import_scan(folder).projections) * 4000, frames[:, ::-1], rtol=1e-5)
-
-
-def test_kinds_that_are_not_read_are_named_with_the_way(tmp_path) -> None:
-    ways = {"a.PNG": "Fiji", "b.edf": "silx", "c.raw": "raw numbers", "d.dcm": "DICOM.*SimpleITK", "e.fits": "astropy"}
-    for name, said in ways.items():
-        (tmp_path / name[0]).mkdir()
-        (tmp_path / name[0] / name).write_bytes(b"\0" * 200)
-        with pytest.raises(InputError, match=said):
-            import_scan(tmp_path / name[0])
-    (tmp_path / "d" / "IM001").write_bytes(b"\0" * 128 + b"DICM")
-    for path in (tmp_path / "d", tmp_path / "d" / "IM001"):
-        with pytest.raises(InputError, match="DICOM"):
-            load_volume(path)

@@ -16,8 +16,7 @@ from phyradgs_cl.acquisition import Shutter
 from phyradgs_cl.commands.import_scan import EXAMPLES, import_command
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers import FORMATS, import_scan
-from phyradgs_cl.importers.options import FIELDS, option_name
+from phyradgs_cl.importers import import_scan
 from phyradgs_cl.io import read_scan
 
 pytestmark = pytest.mark.slow
@@ -71,13 +70,6 @@ def test_timing_and_geometry_by_options(run, imported, tmp_path, make_truth) -> 
     np.testing.assert_allclose(imported().projections, make_truth().scan.projections, atol=1e-5)
 
 
-def test_formats_and_options_are_described() -> None:
-    text = DOCS.read_text(encoding="utf-8")
-    missing = [form for form in FORMATS if f"`{form}`" not in text]
-    missing += [name for name in FIELDS if f"`{option_name(name)}" not in text]
-    assert not missing
-
-
 def test_the_documentation_s_example_runs(tmp_path, make_truth, monkeypatch) -> None:
     text = DOCS.read_text(encoding="utf-8")
     toml = next(block for block in re.findall(r"```toml\n(.*?)```", text, re.S) if "[frames]" in block)
@@ -102,21 +94,6 @@ def test_nothing_that_is_read_is_overwritten(run, tmp_path, make_truth) -> None:
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     for _ in range(2):
         run(folder, out=folder / "scan.h5")
-
-
-def test_what_is_no_scan_is_told_what_it_is_or_lacks(run, tmp_path) -> None:
-    (tmp_path / "images").mkdir()
-    (tmp_path / "images" / "a.tif").write_bytes(b"II*")
-    for path in (tmp_path / "images", tmp_path / "images" / "a.tif"):
-        assert "no TOML" in str(run(path, ok=False).exception)
-    for member in ("/entry/reconstruction", "/volume"):
-        with h5py.File(tmp_path / "volume.h5", "w") as file:
-            file[member] = np.zeros((2, 2, 2), np.float32)
-        done = run(tmp_path / "volume.h5", ok=False)
-        assert isinstance(done.exception, InputError)
-        assert all(
-            w in str(done.exception) for w in ("found a volume", f"volume.h5:{member}", "phyradgs export")
-        )
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="file systems that take any bytes")

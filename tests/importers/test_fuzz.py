@@ -110,7 +110,7 @@ def changed_objects(file: Path, read: Callable[[], object], draw: random.Random)
         opened.visit(addresses.append)
     for address in addresses:
         is_needed = False
-        for change in ("removed", *draw.sample(sorted(CHANGES), min(len(CHANGES), 3 * TIMES))):
+        for change in ("removed", *draw.sample(sorted(CHANGES), min(len(CHANGES), 2 * TIMES))):
             file.write_bytes(content)
             with h5py.File(file, "r+") as opened:
                 is_number = isinstance(opened[address], h5py.Dataset) and opened[address].dtype.kind in "iuf"
@@ -141,7 +141,7 @@ def with_other_values(content: bytes, draw: random.Random, _: int) -> bytes:
 def damaged(file: Path, read: Callable[[], object], draw: random.Random) -> Iterator[tuple[str, bool]]:
     """Damages a file in one way after the other. Yields what was done, and whether a file that is read must be refused."""
     content = file.read_bytes()
-    for _ in range(8 * TIMES):
+    for _ in range(5 * TIMES):
         share = draw.uniform(0.02, 0.98)
         file.write_bytes(content[: int(share * len(content))])
         yield f"cut off after {share:.3f}", share < 0.9 and file.suffix not in TEXTS
@@ -151,7 +151,7 @@ def damaged(file: Path, read: Callable[[], object], draw: random.Random) -> Iter
         return
     ways = [with_other_bytes, *([with_other_values] if file.suffix in TEXTS else [])]
     for way in ways:
-        for _ in range(24 * TIMES):
+        for _ in range(12 * TIMES):
             file.write_bytes(new := way(content, draw, len(content) // 2 if file.suffix in IMAGES else 0))
             yield repr(new[:2000]), False
     file.write_bytes(content)

@@ -181,12 +181,6 @@ def test_the_pixel_at_the_sample_counts(tmp_path, added, side_mm) -> None:
     assert import_scan(path).geometry.pixel_size_mm == pytest.approx((side_mm, side_mm))
 
 
-def test_a_pixel_without_a_number_is_named(tmp_path) -> None:
-    path = nxtomo(tmp_path / "a.nxs", x_pixel_size=np.zeros(0))
-    with pytest.raises(InputError, match=r"x_pixel_size: found shape \(0,\)"):
-        import_scan(path)
-
-
 def test_the_pixel_at_the_sample_grows_with_a_cone_beam(tmp_path) -> None:
     path = nxtomo(tmp_path / "a.nxs")
     with h5py.File(path, "r+") as file:

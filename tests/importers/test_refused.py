@@ -293,14 +293,12 @@ def test_sizes_are_held_against_this_machine_before_anything_is_unpacked(tmp_pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("dtype", "compression"), [(np.float32, None), (np.float32, "zlib"), (np.uint16, None)])
-def test_a_good_stack_takes_twice_its_line_integrals(tmp_path, make_truth, dtype, compression) -> None:
+def test_a_good_stack_takes_twice_its_line_integrals(tmp_path, make_truth) -> None:
     """The frames as stored and their line integrals, one byte per pixel for the mask, and blocks."""
     path = w.write_tiff(tmp_path / "tiff", make_truth(), angles="step_deg = 10")
-    frames = np.random.default_rng(0).integers(1000, 50000, (32, 250, 250)).astype(dtype)
+    frames = np.random.default_rng(0).integers(1000, 50000, (32, 250, 250)).astype(np.float32)
     for name, stack in (("proj", frames), ("flat", frames[:2]), ("dark", frames[:1] * 0)):
-        options = {"compression": compression, "photometric": "minisblack"}
-        tifffile.imwrite(path / f"{name}_all.tif", stack, **options)
+        tifffile.imwrite(path / f"{name}_all.tif", stack, compression="zlib", photometric="minisblack")
         text(TOML, f"{name}_*", f"{name}_all")(path)
     with at_most(2.5 * 4 * frames.size + 8e6):
         import_scan(path)

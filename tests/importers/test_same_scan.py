@@ -30,13 +30,11 @@ SAME = {
     # the first stored line is read first: the left column, or the top row, which is our last
     "phyradgs by columns": ("phyradgs", {}, MOVING | {"direction": 1}, ImportOptions(exposure_s=0.4)),
     "phyradgs by rows": ("phyradgs", {}, MOVING | {"axis": "rows"}, ROWS),
-    **{f"naf in {dtype}": ("naf", {"dtype": np.dtype(dtype)}, {}, ALL) for dtype in ("f8", ">f4", ">f8")},
+    **{f"naf in {dtype}": ("naf", {"dtype": np.dtype(dtype)}, {}, ALL) for dtype in ("f8", ">f4")},
     "naf, protocol 2": ("naf", {"protocol": 2}, {}, ALL),
-    **{
-        f"rtk {name} {flip} {packed}": ("rtk", {"flip": flip, "compressed": packed, "name": name}, {}, None)
-        for name in ("projections.mha", "projections.mhd") for flip in (False, True)
-        for packed in (False, True)
-    },
+    "rtk flipped and packed": ("rtk", {"flip": True, "compressed": True}, {}, None),
+    "rtk packed": ("rtk", {"compressed": True}, {}, None), "rtk": ("rtk", {}, {}, None),
+    "rtk with a header of its own": ("rtk", {"flip": True, "name": "projections.mhd"}, {}, None),
     "rtk, moving": ("rtk", {}, MOVING, FLY),
     "data-exchange, moving": ("data-exchange", {}, MOVING, replace(FLY, **CONE)),
     "nxtomo, moving": ("nxtomo", {}, MOVING, replace(FLY, exposure_s=None, detector_offset_mm=(4.0, -6.0))),

@@ -144,29 +144,6 @@ def test_damage_is_named(good, make_scan) -> None:
 
 
 @pytest.mark.slow
-def test_whole_files_that_are_wrong(tmp_path, good) -> None:
-    content = good.read_bytes()
-    (tmp_path / "text.h5").write_text("not HDF5 at all\n" * 100)
-    (tmp_path / "empty.h5").write_bytes(b"")
-    (tmp_path / "half.h5").write_bytes(content[: len(content) // 2])
-    (tmp_path / "noise.h5").write_bytes(content[:8] + bytes(range(256)) * 20)
-    words = {"missing.h5": "no such file", "": "a folder", "text.h5": "not HDF5", "empty.h5": "HDF5"}
-    words |= {"half.h5": "truncated", "noise.h5": "HDF5"}
-    for name, word in words.items():
-        with pytest.raises(InputError) as caught:
-            read_scan(tmp_path / name, counts_to_attenuation)
-        assert str(tmp_path / name) in str(caught.value) and word in str(caught.value)
-        assert "\n" not in str(caught.value)
-
-
-@pytest.mark.slow
-def test_a_file_that_may_not_be_read(good, monkeypatch) -> None:
-    """The superuser may read any: the system's answer is put in its place."""
-    monkeypatch.setattr(os, "access", lambda path, mode: not (mode & os.R_OK and Path(path) == good))
-    refuses(good, "", "no permission to read it")
-
-
-@pytest.mark.slow
 def test_a_spoilt_chunk_is_named(tmp_path, good) -> None:
     with h5py.File(good, "r+") as file:
         put(file, DATA, file[DATA][...], compression="gzip", fletcher32=True)

@@ -9,7 +9,7 @@ from damage import on, removed, value
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid, States
-from phyradgs_cl.io import file_kind, read_states, read_volume, sha256_of, volume_summary, write_volume
+from phyradgs_cl.io import read_states, read_volume, sha256_of, volume_summary, write_volume
 
 GRID = Grid((2, 3, 4), (1.5, 1.25, 1.0), (0.1, -0.2, 0.3))
 PROVENANCE = {"method": "fdk", "seed": 7, "options": {"filter": "ram-lak", "M": [1, 2]}, "loss": float("inf")}
@@ -93,18 +93,3 @@ def test_damage_is_named(stored) -> None:
             with pytest.raises(InputError) as caught:
                 read(path)
             assert caught.value.subject == f"{path}:/{address}"
-
-
-def test_kinds(tmp_path, stored) -> None:
-    path, _, _ = stored
-    assert file_kind(path) == "volume"
-    with h5py.File(tmp_path / "plain.h5", "w") as file:
-        file["volume"] = np.zeros((2, 2, 2))
-    assert file_kind(tmp_path / "plain.h5") == "plain-volume"
-    with h5py.File(tmp_path / "other.h5", "w") as file:
-        file["temperature"] = 3.0
-    with pytest.raises(InputError, match="members: temperature"):
-        file_kind(tmp_path / "other.h5")
-    (tmp_path / "text.h5").write_text("no")
-    with pytest.raises(InputError):
-        file_kind(tmp_path / "text.h5")

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 import pytest
@@ -60,7 +61,7 @@ class Rays(Operator):
     shape: tuple[int, int] = SHAPE
     factor = 2.0  # of values, where lengths are twice as long
 
-    @property
+    @cached_property
     def made(self) -> RayOperator:
         return RayOperator(self.rt, self.grid, self.shape, self.cells)
 
@@ -81,7 +82,7 @@ class Rays(Operator):
 class Intensities(Rays):
     """The derivative of averaged intensities at a volume."""
 
-    @property
+    @cached_property
     def made(self) -> RayOperator:
         operator = IntensityOperator(self.rt, self.grid, self.shape, self.cells)
         operator.expected(noise(self.grid.shape, 7))
@@ -228,8 +229,9 @@ def make(make_geometry, make_cloud) -> Callable[[str, Runtime], Operator]:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_operator_is_linear_and_has_its_adjoint(any_rt, make, name) -> None:
-    is_adjoint(make(name, any_rt))
-    is_linear(make(name, any_rt))
+    operator = make(name, any_rt)
+    is_adjoint(operator)
+    is_linear(operator)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "intensities"])
@@ -245,8 +247,9 @@ def test_frames_and_time_cells_add_up_and_space_may_move_and_grow(rt, make, name
 @given(scanner=tables(), grid=grids(), seed=seeds)
 def test_rays_of_random_scanners(rt, scanner, grid, seed) -> None:
     shape, cells = scanner
-    is_adjoint(Rays(rt, cells, grid, shape), seed)
-    is_linear(Rays(rt, cells, grid, shape), seed)
+    operator = Rays(rt, cells, grid, shape)
+    is_adjoint(operator, seed)
+    is_linear(operator, seed)
 
 
 @pytest.mark.slow

@@ -86,17 +86,6 @@ def test_the_mean_over_all_subsets_of_times_is_the_loss_of_all_times(field, bund
         assert torch.allclose(gradient, parameter.grad, rtol=1e-8, atol=slack)
 
 
-def test_a_plain_subset_would_be_biased(field, bundle) -> None:
-    integrals = line_integrals(field, *bundle[:2], torch.ones(3, dtype=torch.float64), SAMPLES, bundle[2])
-    integrals = integrals.reshape(RAYS, TIMES).detach()
-    measured = torch.zeros(RAYS, dtype=torch.float64)
-    pairs = combinations(range(TIMES), 2)
-    plain = torch.stack([(integrals[:, list(times)].mean(1) - measured) ** 2 for times in pairs])
-    excess = plain.mean(0) - log_squares(integrals, measured, TIMES)
-    assert torch.allclose(excess, (1 / 2 - 1 / TIMES) * integrals.var(1))
-    assert float(excess.max()) > 1e-6
-
-
 def test_how_many_times_a_step_looks_at_and_how_light_is_averaged(bundle) -> None:
     options = NeuralOptions()
     assert [options.times_for(5, model) for model in ("log", "intensity")] == [5, 5]

@@ -40,19 +40,3 @@ def test_four_turns_are_the_mean_over_all_blocks() -> None:
         shrunk[at] += scipy.fft.idctn(less, norm="ortho")
         count[at] += 1
     np.testing.assert_allclose(mean_of_turns(volume, 0.7), shrunk / count, atol=FLOAT64)
-
-
-def test_what_is_kept_and_what_goes() -> None:
-    """A constant stays; noise below the threshold leaves its block means; a strong wave loses the threshold alone."""
-    rng = np.random.default_rng(0)
-    flat = np.full((8, 8, 8), 3.0)
-    np.testing.assert_allclose(dct_prox(flat, 1.0, 0, nonnegative=True), flat, atol=FLOAT64)
-    noise = 1e-3 * rng.normal(size=(12, 12, 12))
-    smoothed = mean_of_turns(flat[0, 0, 0] + noise, 1.0) - 3
-    assert smoothed[4:8, 4:8, 4:8].std() < noise.std() / 8  # the mean over 64 voxels and their 64 shifts
-    block = np.zeros((4, 4, 4))
-    block[...] = 10 * np.cos(np.pi * (2 * np.arange(4) + 1) / 8)  # one coefficient of the only block
-    norm = np.linalg.norm(block)
-    np.testing.assert_allclose(
-        mean_of_turns(block, 2.0), block * (norm - 2) / norm, atol=FLOAT64
-    )

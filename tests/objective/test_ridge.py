@@ -76,15 +76,6 @@ def test_the_kernels_are_their_twin(any_rt, shape) -> None:
     np.testing.assert_array_equal(any_rt.download(on_device), any_rt.download(descended))
 
 
-def test_a_constant_is_kept_and_adds_nothing(rt) -> None:
-    volume, ridge = noise((9, 8, 21), 2).astype(np.float32), any_ridge()
-    step = RidgeStep(rt, volume.shape, ridge)
-    flat = np.full_like(volume, 3.0)
-    np.testing.assert_allclose(step(flat, SIGMA, 0.3, nonnegative=True), flat, atol=FLOAT32)
-    moved = step(volume + np.float32(2), SIGMA, 0.3, nonnegative=False)
-    np.testing.assert_allclose(moved, step(volume, SIGMA, 0.3, nonnegative=False) + 2, rtol=0, atol=FLOAT32)
-
-
 def test_correlations_are_scipy_s_and_transposes_are_theirs() -> None:
     ridge, channels = any_ridge(), noise((4, 7, 5, 6), 3)
     responses = correlated(channels, ridge.second)

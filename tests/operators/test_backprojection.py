@@ -64,7 +64,10 @@ def test_by_the_first_power_of_the_distance(any_rt, make_geometry: Geometries) -
         assert_same(backproject_lines(any_rt, frames, pose, weight, GRID, axis, power=1), expected, 2)
 
 
-@pytest.mark.parametrize("lanes", [1, 4, 8, 16])
+LANES = [8, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4, 16))]
+
+
+@pytest.mark.parametrize("lanes", LANES)
 def test_panels_rolled_and_tilted_to_either_side(lanes) -> None:
     """Tilted by 6 degrees, a voxel's detector column hardly changes along z; rolled, it passes several columns."""
     shape, grid = (120, 50), Grid((70, 3, 45), (0.03, 0.05, 0.045), (0.0, 0.005, 0.03))
@@ -88,9 +91,8 @@ def test_rows_that_run_downwards_and_tall_detectors(any_rt, make_geometry: Geome
     assert_same(backproject(any_rt, smooth, pose, weight, grid), expected, 5)
 
 
-@pytest.mark.parametrize("lanes", [1, 4, 8, 16])
-@pytest.mark.parametrize("voxel_mm", [0.02, 0.05, 0.09, 0.15])
-@pytest.mark.parametrize("rows", [9, 97])
+@pytest.mark.parametrize("lanes", LANES)
+@pytest.mark.parametrize(("voxel_mm", "rows"), [(0.02, 97), (0.05, 9), (0.05, 97), (0.09, 9), (0.15, 97)])
 def test_columns_of_many_voxels_at_any_pitch(lanes, voxel_mm, rows, make_geometry: Geometries) -> None:
     """Where a vector of voxels meets few rows, and where it meets more than two vectors hold."""
     grid, (frames, weight) = Grid((43, 3, 5), (voxel_mm, 0.2, 0.2)), random_frames((rows, 7))

@@ -39,44 +39,44 @@ def on_device(rt, call, values: np.ndarray) -> np.ndarray:
     [("static", UPRIGHT, "rows"), ("static", UPRIGHT, "columns"),
      ("per line", TALL, "columns"), ("micro-views", TALL, "rows")],
 )
-def test_rays(any_rt, motion, grid, axis) -> None:
-    operator = RayOperator(any_rt, grid, SHAPE, tables(motion, SHAPE, axis, frames=4))
+def test_rays(two_rt, motion, grid, axis) -> None:
+    operator = RayOperator(two_rt, grid, SHAPE, tables(motion, SHAPE, axis, frames=4))
     for part in (operator, operator.subset([2, 0])):
         x, y = noise(grid.shape, 31), noise(part.frames_shape, 32)
-        np.testing.assert_array_equal(on_device(any_rt, part.forward, x), part.forward(x))
-        np.testing.assert_array_equal(on_device(any_rt, part.adjoint, y), part.adjoint(y))
+        np.testing.assert_array_equal(on_device(two_rt, part.forward, x), part.forward(x))
+        np.testing.assert_array_equal(on_device(two_rt, part.adjoint, y), part.adjoint(y))
 
 
 @AXES
-def test_the_intensity_model(any_rt, axis) -> None:
+def test_the_intensity_model(two_rt, axis) -> None:
     cells = tables("per line", SHAPE, axis, frames=3)
-    host, device = (IntensityOperator(any_rt, TALL, SHAPE, cells) for _ in range(2))
+    host, device = (IntensityOperator(two_rt, TALL, SHAPE, cells) for _ in range(2))
     x, d = 4 * noise(TALL.shape, 33), noise(TALL.shape, 34)
     for chosen in ([0, 1, 2], [2, 1]):
         on_host, there = host.subset(chosen), device.subset(chosen)
         y = noise(there.frames_shape, 35)
         for name, values in (("forward", d), ("expected", x), ("forward", d), ("adjoint", y)):
             expected = getattr(on_host, name)(values)
-            found = on_device(any_rt, getattr(there, name), values)
+            found = on_device(two_rt, getattr(there, name), values)
             np.testing.assert_allclose(found, expected, rtol=0, atol=RAYS * np.abs(expected).max(), err_msg=name)
-    swapped = there.forward(d), any_rt.download(on_host.forward(any_rt.upload(d)))  # each has stood at the other's kind
+    swapped = there.forward(d), two_rt.download(on_host.forward(two_rt.upload(d)))  # each has stood at the other's kind
     np.testing.assert_allclose(*swapped, rtol=0, atol=RAYS * swapped[0].max())
 
 
 @AXES
-def test_bricks(any_rt, axis) -> None:
+def test_bricks(two_rt, axis) -> None:
     """Where a volume does not fit beside its copy, device arrays are cut on the device, and come out the same."""
     cells = tables("per line", SHAPE, axis, frames=5)
     x, y = noise(TALL.shape, 36), noise((5, *SHAPE), 37)
-    whole, parts = (RayOperator(any_rt, TALL, SHAPE, cells) for _ in range(2))
+    whole, parts = (RayOperator(two_rt, TALL, SHAPE, cells) for _ in range(2))
     expected, back = whole.forward(x), whole.adjoint(y)
-    volume, frames = any_rt.upload(x), any_rt.upload(y)
-    projected, summed = any_rt.empty(y.shape), any_rt.empty(x.shape)
-    with room_for(any_rt, 250_000):
+    volume, frames = two_rt.upload(x), two_rt.upload(y)
+    projected, summed = two_rt.empty(y.shape), two_rt.empty(x.shape)
+    with room_for(two_rt, 250_000):
         for _ in range(2):
             parts.forward(volume, projected)
-            assert np.abs(any_rt.download(projected) - expected).max() <= BRICKS * expected.max()
-            np.testing.assert_array_equal(any_rt.download(parts.adjoint(frames, summed)), back)
+            assert np.abs(two_rt.download(projected) - expected).max() <= BRICKS * expected.max()
+            np.testing.assert_array_equal(two_rt.download(parts.adjoint(frames, summed)), back)
         assert len(parts.memory.plan()) > 1
 
 
@@ -95,7 +95,7 @@ def test_what_does_not_fit_is_said(rt) -> None:
 
 
 @AXES
-def test_backprojection(any_rt, make_geometry, axis) -> None:
+def test_backprojection(two_rt, make_geometry, axis) -> None:
     """Frames that are on the device give the same bits; only poses and weights go up."""
     grid, pixels, rng = Grid((11, 9, 19), (0.12, 0.2, 0.1)), (13, 18), np.random.default_rng(38)
     geometry, frames = make_geometry(*pixels), rng.uniform(-1, 1, (9, *pixels)).astype(np.float32)
@@ -104,19 +104,19 @@ def test_backprojection(any_rt, make_geometry, axis) -> None:
     poses = geometry.pose(angles.ravel()).reshape(9, lines, 12)
     tilted = poses[:, 0].copy()
     tilted[:, 9:12] += 0.05 * tilted[:, 6:9]
-    views = any_rt.upload(frames)
+    views = two_rt.upload(frames)
     calls = {
-        "lines": lambda y: backproject_lines(any_rt, y, poses, np.ones(9), grid, axis),
-        "upright": lambda y: backproject(any_rt, y, poses[:, 0], np.ones(9), grid),
-        "tilted": lambda y: backproject(any_rt, y, tilted, np.ones(9), grid),
+        "lines": lambda y: backproject_lines(two_rt, y, poses, np.ones(9), grid, axis),
+        "upright": lambda y: backproject(two_rt, y, poses[:, 0], np.ones(9), grid),
+        "tilted": lambda y: backproject(two_rt, y, tilted, np.ones(9), grid),
     }
     for name, call in calls.items():
         expected = call(frames)
         for room in (10**7, 40_000):
-            with room_for(any_rt, room):
-                before = replace(any_rt.traffic)
+            with room_for(two_rt, room):
+                before = replace(two_rt.traffic)
                 volume = call(views)
-                assert any_rt.traffic.bytes_down == before.bytes_down
-                assert any_rt.traffic.bytes_up - before.bytes_up <= 4 * 9 * (12 * lines + 1) * 9
-                np.testing.assert_array_equal(any_rt.download(volume), expected, err_msg=name)
+                assert two_rt.traffic.bytes_down == before.bytes_down
+                assert two_rt.traffic.bytes_up - before.bytes_up <= 4 * 9 * (12 * lines + 1) * 9
+                np.testing.assert_array_equal(two_rt.download(volume), expected, err_msg=name)
                 del volume

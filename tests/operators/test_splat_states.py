@@ -141,6 +141,7 @@ def test_an_object_on_bent_paths_gets_more_segments(rt, make_cloud, make_geometr
     assert count > 2 and several < 0.1 * one
 
 
+@pytest.mark.slow
 def test_results_repeat_bit_for_bit(any_rt, make_cloud, make_geometry) -> None:
     rows, table, h = make_cloud(40, 48), frame_cells("exact", make_geometry(*SHAPE)), random_weights(SHAPE)
     frames = [gradients(any_rt, rows, table, deformation(), h, cutoff_sigma=3.7) for _ in range(2)]

@@ -105,7 +105,7 @@ def test_cutoff_is_the_outline_of_the_path(any_rt, speed) -> None:
     assert (high == 0).any()
 
 
-@pytest.mark.parametrize("speed", [0.01, 0.05, 0.2, 0.8])
+@pytest.mark.parametrize("speed", [0.01, 0.05, 0.2])
 def test_rules_keep_their_bound(rt, speed) -> None:
     table = table_of(fast_geometry(), Shutter(0.8, 0.6), speed, 2)
     orbit = CircularOrbit(fast_geometry(), ConstantSpeed(0.3, speed))
@@ -117,8 +117,7 @@ def test_rules_keep_their_bound(rt, speed) -> None:
             assert_near(frame, moving_frame(row, table, WIDE), TIME_RULE * time_error + SPLAT_MOVING, peak)
 
 
-@MODELS
-@pytest.mark.parametrize("pixels", [1e-3, 1.0, 4.0, 15.0, 50.0])
+@pytest.mark.parametrize(("pixels", "affine"), [(1e-3, False), (4.0, False), (4.0, True), (50.0, False)])
 def test_gradients_from_rest_to_fifty_pixels_a_segment(rt, finite_differences, pixels, affine) -> None:
     """Windows end within the footprints: with a readout as long as that, neighbouring lines differ in what they see."""
     rows = fast_cloud(45, 2)

@@ -54,25 +54,25 @@ def test_a_pixel_is_the_mean_over_a_finer_panel(any_rt, motion, grid, beam, axis
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", ["rows", "columns"])
 @pytest.mark.parametrize("motion", ["static", "common"])
-def test_arrays_of_the_device_and_some_of_the_frames(any_rt, motion, axis) -> None:
-    whole = of(any_rt, motion, axis, UPRIGHT)
+def test_arrays_of_the_device_and_some_of_the_frames(two_rt, motion, axis) -> None:
+    whole = of(two_rt, motion, axis, UPRIGHT)
     part, x = whole.subset([1]), noise(UPRIGHT.shape, 7)
     y = noise(part.frames_shape, 8)
     np.testing.assert_allclose(part.forward(x), whole.forward(x)[[1]], rtol=0, atol=RAYS * whole.forward(x).max())
     for call, values in ((part.forward, x), (part.adjoint, y)):
         host = call(values)
-        there = any_rt.download(call(any_rt.upload(values)))
+        there = two_rt.download(call(two_rt.upload(values)))
         np.testing.assert_allclose(there, host, rtol=0, atol=RAYS * np.abs(host).max())
 
 
 @pytest.mark.slow
-def test_a_volume_in_bricks(any_rt) -> None:
+def test_a_volume_in_bricks(two_rt) -> None:
     grid = Grid((21, 70, 37), (0.09, 0.03, 0.05), (0.05, 0.1, -0.1))
-    whole = of(any_rt, "static", grid=grid, shape=(7, 37))
+    whole = of(two_rt, "static", grid=grid, shape=(7, 37))
     x, y = noise(grid.shape, 9), noise(whole.frames_shape, 10)
     frames, volume = whole.forward(x), whole.adjoint(y)
-    with room_for(any_rt, 320_000):
-        parts = of(any_rt, "static", grid=grid, shape=(7, 37))
+    with room_for(two_rt, 320_000):
+        parts = of(two_rt, "static", grid=grid, shape=(7, 37))
         assert len(parts.memory.plan()) > 1
         assert np.abs(parts.forward(x) - frames).max() <= BRICKS * frames.max()
         assert np.abs(parts.adjoint(y) - volume).max() <= BRICKS * volume.max()

@@ -88,13 +88,13 @@ def test_gradients(any_rt, make_cloud, finite_differences, grid) -> None:
 
 
 @pytest.mark.parametrize("cutoff_sigma", [0.0, DEFAULT_CUTOFF_SIGMA])
-def test_a_group_sums_what_one_item_sums(make_cloud, cutoff_sigma) -> None:
+def test_a_group_sums_what_one_item_sums(banded_rt, make_cloud, cutoff_sigma) -> None:
     """Rows are walked within the cutoff there and from side to side of a box here: thin and tilted Gaussians."""
     rows, grid = make_cloud(40, 49, scale=(0.01, 0.5)), Grid((21, 25, 30), (0.07, 0.06, 0.05))
     h = np.random.default_rng(10).normal(size=grid.shape).astype(np.float32)
     one, group = (
         Voxeliser(rt, grid.shape, cutoff_sigma=cutoff_sigma).voxelise_adjoint(rows, grid, h)
-        for rt in (Runtime(lanes=1), Runtime(lanes=1, pixel_items=True))
+        for rt in (banded_rt, Runtime(lanes=1, pixel_items=True))
     )
     assert_classes(group, one, SERIAL_SUM)
 

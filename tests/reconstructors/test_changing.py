@@ -121,13 +121,8 @@ def test_states_come_back(rt, scan) -> None:
 
 def test_without_a_price_of_change_states_do_not_help_each_other(rt, scan) -> None:
     truth = changing_object()
-    apart, together = (np.mean(psnr_db(run(rt, scan, states=20, time_weight=w), truth)) for w in (0.0, 3.0))
+    apart, together = (np.mean(psnr_db(run(rt, scan, states=20, iterations=15, time_weight=w), truth)) for w in (0.0, 3.0))
     assert together > apart + 3
-
-
-def test_an_enormous_price_of_change_gives_one_volume(rt, scan) -> None:
-    spreads = [np.ptp(run(rt, scan, states=5, time_weight=w).states.volumes, axis=0).max() for w in (3.0, 1000.0)]
-    assert spreads[1] < 0.1 * spreads[0]
 
 
 def test_resumed_runs_have_the_same_bits(rt, scan) -> None:
@@ -141,19 +136,19 @@ def test_resumed_runs_have_the_same_bits(rt, scan) -> None:
 def test_computed_frames_and_held_out_pixels_are_those_of_the_states(rt, scan) -> None:
     shown = []
     hold = Preprocessing(holdout=2.0)
-    plan = replace(plan_run("changing", {"states": 10, "iterations": 20}), preprocessing=hold)
+    plan = replace(plan_run("changing", {"states": 5, "iterations": 20}), preprocessing=hold)
     result = reconstruct(scan, plan, rt, report=lambda p: shown.append(p.frames(2)) if p.iteration == 20 else None)
     assert max(pair.rms for pair in shown[0]) < 0.007  # 0.015 of the mean of the states
     titles = [re.search(r"RMS (.*) %", axes.get_title()) for axes in result.plot(scan, frame=2, device=rt).axes]
     (percent,) = (float(title[1]) for title in titles if title)
     assert percent < 0.7 * 100 * frame_pairs(rt, scan, result.volume, GRID, [2])[0].relative
     assert result.facts["held_out"]["holdout_rms"] < 0.007
-    resting = reconstruct(scan, replace(plan_run("fista", {}), preprocessing=hold), rt)
+    resting = reconstruct(scan, replace(plan_run("fista", {"iterations": 20}), preprocessing=hold), rt)
     assert resting.facts["held_out"]["holdout_rms"] > 0.01
 
 
 def test_subsets_of_fewer_than_half_a_frame_for_each_state_are_joined(rt, scan) -> None:
-    eight, eighty = (run(rt, scan, states=20, iterations=2, subsets=n).states.volumes for n in (8, 80))
+    eight, eighty = (run(rt, scan, states=20, iterations=1, subsets=n).states.volumes for n in (8, 80))
     np.testing.assert_array_equal(eight, eighty)
 
 

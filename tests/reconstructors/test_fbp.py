@@ -31,10 +31,10 @@ def scan_of(
     orbit, start_s = CircularOrbit(geometry, ConstantSpeed(0.3, np.deg2rad(turn_deg) / views)), np.arange(float(views))
     frames = np.empty((views, ROWS, columns), np.float32)
     middles_s = (shutter or Shutter(0.0)).line_windows_s(ROWS).mean(1)
-    for frame, line in np.ndindex(views, ROWS):
-        pose = orbit.pose(frame, start_s[frame] + middles_s[line])
-        pixels = pixel_centres(pose, (ROWS, columns))[line]
-        frames[frame, line] = DISC.line_integrals(pixels - 200 * pose[:3], pixels + 200 * pose[:3])
+    for line, middle_s in enumerate(middles_s):
+        pose = orbit.pose(0, start_s + middle_s)
+        pixels, along_mm = pixel_centres(pose, (ROWS, columns))[:, line], 200 * pose[:, None, :3]
+        frames[:, line] = DISC.line_integrals(pixels - along_mm, pixels + along_mm)
     return Scan(frames, geometry, orbit, shutter or Shutter(0.0), start_s, GRID, shutter is not None)
 
 

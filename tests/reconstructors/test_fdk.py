@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tolerances import FDK_MEAN, FDK_SCALE, FDK_SHEPP_LOGAN, FLOAT32
+from tolerances import FDK_MEAN, FLOAT32
 
 from phyradgs_cl.acquisition import (
     CircularOrbit,
@@ -19,7 +19,7 @@ from phyradgs_cl.acquisition import (
 )
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, shepp_logan
+from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.prepare.step import fill_masked
 from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume, static_fdk
 
@@ -60,22 +60,6 @@ def test_a_sphere_has_its_attenuation_in_1_per_mm(rt) -> None:
         volume = reconstruct(rt, sphere(half_size_mm), half_size_mm, angles) * half_size_mm / 0.8
         assert abs(volume[distance < 0.5].mean() - 1) <= FDK_MEAN, half_size_mm
         assert abs(volume[outside].mean()) <= 2 * FDK_MEAN or angles is uneven
-
-
-def test_shepp_logan_mid_plane(rt) -> None:
-    """The brain's level between the details, on the mid-plane that FDK reconstructs exactly."""
-    volume = reconstruct(rt, shepp_logan(1.0), 1.0, FULL_TURN)
-    _, axis_y, axis_x = Grid.cube(VOXELS, 2.0).axes_mm()
-    y, x = np.meshgrid(axis_y, axis_x, indexing="ij")
-    brain = (np.hypot(x / 0.5, (y + 0.45) / 0.12) < 1) | (np.hypot(x, (y - 0.7) / 0.5) < 0.1)
-    middle = volume[VOXELS // 2 - 1 : VOXELS // 2 + 1, brain].mean()
-    assert abs(middle - 0.2) <= FDK_SHEPP_LOGAN
-
-
-def test_scale_law(rt) -> None:
-    """Lengths × 1000 with attenuation ÷ 1000: the same frames, the volume ÷ 1000."""
-    small, large = (reconstruct(rt, sphere(size), size, FULL_TURN) for size in (1.0, 1000.0))
-    np.testing.assert_allclose(large * 1000, small, rtol=0, atol=FDK_SCALE * np.abs(small).max())
 
 
 def test_scan_and_volume_agree(rt) -> None:

@@ -6,7 +6,7 @@ from tolerances import FLOAT64, RAMP
 
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.reconstructors.fdk import METHOD, WINDOWS, FdkOptions, fdk_volume, ramp_filter, ramp_spectrum
+from phyradgs_cl.reconstructors.fdk import fdk_volume, ramp_filter, ramp_spectrum
 
 FROM_SHARP_TO_SMOOTH = ["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]
 
@@ -51,9 +51,3 @@ def test_noise_falls_from_window_to_window(rt) -> None:
     grid = Grid((2, 24, 24), (0.05, 0.06, 0.06))
     noise = [fdk_volume(rt, frames, pose, grid, window=window).std() for window in FROM_SHARP_TO_SMOOTH]
     assert all(after < 0.97 * before for before, after in zip(noise[:-1], noise[1:], strict=True))
-
-
-def test_windows_are_presets_and_options() -> None:
-    assert list(METHOD.presets) == list(WINDOWS) == FROM_SHARP_TO_SMOOTH
-    assert next(iter(METHOD.presets.values())) == FdkOptions()
-    assert all(options.window == name for name, options in METHOD.presets.items())

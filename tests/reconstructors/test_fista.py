@@ -106,12 +106,11 @@ def test_a_prior_image_helps_where_it_is_right_and_costs_little_where_it_is_wron
 
 
 def test_subsets_that_pull_apart_slowly_are_joined_too(rt) -> None:
-    """Their residual grows by less than a fifth from pass to pass, for ever."""
-    scan = simulate("jaw", device=rt, size=32, detector=48, views=120, exposure_deg=3.0, peak=3.0, noise="tigre")
-    options = method_options("fista", None, {"motion": "per-row", "iterations": 30})
-    result = reconstruct(scan, RunPlan("fista", options), rt)
-    residuals = [line["residual"] for line in result.record]
-    assert residuals[-1] < 1.1 * min(residuals) and quality(scan, result.volume) > 30
+    """Their residual grows by less than a fifth from pass to pass: if none were joined, or those of a jump alone, the last
+    would be more than twice the least."""
+    scan = simulate("jaw", device=rt, size=24, detector=36, views=90, exposure_deg=4.0, peak=3.0, noise="tigre")
+    residuals = [line["residual"] for line in run(rt, scan, "fista", motion="per-row", iterations=20, subsets=22).record]
+    assert residuals[-1] < 1.5 * min(residuals)
 
 
 def test_the_weight_follows_what_comes_back_of_noise_and_edges(rt, scan) -> None:
@@ -194,10 +193,7 @@ def test_a_first_volume_is_where_the_run_starts(rt, scan, method) -> None:
     assert quality(scan, from_truth) > begun + (0.1 if method in ("phyradgs", "r2") else 1)
 
 
-@pytest.mark.parametrize(
-    ("at", "prior"),
-    [(1, "dct"), (5, "dct"), (3, "ridge"), (2, "tv")],
-)
+@pytest.mark.parametrize(("at", "prior"), [(1, "dct"), (5, "ridge"), (2, "tv")])
 def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) -> None:
     options = method_options("fista", None, {"iterations": 7, "subvoxels": 2, "prior": prior})
 

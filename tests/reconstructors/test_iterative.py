@@ -9,13 +9,13 @@ from scipy.optimize import nnls
 from scipy.sparse.linalg import lsqr
 from tolerances import CONVERGED, FLOAT32, ITERATIVE_TWIN, KRYLOV
 
-from phyradgs_cl.acquisition import ConeGeometry, PerRow, Scan
+from phyradgs_cl.acquisition import ConeGeometry, Scan
 from phyradgs_cl.api import simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.metrics import psnr
 from phyradgs_cl.objective import TvDescent, TvProx
 from phyradgs_cl.objective.tv import differences, tv_gradient, tv_prox
-from phyradgs_cl.reconstructors import METHODS, RunPlan, method_options, plan_run, reconstruct
+from phyradgs_cl.reconstructors import RunPlan, method_options, plan_run, reconstruct
 from phyradgs_cl.reconstructors.result import Progress
 from phyradgs_cl.reconstructors.voxels.asd_pocs import AsdPocs, AsdPocsOptions
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
@@ -175,15 +175,6 @@ def test_cgls_stops_at_once() -> None:
     assert not algorithm.volume.any()
 
 
-def test_fista_without_tv_is_non_negative_least_squares(rt) -> None:
-    system, matrix, _ = dense_system(noise=1.0)
-    algorithm, residual = stepped(without_tv(rt, system), 600)
-    expected, rest = nnls(matrix, system.measured.ravel())
-    assert (expected == 0).any(), "the bound must matter"
-    assert residual == pytest.approx(rest, rel=CONVERGED)
-    np.testing.assert_allclose(algorithm.volume.ravel(), expected, rtol=0, atol=0.01)
-
-
 def test_fista_reaches_the_minimum_of_its_objective(rt) -> None:
     system, matrix, _ = dense_system(noise=0.5)
     options = FistaTvOptions(tv_weight=0.003, tv_iterations=20)
@@ -233,11 +224,11 @@ def run(rt, scan: Scan, method: str, **changes: object):
 def test_knowing_the_motion_helps(rt, fly_scan, method) -> None:
     peak = float(fly_scan.reference.max())
     iterations = {"sirt": 30, "os-sart": 30, "fista-tv": 40, "cgls": 6}.get(method, 8)
-    static, *known = (
+    static, known = (
         psnr(run(rt, fly_scan, method, motion=motion, iterations=iterations).volume, fly_scan.reference, peak)
-        for motion in ("static", "micro-views", "per-row")
+        for motion in ("static", "per-row")
     )
-    assert min(known) > static + 0.3, (static, known)
+    assert known > static + 0.3, (static, known)
 
 
 @pytest.mark.parametrize("method", ITERATIVE)
@@ -296,7 +287,7 @@ def test_masked_pixels_do_not_count(rt, fly_scan, masked, method) -> None:
     mask = np.zeros(fly_scan.projections.shape[1:], np.uint8)
     mask[5:9, 11] = 1
     mask[17] = 1
-    one, two = (run(rt, spoilt, method) for spoilt in masked(fly_scan, mask))
+    one, two = (run(rt, spoilt, method, iterations=3) for spoilt in masked(fly_scan, mask))
     np.testing.assert_array_equal(one.volume, two.volume)
 
 
@@ -307,13 +298,7 @@ def test_units_do_not_matter(rt, fly_scan, method) -> None:
     trajectory = replace(fly_scan.trajectory, geometry=geometry)
     larger = replace(fly_scan, geometry=geometry, trajectory=trajectory, grid=fly_scan.grid.scaled(8.0))
     doubled = replace(fly_scan, projections=2 * fly_scan.projections)
-    volume = run(rt, fly_scan, method).volume
+    volume, of_larger, of_doubled = (run(rt, scan, method, iterations=3).volume for scan in (fly_scan, larger, doubled))
     scale = np.abs(volume).max()
-    assert np.abs(8 * run(rt, larger, method).volume - volume).max() <= 1e-3 * scale
-    assert np.abs(run(rt, doubled, method).volume / 2 - volume).max() <= 1e-3 * scale
-
-
-def test_methods_are_registered() -> None:
-    assert set(ITERATIVE) <= set(METHODS)
-    for name in ITERATIVE:
-        assert method_options(name).motion == PerRow()
+    assert np.abs(8 * of_larger - volume).max() <= 1e-3 * scale
+    assert np.abs(of_doubled / 2 - volume).max() <= 1e-3 * scale

@@ -144,9 +144,8 @@ def test_an_unknown_motion_is_found_and_taken_out(rt, scan, result) -> None:
 
 def test_parallel_beams_show_an_unknown_motion_too(rt) -> None:
     scan = breathing_scan(rt, 0.3, is_parallel=True)
-    result = run(rt, scan)
-    assert result.facts[MOTION_FOUND]["moves"] and result.facts[MOTION_FOUND]["period_s"] == pytest.approx(2.3, rel=0.05)
-    assert mean_psnr_db(result, scan) > mean_psnr_db(run(rt, scan, "fista", ITERATIONS - 2), scan) + 2.25
+    found = run(rt, scan).facts[MOTION_FOUND]
+    assert found["moves"] and found["period_s"] == pytest.approx(2.3, rel=0.05) and found["gain"] > 0.2
 
 
 @pytest.mark.parametrize("at", [1, 6])
@@ -172,12 +171,6 @@ def test_an_object_at_rest_stays_at_rest(rt) -> None:
     result, plain = run(rt, still), run(rt, still, "fista", ITERATIONS - 2)
     assert not result.facts[MOTION_FOUND]["moves"] and result.deformation.is_still
     np.testing.assert_array_equal(result.volume, plain.volume)
-
-
-def test_a_gain_that_coefficients_explain_is_said_to_show_no_motion() -> None:
-    few, none = ({"moves": False, "period_s": None, "gain": gain} for gain in (0.32, 0.01))
-    assert "32 % below that at rest, which a field's coefficients can explain" in motion_line(few)
-    assert "coefficients" not in motion_line(none) and motion_line({**few, "moves": True, "rms_mm": 0.1}).endswith("rest")
 
 
 def loaded(path, scan: Scan):

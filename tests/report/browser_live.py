@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
-from report.browser import POOR_CONTRAST, launched, watched
+from report.browser import launched, watched
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors import Progress
@@ -106,11 +106,3 @@ def test_without_scripts_it_reloads_too(browser, file) -> None:
     page.wait_for_timeout(2500)
     assert "10 of 20" in page.locator(".tiles").inner_text() and not page.locator("#pause").is_visible()
     context.close()
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_its_letters_stand_out_from_their_ground(browser, file, scheme) -> None:
-    page = browser.new_page(color_scheme=scheme)
-    page.goto(file.as_uri())
-    assert page.evaluate(POOR_CONTRAST) == []
-    page.close()

@@ -9,14 +9,13 @@ PHYRADGS_CHROMIUM names the browser's program if it is not on the path; PHYRADGS
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
 from report.browser import POOR_CONTRAST, SOFTWARE, launched, watched
 
-from phyradgs_cl.io import read_volume, write_scan, write_volume
+from phyradgs_cl.io import read_volume
 from phyradgs_cl.report import write_report
 
 WIDTHS = (1280, 390)
@@ -44,37 +43,6 @@ def page(request, browser, address) -> Iterator[Page]:
     yield page
     page.close()
     assert not trouble
-
-
-CALIBRATION = {
-    "parameters": [
-        {"name": "offset-u", "unit": "mm", "stated": 0.0, "found": 3.8e-5, "deviation": 0.0022, "verdict": "agrees"},
-        {"name": "exposure", "unit": "s", "stated": 0.86, "found": None, "deviation": None, "verdict": "cannot tell"},
-    ]
-}
-BROKEN_WORDS = """cells => cells.flatMap(cell => {
-  const text = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT).nextNode(), broken = [];
-  for (const word of text.data.matchAll(/\\S+/g)) {
-    const range = document.createRange();
-    range.setStart(text, word.index), range.setEnd(text, word.index + word[0].length);
-    if (new Set([...range.getClientRects()].map(box => box.top)).size > 1) broken.push(word[0]);
-  }
-  return broken;
-})"""
-
-
-@pytest.mark.parametrize("width", WIDTHS)
-def test_no_word_of_the_calibration_is_broken(rt, browser, small_scan, tmp_path, width) -> None:
-    write_scan(tmp_path / "scan.h5", replace(small_scan, provenance={"calibration": CALIBRATION}))
-    write_volume(tmp_path / "volume.h5", small_scan.reference, small_scan.grid, {})
-    write_report(tmp_path / "volume.h5", tmp_path / "page.html", lambda: rt, scan=tmp_path / "scan.h5", views=0)
-    page = browser.new_page(viewport={"width": width, "height": 800})
-    page.goto((tmp_path / "page.html").as_uri())
-    cells = page.locator("#calibration :is(th, td)")
-    assert cells.count() == 12 and "cannot tell" in cells.all_inner_texts()
-    assert cells.evaluate_all(BROKEN_WORDS) == []
-    assert page.evaluate("document.documentElement.scrollWidth") == width
-    page.close()
 
 
 def place(page: Page, plane: str) -> str:
@@ -115,17 +83,6 @@ def test_a_slider_moves_by_keys(page) -> None:
     page.keyboard.press("End")
     assert "12 of 12" in place(page, "axial")
     assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
-
-
-def test_a_slider_moves_by_mouse(page) -> None:
-    slider = page.locator("#slider-coronal")
-    slider.scroll_into_view_if_needed()
-    box = slider.bounding_box()
-    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    page.mouse.down()
-    page.mouse.move(box["x"] + box["width"] - 2, box["y"] + box["height"] / 2, steps=4)
-    page.mouse.up()
-    assert "12 of 12" in place(page, "coronal")
 
 
 def test_a_click_in_a_picture_moves_the_other_two(page) -> None:

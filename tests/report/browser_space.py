@@ -173,19 +173,6 @@ def test_one_finger_turns_and_leaves_the_page_to_scroll(browser, address) -> Non
     context.close()
 
 
-def test_without_webgl_the_page_is_that_of_the_slices(browser, address) -> None:
-    without = launch(browser.browser_type, *WITHOUT_WEBGL)
-    trouble: list[str] = []
-    page = watched(without.new_page(), address, trouble)
-    page.wait_for_timeout(500)
-    assert not page.locator("#volume").is_visible() and not page.locator('a[href="#volume"]').is_visible()
-    page.locator("#slider-axial").focus()
-    page.keyboard.press("Home")
-    assert f" 1 of {EDGE}" in page.locator("#place-axial").inner_text()
-    assert not trouble
-    without.close()
-
-
 @pytest.fixture(scope="module")
 def field() -> Deformation:
     """All matter goes to +x and −z by up to two voxels, and turns a little."""

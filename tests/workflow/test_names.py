@@ -31,7 +31,7 @@ def test_names_beside_a_name_fit_a_file_system() -> None:
     assert shortened("v" * 300, 80) != shortened("v" * 299 + "w", 80)
 
 
-@pytest.mark.parametrize("stem", [BAD, "v" * 240, "v" * 252, "ä" * 126], ids=["bytes", "243", "255", "umlauts"])
+@pytest.mark.parametrize("stem", [BAD, "ä" * 126], ids=["bytes", "255"])
 def test_a_scan_and_a_volume_of_that_name(tiny_scan, tmp_path, cli, stem, capfd) -> None:
     scan, output = tmp_path / f"{stem}.h5", tmp_path / "out" / f"{stem}.h5"
     output.parent.mkdir()

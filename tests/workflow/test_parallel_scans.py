@@ -6,7 +6,6 @@ from parallel_kit import BODIES, laminography_scan, parallel_scan
 
 from phyradgs_cl.acquisition import Shutter
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.estimate import estimate
 from phyradgs_cl.io import write_scan
 from phyradgs_cl.reconstructors import plan_run, reconstruct
 from phyradgs_cl.report import write_report
@@ -38,9 +37,3 @@ def test_laminography_is_reconstructed(rt, method: str) -> None:
 def test_laminography_by_filtered_backprojection_is_refused(rt) -> None:
     with pytest.raises(InputError, match="laminography"):
         reconstruct(laminography_scan(8), plan_run("fbp", {}), rt)
-
-
-@pytest.mark.parametrize("method", ["fbp", "sirt"])
-def test_a_parallel_run_is_estimated(rt, method: str) -> None:
-    guess = estimate(parallel_scan(12), plan_run(method, {}), rt)
-    assert guess.seconds > 0 and guess.device_bytes > 0
