@@ -13,30 +13,31 @@ from phyradgs_cl.api import compare, reconstruct, simulate
 from phyradgs_cl.runtime import Runtime
 
 PHOTONS = 25 * 1e4  # per pixel, over all frames
-GLOBAL = [(25, 14.4), (50, 7.2), (100, 3.6), (200, 1.8), (25, 7.2), (25, 3.6), (25, 1.8), (50, 3.6), (50, 1.8), (100, 1.8)]
-ROLLING = [(frames, arc, ratio) for ratio in (0.86, 4.0) for frames, arc in ((25, 14.4), (50, 7.2), (100, 3.6))]
-SCANS = [(*pair, 0.0) for pair in GLOBAL] + ROLLING
+FULL = [(25, 14.4), (50, 7.2), (100, 3.6)]  # frames and degrees of an exposure that fill a turn
+PULSED = [(25, 7.2), (25, 3.6), (25, 1.8), (50, 3.6), (50, 1.8), (100, 1.8)]
+SCANS = [(*pair, ratio) for ratio in (0.0, 0.86, 4.0) for pair in FULL] + [(*pair, 0.0) for pair in PULSED]
+SCANS += [(200, 1.8, 0.0), (400, 0.9, 0.0)]
 
 
 def main() -> None:
     given = runs_parser(__doc__).parse_args()
     rt = Runtime(given.device)
     there = read_lines(given.results)
-    for name, path in files_of(given.volumes, given.names, 64).items():
-        for seed in given.seeds:
-            for frames, arc_deg, ratio in SCANS:
-                key = {"volume": name, "seed": seed, "frames": frames, "arc_deg": arc_deg, "readout_ratio": ratio}
-                made = [line["motion"] for line in there if key.items() <= line.items()]
-                left = [motion for motion in ("per-row", "static") if motion not in made]
-                if not left:
-                    continue
-                scan = simulate(
-                    path, views=frames, exposure_deg=arc_deg, readout_ratio=ratio, size=64, detector=128, noise="tigre",
-                    dose=PHOTONS / frames, seed=seed, device=rt,
-                )  # fmt: skip
-                for motion in left:
-                    volume = reconstruct(scan, motion=motion, device=rt, report=False).volume
-                    append(given.results, {**key, "motion": motion, "psnr_db": compare(volume, scan.reference)["psnr_db"]})
+    files = files_of(given.volumes, given.names, 64)
+    runs = [(*scan, name, seed) for scan in SCANS for name in files for seed in given.seeds]
+    for frames, arc_deg, ratio, name, seed in runs:
+        key = {"volume": name, "seed": seed, "frames": frames, "arc_deg": arc_deg, "readout_ratio": ratio}
+        made = [line["motion"] for line in there if key.items() <= line.items()]
+        left = [motion for motion in ("per-row", "static") if motion not in made]
+        if not left:
+            continue
+        scan = simulate(
+            files[name], views=frames, exposure_deg=arc_deg, readout_ratio=ratio, size=64, detector=128, noise="tigre",
+            dose=PHOTONS / frames, seed=seed, device=rt,
+        )  # fmt: skip
+        for motion in left:
+            volume = reconstruct(scan, motion=motion, device=rt, report=False).volume
+            append(given.results, {**key, "motion": motion, "psnr_db": compare(volume, scan.reference)["psnr_db"]})
 
 
 if __name__ == "__main__":

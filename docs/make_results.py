@@ -594,6 +594,8 @@ def turning() -> str:
     for one in lines_of("turning.jsonl"):
         scan = cells.setdefault((one["frames"], one["arc_deg"]), {})
         scan.setdefault((one["readout_ratio"], one["motion"]), []).append(one["psnr_db"])
+    whole = max(len(values) for by in cells.values() for values in by.values())
+    cells = {key: kept for key, by in cells.items() if (kept := {k: v for k, v in by.items() if len(v) == whole})}
     columns = [(ratio, motion) for ratio in (0, 0.86, 4) for motion in ("per-row", "static")]
     rows = [
         [str(frames), f"{arc:g}°", *(f"{mean(by[column]):.2f}" if column in by else "" for column in columns)]
@@ -601,7 +603,7 @@ def turning() -> str:
     ]
     gains = [
         stdev(known - ignored for known, ignored in zip(by[ratio, "per-row"], by[ratio, "static"], strict=True))
-        for by in cells.values() for ratio in (0, 0.86, 4) if (ratio, "static") in by
+        for by in cells.values() for ratio in (0, 0.86, 4) if (ratio, "static") in by and (ratio, "per-row") in by
     ]  # fmt: skip
     heads = [f"readout {ratio:g}, {motion}" for ratio in (0, 0.86, 4) for motion in ("known", "ignored")]
     spread_db = f"The gain of knowing the motion deviates by at most {max(gains):.2f} dB between volumes."
