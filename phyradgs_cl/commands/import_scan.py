@@ -71,7 +71,6 @@ def import_command(
     voxel_mm: VoxelMm = None,
     roi_mm: RoiMm = None,
 ) -> None:
-    """Import a scan: TIFF, Nikon, SkyScan, Zeiss, FleX-ray, NXtomo, Data Exchange, RTK, LEAP, TIGRE, NAF, R2-Gaussian."""
     if template:
         say(TEMPLATE)
         return
@@ -96,6 +95,9 @@ def import_command(
         remark(f"no pixel can be used in {len(unusable)} frames (from 0): {', '.join(map(str, unusable[:10]))}")
     facts = [f"{frames} frames of {rows}×{columns}", *_applied_in_words(scan), "fly-scan" if scan.is_fly else "at rest"]
     say(f"{output}: {format_name}, {', '.join(facts)}, {masked} pixels masked\n{scan.provenance[TAKEN]}\n{scan.summary()}")
+
+
+import_command.__doc__ = f"Import a scan: {', '.join(dict.fromkeys(whose for _, whose in FORMATS.values()))}."
 
 
 def _applied_in_words(scan: Scan) -> list[str]:

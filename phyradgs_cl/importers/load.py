@@ -58,24 +58,25 @@ def _is_dicom(path: Path) -> bool:
         return file.read(132)[128:] == b"DICM"
 
 
-# The module of formats/ by the format's name, loaded when it is needed. It has two functions for a file or folder:
-# recognises(path) -> bool and import_scan(path, options) -> Scan. MODULE:END stands for recognises_END, import_scan_END.
+# By the format's name, its module of formats/, loaded when it is needed, and whose scans it has, for the help. The module
+# has two functions for a file or folder: recognises(path) -> bool and import_scan(path, options) -> Scan. MODULE:END stands
+# for recognises_END, import_scan_END.
 FORMATS = {
-    "r2": "r2_gaussian",
-    "phyradgs": "r2_gaussian:with_times",
-    "phyradgs-real": "phyradgs_real",
-    "naf": "pickles",
-    "rtk": "rtk",
-    "data-exchange": "beamlines:exchange",
-    "nxtomo": "beamlines",
-    "tiff": "tiff_folder",
-    "nikon": "nikon",
-    "skyscan": "skyscan",
-    "zeiss": "zeiss",
-    "flexray": "flexray",
-    "rtk-projections": "rtk_projections",
-    "leap": "leap",
-    "tigre": "pickles:tigre",
+    "r2": ("r2_gaussian", "R2-Gaussian"),
+    "phyradgs": ("r2_gaussian:with_times", "PhyRadGS"),
+    "phyradgs-real": ("phyradgs_real", "PhyRadGS"),
+    "naf": ("pickles", "NAF"),
+    "rtk": ("rtk", "RTK"),
+    "data-exchange": ("beamlines:exchange", "Data Exchange"),
+    "nxtomo": ("beamlines", "NXtomo"),
+    "tiff": ("tiff_folder", "TIFF"),
+    "nikon": ("nikon", "Nikon"),
+    "skyscan": ("skyscan", "SkyScan"),
+    "zeiss": ("zeiss", "Zeiss"),
+    "flexray": ("flexray", "FleX-ray"),
+    "rtk-projections": ("rtk_projections", "Elekta, Varian, ORA"),
+    "leap": ("leap", "LEAP"),
+    "tigre": ("pickles:tigre", "TIGRE"),
 }
 _MOST_BODIES = 1000  # most beads and wires of a phantom
 _LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5  # largest size of coordinates in mm, and of attenuations in 1/mm
@@ -127,7 +128,7 @@ def recognise(path: Path) -> str:
 
 
 def _function(name: str, form: str) -> Callable[..., Any]:
-    module, _, end = FORMATS[form].partition(":")
+    module, _, end = FORMATS[form][0].partition(":")
     function: Callable[..., Any] = getattr(import_module(f"{__package__}.formats.{module}"), f"{name}_{end}".rstrip("_"))
     return function
 

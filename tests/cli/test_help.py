@@ -97,7 +97,6 @@ def test_a_default_is_that_of_the_command(told) -> None:
 
 
 def test_the_priors_are_named(told) -> None:
-    """In words of its own: what knows their names takes a moment to load."""
     text = " ".join(told("reconstruct", "-h").split("--prior ")[1].split(" --")[0].split())
     assert text.split("for fista: ")[1].split(";")[0].replace(" or ", ", ").split(", ") == [*PRIORS], text
 
