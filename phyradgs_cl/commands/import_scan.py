@@ -15,8 +15,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.formats.tiff_folder import TEMPLATE
+from phyradgs_cl.importers.frames import TAKEN
 from phyradgs_cl.importers.options import WORDS, option_name
-from phyradgs_cl.importers.reading.frames import TAKEN
 from phyradgs_cl.io import file_kind, only_run, refuse_overwriting, write_scan
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import check_output
@@ -47,7 +47,6 @@ GROUPS = {
 
 
 def _annotated(one: Field[Any]) -> tuple[Any, Any]:
-    """Returns Typer's annotation of a field of ``ImportOptions``, and its default."""
     words = one.metadata["help"], one.metadata["usual"]
     if one.name in _PAIRS:
         return Annotated[Any, _PAIRS[one.name](option_name(one.name), *words)], None

@@ -14,11 +14,10 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.hounsfield import of_note
+from phyradgs_cl.importers import tiff
+from phyradgs_cl.importers.files import SafeFolder, read_json, read_npy
+from phyradgs_cl.importers.images import image_times_s, read_image_volume, read_zarr
 from phyradgs_cl.importers.options import ImportOptions
-from phyradgs_cl.importers.reading import tiff
-from phyradgs_cl.importers.reading.files import SafeFolder, read_json, read_npy
-from phyradgs_cl.importers.reading.images import image_times_s, read_image_volume
-from phyradgs_cl.importers.reading.ome_zarr import read_zarr
 from phyradgs_cl.io.attenuation import VALUES, check_attenuation, in_per_mm
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 from phyradgs_cl.io.volume import Volume, finite_float32, read_volume, shares_of_maximum
@@ -103,7 +102,6 @@ def import_scan(path: str | Path, options: ImportOptions | None = None, form: st
 
 
 def _check_there(path: Path) -> None:
-    """Raises InputError for a path that is neither a file nor a folder."""
     if not (path.is_dir() or path.is_file()):
         found = "something that is neither a file nor a folder" if path.exists() else "nothing there"
         raise InputError(str(path), found, "a scan to import", "check the path")
@@ -197,10 +195,6 @@ def _read_tiff(path: Path) -> Volume:
     return _on_grid(path, values, size_mm[::-1], first_mm, note)
 
 
-def _read_zarr(path: Path) -> Volume:
-    return _on_grid(path, *read_zarr(path))
-
-
 def _on_grid(
     path: Path, values: np.ndarray, size_mm: np.ndarray | None = None, first_mm: np.ndarray | None = None, note: str = ""
 ) -> Volume:
@@ -218,7 +212,8 @@ _READERS: dict[str, tuple[str, Callable[[Path], Volume]]] = {
     **dict.fromkeys((".mha", ".mhd"), ("MetaImage", read_image_volume)),
     **dict.fromkeys((".nii", ".nii.gz"), ("NIfTI", read_image_volume)),
     **dict.fromkeys(tiff.SUFFIXES, ("TIFF", _read_tiff)),
-    **{".nrrd": ("NRRD", read_image_volume), ".npy": ("NumPy", _read_npy), ".zarr": ("OME-Zarr", _read_zarr)},
+    **{".nrrd": ("NRRD", read_image_volume), ".npy": ("NumPy", _read_npy)},
+    ".zarr": ("OME-Zarr", lambda path: _on_grid(path, *read_zarr(path))),
 }
 
 

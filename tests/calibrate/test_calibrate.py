@@ -11,9 +11,8 @@ from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, pertur
 from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
 from phyradgs_cl.calibrate.parameters import in_words
-from phyradgs_cl.calibrate.problem import CoarseProblem
+from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
 from phyradgs_cl.calibrate.search import Reduced, Search
-from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import write_scan
 from phyradgs_cl.removed import REMOVED
