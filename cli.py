@@ -1,7 +1,7 @@
 """The command line, with all commands. Every error gives one line on stderr and the exit status of its kind."""
 
 import importlib
-from collections.abc import Iterator, Mapping
+from collections import UserDict
 from typing import Annotated, Any
 
 import typer
@@ -38,7 +38,7 @@ class Interrupted(Exception):
     """Carries Ctrl-C past Typer, which would end the program without a message."""
 
 
-class Loaded(Mapping[str, Any]):
+class Loaded(UserDict[str, Any]):
     """Typer's commands by name. Each is imported when it is used, since imports take time."""
 
     def __getitem__(self, name: str) -> Any:
@@ -51,19 +51,13 @@ class Loaded(Mapping[str, Any]):
         command.groups = getattr(module, "GROUPS", {}).get(name, {})
         return command
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(COMMANDS)
-
-    def __len__(self) -> int:
-        return len(COMMANDS)
-
 
 class Commands(TyperGroup):
     """The group of all commands."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
-        self.commands = Loaded()  # type: ignore[assignment]
+        self.commands = Loaded(COMMANDS)
 
     def list_commands(self, ctx: Any) -> list[str]:
         return list(COMMANDS)

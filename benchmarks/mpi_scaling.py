@@ -101,12 +101,12 @@ class Clock:
     def step(self, run: SplatRun) -> list[float]:
         """Takes one step. Returns its parts in seconds, in the order of PARTS."""
         self.summing = self.sending = self.waiting = self.idle = 0.0
-        self.rt.kernel_seconds()
+        self.rt.kernel_uses()
         begun, own, whole = time.perf_counter(), self.own(), time.process_time()
         run.step()
         self.rt.finish()
         step, own, whole = time.perf_counter() - begun, self.own() - own, time.process_time() - whole
-        kernels = whole - own if self.is_cpu else sum(self.rt.kernel_seconds().values())
+        kernels = whole - own if self.is_cpu else sum(use.seconds for use in self.rt.kernel_uses().values())
         host = own - self.summing - self.waiting - (0.0 if self.is_cpu else kernels)
         return [step, kernels, host, self.summing, self.sending, self.idle]
 

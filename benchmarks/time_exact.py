@@ -124,10 +124,10 @@ class Bench:
 
     def _seconds(self, call: Callable[[], None]) -> float:
         """Returns processor time on CPUs, kernel time on GPUs."""
-        self.rt.kernel_seconds()
+        self.rt.kernel_uses()
         started = time.process_time()
         call()
-        kernels = sum(self.rt.kernel_seconds().values())
+        kernels = sum(use.seconds for use in self.rt.kernel_uses().values())
         return kernels if self.rt.pixel_items else time.process_time() - started
 
     def facts(self) -> dict[str, object]:

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from typing import Any, NoReturn
 
 import numpy as np
@@ -157,12 +157,12 @@ class Mpi(Communicator):
         raise SystemExit(status)
 
 
-@lru_cache(maxsize=1)
-def launched_ranks(launch: Launch | None = None) -> Communicator:
+@cache
+def launched_ranks() -> Communicator:
     """Returns the ranks that this process was launched with, or a single process.
 
     Raises InputError where mpi4py is missing, or belongs to another MPI than the launcher."""
-    start = launched() if launch is None else launch
+    start = launched()
     if start.size == 1:
         return Communicator()
     try:

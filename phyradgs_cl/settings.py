@@ -93,7 +93,7 @@ def read_settings(
 ) -> Settings:
     """Reads a configuration file. ``assignments`` NAME=VALUE replace its values, and options ``given``, if not None, replace
     both. Raises InputError for a wrong file, assignment, device or memory."""
-    values = read_config(config)
+    values: dict[str, Any] = {} if config is None else read_toml(config, f"--config {config}")
     origins = {key: f"config {config}: {key}" for key in values}
     for text in assignments:
         merge(values, assignment(text))
@@ -135,11 +135,6 @@ def _origin_of(subject: str, origins: Mapping[str, str]) -> str | None:
     first, *rest = [part for word in words for part in word.lstrip("-").split(".")] or [""]
     origin = origins.get(first.replace("-", "_"))
     return origin if origin is None or origin.startswith("--") else ".".join([origin, *rest])
-
-
-def read_config(path: Path | None) -> dict[str, Any]:
-    """Returns the content of a TOML file; {} for None. Raises InputError for a file that is missing or not TOML."""
-    return {} if path is None else read_toml(path, f"--config {path}")
 
 
 def assignment(text: str) -> dict[str, Any]:

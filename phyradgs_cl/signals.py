@@ -71,17 +71,29 @@ def answer_signals(*, takes_default: bool = True) -> Iterator[StopFlag]:
 
 
 @contextmanager
-def stop_on_interrupt() -> Iterator[StopFlag]:
-    """Makes the first signal in the body, a loop of iterations, only set ``is_set`` of the flag that it yields."""
-    with _waiting() as flag:
-        yield flag
+def stop_on_interrupt(waits: bool = True) -> Iterator[StopFlag]:
+    """Makes the first signal in the body, as a loop of iterations, wait: it only sets ``is_set`` of the flag that is
+    yielded. With ``waits`` False it waits only where it waits around the body.
+
+    A device that fails after a signal has only lost its compiler, which got the signal too: this raises
+    KeyboardInterrupt."""
+    with answer_signals(takes_default=False) as flag:
+        before, flag.waits = flag.waits, flag.waits or waits
+        try:
+            yield flag
+        except DeviceError as error:
+            if not flag.is_set:
+                raise
+            raise KeyboardInterrupt from error
+        finally:
+            flag.waits = before or (flag.keeps and flag.waits)  # after a loop the block around it still keeps its result
 
 
 @contextmanager
 def keep_finished_work() -> Iterator[None]:
     """Makes signals wait from the first loop in the body to the end of the body, so that the loop's result is written.
     Then raises InterruptedAfterwards if a signal has waited."""
-    with _waiting(waits=False) as flag:
+    with stop_on_interrupt(waits=False) as flag:
         keeps, flag.keeps = flag.keeps, True
         try:
             yield
@@ -93,7 +105,7 @@ def keep_finished_work() -> Iterator[None]:
 @contextmanager
 def finish_despite_interrupt() -> Iterator[None]:
     """Makes a signal wait during short work such as writing. Then raises InterruptedAfterwards if one has waited."""
-    with _waiting() as flag:
+    with stop_on_interrupt() as flag:
         yield
     flag.farewell = COMPLETE
     _raise_what_waited(flag)
@@ -109,24 +121,6 @@ def farewell() -> str:
     """Returns the message of the command line for a command that a signal has ended."""
     flag = _installed()
     return NOTHING if flag is None else flag.farewell
-
-
-@contextmanager
-def _waiting(waits: bool = True) -> Iterator[StopFlag]:
-    """Makes the first signal wait in the body; with ``waits`` False only where it waits around the body.
-
-    A device that fails after a signal has only lost its compiler, which got the signal too: this raises
-    KeyboardInterrupt."""
-    with answer_signals(takes_default=False) as flag:
-        before, flag.waits = flag.waits, flag.waits or waits
-        try:
-            yield flag
-        except DeviceError as error:
-            if not flag.is_set:
-                raise
-            raise KeyboardInterrupt from error
-        finally:
-            flag.waits = before or (flag.keeps and flag.waits)  # after a loop the block around it still keeps its result
 
 
 def _installed() -> StopFlag | None:

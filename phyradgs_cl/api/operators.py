@@ -34,15 +34,6 @@ def _runtime_by_name(name: str | None) -> Runtime:
     return Runtime(name)
 
 
-def to_operator_array(rt: Runtime, name: str, values: Any, shape: Sequence[int | None]) -> Values:
-    """Returns a user's array as float32 in C order, on the host or the device where it is; copied only if it must be.
-
-    Raises InputError about ``name`` for anything but an array of numbers, and for another shape."""
-    array = adopted(name, values, rt.queue) if is_cl_array(values) else on_host(name, values)
-    checks.shape(name, array, shape)  # type: ignore[arg-type]
-    return array
-
-
 def to_user_array(rt: Runtime, values: Values) -> Any:
     """Returns a result in the caller's kind of array: NumPy's, or pyopencl's on the device."""
     return lent(values, rt.queue) if isinstance(values, DeviceArray) else values
@@ -190,7 +181,10 @@ class Operator:
         return self._at(self._to_array(self._domain, x))
 
     def _to_array(self, side: tuple[str, Shape], values: Any) -> Values:
-        return to_operator_array(self.rt, side[0], values, side[1])
+        """Returns an x or a y as float32 in C order, on the host or the device where it is; copied only if it must be."""
+        array = adopted(side[0], values, self.queue) if is_cl_array(values) else on_host(side[0], values)
+        checks.shape(side[0], array, side[1])  # type: ignore[arg-type]
+        return array
 
 
 @dataclass(frozen=True)

@@ -253,8 +253,6 @@ def reconstruct(
 
 
 def _first_volume(initial: object, grid: Grid) -> InitialVolume:
-    """Returns the volume ``initial`` with its grid. Raises InputError for anything else, and for an array that does not fit
-    ``grid``."""
     if isinstance(initial, Reconstruction):
         return InitialVolume(initial.volume, initial.grid)
     if not isinstance(initial, np.ndarray):

@@ -18,8 +18,8 @@ from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.detector.attenuation import QUANTITIES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.importers.frames import LineIntegrals, line_integrals
 from phyradgs_cl.importers.options import ImportOptions
-from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals
 from phyradgs_cl.removed import refuse_removed
 
 log = logging.getLogger(__name__)

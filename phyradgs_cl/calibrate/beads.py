@@ -18,8 +18,7 @@ from phyradgs_cl.acquisition.altered.angles import exposure_arc_rad
 from phyradgs_cl.acquisition.altered.coarse import MOST_FRAMES, binned, fewer_frames
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.calibrate.problem import CoarseFrames, measured_blocks, without_pixels
-from phyradgs_cl.calibrate.stages import Stage
+from phyradgs_cl.calibrate.problem import CoarseFrames, Stage, measured_blocks, without_pixels
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.phantoms import EllipsoidPhantom
 

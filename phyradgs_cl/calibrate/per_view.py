@@ -14,9 +14,8 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, scan_course, splines
-from phyradgs_cl.calibrate.problem import CoarseProblem
+from phyradgs_cl.calibrate.problem import CoarseProblem, PassCounter, Passes, Stage, pass_cost
 from phyradgs_cl.calibrate.result import AGREES, CORRECTED, ParameterEstimate
-from phyradgs_cl.calibrate.stages import PassCounter, Passes, Stage, pass_cost
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.operators.rays.operator import RayOperator
 from phyradgs_cl.reconstructors.fits.residuals import AugmentedOperator, ViewParameters

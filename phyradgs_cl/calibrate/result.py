@@ -8,6 +8,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.perturbed import Sway, Views
 from phyradgs_cl.drawing import draw_image, new_figure
+from phyradgs_cl.text import to_digits_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,6 +33,13 @@ class ParameterEstimate:
     deviation: float | None
     share: float
     verdict: str
+
+    @property
+    def words(self) -> str:
+        """The value found, with two digits of its standard deviation; "-" without one."""
+        if self.found is None or self.deviation is None:
+            return "-"
+        return " ± ".join(to_digits_of(number, self.deviation) for number in (self.found, self.deviation))
 
     def facts(self) -> dict[str, object]:
         """Returns the fields as plain values, for JSON."""

@@ -37,10 +37,9 @@ from phyradgs_cl.calibrate.per_view import (
     passes_of_views,
 )
 from phyradgs_cl.calibrate.placing import WRONG_PHANTOM, bead_centres_mm, placements
-from phyradgs_cl.calibrate.problem import CoarseProblem
+from phyradgs_cl.calibrate.problem import CoarseProblem, PassCounter, Passes, Report, Stage, pass_cost
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, Calibration, ParameterEstimate, rms
 from phyradgs_cl.calibrate.search import Fallback, Problem, Search
-from phyradgs_cl.calibrate.stages import PassCounter, Passes, Report, Stage, pass_cost
 from phyradgs_cl.check import SUSPICIOUS
 from phyradgs_cl.check.coverage import CUT_OFF, check_coverage
 from phyradgs_cl.check.hypotheses import has_axis_near_edge
@@ -51,7 +50,6 @@ from phyradgs_cl.phantoms import EllipsoidPhantom
 from phyradgs_cl.reconstructors.fits.axis import axis_shift, columns_per_block
 from phyradgs_cl.reconstructors.fits.residuals import residual_ratio, t_statistic
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.text import to_digits_of
 
 log = logging.getLogger(__name__)
 STAGES = (
@@ -188,7 +186,8 @@ class _Calibrator:
         for number, stage in enumerate(self.stages):
             self.passes.begin(f"stage {number}", f"at most {stage.columns} columns")
             self.search.descend(self._problem(steady, stage), stage)
-            estimates = ", ".join(_in_short(one) for one in self.search.table(self.scan, {}))
+            units = [(one, "" if one.found is None else f" {one.unit}") for one in self.search.table(self.scan, {})]
+            estimates = ", ".join(f"{one.name} {one.words}{unit}" for one, unit in units)
             self.note(f"so far, {stage.columns} columns: {estimates}")
             if not self.search.determined:
                 return
@@ -214,7 +213,6 @@ class _Calibrator:
         return self.views_estimates[correction]
 
     def _problem(self, scans: Sequence[Scan], stage: Stage, most_frames: int = MOST_FRAMES) -> Problem:
-        """Returns the frames on the grid of ``stage``, with their passes counted."""
         problem: Problem
         if self.phantom is None:
             problem = CoarseProblem.of(self.rt, scans, stage, most_frames)
@@ -296,15 +294,7 @@ class _Calibrator:
         return count, count * pass_cost(self.ready, stage.columns, most_frames)
 
 
-def _in_short(one: ParameterEstimate) -> str:
-    if one.found is None or one.deviation is None:
-        return f"{one.name} -"
-    value, deviation = (to_digits_of(number, one.deviation) for number in (one.found, one.deviation))
-    return f"{one.name} {value} ± {deviation} {one.unit}"
-
-
 def _with_provenance(corrected: Scan, scan: Scan, calibration: Calibration) -> Scan:
-    """Returns the corrected scan with this calibration in its provenance, behind earlier calibrations."""
     provenance = dict(scan.provenance)
     if (former := provenance.get("calibration")) is not None:
         earlier = provenance.get("calibrated_before", [])
@@ -314,7 +304,6 @@ def _with_provenance(corrected: Scan, scan: Scan, calibration: Calibration) -> S
 
 
 def _check(scans: Sequence[Scan], request: Request, phantom: EllipsoidPhantom | None, splines: int) -> None:
-    """Raises InputError for options that exclude each other, a scan too small, and others that do not fit the first scan."""
     first, per_view = scans[0], request.per_view
     if splines and per_view != WOBBLE:
         raise InputError("--splines", str(splines), f"with --what {WOBBLE}", f"leave it out, or ask for {WOBBLE}")
@@ -341,7 +330,6 @@ def _check(scans: Sequence[Scan], request: Request, phantom: EllipsoidPhantom | 
 
 
 def _warn(scans: Sequence[Scan], phantom: EllipsoidPhantom | None) -> None:
-    """Warns of an unknown object wider than the panel, and of further scans with the turn and timing of the first."""
     first, *others = scans
     if phantom is None and check_coverage(first).unit == CUT_OFF:
         log.warning(

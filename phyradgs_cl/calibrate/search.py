@@ -22,9 +22,8 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.calibrate.beads import BeadProblem
 from phyradgs_cl.calibrate.parameters import GAUGES, PARAMETERS, Parameter, correction_of, in_words
 from phyradgs_cl.calibrate.per_view import DISCRETISATION
-from phyradgs_cl.calibrate.problem import CoarseProblem
+from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, ParameterEstimate
-from phyradgs_cl.calibrate.stages import Stage
 
 # A parameter is determined only if object and other parameters leave at least this fraction of its signal unexplained.
 LEAST_SHARE = 0.2

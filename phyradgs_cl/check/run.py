@@ -20,6 +20,7 @@ from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding, same
 from phyradgs_cl.check.hypotheses import has_axis_near_edge
 from phyradgs_cl.detector import without_lag
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.io.scan.reader import united
 from phyradgs_cl.runtime import Runtime
 
 _SPARE_COLUMNS = 2.0  # error of a stated detector offset, in coarse columns, for which the grid has room
@@ -97,7 +98,7 @@ def check(
     if finding.verdict == SUSPICIOUS and saturation.verdict != OK:  # a saturated pixel is as constant as a dead one
         finding = replace(finding, verdict=CANNOT_TELL, text=f"rests on saturation: {saturation.verdict}", advice="")
     answers.add(finding)
-    scan = _with_masked(scan, dead)
+    scan = replace(scan, pixel_mask=united(scan.pixel_mask, dead))
     covered = answers.add(coverage.check_coverage(scan))
     if covered.unit in (coverage.NO_OBJECT, coverage.OPAQUE, coverage.TOO_BRIGHT):
         return answers.stop()
@@ -152,10 +153,3 @@ def _finite(scan: Scan) -> Scan:
         return scan
     checks.finite("projections", p[scan.valid])
     return replace(scan, projections=np.where(is_finite, p, 0).astype(np.float32))
-
-
-def _with_masked(scan: Scan, dead: np.ndarray) -> Scan:
-    if not dead.any():
-        return scan
-    mask = dead if scan.pixel_mask is None else (np.asarray(scan.pixel_mask) != 0) | dead
-    return replace(scan, pixel_mask=mask)

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan as Loaded
-from phyradgs_cl.calibrate import Calibration, ParameterEstimate, calibrate
+from phyradgs_cl.calibrate import Calibration, calibrate
 from phyradgs_cl.calibrate.parameters import NAMES, WOBBLE
 from phyradgs_cl.commands.console import AsJson, file_option, option, say
 from phyradgs_cl.commands.options import Device, Scan
@@ -19,7 +19,6 @@ from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
 from phyradgs_cl.signals import finish_despite_interrupt
-from phyradgs_cl.text import to_digits_of
 from phyradgs_cl.workflow.files import check_output, check_picture, load_scan
 
 EXAMPLES = {"calibrate": "Example: phyradgs calibrate scan.h5 -o calibrated.h5"}
@@ -96,20 +95,12 @@ def _check_storable(scan: Loaded, names: list[str]) -> None:
 
 
 def _as_text(result: Calibration) -> str:
-    """Returns a line per parameter, the combinations that no frame distinguishes, and the residuals."""
     lines = [f"{'parameter':18s} {'stated':>12s} {'found':>25s}      verdict"]
     for one in result.parameters:
-        lines.append(f"{one.name:18s} {one.stated:12.6g} {_value(one):>25s} {one.unit:4s} {one.verdict}")
+        lines.append(f"{one.name:18s} {one.stated:12.6g} {one.words:>25s} {one.unit:4s} {one.verdict}")
     lines += [f"not determined: {words}" for words in result.alike]
     if result.alike:
         lines.append(_UNDETERMINED)
     before, after = result.residual_rms
     lines.append(f"residual of the frames: {before:.4g} before, {after:.4g} after (RMS of line integrals)")
     return "\n".join(lines)
-
-
-def _value(one: ParameterEstimate) -> str:
-    """Returns the estimate with two digits of its standard deviation; "-" without an estimate."""
-    if one.found is None or one.deviation is None:
-        return "-"
-    return f"{to_digits_of(one.found, one.deviation)} ± {to_digits_of(one.deviation, one.deviation)}"

@@ -71,7 +71,6 @@ def _write_copy(scan: Path, target: Path, result: CheckResult, quiet: bool) -> N
 
 
 def _as_text(result: CheckResult, blur: str) -> str:
-    """Returns a line per question with its advice below, the line ``blur``, if not empty, and the totals."""
     lines: list[str] = []
     for finding in result.findings:
         lines.append(f"{finding.verdict:12s} {finding.question:19s} {finding.text}")

@@ -10,6 +10,7 @@ from phyradgs_cl.exporters import (
     CLOUDS,
     EXPORTS,
     OWN,
+    VOXELS,
     DicomLabels,
     export_states,
     export_volume,
@@ -40,7 +41,7 @@ _DURING = "Time that the states cover, s."
 _PEAK, _BOX = "the volume's own peak", "Z0,Z1,Y0,Y1,X0,X1"
 _LONGEST = 2000  # most characters of a value that are printed
 _OUTPUT = "File to write, or for dicom and zarr a new folder; nii.gz is compressed."
-_TO = "nii, mha, nrrd, tiff, npy, zarr and dicom (folders): the voxels; ply, npz: the Gaussians."
+_TO = f"{', '.join(VOXELS)}, zarr and dicom (folders): the voxels; {', '.join(CLOUDS)}: the Gaussians."
 _WATER = "Attenuation of water in 1/mm; the values are then Hounsfield units, with air at 0."
 _HU = "Hounsfield units by the volume's own scale, else fitted to air and water. An output .h5 keeps 1/mm and the scale."
 _AIR = "Box of air, for Hounsfield units."

@@ -15,8 +15,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.formats.tiff_folder import TEMPLATE
+from phyradgs_cl.importers.frames import TAKEN
 from phyradgs_cl.importers.options import WORDS, option_name
-from phyradgs_cl.importers.reading.frames import TAKEN
 from phyradgs_cl.io import file_kind, only_run, refuse_overwriting, write_scan
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import check_output
@@ -47,7 +47,6 @@ GROUPS = {
 
 
 def _annotated(one: Field[Any]) -> tuple[Any, Any]:
-    """Returns Typer's annotation of a field of ``ImportOptions``, and its default."""
     words = one.metadata["help"], one.metadata["usual"]
     if one.name in _PAIRS:
         return Annotated[Any, _PAIRS[one.name](option_name(one.name), *words)], None
@@ -71,7 +70,6 @@ def import_command(
     voxel_mm: VoxelMm = None,
     roi_mm: RoiMm = None,
 ) -> None:
-    """Import a scan: TIFF, Nikon, SkyScan, Zeiss, FleX-ray, NXtomo, Data Exchange, RTK, LEAP, TIGRE, NAF, R2-Gaussian."""
     if template:
         say(TEMPLATE)
         return
@@ -96,6 +94,9 @@ def import_command(
         remark(f"no pixel can be used in {len(unusable)} frames (from 0): {', '.join(map(str, unusable[:10]))}")
     facts = [f"{frames} frames of {rows}×{columns}", *_applied_in_words(scan), "fly-scan" if scan.is_fly else "at rest"]
     say(f"{output}: {format_name}, {', '.join(facts)}, {masked} pixels masked\n{scan.provenance[TAKEN]}\n{scan.summary()}")
+
+
+import_command.__doc__ = f"Import a scan: {', '.join(dict.fromkeys(whose for _, whose in FORMATS.values()))}."
 
 
 def _applied_in_words(scan: Scan) -> list[str]:

@@ -12,6 +12,7 @@ from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.commands.console import file_argument, file_option, numbers, option, pair_of
 from phyradgs_cl.prepare import DEFAULT_STEPS, STEPS
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS
+from phyradgs_cl.reconstructors.voxels.priors import PRIORS
 from phyradgs_cl.removed import REMOVED
 from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
 from phyradgs_cl.settings import Settings, read_settings
@@ -83,7 +84,7 @@ _MOTION = (
     "line (per-row), or, for splats, integrals over time (exact), or M×N that move only centres (centres)."
 )
 _MOTIONS = tuple(name for name in MOTIONS if f"--motion {name}" not in REMOVED)
-_PRIOR = "Prior, for fista: ridge, dct, tv, piccs or none; MODULE:NAME: a denoiser of your own."
+_PRIOR = f"Prior, for fista: {' or '.join(', '.join(PRIORS).rsplit(', ', 1))}; MODULE:NAME: a denoiser of your own."
 _PRESET = "Constants: default, quick, paper (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
 _CONFIG = "TOML file of options, with underscores for dashes (docs: formats.md); the command line wins."
 _SET = "An option of the method by name: --set tv_weight=0.002 (docs: methods.md)."

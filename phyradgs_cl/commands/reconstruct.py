@@ -24,12 +24,12 @@ from phyradgs_cl.estimate import duration, estimate, seconds_around
 from phyradgs_cl.io import partial_path, refuse_overwriting
 from phyradgs_cl.parallel import failing_together, launched_ranks
 from phyradgs_cl.progress import Ticker
-from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, Report, RunPlan
+from phyradgs_cl.reconstructors import ProgressReport, Reconstruction, Report
 from phyradgs_cl.reconstructors.moving import motion_line
 from phyradgs_cl.reconstructors.result import COMPARED, DOUBT, MOTION_FOUND, option_facts
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime import Runtime, profile_text
 from phyradgs_cl.settings import Settings
-from phyradgs_cl.workflow import load_scan, profile_report, run_reconstruction
+from phyradgs_cl.workflow import load_scan, run_reconstruction
 from phyradgs_cl.workflow.files import check_picture
 from phyradgs_cl.workflow.slabs import Slabs, rows_of
 
@@ -84,7 +84,9 @@ def reconstruct_command(
         if live is not None:
             check_picture("--live", live, *files, suffixes=(".html", ".htm"))
             if ranks.rank == 0:
-                page = stack.enter_context(report.LivePage(live, output.name, _settings_of(plan, scan)))
+                shown = {"scan": str(scan), "method": plan.method_name, "seed": plan.seed}
+                shown |= {"input": plan.preprocessing.facts(), "options": option_facts(plan.options)}
+                page = stack.enter_context(report.LivePage(live, output.name, shown))
                 listeners.append(page)
         stage(f"reading {scan}")
         picture = None
@@ -122,18 +124,12 @@ def reconstruct_command(
         mean = f"mean σ of the object {of_bars['mean_per_mm']:.3g} 1/mm"
         say(f"error bars: {mean}, the 95 % bar is {of_bars['multiple_95']:.3g} σ")
     if profile:
-        say(profile_report(runtimes[-1], result))
+        say(profile_text(runtimes[-1].kernel_uses(), float(result.facts["seconds"])))
     if result.state is not None:
         at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
         run = f" of run {result.facts[DOUBT]['interrupted_in_run']}" if DOUBT in result.facts else ""
         complain(f"interrupted at iteration {at} of {asked}{run}: repeat the command with --resume to continue")
         raise typer.Exit(signals.exit_status())
-
-
-def _settings_of(plan: RunPlan, scan: Path) -> dict[str, object]:
-    """Returns the settings that a live page shows."""
-    about = {"scan": str(scan), "method": plan.method_name, "seed": plan.seed, "input": plan.preprocessing.facts()}
-    return {**about, "options": option_facts(plan.options)}
 
 
 def _finish(page: "report.LivePage", result: Reconstruction, scan: Path, output: Path, rt: Runtime) -> None:

@@ -14,7 +14,7 @@ from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
 from phyradgs_cl.simulation import OPTION_NAMES, scanner_for, scanner_options
-from phyradgs_cl.workflow import SimulationJob, refuse_jitter, refuse_noise_options, run_simulation
+from phyradgs_cl.workflow import refuse_jitter, refuse_noise_options, run_simulation
 
 EXAMPLES = {"simulate": "Example: phyradgs simulate --phantom foot --size 64 --detector 128 --noise tigre -o scan.h5"}
 GROUPS = {
@@ -93,8 +93,11 @@ def simulate_command(
     wish = device_wish(device)
     described = scanner_for(scanner, detector, detector_offset, truncation)
     options = scanner_options(described, protocol, **given)
-    job = SimulationJob(output, phantom, volume, scanner, size, pixel_samples, motion_of_object)
+    inputs = [Path(one) for one in (scanner if scanner.endswith(".toml") else None, motion_of_object) if one is not None]
     with Ticker("frame") as ticker:
-        scan = run_simulation(job, described, options, Runtime(wish, memory=memory), ticker.show)
+        scan = run_simulation(
+            output, described, options, Runtime(wish, memory=memory), ticker.show, phantom=phantom, volume=volume,
+            size=size, pixel_samples=pixel_samples, inputs=inputs,
+        )
     frames, rows, columns = scan.projections.shape
     say(f"{output}: {frames} frames of {rows}×{columns}, largest line integral {scan.projections.max():.3g}")

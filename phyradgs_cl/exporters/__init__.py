@@ -10,7 +10,6 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import writers
 from phyradgs_cl.exporters.dicom import DicomLabels, write_dicom
-from phyradgs_cl.exporters.ome_zarr import write_zarr
 from phyradgs_cl.fields import Deformation, Hounsfield, States
 from phyradgs_cl.fields.hounsfield import Box
 from phyradgs_cl.io import Volume, read_state, read_volume, refuse_overwriting, write_volume
@@ -169,7 +168,7 @@ def export_stored(
         _write_own(target, volume, subject, scale)
         return
     if to == "zarr":
-        write_zarr(target, volume, scale)
+        writers.write_zarr(target, volume, scale)
         return
     values, note = _in_unit(volume.values, scale)
     volume = replace(volume, values=values)
@@ -180,7 +179,6 @@ def export_stored(
 
 
 def _write_own(target: Path, volume: Volume, path: str, scale: Hounsfield | None) -> None:
-    """Writes all that the volume file ``path`` holds to another volume file, with the scale of Hounsfield units."""
     facts = volume.provenance if scale is None else {**volume.provenance, **scale.facts()}
     parts = volume.gaussians, volume.metrics, read_state(path), volume.deformation, volume.states, volume.doubt
     write_volume(target, volume.values, volume.required_grid, facts, *parts)

@@ -100,7 +100,6 @@ def _rescale_slope(values: np.ndarray, unit: str) -> str:
 
 
 def _common(pydicom: Any, shape: tuple[int, ...], unit: str, slope: str, uid: dict[str, str]) -> Any:
-    """Returns a DICOM data set with the values that all slices of a series have."""
     image = pydicom.dataset.Dataset()
     image.file_meta = pydicom.dataset.FileMetaDataset()
     image.file_meta.MediaStorageSOPClassUID = image.SOPClassUID = _CT_IMAGE

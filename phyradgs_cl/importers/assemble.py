@@ -4,7 +4,7 @@ between a source and a panel at rest; its axis may be off the central ray."""
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,8 @@ from phyradgs_cl.acquisition.plausible import check_plausible
 from phyradgs_cl.acquisition.trajectory import grid_of_scan, resting_poses
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.importers.frames import TAKEN, LineIntegrals, line_integrals, oriented
 from phyradgs_cl.importers.options import ImportOptions
-from phyradgs_cl.importers.reading.frames import TAKEN, LineIntegrals, line_integrals, oriented
 
 _log = logging.getLogger(__name__)
 _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_direction")
@@ -321,10 +321,10 @@ def scan_on_stage(
     trajectory, geometry = stage.turned(angle_rad, timing, str(path))
     images = (None if one is None else oriented(one, options, *sides) for one in (frames, flats, darks))
     frames, flats, darks = images  # type: ignore[assignment]
+    with_air = replace(options, flat_value=options.flat_value or flat_value)
     integrals = line_integrals(
-        str(path), frames, options.with_air(flat_value), flats=flats, darks=darks, convention="counts",
-        is_corrected=darks is None,
-    )  # fmt: skip
+        str(path), frames, with_air, flats=flats, darks=darks, convention="counts", is_corrected=darks is None
+    )
     parts = integrals, trajectory, geometry, timing, options
     return assemble_scan(*parts, title=title, source=str(path), names=names, said=said)
 

@@ -13,14 +13,14 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.assemble import Turned, cone, parallel
+from phyradgs_cl.importers.files import SafeFolder
+from phyradgs_cl.importers.frames import LineIntegrals, line_integrals, oriented, places
 from phyradgs_cl.importers.options import ImportOptions
-from phyradgs_cl.importers.reading.files import SafeFolder
-from phyradgs_cl.importers.reading.frames import LineIntegrals, line_integrals, oriented, places
 from phyradgs_cl.io import scan as schema
+from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.datasets import ANGLE, LENGTH
-from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
-from phyradgs_cl.io.scan.detector import read_duration
+from phyradgs_cl.io.scan.header import read_duration
 from phyradgs_cl.io.scan.reader import united
 
 _log = logging.getLogger(__name__)

@@ -14,11 +14,10 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.hounsfield import of_note
+from phyradgs_cl.importers import tiff
+from phyradgs_cl.importers.files import SafeFolder, read_json, read_npy
+from phyradgs_cl.importers.images import image_times_s, read_image_volume, read_zarr
 from phyradgs_cl.importers.options import ImportOptions
-from phyradgs_cl.importers.reading import tiff
-from phyradgs_cl.importers.reading.files import SafeFolder, read_json, read_npy
-from phyradgs_cl.importers.reading.images import image_times_s, read_image_volume
-from phyradgs_cl.importers.reading.ome_zarr import read_zarr
 from phyradgs_cl.io.attenuation import VALUES, check_attenuation, in_per_mm
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 from phyradgs_cl.io.volume import Volume, finite_float32, read_volume, shares_of_maximum
@@ -58,24 +57,25 @@ def _is_dicom(path: Path) -> bool:
         return file.read(132)[128:] == b"DICM"
 
 
-# The module of formats/ by the format's name, loaded when it is needed. It has two functions for a file or folder:
-# recognises(path) -> bool and import_scan(path, options) -> Scan. MODULE:END stands for recognises_END, import_scan_END.
+# By the format's name, its module of formats/, loaded when it is needed, and whose scans it has, for the help. The module
+# has two functions for a file or folder: recognises(path) -> bool and import_scan(path, options) -> Scan. MODULE:END stands
+# for recognises_END, import_scan_END.
 FORMATS = {
-    "r2": "r2_gaussian",
-    "phyradgs": "r2_gaussian:with_times",
-    "phyradgs-real": "phyradgs_real",
-    "naf": "pickles",
-    "rtk": "rtk",
-    "data-exchange": "beamlines:exchange",
-    "nxtomo": "beamlines",
-    "tiff": "tiff_folder",
-    "nikon": "nikon",
-    "skyscan": "skyscan",
-    "zeiss": "zeiss",
-    "flexray": "flexray",
-    "rtk-projections": "rtk_projections",
-    "leap": "leap",
-    "tigre": "pickles:tigre",
+    "r2": ("r2_gaussian", "R2-Gaussian"),
+    "phyradgs": ("r2_gaussian:with_times", "PhyRadGS"),
+    "phyradgs-real": ("phyradgs_real", "PhyRadGS"),
+    "naf": ("pickles", "NAF"),
+    "rtk": ("rtk", "RTK"),
+    "data-exchange": ("beamlines:exchange", "Data Exchange"),
+    "nxtomo": ("beamlines", "NXtomo"),
+    "tiff": ("tiff_folder", "TIFF"),
+    "nikon": ("nikon", "Nikon"),
+    "skyscan": ("skyscan", "SkyScan"),
+    "zeiss": ("zeiss", "Zeiss"),
+    "flexray": ("flexray", "FleX-ray"),
+    "rtk-projections": ("rtk_projections", "Elekta, Varian, ORA"),
+    "leap": ("leap", "LEAP"),
+    "tigre": ("pickles:tigre", "TIGRE"),
 }
 _MOST_BODIES = 1000  # most beads and wires of a phantom
 _LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5  # largest size of coordinates in mm, and of attenuations in 1/mm
@@ -102,7 +102,6 @@ def import_scan(path: str | Path, options: ImportOptions | None = None, form: st
 
 
 def _check_there(path: Path) -> None:
-    """Raises InputError for a path that is neither a file nor a folder."""
     if not (path.is_dir() or path.is_file()):
         found = "something that is neither a file nor a folder" if path.exists() else "nothing there"
         raise InputError(str(path), found, "a scan to import", "check the path")
@@ -127,7 +126,7 @@ def recognise(path: Path) -> str:
 
 
 def _function(name: str, form: str) -> Callable[..., Any]:
-    module, _, end = FORMATS[form].partition(":")
+    module, _, end = FORMATS[form][0].partition(":")
     function: Callable[..., Any] = getattr(import_module(f"{__package__}.formats.{module}"), f"{name}_{end}".rstrip("_"))
     return function
 
@@ -196,10 +195,6 @@ def _read_tiff(path: Path) -> Volume:
     return _on_grid(path, values, size_mm[::-1], first_mm, note)
 
 
-def _read_zarr(path: Path) -> Volume:
-    return _on_grid(path, *read_zarr(path))
-
-
 def _on_grid(
     path: Path, values: np.ndarray, size_mm: np.ndarray | None = None, first_mm: np.ndarray | None = None, note: str = ""
 ) -> Volume:
@@ -217,7 +212,8 @@ _READERS: dict[str, tuple[str, Callable[[Path], Volume]]] = {
     **dict.fromkeys((".mha", ".mhd"), ("MetaImage", read_image_volume)),
     **dict.fromkeys((".nii", ".nii.gz"), ("NIfTI", read_image_volume)),
     **dict.fromkeys(tiff.SUFFIXES, ("TIFF", _read_tiff)),
-    **{".nrrd": ("NRRD", read_image_volume), ".npy": ("NumPy", _read_npy), ".zarr": ("OME-Zarr", _read_zarr)},
+    **{".nrrd": ("NRRD", read_image_volume), ".npy": ("NumPy", _read_npy)},
+    ".zarr": ("OME-Zarr", lambda path: _on_grid(path, *read_zarr(path))),
 }
 
 

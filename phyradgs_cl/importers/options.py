@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition.readout import SIDES, Named, frame_time_of, readout
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.reading.text import read_angles_rad
+from phyradgs_cl.importers.text import read_angles_rad
 from phyradgs_cl.io.files import regular_file
 
 T = TypeVar("T")
@@ -133,10 +133,6 @@ class ImportOptions:
             return read_angles_rad(path, count)
         first, last = float(steps[1]), float(steps[3])
         return np.deg2rad(first + last * np.arange(count) if steps[2] == "," else np.linspace(first, last, count))
-
-    def with_air(self, flat_value: float | None) -> "ImportOptions":
-        """Returns the options with a file's counts of air as ``flat_value``, unless they state their own."""
-        return replace(self, flat_value=self.flat_value or flat_value)
 
     def called(self, name: str, in_file: Mapping[str, str] | None = None) -> str:
         """Returns the name of the field ``name`` in messages: its name ``in_file`` where the user gave no option, else the

@@ -12,8 +12,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid, MovingTruth, triple
 from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.files import sha256_of
+from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5 import datasets as h5
-from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 
 DEFORMATION = "/entry/deformation"
 _MEANS = "at time t the object has, at point y, the attenuation of the reference volume at y + sum_r weights_r(t) U_r(y)"
@@ -30,7 +30,8 @@ def read_deformation(path: str | Path) -> Deformation:
     missing values, shapes that do not fit, unknown units, values that are not finite, and a map that folds (a determinant
     of 0 or less)."""
     with open_hdf5(path) as source:
-        places = [name for name in (DEFORMATION, *_in_scans(source)) if source.find(name) is not None]
+        in_scans = [f"{name}/{schema.DEFORMATION}" for name in source.groups()]
+        places = [name for name in (DEFORMATION, *in_scans) if source.find(name) is not None]
         if not places:
             expected = f"a group {DEFORMATION}, or a scan simulated with --motion-of-object"
             raise source.error("/", "members: " + (", ".join(sorted(source.file)) or "nothing"), expected)
@@ -84,10 +85,6 @@ def read_deformation_group(source: Hdf5Source, address: str) -> Deformation:
         found = f"matter that folds (the smallest determinant of the map is {determinant:.3g})"
         raise source.error(address, found, "determinants above 0", "use a smoother or smaller field")
     return deformation
-
-
-def _in_scans(source: Hdf5Source) -> list[str]:
-    return [f"{name}/phyradgs/reference/deformation" for name in source.groups()]
 
 
 def write_truth(extra: h5py.Group, scan: Scan) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
@@ -17,13 +17,10 @@ from phyradgs_cl.fields import Deformation, Gaussians, Grid, Hounsfield, States,
 from phyradgs_cl.fields.hounsfield import Box, fitted, of_facts
 from phyradgs_cl.io.deformation import DEFORMATION, read_deformation_group, write_deformation_group
 from phyradgs_cl.io.files import sha256_of
+from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5 import datasets as h5
-from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.tables import PROVENANCE, read_facts
 from phyradgs_cl.text import plain_text
-
-if TYPE_CHECKING:
-    from xarray import DataArray
 
 _DATA = "/entry/reconstruction"
 _VOLUME, _DOUBT, _BARE = f"{_DATA}/volume", f"{_DATA}/doubt", "/volume"
@@ -76,10 +73,6 @@ class Volume:
         """Returns the volume, still in 1/mm, with a scale of Hounsfield units. See ``hounsfield.fitted``."""
         scale = fitted(self.values, self.required_grid, air, water, insert_hu)
         return replace(self, provenance={**self.provenance, **scale.facts()})
-
-    def to_xarray(self) -> "DataArray":
-        """Returns the values in 1/mm as xarray's DataArray with coordinates in mm. See ``Grid.data_array``."""
-        return self.required_grid.data_array(self.values, "1/mm")
 
     @property
     def required_grid(self) -> Grid:
@@ -321,7 +314,6 @@ def _states_datasets(source: Hdf5Source, shape: tuple[int, ...]) -> tuple[np.nda
 
 
 def _read_attenuation(source: Hdf5Source, address: str, dataset: h5py.Dataset) -> np.ndarray:
-    """Reads attenuation as float32 in 1/mm. Raises InputError for values that are not finite."""
     values = h5.read_values(source, address, dataset)
     checks.finite(source.name(address), values)
     return h5.in_unit(source, address, values, h5.ATTENUATION).astype(np.float32)

@@ -4,7 +4,11 @@ Over a full turn the mean of all views is the projection of the object averaged 
 difference between a column and its mirror image is therefore an error of the panel. Its covariance between two independent
 sets of views tells whether there are rings and how strong they are; without rings the frames stay unchanged.
 The pattern comes from the mean over views, which is denoised in overlapping blocks of cosines with the measured strength:
-coefficients above the noise belong to the object."""
+coefficients above the noise belong to the object.
+
+Single columns and pixels with a wrong gain are outliers of the mean over views on one side of the axis only. The mean over
+a full turn is symmetric about the axis for every object, on an arc for a round one. A wrong gain therefore shows as a
+deviation that neither its neighbours nor their mirror images have, in two independent sets of views."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,9 +20,9 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.angles import middle_poses
 from phyradgs_cl.detector import robust_deviation
+from phyradgs_cl.detector.noise_level import NORMAL_MAD
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.bad_pixels import axis_column
-from phyradgs_cl.prepare.single_gains import find_single_gains
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 _LEAST_FRAMES = 8  # scans of fewer frames stay as they are
@@ -28,6 +32,14 @@ _NEGLIGIBLE = 1e-4  # standard deviation of a negligible pattern, in line integr
 _SURE = 12.0  # least variance of a pattern over that of the noise, in standard errors of about 1/√pixels
 _THRESHOLD = 3.5  # standard deviations of the pattern above which coefficients belong to the object
 _SHIFTS = 8  # positions of the blocks along each side, over which the result is averaged
+# Single gains
+_DEVIATIONS = 8.0  # least deviation in robust standard deviations, in both sets of views
+_LEAST = 2e-3  # least deviation in line integrals: a gain that is 0.2 % off
+_NEIGHBOURS = 7  # width in columns of the median from which deviations are measured
+_NEAR = 21  # width in columns of the neighbourhood that gives the usual deviation
+_AXIS = 3  # columns at each side of the axis that are never changed, because an object's edges stand still there
+_UNEQUAL = 0.25  # largest difference between the two sets, relative to their mean, plus two standard deviations
+_OBJECT = 0.5  # largest deviation of the mirrored pixel, relative to the pixel's own: above it either may be wrong
 _EQUALLY_FAR = 1.15  # largest over smallest distance of the sources from their mean, on a full turn
 
 
@@ -56,16 +68,11 @@ class Strength:
         return self.pattern > self.least
 
 
-def ring_strength(frames: np.ndarray, *, axis_column: float | None = None, full_turn: bool = True) -> Strength:
-    """Measures the pattern that all views of line integrals (F, v, u) share and no object can cause.
+def _strength(means: np.ndarray, axis_column: float) -> Strength:
+    """Measures the pattern that all views share and no object can cause, from the means (2, v, u) of two sets of views.
 
-    Its variance is the robust covariance of two sets of views in second differences along rows, taken of the difference
-    between mirrored columns. The sets are the even and the odd views; on an arc (``full_turn`` False) its halves, which see
-    the object differently. ``axis_column``: the column of the axis, about which columns are mirrored; None: the middle."""
-    return _strength(_means(frames, full_turn), axis_column)
-
-
-def _strength(means: np.ndarray, axis_column: float | None) -> Strength:
+    Its variance is the robust covariance of the sets in second differences along rows, taken of the difference between
+    columns mirrored about the axis."""
     one, other = (_rough(_antisymmetric(mean, axis_column)) for mean in means)
     # the mean of half of the views has twice the variance, and the difference of two such means four times
     noise, rows = robust_deviation(one - other) ** 2 / 4, len(one) // 2
@@ -73,15 +80,6 @@ def _strength(means: np.ndarray, axis_column: float | None) -> Strength:
     pattern = _covariance(one, other)
     column = _covariance(one[:rows], other[rows : 2 * rows]) if rows else 0.0
     return Strength(pattern, float(np.clip(column, 0, max(pattern, 0))), noise, max(least, _NEGLIGIBLE**2))
-
-
-def ring_pattern(
-    frames: np.ndarray, *, window: int = 10, axis_column: float | None = None, full_turn: bool = True
-) -> np.ndarray:
-    """Returns the error (v, u) float32 that the pixels' gains add to line integrals (F, v, u); 0 without a certain pattern.
-    window: side of the blocks in pixels. The other arguments are those of ``ring_strength``."""
-    strength = ring_strength(frames, axis_column=axis_column, full_turn=full_turn)
-    return _pattern(frames, strength, window, axis_column if full_turn else np.inf)
 
 
 def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
@@ -119,7 +117,8 @@ def surround_evenly(scan: Scan) -> bool:
 
 
 def _means(frames: np.ndarray, full_turn: bool) -> np.ndarray:
-    """Returns the means (2, v, u) of two independent sets of views."""
+    """Returns the means (2, v, u) of two independent sets of views: the even and the odd ones; on an arc its halves, which
+    see the object differently."""
     half = (len(frames) + 1) // 2
     sets = (frames[::2], frames[1::2]) if full_turn else (frames[:half], frames[half:])
     return np.stack([part.mean(axis=0, dtype=np.float64) for part in sets])
@@ -213,3 +212,72 @@ def _rough(image: np.ndarray) -> np.ndarray:
 def _covariance(one: np.ndarray, other: np.ndarray) -> float:
     """Returns a covariance that ignores the few pixels at edges (Gnanadesikan and Kettenring, Biometrics 28 (1972) 81)."""
     return (robust_deviation(one + other) ** 2 - robust_deviation(one - other) ** 2) / 4
+
+
+@dataclass(frozen=True)
+class SingleGains:
+    """offset: the error (v, u) float32 that wrong gains add to line integrals, 0 elsewhere. columns, pixels: the numbers of
+    columns and of single pixels with one."""
+
+    offset: np.ndarray
+    columns: int = 0
+    pixels: int = 0
+
+    @property
+    def any(self) -> bool:
+        return bool(self.columns or self.pixels)
+
+    @property
+    def words(self) -> str:
+        """The numbers in words, as "1 column, gain off by 3.0 %"."""
+        counted = [(self.columns, "column"), (self.pixels, "pixel")]
+        names = " and ".join(f"{n} {name}{'s' if n > 1 else ''}" for n, name in counted if n)
+        return f"{names}, gain off by {100 * float(np.abs(np.expm1(-self.offset)).max()):.1f} %"
+
+
+def find_single_gains(
+    means: np.ndarray, mirrored: np.ndarray, usable: np.ndarray, full_turn: bool
+) -> SingleGains:
+    """Finds single wrong gains in the means (2, v, u) of two sets of views. mirrored: the columns' mirror images, as of
+    ``mirror_columns``; columns without one stay. usable: bool (v, u), False for masked pixels."""
+    offset = np.zeros(usable.shape, np.float32)
+    if len(mirrored) < _NEAR:
+        return SingleGains(offset)
+    paired = np.s_[:, mirrored[::-1]]
+    usable = usable[paired] & usable[:, mirrored]
+    means = means[..., mirrored[::-1]]
+    medians = [np.median(_deviation(m), axis=1, keepdims=True) for m in (means, means - means[..., ::-1])]
+    lines = _outliers(medians[0], medians[1], usable.mean(axis=0, keepdims=True) > 0.5)
+    means = means - lines
+    pixels = np.zeros(usable.shape)
+    if full_turn:  # single pixels on an arc cannot be told from edges of the object
+        along, across = _deviation(means), _deviation(means.swapaxes(1, 2)).swapaxes(1, 2)
+        deviation = np.where(np.abs(along) < np.abs(across), along, across)
+        pixels = _outliers(deviation, _deviation(means - means[..., ::-1]), usable)
+    offset[paired] = lines + pixels
+    return SingleGains(offset, int(np.count_nonzero(lines)), int(np.count_nonzero(pixels)))
+
+
+def _deviation(means: np.ndarray) -> np.ndarray:
+    """Returns means (set, v, u) minus the median of their neighbours along the row."""
+    return means - scipy.ndimage.median_filter(means, (1, 1, _NEIGHBOURS))
+
+
+def _outliers(deviation: np.ndarray, unlike: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    """Returns the errors (v, u) of outliers, 0 elsewhere. deviation: ``_deviation`` (set, v, u) of the means. unlike: that
+    of the means minus their mirror images."""
+    around = (1, 3, 3)
+    mirrored = deviation[..., ::-1]
+    low, high = scipy.ndimage.minimum_filter(mirrored, around), scipy.ndimage.maximum_filter(mirrored, around)
+    beyond = deviation - np.clip(deviation, low, high)
+    usual = NORMAL_MAD * scipy.ndimage.median_filter(np.abs(unlike), (1, 1, _NEAR))
+    noise = NORMAL_MAD * scipy.ndimage.median_filter(np.abs(unlike[0] - unlike[1]), (5, 3 if usable.shape[0] > 1 else 5))
+    sigma = np.maximum(usual, noise).max(axis=0)
+    offset, size = unlike.mean(axis=0), np.abs(unlike).min(axis=0)
+    is_outlier = usable & (size > np.maximum(_DEVIATIONS * sigma, _LEAST)) & (unlike[0] * unlike[1] > 0)
+    is_outlier &= np.abs(unlike[0] - unlike[1]) < _UNEQUAL * np.abs(offset) + 2 * sigma
+    is_outlier &= (beyond * offset > 0).all(axis=0) & (np.abs(beyond).min(axis=0) > _OBJECT * size)
+    is_outlier &= np.abs(mirrored).max(axis=0) < _OBJECT * size
+    columns = usable.shape[1]
+    is_outlier &= np.abs(np.arange(columns) - (columns - 1) / 2) > _AXIS
+    return np.where(is_outlier, offset**3 / np.maximum(offset**2 + sigma**2, 1e-30), 0)

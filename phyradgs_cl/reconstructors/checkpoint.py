@@ -1,7 +1,7 @@
 """States of interrupted runs, each with the identity of its run and a checksum, which are compared before a run resumes."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 from zlib import crc32
 
@@ -25,12 +25,16 @@ def with_identity(state: State, identity: Mapping[str, Any]) -> State:
     return {**arrays, _CHECKSUM: np.array(_checksum(arrays))}
 
 
-def without_identity(state: State, identity: Mapping[str, Any]) -> State:
-    """Returns the method's own state. Raises InputError for a damaged state, and for the state of another run."""
+def without_identity(
+    state: State, identity: Mapping[str, Any], completed: Callable[[dict[str, Any]], dict[str, Any]]
+) -> State:
+    """Returns the method's own state. completed: adds the defaults of options that are younger than the state to its
+    identity. Raises InputError for a damaged state, and for the state of another run."""
     arrays = {name: array for name, array in state.items() if name != _CHECKSUM}
     if not np.array_equal(state.get(_CHECKSUM, -1), _checksum(arrays)):
         raise InputError("checkpoint", "arrays that do not match their checksum", "a whole checkpoint", _REMEDY)
-    then, now = json.loads(str(arrays.pop(RUN))), json.loads(json.dumps(identity, default=repr))  # in JSON tuples are lists
+    both = completed(json.loads(str(arrays.pop(RUN)))), identity
+    then, now = (json.loads(json.dumps(one, default=repr)) for one in both)  # in JSON tuples are lists
     differences = list(_differences(then, now))
     if differences:
         more = "; and more" if len(differences) > _MOST_DIFFERENCES else ""

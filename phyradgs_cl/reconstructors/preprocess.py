@@ -1,7 +1,7 @@
 """Changes to a scan before any method sees it: another grid, lag removal, the steps of ``prepare``."""
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 
 import numpy as np
@@ -39,10 +39,10 @@ class Preprocessing(PrepareOptions, GridChoice):
         checks.within("holdout", self.holdout, 0, MOST_HELD_OUT)
 
     def facts(self) -> dict[str, object]:
-        """Returns the options by name, without those that are not set."""
-        unset = {*STEP_FIELDS, *(name for name in ("holdout", "doubt") if not getattr(self, name))}
-        plain = {name: value for name, value in asdict(self).items() if name not in unset and value is not None}
-        return {**plain, **self.step_facts()}
+        """Returns ``ignore_lag``, and the other options that differ from their defaults, by name."""
+        own = {f.name: (getattr(self, f.name), f.default) for f in fields(self) if f.name not in STEP_FIELDS}
+        stated = {name: value for name, (value, usual) in own.items() if name == "ignore_lag" or value != usual}
+        return {**stated, **self.step_facts()}
 
     def check_written(self) -> None:
         """Raises InputError for options that mean nothing in a scan that is written to a file."""

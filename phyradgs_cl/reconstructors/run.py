@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -21,7 +21,7 @@ from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import State, with_identity, without_identity
 from phyradgs_cl.reconstructors.doubt import FITTED, Doubter
 from phyradgs_cl.reconstructors.method import METHODS, method_of
-from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan, check_object_motion
+from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan, check_object_motion, preprocessing_of
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.reconstructors.projected import (
     FramePair,
@@ -103,7 +103,7 @@ class _Prepared:
         self.arguments: dict[str, Any] = {}
         if resume is not None:
             check_resumable(plan)
-            self.arguments["resume"] = without_identity(resume, self.identity())
+            self.arguments["resume"] = without_identity(resume, self.identity(), _with_defaults)
         self.scan = self.visible = prepared(scan, preprocessing, rt)
         self.scan.check_sight()
         self.scan.warn_of_blind_places()
@@ -161,6 +161,13 @@ def check_resumable(plan: RunPlan) -> None:
     if not method_of(plan.method).is_resumable:
         names = ", ".join(name for name, method in METHODS.items() if method.is_resumable)
         raise InputError("--resume", f"--method {plan.method_name}", f"a method with checkpoints: {names}", "leave it out")
+
+
+def _with_defaults(identity: dict[str, Any]) -> dict[str, Any]:
+    """Returns an earlier run's identity with the defaults of options of preprocessing that are younger than the run."""
+    with suppress(InputError):  # it may have options that this version lacks
+        return {**identity, "input": preprocessing_of(identity["input"]).facts()}
+    return identity
 
 
 def _initial(plan: RunPlan, initial: InitialVolume, grid: Grid) -> np.ndarray:

@@ -21,10 +21,10 @@ from phyradgs_cl.io import written_beside
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.reconstructors.projected import FramePair
 from phyradgs_cl.report.images import grey_range, middle_planes
-from phyradgs_cl.report.interactive.viewer import stills
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, label, number, raw_text
 from phyradgs_cl.report.page import head, web_script
 from phyradgs_cl.report.sections import facts_table, frame_pictures, note, section
+from phyradgs_cl.report.viewer import stills
 from phyradgs_cl.text import clock
 
 _MOST_POINTS = 400  # most points of the convergence curve
@@ -141,7 +141,6 @@ def live_page(status: Status, now: float) -> str:
 
 
 def _tab(status: Status) -> str:
-    """Returns the title in the browser's tab, which begins with the run's progress."""
     p = status.progress
     share = "starting" if p is None else f"{100 * p.iteration // max(p.iterations, 1)} %"
     if status.ended:
@@ -182,7 +181,6 @@ def _tiles(status: Status, now: float) -> list[tuple[str, str]]:
 
 
 def _settings(status: Status) -> Markup:
-    """Returns a table of the plain facts, and one for each table of facts."""
     tables = {name: facts for name, facts in status.settings.items() if isinstance(facts, Mapping)}
     plain = {name: value for name, value in status.settings.items() if name not in tables}
     parts = [facts_table(plain)]

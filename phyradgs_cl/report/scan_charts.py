@@ -32,8 +32,8 @@ def orbit_chart(scan: Scan) -> Markup:
     """Returns a chart of the scanner from above: all source positions, the first frame's arc, rays, panel and volume. In a
     parallel beam, places on the middle ray stand for the source."""
     places = "directions of parallel rays" if scan.is_parallel else "source positions"
-    middles, words = source_positions(scan), f"{scan.frames} {places}; the first frame's rays, panel and volume"
-    arc = _first_arc(scan)
+    words = f"{scan.frames} {places}; the first frame's rays, panel and volume"
+    middles, arc = with_sources(scan, middle_poses(scan)), _first_arc(scan)
     first, last = (panel_corners(pose, scan.geometry.detector_shape)[:, :2] for pose in arc[[0, -1]])
     panel, later = (np.array([c[[0, 1]].mean(0), c[[2, 3]].mean(0)]) for c in (first, last))
     box = box_corners(scan)[:4, :2]
@@ -113,11 +113,6 @@ def _plan(draw: "Callable[[Axes], None]", points: Sequence[Points], title: str, 
         axes.set_axis_off()
 
     return chart(scaled, title, words, (SIZE[0], SIZE[0] * (top - bottom) / (right - left)))
-
-
-def source_positions(scan: Scan) -> Points:
-    """Returns the poses (F, 12) of ``with_sources`` at the middle of every frame's lit span."""
-    return with_sources(scan, middle_poses(scan))
 
 
 def with_sources(scan: Scan, poses: Points) -> Points:

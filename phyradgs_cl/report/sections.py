@@ -9,13 +9,13 @@ from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.reconstructors.projected import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report import images
+from phyradgs_cl.report.atlas import has_depth, space
 from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, profile_chart, views_chart
-from phyradgs_cl.report.interactive.atlas import has_depth, space
-from phyradgs_cl.report.interactive.motion import frame_in_motion, object_in_motion
-from phyradgs_cl.report.interactive.viewer import stills, viewer
 from phyradgs_cl.report.markup import Markup, element, joined, label, number, shown, unit
+from phyradgs_cl.report.motion import frame_in_motion, object_in_motion
 from phyradgs_cl.report.run import Change, Run
 from phyradgs_cl.report.scan_charts import frames_chart, orbit_chart, shutter_chart, shutter_words, side_chart
+from phyradgs_cl.report.viewer import stills, viewer
 from phyradgs_cl.text import flattened, to_digits_of
 
 _MOST_ROWS = 400  # most rows of a table
@@ -233,7 +233,6 @@ def _calibration(calibration: Mapping[str, object], scan: Scan) -> list[Markup]:
 
 
 def _cells(line: Mapping[str, object]) -> list[str]:
-    """Returns a parameter's cells of the table: name, stated value, estimate with its deviation, verdict."""
     estimate, deviation, unit_name = line.get("found"), line.get("deviation"), line.get("unit")
     of = unit_name if isinstance(unit_name, str) else ""
     value = "–" if estimate is None else f"{shown(estimate)} ± {_or_dash(deviation, of)}"
@@ -286,7 +285,6 @@ def _or_dash(value: object, unit_name: str = "") -> str:
 
 
 def _row(heading: str, of: str, pictures: Sequence[tuple[str, bytes]], style: str | None = None) -> Markup:
-    """Returns pictures next to each other under a heading, each with its caption."""
     figures = []
     for words, png in pictures:
         image = element("img", src=images.data_uri(png), alt=f"{of}, {words}", style=style)

@@ -327,10 +327,6 @@ class Runtime:
         self.queue.finish()
         return self._profile.uses()
 
-    def kernel_seconds(self) -> dict[str, float]:
-        """Returns the device time in s by kernel since the last call. Needs ``profile=True``."""
-        return {name: use.seconds for name, use in self.kernel_uses().items()}
-
     def best_rates(self) -> Rates:
         """Measures the device's best rates: bytes copied and floating-point operations per second. Needs
         ``profile=True``."""

@@ -65,7 +65,7 @@ def prepare_environment() -> None:
         return
     _share_cores(launched())
     _check_threads(os.environ.get(THREADS_VARIABLE))
-    if not _can_write(_caches() / "pyopencl"):
+    if _fault_of(_caches() / "pyopencl") == "written":
         os.environ.setdefault(_NO_CACHE_VARIABLE, "1")
     wish = os.environ.get(CACHE_VARIABLE)
     own = _caches() / "phyradgs-cl" / f"pocl-{library_target() or platform.machine()}"
@@ -115,10 +115,6 @@ def _caches() -> Path:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     except RuntimeError:  # the user has no home
         return Path("/nonexistent")
-
-
-def _can_write(folder: Path) -> bool:
-    return _fault_of(folder) != "written"
 
 
 def _fault_of(folder: Path) -> str | None:

@@ -1,9 +1,7 @@
 from .files import load_reference as load_reference
 from .files import load_scan as load_scan
 from .files import summary as summary
-from .reconstruct import profile_report as profile_report
 from .reconstruct import run_reconstruction as run_reconstruction
-from .scans import SimulationJob as SimulationJob
 from .scans import refuse_jitter as refuse_jitter
 from .scans import refuse_noise_options as refuse_noise_options
 from .scans import run_preparation as run_preparation

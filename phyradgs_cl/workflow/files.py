@@ -20,7 +20,7 @@ from phyradgs_cl.io import (
     volume_summary,
 )
 from phyradgs_cl.io.attenuation import FROM_HU, VALUES
-from phyradgs_cl.io.hdf5.source import open_hdf5
+from phyradgs_cl.io.hdf5 import open_hdf5
 from phyradgs_cl.io.output import refuse_overwriting
 from phyradgs_cl.prepare.light import read_corrected
 

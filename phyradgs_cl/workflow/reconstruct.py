@@ -33,7 +33,7 @@ from phyradgs_cl.metrics import METRICS, VOXEL_BY_VOXEL, aligned, compare
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors.result import COMPARED, HELD_OUT
 from phyradgs_cl.reconstructors.run import check_resumable
-from phyradgs_cl.runtime import Runtime, profile_text
+from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_output, expecting, load_scan
 from phyradgs_cl.workflow.slabs import Slabs, reconstruct_slabs, remove_slabs, surely_fits
@@ -47,10 +47,6 @@ _AT_REST = 1.05  # largest ratio of the residual after 3/4 of the iterations to 
 # largest ratio of the residual to the noise without a warning: correct scans of 100 photons, residual 0.7, had at most 1.1
 _BEYOND_NOISE = 1.5
 _ALL_ROWS = Slabs()
-
-
-def check_interval(seconds: float) -> None:
-    checks.within("--checkpoint-every (seconds)", seconds, 0, 1e9)
 
 
 class _Checkpoints:
@@ -106,7 +102,7 @@ def run_reconstruction(
     continues. A complete run removes both; a killed run leaves its last checkpoint. inputs: other files that the output
     must not overwrite. ranks: those of the runtime; rank 0 alone writes and has metrics. Raises OutputError where the output
     cannot be written, BusyError while another run writes it, and InputError for a wrong scan, option or checkpoint."""
-    check_interval(checkpoint_every_s)
+    checks.within("--checkpoint-every (seconds)", checkpoint_every_s, 0, 1e9)
     leads = ranks is None or ranks.rank == 0
     if leads:
         export = f"write volume.h5, then 'phyradgs export volume.h5 -o {plain_text(output.name)}'"
@@ -214,7 +210,6 @@ def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
 
 
 def _warn_of_doubts(plan: methods.RunPlan, path: Path, scan: Scan) -> None:
-    """Warns of options that do not suit the scan, of frames out of order, and of a scan without an object."""
     motion, preprocessing = getattr(plan.options, "motion", None), plan.preprocessing
     ignores_model = scan.detector_model == "intensity" and not hasattr(plan.options, "detector_model")
     if ignores_model and _averages(scan, plan.options):
@@ -263,11 +258,6 @@ def _averages(scan: Scan, options: Any) -> bool:
         return False
     cells = options.motion.cells(scan, 0)
     return cells.is_moving or cells.averages
-
-
-def profile_report(rt: Runtime, result: methods.Reconstruction) -> str:
-    """Returns a table of a run's device time by kernel. ``rt``: the run's runtime, opened with ``profile``."""
-    return profile_text(rt.kernel_uses(), float(result.facts["seconds"]))
 
 
 def _provenance(

@@ -1,7 +1,7 @@
 """Writes scan files: simulations of a phantom or a volume, and scans corrected for effects of panel and beam."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,20 +23,6 @@ from phyradgs_cl.text import suggest_name
 from phyradgs_cl.workflow.files import check_output, expecting, load_scan
 
 _TOML = ".toml"
-
-
-@dataclass(frozen=True)
-class SimulationJob:
-    """What to simulate: a ``phantom`` by name or TOML file, or a ``volume`` file, on a ``scanner``. size: voxels along
-    the longest side. pixel_samples: rays along a pixel's side. motion_of_object: a file that must not be overwritten."""
-
-    output: Path
-    phantom: str | None = None
-    volume: Path | None = None
-    scanner: str = "r2"
-    size: int | None = None
-    pixel_samples: int = 0
-    motion_of_object: Path | None = None
 
 
 def refuse_jitter(protocol: str, jitter_deg: float | None) -> None:
@@ -66,26 +52,27 @@ def phantom_of(name: str) -> str | EllipsoidPhantom:
 
 @np.errstate(all="ignore")  # overflow is found in the result, and reported in one line
 def run_simulation(
-    job: SimulationJob, scanner: Scanner, options: SimulationOptions, rt: Runtime,
-    report: Callable[[int, int], None],
-) -> Scan:
-    """Simulates a scan, writes its file and returns it. Raises InputError and OutputError before any work."""
-    if job.volume is not None and job.phantom is not None:
-        raise InputError("--volume", f"given together with --phantom {job.phantom}", "one of the two")
-    described = [Path(name) for name in (job.scanner, job.phantom or "") if name.endswith(_TOML)]
-    described += [] if job.motion_of_object is None else [job.motion_of_object]
-    check_output(job.output, job.volume, *described)
-    with only_run(job.output):
-        of: str | Volume | EllipsoidPhantom = phantom_of(job.phantom or "foot")
-        if job.volume is not None:
-            with expecting(job.volume, "plain-volume", "volume"):
-                of = load_attenuation(job.volume)
-        name = f"volume {job.volume}"
+    output: Path, scanner: Scanner, options: SimulationOptions, rt: Runtime, report: Callable[[int, int], None], *,
+    phantom: str | None = None, volume: Path | None = None, size: int | None = None, pixel_samples: int = 0,
+    inputs: Sequence[Path] = (),
+) -> Scan:  # fmt: skip
+    """Simulates a scan, writes its file and returns it. phantom: a name or TOML file; or a ``volume`` file. size,
+    pixel_samples: as in ``simulated_scan``. inputs: other files that must not be overwritten. Raises InputError and
+    OutputError before any work."""
+    if volume is not None and phantom is not None:
+        raise InputError("--volume", f"given together with --phantom {phantom}", "one of the two")
+    check_output(output, volume, *inputs, Path(phantom) if phantom and phantom.endswith(_TOML) else None)
+    with only_run(output):
+        of: str | Volume | EllipsoidPhantom = phantom_of(phantom or "foot")
+        if volume is not None:
+            with expecting(volume, "plain-volume", "volume"):
+                of = load_attenuation(volume)
+        name = f"volume {volume}"
         scan = simulated_scan(
-            rt, of, scanner, options, size=job.size, pixel_samples=job.pixel_samples, name=name, report=report
+            rt, of, scanner, options, size=size, pixel_samples=pixel_samples, name=name, report=report
         )
         with finish_despite_interrupt():
-            write_scan(job.output, scan)
+            write_scan(output, scan)
         return scan
 
 

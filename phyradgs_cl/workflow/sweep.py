@@ -23,7 +23,7 @@ import numpy as np
 from phyradgs_cl import __version__, checks
 from phyradgs_cl.errors import InputError, NumericalError, OutOfMemoryError, OutputError, PhyradgsError
 from phyradgs_cl.io import only_run, written_beside
-from phyradgs_cl.io.hdf5.source import open_hdf5
+from phyradgs_cl.io.hdf5 import open_hdf5
 from phyradgs_cl.io.output import BusyError, make_folder, shortened
 from phyradgs_cl.io.scan.header import read_header
 from phyradgs_cl.io.tables import read_toml, refuse_unknown

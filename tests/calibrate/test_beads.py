@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, pertur
 from phyradgs_cl.calibrate import CORRECTED, calibrate
 from phyradgs_cl.calibrate.beads import BeadProblem
 from phyradgs_cl.calibrate.placing import placements
-from phyradgs_cl.calibrate.stages import Stage
+from phyradgs_cl.calibrate.problem import Stage
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import load_beads

@@ -10,9 +10,8 @@ from phyradgs_cl.acquisition import CircularOrbit, EncoderTable
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, perturb
 from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
-from phyradgs_cl.calibrate.problem import CoarseProblem
+from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
 from phyradgs_cl.calibrate.search import Reduced, Search
-from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import write_scan
 from phyradgs_cl.removed import REMOVED

@@ -7,9 +7,8 @@ from check_kit import some_frames, stated
 from phyradgs_cl.acquisition import ConeGeometry, Protocol
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
 from phyradgs_cl.calibrate.parameters import PARAMETERS
-from phyradgs_cl.calibrate.problem import CoarseProblem
+from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
 from phyradgs_cl.calibrate.search import LEAST_SHARE, Fallback, Search
-from phyradgs_cl.calibrate.stages import Stage
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 

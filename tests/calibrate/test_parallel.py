@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, 
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
 from phyradgs_cl.calibrate.beads import BeadProblem
 from phyradgs_cl.calibrate.parameters import requested
-from phyradgs_cl.calibrate.stages import Stage
+from phyradgs_cl.calibrate.problem import Stage
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import write_scan
 from phyradgs_cl.io.scan.writer import copy_with_motion

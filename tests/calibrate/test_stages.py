@@ -4,7 +4,7 @@ import pytest
 
 from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import calibrate
-from phyradgs_cl.calibrate.stages import PassCounter
+from phyradgs_cl.calibrate.problem import PassCounter
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,7 @@ from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, 
 from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import AGREES, CORRECTED, Calibration, calibrate
 from phyradgs_cl.calibrate.per_view import SPLINES, MotionParameters, WobbleParameters, estimate_views
-from phyradgs_cl.calibrate.stages import PassCounter, Stage
+from phyradgs_cl.calibrate.problem import PassCounter, Stage
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import write_scan
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom

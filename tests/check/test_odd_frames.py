@@ -16,9 +16,8 @@ from phyradgs_cl.acquisition import (
     Scan,
     Shutter,
 )
-from phyradgs_cl.check.consistency import check_consistency
+from phyradgs_cl.check.consistency import check_consistency, repeated_frames
 from phyradgs_cl.check.finding import OK, SUSPICIOUS
-from phyradgs_cl.check.odd_frames import repeated_frames
 from phyradgs_cl.check.run import quick_scan
 from phyradgs_cl.fields import Grid
 

@@ -18,9 +18,9 @@ from phyradgs_cl.acquisition import (
 from phyradgs_cl.acquisition.altered.angles import exposure_arc_rad
 from phyradgs_cl.api import static_scan
 from phyradgs_cl.check import OK, SUSPICIOUS, CountReader
+from phyradgs_cl.check.consistency import repeated_frames
 from phyradgs_cl.check.coverage import check_coverage
 from phyradgs_cl.check.detector import check_dead_pixels, check_saturation
-from phyradgs_cl.check.odd_frames import repeated_frames
 from phyradgs_cl.check.timing import check_angles, check_timing
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 

@@ -13,7 +13,7 @@ from ome_zarr_models import open_ome_zarr
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import export_volume
-from phyradgs_cl.exporters.ome_zarr import write_zarr
+from phyradgs_cl.exporters.writers import write_zarr
 from phyradgs_cl.fields import Grid, Hounsfield
 from phyradgs_cl.importers import load_volume
 from phyradgs_cl.io import Volume, sha256_of

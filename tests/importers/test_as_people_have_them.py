@@ -15,8 +15,8 @@ from PIL import Image
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan
-from phyradgs_cl.importers.reading.series import flat_places, series_of
-from phyradgs_cl.importers.reading.text import number_at_start, read_angles_rad
+from phyradgs_cl.importers.series import flat_places, series_of
+from phyradgs_cl.importers.text import number_at_start, read_angles_rad
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,7 @@ from phyradgs_cl.acquisition import Saturation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions
 from phyradgs_cl.importers.formats.pickles import PlainUnpickler, read_pickle
-from phyradgs_cl.importers.reading.frames import compact, line_integrals, oriented
+from phyradgs_cl.importers.frames import compact, line_integrals, oriented
 from phyradgs_cl.io.scan.reader import united
 
 pytestmark = pytest.mark.slow

@@ -19,12 +19,12 @@ import writers_of_importers as w
 from damage import changed, put, removed, value
 
 from phyradgs_cl.errors import PhyradgsError
-from phyradgs_cl.exporters.ome_zarr import write_zarr
+from phyradgs_cl.exporters.writers import write_zarr
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.importers import ImportOptions, import_scan, load_beads, load_volume
-from phyradgs_cl.importers.reading.text import read_angles_rad
+from phyradgs_cl.importers.text import read_angles_rad
 from phyradgs_cl.io import Volume, load_scanner, write_scan, write_volume
-from phyradgs_cl.settings import read_config
+from phyradgs_cl.settings import read_settings
 from phyradgs_cl.workflow import load_scan
 
 pytestmark = pytest.mark.slow
@@ -58,7 +58,7 @@ WRITERS: dict[str, tuple[Callable[[Path, Any], object], Callable[[Path], object]
     "v.npy": (lambda path, _: np.save(path, VALUES), load_volume),
     "v.ome.zarr": (lambda path, _: write_zarr(path, Volume(VALUES, GRID), None), load_volume),
     "scanner.toml": (lambda path, _: path.write_bytes(CARM.read_bytes()), lambda path: load_scanner(path, Path("/nowhere"))),
-    "configuration.toml": (lambda path, _: path.write_text(CONFIG), read_config),
+    "configuration.toml": (lambda path, _: path.write_text(CONFIG), lambda path: read_settings(path, {})),
     "beads.toml": (lambda path, _: path.write_text(BEADS), load_beads),
     "angles.txt": (lambda path, _: path.write_text("angle (deg)\n0\n1,5\n3\n4,5\n"), lambda path: read_angles_rad(path, 4)),
 }  # fmt: skip

@@ -280,7 +280,7 @@ def test_sizes_are_held_against_this_machine_before_anything_is_unpacked(tmp_pat
     path = w.write("tiff", tmp_path, make_truth)
     tifffile.imwrite(path / "proj_all.tif", np.zeros((6, 1000, 1000), np.float32), compression="zlib")
     text(TOML, "proj_*", "proj_all")(path)
-    monkeypatch.setattr("phyradgs_cl.importers.reading.files.host_bytes", lambda: 50e6)
+    monkeypatch.setattr("phyradgs_cl.importers.files.host_bytes", lambda: 50e6)
     with at_most(2e6):
         refused(path, None, "tiff", "proj_all.tif: found 0.0503 GiB to unpack; expected at most 0.0373 GiB")
     packed = sitk.GetImageFromArray(np.zeros((200, 200, 200), np.float32))

@@ -1,6 +1,7 @@
 """What is done to frames before a method sees them: lag undone or ignored, and the median filter."""
 
-from dataclasses import replace
+import json
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -8,9 +9,11 @@ from tolerances import FLOAT32
 
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
 from phyradgs_cl.detector.effects import lagged
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors import Preprocessing, RunPlan, method_options, preprocessing_of, reconstruct
+from phyradgs_cl.reconstructors.checkpoint import RUN, with_identity
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
@@ -54,3 +57,31 @@ def test_options_by_name() -> None:
     assert preprocessing_of({"size": [4, 5, 6], "voxel_mm": 2}).facts() == {
         "size": (4, 5, 6), "voxel_mm": (2.0, 2.0, 2.0), "ignore_lag": False
     }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Newer(Preprocessing):
+    """The options of a later version, with one more."""
+
+    younger: float = 0.0
+
+
+def test_a_checkpoint_from_before_an_option_is_taken_where_the_option_has_its_default(rt, scan) -> None:
+    """Of the preprocessing, and of a step: the older checkpoint has neither."""
+
+    def stop(progress) -> None:
+        raise KeyboardInterrupt
+
+    steps = {"steps": "rings", "rings": {"window": 5}}
+    plan = RunPlan("sirt", method_options("sirt", None, {"iterations": 3}), preprocessing=preprocessing_of(steps))
+    state = dict(reconstruct(scan, plan, rt, report=stop).state)
+    identity = json.loads(str(state.pop(RUN)))
+    identity["input"]["rings"] = {}
+    del state["checksum"], identity["input"]["ignore_lag"]
+    older = with_identity(state, identity)
+    with pytest.raises(InputError, match=r"other input.rings.window \(10, now 5\)"):
+        reconstruct(scan, plan, rt, resume=older)
+    usual = replace(plan, preprocessing=Newer(steps="rings"))
+    assert reconstruct(scan, usual, rt, resume=older).volume.any()
+    with pytest.raises(InputError, match="other input.younger"):
+        reconstruct(scan, replace(plan, preprocessing=Newer(steps="rings", younger=1.0)), rt, resume=older)

@@ -9,8 +9,8 @@ import pytest
 from skimage import io
 
 from phyradgs_cl.fields import Gaussians, Grid
+from phyradgs_cl.report.atlas import MOST_CENTRES, MOST_EDGE, MOST_TEXT, space
 from phyradgs_cl.report.images import Window, bytes_of
-from phyradgs_cl.report.interactive.atlas import MOST_CENTRES, MOST_EDGE, MOST_TEXT, space
 
 pytestmark = pytest.mark.slow
 

@@ -87,7 +87,7 @@ def test_samples_lie_at_the_times_of_the_cells(small_scan) -> None:
 
 
 def test_the_orbit_is_that_of_the_scan_and_the_panel_ends_half_a_pixel_beyond_its_pixels(small_scan) -> None:
-    positions = scan_charts.source_positions(small_scan)[:, :3]
+    positions = scan_charts.with_sources(small_scan, middle_poses(small_scan))[:, :3]
     assert np.allclose(np.linalg.norm(positions, axis=1), 5.0) and len(positions) == 8
     corners = scan_charts.panel_corners(small_scan.geometry.pose(0.0), small_scan.geometry.detector_shape)
     assert np.allclose(corners.mean(axis=0), [-2, 0, 0])
@@ -100,7 +100,7 @@ def test_parallel_rays_come_from_their_direction_and_have_no_source() -> None:
         for drawing in (from_above, from_the_side):
             assert drawing.startswith("<svg") and "nan" not in drawing and "source" not in drawing
         assert "12 directions of parallel rays" in from_above
-        pose, drawn_pose = (of(scan)[3] for of in (middle_poses, scan_charts.source_positions))
+        pose, drawn_pose = (poses[3] for poses in (middle_poses(scan), scan_charts.with_sources(scan, middle_poses(scan))))
         middle, reach_mm = scan_charts.panel_corners(drawn_pose, (SIDE, SIDE)).mean(0), np.linalg.norm(scan.grid.size_mm) / 2
         assert np.allclose(np.cross(middle - drawn_pose[:3], pose[:3]), 0)  # the middle ray
         assert drawn_pose[:3] @ pose[:3] < -reach_mm < reach_mm < middle @ pose[:3]  # the volume between both

@@ -14,7 +14,7 @@ from phyradgs_cl.fields.deformation import control_points
 from phyradgs_cl.io import read_volume, sha256_of, write_deformation, write_volume
 from phyradgs_cl.report import load_run, report_page
 from phyradgs_cl.report.images import Window
-from phyradgs_cl.report.interactive.motion import MOST_VALUES, fitting, object_in_motion
+from phyradgs_cl.report.motion import MOST_VALUES, fitting, object_in_motion
 from phyradgs_cl.report.sections import motion_section
 
 pytestmark = pytest.mark.slow

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import Shutter, make_protocol
-from phyradgs_cl.report.interactive.motion import frame_in_motion
+from phyradgs_cl.report.motion import frame_in_motion
 
 pytestmark = pytest.mark.slow
 

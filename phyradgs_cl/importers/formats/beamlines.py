@@ -18,14 +18,13 @@ from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble, hdf5
+from phyradgs_cl.importers.frames import gantry_sign
 from phyradgs_cl.importers.options import OF_HDF5, ImportOptions
-from phyradgs_cl.importers.reading.frames import gantry_sign
 from phyradgs_cl.io import scan as schema
+from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.datasets import ANGLE, LENGTH, TIME
-from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
-from phyradgs_cl.io.scan.detector import read_duration
-from phyradgs_cl.io.scan.header import find_entry
+from phyradgs_cl.io.scan.header import find_entry, read_duration
 
 _log = logging.getLogger(__name__)
 _NOWHERE = "/no entry"  # stands for the entry of bare arrays: all else comes from the options

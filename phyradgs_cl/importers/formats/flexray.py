@@ -12,11 +12,11 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.importers.assemble import RotaryStage, StoredTiming, cone, scan_on_stage
+from phyradgs_cl.importers.files import SafeFolder
+from phyradgs_cl.importers.frames import gantry_sign
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
-from phyradgs_cl.importers.reading.files import SafeFolder
-from phyradgs_cl.importers.reading.frames import gantry_sign
-from phyradgs_cl.importers.reading.text import Settings, head_has, read_settings, say_missing
-from phyradgs_cl.importers.reading.tiff import read_numbered
+from phyradgs_cl.importers.text import Settings, head_has, read_settings, say_missing
+from phyradgs_cl.importers.tiff import read_numbered
 from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
 
 _log = logging.getLogger(__name__)

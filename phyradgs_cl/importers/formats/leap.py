@@ -15,12 +15,12 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers.assemble import RotaryStage, along
+from phyradgs_cl.importers.files import SafeFolder, read_npy
+from phyradgs_cl.importers.frames import gantry_sign, line_integrals, oriented
 from phyradgs_cl.importers.options import OF_BARE_FRAMES, TIMING, ImportOptions
-from phyradgs_cl.importers.reading.files import SafeFolder, read_npy
-from phyradgs_cl.importers.reading.frames import gantry_sign, line_integrals, oriented
-from phyradgs_cl.importers.reading.series import series_of
-from phyradgs_cl.importers.reading.text import Settings, head_has, read_settings, say_missing
-from phyradgs_cl.importers.reading.tiff import SUFFIXES, read_tiffs
+from phyradgs_cl.importers.series import series_of
+from phyradgs_cl.importers.text import Settings, head_has, read_settings, say_missing
+from phyradgs_cl.importers.tiff import SUFFIXES, read_tiffs
 
 _VECTORS = ("sourcePositions", "moduleCenters", "colVectors", "rowVectors")
 _NAMES = (
@@ -101,7 +101,6 @@ def _turning(
 def _modular(
     scan: Settings, shape: tuple[int, int, int], options: ImportOptions, timing: assemble.Timing
 ) -> tuple[PoseTable, Geometry]:
-    """Returns the pose table of a modular beam, and the nearest circular geometry."""
     options.refuse_unused("leap, which states every view", _OF_TABLES)
     source, centre, right, up = (scan.listed(name, 3 * shape[0]).reshape(-1, 3) for name in _VECTORS)
     step_u, step_v = right * scan.length("pixelWidth"), up * scan.length("pixelHeight")
@@ -112,7 +111,6 @@ def _modular(
 
 
 def _grid(scan: Settings) -> Grid | None:
-    """Returns the grid of LEAP's volume; None where the file states none."""
     if not all(map(scan.has, ("numX", "numY", "numZ", "voxelWidth", "voxelHeight"))):
         return None
     sizes_mm = triple(scan.length(name) for name in ("voxelHeight", "voxelWidth", "voxelWidth"))

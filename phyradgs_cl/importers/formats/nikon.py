@@ -14,10 +14,10 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.importers.assemble import RotaryStage, cone, scan_on_stage
+from phyradgs_cl.importers.files import SafeFolder, checked_name
+from phyradgs_cl.importers.frames import gantry_sign
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
-from phyradgs_cl.importers.reading.files import SafeFolder, checked_name
-from phyradgs_cl.importers.reading.frames import gantry_sign
-from phyradgs_cl.importers.reading.text import (
+from phyradgs_cl.importers.text import (
     Settings,
     file_of_angles,
     measured_angles_rad,
@@ -26,7 +26,7 @@ from phyradgs_cl.importers.reading.text import (
     say_missing,
     white_level,
 )
-from phyradgs_cl.importers.reading.tiff import read_numbered
+from phyradgs_cl.importers.tiff import read_numbered
 from phyradgs_cl.io.hdf5.datasets import LENGTH
 
 _log = logging.getLogger(__name__)
@@ -83,7 +83,6 @@ def _angles(scan: Settings, measured: Path | None, count: int) -> np.ndarray:
 
 
 def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:
-    """Returns the stage that the .xtekct describes, with the options' lengths in place of its own."""
     lengths = partial(scan.length, "SrcToObject"), partial(scan.length, "SrcToDetector")
 
     def pitch_mm() -> tuple[float, float]:

@@ -14,13 +14,13 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
 from phyradgs_cl.acquisition.geometry import plain_geometry
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers import tiff
 from phyradgs_cl.importers.assemble import Timing, assemble_scan, turn_of
+from phyradgs_cl.importers.files import SafeFolder, read_json
 from phyradgs_cl.importers.formats import r2_gaussian as synthetic
+from phyradgs_cl.importers.frames import line_integrals
 from phyradgs_cl.importers.options import ImportOptions
-from phyradgs_cl.importers.reading import tiff
-from phyradgs_cl.importers.reading.files import SafeFolder, read_json
-from phyradgs_cl.importers.reading.frames import line_integrals
-from phyradgs_cl.importers.reading.series import series_of
+from phyradgs_cl.importers.series import series_of
 from phyradgs_cl.io.tables import Fields
 
 _log = logging.getLogger(__name__)

@@ -24,10 +24,10 @@ from phyradgs_cl.acquisition.scans_from import is_parallel_tigre, poses_of_tigre
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, PoseTable
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.assemble import Timing, along, assemble_scan, make_timing, table_over_time, turning
+from phyradgs_cl.importers.files import check_room, naming_damage
 from phyradgs_cl.importers.formats import r2_gaussian
+from phyradgs_cl.importers.frames import line_integrals, oriented
 from phyradgs_cl.importers.options import TIMING, ImportOptions
-from phyradgs_cl.importers.reading.files import check_room, naming_damage
-from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.io.files import read_regular, regular_file
 from phyradgs_cl.io.tables import Fields, described
 

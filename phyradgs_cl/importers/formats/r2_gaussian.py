@@ -15,9 +15,9 @@ from phyradgs_cl.acquisition.geometry import ConeGeometry, Geometry, ParallelGeo
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.importers.assemble import Timing, assemble_scan, make_timing, turning
+from phyradgs_cl.importers.files import SafeFolder, read_json, read_npy
+from phyradgs_cl.importers.frames import line_integrals, oriented
 from phyradgs_cl.importers.options import TIMING, ImportOptions
-from phyradgs_cl.importers.reading.files import SafeFolder, read_json, read_npy
-from phyradgs_cl.importers.reading.frames import line_integrals, oriented
 from phyradgs_cl.io.scan import BEAMS
 from phyradgs_cl.io.tables import Fields
 

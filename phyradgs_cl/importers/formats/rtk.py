@@ -16,11 +16,11 @@ from phyradgs_cl.acquisition.geometry import Geometry, plain_geometry, towards_s
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers.assemble import along
+from phyradgs_cl.importers.files import SafeFolder, read_bytes
+from phyradgs_cl.importers.frames import line_integrals
+from phyradgs_cl.importers.images import STACKS, read_image
 from phyradgs_cl.importers.options import TIMING, ImportOptions
-from phyradgs_cl.importers.reading.files import SafeFolder, read_bytes
-from phyradgs_cl.importers.reading.frames import line_integrals
-from phyradgs_cl.importers.reading.images import STACKS, read_image
-from phyradgs_cl.importers.reading.text import Settings
+from phyradgs_cl.importers.text import Settings
 
 _log = logging.getLogger(__name__)
 OPTIONS = (*TIMING, "quantity", "flat_value", "detector_model")

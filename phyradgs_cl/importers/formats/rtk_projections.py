@@ -14,9 +14,9 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.files import SafeFolder, check_room, in_natural_order, naming_damage
 from phyradgs_cl.importers.formats.rtk import XIM_BELOW, read_rtk_xml, scan_of, stack_of
 from phyradgs_cl.importers.options import TIMING, ImportOptions
-from phyradgs_cl.importers.reading.files import SafeFolder, check_room, in_natural_order, naming_damage
 
 _COPIES = 12  # bytes of memory for every byte of the files: RTK's images, packed by some makers, and line integrals
 

@@ -15,12 +15,12 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.importers import assemble
+from phyradgs_cl.importers import text as settings
 from phyradgs_cl.importers.assemble import RotaryStage, scan_on_stage
+from phyradgs_cl.importers.files import SafeFolder
+from phyradgs_cl.importers.frames import gantry_sign
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
-from phyradgs_cl.importers.reading import text as settings
-from phyradgs_cl.importers.reading.files import SafeFolder
-from phyradgs_cl.importers.reading.frames import gantry_sign
-from phyradgs_cl.importers.reading.tiff import read_numbered
+from phyradgs_cl.importers.tiff import read_numbered
 from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
 
 _log = logging.getLogger(__name__)

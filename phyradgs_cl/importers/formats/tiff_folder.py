@@ -10,14 +10,13 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.readout import frame_time_of, seconds_of
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers import hdf5
+from phyradgs_cl.importers import hdf5, tiff
 from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, make_timing, turning, with_options
+from phyradgs_cl.importers.files import SafeFolder, checked_name
+from phyradgs_cl.importers.frames import LineIntegrals, gantry_sign, line_integrals, oriented
 from phyradgs_cl.importers.options import FIELDS, OF_BARE_FRAMES, WORDS, ImportOptions
-from phyradgs_cl.importers.reading import tiff
-from phyradgs_cl.importers.reading.files import SafeFolder, checked_name
-from phyradgs_cl.importers.reading.frames import LineIntegrals, gantry_sign, line_integrals, oriented
-from phyradgs_cl.importers.reading.series import Series, flat_places, series_of
-from phyradgs_cl.importers.reading.text import TO_RAD, read_angles_rad
+from phyradgs_cl.importers.series import Series, flat_places, series_of
+from phyradgs_cl.importers.text import TO_RAD, read_angles_rad
 from phyradgs_cl.io.scan.reader import united
 from phyradgs_cl.io.scanner import TABLES, Scanner, scanner_from
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown

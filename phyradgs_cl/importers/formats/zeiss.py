@@ -21,10 +21,10 @@ from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers.assemble import RotaryStage, scan_on_stage
+from phyradgs_cl.importers.files import check_room, naming_damage
+from phyradgs_cl.importers.frames import gantry_sign
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
-from phyradgs_cl.importers.reading.files import check_room, naming_damage
-from phyradgs_cl.importers.reading.frames import gantry_sign
-from phyradgs_cl.importers.reading.text import say_missing
+from phyradgs_cl.importers.text import say_missing
 from phyradgs_cl.io.files import regular_file
 from phyradgs_cl.io.tables import LARGEST, Fields
 

@@ -17,7 +17,7 @@ from phyradgs_cl.errors import InputError, OutOfMemoryError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.volume import MOST_VOXELS
 from phyradgs_cl.io.files import HOST_SHARE, decoded, host_bytes
-from phyradgs_cl.io.hdf5.source import Hdf5Source
+from phyradgs_cl.io.hdf5 import Hdf5Source
 from phyradgs_cl.io.output import written_beside
 
 _log = logging.getLogger(__name__)

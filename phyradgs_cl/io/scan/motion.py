@@ -14,8 +14,8 @@ from phyradgs_cl.acquisition.trajectory import ConstantSpeed, sampled
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gating
 from phyradgs_cl.io import scan as schema
+from phyradgs_cl.io.hdf5 import Hdf5Source
 from phyradgs_cl.io.hdf5 import datasets as h5
-from phyradgs_cl.io.hdf5.source import Hdf5Source
 
 _log = logging.getLogger(__name__)
 _KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # trajectories that files can hold

@@ -16,8 +16,8 @@ from phyradgs_cl.fields import Metal
 from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.deformation import read_moving_truth, read_reference
 from phyradgs_cl.io.files import sha256_of
+from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5.datasets import ATTENUATION, read_array, read_grid, read_values
-from phyradgs_cl.io.hdf5.source import Hdf5Source, open_hdf5
 from phyradgs_cl.io.scan.header import ScanHeader, read_header
 
 LARGEST_LINE_INTEGRAL = 1e6  # largest size of a line integral in a file; a larger one raises an error
@@ -67,7 +67,6 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, 
 
 
 def _read_metal(source: Hdf5Source, address: str) -> Metal | None:
-    """Reads the metal that is put back into volumes; None where there is none."""
     if source.optional_group(address) is None:
         return None
     grid = read_grid(source, f"{address}/grid")

@@ -16,7 +16,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.deformation import write_truth
 from phyradgs_cl.io.hdf5 import datasets as h5
-from phyradgs_cl.io.hdf5.source import open_hdf5
+from phyradgs_cl.io.hdf5 import open_hdf5
 from phyradgs_cl.io.output import written_beside
 from phyradgs_cl.io.scan.header import read_header
 from phyradgs_cl.io.scan.motion import storable, write_gating, write_motion, write_poses

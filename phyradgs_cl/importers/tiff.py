@@ -13,9 +13,9 @@ from PIL import Image, ImageSequence
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.importers.files import SafeFolder, check_room, naming_damage
 from phyradgs_cl.importers.options import ImportOptions
-from phyradgs_cl.importers.reading.files import SafeFolder, check_room, naming_damage
-from phyradgs_cl.importers.reading.series import series_of
+from phyradgs_cl.importers.series import series_of
 from phyradgs_cl.io.files import regular_file
 from phyradgs_cl.io.hdf5.datasets import LENGTH
 

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.report.images import Window, base64_of, block_means, bytes_of, png_bytes
-from phyradgs_cl.report.interactive.viewer import decimals_of, slider
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
+from phyradgs_cl.report.viewer import decimals_of, slider
 
 MOST_EDGE = 128  # most voxels along each side of the volume in the page
 MOST_TEXT = 2_000_000  # most characters of base64, for voxels and centres together
@@ -57,7 +57,6 @@ def has_depth(volume: NDArray[np.floating]) -> bool:
 
 
 def _stage() -> Markup:
-    """Returns the canvas with the letters of the axes and a scale bar."""
     canvas = element(
         "canvas", id="space", tabindex=0, role="img", aria_label="The volume in 3D", aria_describedby="space-help",
         data_patience=_PATIENCE_MS,

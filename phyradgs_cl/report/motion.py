@@ -11,11 +11,11 @@ from scipy.ndimage import spline_filter1d
 from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.fields import Deformation, Grid, deformed, triple
 from phyradgs_cl.fields.deformation import control_points
+from phyradgs_cl.report.atlas import MOST_EDGE
 from phyradgs_cl.report.images import Plane, Window, base64_of, block_means, middle_planes
-from phyradgs_cl.report.interactive.atlas import MOST_EDGE
-from phyradgs_cl.report.interactive.viewer import decimals_of, picture, place, slider
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 from phyradgs_cl.report.scan_charts import box_corners, with_sources
+from phyradgs_cl.report.viewer import decimals_of, picture, place, slider
 
 _TIMES = 49  # number of times at which the scanner's pose is given; the script interpolates between them
 _MOST_LINES = 64  # most detector lines that are drawn

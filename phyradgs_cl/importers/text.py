@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.reading.files import SafeFolder, read_text
+from phyradgs_cl.importers.files import SafeFolder, read_text
 from phyradgs_cl.io.files import decoded
 from phyradgs_cl.io.hdf5.datasets import Quantity
 from phyradgs_cl.io.tables import LARGEST, Fields
@@ -22,6 +22,7 @@ _COLUMNS = re.compile(r",\s+|[;:\s]+")
 _ANGLE, _RAD = re.compile(r"angle|theta|phi|rot|deg", re.I), re.compile(r"\brad", re.I)
 _BRIGHTER = 1.2  # pixels above this many times the stated counts of air are too bright: no noise exceeds it
 _FEW = 0.01  # largest fraction of the pixels that may be too bright: they may be broken
+_HEAD_BYTES = 1 << 14  # bytes at a file's beginning that are searched for marks of its format
 TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
 
 
@@ -201,12 +202,12 @@ def read_settings(
     return Settings(f"{path}:", first, commas_are_decimal(others))
 
 
-def head_has(path: Path, *marks: bytes, most_bytes: int = 1 << 14) -> bool:
-    """Returns whether a regular file has all the marks in its first ``most_bytes``, in upper or lower case."""
+def head_has(path: Path, *marks: bytes) -> bool:
+    """Returns whether a regular file has all the marks in its first 16 KiB, in upper or lower case."""
     if not path.is_file():
         return False
     with open(path, "rb") as file:
-        head = decoded(file.read(most_bytes)).lower()
+        head = decoded(file.read(_HEAD_BYTES)).lower()
     return all(mark.decode().lower() in head for mark in marks)
 
 
