@@ -27,10 +27,9 @@ from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
-from phyradgs_cl.reconstructors.splats.device import DeviceCloud, Scale
 from phyradgs_cl.reconstructors.splats.options import PRESETS, R2_PUBLISHED, SplatOptions
 from phyradgs_cl.reconstructors.splats.start import box_of, first_population, internal_scale
-from phyradgs_cl.reconstructors.splats.step import Batch, FrameStep, sharing_of
+from phyradgs_cl.reconstructors.splats.step import Batch, DeviceCloud, FrameStep, Scale, sharing_of
 from phyradgs_cl.runtime import Runtime
 
 REPORT_EVERY = 50  # number of iterations between reports, and most between lines of the record
