@@ -177,9 +177,7 @@ def detector_position(
     offset = np.stack([x, y, z]).reshape(3, -1) - pose[0:3, None]
     basis = np.stack([pose[6:9], pose[9:12], pose[3:6] - pose[0:3]], -1)
     u, v, depth = np.linalg.solve(basis, offset).reshape(3, *grid.shape)
-    with np.errstate(
-        divide="ignore", invalid="ignore"
-    ):  # a voxel in the plane of the source has no position on the detector
+    with np.errstate(divide="ignore", invalid="ignore"):  # a voxel in the plane of the source has no position on the panel
         return u / depth, v / depth, depth
 
 

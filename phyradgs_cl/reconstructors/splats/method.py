@@ -131,13 +131,9 @@ class SplatRun:
         self.cloud.write_statistics(state["statistics"])
         self._queue = state["queue"].tolist()
 
-    def parameters(self) -> np.ndarray:
-        """Returns parameter rows (11, G) float64 in internal units."""
-        return self.activation.apply(self.cloud.population().raw.astype(np.float64))
-
     def present_cloud(self) -> Gaussians:
         """Returns the cloud in internal units, without Gaussians whose shape density control would not allow."""
-        rows = self.parameters()
+        rows = self.activation.apply(self.cloud.population().raw.astype(np.float64))
         return Gaussians.from_rows(rows[:, self.options.control.allows(rows[SCALE])])
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:

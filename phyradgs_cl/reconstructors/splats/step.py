@@ -106,9 +106,6 @@ class DeviceFrames:
         self._cells = [DeviceCells.upload(self.rt, table, own) for table, own in zip(scaled, states, strict=True)]
         return merges
 
-    def cells(self, frame: int) -> DeviceCells:
-        return self._cells[frame]
-
     @property
     def most_cells(self) -> int:
         """The largest number of time cells of a frame."""

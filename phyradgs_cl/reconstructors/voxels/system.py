@@ -162,15 +162,6 @@ class System:
         expected = self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
         return self.space.add(self.measured, expected, -1.0)
 
-    def difference(self, x: Any, y: Any) -> Any:
-        """Returns x − y for arrays of one shape."""
-        return self.space.add(x, y, -1.0)
-
-    def linearise_at(self, volume: Any) -> None:
-        """Sets J to the derivative of I at ``volume``, for a run that resumes there. A is the same at every volume."""
-        if self.intensity is not None:
-            self.expected(volume)
-
     def noise_norm(self) -> float:
         """Returns the norm of the measurement's noise over the valid pixels, estimated from the measurement."""
         measured = self.space.numpy(self.measured)
