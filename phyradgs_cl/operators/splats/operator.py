@@ -223,7 +223,7 @@ class VoxelOperator:
         self._voxeliser = Voxeliser(rt, grid.shape, cutoff_sigma=cutoff_sigma)
         self.rows = PlainRows(rt, length_mm, line_integrals=False)
         self._images = PlainImages(rt, nz * ny, nx)
-        self._ready: list[object] = []  # cloud and cells for which the kernels' buffers are ready; subsets share it
+        self._ready: list[object] = []  # this and the cloud for which the kernels' buffers are ready
 
     def forward(self, point: SplatPoint) -> DeviceArray:
         """Returns the field (nz, ny, nx) float32 of a cloud."""
