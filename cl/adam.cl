@@ -1,6 +1,6 @@
 /* Activations and one step of Adam on the raw parameters of all Gaussians: the chain through softplus, bounded sigmoid and
    normalisation, the density term of the objective, the moments, and the step.
-   Twins: fields/gaussians.py and optim/adam.py. */
+   Twins: fields/gaussians.py and optim/__init__.py. */
 #include "common/gaussian.h"
 
 static inline vf logistic(vf x) { return 1.0f / (1.0f + exp(-x)); }

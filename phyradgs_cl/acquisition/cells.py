@@ -139,8 +139,7 @@ def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np
         # Cells of two frames that cover the same time then get times with the same bits, and so the same pose: ``slots.py``
         # of operators/rays projects equal poses once.
         start_s, number = origin_s, round(cells) + number
-    middles_s: np.ndarray = start_s + edges_s[0] + number * step_s
-    return middles_s
+    return np.asarray(start_s + edges_s[0] + number * step_s)
 
 
 def _shares(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:

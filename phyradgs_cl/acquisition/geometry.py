@@ -260,15 +260,17 @@ def misses(grid: Grid, geometry: Geometry) -> bool:
 
 def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_parallel: bool = False) -> str:
     """Returns "behind the panel" or "beside the rays" for a grid that no ray of a pose (12,) meets; otherwise ""."""
+    corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(-1, 3)
     if is_parallel:
-        at = grid_on_panel(grid, pose)[:2]
+        basis = np.stack([pose[6:9], pose[9:12], pose[0:3]], -1)
+        at = np.linalg.solve(basis, (corners - pose[3:6]).T)[:2]  # columns and rows (2, 8)
         last = np.array(detector_shape[::-1])[:, None] - 0.5
         return "beside the rays" if ((at < -0.5).all(1) | (at > last).all(1)).any() else ""
     source, first, step_u, step_v = pose.reshape(4, 3)
     rows, columns = detector_shape
     edges = [(-0.5, -0.5), (columns - 0.5, -0.5), (columns - 0.5, rows - 0.5), (-0.5, rows - 0.5)]
     rays = np.array([first + u * step_u + v * step_v - source for u, v in edges])
-    corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(-1, 3) - source
+    corners = corners - source
     away = np.cross(step_u, step_v)
     away = away * np.sign(away @ rays[0])
     sides = np.cross(rays, np.roll(rays, -1, axis=0))
@@ -277,13 +279,6 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_par
         return "behind the panel"
     planes = np.concatenate([inward, away[None]])  # the sides of the pyramid of rays, and the source's own plane
     return "beside the rays" if (corners @ planes.T < 0).all(axis=0).any() else ""
-
-
-def grid_on_panel(grid: Grid, pose: np.ndarray) -> np.ndarray:
-    """Projects a grid's 8 corners by the parallel beam of a pose (12,). Returns columns, rows and depths in mm, (3, 8)."""
-    corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(-1, 3)
-    basis = np.stack([pose[6:9], pose[9:12], pose[0:3]], -1)
-    return np.asarray(np.linalg.solve(basis, (corners - pose[3:6]).T))
 
 
 def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:

@@ -35,7 +35,6 @@ class Motion(Protocol):
     """The interface of a motion model. Its ``name``, if it has one, and dataclass fields go into a result's provenance."""
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """Returns the time cells of one frame. The weights of every line sum to 1."""
-        ...
 
 
 def rim_travel_voxels(scan: Scan) -> float:

@@ -87,8 +87,7 @@ def _source_angle_rad(scan: "Scan", first_s: float, last_s: float) -> np.ndarray
     delay_s = np.linspace(first_s, last_s, _TIMES)
     poses = np.stack([scan.trajectory.pose(f, t + delay_s) for f, t in enumerate(scan.frame_start_s)])
     source = towards_source(poses, scan.is_parallel)
-    angle_rad: np.ndarray = np.unwrap(np.arctan2(source[..., 1], source[..., 0]))
-    return angle_rad
+    return np.asarray(np.unwrap(np.arctan2(source[..., 1], source[..., 0])))
 
 
 def _timing(scan: "Scan") -> str:

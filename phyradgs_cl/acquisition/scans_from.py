@@ -106,8 +106,9 @@ def astra_vectors(scan: "Scan") -> np.ndarray:
     ``from_astra`` inverts it. ASTRA stacks frames as (rows, F, columns), ``scan.projections.swapaxes(0, 1)``; volumes are
     (z, y, x)."""
     times_s = scan.frame_start_s + scan.shutter.middle_s
-    poses = np.stack([scan.trajectory.pose(f, np.array(t)) for f, t in enumerate(times_s)])
-    return astra_of_poses(poses, scan.geometry.detector_shape)
+    vectors = np.stack([scan.trajectory.pose(f, np.array(t)) for f, t in enumerate(times_s)]).astype(np.float64)
+    vectors[:, 3:6] += _to_middle(vectors, scan.geometry.detector_shape)
+    return vectors
 
 
 def check_others(others: Iterable[str], arguments: Iterable[str] = ()) -> None:
@@ -157,13 +158,6 @@ def poses_of_astra(vectors: ArrayLike, panel: tuple[int, int]) -> np.ndarray:
     pose: np.ndarray = table.copy()
     pose[:, 3:6] -= _to_middle(pose, panel)
     return pose
-
-
-def astra_of_poses(pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-    """Returns ASTRA's ``cone_vec`` (F, 12) in mm of poses (F, 12): inverts ``poses_of_astra``."""
-    vectors = np.array(pose, np.float64)
-    vectors[:, 3:6] += _to_middle(vectors, panel)
-    return vectors
 
 
 def _to_middle(pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:

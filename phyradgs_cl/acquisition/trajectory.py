@@ -37,7 +37,6 @@ class Trajectory(Protocol):
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s. A pose is source, centre of pixel (0,
         0), step to the next column, step to the next row, x y z each. A parallel beam's begins with the rays' direction."""
-        ...
 
 
 def is_parallel(trajectory: Trajectory) -> bool:
@@ -50,7 +49,6 @@ class Kinematics(Protocol):
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns angles (...) in rad of frame number ``frame`` at times (...) s, counterclockwise seen from above."""
-        ...
 
 
 @dataclass(frozen=True)

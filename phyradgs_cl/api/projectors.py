@@ -30,9 +30,9 @@ from phyradgs_cl.operators import voxelise as voxelise_rows
 from phyradgs_cl.operators.rays.intensity import IntensityOperator
 from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, DEFAULT_TIME_ERROR
-from phyradgs_cl.reconstructors.splats.device import tables_of
 from phyradgs_cl.reconstructors.splats.method import first_cloud
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.reconstructors.splats.step import tables_of
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
 _FRAMES, _VOLUME, _ROWS, _DENSITY = "frames", "volume", "rows", "density"

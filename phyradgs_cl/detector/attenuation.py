@@ -4,7 +4,7 @@ The spectrum follows Kramers' law (Phil. Mag. 46 (1923) 836), or SpekPy's tungst
 (2021) 3630), behind aluminium. Attenuation is interpolated in the logarithms of NIST's tables (Hubbell and Seltzer, NISTIR
 5632). The thinnest layer of each material attenuates as stated; thicker layers attenuate less per length."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,27 +44,21 @@ def counts_to_attenuation(
     The second result (P, v, u) is True where a value must not be used: it is not finite, the flat is not brighter than the
     dark, or the transmission is at most ``TRANSMISSION_FLOOR``. Raises InputError for counts without a flat."""
     frames, key = np.asarray(data), np.asarray(image_key)
-    return _converted(frames, np.flatnonzero(key == PROJECTION), quantity, frames[key == FLAT], frames[key == DARK])
+    numbers = np.flatnonzero(key == PROJECTION)
+    return frames_to_attenuation(frames, quantity, frames[key == FLAT], frames[key == DARK], numbers=numbers)
 
 
 def frames_to_attenuation(
-    frames: NDArray[np.generic], quantity: str, flats: NDArray[np.generic] | None = None,
-    darks: NDArray[np.generic] | None = None, largest: float = _LARGEST, place: NDArray[np.floating] | None = None
+    frames: NDArray[np.generic], quantity: str, flats: NDArray[np.generic] | None, darks: NDArray[np.generic] | None,
+    largest: float = _LARGEST, place: NDArray[np.floating] | None = None, numbers: NDArray[np.intp] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Converts projections (P, v, u) to line integrals, as ``counts_to_attenuation``, with flats and darks (n, v, u) in
     arrays of their own.
 
     Attenuation above ``largest`` is marked as unusable too. place (P,): each projection's place between the flats, which
-    are interpolated; 0.5 is halfway from the first to the second. None takes the flats' mean."""
-    return _converted(frames, range(len(frames)), quantity, flats, darks, largest, place)
-
-
-def _converted(
-    frames: NDArray[np.generic], projections: Sequence[int] | NDArray[np.intp], quantity: str,
-    flats: NDArray[np.generic] | None, darks: NDArray[np.generic] | None, largest: float = _LARGEST,
-    place: NDArray[np.floating] | None = None
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    panel = frames.shape[1:]
+    are interpolated; 0.5 is halfway from the first to the second. None takes the flats' mean. numbers (P,): the
+    projections' numbers among ``frames``; None takes all."""
+    panel, projections = frames.shape[1:], range(len(frames)) if numbers is None else numbers
     result = np.empty((len(projections), *panel), dtype=np.float32)
     unusable = np.empty(result.shape, dtype=bool)
     rows = max(1, _BLOCK_PIXELS // max(1, panel[1]))

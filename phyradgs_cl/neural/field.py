@@ -1,9 +1,14 @@
-"""The field that is fitted: it maps positions in the volume's cube to attenuation. Also its first parameters, its values on
-a grid, and PyTorch's devices and tensors."""
+"""The field that is fitted: a hash encoding of positions, and a network from its features to attenuation. Also its first
+parameters, its values on a grid, and PyTorch's devices and tensors.
 
+The networks are NAF's, and SAX-NeRF's with attention along line segments (both in ``reconstructors/neural.py``). Encoding:
+Müller, Evans, Schied, Keller, ACM Trans. Graph. 41 (2022) 102."""
+
+import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,10 +17,12 @@ from torch import nn
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.fields import Grid, triple
-from phyradgs_cl.neural.networks import AttenuationNetwork, HashEncoding, network_of
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
 _ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # orders of a volume's axes z, y, x
+_WIDER = 4  # width of the feed-forward layers over that of the others
+_FACTORS = (1, 2_654_435_761, 805_459_861)  # factors of x, y, z in the hash (Müller et al., Eq. 4)
+_FIRST_FEATURES = 1e-4  # largest size of the random initial features, which are uniform (Müller et al., NAF)
 
 
 def torch_device(name: str) -> torch.device:
@@ -57,6 +64,186 @@ def to_tensor(array: np.ndarray, device: torch.device) -> torch.Tensor:
 def to_array(tensor: torch.Tensor) -> np.ndarray:
     """Returns an array of the tensor's values, with the same type and shape."""
     return np.from_dlpack(tensor.detach().to("cpu").contiguous()).copy()
+
+
+class LineAttention(nn.Module):
+    """Multi-head attention within segments of ``segment`` neighbours, for values (P, width). ``segment`` divides P."""
+
+    def __init__(self, width: int, segment: int, heads: int, head_width: int) -> None:
+        super().__init__()
+        self.segment, self.heads, self.scale = segment, heads, head_width**-0.5
+        inner = heads * head_width
+        self.position = nn.Parameter(nn.init.trunc_normal_(torch.empty(heads, segment, segment)))
+        self.to_query = nn.Linear(width, inner, bias=False)
+        self.to_key_value = nn.Linear(width, 2 * inner, bias=False)
+        self.to_output = nn.Linear(inner, width)
+
+    def forward(self, values: torch.Tensor) -> torch.Tensor:
+        query = self._by_head(self.to_query(values)) * self.scale
+        key, value = (self._by_head(part) for part in self.to_key_value(values).chunk(2, -1))
+        likeness = (query.unsqueeze(2) * key.unsqueeze(1)).sum(-1)  # (L, segment, segment, heads)
+        share = (likeness + self.position.permute(1, 2, 0)).softmax(2)
+        mixed = (share.unsqueeze(-1) * value.unsqueeze(1)).sum(2)
+        return self.to_output(mixed.reshape(values.shape[0], -1))
+
+    def _by_head(self, values: torch.Tensor) -> torch.Tensor:
+        """Returns values (P, inner) as (P / segment, segment, heads, head_width)."""
+        return values.reshape(-1, self.segment, self.heads, values.shape[1] // self.heads)
+
+
+class LineAttentionBlocks(nn.Module):
+    """Attention and feed-forward layers in turn, each after a layer norm and with a skip connection. Shapes stay (P,
+    width)."""
+
+    def __init__(self, width: int, segment: int, heads: int, head_width: int, blocks: int) -> None:
+        super().__init__()
+        self.attention = nn.ModuleList(
+            nn.Sequential(nn.LayerNorm(width), LineAttention(width, segment, heads, head_width))
+            for _ in range(blocks)
+        )
+        self.feed_forward = nn.ModuleList(
+            nn.Sequential(
+                nn.LayerNorm(width), nn.Linear(width, _WIDER * width, bias=False), nn.GELU(),
+                nn.Linear(_WIDER * width, _WIDER * width, bias=False), nn.GELU(),
+                nn.Linear(_WIDER * width, width, bias=False),
+            )
+            for _ in range(blocks)
+        )
+
+    def forward(self, values: torch.Tensor) -> torch.Tensor:
+        for attention, feed_forward in zip(self.attention, self.feed_forward, strict=True):
+            values = values + attention(values)
+            values = values + feed_forward(values)
+        return values
+
+
+class AttenuationNetwork(nn.Module):
+    """Maps features (P, inputs) to attenuation (P,) in the units of ``options.density_bound``.
+
+    middle: the modules between the first and the last layer. skip: the index among all layers where the features enter
+    again. Leaky ReLU follows every layer but the last."""
+
+    def __init__(self, inputs: int, middle: list[nn.Module], skip: int, options: NeuralOptions) -> None:
+        super().__init__()
+        end = nn.Linear(options.width, 1)
+        self.layers = nn.ModuleList([nn.Linear(inputs, options.width), *middle, end])
+        self.skip, self.last, self.bound = skip, options.last_activation, options.density_bound
+        if self.last == "sigmoid":
+            with torch.no_grad():
+                end.bias += math.log(options.first_share / (1 - options.first_share))
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        values = features
+        for number, layer in enumerate(self.layers):
+            if number > 0:
+                values = nn.functional.leaky_relu(values)
+            if number == self.skip:
+                values = torch.cat([features, values], -1)
+            values = layer(values)
+        values = values.squeeze(-1)
+        if self.last == "sigmoid":
+            return self.bound * torch.sigmoid(values)
+        return nn.functional.leaky_relu(values)
+
+
+def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
+    """Returns NAF's linear layers. For ``LineOptions``, line-segment attention takes the place of the layers in the middle.
+
+    In the middle of three or more layers the encoding enters again. The layer after this skip stays linear."""
+    skip, width = options.layers // 2 if options.layers > 2 else 0, options.width
+    middle: list[nn.Module] = []
+    for number in range(1, options.layers - 1):
+        if isinstance(options, LineOptions) and number != skip:
+            middle.append(LineAttentionBlocks(width, options.segment, options.heads, options.head_width, options.blocks))
+        else:
+            middle.append(nn.Linear(width + inputs if number == skip else width, width))
+    return AttenuationNetwork(inputs, middle, skip, options)
+
+
+class HashEncoding(nn.Module):
+    """Maps positions (P, 3) in [0, 1]³ to features (P, levels · features), interpolated linearly between a level's
+    corners.
+
+    A level has an entry for each corner if its corners fit into 2^table_log2 entries. Otherwise corners share entries by
+    a hash."""
+
+    def __init__(
+        self, levels: int, features: int, base_resolution: int, growth: float, table_log2: int
+    ) -> None:
+        super().__init__()
+        self.features = features
+        self.resolutions = [int(base_resolution * growth**level) for level in range(levels)]
+        most = 2**table_log2
+        self.sizes = [min((cells + 1) ** 3, most) for cells in self.resolutions]
+        first = torch.empty(sum(self.sizes), features).uniform_(-_FIRST_FEATURES, _FIRST_FEATURES)
+        self.table = nn.Parameter(first)
+
+    @property
+    def width(self) -> int:
+        """The number of features of a position."""
+        return len(self.sizes) * self.features
+
+    def forward(self, positions: torch.Tensor) -> torch.Tensor:
+        indices, weights, start = [], [], 0
+        for cells, size in zip(self.resolutions, self.sizes, strict=True):
+            index, weight = corners(positions, cells, size)
+            indices.append((index + start).t())
+            weights.append(weight.t())
+            start += size
+        encoded = _Interpolate.apply(self.table, torch.cat(indices), torch.cat(weights))
+        return encoded.reshape(len(self.sizes), -1, self.features).transpose(0, 1).reshape(-1, self.width)
+
+
+def corners(positions: torch.Tensor, cells: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns entries (8, P) int64 and weights (8, P) of the corners around positions (P, 3), in a level of ``cells``
+    cells along a side and ``size`` entries."""
+    scaled = positions.t() * cells
+    low = scaled.floor().clamp_(0, cells - 1)
+    high_share = scaled - low  # (3, P)
+    low_share = 1 - high_share
+    side, whole = cells + 1, low.to(torch.int64)
+    is_dense = side**3 <= size
+    strides = (1, side, side * side) if is_dense else _FACTORS
+    first = [whole[axis] * stride for axis, stride in enumerate(strides)]
+    ends = [torch.stack([start, start + stride]) for start, stride in zip(first, strides, strict=True)]
+    shares = [torch.stack([low_share[axis], high_share[axis]]) for axis in range(3)]
+    x, y, z = (ends[axis].reshape(_corner_shape(axis)) for axis in range(3))
+    index = x + y + z if is_dense else (x ^ y ^ z) % size
+    wx, wy, wz = (shares[axis].reshape(_corner_shape(axis)) for axis in range(3))
+    return index.reshape(8, -1), (wx * wy * wz).reshape(8, -1)
+
+
+def _corner_shape(axis: int) -> tuple[int, int, int, int]:
+    return (2 if axis == 2 else 1, 2 if axis == 1 else 1, 2 if axis == 0 else 1, -1)
+
+
+def weighted_rows(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """Returns Σ weight · table[index] over the last axis of index (B, 8). Some devices lack ``embedding_bag``."""
+    rows = table.index_select(0, index.reshape(-1)).reshape(*index.shape, table.shape[1])
+    return torch.einsum("bkf,bk->bf", rows, weight)
+
+
+class _Interpolate(torch.autograd.Function):
+    """Returns Σ weight · table[index] over 8 corners, (B, 8). The gradient is summed into the table in one fixed order."""
+
+    @staticmethod
+    def forward(ctx: Any, table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(index, weight)
+        ctx.entries = table.shape[0]
+        if table.device.type != "cpu":
+            return weighted_rows(table, index, weight)
+        return nn.functional.embedding_bag(index, table, mode="sum", per_sample_weights=weight)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, by_features: torch.Tensor) -> tuple[torch.Tensor, None, None]:
+        index, weight = ctx.saved_tensors
+        features = by_features.shape[1]
+        first = (index * features).reshape(-1)
+        gradient = by_features.new_zeros(ctx.entries * features)
+        for number in range(features):
+            gradient.scatter_add_(0, first + number, (weight * by_features[:, number, None]).reshape(-1))
+        return gradient.reshape(ctx.entries, features), None, None
 
 
 class NeuralField(nn.Module):

@@ -118,7 +118,6 @@ _Launch = Callable[[Arguments, Brick, DeviceArray], None]
 def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch) -> Array:
     """Returns the volume (nz, ny, nx) that ``launch`` fills. One that does not fit is filled brick by brick; their sides
     along z are multiples of ``step`` voxels. Raises OutOfMemoryError where no brick fits."""
-
     is_resident = isinstance(views.frames, DeviceArray)
     volume: Array = rt.empty(grid.shape) if is_resident else np.empty(grid.shape, np.float32)
 
@@ -128,7 +127,12 @@ def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch)
         views_bytes = views.bytes(parts[0].stop)
         bricks = cut(grid.shape, (step, 1), lambda shape: (_volume_bytes(shape), views_bytes), room, share)
         for brick in bricks:
-            padded = _backprojected(rt, views, parts, brick, launch)
+            nz, ny, nx = brick.shape
+            padded = padded_zeros(rt, nz * ny, nx)
+            for part in parts:
+                images = _images(rt, views, part)
+                launch(images, brick, padded)
+                del images  # frees their memory for the next part
             if isinstance(volume, DeviceArray):
                 move(rt, (padded, _strides(brick)), (volume, Strides.plain(grid.shape, brick.start)), brick.shape)
             else:
@@ -137,19 +141,6 @@ def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch)
     for attempt in attempts("FDK's backprojection"):
         with attempt as share:
             fill(share)
-    return volume
-
-
-def _backprojected(
-    rt: Runtime, views: Views, parts: list[slice], brick: Brick, launch: _Launch
-) -> DeviceArray:
-    """Returns the backprojection of all views in a brick, in the padded layout."""
-    nz, ny, nx = brick.shape
-    volume = padded_zeros(rt, nz * ny, nx)
-    for part in parts:
-        images = _images(rt, views, part)
-        launch(images, brick, volume)
-        del images  # frees their memory for the next part
     return volume
 
 

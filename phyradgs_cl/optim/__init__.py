@@ -1,9 +1,226 @@
-"""Optimisation of Gaussians: Adam, learning-rate schedules, density control."""
+"""Optimisation of Gaussians: Adam (Kingma and Ba 2015) on all raw parameters at once, with decaying rates per parameter.
+Adaptive density control clones and splits Gaussians with a large image gradient, and prunes faint and thin ones.
 
-from phyradgs_cl.optim.adam import PUBLISHED_RATES, DeviceAdam, Rates, adam_step
-from phyradgs_cl.optim.density_control import DensityControl, Population, control_density, prune
+Density control follows Kerbl et al. 2023 in R2-Gaussian's radiative form. The statistic is the mean norm of dL/d(projected
+centre), in normalised detector units. Both halves of a clone or split have half the density."""
 
-__all__ = [
-    "PUBLISHED_RATES", "DensityControl", "DeviceAdam", "Population", "Rates", "adam_step", "control_density",
-    "prune",
-]
+from dataclasses import dataclass
+
+import numpy as np
+
+from phyradgs_cl import checks
+from phyradgs_cl.fields import Activation
+from phyradgs_cl.fields import gaussians as g
+from phyradgs_cl.runtime import DeviceArray, Runtime
+
+_RANGE = (1e-12, 10)  # limits of a learning rate: 0 could not decay, and 1e-12 moves nothing in float32
+
+
+@dataclass(frozen=True)
+class Rates:
+    """The (first, last) learning rate of each type of parameter, in internal units (half-sides of the volume).
+
+    The default rates are two to ten times the published ones, which are made for 20,000 iterations and more. In 3,000
+    iterations, the published rates end 1 to 2 dB lower (docs/results/settings.md)."""
+
+    position: tuple[float, float] = checks.ranged((2e-3, 2e-4), *_RANGE)
+    scale: tuple[float, float] = checks.ranged((2e-2, 2e-3), *_RANGE)
+    rotation: tuple[float, float] = checks.ranged((1e-2, 1e-3), *_RANGE)
+    density: tuple[float, float] = checks.ranged((6e-2, 6e-3), *_RANGE)
+
+    def __post_init__(self) -> None:
+        checks.fields_within("rates.", self)
+
+    def at(self, progress: float) -> np.ndarray:
+        """Returns the rates (11,) per parameter row, at ``progress`` (0 to 1) of the run."""
+        position, scale, rotation, density = (
+            first * (last / first) ** progress
+            for first, last in (self.position, self.scale, self.rotation, self.density)
+        )
+        return np.array([position] * 3 + [scale] * 3 + [rotation] * 4 + [density])
+
+
+PUBLISHED_RATES = Rates(
+    position=(2e-4, 2e-5), scale=(5e-3, 5e-4), rotation=(1e-3, 1e-4), density=(1e-2, 1e-3)
+)
+
+
+BETA1, BETA2 = 0.9, 0.999  # Adam's decay rates of the first and second moments
+EPSILON = 1e-15  # Adam's addend to the root of the second moments, before the division by it
+
+
+def folded_rates(rates: np.ndarray, step: int) -> np.ndarray:
+    """Returns the learning rates (11,) with both bias corrections of step ``step`` (from 1) folded in.
+
+    m̂/√v̂ = m/√v · √(1−β2^t)/(1−β1^t). ε is scaled along, which has no effect at 1e-15."""
+    return np.asarray(rates * np.sqrt(1 - BETA2**step) / (1 - BETA1**step))
+
+
+def adam_step(
+    raw: np.ndarray, gradients: np.ndarray, moments: np.ndarray, rates: np.ndarray, step: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the raw parameters (11, G) and moments (2, 11, G) after one step: the float64 twin of ``DeviceAdam.step``."""
+    first = BETA1 * moments[0] + (1 - BETA1) * gradients
+    second = BETA2 * moments[1] + (1 - BETA2) * gradients**2
+    stepped = raw - folded_rates(rates, step)[:, None] * first / (np.sqrt(second) + EPSILON)
+    return stepped, np.stack([first, second])
+
+
+class DeviceAdam:
+    """Runs Adam's kernels on raw parameters (11, stride) and their moments on the device."""
+
+    def __init__(self, rt: Runtime, activation: Activation) -> None:
+        self.rt, self.activation = rt, activation
+        self._activate = rt.kernel("adam", "activate")
+        self._chain = rt.kernel("adam", "chain_activations")
+        self._step = rt.kernel("adam", "adam_step")
+
+    def activate(self, raw: DeviceArray, parameters: DeviceArray, count: int, stride: int) -> None:
+        """Writes parameter rows (11, stride) from raw rows; ``count`` of the columns are Gaussians."""
+        self.rt.launch(
+            self._activate, stride // self.rt.lanes, raw, count, stride,
+            np.float32(self.activation.scale_min), np.float32(self.activation.scale_max), parameters,
+            group=self.rt.group(),
+        )  # fmt: skip
+
+    def chain(
+        self, raw: DeviceArray, parameters: DeviceArray, gradients: DeviceArray, statistics: DeviceArray,
+        count: int, stride: int, *, density_weight: float,
+    ) -> None:
+        """Replaces dL/d(parameters) in ``gradients`` by dL/d(raw), adds the term of the mean density, and adds to the
+        ``statistics`` of density control."""
+        share = 1.0 / max(count, 1)
+        self.rt.launch(
+            self._chain, stride // self.rt.lanes, raw, parameters, count, stride,
+            np.float32(self.activation.scale_min), np.float32(self.activation.scale_max),
+            np.float32(density_weight * share), gradients, statistics, group=self.rt.group(),
+        )  # fmt: skip
+
+    def step(
+        self, raw: DeviceArray, gradients: DeviceArray, moments: DeviceArray, stride: int, rates: np.ndarray,
+        step: int,
+    ) -> None:
+        """Takes one step of Adam down ``gradients``, dL/d(raw). rates (11,): learning rates per parameter row. step:
+        counts from 1."""
+        rates16 = np.zeros(16, np.float32)
+        rates16[:11] = folded_rates(rates, step)
+        self.rt.launch(
+            self._step, (stride // self.rt.lanes, 11), raw, gradients, moments, stride, rates16,
+            np.float32(BETA1), np.float32(BETA2), np.float32(EPSILON), group=self.rt.group(),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DensityControl:
+    """When and which Gaussians to clone, split and prune. Lengths are in half-sides of the volume, times in fractions of a
+    run.
+
+    ``every``: iterations between two rounds; 0 keeps the first population. Gaussians whose longest scale is more than
+    ``prune_aspect`` times their shortest are removed (0: never). Such thin sheets and needles lie between the rays, where no
+    measurement constrains them, and are visible in the volume."""
+
+    every: int = checks.ranged(100, 0, 1_000_000_000)
+    start_iteration: int = checks.ranged(500, 0, 1_000_000_000)
+    stop_fraction: float = checks.ranged(0.75, 0, 1)
+    threshold: float = checks.ranged(3e-4, 0, 1e6)
+    split_scale: float = checks.ranged(0.2, 0, 1e3)
+    split_factor: float = checks.ranged(1.6, 1, 1e3)
+    prune_density: float = checks.ranged(1e-5, 0, 1e6)
+    prune_aspect: float = checks.ranged(50.0, 0, 1e9)
+    max_gaussians: int = checks.ranged(500_000, 1, 100_000_000)
+
+    def __post_init__(self) -> None:
+        checks.fields_within("control.", self)
+
+    def allows(self, scale: np.ndarray) -> np.ndarray:
+        """Returns which Gaussians of scales (3, G) are not too thin, bool (G,)."""
+        if self.prune_aspect <= 0:
+            return np.ones(scale.shape[1], bool)
+        return np.asarray(scale.max(0) <= self.prune_aspect * scale.min(0))
+
+    def is_due(self, iteration: int, iterations: int) -> bool:
+        """Returns whether a round is due after ``iteration`` (counted from 1) of a run of ``iterations``."""
+        inside = self.start_iteration < iteration < self.stop_fraction * iterations
+        return self.every > 0 and inside and iteration % self.every == 0
+
+
+@dataclass(eq=False)
+class Population:
+    """Raw parameters (11, G) and Adam's moments (2, 11, G) of the same Gaussians."""
+
+    raw: np.ndarray
+    moments: np.ndarray
+
+    @property
+    def count(self) -> int:
+        return int(self.raw.shape[1])
+
+    def take(self, index: np.ndarray) -> "Population":
+        return Population(self.raw[:, index], self.moments[:, :, index])
+
+
+def control_density(
+    population: Population, statistic: np.ndarray, activation: Activation, control: DensityControl,
+    box: np.ndarray, rng: np.random.Generator,
+) -> Population:
+    """Returns the population after one round of density control: clones, splits and prunes.
+
+    statistic (G,): mean gradient norm. box (2, 3): lowest and highest corner x y z; Gaussians with centres outside are
+    removed."""
+    rows = activation.apply(population.raw)
+    room = max(control.max_gaussians - statistic.size, 0)
+    has_large_gradient = _strongest(statistic, control.threshold, room)
+    is_large = rows[g.SCALE].max(0) > control.split_scale
+    cloned = np.flatnonzero(has_large_gradient & ~is_large)
+    split = np.flatnonzero(has_large_gradient & is_large)
+    rows[g.DENSITY, cloned] *= 0.5
+    copies, first = rows[:, cloned].copy(), _children(rows[:, split], control, rng)
+    second = _children(rows[:, split], control, rng)
+    changed = population.raw.copy()
+    changed[:, cloned] = activation.invert(rows[:, cloned])
+    new_raw = activation.invert(np.concatenate([copies, first, second], axis=1))
+    # Two children replace a Gaussian that is split. A cloned Gaussian stays, with its copy.
+    remaining = np.setdiff1d(np.arange(population.count), split)
+    raw = np.concatenate([changed[:, remaining], new_raw], axis=1)
+    # New Gaussians have no history of gradients.
+    fresh = np.zeros((2, g.ROWS, new_raw.shape[1]), population.moments.dtype)
+    grown = Population(raw, np.concatenate([population.moments[:, :, remaining], fresh], axis=2))
+    return prune(grown, activation, control, box)
+
+
+def prune(
+    population: Population, activation: Activation, control: DensityControl, box: np.ndarray
+) -> Population:
+    """Returns the population without Gaussians that are faint, outside the box or too thin, sorted by height: neighbours
+    then share lines of the detector."""
+    rows = activation.apply(population.raw)
+    inside = np.all((rows[g.MEAN] >= box[0][:, None]) & (rows[g.MEAN] <= box[1][:, None]), axis=0)
+    kept = np.flatnonzero(inside & (rows[g.DENSITY] >= control.prune_density) & control.allows(rows[g.SCALE]))
+    return population.take(kept[np.argsort(population.raw[2, kept], kind="stable")])
+
+
+def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray:
+    """Returns which statistics are at or above the threshold, bool (G,); of more than ``room``, only the largest."""
+    chosen = statistic >= threshold
+    if int(chosen.sum()) > room:
+        order = np.argsort(-statistic, kind="stable")[:room]
+        chosen = np.zeros_like(chosen)
+        chosen[order] = statistic[order] >= threshold
+    return chosen
+
+
+def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:
+    """Draws one child (11, S) from each Gaussian (11, S): smaller, half as dense, with its centre drawn from the parent's
+    distribution."""
+    child: np.ndarray = rows.copy()
+    child[g.MEAN] += rotate(rows[g.QUATERNION], rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE])
+    child[g.SCALE] /= control.split_factor
+    child[g.DENSITY] *= 0.5
+    return child
+
+
+def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Returns vectors (3, S) rotated by unit quaternions (4, S), w x y z."""
+    w, axis = quaternion[0], quaternion[1:]
+    cross = 2 * np.cross(axis, vector, axis=0)
+    return np.asarray(vector + w * cross + np.cross(axis, cross, axis=0))

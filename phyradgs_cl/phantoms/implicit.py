@@ -115,10 +115,9 @@ def capsule_union(lattice: Lattice, capsules: Sequence[Capsule], blend: float, b
     union = np.zeros((z.size, y.size, x.size), dtype=np.float32)
     for capsule in capsules:
         inner = _intersect(capsule_box(lattice, [capsule], _REACH * blend), box)
-        local = (inner[0], inner[1], inner[2])
-        xs, ys, zs = x[..., local[2]], y[:, local[1], :], z[local[0]]
+        xs, ys, zs = x[..., inner[2]], y[:, inner[1], :], z[inner[0]]
         if xs.size and ys.size and zs.size:
-            add_to_union(union, local, capsule_distance(capsule, xs, ys, zs), blend)
+            add_to_union(union, inner, capsule_distance(capsule, xs, ys, zs), blend)
     return union_distance(union, blend)
 
 

@@ -1,7 +1,7 @@
 """States of interrupted runs, each with the identity of its run and a checksum, which are compared before a run resumes."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 from zlib import crc32
 
@@ -60,13 +60,3 @@ def _differences(then: object, now: object, name: str = "") -> Iterator[str]:
             yield from _differences(then.get(key), now.get(key), f"{name}.{key}" if name else key)
     elif then != now:
         yield f"{name[:_LONGEST_NAME]} ({checks.short_repr(then)}, now {checks.short_repr(now)})"
-
-
-def history_arrays(record: Sequence[Mapping[str, float]], seconds: float) -> dict[str, np.ndarray]:
-    """Returns the convergence record and the run's seconds so far as arrays of a state."""
-    return {"record": np.array(json.dumps(list(record))), "seconds": np.array(seconds)}
-
-
-def history_of(state: State) -> tuple[list[dict[str, float]], float]:
-    """Returns the convergence record and the run's seconds so far from a state."""
-    return json.loads(str(state["record"])), float(state["seconds"])

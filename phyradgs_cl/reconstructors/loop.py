@@ -2,6 +2,7 @@
 
 A method is a class with the attributes of ``Stepwise``. ``Loop`` runs it, in one process or in ranks that do the same."""
 
+import json
 import time
 from collections.abc import Mapping
 from typing import Protocol
@@ -11,7 +12,7 @@ import numpy as np
 from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.parallel import Communicator
-from phyradgs_cl.reconstructors.checkpoint import State, history_arrays, history_of
+from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport
 from phyradgs_cl.signals import stop_on_interrupt
 
@@ -78,8 +79,8 @@ class Loop:
         method = self.method
         if resume is not None:
             method.restore(resume)
-            self.record, before_s = history_of(resume)
-            self._started -= before_s
+            self.record = json.loads(str(resume["record"]))
+            self._started -= float(resume["seconds"])
         with stop_on_interrupt() as request:
             while method.iteration < method.iterations and self.stopped_by == "iterations":
                 before = method.iteration
@@ -102,7 +103,8 @@ class Loop:
 
     def state(self) -> dict[str, np.ndarray]:
         """Returns the state from which ``run`` can resume."""
-        return {**self.method.state(), **history_arrays(self.record, self.seconds)}
+        history = {"record": np.array(json.dumps(self.record)), "seconds": np.array(self.seconds)}
+        return {**self.method.state(), **history}
 
     def state_if_interrupted(self) -> dict[str, np.ndarray] | None:
         """Returns the state of an interrupted run; None without an interruption."""
@@ -140,4 +142,3 @@ class Loop:
         iteration."""
         now = self.method.iteration
         return now // every > before // every or now == self.method.iterations
-

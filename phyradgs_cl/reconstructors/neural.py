@@ -4,16 +4,11 @@ NAF: R. Zha, Y. Zhang, H. Li, "NAF: Neural Attenuation Fields for Sparse-View CB
 encoding and a small network. SAX-NeRF: Y. Cai, J. Wang, A. Yuille, Z. Zhou, A. Wang, "Structure-Aware Sparse-View X-ray 3D
 Reconstruction", CVPR 2024: attention along line segments, and windows of rays beside scattered ones."""
 
-import json
 import time
 from functools import partial
 from importlib.metadata import version
-from typing import TYPE_CHECKING
-
-import numpy as np
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import LineOptions, NeuralOptions, require_torch
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.fdk import static_fdk
@@ -22,9 +17,6 @@ from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
 from phyradgs_cl.reconstructors.splats.start import internal_scale
 from phyradgs_cl.runtime import Runtime
-
-if TYPE_CHECKING:
-    from phyradgs_cl.neural.trainer import Trainer
 
 
 def reconstruct_neural(
@@ -44,51 +36,18 @@ def reconstruct_neural(
     scale = internal_scale(static_fdk(rt, scan), scan.grid)
     field = first_field(options, max(scan.grid.shape), seed)
     trainer = Trainer(scan, options, field, device, scale.density_per_mm, seed)
-    loop = Loop(_Passes(trainer, options.iterations), rt.ranks, report, started)
+    loop = Loop(trainer, rt.ranks, report, started)
     loop.run(resume)
     facts: dict[str, object] = {
         "method": method, "options": option_facts(options), "seed": seed, "unit_length_mm": scale.length_mm,
         "unit_density_per_mm": scale.density_per_mm, "detector_model": trainer.model,
         "parameters": trainer.parameters, "levels": options.levels_for(max(scan.grid.shape)),
-        "samples": trainer.samples, "times": trainer.times, "iterations": trainer.passes,
+        "samples": trainer.samples, "times": trainer.times, "iterations": trainer.iteration,
         "torch_device": str(device), "torch_version": version("torch"), "seconds": loop.seconds,
         "interrupted_at": loop.interrupted_at,
     }  # fmt: skip
-    volume = trainer.volume(scan.grid)
     state = loop.state_if_interrupted()
-    return Reconstruction(volume, scan.grid, record=loop.record, facts=facts, state=state)
-
-
-class _Passes:
-    """A trainer as the ``Stepwise`` that a ``Loop`` runs: a step takes one frame, an iteration is a pass over all
-    frames."""
-
-    quantity, remedy, finished = "loss", "check the scan for extreme values, or lower the rate", None
-
-    def __init__(self, trainer: "Trainer", iterations: int) -> None:
-        self.trainer, self.iterations = trainer, iterations
-
-    @property
-    def iteration(self) -> int:
-        return self.trainer.passes
-
-    def step(self) -> None:
-        self.trainer.step()
-
-    def measures(self) -> dict[str, float]:
-        return {"loss": float(np.mean(self.trainer.losses))}
-
-    def state(self) -> dict[str, np.ndarray]:
-        return self.trainer.state()
-
-    def restore(self, state: State) -> None:
-        trainer = self.trainer
-        trainer.rng.bit_generator.state = json.loads(str(state["rng"]))
-        trainer.steps, trainer.queue, trainer.losses = int(state["steps"]), state["queue"].tolist(), state["losses"].tolist()
-        trainer.restore(state["parameters"], state["moments"], int(state["updates"]))
-
-    def present_volume(self) -> tuple[np.ndarray, Grid]:
-        return self.trainer.volume(self.trainer.scan.grid), self.trainer.scan.grid
+    return Reconstruction(*trainer.present_volume(), record=loop.record, facts=facts, state=state)
 
 
 # Paper, section 3, and the released configuration chest_50: 192 samples for 128 voxels per side

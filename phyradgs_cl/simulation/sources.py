@@ -3,7 +3,6 @@
 Every line sees a moving object at the times at which the line is open."""
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
@@ -29,13 +28,14 @@ _MOST_SAMPLES = 32  # most rays along each side of a pixel
 NEAREST = 0.1  # largest distance of moving matter from its exact place, in voxels to be reconstructed
 
 
-class FrameSource(ABC):
-    """An object that is projected to the frame of a table of time cells, with its attenuation multiplied by ``factor``."""
+class FrameSource:
+    """An object that is projected to the frame of a table of time cells, with its attenuation multiplied by ``factor``. A
+    subclass writes ``frame`` or ``frames``."""
 
     pixel_samples = 1  # rays along each side of a pixel
 
-    @abstractmethod
-    def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray: ...
+    def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
+        return next(self.frames([cells], model, factor))
 
     def frames(self, tables: Sequence[TimeCells], model: str, factor: float) -> Iterator[np.ndarray]:
         """Yields the frame of each table."""
@@ -109,9 +109,6 @@ class PixelAreaSource(FrameSource):
         self._finer, self._samples = finer, samples
         self.pixel_samples = samples
 
-    def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
-        return self._averaged(self._finer.frame(cells.finer(self._samples, self._samples), model, factor), model)
-
     def frames(self, tables: Sequence[TimeCells], model: str, factor: float) -> Iterator[np.ndarray]:
         fine = self._finer.frames([cells.finer(self._samples, self._samples) for cells in tables], model, factor)
         return (self._averaged(frame, model) for frame in fine)
@@ -162,9 +159,6 @@ class DeformedSource(FrameSource):
         reach_mm = np.maximum(deformation.reach_mm, np.finfo(float).tiny)
         self._step = 2 * NEAREST * voxel_mm / (deformation.rank * reach_mm)
         self._make = make
-
-    def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
-        return next(self.frames([cells], model, factor))
 
     def frames(self, tables: Sequence[TimeCells], model: str, factor: float) -> Iterator[np.ndarray]:
         weights = [self._rounded_weights(cells) for cells in tables]

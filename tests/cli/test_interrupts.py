@@ -13,7 +13,7 @@ import pytest
 from phyradgs_cl import signals
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.signals import finish_despite_interrupt, stop_on_interrupt
-from phyradgs_cl.simulation import options as simulation_options
+from phyradgs_cl.simulation import run as simulation_run
 from phyradgs_cl.workflow import reconstruct, scans, volumes
 
 pytestmark = pytest.mark.slow
@@ -39,7 +39,7 @@ COMMANDS = {
     "evaluate": ["evaluate", "{volume}", "--reference", "{scan}"],
 }
 STAGES = [
-    ("simulate", simulation_options, "load_scanner"),
+    ("simulate", simulation_run, "load_scanner"),
     ("simulate", scans, "check_output"),
     ("simulate", scans, "simulated_scan"),
     ("reconstruct", reconstruct, "load_scan"),

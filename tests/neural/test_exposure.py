@@ -11,7 +11,7 @@ from tolerances import FINITE_DIFFERENCE_STEP, FLOAT64, GRADIENT
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.neural import NeuralOptions
 from phyradgs_cl.neural.field import first_field
-from phyradgs_cl.neural.rays import intensity_average, line_integrals, log_squares, sample_shifts
+from phyradgs_cl.neural.trainer import intensity_average, line_integrals, log_squares, sample_shifts
 
 RAYS, TIMES, SAMPLES = 6, 5, 24
 SMALL = NeuralOptions(levels=2, base_resolution=3, width=8, first_share=0.3)

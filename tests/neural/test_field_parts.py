@@ -8,9 +8,16 @@ from tolerances import FLOAT32
 from phyradgs_cl.errors import DeviceError, InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import LineOptions, NeuralOptions
-from phyradgs_cl.neural.field import first_field, torch_device, voxel_values
-from phyradgs_cl.neural.networks import HashEncoding, LineAttention, corners, weighted_rows
-from phyradgs_cl.neural.rays import chosen_times, scattered_pixels, windows_and_scattered_pixels
+from phyradgs_cl.neural.field import (
+    HashEncoding,
+    LineAttention,
+    corners,
+    first_field,
+    torch_device,
+    voxel_values,
+    weighted_rows,
+)
+from phyradgs_cl.neural.trainer import chosen_times, scattered_pixels, windows_and_scattered_pixels
 
 CPU = torch.device("cpu")
 

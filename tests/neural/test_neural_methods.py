@@ -17,7 +17,6 @@ from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors import METHODS, RunPlan, method_options
 from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.loop import Loop
-from phyradgs_cl.reconstructors.neural import _Passes
 from phyradgs_cl.reconstructors.result import Progress, ignore_progress
 
 NEURAL = ("naf", "sax-nerf")
@@ -96,7 +95,7 @@ def small_run(scan: Scan) -> Loop:
     """Three passes of naf, not begun yet."""
     options = method_options("naf", None, SHORT["naf"])
     trainer = Trainer(scan, options, first_field(options, 16, 0), torch.device("cpu"), 1.0, 0)
-    return Loop(_Passes(trainer, 3), Communicator(), ignore_progress, 0.0)
+    return Loop(trainer, Communicator(), ignore_progress, 0.0)
 
 
 def test_a_run_goes_on_from_the_middle_of_a_pass(scan) -> None:
@@ -171,7 +170,7 @@ def test_the_published_constants_run(rt, scan, method) -> None:
 def test_a_field_that_is_lost_is_told_in_one_line(scan) -> None:
     run = small_run(scan)
     with torch.no_grad():
-        run.method.trainer.field.encoding.table.fill_(float("nan"))
+        run.method.field.encoding.table.fill_(float("nan"))
     with pytest.raises(NumericalError, match="loss: found nan at iteration 1"):
         run.run(None)
 

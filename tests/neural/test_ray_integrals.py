@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition import MicroViews, OwnTimes, Static
 from phyradgs_cl.acquisition.geometry import pixel_centres
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural import NeuralOptions
-from phyradgs_cl.neural.rays import ExposureRays, box_span, line_integrals, sample_shifts
+from phyradgs_cl.neural.trainer import ExposureRays, box_span, line_integrals, sample_shifts
 from phyradgs_cl.operators import RayOperator
 
 VOXELS = 64  # of the longest side; 96 samples per ray by default

@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 from tolerances import FLOAT64
 
 from phyradgs_cl.fields import Activation
-from phyradgs_cl.optim import DensityControl, Population, control_density, prune
-from phyradgs_cl.optim.density_control import rotate
+from phyradgs_cl.optim import DensityControl, Population, control_density, prune, rotate
 
 ACTIVATION = Activation(0.01, 0.5)
 CONTROL = DensityControl(threshold=1.0, split_scale=0.2, prune_density=1e-3)

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from phyradgs_cl.optim import DensityControl, Rates
-from phyradgs_cl.optim.adam import PUBLISHED_RATES
+from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 
 
 def test_published_numbers() -> None:

@@ -21,8 +21,7 @@ from phyradgs_cl.reconstructors.voxels.asd_pocs import AsdPocs, AsdPocsOptions
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTv, FistaTvOptions
 from phyradgs_cl.reconstructors.voxels.sart import OS_SART, Sart, SartOptions, Sirt, SirtOptions
-from phyradgs_cl.reconstructors.voxels.subsets import spread_order
-from phyradgs_cl.reconstructors.voxels.system import System
+from phyradgs_cl.reconstructors.voxels.system import System, spread_order
 from phyradgs_cl.runtime.algebra import norm
 
 pytestmark = pytest.mark.slow

@@ -18,9 +18,9 @@ from phyradgs_cl.fields.gaussians import MEAN
 from phyradgs_cl.objective.terms import image_loss, mean_density, total_variation
 from phyradgs_cl.operators.twins.splat import splat_frame, voxel_field
 from phyradgs_cl.optim import DensityControl, Population
-from phyradgs_cl.reconstructors.splats.device import Scale
 from phyradgs_cl.reconstructors.splats.method import SplatRun
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.reconstructors.splats.step import Scale
 
 SHAPE, COUNT, SEED = (13, 15), 5, 17
 UNIT = Scale(length_mm=20.0, density_per_mm=0.05)

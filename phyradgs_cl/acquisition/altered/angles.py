@@ -9,8 +9,7 @@ _ACROSS = 1e-3  # a ray counts as perpendicular to the axis where the cosine of 
 
 def azimuth_rad(pose: np.ndarray) -> np.ndarray:
     """Returns the angles (...) of poses (..., 12) about +z, in (-π, π]: those of the source, or of the rays' direction."""
-    angle_rad: np.ndarray = np.arctan2(pose[..., 1], pose[..., 0])
-    return angle_rad
+    return np.asarray(np.arctan2(pose[..., 1], pose[..., 0]))
 
 
 def start_azimuths_rad(scan: Scan) -> np.ndarray:

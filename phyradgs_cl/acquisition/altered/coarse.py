@@ -141,15 +141,11 @@ def _binned_panel(geometry: Geometry, height: int, width: int) -> Geometry:
     """Returns the panel of whole blocks of ``height`` × ``width`` pixels. Pixels dropped at the far end move its middle."""
     (rows, columns), (pitch_v_mm, pitch_u_mm) = geometry.detector_shape, geometry.pixel_size_mm
     offset_v_mm, offset_u_mm = geometry.detector_offset_mm
+    offset_mm = offset_v_mm - rows % height / 2 * pitch_v_mm, offset_u_mm - columns % width / 2 * pitch_u_mm
     return replace(
-        geometry,
-        detector_shape=(rows // height, columns // width),
+        geometry, detector_shape=(rows // height, columns // width), detector_offset_mm=offset_mm,
         pixel_size_mm=(pitch_v_mm * height, pitch_u_mm * width),
-        detector_offset_mm=(
-            offset_v_mm - rows % height / 2 * pitch_v_mm,
-            offset_u_mm - columns % width / 2 * pitch_u_mm,
-        ),
-    )
+    )  # fmt: skip
 
 
 def _binned_shutter(scan: Scan, block: int) -> tuple[Shutter, float]:

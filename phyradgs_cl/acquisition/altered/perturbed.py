@@ -64,8 +64,7 @@ class Sway:
 
     def at(self, time_s: np.ndarray) -> np.ndarray:
         """Returns rotations in rad and shifts in mm, (..., 6), at times (...) in s."""
-        six: np.ndarray = self.basis(time_s) @ self.coefficients
-        return six
+        return np.asarray(self.basis(time_s) @ self.coefficients)
 
 
 def splines(fraction: np.ndarray, count: int) -> np.ndarray:
@@ -93,11 +92,8 @@ class PerturbedTrajectory:
     @cached_property
     def _turn(self) -> np.ndarray:
         """The panel's corrected u, v and normal as columns (3, 3), in components along the stated u, v and normal."""
-        correction = self.correction
-        turn: np.ndarray = Rotation.from_rotvec(
-            [correction.tilt_u_rad, correction.tilt_v_rad, correction.roll_rad]
-        ).as_matrix()
-        return turn
+        angles_rad = [self.correction.tilt_u_rad, self.correction.tilt_v_rad, self.correction.roll_rad]
+        return np.asarray(Rotation.from_rotvec(angles_rad).as_matrix())
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         shift_v_mm, shift_u_mm, turn_rad = 0.0, 0.0, self.correction.turn_rad
@@ -166,12 +162,8 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
     elif of_poses != GeometryCorrection() or views is not None:
         trajectory = PerturbedTrajectory(trajectory, geometry.detector_shape, correction, views)
     readout_s, exposure_s = shutter.readout_s + correction.readout_s, shutter.exposure_s + correction.exposure_s
-    return replace(
-        scan,
-        geometry=geometry,
-        trajectory=trajectory,
-        shutter=replace(shutter, readout_s=readout_s, exposure_s=exposure_s),
-    )
+    shutter = replace(shutter, readout_s=readout_s, exposure_s=exposure_s)
+    return replace(scan, geometry=geometry, trajectory=trajectory, shutter=shutter)
 
 
 def scan_course(scan: Scan) -> np.ndarray:

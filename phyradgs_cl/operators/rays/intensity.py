@@ -7,7 +7,7 @@ they cost as much as one launch over all cells. Twins in twins/rays.py: ``ray_fr
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -51,8 +51,7 @@ class IntensityOperator:
     @property
     def memory(self) -> RayMemory:
         """The buffers that the projectors of all layers share."""
-        memory: RayMemory = self._operators[0].memory
-        return memory
+        return cast(RayMemory, self._operators[0].memory)
 
     @property
     def holds(self) -> tuple[int, int]:
@@ -73,8 +72,7 @@ class IntensityOperator:
             )
             frames = averaged.astype(np.float32)
             self._shares = [share.astype(np.float32) for share in shares]
-        same: SameArray = self._given(frames, out)
-        return same
+        return cast(SameArray, self._given(frames, out))
 
     def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
         """Returns J d, frames (F, rows, columns) float32, for a change d of the volume (nz, ny, nx)."""
@@ -83,8 +81,7 @@ class IntensityOperator:
         for share, operator in zip(self._shares_for(volume), self._operators, strict=True):
             part = operator.forward(volume, space.place(self.frames_shape))
             total = space.multiply(part, share) if total is None else space.add_product(total, part, share)
-        same: SameArray = self._given(total, out)
-        return same
+        return cast(SameArray, self._given(total, out))
 
     def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
         """Returns Jᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
@@ -93,8 +90,7 @@ class IntensityOperator:
         for share, operator in zip(self._shares_for(frames), self._operators, strict=True):
             part = operator.adjoint(space.multiply(frames, share), space.place(self.volume_shape))
             total = part if total is None else space.add(total, part)
-        same: SameArray = self._given(total, out)
-        return same
+        return cast(SameArray, self._given(total, out))
 
     def subset(self, frames: Sequence[int]) -> "IntensityOperator":
         """Returns the operator for some of the frames, in the order given. Its J is that of x = 0 until its own
@@ -115,11 +111,9 @@ class IntensityOperator:
     def _space(self, like: Array) -> Space[Any]:
         return self._device if isinstance(like, DeviceArray) else _HOST
 
-    def _given(self, result: Any, out: SameArray | None) -> SameArray:
-        """Returns the result, copied to ``out`` if given."""
+    def _given(self, result: Any, out: SameArray | None) -> Any:
         if out is None:
-            new: SameArray = result
-            return new
+            return result
         if isinstance(out, DeviceArray):
             self._device.rt.copy(result, out)
         else:

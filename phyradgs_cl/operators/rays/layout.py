@@ -65,9 +65,10 @@ class RayLayout:
     def frames_floats(self, count: int) -> int:
         return 2 * GUARD + count * self.lines * pitch_of(self.width)
 
-    def turned_floats(self, count: int) -> int:
-        """Returns the floats of ``count`` padded frames stored transposed (F, width, lines)."""
-        return 2 * GUARD + count * self.width * pitch_of(self.lines)
+    @property
+    def turned(self) -> "RayLayout":
+        """The layout of frames stored transposed (F, width, lines)."""
+        return replace(self, lines=self.width, width=self.lines)
 
     def frames_shape(self, count: int) -> tuple[int, int, int]:
         return count, self.lines, self.width
@@ -85,22 +86,16 @@ class RayLayout:
         row = pitch_of(self.width)
         return Strides(GUARD, self.lines * row, row)
 
-    @property
-    def turned_strides(self) -> Strides:
-        """Strides in floats of a stack of transposed frames (F, width, lines) whose rows are padded to their pitch."""
-        row = pitch_of(self.lines)
-        return Strides(GUARD, self.width * row, row)
-
     def pixel_strides(self, axis: str, *, turned: bool = False) -> tuple[int, int, int, int]:
         """Returns, in floats, the start of padded frames and the steps from column to column, row to row and frame to
         frame of the detector. axis: the readout's. turned: the frames are stored transposed, (F, width, lines)."""
-        strides = self.turned_strides if turned else self.frames_strides
+        strides = self.turned.frames_strides if turned else self.frames_strides
         steps = (1, strides.row) if (axis == "rows") != turned else (strides.row, 1)
         return (strides.start, *steps, strides.slice)
 
     def column_floats(self, axis: str) -> int:
         """Returns the floats of one padded frame stored by detector columns, for a readout along ``axis``."""
-        return self.width * pitch_of(self.lines) if axis == "rows" else self.lines * pitch_of(self.width)
+        return (self.turned if axis == "rows" else self).frames_strides.slice
 
     def inside(self, flat: np.ndarray) -> np.ndarray:
         """Returns the volume (nz, ny, nx) as a view into its padded floats, without the border."""
@@ -156,6 +151,7 @@ class RayCells:
             # vectors may begin at every column and reach beyond a cell's lines: there its weight is 0
             weights = [np.pad(weight, _WIDEST) for weight in weights]
             served = [np.tile(ends, (rows_across, 1)) for ends in zip(starts[:-1], starts[1:], strict=True)]
+        weight_at = np.concatenate([[0], np.cumsum([len(weight) for weight in weights])])
         matrices, stride = matrix_table(pose, grid, tables[0].is_parallel)
         cell_lines = np.zeros((stride, 2), np.int32)
         cell_lines[: starts[-1]] = np.concatenate(ranges)
@@ -167,15 +163,11 @@ class RayCells:
             matrix_stride=stride,
             frame_cells=rt.upload(starts, np.int32),
             weights=rt.upload(np.concatenate(weights), np.float32),
-            weight_at=rt.upload(_starts_of(weights) + (_WIDEST if rows_across is not None else 0), np.int32),
+            weight_at=rt.upload(weight_at + (_WIDEST if rows_across is not None else 0), np.int32),
             is_parallel=tables[0].is_parallel,
             is_across=rows_across is not None,
             most_per_line=max(1, *(int(np.ptp(ends, axis=1).max()) for ends in served)),
         )
-
-
-def _starts_of(parts: Sequence[np.ndarray]) -> np.ndarray:
-    return np.concatenate([[0], np.cumsum([len(part) for part in parts])])
 
 
 def matrix_table(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> tuple[np.ndarray, int]:

@@ -189,20 +189,20 @@ class RayMemory:
 
     def _frames_floats(self, count: int) -> int:
         """Returns the floats of a buffer for ``count`` frames, which holds them by rows or, with slots, by columns."""
-        turned = self.layout.turned_floats(count) if self.slot_floats else 0
+        turned = self.layout.turned.frames_floats(count) if self.slot_floats else 0
         return max(self.layout.frames_floats(count), turned)
 
     def write_frames(self, frames: Array, part: slice, axis: str, *, turned: bool = False) -> DeviceArray:
         """Copies the frames ``part`` of (F, rows, columns) to the device, padded. Lines along ``axis`` become rows of the
         copy, or its columns where ``turned``."""
         count, layout = part.stop - part.start, self.layout
-        on_device = self._some_frames(layout.turned_floats(count)) if turned else self.frames(count)
+        on_device = self._some_frames(layout.turned.frames_floats(count)) if turned else self.frames(count)
         if layout.subrays != SINGLE and isinstance(frames, DeviceArray):
             strides = layout.pixel_strides(axis, turned=turned)
             launch_spread(self.rt, frames, part, layout.subrays, on_device, strides)
         elif isinstance(frames, DeviceArray):
             source = frames, Strides.plain(frames.shape, (part.start, 0, 0))
-            padded = on_device, layout.turned_strides if turned else layout.frames_strides
+            padded = on_device, (layout.turned if turned else layout).frames_strides
             move(self.rt, source, padded, (count, *frames.shape[1:]), turned=turned != (axis == "columns"))
         else:
             chosen = frames[part] if layout.subrays == SINGLE else spread(frames[part], layout.subrays)

@@ -39,15 +39,12 @@ class LinearOperator(Protocol):
 
     def forward(self, volume: Any, out: Any = None) -> Any:
         """Returns A x, frames (F, rows, columns) float32, of a volume x (nz, ny, nx) in 1/mm."""
-        ...
 
     def adjoint(self, frames: Any, out: Any = None) -> Any:
         """Returns Aᵀ y, a volume (nz, ny, nx) float32, of frames y (F, rows, columns)."""
-        ...
 
     def subset(self, frames: Sequence[int]) -> "LinearOperator":
         """Returns the operator for the frames with the numbers ``frames``, in the order given."""
-        ...
 
 
 class RayOperator:

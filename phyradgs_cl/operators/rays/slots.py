@@ -73,12 +73,13 @@ class UprightPoses:
         order = np.argsort(appears)
         appears, slot = appears[order], np.argsort(order)[slot.reshape(-1)]
         table = self._table(cells, appears, slot, detector_shape)
-        values = 2 if leans else 1
-        if values * len(table) * _columns_of(table) * pitch_of(_rows_of(table)) > most_floats:
+        columns, rows = _largest(table)
+        if (2 if leans else 1) * len(table) * columns * pitch_of(rows) > most_floats:
             # the lines of cells that share a pose lie far apart, and a slot would have all between: each cell gets its own
             # slot
             appears = slot = np.arange(len(cells))
             table = self._table(cells, appears, slot, detector_shape)
+            columns, rows = _largest(table)
         by_slot = np.argsort(slot, kind="stable")
         return Slots(
             slots=rt.upload(table),
@@ -88,8 +89,8 @@ class UprightPoses:
             shares_by_slot=rt.upload(self._shares(cells[by_slot], of_frame[by_slot]), np.int32),
             count=len(table),
             frames=len(frames),
-            columns=_columns_of(table),
-            rows=_rows_of(table),
+            columns=columns,
+            rows=rows,
             is_plain=self.is_plain and len(table) == len(frames),
             leans=leans,
             is_parallel=self.is_parallel,
@@ -117,14 +118,9 @@ class UprightPoses:
         return np.stack([of, self.first[cells], self.stop[cells], begins[cells]], -1)
 
 
-def _columns_of(table: np.ndarray) -> int:
-    """Returns the columns of the widest slot."""
-    return int((table[:, 2] - table[:, 1]).max())
-
-
-def _rows_of(table: np.ndarray) -> int:
-    """Returns the rows of the highest slot."""
-    return int((table[:, 4] - table[:, 3]).max())
+def _largest(table: np.ndarray) -> tuple[int, int]:
+    """Returns the columns of the widest slot and the rows of the highest."""
+    return int((table[:, 2] - table[:, 1]).max()), int((table[:, 4] - table[:, 3]).max())
 
 
 @dataclass(frozen=True, eq=False)

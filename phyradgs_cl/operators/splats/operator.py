@@ -65,27 +65,21 @@ class PlainRows:
             rows, group=rt.group(on_cpu=16),
         )  # fmt: skip
 
-
     def with_densities(self, point: SplatPoint, density: DeviceArray) -> SplatPoint:
         """Returns a cloud like ``point`` with the densities ``density`` (G,) in 1/mm."""
         rt, cloud = self.rt, point.gaussians
         rows = rt.empty((ROWS, cloud.stride))
         rt.copy(cloud.rows, rows)
-        self._copy_row(density, 0, cloud.count, self._density, DENSITY * cloud.stride, rows)
+        where = np.int64(0), np.int32(cloud.count), self._density, np.int64(DENSITY * cloud.stride)
+        rt.launch(self._copy, cloud.count, density, *where, rows, group=rt.group(on_cpu=16))
         return SplatPoint(DeviceGaussians(rows, cloud.count, cloud.stride), point.norms)
 
     def densities(self, rows: DeviceArray) -> DeviceArray:
         """Returns a copy (G,) of the densities in plain rows (11, G)."""
         count = rows.shape[1]
         density = self.rt.empty(count)
-        self._copy_row(rows, DENSITY * count, count, np.float32(1), 0, density)
+        self.rt.copy(rows, density, nbytes=4 * count, source_offset=4 * DENSITY * count)
         return density
-
-    def _copy_row(
-        self, source: DeviceArray, start: int, count: int, factor: np.float32, to: int, target: DeviceArray
-    ) -> None:
-        rt, where = self.rt, (np.int64(start), np.int32(count), factor, np.int64(to))
-        rt.launch(self._copy, count, source, *where, target, group=rt.group(on_cpu=16))
 
 
 class PlainImages:
@@ -139,16 +133,16 @@ class SplatOperator:
         self._images = PlainImages(rt, self._projector.lines, self._projector.width, turned=readout.axis != "rows")
         self._cells = [DeviceCells.upload(rt, table.scaled(1 / length_mm)) for table in tables]
         self._poses = [table.pose[table.count // 2] for table in tables]
-        self._ready = _Ready()
+        self._ready: list[object] = []  # cloud and cells for which the kernels' buffers are ready; subsets share it
         self.frames_shape = (len(tables), *detector_shape)
 
     def forward(self, point: SplatPoint) -> DeviceArray:
         """Renders a cloud to frames (F, rows, columns) float32."""
         frames = self.rt.empty(self.frames_shape)
-        self._ready.forget()
+        self._ready.clear()  # before the buffers change: a failure may leave them half written
         for number, cells in enumerate(self._cells):
             self._images.leave(self._projector.forward(point.gaussians, cells), frames, number)
-        self._ready.note(point, self._cells[-1])
+        self._ready[:] = point, self._cells[-1]
         return frames
 
     def back(self, point: SplatPoint, by_frames: DeviceArray) -> DeviceArray:
@@ -164,8 +158,8 @@ class SplatOperator:
         self, point: SplatPoint, cells: DeviceCells, by_image: DeviceArray, gradients: DeviceArray
     ) -> None:
         """Writes one frame's gradients dL/d(kernels' rows), (13, stride), from its padded dL/d(frame)."""
-        is_ready = self._ready.holds(point, cells)
-        self._ready.forget()
+        is_ready = self._ready == [point, cells]
+        self._ready.clear()
         if not is_ready:
             see = self._projector.forward if self.is_layered else self._projector.prepare
             see(point.gaussians, cells)  # the derivative of merged intensities depends on every layer
@@ -229,45 +223,27 @@ class VoxelOperator:
         self._voxeliser = Voxeliser(rt, grid.shape, cutoff_sigma=cutoff_sigma)
         self.rows = PlainRows(rt, length_mm, line_integrals=False)
         self._images = PlainImages(rt, nz * ny, nx)
-        self._ready = _Ready()
+        self._ready: list[object] = []  # this and the cloud for which the kernels' buffers are ready
 
     def forward(self, point: SplatPoint) -> DeviceArray:
         """Returns the field (nz, ny, nx) float32 of a cloud."""
         volume = self.rt.empty(self.volume_shape)
-        self._ready.forget()
+        self._ready.clear()
         self._images.leave(self._voxeliser.forward(point.gaussians, self._inside), volume)
-        self._ready.note(point, self)
+        self._ready[:] = point, self
         return volume
 
     def back(self, point: SplatPoint, by_volume: DeviceArray) -> DeviceArray:
         """Returns dL/d(rows), (11, G) float32 at a cloud, from dL/d(volume), (nz, ny, nx)."""
         rt, gaussians = self.rt, point.gaussians
         by_rows, gradients = rt.empty((ROWS, gaussians.count)), rt.empty((ROWS + 2, gaussians.stride))
-        if not self._ready.holds(point, self):
-            self._ready.forget()
+        if self._ready != [point, self]:
+            self._ready.clear()
             self._voxeliser.prepare(gaussians, self._inside, (0, 0, 0))
         self._voxeliser.backward(gaussians, self._inside, self._images.enter(by_volume), gradients, add=False)
         self.rows.leave(gradients, point, by_rows)
-        self._ready.note(point, self)
+        self._ready[:] = point, self
         return by_rows
-
-
-class _Ready:
-    """Records for which cloud and cells the kernels' buffers are ready for a gradient."""
-
-    def __init__(self) -> None:
-        self.forget()
-
-    def forget(self) -> None:
-        """Marks the buffers as invalid. Call it before they change, because a failure may leave them half written."""
-        self._point: SplatPoint | None = None
-        self._where: object = None
-
-    def note(self, point: SplatPoint, where: object) -> None:
-        self._point, self._where = point, where
-
-    def holds(self, point: SplatPoint, where: object) -> bool:
-        return self._point is point and self._where is where
 
 
 def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, float]:

@@ -116,8 +116,6 @@ class SplatProjector:
         """The function ``path_limits`` as the kernels' argument, (4,) float32 with an unused last element."""
         return np.array([*path_limits(self.time_error), 0], np.float32)
 
-    # --- device to device: the reconstruction's loop --------------------------------------------------
-
     def forward(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
         """Renders the merged frame in the padded layout, valid until the next call."""
         self.draw(gaussians, cells)
@@ -196,8 +194,6 @@ class SplatProjector:
             cells.matrices, cells.cell_lines, cells.count, self.width, self.cutoff2, self._records,
             self._is_visible, self._extents, self._cloud, cells.cell_states, *times, group=rt.group(),
         )  # fmt: skip
-
-    # --- arrays to arrays -----------------------------------------------------------------------------
 
     def project(self, rows: np.ndarray, cells: DeviceCells) -> np.ndarray:
         """Renders parameter rows (11, G) to a frame (lines, width) float32."""

@@ -133,7 +133,8 @@ def backprojection(
     for frame, one, share, moved in zip(frames.astype(np.float64), pose, weight, pushes, strict=True):
         u, v, depth = detector_position(one, grid, is_parallel, moved)
         inside = (depth > 0) & _on(u, frame.shape[1]) & _on(v, frame.shape[0])
-        volume[inside] += share / depth[inside] ** power * _bilinear(frame, v[inside], u[inside])
+        seen = map_coordinates(frame, [v[inside], u[inside]], order=1, mode="nearest")
+        volume[inside] += share / depth[inside] ** power * seen
     return volume
 
 
@@ -177,9 +178,7 @@ def detector_position(
     offset = np.stack([x, y, z]).reshape(3, -1) - pose[0:3, None]
     basis = np.stack([pose[6:9], pose[9:12], pose[3:6] - pose[0:3]], -1)
     u, v, depth = np.linalg.solve(basis, offset).reshape(3, *grid.shape)
-    with np.errstate(
-        divide="ignore", invalid="ignore"
-    ):  # a voxel in the plane of the source has no position on the detector
+    with np.errstate(divide="ignore", invalid="ignore"):  # a voxel in the plane of the source has no position on the panel
         return u / depth, v / depth, depth
 
 
@@ -203,10 +202,6 @@ def _seen(
 
 def _on(position: np.ndarray, count: int) -> np.ndarray:
     return (position >= 0) & (position <= count - 1)
-
-
-def _bilinear(frame: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-    return np.asarray(map_coordinates(frame, [v, u], order=1, mode="nearest"))
 
 
 def warp_forward(volume: Volume, displacement: np.ndarray) -> Volume:

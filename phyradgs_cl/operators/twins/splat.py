@@ -31,24 +31,16 @@ def splat_image(
 ) -> np.ndarray:
     """Returns the frame (nv, nu) of parameter rows (11, G) from one pose (12,), at rest."""
     image = np.zeros(detector_shape)
-    if is_parallel:
-        for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
-            image += _in_parallel(row, precision, pose, detector_shape, cutoff_sigma)
-        return image
-    to_pixel = pixel_centres(pose, detector_shape) - pose[:3]
+    one_image = _in_parallel if is_parallel else _affine if affine else _exact
     for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
-        image += (
-            _affine(row, precision, pose, detector_shape, cutoff_sigma)
-            if affine
-            else _exact(row, precision, pose, to_pixel, cutoff_sigma)
-        )
+        image += one_image(row, precision, pose, detector_shape, cutoff_sigma)
     return image
 
 
 def _exact(
-    row: np.ndarray, precision: np.ndarray, pose: np.ndarray, to_pixel: np.ndarray, cutoff_sigma: float
+    row: np.ndarray, precision: np.ndarray, pose: np.ndarray, detector_shape: tuple[int, int], cutoff_sigma: float
 ) -> np.ndarray:
-    centre = row[:3] - pose[:3]
+    to_pixel, centre = pixel_centres(pose, detector_shape) - pose[:3], row[:3] - pose[:3]
     normal = np.cross(pose[6:9], pose[9:12])
     if normal @ centre * (normal @ to_pixel[0, 0]) <= 0:
         return np.zeros(to_pixel.shape[:2])
@@ -114,10 +106,7 @@ def splat_frame(
         lines = slice(int(table.line_start[cell]), int(table.line_stop[cell]))
         like = detector_shape, cutoff_sigma, affine, table.is_parallel
         image = table.weight[cell] * splat_image(rows, table.pose[cell], *like)
-        if table.axis == "rows":
-            frame[lines] += image[lines]
-        else:
-            frame[:, lines] += image[:, lines]
+        table.readout.frames(frame)[lines] += table.readout.frames(image)[lines]
     return frame
 
 

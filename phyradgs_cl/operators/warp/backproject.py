@@ -5,6 +5,7 @@ methods for motion-compensated cone-beam CT reconstruction of the thorax, IEEE T
 
 from copy import copy
 from functools import lru_cache
+from typing import cast
 
 import numpy as np
 
@@ -76,8 +77,7 @@ class MovingBackprojector:
             samples = LINE_SAMPLES * nx * ny * nz * int(images[3])
             rt.launch(kernel, items, *arguments, group=rt.group(on_cpu=group), samples=samples)
 
-        result: np.ndarray = in_bricks(rt, Views(frames, turned, matrices, weights), grid, 1, launch)  # type: ignore[assignment]
-        return result
+        return cast(np.ndarray, in_bricks(rt, Views(frames, turned, matrices, weights), grid, 1, launch))
 
     def _push_of(self, state: int) -> DeviceArray:
         """Returns the displacement u of a state's matter from the reference, (3, nz, ny, nx) in voxels, components x, y,

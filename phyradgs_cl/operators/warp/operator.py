@@ -26,9 +26,8 @@ from phyradgs_cl.operators.rays.layout import some_cells
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.rays.operator import RayOperator
 from phyradgs_cl.operators.rays.subrays import SINGLE
-from phyradgs_cl.operators.warp.stack import StateStack, TimeStates
 from phyradgs_cl.operators.warp.states import MOST_STATES, MotionStates
-from phyradgs_cl.operators.warp.volume import VolumeWarp
+from phyradgs_cl.operators.warp.volume import StateStack, TimeStates, VolumeWarp
 from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 
 # number of frames that allows one state more than MOST_STATES: with more frames, warps take a smaller part of the time

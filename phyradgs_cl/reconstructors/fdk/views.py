@@ -64,16 +64,14 @@ class Arc:
         """Returns the angle, of half a turn, from which rays are measured from neither side: the largest for rays at fan
         angles −fan_rad, 0 and fan_rad."""
         at_rad = np.linspace(0, 2 * np.pi, 1440, endpoint=False)
-        shares = [
-            (self.covers(at_rad) | self.covers(at_rad + np.pi + 2 * fan)).mean() for fan in (-fan_rad, 0.0, fan_rad)
-        ]
+        fans = (-fan_rad, 0.0, fan_rad)
+        shares = [(self.covers(at_rad) | self.covers(at_rad + np.pi + 2 * fan)).mean() for fan in fans]
         return float(np.pi * (1 - min(shares)))
 
     def covers(self, at_rad: np.ndarray) -> np.ndarray:
         """Returns whether a part of the arc holds each angle (...), counted as progress in rad; bool (...)."""
         turned = np.mod(at_rad, 2 * np.pi)[..., None]
-        held: np.ndarray = ((turned >= self.parts_rad[:, 0]) & (turned <= self.parts_rad[:, 1])).any(-1)
-        return held
+        return ((turned >= self.parts_rad[:, 0]) & (turned <= self.parts_rad[:, 1])).any(-1)
 
 
 def filled_gap_rad(fan: weights.Fan) -> float:

@@ -161,16 +161,14 @@ def parted_weight(progress_rad: float, angle_rad: np.ndarray, parts_rad: np.ndar
     opposite counts 2. After F. Noo et al., Phys. Med. Biol. 47 (2002) 2525."""
     here = max(float(_depth(np.array(progress_rad), parts_rad)), 1e-6)
     there = _depth(np.mod(progress_rad + np.pi + 2 * angle_rad, 2 * np.pi), parts_rad)
-    weight: np.ndarray = 2 * here / (here + there)
-    return weight
+    return 2 * here / (here + there)
 
 
 def _depth(at_rad: np.ndarray, parts_rad: np.ndarray) -> np.ndarray:
     """Returns a smooth weight (sin²) at angles (...), from 0 at the ends of parts (P, 2) to 1 inside; 0 outside."""
     begin, end = parts_rad.T
     from_end = np.minimum(at_rad[..., None] - begin, end - at_rad[..., None])
-    deep: np.ndarray = _eased(from_end, np.minimum(_PART_EDGE_RAD, (end - begin) / 2) / 2).max(-1)
-    return deep
+    return _eased(from_end, np.minimum(_PART_EDGE_RAD, (end - begin) / 2) / 2).max(-1)
 
 
 def _eased(distance_rad: float | np.ndarray, half_width_rad: np.ndarray) -> np.ndarray:

@@ -23,10 +23,10 @@ ANYWHERE = (-math.inf, math.inf)  # limits of the shift in pixels: none
 _MOST_VIEWS = 60  # most views that are compared with their opposites
 _MOST_ROWS = 64  # most blocks of rows that are compared
 _BEYOND = 1.5  # largest distance of a view's opposite from the nearest view beyond the scan's end, in steps between views
-_WIDEST_STEP_RAD = math.radians(10.0)  # largest angle between two views that are interpolated
+WIDEST_STEP_RAD = math.radians(10.0)  # largest angle between two views that are interpolated
 # standard deviation in pixels of a smoothing along rows: interpolation lowers noise between pixels, which biases shifts
-_SMOOTHING_PX = 1.0
-_CORRELATED_PX = 2 * math.sqrt(math.pi) * _SMOOTHING_PX  # columns of smoothed noise per independent one
+SMOOTHING_PX = 1.0
+_CORRELATED_PX = 2 * math.sqrt(math.pi) * SMOOTHING_PX  # columns of smoothed noise per independent one
 _LEAST_OVERLAP = 0.25  # least overlap of a view and its mirrored opposite, as a fraction of the columns
 _LEAST_ENERGY = 0.2  # least sum of squares in an overlap, as a fraction of the largest over all shifts
 _STEPS = 12  # most Gauss–Newton steps
@@ -49,7 +49,7 @@ class AxisShift:
         return math.isfinite(self.pixels)
 
 
-_NONE = AxisShift(math.nan, math.nan, np.empty(0))
+NOT_FOUND = AxisShift(math.nan, math.nan, np.empty(0))
 
 
 def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHERE) -> AxisShift:
@@ -127,15 +127,15 @@ def opposite_shift(scan: Scan) -> AxisShift:
     no views are opposite. NaN also for columns read one after the other, whose mirror images are seen from other
     angles."""
     if not has_opposite_views(scan) or (scan.shutter.axis == "columns" and scan.shutter.readout_s > 0):
-        return _NONE
+        return NOT_FOUND
     pairs = _pairs(scan)
     if not pairs:
-        return _NONE
+        return NOT_FOUND
     start_px = _rough_shift(pairs)
     shifts, information = np.array([_refined_shift(pair, start_px) for pair in pairs]).T
     is_found = np.isfinite(shifts) & (information > 0)
     if not is_found.any():
-        return _NONE
+        return NOT_FOUND
     shifts, weight = shifts[is_found], information[is_found] / information[is_found].sum()
     shift = float(weight @ shifts)
     noise, scatter = 1 / information[is_found].sum(), float(weight**2 @ (shifts - shift) ** 2)
@@ -172,11 +172,11 @@ def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     step = float(np.median(np.abs(np.diff(away[order])))) if len(away) > 1 else math.inf
     above = int(np.searchsorted(away[order], 0.0))
     two = order[np.clip([above - 1, above], 0, len(away) - 1)]
-    if two[0] == two[1] or np.ptp(away[two]) > min(_WIDEST_STEP_RAD, 2 * _BEYOND * step):
+    if two[0] == two[1] or np.ptp(away[two]) > min(WIDEST_STEP_RAD, 2 * _BEYOND * step):
         nearest = order[np.argsort(np.abs(away[order]), kind="stable")]
         near = nearest[0]
         same_side = [frame for frame in nearest[1:] if step / 2 < abs(away[frame] - away[near]) < _BEYOND * step]
-        if not same_side or abs(away[near]) > min(_WIDEST_STEP_RAD, _BEYOND * step):
+        if not same_side or abs(away[near]) > min(WIDEST_STEP_RAD, _BEYOND * step):
             return None
         two = np.array([near, same_side[0]])
     # linear in the angle: the two shares put the mean of the pair at angle 0, also outside of the two
@@ -196,7 +196,7 @@ def _few_rows(scan: Scan, frame: int) -> np.ndarray:
         ])
     starts = np.unique(np.linspace(0, len(image), min(len(image), _MOST_ROWS), endpoint=False).astype(int))
     means = np.add.reduceat(image, starts, axis=0) / np.diff(starts, append=len(image))[:, None]
-    return gaussian_filter1d(means, _SMOOTHING_PX, axis=1)
+    return gaussian_filter1d(means, SMOOTHING_PX, axis=1)
 
 
 def _rough_shift(pairs: list[_Pair]) -> float:

@@ -13,23 +13,19 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.angles import azimuth_rad, middle_poses
 from phyradgs_cl.prepare.step import fill_masked
 from phyradgs_cl.reconstructors.fdk.weights import fan_angle, pixel_rays
-from phyradgs_cl.reconstructors.fits.axis import AxisShift
+from phyradgs_cl.reconstructors.fits.axis import NOT_FOUND, SMOOTHING_PX, WIDEST_STEP_RAD, AxisShift
 
-# standard deviation in pixels of a smoothing along rows: interpolation lowers noise between pixels, which biases shifts
-_SMOOTHING_PX = 1.0
 _COARSE_COLUMNS = 128  # most columns of the coarse frames
 _MOST_PX = 16.0  # largest trial shift to either side, in coarse pixels
 _STEP_PX = 0.5  # distance between trial shifts, in pixels of the frames that are compared
 _NEAR_PX = 2.0  # largest distance, in coarse pixels, of the trial shifts on full frames from the best coarse one
 _FEWEST_VIEWS = 24  # least number of views of a scan
 _MOST_VIEWS = 360  # most views that are compared
-_WIDEST_STEP_RAD = math.radians(10.0)  # largest angle between neighbouring views: wider steps are not interpolated
 _MOST_ROWS = 32  # most rows that are compared
 _MOST_PAIRS = 48  # most pairs of opposite rays in a row that are compared
 _LEAST_PX = 1.0  # least distance, in pixels, from the axis to the middle of the panel's outer column
 _BLOCKS = 12  # blocks of views of the jackknife
 _BIAS_PX = 0.05  # standard error of the shift in pixels beside noise, measured with half-fans and features of two pixels
-_NONE = AxisShift(math.nan, math.nan, np.empty(0))
 
 
 def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
@@ -39,11 +35,11 @@ def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
     NaN where views are more than 10° apart, where columns are read one after the other, and where no shift within an
     eighth of the panel agrees best."""
     if scan.shutter.axis == "columns" and scan.shutter.readout_s > 0:
-        return _NONE  # a ray and its opposite are read at other times
+        return NOT_FOUND  # a ray and its opposite are read at other times
     poses = middle_poses(scan)
     turned, views = np.unique(np.round(np.mod(azimuth_rad(poses), 2 * np.pi), 9), return_index=True)
-    if len(turned) < _FEWEST_VIEWS or np.diff(turned, append=turned[0] + 2 * np.pi).max() > _WIDEST_STEP_RAD:
-        return _NONE
+    if len(turned) < _FEWEST_VIEWS or np.diff(turned, append=turned[0] + 2 * np.pi).max() > WIDEST_STEP_RAD:
+        return NOT_FOUND
     some = np.unique(np.linspace(0, len(views) - 1, min(len(views), _MOST_VIEWS)).round().astype(int))
     turned, views = turned[some], views[some]
     frames, pose = _level_rows(scan, views, poses[views[0]]), poses[views[0]]
@@ -74,7 +70,7 @@ def _binned(frames: np.ndarray, pose: np.ndarray, block: int) -> tuple[np.ndarra
     coarse = pose.copy()
     coarse[3:6] += (block - 1) / 2 * pose[6:9]
     coarse[6:9] *= block
-    return np.asarray(gaussian_filter1d(means, _SMOOTHING_PX, axis=2)), coarse
+    return np.asarray(gaussian_filter1d(means, SMOOTHING_PX, axis=2)), coarse
 
 
 def _best(scan: Scan, turned: np.ndarray, frames: np.ndarray, pose: np.ndarray, shifts_px: np.ndarray) -> AxisShift:
@@ -90,7 +86,7 @@ def _best(scan: Scan, turned: np.ndarray, frames: np.ndarray, pose: np.ndarray, 
             shifts.append(shift_px)
             scores.append(squares)
     if len(shifts) < 3:
-        return _NONE
+        return NOT_FOUND
     by_view, places = np.array(scores), np.array(shifts)
     parts = np.array_split(np.arange(len(turned)), _BLOCKS)
     some = np.array([_minimum(places, np.delete(by_view, part, axis=1).mean(1)) for part in parts])
@@ -115,8 +111,7 @@ def _mean_squares(turned: np.ndarray, frames: np.ndarray, fan: np.ndarray, is_pa
         ray, opposite = (_at_column(frames, float(np.interp(one, fan, columns))) for one in (angle, -angle))
         around = CubicSpline(whole, np.append(opposite, opposite[:1], 0), bc_type="periodic")
         total += ((ray - around(turned + np.pi + (0.0 if is_parallel else 2 * angle))) ** 2).mean(1)
-    mean: np.ndarray = total / len(pairs)
-    return mean
+    return total / len(pairs)
 
 
 def _at_column(frames: np.ndarray, column: float) -> np.ndarray:

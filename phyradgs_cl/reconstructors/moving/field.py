@@ -16,9 +16,8 @@ from phyradgs_cl.fields import Deformation, control_points
 from phyradgs_cl.fields.deformation import fitted_control_mm
 from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.operators.warp.operator import FieldDerivative, WarpedOperator
-from phyradgs_cl.operators.warp.stack import StateStack
 from phyradgs_cl.operators.warp.states import MotionStates
-from phyradgs_cl.operators.warp.volume import VolumeWarp
+from phyradgs_cl.operators.warp.volume import StateStack, VolumeWarp
 from phyradgs_cl.reconstructors.moving.signal import Bending, TemporalSplines
 from phyradgs_cl.runtime import Runtime
 

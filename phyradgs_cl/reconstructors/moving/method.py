@@ -30,7 +30,6 @@ from phyradgs_cl.reconstructors.moving.field import FieldProblem, MotionField, s
 from phyradgs_cl.reconstructors.moving.signal import (
     MotionSignal,
     TemporalSplines,
-    gating_of_scan,
     load_gating,
     motion_signal,
     signal_of,
@@ -287,7 +286,11 @@ def moving(scan: Scan, options: MovingOptions, rt: Runtime, **arguments: Any) ->
     # the first passes start as ``fista`` does, not from the volume of the search
     stages += [replace(coarse, make=lambda _: coarse.make(None)), *fine]
     report = Report.of(run.report)
-    with report.through(partial(_with_field_in_progress, one)):
+
+    def with_field(progress: Progress) -> Progress:
+        return progress.mapped(state=lambda state: {**state, **one.state()}, deformation=one.for_passes)
+
+    with report.through(with_field):
         result = replace(run, report=report).result("moving", Stages(stages, run))
     state = None if result.state is None else {**result.state, **one.state()}
     facts = option_facts(replace(options, motion=of_passes().options.motion))
@@ -299,17 +302,17 @@ METHOD = Method(moving, {"default": MovingOptions()}, finds_motion=True)
 
 
 def _signal_of(scan: Scan, gating: str) -> MotionSignal:
-    """Returns the signal of the scan, of a file, or that of the frames; ``free`` has no period."""
+    """Returns the signal of the scan, of a file, or that of the frames; ``free`` has no period. Raises InputError for the
+    signal of a scan that states none."""
     if gating == "scan":
-        return signal_of(gating_of_scan(scan), scan, "gating scan")
+        if scan.gating is None:
+            remedy = "take --set gating=auto, or a file NAME.csv"
+            raise InputError("gating", "scan, which states neither", "a signal or a phase in phyradgs/gating", remedy)
+        return signal_of(scan.gating, scan, "gating scan")
     if gating.endswith(".csv"):
         return signal_of(load_gating(gating, scan), scan, f"gating {gating}")
     signal = motion_signal(scan)
     return replace(signal, period_s=None, knot_s=None) if gating == "free" else signal
-
-
-def _with_field_in_progress(one: _Field, progress: Progress) -> Progress:
-    return progress.mapped(state=lambda state: {**state, **one.state()}, deformation=one.for_passes)
 
 
 def _motion_facts(one: _Field, signal: MotionSignal, scan: Scan) -> dict[str, object]:

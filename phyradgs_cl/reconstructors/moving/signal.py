@@ -208,14 +208,6 @@ def scaled(values: np.ndarray) -> np.ndarray:
     return np.asarray(centred / largest if largest > 0 else centred)
 
 
-def gating_of_scan(scan: Scan) -> Gating:
-    """Returns the signal or phase that the scan states. Raises InputError for a scan without gating."""
-    if scan.gating is None:
-        remedy = "take --set gating=auto, or a file NAME.csv"
-        raise InputError("gating", "scan, which states neither", "a signal or a phase in phyradgs/gating", remedy)
-    return scan.gating
-
-
 def load_gating(path: str, scan: Scan) -> Gating:
     """Loads a file with lines ``time in s, value``, or with one value for each frame in their order, with or without a
     heading. Values whose heading is ``phase`` are phases in cycles. Raises InputError for other files."""

@@ -27,10 +27,9 @@ from phyradgs_cl.reconstructors.fdk import static_fdk
 from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
-from phyradgs_cl.reconstructors.splats.device import DeviceCloud, Scale
 from phyradgs_cl.reconstructors.splats.options import PRESETS, R2_PUBLISHED, SplatOptions
 from phyradgs_cl.reconstructors.splats.start import box_of, first_population, internal_scale
-from phyradgs_cl.reconstructors.splats.step import Batch, FrameStep, sharing_of
+from phyradgs_cl.reconstructors.splats.step import Batch, DeviceCloud, FrameStep, Scale, sharing_of
 from phyradgs_cl.runtime import Runtime
 
 REPORT_EVERY = 50  # number of iterations between reports, and most between lines of the record
@@ -132,13 +131,9 @@ class SplatRun:
         self.cloud.write_statistics(state["statistics"])
         self._queue = state["queue"].tolist()
 
-    def parameters(self) -> np.ndarray:
-        """Returns parameter rows (11, G) float64 in internal units."""
-        return self.activation.apply(self.cloud.population().raw.astype(np.float64))
-
     def present_cloud(self) -> Gaussians:
         """Returns the cloud in internal units, without Gaussians whose shape density control would not allow."""
-        rows = self.parameters()
+        rows = self.activation.apply(self.cloud.population().raw.astype(np.float64))
         return Gaussians.from_rows(rows[:, self.options.control.allows(rows[SCALE])])
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:

@@ -8,8 +8,8 @@ import scipy
 from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.optim import Population, prune
-from phyradgs_cl.reconstructors.splats.device import Scale
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.reconstructors.splats.step import Scale
 
 log = logging.getLogger(__name__)
 _REFERENCE_PERCENTILE = 99.9  # percentile of the first volume's values that is the unit of density

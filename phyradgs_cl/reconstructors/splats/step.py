@@ -1,30 +1,148 @@
-"""The gradient of one step: render a frame, compare, go back, total variation, chain rule; and its sum over ranks.
+"""One step of a splatting run on the device: its Gaussians and frames there, and the gradient, summed over ranks.
 
-``FrameStep.gradient`` is the only place where these parts meet. Ranks have all Gaussians each, and some frames of the batch;
-their gradients sum to bits that depend on the batch, not on the number of ranks."""
+``FrameStep.gradient`` is the only place that renders a frame, compares, goes back, adds total variation and applies the
+chain rule. Ranks have all Gaussians each, and some frames of the batch. Their gradients sum to bits that depend on the
+batch, not on the number of ranks."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition import Exact, Motion, Scan, TimeCells
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.objective import ImageLoss, TotalVariation
-from phyradgs_cl.operators import SplatProjector, Voxeliser
+from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector, Voxeliser
+from phyradgs_cl.operators.splats.layout import pad_columns, stride_of
 from phyradgs_cl.operators.splats.projector import DEFAULT_TIME_ERROR
-from phyradgs_cl.operators.splats.states import CloudStates
-from phyradgs_cl.optim import DeviceAdam
+from phyradgs_cl.operators.splats.states import CloudStates, segments_for_object, states_of
+from phyradgs_cl.optim import DeviceAdam, Population
 from phyradgs_cl.parallel import Communicator, exact_sum
-from phyradgs_cl.reconstructors.splats.device import DeviceCloud, DeviceFrames, Scale
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
+from phyradgs_cl.runtime.layout import pad_rows
 
+_PEAK_PERCENTILE = 99.9  # percentile of the line integrals that counts as their peak; the maximum would be noise
 _ROWS = 11  # parameters of a Gaussian: rows of dL/d(parameters)
 _STATISTICS = 2  # rows of a Gaussian's statistics for density control
 _DERIVED = 13  # rows of ``cloud.gradients``: dL/d(parameters), then dL/d(centre on the detector), (u, v)
 Corner = tuple[int, int, int]
 """First voxel (z, y, x) of the sub-volume of the total variation."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Internal units of a splatting run: the unit of length in mm, and of density in 1/mm."""
+
+    length_mm: float
+    density_per_mm: float
+
+    @property
+    def line_integral(self) -> float:
+        return self.length_mm * self.density_per_mm
+
+
+class DeviceCloud:
+    """The Gaussians of a run on the device. Arrays have ``gaussians.stride`` columns, the first ``count`` of them
+    Gaussians."""
+
+    def __init__(self, rt: Runtime, population: Population) -> None:
+        self.rt, self.count = rt, population.count
+        stride = stride_of(self.count)
+        moments = np.zeros((2, 11, stride), np.float32)
+        moments[:, :, : self.count] = population.moments
+        self.raw = rt.upload(pad_columns(population.raw))
+        self.moments = rt.upload(moments)
+        self.gradients = rt.zeros((13, stride))
+        self.statistics = rt.zeros((2, stride))
+        self.gaussians = DeviceGaussians(rt.zeros((11, stride)), self.count, stride)
+
+    def activate(self, adam: DeviceAdam) -> None:
+        adam.activate(self.raw, self.gaussians.rows, self.count, self.gaussians.stride)
+
+    def move(self, adam: DeviceAdam, rates: np.ndarray, step: int) -> None:
+        """Does a step of Adam down the gradients. rates (11,): step sizes by parameter; step: counts from 1."""
+        adam.step(self.raw, self.gradients, self.moments, self.gaussians.stride, rates, step)
+
+    def population(self) -> Population:
+        count = self.count
+        return Population(self.rt.download(self.raw)[:, :count], self.rt.download(self.moments)[:, :, :count])
+
+    def read_statistics(self) -> np.ndarray:
+        """Returns (2, count) float32: the sum of the centre's gradient norms over frames, and the number of frames with a
+        gradient."""
+        return self.rt.download(self.statistics)[:, : self.count]
+
+    def write_statistics(self, statistics: np.ndarray) -> None:
+        """Replaces the statistics (2, count)."""
+        padded = np.zeros((2, self.gaussians.stride), np.float32)
+        padded[:, : self.count] = statistics
+        self.rt.write(self.statistics, padded)
+
+
+class DeviceFrames:
+    """Time cells, measurement in internal units and mask of every frame on the device."""
+
+    def __init__(
+        self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, deformation: Deformation | None = None
+    ) -> None:
+        self.rt, self.scan, self.scale, self.deformation = rt, scan, scale, deformation
+        self.count = scan.frames
+        readout = scan.shutter.readout
+        self.lines, self.width = readout.shape(scan.geometry.detector_shape)
+        self._model = scan.detector_model if options.detector_model == "scan" else options.detector_model
+        self.intensity_unit = scale.line_integral if self.follow(options.motion) else None
+        measured = (frame / np.float32(scale.line_integral) for frame in scan.projections)
+        self._measured = [rt.upload(pad_rows(readout.frames(m))) for m in measured]
+        self._mask, self._pixels = _upload_masks(rt, scan)
+
+    def follow(self, motion: Motion) -> bool:
+        """Takes the time cells of a motion model. Returns whether frames average intensities over a line's cells."""
+        tables, merges = tables_of(self.scan, motion, self._model, self.deformation)
+        of_object = self.deformation
+        states = [None if of_object is None else states_of(table, of_object) for table in tables]
+        scaled = (table.scaled(1 / self.scale.length_mm) for table in tables)
+        self._cells = [DeviceCells.upload(self.rt, table, own) for table, own in zip(scaled, states, strict=True)]
+        return merges
+
+    @property
+    def most_cells(self) -> int:
+        """The largest number of time cells of a frame."""
+        return max(cells.count for cells in self._cells)
+
+    def get(self, frame: int) -> tuple[DeviceCells, DeviceArray, DeviceArray, float]:
+        """Returns a frame's time cells, measurement, mask (1 at valid pixels) and number of valid pixels."""
+        mask = frame if len(self._mask) > 1 else 0
+        return self._cells[frame], self._measured[frame], self._mask[mask], self._pixels[mask]
+
+
+def tables_of(
+    scan: Scan, motion: Motion, model: str, deformation: Deformation | None = None
+) -> tuple[list[TimeCells], bool]:
+    """Returns the time cells of every frame in mm, and whether frames average intensities over a line's cells.
+
+    Where ``exact`` chooses the segments, an object that moves gets as many as its paths need."""
+    peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
+    cells = partial(motion.cells, intensity_peak=peak) if isinstance(motion, Exact) else motion.cells
+    tables = [cells(scan, frame) for frame in range(scan.frames)]
+    if deformation is not None and isinstance(motion, Exact) and motion.segments == 0 and scan.is_fly:
+        voxel_mm, lit_s = min(scan.grid.voxel_size_mm), np.array(scan.shutter.lit_span_s)
+        for frame, start_s in enumerate(scan.frame_start_s):
+            needed = segments_for_object(deformation, start_s + lit_s, voxel_mm)
+            if needed > tables[frame].count:
+                tables[frame] = replace(motion, segments=needed).cells(scan, frame)
+    # with a single value the log and the intensity model agree
+    return tables, model == "intensity" and any(table.averages for table in tables)
+
+
+def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[float]]:
+    """Uploads masks, 1 at valid pixels: one for all frames, or one per frame. Returns the masks and their numbers of
+    valid pixels."""
+    masks = np.zeros((1, *scan.geometry.detector_shape)) if scan.pixel_mask is None else scan.pixel_mask
+    stack = [(m == 0).astype(np.float32) for m in (masks if masks.ndim == 3 else masks[None])]
+    arrays = [rt.upload(pad_rows(scan.shutter.readout.frames(m))) for m in stack]
+    return arrays, [float(m.sum()) for m in stack]
 
 
 @dataclass(frozen=True)

@@ -30,8 +30,7 @@ from phyradgs_cl.reconstructors.voxels import priors
 from phyradgs_cl.reconstructors.voxels.priors import Denoiser, Prior, PriorWeight, frame_error
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, Iterations, IterativeOptions, MethodRun
 from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages, merge_subvoxels, repeated
-from phyradgs_cl.reconstructors.voxels.subsets import OrderedSubsets
-from phyradgs_cl.reconstructors.voxels.system import System
+from phyradgs_cl.reconstructors.voxels.system import OrderedSubsets, System
 from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.algebra import HostSpace

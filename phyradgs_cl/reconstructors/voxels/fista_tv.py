@@ -50,12 +50,12 @@ class FistaTv(Accelerated):
         system, space = self.system, self.system.space
         point = space.extrapolate(self.volume, self.previous, self.extrapolation)
         projected = space.extrapolate(self.projected, self.projected_previous, self.extrapolation)
-        gradient = system.back(system.apply_weights(system.difference(system.measured, projected)))
+        gradient = system.back(system.apply_weights(space.add(system.measured, projected, -1.0)))
         descended = space.add(point, gradient, 1 / self.curvature)
         volume = self.prior(space, descended, self.tv_weight / self.curvature, nonnegative=self.nonnegative)
         self.accept(point, volume)
         self.projected_previous, self.projected = self.projected, system.expected(self.volume)
-        return space.norm(system.difference(system.measured, self.projected))
+        return space.norm(space.add(system.measured, self.projected, -1.0))
 
 
 def _started(system: System, options: FistaTvOptions, run: MethodRun) -> FistaTv:

@@ -15,8 +15,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.checks import ranged
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, voxel_method
-from phyradgs_cl.reconstructors.voxels.subsets import spread_order
-from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights
+from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights, spread_order
 
 _WEIGHT_CACHE_BYTES = 1 << 29  # most bytes of the column weights of subsets that are kept
 

@@ -37,7 +37,6 @@ class Stages:
 
     The first stage starts from the run's first volume, if any."""
 
-
     def __init__(self, stages: Sequence[Stage], run: MethodRun) -> None:
         self.stages, self.grid = stages, run.scan.grid
         self.before = run.initial

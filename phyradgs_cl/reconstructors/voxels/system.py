@@ -5,13 +5,14 @@ through the system's ``space``. Over several ranks each projects its own frames;
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.detector import noise_level, transmission_weights
 from phyradgs_cl.fields import Deformation
 from phyradgs_cl.operators.rays.intensity import IntensityOperator
@@ -25,6 +26,7 @@ log = logging.getLogger(__name__)
 
 _SHORTEST_PATH = 0.1  # lower limit of a ray's path length through the volume, as a fraction of the longest path
 _FAINTEST = 1e-6  # lower limit of the sum of path lengths over a voxel's rays, as a fraction of the largest sum
+_GROWTH = 1.2  # steps of subsets diverge where a pass leaves more than this many times the least residual so far
 S = TypeVar("S", bound="SharedOperator")
 
 
@@ -160,15 +162,6 @@ class System:
         expected = self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
         return self.space.add(self.measured, expected, -1.0)
 
-    def difference(self, x: Any, y: Any) -> Any:
-        """Returns x − y for arrays of one shape."""
-        return self.space.add(x, y, -1.0)
-
-    def linearise_at(self, volume: Any) -> None:
-        """Sets J to the derivative of I at ``volume``, for a run that resumes there. A is the same at every volume."""
-        if self.intensity is not None:
-            self.expected(volume)
-
     def noise_norm(self) -> float:
         """Returns the norm of the measurement's noise over the valid pixels, estimated from the measurement."""
         measured = self.space.numpy(self.measured)
@@ -216,6 +209,41 @@ def row_weights(system: System) -> Any:
 def column_weights(system: System) -> Any:
     """Returns 1/(Aᵀ 1) of every voxel in 1/mm; 0 where no ray passes."""
     return system.space.reciprocal(system.column_sums(), _FAINTEST)
+
+
+def spread_order(count: int) -> list[int]:
+    """Returns the numbers 0 … count − 1, each far from the few before it, in steps near the golden section of ``count``."""
+    step = next(s for s in range(max(round(0.618 * count), 1), 2 * count + 1) if np.gcd(s, count) == 1)
+    return [(i * step) % count for i in range(count)]
+
+
+class OrderedSubsets:
+    """A system divided into ``count`` subsets: every count-th frame each, in an order that spreads them over the turn. H. M.
+    Hudson and R. S. Larkin, IEEE Trans. Med. Imaging 13 (1994) 601."""
+
+    def __init__(self, system: System, count: int) -> None:
+        self.system, self.least_residual = system, float("inf")
+        self.split(min(count, system.frames))
+
+    def __iter__(self) -> Iterator[System]:
+        return iter(self._systems)
+
+    def __len__(self) -> int:
+        return len(self._systems)
+
+    def split(self, count: int) -> None:
+        """Divides the frames into ``count`` subsets."""
+        frames = self.system.frames
+        self._systems = [self.system.subset(range(first, frames, count)) for first in spread_order(count)]
+
+    def join_if_diverging(self, residual: float) -> bool:
+        """Joins subsets two by two where the ``residual`` of a pass has grown so much that their steps diverge. Returns
+        whether it did."""
+        diverges = residual > _GROWTH * self.least_residual and len(self) > 1
+        if diverges:
+            self.split(ceil_div(len(self), 2))
+        self.least_residual = residual if diverges else min(self.least_residual, residual)
+        return diverges
 
 
 class SharedOperator:
