@@ -1,6 +1,6 @@
 """Writes the pages in docs/reference from the code and examples/: python docs/make_reference.py
 
-tests/test_docs.py fails when what is committed is not what this writes.
+tests/test_docs.py fails where a command, an option or a name of the API is missing in what is committed.
 """
 
 import inspect

@@ -8,7 +8,8 @@ of a subset, times the number of subsets, stands for that of all frames (Kim, Ra
 The last 2/5 of the passes run on smaller voxels, whose means make up most of the result (``stages.py``). The passes before
 them only bring a first volume: they have more subsets, and few times in an exposure.
 
-A run: ``MethodRun``, ``Stages``, ``Loop``, ``Iterations.step``, ``Fista.step``, ``System``, ``RayOperator``, a launch."""
+A run: ``MethodRun``, ``Stages``, ``Loop``, ``Iterations.step``, ``Fista.step``, ``System``, ``RayOperator``, a launch.
+``fista_passes`` already projects before its loop, for the step sizes and the ``PriorWeight``."""
 
 import logging
 import math

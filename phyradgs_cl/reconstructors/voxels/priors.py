@@ -1,5 +1,5 @@
 """The priors of ``fista``, as proximal maps, and their weight, relative to the error of the data term's gradient. A new
-prior is a class and a line of ``PRIORS``; its map is in ``objective``.
+prior is a line of ``PRIORS``: a class, whose map is in ``objective``, or ``OwnPrior`` of a function.
 
 A pixel of a frame differs from that of the best volume by its noise and by the discretisation error of voxels at edges. Both
 reach the gradient through Aᵀ. The constants are fitted (docs/results/settings.md)."""
@@ -325,7 +325,9 @@ def prior_of(prior: str | Denoiser, inputs: PriorInputs) -> Prior:
 
 def volumes_of(prior: str | Denoiser) -> int:
     """Returns how many more volumes the prior holds on the device than ``dct``."""
-    return ThenRidge.VOLUMES if prior == "ridge" else 0
+    if prior == "ridge":
+        return ThenRidge.VOLUMES
+    return int(getattr(PRIORS.get(prior), "VOLUMES", 0)) if isinstance(prior, str) else 0
 
 
 def subvoxel_share(prior: str | Denoiser, shape: tuple[int, int, int]) -> float:
