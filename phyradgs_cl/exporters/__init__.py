@@ -32,6 +32,7 @@ OWN = "h5"
 """The format of this package's volume files, which store a scale of Hounsfield units; their values stay in 1/mm."""
 ScaleOf = Callable[[Volume], Hounsfield | None]
 _SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": (), "zarr": (".ome.zarr", ".zarr")}
+_PLAIN = "values in 1/mm"  # note of the unit in files of other programs
 
 
 def export_volume(
@@ -41,23 +42,24 @@ def export_volume(
     """Writes a volume file in another format, whole or not at all, and returns the path of the output.
 
     to: one of ``EXPORTS``; ply and npz take the Gaussians, all others the voxels. Or ``OWN``, a volume file with its scale.
-    output: a file, or a folder for dicom and zarr; None takes the folder of ``path``.
+    output: a file, or a folder for dicom and zarr; None takes the folder of ``path``, and NAME.doubt for error bars.
     mu_water_per_mm: water's attenuation; the values are then written in Hounsfield units.
     scale_of: in place of it, a function from the volume to its scale of Hounsfield units, as ``hu_scale``.
     labels: patient, study and series, for dicom only. doubt: whether the voxels are the error bars σ in 1/mm.
 
     Raises InputError for an unknown format, a damaged volume or one without Gaussians, a suffix of another format, and
     labels with another format. Raises OutputError where the output cannot be written."""
-    target, scale_of = _checked(Path(path), to, output, mu_water_per_mm, labels, scale_of)
-    stored = read_volume(path)
+    named = Path(path).with_name(f"{Path(path).stem}.doubt.h5") if doubt else Path(path)
+    target, scale_of = _checked(named, to, output, mu_water_per_mm, labels, scale_of)
+    stored, unit = read_volume(path), _PLAIN
     if doubt:
         if to in (*CLOUDS, OWN) or scale_of is not None:
             found = f"given with {'Hounsfield units' if scale_of is not None and to != OWN else to}"
             raise InputError("--doubt", found, "a format of voxels, in 1/mm", "use nii or mha, without --hu")
         if stored.doubt is None:
             raise InputError(str(path), "no error bars", "a volume of 'reconstruct --doubt'", "run it again with --doubt")
-        stored = replace(stored, values=stored.doubt)
-    export_stored(stored, to, target, str(path), scale_of, labels)
+        stored, unit = replace(stored, values=stored.doubt), "error bars (68 %) in 1/mm"
+    export_stored(stored, to, target, str(path), scale_of, labels, unit)
     return target
 
 
@@ -96,10 +98,10 @@ def _checked(
     return target, scale_of
 
 
-def _in_unit(values: np.ndarray, scale: Hounsfield | None) -> tuple[np.ndarray, str]:
+def _in_unit(values: np.ndarray, scale: Hounsfield | None, unit: str = _PLAIN) -> tuple[np.ndarray, str]:
     """Returns values (z, y, x) float32 in 1/mm, or in Hounsfield units where there is a scale, and a note of their unit."""
     plain = np.ascontiguousarray(values, np.float32)
-    return (plain, "values in 1/mm") if scale is None else (scale.of(plain), scale.note)
+    return (plain, unit) if scale is None else (scale.of(plain), scale.note)
 
 
 def state_times_s(moves: Deformation | States, count: int, during_s: tuple[float, float] | None = None) -> list[float]:
@@ -155,9 +157,10 @@ def export_states(
 
 def export_stored(
     volume: Volume, to: str, target: Path, subject: str, scale_of: ScaleOf | None = None,
-    labels: DicomLabels | None = None,
+    labels: DicomLabels | None = None, unit: str = _PLAIN,
 ) -> None:  # fmt: skip
-    """Writes a volume to ``target`` as ``export_volume`` does; ``subject`` names the volume in messages."""
+    """Writes a volume to ``target`` as ``export_volume`` does; ``subject`` names the volume in messages. unit: of values
+    without a scale, for the file."""
     if to in CLOUDS:
         CLOUDS[to](target, writers.gaussians_of(volume, subject))
         return
@@ -168,9 +171,9 @@ def export_stored(
         _write_own(target, volume, subject, scale)
         return
     if to == "zarr":
-        writers.write_zarr(target, volume, scale)
+        writers.write_zarr(target, volume, scale, unit)
         return
-    values, note = _in_unit(volume.values, scale)
+    values, note = _in_unit(volume.values, scale, unit)
     volume = replace(volume, values=values)
     if to == "dicom":
         write_dicom(target, volume, note, labels or DicomLabels())

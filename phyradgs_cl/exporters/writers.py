@@ -84,10 +84,10 @@ def write_npy(path: Path, volume: Volume, note: str) -> None:
         np.save(file, volume.values)  # given a name, it would add a suffix
 
 
-def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None) -> None:
+def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None, unit: str = "values in 1/mm") -> None:
     """Writes OME-Zarr 0.5: a new folder of chunks, at full and at successively halved resolution, which viewers load as
     needed. Besides the volume (nz, ny, nx) in 1/mm, memory holds at most 128 slices. A level's voxels are means of 2×2×2
-    voxels of the level before. scale: that of Hounsfield units to write; None writes 1/mm. Raises OutputError as
+    voxels of the level before. scale: that of Hounsfield units to write; None writes ``unit``. Raises OutputError as
     ``folder_written_beside`` does."""
     of_extra = "the package that this export needs", "phyradgs-cl[zarr]"
     writer, zarr = (checks.package(name, *of_extra) for name in ("ome_zarr.writer", "zarr"))
@@ -111,7 +111,7 @@ def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None) -> None:
             step = np.where(np.array(shape) > 1, 2, 1)
             factors, before = factors * step, level
         axes = [{"name": axis, "type": "space", "unit": "millimeter"} for axis in "zyx"]
-        note = {"values": "values in 1/mm" if scale is None else scale.note}
+        note = {"values": unit if scale is None else scale.note}
         writer.write_multiscales_metadata(group, levels, axes=axes, name=path.name, metadata=note)
 
 

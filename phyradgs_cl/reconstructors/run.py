@@ -19,7 +19,7 @@ from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import State, with_identity, without_identity
-from phyradgs_cl.reconstructors.doubt import FITTED, Doubter
+from phyradgs_cl.reconstructors.doubt import FITTED, FITTED_SIDE, Doubter
 from phyradgs_cl.reconstructors.method import METHODS, method_of
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan, check_object_motion, preprocessing_of
 from phyradgs_cl.reconstructors.preprocess import prepared
@@ -69,8 +69,8 @@ def reconstruct(
 
     with report.through(run.shown), _naming_size_that_fits(rt, run.scan, plan), naming_host_memory():
         if plan.preprocessing.doubt:
-            _check_doubt(plan)
             kind = "iterative" if hasattr(run.options, "iterations") else "analytic"
+            _check_doubt(plan, kind, run.scan.grid)
             doubter = Doubter(rt, run.visible, run.scan, run.hidden, run.deformation, plan.seed, kind)
             result = doubter.run(once, report, state)
         else:
@@ -78,15 +78,18 @@ def reconstruct(
     return run.finished(result)
 
 
-def _check_doubt(plan: RunPlan) -> None:
+def _check_doubt(plan: RunPlan, kind: str, grid: Grid) -> None:
     """Raises InputError for error bars of a run from a first volume, which all three runs would share with its errors. Warns
-    of methods to which the bars were not fitted."""
+    of methods and grids to which the bars were not fitted."""
     if plan.initial is not None:
         found, expected = "given with a first volume, whose errors all runs share", "one of both"
         raise InputError("--doubt", found, expected, "leave --initial out")
     if plan.method not in FITTED:
-        text = "error bars were fitted to %s: of %s they may be far too narrow; compare held_out_factor of --holdout"
+        text = "error bars were fitted to %s: of %s they may be far too narrow; --holdout 2 widens them in part"
         log.warning(text, ", ".join(FITTED), plan.method)
+    elif kind == "analytic" and grid.shape[2] < FITTED_SIDE and not plan.preprocessing.holdout:
+        text = "error bars of %s were fitted to grids of 64³ voxels: on smaller ones they are 2 to 3 times too narrow; give "
+        log.warning(text + "--holdout 2", plan.method)
 
 
 class _Prepared:

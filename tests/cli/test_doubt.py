@@ -26,6 +26,10 @@ def test_error_bars_go_with_their_volume_through_every_command(cli, scan, tmp_pa
     assert (tmp_path / "volume.evaluated.doubt.png").is_file()
     assert cli.run(["export", volume, "-o", bars, "--doubt"]) == 0
     np.testing.assert_array_equal(np.load(bars), sigma)
+    assert "error bars" in (tmp_path / "bars.json").read_text(encoding="utf-8")
+    assert cli.run(["export", volume, "--to", "npy"]) == cli.run(["export", volume, "--to", "npy", "--doubt"]) == 0
+    np.testing.assert_array_equal(np.load(tmp_path / "volume.doubt.npy"), sigma)
+    assert not np.array_equal(np.load(tmp_path / "volume.npy"), sigma)
     assert cli.run(["report", volume, "-o", page, "--views", "0"]) == 0
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "Error bars" in text and 'value="doubt"' in text
