@@ -172,7 +172,8 @@ class Doubter:
             inside.append([np.abs(error) <= np.hypot(noise, bar), np.abs(error) <= wide])
         wanted = float(np.sqrt(max(np.quantile(np.concatenate(ratios), _SHARE), 1.0)))
         if wanted > _WIDEST:
-            log.warning("held-out pixels are %.3g times farther off than the error bars: run 'phyradgs check'", wanted)
+            text = "held-out pixels are %.3g times farther off than the error bars: run 'phyradgs check', and take a box "
+            log.warning(text + "around the whole object", wanted)
         within, within_95 = np.mean(np.concatenate(inside, axis=1), axis=1).tolist()
         return {"held_out_within": within, "held_out_within_95": within_95, "held_out_factor": min(wanted, _WIDEST)}
 
