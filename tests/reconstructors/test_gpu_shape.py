@@ -30,6 +30,7 @@ RUNS = [
     ("r2", {**SPLATS, "motion": "static"}), ("fdk", {"motion": "static"}), ("fdk", {"motion": "per-row"}),
     ("asd-pocs", {"iterations": 2, "motion": "static"}),
     ("fista-tv", {"iterations": 2, "motion": "static"}),
+    ("fista-tv", {"iterations": 1, "motion": "per-row"}),
     ("fista", {"iterations": 1, "motion": "per-row", "prior": "ridge"}),
     ("fista", {"iterations": 4, "motion": "static", "prior": "dct"}),
     ("changing", {"iterations": 2, "states": 2}),
