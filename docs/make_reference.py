@@ -1,6 +1,6 @@
 """Writes the pages in docs/reference from the code and examples/: python docs/make_reference.py
 
-tests/test_docs.py fails where a command, an option or a name of the API is missing in what is committed.
+tests/test_docs.py fails where the committed pages lack a command, an option or a name of the API.
 """
 
 import inspect
