@@ -20,7 +20,6 @@ METHODS = (
     ("`fista --prior dct`, on one grid", "", "FISTA with DCT on one grid per-row", "FISTA with DCT on one grid"),
     ("`fista --prior dct`", "", "FISTA with DCT per-row", "FISTA with DCT"),
     (DEFAULT, "", "FISTA with ridge per-row", "FISTA with ridge"),
-    ("`fused` (until 0.2), its voxels with `dct`", "", "Fused exact in time", "Fused"),
     ("R2-Gaussian", "R2-Gaussian", "R2-Gaussian w/ ST", "R2-Gaussian"),
     ("PhyRadGS, 8 × 5 (the paper's)", "PhyRadGS w/o ST", "PhyRadGS", "PhyRadGS w/o ST"),
     ("PhyRadGS, exact in time", "PhyRadGS w/o ST", "PhyRadGS exact in time", "PhyRadGS w/o ST"),

@@ -1,7 +1,8 @@
-"""Error bars of voxels: the run is repeated on two scans that are synthesised from its own volume, with this scan's noise.
+"""Error bars of voxels: the run is repeated on two scans that are synthesised from its own volume and its own residual.
 
-The differences of their volumes from the first hold the noise of the scan, and what the method does to such an object: blur,
-prior, missing views. That is a parametric bootstrap (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, ch. 6).
+The differences of their volumes from the first hold the noise of the scan, other causes of the residual, and what the method
+does to such an object: blur, prior, missing views. That is a wild bootstrap (Wu, Ann. Stat. 14 (1986) 1261): each frame's
+residual keeps its size and shape, but a random sign. The second scan has the opposite signs (antithetic variables).
 Numbers that make it a σ come from procedural volumes (benchmarks/doubt.py), and from held-out pixels where there are any."""
 
 import json
@@ -62,14 +63,13 @@ def fitted_law(kind: str) -> Law:
 def spread(first: Array, second: Array, third: Array, law: Law) -> Array:
     """Returns σ (nz, ny, nx) of the first of three volumes, or of images.
 
-    What both differences from the first have in common is what the method does to the object; half of what they have not is
-    noise. Both variances, smoothed over ``NEAR`` voxels, are weighed by ``shape`` and ``noise``. Dense matter may have
-    texture that all runs lack: it gets ``density``² of the object's mean variance, in proportion to its density. σ is at
-    least a hundredth of its RMS."""
+    The mean of both differences from the first is what the method does to the object. Half the difference between them is
+    noise, whose signs are opposite. The squares of both, smoothed over ``NEAR`` voxels, are weighed by ``shape``² and
+    ``noise``². Dense matter may have texture that all runs lack: it gets ``density``² of the object's mean variance, in
+    proportion to its density. σ is at least a hundredth of its RMS."""
     one, two = (other.astype(np.float64) - first for other in (second, third))
-    own = (one - two) ** 2 / 4
-    shape, noise = (scipy.ndimage.gaussian_filter(part, NEAR) for part in ((one + two) ** 2 / 4 - own, 2 * own))
-    variance = law.shape**2 * np.maximum(shape, 0) + law.noise**2 * noise
+    shape, noise = (scipy.ndimage.gaussian_filter(part**2 / 4, NEAR) for part in (one + two, one - two))
+    variance = law.shape**2 * shape + law.noise**2 * noise
     if (inside := object_voxels(first)).any():
         density = np.maximum(scipy.ndimage.gaussian_filter(first, 1.0), 0)
         times = np.minimum(density / density[inside].mean(), _DENSEST)
@@ -115,14 +115,16 @@ class Doubter:
         return self.finished(results)
 
     def synthesised(self, result: Reconstruction, number: int) -> Scan:
-        """Returns the scan that the result's volume would give, with the noise of this one. ``number`` draws it."""
+        """Returns the scan that the result's volume would give, with each frame's residual by a random sign.
+
+        ``number``: 1, or 2 for the opposite signs."""
         frames, squares = np.zeros(self.scan.projections.shape, np.float32), np.zeros(2)
+        signs = np.random.default_rng(self.seed).choice((-1, 1), self.whole.frames) * (3 - 2 * number)
         if self.rt.ranks.rank == 0:
             for pair in self._pairs(result, self.whole.frames):
-                rng = np.random.default_rng([self.seed, number, pair.frame])
+                noisy = pair.computed + np.float32(signs[pair.frame]) * pair.residual
+                frames[pair.frame] = np.where(pair.valid, noisy, self.scan.projections[pair.frame])
                 rms = noise_map(pair.residual, pair.valid)
-                noise = rms * rng.standard_normal(pair.measured.shape, np.float32)
-                frames[pair.frame] = np.where(pair.valid, pair.computed + noise, self.scan.projections[pair.frame])
                 squares += [np.sum(one[pair.valid] ** 2, dtype=np.float64) for one in (pair.residual, rms)]
             ratio = float(np.sqrt(squares[0] / max(squares[1], np.finfo(float).tiny)))
             if number == 1 and self.kind == "iterative" and ratio > _UNEXPLAINED:
