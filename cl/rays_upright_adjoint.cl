@@ -1,11 +1,10 @@
 /* The adjoint of rays_upright.cl. A ray weighs voxels by its distance from their centres. Lines follow
    each other along the voxels, so a vector of voxels gathers from a few neighbouring lines. Each voxel has one writer, in a
    fixed order. LEAN as in ray_column.h. Twin: operators/twins/rays.py. */
-#include "common/ray_column.h"
+#include "common/near_lines.h"
 
 #define LINE_MARGIN 0.01f /* lines added to each range, more than the rounding; lines too far from a voxel have weight 0 */
 #define PLANES ((ADJOINT_X > ADJOINT_Y ? ADJOINT_X : ADJOINT_Y) + LANES) /* planes of a box, in whole vectors */
-#define LEAST_SLOPE 1e-6f /* voxels per line, lower limit: near the source all lines have one height */
 
 /* Floor and ceil of what an int can hold: PoCL's functions take ten times as long. */
 RAY_INLINE int whole_below(const float at)
@@ -57,153 +56,6 @@ RAY_INLINE int2 lines_along(__global const float *cell, const int u, const int f
     }
     return begins ? (int2)(first, high) : (int2)(high, stop);
 }
-
-/* A detector column and the course of its rays. At plane i, ahead of the source, line v is at the height
-   c = sc + ahead (dz + v ez) / (da + v ea) and at b = sb + across ahead + along (c - sc). The rays lie in a plane. */
-typedef struct {
-    __global const float *values, *slopes; /* of line v; slopes where columns lean: (dz + v ez) / (da + v ea) */
-    int is_cut;                     /* whether lines of the slot beyond the last follow the other main axis */
-    int v_first, v_stop, last_start; /* last_start: the last place where two vectors may begin */
-    float sb, sc, da, ea, dz, ez;
-    float inv;                      /* 1 / da; where columns lean, 1 / (da ez - dz ea) */
-    float bend, per_along;          /* 4 |ea / da|, 1 / |along| */
-    float across, along;
-    float first, last;              /* slope (dz + v ez) / (da + v ea) of the first and the last line */
-    float dense;                    /* largest number of lines per voxel, times ahead */
-} column_t;
-
-RAY_INLINE column_t column_of(__global const float *cell, const int u, const int along_x, const int2 lines)
-{
-    column_t r;
-    r.v_first = lines.x;
-    r.v_stop = lines.y;
-    r.sb = cell[RAY_SOURCE + along_x];
-    r.sc = cell[RAY_SOURCE + 2];
-    r.da = ray_component(cell, !along_x, u, 0);
-    r.dz = ray_component(cell, 2, u, 0);
-    r.ea = LEAN ? cell[RAY_EV + !along_x] : 0.0f;
-    r.ez = cell[RAY_EV + 2];
-    const float db = ray_component(cell, along_x, u, 0), over_first = r.dz + (float)lines.x * r.ez;
-    const float over_last = r.dz + (float)(lines.y - 1) * r.ez;
-#if LEAN
-    const float eb = cell[RAY_EV + along_x];
-    const float near = r.da + (float)lines.x * r.ea, far = r.da + (float)(lines.y - 1) * r.ea;
-    r.inv = 1.0f / (r.da * r.ez - r.dz * r.ea);
-    r.across = (db * r.ez - r.dz * eb) * r.inv;
-    r.along = (r.da * eb - db * r.ea) * r.inv;
-    r.bend = 4.0f * fabs(r.ea / r.da);
-    r.per_along = 1.0f / fmax(fabs(r.along), LEAST_SLOPE);
-    r.first = over_first / near;
-    r.last = over_last / far;
-    r.dense = fmax(near * near, far * far) * fabs(r.inv);
-#else
-    r.inv = 1.0f / r.da;
-    r.across = db * r.inv;
-    r.along = 0.0f;
-    r.first = over_first * r.inv;
-    r.last = over_last * r.inv;
-#endif
-    return r;
-}
-
-/* The lines that may touch LANES voxels of a column: `most` lines from `first` on, in each lane. */
-typedef struct {
-    vi first;
-    int base;  /* begin of two vectors of lines that hold them all, if they do */
-    int some;  /* whether any line touches */
-    int dense; /* whether two vectors hold them */
-} near_lines_t;
-
-RAY_INLINE near_lines_t near_lines(const column_t r, const vi first, const int most)
-{
-    near_lines_t found;
-    found.first = first;
-    const int begin = V_FIRST(first), end = V_LAST(first), lowest = min(begin, end);
-    found.some = lowest < r.v_stop;
-    found.base = min(lowest, r.last_start);
-    found.dense = max(begin, end) + most - found.base <= 2 * LANES;
-    return found;
-}
-
-#ifdef V_LOOKUP
-/* Begin of two vectors of lines for the lower and for the upper half of the voxels; negative where these do not hold them.
-   */
-RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, const int most)
-{
-    const int begin = V_FIRST(lines.first), before = V_END_OF_HALF(lines.first);
-    const int middle = V_HALF(lines.first), end = V_LAST(lines.first);
-    const int2 base = (int2)(min(min(begin, before), r.last_start), min(min(middle, end), r.last_start));
-    const int fit = max(begin, before) + most - base.x <= 2 * LANES && max(middle, end) + most - base.y <= 2 * LANES;
-    return fit ? base : (int2)(-1);
-}
-#endif
-
-#if LEAN
-/* Line first + m of each lane. Values are 0 beyond the last line. */
-#define GATHER_SLOPE(m) GATHER(r.slopes, min(lines.first + (m), r.v_stop - 1))
-#define GATHER_VALUE(m) V_PICK(0.0f, GATHER(r.values, min(lines.first + (m), r.v_stop - 1)), lines.first + (m) < r.v_stop)
-
-/* The vectors in which LANES voxels look up their lines. Lines beyond the last have the other main axis, or are 0. */
-#define LINE_VECTORS                                                                                       \
-    vf v0 = V_LOAD(r.values + lines.base), v1 = V_LOAD(r.values + lines.base + LANES);                     \
-    const vf c0 = V_LOAD(r.slopes + lines.base), c1 = V_LOAD(r.slopes + lines.base + LANES);               \
-    vi place = lines.first - lines.base;                                                                   \
-    if (r.is_cut) {                                                                                        \
-        v0 = V_PICK(0.0f, v0, VI_IOTA + lines.base < r.v_stop);                                            \
-        v1 = V_PICK(0.0f, v1, VI_IOTA + (lines.base + LANES) < r.v_stop);                                  \
-    }
-
-/* Runs `body` for all lines that may touch LANES voxels, with a line's value and its height above the voxel (off). */
-#define OF_LINES(value_of, slope_of, next, body)                                                           \
-    for (int m = 0; m < most; ++m, next) {                                                                 \
-        const vf value = value_of, off = fma(slope_of, (vf)(ahead), under);                                \
-        body                                                                                               \
-    }
-#ifdef V_LOOKUP
-#define EACH_LINE(body)                                                                                    \
-    if (lines.dense) {                                                                                     \
-        LINE_VECTORS                                                                                       \
-        OF_LINES(V_LOOKUP(v0, v1, place), V_LOOKUP(c0, c1, place), place += 1, body)                       \
-    } else                                                                                                 \
-        OF_LINES(GATHER_VALUE(m), GATHER_SLOPE(m), (void)0, body)
-#else
-#define EACH_LINE(body) OF_LINES(GATHER_VALUE(m), GATHER_SLOPE(m), (void)0, body)
-#endif
-
-/* Adds to LANES voxels of two columns, between which all their lines pass. under: the source's height less
-   the voxels'. b: the place of the rays' plane at the voxels' heights, from the first column on. */
-RAY_INLINE void add_between(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
-                            const vf b, float *low, float *high)
-{
-    vf sum = (vf)(0.0f), moment = (vf)(0.0f);
-    EACH_LINE(const vf part = value * max(1.0f - fabs(off), 0.0f); sum += part; moment = fma(part, off, moment);)
-    const vf far = fma(b, sum, r.along * moment);
-    V_STORE(V_LOAD(low) + (sum - far), low);
-    V_STORE(V_LOAD(high) + far, high);
-}
-
-/* Adds to LANES voxels of three columns, where lines pass the second on both sides. b: from the second column on. */
-RAY_INLINE void add_around(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
-                           const vf b, float *low, float *middle, float *high)
-{
-    vf sum = (vf)(0.0f), before = (vf)(0.0f), after = (vf)(0.0f);
-    EACH_LINE(const vf part = value * max(1.0f - fabs(off), 0.0f); const vf across = fma(off, (vf)(r.along), b);
-              sum += part; before = fma(part, max(-across, 0.0f), before); after = fma(part, max(across, 0.0f), after);)
-    V_STORE(V_LOAD(low) + before, low);
-    V_STORE(V_LOAD(middle) + (sum - before - after), middle);
-    V_STORE(V_LOAD(high) + after, high);
-}
-
-/* Adds to LANES voxels of one column, where lines pass from one column to the next. b: from this column on. */
-RAY_INLINE void add_across(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
-                           const vf b, float *own)
-{
-    vf sum = (vf)(0.0f);
-    EACH_LINE(const vf across = fma(off, (vf)(r.along), b);
-              sum += value * max(1.0f - fabs(off), 0.0f) * max(1.0f - fabs(across), 0.0f);)
-    V_STORE(V_LOAD(own) + sum, own);
-}
-#endif
 
 /* The voxels and lines that a detector column meets on each plane of a box. */
 typedef struct {
