@@ -115,21 +115,24 @@ class Doubter:
         return self.finished(results)
 
     def synthesised(self, result: Reconstruction, number: int) -> Scan:
-        """Returns the scan that the result's volume would give, with each frame's residual by a random sign.
+        """Returns the scan that the result's volume would give, with what ``number`` 1 adds, and 2 subtracts, in each frame.
 
-        ``number``: 1, or 2 for the opposite signs."""
+        That is the residual by a random sign. Analytic methods leave missing views in it: they get white noise of its size."""
         frames, squares = np.zeros(self.scan.projections.shape, np.float32), np.zeros(2)
-        signs = np.random.default_rng(self.seed).choice((-1, 1), self.whole.frames) * (3 - 2 * number)
         if self.rt.ranks.rank == 0:
             for pair in self._pairs(result, self.whole.frames):
-                noisy = pair.computed + np.float32(signs[pair.frame]) * pair.residual
+                rng, rms = np.random.default_rng([self.seed, pair.frame]), noise_map(pair.residual, pair.valid)
+                if self.kind == "iterative":
+                    added = rng.choice((-1, 1)) * pair.residual
+                else:
+                    added = rms * rng.standard_normal(rms.shape, np.float32)
+                noisy = pair.computed + (added if number == 1 else -added)
                 frames[pair.frame] = np.where(pair.valid, noisy, self.scan.projections[pair.frame])
-                rms = noise_map(pair.residual, pair.valid)
                 squares += [np.sum(one[pair.valid] ** 2, dtype=np.float64) for one in (pair.residual, rms)]
             ratio = float(np.sqrt(squares[0] / max(squares[1], np.finfo(float).tiny)))
             if number == 1 and self.kind == "iterative" and ratio > _UNEXPLAINED:
-                text = "the volume leaves %.3g times the noise of the projections unexplained: error bars do not hold what "
-                text += "causes that, and may be far too narrow; give --holdout 2, and run 'phyradgs check'"
+                text = "the volume leaves %.3g times the noise of the projections unexplained: error bars hold what causes "
+                text += "that in part, and may be too narrow; give --holdout 2, and run 'phyradgs check'"
                 log.warning(text, ratio)
         return replace(self.scan, projections=self.rt.ranks.bcast(frames))
 
