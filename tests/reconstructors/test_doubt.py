@@ -159,14 +159,17 @@ def test_held_out_pixels_widen_bars_that_do_not_reach_them(rt, scan, monkeypatch
     assert right.facts[DOUBT]["held_out_within"] > 0.5
 
 
-def test_a_residual_far_above_the_noise_is_warned_of(rt, scan, caplog) -> None:
+def test_a_residual_far_above_the_noise_and_much_noise_are_warned_of(rt, caplog) -> None:
     """Of errors of the scan's description, bars hold what the residual shows: on real scans they were too narrow."""
-    usual = {"method": "sirt", "iterations": 30, "report": False, "device": rt, "doubt": True}
-    reconstruct(scan, **usual)
-    assert "unexplained" not in caplog.text
-    waves = 1 + 0.3 * np.sin(np.arange(scan.projections.shape[2]) / 3 + np.arange(scan.frames)[:, None, None])
-    reconstruct(replace(scan, projections=(scan.projections * waves).astype(np.float32)), **usual)
-    assert "times the noise of the projections unexplained" in caplog.text
+    usual = {"method": "sirt", "iterations": 60, "report": False, "device": rt, "doubt": True}
+    scan, noisy = (simulate("foot", size=16, detector=32, views=12, noise="tigre", dose=d, device=rt) for d in (2e4, 300))
+    waves = 1 + 0.3 * np.sin(np.arange(32) / 3 + np.arange(scan.frames)[:, None, None])
+    wrong = replace(scan, projections=(scan.projections * waves).astype(np.float32))
+    for one, is_unexplained, is_noisy in ((scan, False, False), (wrong, True, False), (noisy, False, True)):
+        caplog.clear()
+        reconstruct(one, **usual)
+        assert ("times the noise of the projections unexplained" in caplog.text) == is_unexplained
+        assert ("do not hold soft texture" in caplog.text) == is_noisy
 
 
 def test_a_box_has_its_part_of_the_bars_and_a_scan_without_a_method_has_none(rt, scan) -> None:
