@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from statistics import mean
 from typing import Any
 
-from page_tables import facts_of, lines_of, markdown, table
+from page_tables import facts_of, grouped, lines_of, markdown, span, table
 
 
 @table("prepare")
@@ -12,14 +12,11 @@ def prepared() -> str:
     """Returns the decibels that an effect costs, and the percentage that ``prepare`` regains, by effect and size.
 
     Both are ranges from the least to the largest of all volumes."""
-    cells: dict[tuple[str, int], dict[str, list[dict[str, Any]]]] = {}
-    for line in _prepared_lines():
-        by_method = cells.setdefault((line["effect"], line["size"]), {})
-        by_method.setdefault(line["method"], []).append(line)
     text = []
-    for (effect, size), by_method in sorted(cells.items()):
-        volumes = len({line["phantom"] for lines in by_method.values() for line in lines})
-        shown = [_losses(by_method.get(method, [])) for method in PREPARED_METHODS]
+    for (effect, size), lines in sorted(grouped(_prepared_lines(), "effect", "size").items()):
+        by_method = grouped(lines, "method")
+        volumes = len(grouped(lines, "phantom"))
+        shown = [_losses(by_method.get((method,), [])) for method in PREPARED_METHODS]
         text.append([effect, f"{size}³", str(volumes), *shown])
     return markdown(["effect", "voxels", "volumes", *PREPARED_METHODS], text)
 
@@ -46,25 +43,25 @@ def _losses(lines: Sequence[dict[str, Any]]) -> str:
 
 
 def _range(values: Sequence[float], form: str) -> str:
-    least, most = (f"{value:{form}}" for value in (min(values), max(values)))
-    return least if least == most else f"{least} to {most}" if min(values) < 0 else f"{least}–{most}"
+    """Returns a range with a dash, or with words where a minus would stand beside it."""
+    return span(values, form) if min(values) < 0 else span(values, form).replace(" to ", "–")
 
 
 @table("prepare_clean")
 def clean_scans() -> str:
-    """Returns what the usual steps change in clean scans, and the part of rings that returns."""
-    text = []
+    """Returns the part of rings that returns, and below the table what the usual steps change in clean scans."""
     lines = lines_of("prepare_clean.jsonl")
-    for method, views in sorted({(line["method"], line["views"]) for line in lines}):
-        cell = [line for line in lines if (line["method"], line["views"]) == (method, views)]
-        clean = [line for line in cell if "lost_db" in line]
-        changed = sum(not line["unchanged"] for line in clean)
+    text = []
+    for (method, views), cell in sorted(grouped(lines, "method", "views").items()):
         rings = [[line["regained"] for line in cell if line["steps"] == f"rings {spread}"] for spread in (0.01, 0.02, 0.05)]
-        ranges = [f"{100 * min(parts):.0f}–{100 * max(parts):.0f} %" if parts else "" for parts in rings]
-        lost = f"{changed} of {len(clean)}, {max((line['lost_db'] for line in clean), default=0):.3f} dB"
-        text.append([method, str(views), str(len({line["phantom"] for line in cell})), lost, *ranges])
-    heads = ["method", "views", "volumes", "clean: changed, most lost", "rings of 1 %", "2 %", "5 %"]
-    return markdown(heads, text)
+        if any(rings):
+            text.append([method, str(views), *(f"{100 * min(parts):.0f}–{100 * max(parts):.0f} %" for parts in rings)])
+    clean = [line for line in lines if "lost_db" in line]
+    changed = [line for line in clean if not line["unchanged"]]
+    views = ", ".join(str(views) for (views,) in sorted(grouped(changed, "views")))
+    lost_db = max(line["lost_db"] for line in changed)
+    table = markdown(["method", "views", "rings of 1 %", "2 %", "5 %"], text)
+    return f"{table}\nOf {len(clean)} clean scans {len(changed)} change, all from {views} views, by at most {lost_db:.3f} dB.\n"
 
 
 @table("stripes")
@@ -92,35 +89,30 @@ def calibrate_lines() -> list[dict[str, Any]]:
 @table("calibrated_parameters")
 def calibrated_parameters() -> str:
     """Returns the worst error of every parameter with two runs or more, the stated σ, and how often 2 σ held the truth."""
-    cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for line in calibrate_lines():
-        for one in line["parameters"]:
-            if one.get("error") is not None:
-                key = (line["case"], line["size"], one["name"], one["unit"])
-                cells.setdefault(key, []).append(one)
+    found = [
+        {**one, "case": line["case"], "size": line["size"]}
+        for line in calibrate_lines() for one in line["parameters"] if one.get("error") is not None
+    ]  # fmt: skip
     text = []
-    for (case, size, name, unit), found in cells.items():
-        if len(found) < 2:
-            continue
-        worst = max(abs(one["error"]) for one in found)
-        inside = sum(abs(one["z"]) <= 2 for one in found)
-        sigma = mean(one["deviation"] for one in found)
-        text.append([case, f"{size}³", name, f"{worst:.2g} {unit}", f"{sigma:.2g}", f"{inside}/{len(found)}"])
+    for (case, size, name, unit), of in grouped(found, "case", "size", "name", "unit").items():
+        if len(of) > 1 and case != "right":  # with nothing planted errors are those of the case panel
+            worst = max(abs(one["error"]) for one in of)
+            inside = sum(abs(one["z"]) <= 2 for one in of)
+            sigma = mean(one["deviation"] for one in of)
+            text.append([case, f"{size}³", name, f"{worst:.2g} {unit}", f"{sigma:.2g}", f"{inside}/{len(of)}"])
     return markdown(["case", "voxels", "parameter", "worst error", "σ stated", "within 2 σ"], text)
 
 
 @table("calibrated_psnr")
 def calibrated_psnr() -> str:
     """Returns PSNR with the stated, the calibrated and the right geometry."""
-    cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for line in calibrate_lines():
-        if "stated" in line.get("psnr_db", {}) and not line["case"].startswith("draw"):
-            cells.setdefault((line["case"], f"{line['size']}, {line['views']}"), []).append(line["psnr_db"])
+    lines = [line for line in calibrate_lines() if "stated" in line.get("psnr_db", {}) and not line["case"].startswith("draw")]
     text = []
-    for (case, size), found in cells.items():
+    for (case, size, views), of in grouped(lines, "case", "size", "views").items():
+        found = [line["psnr_db"] for line in of]
         means = [f"{mean(one[key] for one in found):.2f}" for key in ("stated", "calibrated", "right")]
         worst = min(one["calibrated"] - one["right"] for one in found)
-        text.append([case, size, *means, f"{worst:+.3f}", str(len(found))])
+        text.append([case, f"{size}, {views}", *means, f"{worst:+.3f}", str(len(found))])
     return markdown(["case", "voxels, views", "stated", "calibrated", "right", "worst difference", "runs"], text)
 
 
@@ -162,13 +154,13 @@ def parallel_fly() -> str:
 
 @table("fan_fly")
 def fan_fly() -> str:
-    """Returns NMSE of a fan beam's fly-scan."""
-    rows = [
-        [f"{one['side']}²", f"`{one['method']}`", one["model"]]
-        + [f"{one['nmse']:.4f}", f"{one['best']:.4f} ({one['best_at']})"]
-        for one in lines_of("fan_fly.jsonl")
-    ]
-    return markdown(["voxels", "method", "motion", "NMSE", "smallest (pass)"], rows)
+    """Returns NMSE of a fan beam's fly-scan: a row per method, a column per size and way to average."""
+    sizes = (175, 350, 700)
+    cells: dict[tuple[str, str], dict[int, str]] = {}
+    for one in lines_of("fan_fly.jsonl"):
+        cells.setdefault((one["method"], one["model"]), {})[one["side"]] = f"{one['nmse']:.4f}"
+    rows = [[f"`{method}`", model, *(by[side] for side in sizes)] for (method, model), by in cells.items()]
+    return markdown(["method", "motion", *(f"{side}²" for side in sizes)], rows)
 
 
 @table("parallel_memory")
