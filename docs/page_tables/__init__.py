@@ -48,9 +48,9 @@ def grouped(lines: Iterable[Scores], *keys: str) -> dict[tuple[Any, ...], list[S
 
 
 def span(values: Sequence[float], form: str) -> str:
-    """Returns the least and the largest value, or the only one."""
+    """Returns the least and the largest value, or the only one. A minus would be lost beside a dash."""
     least, most = (f"{value:{form}}" for value in (min(values), max(values)))
-    return least if least == most else f"{least} to {most}"
+    return least if least == most else f"{least} to {most}" if min(values) < 0 else f"{least}–{most}"
 
 
 def rows_of(name: str) -> dict[tuple[str, str, str], Row]:
