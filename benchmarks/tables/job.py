@@ -224,4 +224,3 @@ class BenchProgress:
     iteration: int = 0
     iterations: int = 0
     line: Line | None = None
-    left_s: float | None = None

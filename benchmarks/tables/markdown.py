@@ -1,4 +1,4 @@
-"""The Markdown of a benchmark's tables: means of every row, and volumes one by one."""
+"""The Markdown of a benchmark's tables: means of every row."""
 
 from collections.abc import Callable, Sequence
 
@@ -13,7 +13,7 @@ Cell = Callable[[Summary], str]
 
 
 def markdown(job: BenchJob, lines: Sequence[Line]) -> str:
-    """Returns a block for each protocol: the means of every row, and the volumes one by one."""
+    """Returns a block for each protocol: the means of every row."""
     size = job.bench_size
     text = [
         f"# {_TITLES[job.kind]}: {size.voxels}³ voxels, {size.pixels}² pixels", "", *_notes(job, lines), ""
@@ -22,9 +22,6 @@ def markdown(job: BenchJob, lines: Sequence[Line]) -> str:
         block = [line for line in lines if line["protocol"] == protocol]
         if block:
             text += [f"## {protocol}: {block[0]['views']} views", "", *_means(job, protocol, block), ""]
-            volumes = sorted({line["volume"] for line in block})
-            if len(volumes) > 1:
-                text += [*_by_volume(job, block, volumes), ""]
     return "\n".join(text)
 
 
@@ -110,16 +107,6 @@ def _both(summary: Summary) -> str:
 def _paper_cell(label: str, column: str) -> str:
     cell = published(label, column)
     return f"{cell.psnr_db:.2f} / {cell.ssim:.3f}" if cell is not None else ""
-
-
-def _by_volume(job: BenchJob, lines: Sequence[Line], volumes: Sequence[str]) -> list[str]:
-    text = [_row_text(["PSNR (dB) / SSIM", *volumes]), "|---" * (len(volumes) + 1) + "|"]
-    for row in job.chosen_rows:
-        found = [x for x in lines if x["run"] == row.run and x["acquisition"] == FLY]
-        if found:
-            each = [summarise([x for x in found if x["volume"] == volume]) for volume in volumes]
-            text.append(_row_text([row.label, *(_both(s) if s is not None else "" for s in each)]))
-    return text
 
 
 def _row_text(cells: Sequence[str]) -> str:

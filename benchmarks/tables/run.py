@@ -114,20 +114,10 @@ class Batch:
         self.lines.append(line)
 
     def finish(self, run: PlannedRun, line: Line) -> None:
-        """Reports the result of a run, and how long the others will take."""
+        """Reports the result of a run."""
         number = self.total - len(self.left) + 1
         self.left.remove(run)
-        self.report(BenchProgress(number, self.total, run.title, line=line, left_s=self._left_s()))
-
-    def _left_s(self) -> float | None:
-        """Returns the seconds that the missing runs will take, from the same runs on other objects; None if unknown."""
-        total = 0.0
-        for run in self.left:
-            like = [line["seconds"] for line in self.lines if "seconds" in line and _is_like(line, run)]
-            if not like:
-                return None
-            total += float(np.mean(like))
-        return total
+        self.report(BenchProgress(number, self.total, run.title, line=line))
 
     def run_case(self, runs: Sequence[PlannedRun]) -> None:
         """Makes all missing runs of one case."""
@@ -214,11 +204,6 @@ def _forwarded(report: Report, started: BenchProgress) -> ProgressReport:
         report(BenchProgress(started.number, started.runs, started.title, p.iteration, p.iterations))
 
     return forward
-
-
-def _is_like(line: Line, run: PlannedRun) -> bool:
-    same = ("run", "voxels", "pixels", "iterations", "views")
-    return all(line.get(name) == run.facts[name] for name in same)
 
 
 def _check_volumes(runs: Sequence[PlannedRun]) -> None:
