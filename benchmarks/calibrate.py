@@ -2,23 +2,10 @@
 
     python benchmarks/calibrate.py FOLDER RESULTS.jsonl [--cases panel,...] [--only NAME,...] [--size 32] [--views 25]
 
-It writes one line of JSON per run, and continues where it stopped. docs/make_results.py makes the tables of
-docs/results/calibrate.md from the lines. FOLDER holds volumes as for benchmarks/tables; --only spheres is the sphere
-phantom, in closed form. The scanner is R2-Gaussian's with TIGRE's noise and a panel twice as wide as the volume. Volumes are
-those of fista-tv, with every line at its own times.
-
-Cases:
-
-        panel      offset of 2.5 pixels, roll of 0.5°, tilt about v of 1°, all at once. right      no error; every parameter
-        is estimated. columns    readout 20 % longer than stated, by columns. rows       readout 20 % longer than stated, by
-        rows; such a scan does not determine it. turned     readout and exposure 20 % longer than stated, by rows, and a
-        second scan turned the other way. wobble     0.3° and 1 pixel (RMS) per view. slow       0.3° and 1 pixel (RMS), as
-        six splines of time, and estimated as splines. kaist      0.03 rad and 1 voxel (RMS) per view, with the noise of Choi
-        et al. (2026), for --views 75. motion     the object turns by up to 2° and moves by up to 2 voxels during the scan,
-        about and along all axes. beads      a phantom of known shape at any place, read by rows. The seed draws readout,
-        exposure, offset, roll, tilt and both distances. No volume is scored. draw       read by columns. The seed draws the
-        offset to 2.5 pixels, roll to 0.5°, tilt about v to 1°, readout to 20 %. Counts how often the stated intervals hold
-        the truth; no volume is scored. draw_rows  as draw but read by rows, which do not determine readout and exposure. """
+It writes one line of JSON per run, and continues where it stopped. docs/results/calibrate.md lists the cases, and has the
+tables that docs/make_results.py makes from the lines. FOLDER holds volumes as for benchmarks/tables; --only spheres is the
+sphere phantom, in closed form. The scanner is R2-Gaussian's with TIGRE's noise and a panel twice as wide as the volume.
+Volumes are those of fista-tv, with every line at its own times."""
 
 import time
 from collections.abc import Callable

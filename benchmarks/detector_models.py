@@ -1,7 +1,6 @@
 """Measures the gain from modelling the detector: every effect modelled and ignored, several methods, means over seeds.
 
     python benchmarks/detector_models.py RESULTS.jsonl [--names shepp-logan,VOLUME.h5] [--effects lag,pulse] [--seeds 0]
-    python benchmarks/detector_models.py RESULTS.jsonl --table
 
 Scans are rapid fly-scans: 25 frames of 14.4 degrees, read by rows, 48³ voxels, 72² pixels. Counts are of 1e5 photons with
 electronic noise of 10, unless an effect has others. Iterative methods take every line at its own 5 times. phyradgs is exact

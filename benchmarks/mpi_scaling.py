@@ -51,9 +51,6 @@ NETWORKS = {
 PREDICTED = (2, 4, 8, 16, 32, 64)
 
 
-# --- one rank -------------------------------------------------------------------------------------------
-
-
 def started(rt: Runtime, gaussians: int, pixels: int, batch: int) -> SplatRun:
     """Returns a run of about this number of Gaussians, which stays constant."""
     geometry = ConeGeometry(5.0, 7.0, (pixels, pixels), (4.0 / pixels,) * 2)
@@ -150,9 +147,6 @@ def be_a_rank(gaussians: int, pixels: int, batch: int, steps: int, device: str |
             ],
         }
         out.write_text(json.dumps(facts))
-
-
-# --- all of them ----------------------------------------------------------------------------------------
 
 
 def on_ranks(ranks: int, words: list[str]) -> Facts:

@@ -6,32 +6,22 @@
 
 There is a line per volume, scan and factor: the PSNR in dB with ``factor`` times the default of the option. ``--holdout``
 adds the error on that percentage of the pixels, which the run does not see. Runs in the file are not made again. Scans are
-those of benchmarks/tables with other ``--dose`` and ``--views``. Weights are swept with 30 passes on the scan's own voxels
+those of priors.py. Weights are swept with 30 passes on the scan's own voxels
 (``subvoxels`` 1), passes with the other defaults."""
 
 import argparse
 from itertools import product
-from pathlib import Path
 
+from priors import MOTIONS, scan_of
 from scans import append, files_of, read_lines, runs_parser
 
-from phyradgs_cl.acquisition import PerRow, Scan, Static
-from phyradgs_cl.api import compare, reconstruct, simulate
+from phyradgs_cl.api import compare, reconstruct
 from phyradgs_cl.reconstructors.voxels.fista import FistaOptions
 from phyradgs_cl.runtime import Runtime
 
-MOTIONS = {"still": Static(), "fly": PerRow()}
-PROTOCOLS = {25: "rapid", 50: "standard"}
 USUAL = {"prior_weight": {"subvoxels": 1, "iterations": 30}, "iterations": {}}
 """Further options of a run in which an option is swept."""
 SCAN = ("kind", "views", "dose", "size", "pixels")
-
-
-def scan_of(rt: Runtime, path: Path, size: int, pixels: int, kind: str, views: int, dose: float, seed: int) -> Scan:
-    """Returns a scan of a volume's file: still, or of the protocol with so many views."""
-    protocol = "static" if kind == "still" else PROTOCOLS[views]
-    usual = {"size": size, "detector": pixels, "noise": "tigre", "dose": dose, "seed": seed, "device": rt}
-    return simulate(path, protocol=protocol, views=views if kind == "still" else None, **usual)  # type: ignore[arg-type]
 
 
 def run(given: argparse.Namespace) -> None:
@@ -39,10 +29,10 @@ def run(given: argparse.Namespace) -> None:
     there = {_key(line) for line in read_lines(given.results)}
     for name, path in files_of(given.volumes, given.names, given.size).items():
         for kind, views, dose, seed in product(given.kinds, given.views, given.doses, given.seeds):
-            of_scan = dict(zip(SCAN, (kind, views, dose, given.size, given.pixels), strict=True))
+            of_scan = dict(zip(SCAN, (kind, views, dose, given.size, 2 * given.size), strict=True))
             facts = {"volume": name, **of_scan, "seed": seed}
             left = [f for f in given.factors if _key({**facts, "factor": f}) not in there]
-            scan = scan_of(rt, path, given.size, given.pixels, kind, views, dose, seed) if left else None
+            scan = scan_of(rt, path, facts) if left else None
             for factor in left:
                 usual = getattr(FistaOptions(), given.option)
                 chosen = {**USUAL[given.option], given.option: type(usual)(factor * usual), "motion": MOTIONS[kind]}
@@ -61,18 +51,13 @@ def _key(line: dict[str, object]) -> tuple[object, ...]:
 def main() -> None:
     parser = runs_parser(__doc__)
     parser.add_argument("--size", type=int, default=64, help="voxels per side; up to 48 far fewer than what is projected")
-    parser.add_argument("--pixels", type=int, help="per side of the detector; twice --size")
     parser.add_argument("--kinds", nargs="+", default=["still"], choices=list(MOTIONS))
-    parser.add_argument("--views", nargs="+", type=int, default=[25, 50], help="of fly-scans 25 or 50")
+    parser.add_argument("--views", nargs="+", type=int, default=[25, 50])
     parser.add_argument("--doses", nargs="+", type=float, default=[1e3, 1e4, 1e5])
     parser.add_argument("--factors", nargs="+", type=float, default=[0.5, 0.71, 1.0, 1.41, 2.0])
     parser.add_argument("--option", choices=list(USUAL), default="prior_weight")
     parser.add_argument("--holdout", type=float, default=0.0, help="percent of the pixels")
-    given = parser.parse_args()
-    if "fly" in given.kinds and not set(given.views) <= set(PROTOCOLS):
-        parser.error("fly-scans have --views 25 or 50")
-    given.pixels = given.pixels or 2 * given.size
-    run(given)
+    run(parser.parse_args())
 
 
 if __name__ == "__main__":
