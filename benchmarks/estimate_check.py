@@ -60,12 +60,12 @@ def changed(name: str, iterations: int | None) -> tuple[str, Facts]:
 
 
 def one(name: str, scan: Path, words: list[str]) -> Facts:
-    said = child(__file__, "--child", "said", str(scan), name, *words)
+    predicted = child(__file__, "--child", "said", str(scan), name, *words)
     begun = time.perf_counter()
-    happened = child(__file__, "--child", "happened", str(scan), name, *words)
-    happened["seconds"] = time.perf_counter() - begun
-    ratio = {key: said[key] / max(happened[key], 1e-9) for key in said}  # type: ignore[operator, call-overload]
-    return {"method": name, "said": said, "happened": happened, "ratio": ratio}
+    taken = child(__file__, "--child", "happened", str(scan), name, *words)
+    taken["seconds"] = time.perf_counter() - begun
+    ratio = {key: predicted[key] / max(taken[key], 1e-9) for key in predicted}  # type: ignore[operator, call-overload]
+    return {"method": name, "said": predicted, "happened": taken, "ratio": ratio}
 
 
 def main() -> None:

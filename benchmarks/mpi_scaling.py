@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import Facts, finish, median, parser_of, splat_run, where
+from measuring import Facts, finish, parser_of, splat_run, where
 
 from phyradgs_cl.acquisition import ConeGeometry, make_protocol
 from phyradgs_cl.fields import Grid
@@ -140,7 +140,7 @@ def be_a_rank(gaussians: int, pixels: int, batch: int, steps: int, device: str |
             "bytes_a_step": nbytes,
             "by_rank": [
                 {
-                    name: round(median(rank[:, k]) if name == "idle_ms" else float(rank[:, k].min()), 3)
+                    name: round(float((np.median if name == "idle_ms" else np.min)(rank[:, k])), 3)
                     for k, name in enumerate(PARTS)
                 }
                 for rank in everyone

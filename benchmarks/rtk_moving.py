@@ -118,11 +118,8 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         for line in own_test(arguments.peer_python, Path(name)):
-            print(line, flush=True)
             append(arguments.results, line)
-        line = same_field(Runtime(arguments.device), arguments.peer_python, Path(name))
-        print(line, flush=True)
-        append(arguments.results, line)
+        append(arguments.results, same_field(Runtime(arguments.device), arguments.peer_python, Path(name)))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol as Interface
 
 import numpy as np
 
@@ -17,26 +16,6 @@ from tables.metrics import compare_projections
 FLY, STILL = "fly-scan", "stop-and-shoot"
 Images = list[np.ndarray]
 Measure = Callable[[], dict[str, float]]
-
-
-class Case(Interface):
-    """The parts that a run needs: a scan, the truth, and the numbers of a result (z, y, x)."""
-
-    truth: np.ndarray
-
-    def scan(self, acquisition: str) -> Scan: ...
-
-    def measure(self, volume: np.ndarray) -> dict[str, float]: ...
-
-    def slices(self, volume: np.ndarray) -> Images: ...
-
-    def references(self) -> dict[str, Measure]:
-        """Returns what results are compared with, where its own numbers are worth a line."""
-        ...
-
-    def warn_of_inverse_crime(self) -> None:
-        """Warns where the projected object is no finer than the reconstructed grid."""
-        ...
 
 
 def stop_and_shoot(protocol: Protocol) -> Protocol:

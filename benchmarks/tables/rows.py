@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from typing import Any
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.neural import NeuralOptions, has_torch
 from phyradgs_cl.reconstructors import METHODS, method_options
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.text import suggest_name
 
 _MOST_NEURAL_VOXELS = 128  # per side, on a CPU: beyond it a run takes hours
 KINDS = ("table1", "table2", "phantom")
@@ -154,8 +154,7 @@ def choose_rows(kind: str, labels: Sequence[str] | None) -> tuple[Row, ...]:
     for label in labels:
         name = label.strip().casefold()
         if name not in by_name:
-            close = get_close_matches(name, by_name, n=1)
-            remedy = f"did you mean {by_name[close[0]].label!r}?" if close else ""
-            raise InputError("--rows", repr(label), "; ".join(row.label for row in candidates), remedy)
+            known = [row.label for row in candidates]
+            raise InputError("--rows", repr(label), "; ".join(known), suggest_name(label, known, ""))
         wanted.add(name)
     return tuple(row for name, row in by_name.items() if name in wanted)

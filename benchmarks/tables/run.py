@@ -21,7 +21,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.device import environment
 from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.simulation import Scene, phantom_scene, volume_scene
-from tables.case import Case, SyntheticCase
+from tables.case import SyntheticCase
 from tables.figures import truth_of, write_figures, write_slices
 from tables.identity import refuse_other_objects
 from tables.job import PHANTOM, BenchJob, BenchProgress, PlannedRun, Report, plan_runs
@@ -32,6 +32,7 @@ from tables.summary import REFERENCE
 from tables.tables import write_tables
 
 RESULTS = "results.jsonl"
+Case = SyntheticCase | PhantomCase
 # R2-Gaussian's scanner: distances and sides in scene units.
 _TO_AXIS, _TO_DETECTOR, _PANEL_SIDE, _BOX_SIDE = 5.0, 7.0, 4.0, 2.0
 log = logging.getLogger(__name__)
