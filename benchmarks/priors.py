@@ -54,6 +54,11 @@ def options_of(row: dict[str, object], option: str) -> dict[str, object]:
     return {**USUAL[option], option: type(usual)(row["factor"] * usual)}
 
 
+def _is_of(line: dict[str, object], row: dict[str, object]) -> bool:
+    """Returns whether a line is that of a row. Lines of early versions have no ``numbers``."""
+    return row.items() <= ({"numbers": row.get("numbers")} | line).items()
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("volumes")
@@ -84,7 +89,7 @@ def main() -> None:
         choices += [{"method": given.method, "times": count} for count in given.counts]
     for case in cases:
         rows = [{**case, **choice} for choice in choices]
-        rows = [row for row in rows if not any(row.items() <= ({"numbers": row.get("numbers")} | line).items() for line in there)]
+        rows = [row for row in rows if not any(_is_of(line, row) for line in there)]
         scan = scan_of(rt, objects[str(case["volume"])], case) if rows else None
         for row in rows:
             before_s = time.process_time()

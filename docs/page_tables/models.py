@@ -35,17 +35,6 @@ def centres_distance() -> str:
     return markdown(["Gaussians", "distance", *ONE_FRAME.values()], text)
 
 
-@table("centres_object")
-def centres_object() -> str:
-    """Returns errors of a frame of whole objects, by motion model, from the least to the largest."""
-    lines = [line for line in lines_of("centres_only.jsonl") if "volume" in line]
-    text = []
-    for protocol in ("rapid", "standard"):
-        errors = {name: [100 * line[name] for line in lines if line["protocol"] == protocol] for name in ONE_FRAME}
-        text.append([protocol, *(f"{min(of):.2g}–{max(of):.2g} %" for of in errors.values())])
-    return markdown(["protocol", *ONE_FRAME.values()], text)
-
-
 @table("detector_models")
 def detector_models() -> str:
     """Returns the gain of each method from modelling a detector's effect: modelled PSNR, and its excess over ignoring it."""
