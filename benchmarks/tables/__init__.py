@@ -1,4 +1,4 @@
-"""Benchmarks of volumes × methods × protocols: a results file, tables and figures. They continue after any run."""
+"""Benchmarks of volumes × methods × protocols: a results file and tables. They continue after any run."""
 
 from tables.job import BenchJob, plan_runs
 from tables.rows import KINDS, rows_of

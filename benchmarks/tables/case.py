@@ -14,7 +14,6 @@ from phyradgs_cl.simulation import FrameSource, Scene, SimulationOptions, Volume
 from tables.metrics import compare_projections
 
 FLY, STILL = "fly-scan", "stop-and-shoot"
-Images = list[np.ndarray]
 Measure = Callable[[], dict[str, float]]
 
 
@@ -89,11 +88,6 @@ class SyntheticCase:
             where = (self._geometry, self._scene.grid, self._protocol, self._axis)
             self._views = HeldOutViews(self._rt, self._scene.source, *where)
         return {**compare(volume, self.truth), **self._views.measure(volume)}
-
-    def slices(self, volume: np.ndarray) -> Images:
-        """Returns the middle axial and coronal slice."""
-        nz, ny, _ = volume.shape
-        return [volume[nz // 2], volume[:, ny // 2]]
 
     def references(self) -> dict[str, Measure]:
         """Returns nothing: the truth is exact."""

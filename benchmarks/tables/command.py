@@ -22,13 +22,13 @@ EXAMPLE = (
 
 def parser() -> argparse.ArgumentParser:
     """Returns the parser of the command's words."""
-    text = "Compares methods on volumes: a results file that grows, tables in Markdown and CSV, figures of slices."
+    text = "Compares methods on volumes: a results file that grows, tables in Markdown and CSV."
     parser = argparse.ArgumentParser(prog="tables", description=text, epilog=EXAMPLE)
     kinds = "table1: all methods, 25 and 50 views; table2: PhyRadGS over M and N; phantom: the paper's sphere phantom"
     parser.add_argument("kind", choices=KINDS, help=f"{kinds} against a pseudo-truth")
     volumes = "folder of HDF5 files NAME_COUNT.h5 or NAME.h5 with a dataset /volume, each projected at its own resolution"
     parser.add_argument("--volumes", type=Path, metavar="DIR", help=f"{volumes} (default: the built-in foot and jaw)")
-    output = f"folder for {RESULTS} (one line per run), tables, figures and slices (default: bench-results)"
+    output = f"folder for {RESULTS} (one line per run) and tables (default: bench-results)"
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", default=Path("bench-results"), help=output)
     sizes = "; ".join(f"{s.name}: {s.voxels}³ from {s.pixels}², {s.iterations:,} iterations" for s in SIZES.values())
     parser.add_argument("--size", choices=SIZES, help=f"{sizes} (default: S; M for phantom)")
@@ -40,7 +40,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--seeds", type=_numbers, help=seeds)
     parser.add_argument("--iterations", type=int, help="of the splatting methods (default: the size's)")
     parser.add_argument("--readout", choices=AXES, default="rows", help="what is read out at one time")
-    only = "make tables and figures from the results file, of --names and --seeds or all; run nothing"
+    only = "make tables from the results file, of --names and --seeds or all; run nothing"
     parser.add_argument("--table-only", action="store_true", help=only)
     parser.add_argument("--device", help="as for phyradgs")
     return parser

@@ -22,7 +22,6 @@ from phyradgs_cl.runtime.device import environment
 from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.simulation import Scene, phantom_scene, volume_scene
 from tables.case import SyntheticCase
-from tables.figures import truth_of, write_figures, write_slices
 from tables.identity import refuse_other_objects
 from tables.job import PHANTOM, BenchJob, BenchProgress, PlannedRun, Report, plan_runs
 from tables.phantom_case import PhantomCase
@@ -42,7 +41,7 @@ log = logging.getLogger(__name__)
 def run_bench(
     job: BenchJob, make_runtime: Callable[[], Runtime], report: Report = lambda progress: None
 ) -> list[Path]:
-    """Makes the runs that the results file lacks, then tables and figures. Returns the files written.
+    """Makes the runs that the results file lacks, then tables. Returns the files written.
 
     A run is in the file once it is done. An interruption (KeyboardInterrupt) loses only the present run, and the same job
     continues from there. job: all of it is checked before the first run. make_runtime: called once, if there is anything to
@@ -64,11 +63,11 @@ def run_bench(
             batch = Batch(job, results, lines, missing, len(plan), report, make_runtime())
             for _, group in groupby(missing, key=lambda run: run.case):
                 batch.run_case(list(group))
-        return _write_tables_and_figures(job, lines)
+        return _write_tables(job, lines)
 
 
 def remake_tables(job: BenchJob, seeds: Sequence[int] | None = None) -> list[Path]:
-    """Writes tables and figures from the present results file. Returns the files written.
+    """Writes tables from the present results file. Returns the files written.
 
     The job's names, if it has any, and ``seeds`` restrict what is read."""
     lines = read_lines(job.output / RESULTS)
@@ -77,14 +76,14 @@ def remake_tables(job: BenchJob, seeds: Sequence[int] | None = None) -> list[Pat
         for name in job.names:
             checks.one_of("--names", name, held)
     chosen = [line for line in lines if not job.names or line.get("volume") in job.names]
-    return _write_tables_and_figures(job, [x for x in chosen if seeds is None or x.get("seed") in seeds])
+    return _write_tables(job, [x for x in chosen if seeds is None or x.get("seed") in seeds])
 
 
-def _write_tables_and_figures(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
+def _write_tables(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
     if not lines:
         raise InputError(str(job.output / RESULTS), "no results", "a results file", "run the benchmark first")
     with finish_despite_interrupt():
-        return [*write_tables(job, lines), *write_figures(job, lines)]
+        return write_tables(job, lines)
 
 
 def _name_rows_left_out(job: BenchJob) -> None:
@@ -128,7 +127,6 @@ class Batch:
         if runs[0].volume not in self.warned:
             self.warned.add(runs[0].volume)
             case.warn_of_inverse_crime()
-        write_slices(self.job.output, truth_of(runs[0].facts), case.slices(case.truth))
         for line in reference_lines(self.job, runs[0], case, self.rt, self.present):
             self.keep(line)
         for run in runs:
@@ -136,7 +134,7 @@ class Batch:
             started = BenchProgress(number, self.total, run.title)
             self.report(started)
             with keep_finished_work():  # a finished run is measured and kept, then the benchmark stops
-                line = one_run(self.job, run, case, self.rt, _forwarded(self.report, started))
+                line = one_run(run, case, self.rt, _forwarded(self.report, started))
                 self.keep(line)
             self.finish(run, line)
 
@@ -153,8 +151,8 @@ def reference_lines(
             yield {**facts, "metrics": metrics, **environment(rt.device)}
 
 
-def one_run(job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, progress: ProgressReport) -> Line:
-    """Makes a run and keeps its slices. Where numbers overflowed, the line has the error."""
+def one_run(run: PlannedRun, case: Case, rt: Runtime, progress: ProgressReport) -> Line:
+    """Makes a run. Where numbers overflowed, the line has the error."""
     scan = case.scan(run.acquisition)
     started, used = time.perf_counter(), time.process_time()
     try:
@@ -164,7 +162,6 @@ def one_run(job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, progress: P
         return {**run.facts, "error": str(error), **environment(rt.device)}
     seconds, processor_s = time.perf_counter() - started, time.process_time() - used
     refuse_interrupted(result)
-    write_slices(job.output, run.facts, case.slices(result.volume))
     return {
         **run.facts,
         "metrics": {name: _number(value) for name, value in case.measure(result.volume).items()},
