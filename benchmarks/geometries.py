@@ -84,11 +84,6 @@ class Case:
     radius_mm: float = 7.0
     centre_mm: tuple[float, float, float] = (0.6, -0.8, 0.3)
 
-    @property
-    def has_poses(self) -> bool:
-        """Whether only a table of poses can describe it."""
-        return bool(self.feed_mm or self.tilt_deg or self.roll_deg)
-
     def geometry(self) -> ConeGeometry | ParallelGeometry:
         shape, sizes = (self.rows, self.columns), np.array(self.pitch_mm) * self.unit / (1.5 if self.is_parallel else 1)
         pitch = (float(sizes[0]), float(sizes[1]))
@@ -150,7 +145,7 @@ class Case:
 
     def scan(self) -> Scan:
         frames, grid = self.frames(), self.grid()
-        if not self.has_poses:
+        if not (self.feed_mm or self.tilt_deg or self.roll_deg):  # else only a table of poses can describe it
             if not self.exposure_deg:
                 return static_scan(frames, self.geometry(), self.angles_deg, grid=grid)
             arc = self.exposure_deg * (1 if np.diff(np.unwrap(self.angles_deg, period=360.0))[0] > 0 else -1)

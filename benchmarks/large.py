@@ -61,10 +61,7 @@ def main() -> None:
     rt = Runtime(arguments.device)
     everything, limit = rt.ledger.limit_bytes, bytes_of(arguments.memory, "--memory")
     facts: Facts = where(rt) | {
-        "voxels": arguments.voxels,
-        "detector": arguments.detector,
-        "views": arguments.views,
-        "gaussians": arguments.gaussians,
+        **{name: getattr(arguments, name) for name in ("voxels", "detector", "views", "gaussians")},
         "memory_bytes": limit,
         "largest_buffer_bytes": rt.device.largest_allocation_bytes,
     }

@@ -1,6 +1,5 @@
 """Cases: one object scanned by one protocol with one seed, by a moving gantry and by one at rest, and their scores."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,6 @@ from phyradgs_cl.simulation import FrameSource, Scene, SimulationOptions, Volume
 from tables.metrics import compare_projections
 
 FLY, STILL = "fly-scan", "stop-and-shoot"
-Measure = Callable[[], dict[str, float]]
 
 
 def stop_and_shoot(protocol: Protocol) -> Protocol:
@@ -88,10 +86,6 @@ class SyntheticCase:
             where = (self._geometry, self._scene.grid, self._protocol, self._axis)
             self._views = HeldOutViews(self._rt, self._scene.source, *where)
         return {**compare(volume, self.truth), **self._views.measure(volume)}
-
-    def references(self) -> dict[str, Measure]:
-        """Returns nothing: the truth is exact."""
-        return {}
 
     def warn_of_inverse_crime(self) -> None:
         """Warns where the volume's file has no more voxels than the benchmark's grid."""

@@ -117,12 +117,11 @@ def _notes(job: BenchJob, lines: Sequence[Line]) -> list[str]:
     size = job.bench_size
     seeds = sorted({line["seed"] for line in lines})
     last = lines[-1]
-    scan = _PHANTOM_NOTE if job.study == PHANTOM else _SYNTHETIC_NOTE
     machines = sorted({f"{line['device']} ({line['platform']})" for line in lines})
     return [
-        f"{scan} Readout along {job.axis}. Seeds {', '.join(map(str, seeds))}: numbers are means over volumes, ± is "
-        "the standard deviation over seeds of the mean over those volumes that were run with all of them. "
-        "What the columns are: docs/benchmarks.md.",
+        f"Readout along {job.axis}. Seeds {', '.join(map(str, seeds))}: numbers are means over volumes, ± is the standard "
+        "deviation over seeds of the mean over those volumes that were run with all of them. What the scans and columns "
+        "are: docs/benchmarks.md; the sphere phantom: docs/results/quality.md.",
         "",
         f"All splatting rows start with {job.gaussians:,} Gaussians (or one for every voxel that attenuates, where "
         f"those are fewer) and run {size.iterations:,} iterations of one frame each.",
@@ -130,14 +129,3 @@ def _notes(job: BenchJob, lines: Sequence[Line]) -> list[str]:
         f"Device {', '.join(machines)}; phyradgs-cl {last['version']}, Python {last['python']}, NumPy {last['numpy']}, "
         f"pyopencl {last['pyopencl']}, PoCL {last['pocl'] or 'none'}.",
     ]
-
-
-_SYNTHETIC_NOTE = (
-    "Volumes projected at their own resolution on R2-Gaussian's scanner (DSO 5, DSD 7, panel 4 × 4, box 2³), TIGRE's "
-    "noise with 10,000 photons and σ 10."
-)
-_PHANTOM_NOTE = (
-    "Double-layer sphere phantom in a 200 mm box on a C-arm (DSO 785 mm, DSD 1200 mm, shifted panel), averaged in "
-    "intensity, raw counts with 50,000 photons and σ 10, corrected by flats and darks; the gantry wanders by 0.1° and "
-    "the encoder knows. The pseudo-truth is R2-Gaussian from 64 stop-and-shoot projections."
-)

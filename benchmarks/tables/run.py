@@ -4,6 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
@@ -60,7 +61,7 @@ def run_bench(
         missing = [run for run in plan if not present.has(run.facts)]
         _check_volumes(missing)
         if missing:
-            batch = Batch(job, results, lines, missing, len(plan), report, make_runtime())
+            batch = Batch(job, results, lines, len(plan) - len(missing), len(plan), report, make_runtime())
             for _, group in groupby(missing, key=lambda run: run.case):
                 batch.run_case(list(group))
         return _write_tables(job, lines)
@@ -95,15 +96,15 @@ def _name_rows_left_out(job: BenchJob) -> None:
 
 
 class Batch:
-    """The ``missing`` runs of ``total``, one case after the other. ``lines`` are those of the results file, and grow."""
+    """The runs after the first ``done`` of ``total``, one case after the other. ``lines`` are those of the results file, and
+    grow."""
 
     def __init__(
-        self, job: BenchJob, results: Path, lines: list[Line], missing: Sequence[PlannedRun], total: int,
-        report: Report, rt: Runtime,
+        self, job: BenchJob, results: Path, lines: list[Line], done: int, total: int, report: Report, rt: Runtime
     ) -> None:
         self.job, self.results, self.report, self.rt = job, results, report, rt
         self.lines, self.present = lines, Present(lines)
-        self.left, self.total = list(missing), total
+        self.done, self.total = done, total
         self.warned: set[str] = set()
 
     def keep(self, line: Line) -> None:
@@ -113,36 +114,31 @@ class Batch:
         self.present.add(line)
         self.lines.append(line)
 
-    def finish(self, run: PlannedRun, line: Line) -> None:
-        """Reports the result of a run."""
-        number = self.total - len(self.left) + 1
-        self.left.remove(run)
-        self.report(BenchProgress(number, self.total, run.title, line=line))
-
     def run_case(self, runs: Sequence[PlannedRun]) -> None:
         """Makes all missing runs of one case."""
         title = f"reference of seed {runs[0].seed}"
-        first = BenchProgress(self.total - len(self.left) + 1, self.total, title)
+        first = BenchProgress(self.done + 1, self.total, title)
         case = make_case(self.job, self.rt, runs[0], _forwarded(self.report, first))
-        if runs[0].volume not in self.warned:
+        if isinstance(case, PhantomCase):
+            for line in reference_lines(self.job, runs[0], case, self.rt, self.present):
+                self.keep(line)
+        elif runs[0].volume not in self.warned:
             self.warned.add(runs[0].volume)
             case.warn_of_inverse_crime()
-        for line in reference_lines(self.job, runs[0], case, self.rt, self.present):
-            self.keep(line)
         for run in runs:
-            number = self.total - len(self.left) + 1
-            started = BenchProgress(number, self.total, run.title)
+            self.done += 1
+            started = BenchProgress(self.done, self.total, run.title)
             self.report(started)
             with keep_finished_work():  # a finished run is measured and kept, then the benchmark stops
                 line = one_run(run, case, self.rt, _forwarded(self.report, started))
                 self.keep(line)
-            self.finish(run, line)
+            self.report(replace(started, line=line))
 
 
 def reference_lines(
-    job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, present: Present
+    job: BenchJob, run: PlannedRun, case: PhantomCase, rt: Runtime, present: Present
 ) -> Iterator[Line]:
-    """Returns lines about what results are compared with, where the case has any that are missing."""
+    """Returns lines about what results are compared with, where any are missing."""
     same = {"acquisition": REFERENCE, "method": None, "options": {}, "iterations": job.bench_size.iterations}
     for name, measure in case.references().items():
         facts = {**run.facts, **same, "run": name, "label": name}
