@@ -2,23 +2,10 @@
 
     python benchmarks/calibrate.py FOLDER RESULTS.jsonl [--cases panel,...] [--only NAME,...] [--size 32] [--views 25]
 
-It writes one line of JSON per run, and continues where it stopped. docs/make_results.py makes the tables of
-docs/results/calibrate.md from the lines. FOLDER holds volumes as for benchmarks/tables; --only spheres is the sphere
-phantom, in closed form. The scanner is R2-Gaussian's with TIGRE's noise and a panel twice as wide as the volume. Volumes are
-those of fista-tv, with every line at its own times.
-
-Cases:
-
-        panel      offset of 2.5 pixels, roll of 0.5°, tilt about v of 1°, all at once. right      no error; every parameter
-        is estimated. columns    readout 20 % longer than stated, by columns. rows       readout 20 % longer than stated, by
-        rows; such a scan does not determine it. turned     readout and exposure 20 % longer than stated, by rows, and a
-        second scan turned the other way. wobble     0.3° and 1 pixel (RMS) per view. slow       0.3° and 1 pixel (RMS), as
-        six splines of time, and estimated as splines. kaist      0.03 rad and 1 voxel (RMS) per view, with the noise of Choi
-        et al. (2026), for --views 75. motion     the object turns by up to 2° and moves by up to 2 voxels during the scan,
-        about and along all axes. beads      a phantom of known shape at any place, read by rows. The seed draws readout,
-        exposure, offset, roll, tilt and both distances. No volume is scored. draw       read by columns. The seed draws the
-        offset to 2.5 pixels, roll to 0.5°, tilt about v to 1°, readout to 20 %. Counts how often the stated intervals hold
-        the truth; no volume is scored. draw_rows  as draw but read by rows, which do not determine readout and exposure. """
+It writes one line of JSON per run, and continues where it stopped. docs/results/calibrate.md lists the cases, and has the
+tables that docs/make_results.py makes from the lines. FOLDER holds volumes as for benchmarks/tables; --only spheres is the
+sphere phantom, in closed form. The scanner is R2-Gaussian's with TIGRE's noise and a panel twice as wide as the volume.
+Volumes are those of fista-tv, with every line at its own times."""
 
 import time
 from collections.abc import Callable
@@ -39,7 +26,7 @@ from phyradgs_cl.acquisition.altered.perturbed import (
     Views,
     perturb,
 )
-from phyradgs_cl.calibrate import Calibration, calibrate
+from phyradgs_cl.calibrate import calibrate
 from phyradgs_cl.calibrate.parameters import PARAMETERS, correction_of
 from phyradgs_cl.calibrate.per_view import SPLINES, MotionParameters, WobbleParameters
 from phyradgs_cl.fields import Grid
@@ -83,7 +70,6 @@ class Case:
     what: str | None
     planted: dict[str, float]
     others: tuple[Scan, ...] = ()
-    views: Views | None = None
     is_scored: bool = True
     phantom: EllipsoidPhantom | None = None
     splines: int = 0
@@ -134,7 +120,7 @@ def slow(make: Maker, seed: int) -> Case:
     size = np.array([np.deg2rad(0.3), *scan.geometry.pixel_size_mm])
     views = parameters.views_of(drawn / np.std(parameters.basis @ drawn, axis=0) * size)
     shaken = make(seed, views_off=views)
-    return Case(replace(shaken, trajectory=scan.trajectory), shaken, "wobble", {}, views=views, splines=6)
+    return Case(replace(shaken, trajectory=scan.trajectory), shaken, "wobble", {}, splines=6)
 
 
 def kaist(make: Maker, seed: int) -> Case:
@@ -149,7 +135,7 @@ def _shaken(make: Maker, scan: Scan, seed: int, sizes: np.ndarray) -> Case:
     parameters = WobbleParameters.of(scan)
     views = parameters.views_of(parameters.without_gauges(sizes * rng.normal(size=(scan.frames, 3))))
     shaken = make(seed, views_off=views)
-    return Case(replace(shaken, trajectory=scan.trajectory), shaken, "wobble", {}, views=views)
+    return Case(replace(shaken, trajectory=scan.trajectory), shaken, "wobble", {})
 
 
 def motion(make: Maker, seed: int) -> Case:
@@ -263,7 +249,6 @@ def run_one(rt: Runtime, case: Case) -> dict[str, object]:
         "parameters": [line(one, case.planted) for one in found.parameters],
         "psnr_db": {"stated": scores["right"], "calibrated": scores["right"], **scores} if scores else {},
         **{key: value for key, value in found.facts().items() if key not in ("parameters", "views")},
-        **wobble_left(found, case),
         "seconds": round(seconds, 1),
         "cpu_seconds": round(cpu_seconds, 1),
         "device": rt.device.name,
@@ -277,19 +262,6 @@ def line(found, planted: dict[str, float]) -> dict[str, object]:  # type: ignore
         return {**found.facts(), "truth": truth + found.stated, "error": None, "z": None}
     error = found.found - found.stated - truth
     return {**found.facts(), "truth": truth + found.stated, "error": error, "z": error / found.deviation}
-
-
-def wobble_left(found: Calibration, case: Case) -> dict[str, object]:
-    """Returns the remaining and the planted turns (deg) and shifts (pixels) of views, RMS."""
-    if case.views is None:
-        return {}
-    pitch_mm = case.right.geometry.pixel_size_mm[1]
-    none = Views(np.zeros(case.right.frames), np.zeros((case.right.frames, 2)))
-    facts: dict[str, object] = {}
-    for name, views in (("planted", none), ("left", found.views or none)):
-        facts[f"turn_{name}_deg"] = round(float(np.rad2deg(np.std(case.views.turn_rad - views.turn_rad))), 4)
-        facts[f"shift_{name}_px"] = round(float(np.std(case.views.shift_mm - views.shift_mm)) / pitch_mm, 4)
-    return facts
 
 
 def score(rt: Runtime, scan: Scan) -> float:

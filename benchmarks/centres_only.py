@@ -1,11 +1,10 @@
 """Measures the worth of the covariance: the errors of frames in which only the centres of Gaussians move.
 
-    python benchmarks/centres_only.py docs/results/centres_only.jsonl [VOLUMES]
+    python benchmarks/centres_only.py docs/results/centres_only.jsonl
 
-Errors are relative RMS of one frame of 128² pixels. By distance from the axis (half-sides of the box): the mean of eight
-Gaussians in random orientations, against 60 times of every row's own. Long ones are 0.08 by 0.02 by 0.02, round ones 0.03.
-By object: the Gaussians of each volume file in the folder VOLUMES, as ``reconstruct --method phyradgs`` writes it, against
-20 segments of their motion. """
+Errors are relative RMS of one frame of 128² pixels, by distance from the axis (half-sides of the box): the mean of eight
+Gaussians in random orientations, against 60 times of every row's own. Long ones are 0.08 by 0.02 by 0.02, round ones
+0.03."""
 
 import json
 import sys
@@ -23,7 +22,6 @@ from phyradgs_cl.acquisition.cells import (
     per_line_cells,
     static_cells,
 )
-from phyradgs_cl.io import read_volume
 from phyradgs_cl.operators import DeviceCells, SplatProjector
 from phyradgs_cl.runtime import Runtime
 
@@ -32,9 +30,9 @@ SCALES = {"round": (0.03, 0.03, 0.03), "long": (0.08, 0.02, 0.02)}
 Line = dict[str, object]
 
 
-def frame_of(protocol_name: str) -> tuple:
+def one_frame() -> tuple:
     """Returns trajectory, shutter, frame, start in seconds and lines."""
-    protocol, side = make_protocol(protocol_name), 4.0 / PIXELS
+    protocol, side = make_protocol("rapid"), 4.0 / PIXELS
     geometry = ConeGeometry(5.0, 7.0, (PIXELS, PIXELS), (side, side))
     return protocol.orbit(geometry), protocol.shutter("rows"), FRAME, float(protocol.frame_start_s()[FRAME]), PIXELS
 
@@ -61,7 +59,7 @@ def gaussians(distance: float, scale: tuple[float, float, float], rng: np.random
 
 
 def by_distance(rt: Runtime) -> Iterator[Line]:
-    where, rng = frame_of("rapid"), np.random.default_rng(0)
+    where, rng = one_frame(), np.random.default_rng(0)
     reference = per_line_cells(*where, TIMES)
     for kind, scale in SCALES.items():
         for distance in (0.0, 0.2, 0.4, 0.6, 0.8):
@@ -71,21 +69,9 @@ def by_distance(rt: Runtime) -> Iterator[Line]:
             yield {"gaussians": kind, "distance": distance, **means}
 
 
-def by_object(rt: Runtime, volumes: Path) -> Iterator[Line]:
-    for path in sorted(volumes.glob("*.h5")):
-        cloud = read_volume(path).gaussians
-        rows = cloud.rows()[:, np.argsort(cloud.mean[:, 2])]
-        for protocol in ("rapid", "standard"):
-            where = frame_of(protocol)
-            fine = SplatProjector(rt, PIXELS, PIXELS, time_error=1e-4)
-            expected = fine.project(rows, DeviceCells.upload(rt, exact_cells(*where, 20)))
-            yield {"volume": path.stem, "protocol": protocol, **errors(rt, where, rows, expected.astype(np.float64))}
-
-
 def main() -> None:
     rt = Runtime()
-    lines = [*by_distance(rt), *(by_object(rt, Path(sys.argv[2])) if len(sys.argv) > 2 else ())]
-    Path(sys.argv[1]).write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="utf-8")
+    Path(sys.argv[1]).write_text("".join(json.dumps(line) + "\n" for line in by_distance(rt)), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """Asks `phyradgs check` about a folder of good scans and of scans with planted faults: one line of JSON per scan, resumable.
 
     python benchmarks/check_answers.py FOLDER RESULTS.jsonl [--only PART,...]
-    python benchmarks/check_answers.py FOLDER RESULTS.jsonl --table
 
 FOLDER is what benchmarks/check_scans/make_scans.py writes: scans, and ``manifest.jsonl`` with one line per scan. A line has
 the planted fault, the questions that may rightly be suspicious (``right``), and, where no frame shows the fault, the reason
@@ -9,6 +8,7 @@ the planted fault, the questions that may rightly be suspicious (``right``), and
 
 import argparse
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -64,31 +64,12 @@ def outcome(line: dict[str, Any]) -> str:
     return f"{answer}, wrong cause blamed" if beside else answer
 
 
-def words(line: dict[str, Any]) -> str:
-    """Returns the suspicious findings in words. Without any, returns why the questions that should find it cannot tell."""
-    if "error" in line:
-        return f"refused: {line['error']}"
-    chosen = [f for f in line["findings"] if f["verdict"] == SUSPICIOUS]
-    if not chosen and line["undecidable"]:
-        return str(line["undecidable"])
-    chosen = chosen or [f for f in line["findings"] if f["verdict"] == CANNOT_TELL and f["question"] in line["right"]]
-    return "; ".join(f"**{f['question']}** {f['text']}" for f in chosen).replace("|", "/")
-
-
-def table(path: Path) -> str:
-    """Returns a Markdown table with one row per scan, and the sums."""
-    lines = lines_of(path)
-    text = ["| planted | object | answer | in words |", "| --- | --- | --- | --- |"]
-    sums: dict[tuple[str, str], int] = {}
-    for line in sorted(lines, key=lambda line: line["group"] == "good"):
-        answer = outcome(line)
-        sums[line["group"], answer] = sums.get((line["group"], answer), 0) + 1
-        if line["group"] != "good" or answer != "silent":
-            text.append(f"| {line['planted']} | {line['object']} | {answer} | {words(line)} |")
-    good = [line["planted"] for line in lines if line["group"] == "good" and outcome(line) == "silent"]
-    text += ["", f"Silent on good scans: {'; '.join(good)}.", ""]
-    text += [f"- {group}: {answer} {count}" for (group, answer), count in sorted(sums.items())]
-    return "\n".join(text)
+def summary(lines: Sequence[dict[str, Any]]) -> str:
+    """Returns each outcome with the number of its scans and what was planted in them."""
+    planted: dict[tuple[str, str], list[str]] = {}
+    for line in lines:
+        planted.setdefault((line["group"], outcome(line)), []).append(f"{line['planted']} ({line['object']})")
+    return "\n".join(f"{group}, {answer}, {len(of)}: {'; '.join(of)}" for (group, answer), of in sorted(planted.items()))
 
 
 def main() -> None:
@@ -97,11 +78,9 @@ def main() -> None:
     parser.add_argument("results", type=Path, help="JSON lines, appended to")
     parser.add_argument("--only", default="", help="comma-separated parts of file names")
     parser.add_argument("--device", default=None)
-    parser.add_argument("--table", action="store_true", help="print the table of the results, run nothing")
     asked = parser.parse_args()
-    if not asked.table:
-        run_all(asked.folder, asked.results, asked.only.split(","), asked.device)
-    print(table(asked.results))
+    run_all(asked.folder, asked.results, asked.only.split(","), asked.device)
+    print(summary(lines_of(asked.results)))
 
 
 if __name__ == "__main__":

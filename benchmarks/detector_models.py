@@ -1,7 +1,6 @@
 """Measures the gain from modelling the detector: every effect modelled and ignored, several methods, means over seeds.
 
-    python benchmarks/detector_models.py RESULTS.jsonl [--names shepp-logan,VOLUME.h5] [--effects lag,pulse] [--seeds 0]
-    python benchmarks/detector_models.py RESULTS.jsonl --table
+    python benchmarks/detector_models.py RESULTS.jsonl [--names shepp-logan] [--effects lag,pulse] [--seeds 0]
 
 Scans are rapid fly-scans: 25 frames of 14.4 degrees, read by rows, 48³ voxels, 72² pixels. Counts are of 1e5 photons with
 electronic noise of 10, unless an effect has others. Iterative methods take every line at its own 5 times. phyradgs is exact
@@ -13,17 +12,15 @@ weighted by their transmission)."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 from scans import append, read_lines, results_parser
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.metrics import compare
 from phyradgs_cl.reconstructors import Preprocessing, RunPlan, method_options, reconstruct
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.simulation import Scene, SimulationOptions, phantom_scene, simulate, volume_scene
+from phyradgs_cl.simulation import Scene, SimulationOptions, phantom_scene, simulate
 
 VOXELS, PIXELS, SUB_INTERVALS = 48, 72, 5
 PULSE = (0.86, 0.14)  # the pulse that all lines of the rapid protocol share
@@ -70,10 +67,7 @@ def effects() -> list[Effect]:
 
 
 def scene_of(rt: Runtime, name: str) -> Scene:
-    box = Grid.cube(VOXELS, 2.0)
-    if name.endswith(".h5"):
-        return volume_scene(rt, load_attenuation(name), f"volume {name}", GEOMETRY, box, VOXELS, "rows")
-    return phantom_scene(rt, name, GEOMETRY, box, VOXELS, "rows", 0)
+    return phantom_scene(rt, name, GEOMETRY, Grid.cube(VOXELS, 2.0), VOXELS, "rows", 0)
 
 
 def scan_of(scene: Scene, effect: Effect, seed: int) -> Scan:
@@ -102,7 +96,7 @@ def psnr_db(rt: Runtime, scan: Scan, method: str, told: dict[str, object], seed:
 
 def rows(rt: Runtime, name: str, seed: int, wanted: tuple[str, ...], done: set[tuple]) -> Iterator[Row]:
     for effect in effects():
-        missing = [m for m in effect.methods if (Path(name).stem, effect.name, m, seed) not in done]
+        missing = [m for m in effect.methods if (name, effect.name, m, seed) not in done]
         if not missing or not effect.name.startswith(wanted):
             continue
         scan = scan_of(scene_of(rt, name), effect, seed)
@@ -111,7 +105,7 @@ def rows(rt: Runtime, name: str, seed: int, wanted: tuple[str, ...], done: set[t
             modelled = psnr_db(rt, scan, method, effect.modelled, seed)
             ignored = psnr_db(rt, unaware, method, effect.ignored, seed)
             yield {
-                "object": Path(name).stem,
+                "object": name,
                 "effect": effect.name,
                 "method": method,
                 "seed": seed,
@@ -122,7 +116,7 @@ def rows(rt: Runtime, name: str, seed: int, wanted: tuple[str, ...], done: set[t
 
 def main() -> None:
     parser = results_parser(__doc__)
-    parser.add_argument("--names", default="shepp-logan", help="phantoms and volume files, with commas")
+    parser.add_argument("--names", default="shepp-logan", help="phantoms, with commas")
     parser.add_argument("--effects", default="", help="beginnings of the effects' names, with commas")
     parser.add_argument("--seeds", default="0")
     arguments = parser.parse_args()

@@ -4,7 +4,7 @@
 
 Estimate and run are separate processes, one after the other. Ratios are prediction over measurement. Time is the wall time
 of the whole process, with its start, reading, writing and comparing. Memory is the largest resident memory and the largest
-sum of device buffers. On a CPU the resident memory includes the buffers. --estimates no measures only the runs."""
+sum of device buffers. On a CPU the resident memory includes the buffers."""
 
 import json
 import sys
@@ -12,7 +12,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from measuring import Facts, child, finish, foot_scan, median, parser_of, where
+from measuring import Facts, child, finish, foot_scan, parser_of, where
 
 from phyradgs_cl.api import save_scan
 from phyradgs_cl.estimate import estimate, peak_host_bytes, seconds_around
@@ -42,26 +42,15 @@ def said(scan: Path, name: str, device: str | None, iterations: int | None) -> F
     before_s = time.process_time()
     plan = plan_run(method, changes)
     found = estimate(loaded, plan, rt, around=lambda result: before_s + seconds_around(scan, loaded, result))
-    return {
-        "seconds": found.seconds,
-        "host_bytes": found.host_bytes,
-        "device_bytes": found.device_bytes,
-        "trial_seconds": found.trial_seconds,
-    }
+    return {"seconds": found.seconds, "host_bytes": found.host_bytes, "device_bytes": found.device_bytes}
 
 
 def happened(scan: Path, name: str, device: str | None, iterations: int | None) -> Facts:
     """Returns the time and memory of a run in this process."""
     method, changes = changed(name, iterations)
     rt = Runtime(device)
-    result, metrics = run_reconstruction(plan_run(method, changes), scan, scan.with_name("volume.h5"), lambda: rt)
-    return {
-        "method_seconds": result.facts["seconds"],
-        "host_bytes": peak_host_bytes(),
-        "device_bytes": rt.peak_bytes,
-        "gaussians": result.facts.get("gaussians", 0),
-        "psnr_db": metrics["psnr_db"],
-    }
+    run_reconstruction(plan_run(method, changes), scan, scan.with_name("volume.h5"), lambda: rt)
+    return {"host_bytes": peak_host_bytes(), "device_bytes": rt.peak_bytes}
 
 
 def changed(name: str, iterations: int | None) -> tuple[str, Facts]:
@@ -70,17 +59,13 @@ def changed(name: str, iterations: int | None) -> tuple[str, Facts]:
     return method, {**changes, **more}
 
 
-def one(name: str, scan: Path, words: list[str], with_estimate: bool) -> Facts:
-    line: Facts = {"method": name}
-    if with_estimate:
-        line["said"] = child(__file__, "--child", "said", str(scan), name, *words)
+def one(name: str, scan: Path, words: list[str]) -> Facts:
+    predicted = child(__file__, "--child", "said", str(scan), name, *words)
     begun = time.perf_counter()
-    line["happened"] = child(__file__, "--child", "happened", str(scan), name, *words)
-    line["happened"]["seconds"] = time.perf_counter() - begun  # type: ignore[index]
-    if with_estimate:
-        keys = ("seconds", "host_bytes", "device_bytes")
-        line["ratio"] = {key: line["said"][key] / max(line["happened"][key], 1e-9) for key in keys}  # type: ignore[index]
-    return line
+    taken = child(__file__, "--child", "happened", str(scan), name, *words)
+    taken["seconds"] = time.perf_counter() - begun
+    ratio = {key: predicted[key] / max(taken[key], 1e-9) for key in predicted}  # type: ignore[operator, call-overload]
+    return {"method": name, "said": predicted, "happened": taken, "ratio": ratio}
 
 
 def main() -> None:
@@ -88,7 +73,6 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--methods", default=",".join(RUNS))
     parser.add_argument("--iterations", type=int, default=None, help="else each method's own")
-    parser.add_argument("--estimates", choices=("yes", "no"), default="yes")
     parser.add_argument("--child", nargs=3, default=None, metavar=("WHAT", "SCAN", "METHOD"))
     arguments = parser.parse_args()
     if arguments.child:
@@ -107,13 +91,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         scan = Path(folder) / "scan.h5"
         save_scan(scan, foot_scan(Runtime(arguments.device), arguments.size))
-        lines = [one(name, scan, words, arguments.estimates == "yes") for name in names]
-    facts["runs"] = lines
-    if arguments.estimates == "yes":
-        ratios: list[dict[str, float]] = [line["ratio"] for line in lines]  # type: ignore[misc]
-        facts["median_ratio"] = {key: median([r[key] for r in ratios]) for key in ratios[0]}
-        within = [abs(r["seconds"] - 1) <= 0.3 for r in ratios]
-        facts["time_within_30_percent"] = f"{sum(within)} of {len(within)}"
+        facts["runs"] = [one(name, scan, words) for name in names]
     finish(facts, arguments.json)
 
 

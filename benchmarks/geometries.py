@@ -84,11 +84,6 @@ class Case:
     radius_mm: float = 7.0
     centre_mm: tuple[float, float, float] = (0.6, -0.8, 0.3)
 
-    @property
-    def has_poses(self) -> bool:
-        """Whether only a table of poses can describe it."""
-        return bool(self.feed_mm or self.tilt_deg or self.roll_deg)
-
     def geometry(self) -> ConeGeometry | ParallelGeometry:
         shape, sizes = (self.rows, self.columns), np.array(self.pitch_mm) * self.unit / (1.5 if self.is_parallel else 1)
         pitch = (float(sizes[0]), float(sizes[1]))
@@ -150,7 +145,7 @@ class Case:
 
     def scan(self) -> Scan:
         frames, grid = self.frames(), self.grid()
-        if not self.has_poses:
+        if not (self.feed_mm or self.tilt_deg or self.roll_deg):  # else only a table of poses can describe it
             if not self.exposure_deg:
                 return static_scan(frames, self.geometry(), self.angles_deg, grid=grid)
             arc = self.exposure_deg * (1 if np.diff(np.unwrap(self.angles_deg, period=360.0))[0] > 0 else -1)
@@ -218,26 +213,16 @@ def cases() -> Iterator[Case]:
         yield of_beam(f"{beam}, fly-scan, unit 1e+06 mm", unit=1e6, **moving)
 
 
-class Heard(logging.Handler):
-    """Keeps the warnings."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.WARNING)
-        self.lines: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.lines.append(record.getMessage())
-
-
 def listened(work: Callable[[], object]) -> tuple[object, list[str]]:
     """Returns what the work returns, or the InputError that it raises, and its warnings."""
-    heard = Heard()
-    logger = logging.getLogger("phyradgs_cl")
+    lines: list[str] = []
+    logger, heard = logging.getLogger("phyradgs_cl"), logging.Handler(logging.WARNING)
+    heard.emit = lambda record: lines.append(record.getMessage())  # type: ignore[method-assign]
     logger.addHandler(heard)
     try:
-        return work(), heard.lines
+        return work(), lines
     except InputError as error:
-        return error, heard.lines
+        return error, lines
     finally:
         logger.removeHandler(heard)
 
@@ -257,7 +242,7 @@ def measured(case: Case, method: str) -> dict[str, object]:
         return {"case": case.name, "method": method, "refused": str(scan), "warnings": of_scan}
     assert isinstance(scan, Scan)
     named = "fbp" if method == "fdk" and case.is_parallel else method
-    motion = {"motion": "per-row"} if case.exposure_deg and method not in ("phyradgs",) else {}
+    motion = {"motion": "per-row"} if case.exposure_deg and method != "phyradgs" else {}
     result, of_run = listened(lambda: reconstruct(scan, named, report=False, **motion, **METHODS[method]))
     row: dict[str, object] = {"case": case.name, "method": method, "warnings": of_scan + of_run}
     if isinstance(result, InputError):

@@ -22,15 +22,13 @@ from phyradgs_cl.operators import RayOperator, backproject, voxelise
 from phyradgs_cl.runtime import Runtime, bytes_of
 
 
-def calls(
-    rt: Runtime, voxels: int, detector: int, views: int, gaussians: int
-) -> dict[str, Callable[[], np.ndarray]]:
+def calls(rt: Runtime, voxels: int, detector: int, views: int, gaussians: int) -> dict[str, Callable[[], np.ndarray]]:
     grid = Grid.cube(voxels, 2.0)
     geometry = ConeGeometry(5.0, 7.0, (detector, detector), (4.0 / detector,) * 2)
     orbit = CircularOrbit(geometry, ConstantSpeed(0.2, 2 * np.pi / views))
     tables = [static_cells(orbit, Shutter(0.0), f, float(f), detector) for f in range(views)]
     pose = np.concatenate([table.pose for table in tables])
-    z, y, x = (np.linspace(0, 1, voxels, dtype=np.float32).reshape(shape) for shape in _axes())
+    z, y, x = np.meshgrid(*[np.linspace(0, 1, voxels, dtype=np.float32)] * 3, indexing="ij", sparse=True)
     volume = np.sin(40 * x) * np.cos(30 * y) + z  # every brick differs
     frames = np.random.default_rng(0).uniform(0, 1, (views, detector, detector)).astype(np.float32)
     rows = random_cloud(gaussians, (0.01, 0.03), np.random.default_rng(0))
@@ -40,10 +38,6 @@ def calls(
         "FDK backprojection": lambda: backproject(rt, frames, pose, np.ones(views), grid),
         "voxeliser": lambda: voxelise(rt, rows, grid),
     }
-
-
-def _axes() -> tuple[tuple[int, int, int], ...]:
-    return (-1, 1, 1), (1, -1, 1), (1, 1, -1)
 
 
 def measured(rt: Runtime, call: Callable[[], np.ndarray]) -> tuple[np.ndarray, Facts]:
@@ -67,10 +61,7 @@ def main() -> None:
     rt = Runtime(arguments.device)
     everything, limit = rt.ledger.limit_bytes, bytes_of(arguments.memory, "--memory")
     facts: Facts = where(rt) | {
-        "voxels": arguments.voxels,
-        "detector": arguments.detector,
-        "views": arguments.views,
-        "gaussians": arguments.gaussians,
+        **{name: getattr(arguments, name) for name in ("voxels", "detector", "views", "gaussians")},
         "memory_bytes": limit,
         "largest_buffer_bytes": rt.device.largest_allocation_bytes,
     }

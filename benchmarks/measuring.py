@@ -1,13 +1,11 @@
-"""Functions that the benchmarks share: where they ran, runs of splats, medians, children in processes, results as JSON."""
+"""Functions that the benchmarks share: where they ran, runs of splats, children in processes, results as JSON."""
 
 import argparse
 import json
 import os
 import platform
-import statistics
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -77,10 +75,6 @@ def random_cloud(count: int, scale: tuple[float, float], rng: np.random.Generato
     turn, density = quaternion / np.linalg.norm(quaternion, axis=0), rng.uniform(0.1, 1.0, (1, count))
     rows = np.concatenate([place, size, turn, density])
     return rows[:, np.argsort(rows[2])]
-
-
-def median(values: Sequence[float]) -> float:
-    return float(statistics.median(values))
 
 
 def child(script: str, *words: str) -> Facts:

@@ -2,16 +2,16 @@
 
     python benchmarks/moving.py VOLUMES RESULTS.jsonl [--names a,b] [--views 75,150] [--method fista] [--size 64]
         [--cases rest,known,unknown,still] [--motion breathing]
-        python benchmarks/moving.py --insert VOLUMES RESULTS.jsonl [--size 64]: the error of the centre of a ball in a body
+    python benchmarks/moving.py --insert VOLUMES RESULTS.jsonl [--size 64]: the error of the centre of a ball in a body
 
-    Volumes and scanner are those of benchmarks/scans.py: TIGRE's noise at 1e4 photons, a gantry that turns without stopping,
-    exposures without gaps. A turn takes a minute. The breath has a period of 4 s, jittered by 10 %, and an amplitude of 15 %
-    of half the box; --motion takes another preset with its own defaults. PSNR and SSIM compare with the reference volume.
-    Seconds are processor time.
+Volumes and scanner are those of benchmarks/scans.py: TIGRE's noise at 1e4 photons, a gantry that turns without stopping,
+exposures without gaps. A turn takes a minute. The breath has a period of 4 s, jittered by 10 %, and an amplitude of 15 %
+of half the box; --motion takes another preset with its own defaults. PSNR and SSIM compare with the reference volume.
+Seconds are processor time.
 
-    The case unknown has means over ten true states, of the method ``moving`` and of the volume that --method makes as if the
-    object rested. The case still has ``moving`` and --method on an object at rest. A run that was interrupted continues.
-    There is a line for each volume, number of views, method, case and motion."""
+The case unknown has means over ten true states, of the method ``moving`` and of the volume that --method makes as if the
+object rested. The case still has ``moving`` and --method on an object at rest. A run that was interrupted continues.
+There is a line for each volume, number of views, method, case and motion."""
 
 import argparse
 import tempfile

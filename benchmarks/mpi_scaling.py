@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measuring import Facts, finish, median, parser_of, splat_run, where
+from measuring import Facts, finish, parser_of, splat_run, where
 
 from phyradgs_cl.acquisition import ConeGeometry, make_protocol
 from phyradgs_cl.fields import Grid
@@ -49,9 +49,6 @@ NETWORKS = {
     "400 Gbit/s": (50e9, 2e-6),
 }
 PREDICTED = (2, 4, 8, 16, 32, 64)
-
-
-# --- one rank -------------------------------------------------------------------------------------------
 
 
 def started(rt: Runtime, gaussians: int, pixels: int, batch: int) -> SplatRun:
@@ -143,16 +140,13 @@ def be_a_rank(gaussians: int, pixels: int, batch: int, steps: int, device: str |
             "bytes_a_step": nbytes,
             "by_rank": [
                 {
-                    name: round(median(rank[:, k]) if name == "idle_ms" else float(rank[:, k].min()), 3)
+                    name: round(float((np.median if name == "idle_ms" else np.min)(rank[:, k])), 3)
                     for k, name in enumerate(PARTS)
                 }
                 for rank in everyone
             ],
         }
         out.write_text(json.dumps(facts))
-
-
-# --- all of them ----------------------------------------------------------------------------------------
 
 
 def on_ranks(ranks: int, words: list[str]) -> Facts:

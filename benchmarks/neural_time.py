@@ -1,7 +1,6 @@
-"""Measures PSNR over processor seconds for naf, sax-nerf and phyradgs, static and with known motion: JSON, then a figure.
+"""Measures PSNR over processor seconds for naf, sax-nerf and phyradgs, static and with known motion.
 
-    python benchmarks/neural_time.py run VOLUMES RESULTS.jsonl [--names cthead,walnut] [--size 64] [--methods a,b] ...
-    python benchmarks/neural_time.py draw RESULTS.jsonl FIGURE.png
+    python benchmarks/neural_time.py VOLUMES RESULTS.jsonl [--names cthead,walnut] [--size 64] [--methods a,b] ...
 
 Scans are those of scans.py. A run's volume is scored each time that a third more time has passed. Scoring, and making the
 volume for it, is not counted. Seconds are processor seconds of all threads in this process. With --threads 1, the default,
@@ -10,12 +9,8 @@ run is in the file once it is done; runs in the file are not made again."""
 
 import argparse
 import os
-import platform
-import sys
 import time
-from collections.abc import Sequence
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 from scans import append, files_of, make_scan, read_lines, runs_parser
@@ -79,9 +74,7 @@ def run_one(rt: Runtime, scan: Scan, label: str, factor: float, seed: int) -> di
         "device": rt.device.name,
         "torch_device": result.facts.get("torch_device"),
         "torch_version": result.facts.get("torch_version"),
-        "cpu": platform.processor() or platform.machine(),
         "version": __version__,
-        "options": str(result.facts["options"]),
     }
 
 
@@ -101,51 +94,13 @@ def run_all(arguments: argparse.Namespace) -> None:
                 append(arguments.results, {**facts, **run_one(rt, scan, label, factor, seed)})
 
 
-def draw(lines: Sequence[dict], path: Path) -> None:
-    """Draws a panel per volume, with one line per method from its longest run, and a dot at the end of every run."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    names = sorted({str(line["volume"]) for line in lines})
-    labels = [label for label in METHODS if any(line["method"] == label for line in lines)]
-    colours = dict(zip(("naf", "sax-nerf", "phyradgs"), ("tab:blue", "tab:green", "tab:orange"), strict=True))
-    figure, axes = plt.subplots(
-        1, len(names), figsize=(5 * len(names), 3.8), squeeze=False, layout="constrained"
-    )
-    for panel, name in zip(axes[0], names, strict=True):
-        for label in labels:
-            runs = [line for line in lines if (line["volume"], line["method"]) == (name, label)]
-            for run in sorted(runs, key=lambda run: run["factor"]):
-                seconds, psnr = ([point[key] for point in run["points"]] for key in ("seconds", "psnr_db"))
-                colour = colours[METHODS[label][0]]
-                is_static = METHODS[label][1].get("motion", "static") == "static"
-                is_longest = run["factor"] == max(run["factor"] for run in runs)
-                style = "--" if is_static else "-"
-                legend = {"alpha": 1.0, "label": label} if is_longest else {"alpha": 0.4}
-                panel.plot(seconds, psnr, style, color=colour, **legend)
-                panel.plot(seconds[-1], psnr[-1], "o", color=colour, ms=4)
-        panel.set(xscale="log", xlabel="processor seconds", ylabel="PSNR (dB)", title=name)
-        panel.grid(alpha=0.3)
-    axes[0][0].legend(fontsize=8)
-    figure.savefig(path, dpi=120)
-
-
 def main() -> None:
-    what = sys.argv.pop(1) if len(sys.argv) > 1 else ""
-    if what == "draw":
-        draw(read_lines(Path(sys.argv[1])), Path(sys.argv[2]))
-        return
     parser = runs_parser(__doc__)
     parser.add_argument("--methods", default=",".join(METHODS))
     parser.add_argument("--factors", default="1", help="iterations as multiples of the defaults, e.g. 0.25,1,4")
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--threads", type=int, default=1)
-    asked = parser.parse_args()
-    if what != "run":
-        parser.error(f"found {what!r}; expected run or draw")
-    run_all(asked)
+    run_all(parser.parse_args())
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """Measures the PSNR that each effect of a real scan costs, and what its step of ``prepare`` regains.
 
     python benchmarks/prepare.py docs/results/prepare.jsonl --size 32
-    python benchmarks/prepare.py docs/results/prepare.jsonl --table
 
 There is a line per effect, volume and method: ``clean``, ``clean_prepared`` (the step on a scan without the effect),
 ``spoilt`` and ``prepared``, in dB. Lines in the file are not made again. docs/results/prepare.md has the tables, and the
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scans import append, lines_of, read_lines
+from scans import append, read_lines
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import compare, prepare, reconstruct, simulate
@@ -31,21 +30,17 @@ METHODS: dict[str, dict[str, Any]] = {
     "fista": {"motion": "per-row"},
 }
 USUAL = ["fdk", "fista-tv", "phyradgs"]
-BOXES = (20, 22, 26, 28, 32)  # with the margin, in a grid of 32; a margin of half the part is 24
 GAUSSIANS = 1000  # at least, in a box of any size
-LOST_DB = 0.1  # of a smaller loss no share is given
 
 
 @dataclass(frozen=True)
 class Effect:
-    """What is planted, the steps that undo it, and their options. told: whether the steps know of the effect. part: the
-    share of the grid's sides about the middle that is reconstructed and compared. margin: the share of these filled at each
-    side and discarded."""
+    """What is planted, the steps that undo it, and their options. part: the share of the grid's sides about the middle that
+    is reconstructed and compared. margin: the share of these filled at each side and discarded."""
 
     planted: dict[str, float]
     steps: str
     options: dict[str, Any] = field(default_factory=dict)
-    told: bool = False
     part: float = 1.0
     margin: float = 0.0
 
@@ -72,10 +67,8 @@ EFFECTS = {
     "rings 5 %": Effect({"rings": 0.05}, "rings"),
     "drift 2 %": Effect({"drift": 0.02}, "air"),
     "scatter 0.3, fitted": Effect({"scatter": 0.3}, "scatter"),
-    "scatter 0.3, stated": Effect({"scatter": 0.3}, "scatter", {"scatter": {"to_primary": 0.3}}, told=True),
-    "120 kVp, water": Effect(
-        {"kvp": 120.0}, "hardening", {"hardening": {"polynomial": water_polynomial(120.0)}}, told=True
-    ),
+    "scatter 0.3, stated": Effect({"scatter": 0.3}, "scatter", {"scatter": {"to_primary": 0.3}}),
+    "120 kVp, water": Effect({"kvp": 120.0}, "hardening", {"hardening": {"polynomial": water_polynomial(120.0)}}),
     "120 kVp, bone": Effect({"kvp": 120.0}, "hardening", {"hardening": {"kvp": 120.0}}),
     "a third cut off": Effect({"truncation": 0.6}, "", part=0.375, margin=0.5),  # of the width
     "all": Effect(
@@ -83,12 +76,6 @@ EFFECTS = {
         "sparks,scatter,air,hardening,rings",
         {"hardening": {"kvp": 120.0}},
     ),
-}
-
-USUAL_EFFECTS = list(EFFECTS)
-EFFECTS |= {
-    f"a third cut off, {box} of 32": Effect({"truncation": 0.6}, "", part=0.375, margin=(box / 12 - 1) / 2)
-    for box in BOXES
 }
 
 
@@ -122,33 +109,6 @@ def lines(rt: Runtime, phantom: str, usual: dict[str, Any], left: dict[str, list
             yield {"effect": name, "phantom": Path(phantom).stem, "method": method, **rounded}
 
 
-def table(found: list[dict[str, Any]]) -> str:
-    """Returns a Markdown table: a row per volume and effect, a column per method, and the step's largest cost in a clean
-    scan."""
-    methods = [method for method in METHODS if any(line["method"] == method for line in found)]
-    by_place = {(line["phantom"], line["effect"], line["method"]): line for line in found}
-    head = ["effect", "volume", *(f"{method}: clean, with it, corrected" for method in methods), "clean, step"]
-    text = [f"| {' | '.join(head)} |", "| --- " * len(head) + "|"]
-    for phantom in dict.fromkeys(line["phantom"] for line in found):
-        for name, effect in EFFECTS.items():
-            of = [by_place.get((phantom, name, method)) for method in methods]
-            if not any(of):
-                continue
-            costs = min(line["clean_prepared"] - line["clean"] for line in of if line)
-            last = "told" if effect.told else f"{round(costs, 2) + 0:+.2f}".replace("-", "−")
-            text.append(f"| {' | '.join([name, phantom, *map(_cell, of), last])} |")
-    return "\n".join(text)
-
-
-def _cell(line: dict[str, Any] | None) -> str:
-    """Returns the PSNR in dB, clean, with the effect and corrected, and the regained share of the loss."""
-    if line is None:
-        return ""
-    stages = ", ".join(f"{line[key]:.2f}" for key in ("clean", "spoilt", "prepared"))
-    share = f" ({100 * line['regained']:.0f} %)" if line["clean"] - line["spoilt"] > LOST_DB else ""
-    return (stages + share).replace("-", "−")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("results", type=Path, nargs="?", help="a file of one line of JSON per run")
@@ -158,14 +118,9 @@ def main() -> None:
     parser.add_argument("--phantoms", nargs="+", default=["jaw", "foot"], help="names, or files of volumes")
     parser.add_argument("--seed", type=int, default=0, help="of noise and of what is planted")
     parser.add_argument("--methods", nargs="+", default=USUAL, choices=list(METHODS))
-    parser.add_argument("--effects", nargs="+", default=USUAL_EFFECTS, choices=list(EFFECTS))
-    parser.add_argument("--table", action="store_true", help="print the table, run nothing")
+    parser.add_argument("--effects", nargs="+", default=list(EFFECTS), choices=list(EFFECTS))
     parser.add_argument("--figure", type=Path, help="draw slices of the jaw into this file, run nothing else")
     given = parser.parse_args()
-    if given.table:
-        asked = [line for line in lines_of(given.results)[1:] if line["method"] in given.methods]
-        print(table([line for line in asked if line["effect"] in given.effects]))
-        return
     rt = Runtime()
     facts = {"size": given.size, "views": given.views, "dose": given.dose, "seed": given.seed, "device": rt.device.name}
     usual = {

@@ -6,14 +6,13 @@ There is a line per volume, views, method and cell: a step on the clean scan, or
 the frames bit for bit, ``lost_db`` is 0 without a run. Lines in the file are not made again. docs/results/prepare.md has the
 table."""
 
-import argparse
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scans import append, read_lines
+from scans import append, read_lines, results_parser
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import compare, prepare, reconstruct, simulate
@@ -52,8 +51,7 @@ def ringed_cells(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("results", type=Path, help="a file of one line of JSON per run")
+    parser = results_parser(__doc__)
     parser.add_argument("--phantoms", nargs="+", default=["jaw", "foot"], help="names, or files of volumes")
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--detector", type=int, default=96)
@@ -61,7 +59,7 @@ def main() -> None:
     parser.add_argument("--rings", type=float, nargs="*", default=RINGS, help="spreads of gains; none: clean scans alone")
     parser.add_argument("--methods", nargs="+", default=["fdk"])
     given = parser.parse_args()
-    rt = Runtime()
+    rt = Runtime(given.device)
     for views in given.views:
         for phantom in given.phantoms:
             usual = {

@@ -16,14 +16,14 @@ import json
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from measuring import finish, parser_of
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter, Trajectory
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, PerturbedTrajectory
 from phyradgs_cl.acquisition.cells import common_time_cells, micro_view_cells, per_line_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
@@ -39,29 +39,13 @@ ROLL_DEG, TILT_DEG = 0.3, 0.5
 Seconds = dict[str, float]
 
 
-class Leaning:
-    """An orbit whose panel is rolled and tilted about its middle."""
-
-    def __init__(self, orbit: CircularOrbit) -> None:
-        self.orbit = orbit
-
-    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        pose = self.orbit.pose(frame, time_s).copy()
-        eu, ev = pose[..., 6:9].copy(), pose[..., 9:12].copy()
-        half, roll, tilt = (PIXELS - 1) / 2, np.deg2rad(ROLL_DEG), np.deg2rad(TILT_DEG)
-        middle = pose[..., 3:6] + half * (eu + ev)
-        ev = np.cos(tilt) * ev + np.sin(tilt) * np.cross(eu, ev) / PIXEL_MM
-        pose[..., 6:9], pose[..., 9:12] = np.cos(roll) * eu + np.sin(roll) * ev, np.cos(roll) * ev - np.sin(roll) * eu
-        pose[..., 3:6] = middle - half * (pose[..., 6:9] + pose[..., 9:12])
-        return pose
-
-
 def tables(motion: str) -> list[TimeCells]:
     """Returns the cells of a full turn. ``still`` is a gantry at rest, which is all that RTK knows."""
     geometry = ConeGeometry(SID_MM, SDD_MM, (PIXELS, PIXELS), (PIXEL_MM, PIXEL_MM))
     orbit: Trajectory = CircularOrbit(geometry, ConstantSpeed(0.0, 2 * np.pi / VIEWS / VIEW_S))
     if motion.endswith("leaning"):
-        orbit = Leaning(orbit)
+        lean = GeometryCorrection(roll_rad=np.deg2rad(ROLL_DEG), tilt_u_rad=np.deg2rad(TILT_DEG))
+        orbit = PerturbedTrajectory(orbit, (PIXELS, PIXELS), lean)
     shutter = Shutter(0.0) if motion == "still" else Shutter(EXPOSURE_S, READOUT_S)
     if motion.startswith("gapless"):
         shutter = Shutter(VIEW_S, READOUT_S)
@@ -131,31 +115,18 @@ class Peer:
         return json.loads(line)
 
 
-@contextmanager
-def peer_of(python: str, volume: np.ndarray, frames: np.ndarray) -> Iterator[Peer]:
-    with tempfile.TemporaryDirectory() as folder:
-        peer = Peer(python, Path(folder), volume, frames)
-        try:
-            yield peer
-        finally:
-            assert peer.process.stdin is not None
-            peer.process.stdin.close()
-            peer.process.wait()
-
-
 def least(runs: list[Seconds]) -> Seconds:
     return {key: min(run[key] for run in runs) for key in runs[0]}
 
 
-def beside_rtk(
-    rt: Runtime, grid: Grid, volume: np.ndarray, python: str, repeats: int
-) -> dict[str, dict[str, object]]:
+def beside_rtk(rt: Runtime, grid: Grid, volume: np.ndarray, python: str, repeats: int) -> dict[str, dict[str, object]]:
     """Returns the seconds of both, their ratios, and the relative RMS difference of their results, by operator."""
     operator = RayOperator(rt, grid, (PIXELS, PIXELS), tables("still"))
     frames = np.random.default_rng(1).uniform(0, 1, operator.frames_shape).astype(np.float32)
     mine = {"forward": lambda: operator.forward(volume), "adjoint": lambda: operator.adjoint(frames)}
     result: dict[str, dict[str, object]] = {}
-    with peer_of(python, volume, frames) as peer:
+    with tempfile.TemporaryDirectory() as folder:
+        peer = Peer(python, Path(folder), volume, frames)
         for name, call in mine.items():
             own = INNER[name](call())
             peer.run(name)
@@ -170,6 +141,7 @@ def beside_rtk(
                 "relative_rms_difference": float(np.linalg.norm(own - other) / np.linalg.norm(other)),
             }
         result["peer"] = peer.facts
+        peer.process.communicate()  # ends it
     return result
 
 

@@ -1,13 +1,12 @@
-"""Compares FDK with RTK's on the same projections: difference, RTK's own quality limits, and the ratio of speeds.
+"""Compares FDK with RTK's on the same projections: difference, quality, and the ratio of speeds.
 
     python -m venv PEER && PEER/bin/pip install itk-rtk numpy
     python benchmarks/rtk_fdk.py --peer-python PEER/bin/python [--json docs/results/rtk_fdk.json] [--device D]
 
-The set-up is that of RTK's own tests, whose limits the table names: Shepp-Logan by Kak and Slaney's table, scaled by 116 mm,
+The set-up is that of RTK's own tests: Shepp-Logan by Kak and Slaney's table, scaled by 116 mm,
 with its contrasts in 1/mm. The source is 600 mm from the axis and 1200 mm from the detector, with 128 x 128 pixels of 4 mm
 and 128^3 voxels of 2 mm. PSNR has the range 2, against the phantom at the voxels' centres. It counts the voxels that every
-view sees (displaced: that some view of every opposite pair sees). A second PSNR counts as RTK's tests do: over the whole
-cube, with no error outside that field of view."""
+view sees (displaced: that some view of every opposite pair sees)."""
 
 import subprocess
 import tempfile
@@ -34,14 +33,13 @@ PHANTOM = shepp_logan(116.0, "kak-slaney", 1.0)
 
 @dataclass(frozen=True)
 class Case:
-    """One comparison. Offsets are in mm along u and v; ``limit_db`` is RTK's own."""
+    """One comparison. Offsets are in mm along u and v."""
 
     name: str
     views: int
     arc_deg: float = 360.0
     detector_offset_mm: float = 0.0
     source_offset_mm: tuple[float, float] = (0.0, 0.0)
-    limit_db: float | None = None
 
     @property
     def angles_rad(self) -> np.ndarray:
@@ -77,9 +75,9 @@ class Case:
 
 CASES = (
     Case("full turn", 90),
-    Case("source offset 20 and 15 mm", 180, source_offset_mm=(20.0, 15.0), limit_db=26.0),
-    Case("short scan of 240 degrees", 110, arc_deg=240.0, limit_db=22.0),
-    Case("detector displaced by 120 mm", 180, detector_offset_mm=120.0, limit_db=24.0),
+    Case("source offset 20 and 15 mm", 180, source_offset_mm=(20.0, 15.0)),
+    Case("short scan of 240 degrees", 110, arc_deg=240.0),
+    Case("detector displaced by 120 mm", 180, detector_offset_mm=120.0),
 )
 
 
@@ -116,10 +114,9 @@ def run_peer(python: str, task: dict[str, Any]) -> tuple[np.ndarray, list[list[f
             return volume, found["seconds"].tolist(), str(found["version"])
 
 
-def decibels(volume: np.ndarray, truth: np.ndarray, seen: np.ndarray, voxels: int | None = None) -> float:
-    """Returns the PSNR of range 2 over the voxels seen. ``voxels``: spreads their squared error over so many instead."""
-    squares = float(np.sum((volume[seen] - truth[seen]) ** 2))
-    return float(10 * np.log10(4.0 * (voxels or np.count_nonzero(seen)) / squares))
+def decibels(volume: np.ndarray, truth: np.ndarray, seen: np.ndarray) -> float:
+    """Returns the PSNR of range 2 over the voxels seen."""
+    return float(10 * np.log10(4.0 / np.mean((volume[seen] - truth[seen]) ** 2)))
 
 
 def compare(rt: Runtime, python: str, case: Case) -> dict[str, Any]:
@@ -127,20 +124,14 @@ def compare(rt: Runtime, python: str, case: Case) -> dict[str, Any]:
     frames = projections(pose)
     ours = fdk_volume(rt, frames, pose, GRID).astype(np.float64)
     theirs, _, version = run_peer(python, case.task(frames, 1))
-    seen, truth = (
-        field_of_view(case, pose), PHANTOM.density(*np.meshgrid(*GRID.axes_mm(), indexing="ij")[::-1])
-    )
-    difference = np.sqrt(
-        np.mean((ours[seen] - theirs[seen]) ** 2) / np.mean(theirs[seen].astype(np.float64) ** 2)
-    )
+    seen, truth = field_of_view(case, pose), PHANTOM.density(*np.meshgrid(*GRID.axes_mm(), indexing="ij")[::-1])
+    difference = np.linalg.norm(ours[seen] - theirs[seen]) / np.linalg.norm(theirs[seen].astype(np.float64))
     return {
         "case": case.name,
         "views": case.views,
         "relative_rms": float(difference),
         "psnr_db": decibels(ours, truth, seen),
         "rtk_psnr_db": decibels(theirs, truth, seen),
-        "psnr_whole_cube_db": decibels(ours, truth, seen, truth.size),
-        "limit_db": case.limit_db,
         "rtk_version": version,
     }
 
@@ -167,12 +158,9 @@ def speed(rt: Runtime, python: str, rounds: int) -> dict[str, Any]:
         "seconds": seconds,
         "rtk_seconds": rtk_seconds,
         "ratio": rtk_seconds / seconds,
-        "median_ratio": float(np.median(theirs, 0)[0] / np.median(ours, 0)[0]),
         "processor_seconds": processor_seconds,
         "rtk_processor_seconds": rtk_processor_seconds,
         "processor_ratio": rtk_processor_seconds / processor_seconds,
-        "all_seconds": ours,
-        "all_rtk_seconds": theirs,
     }
 
 

@@ -73,12 +73,9 @@ def own_test(python: str, folder: Path) -> list[dict[str, object]]:
     one = Deformation(control_mm, (-24.0,) * 3, 8.0, times_s, (16 * PHASE - 8)[:, None])
     write_scan(folder / "scan.h5", scan)
     write_deformation(folder / "field.h5", one)
-    command = ["reconstruct", "scan.h5", "-o", "volume.h5", "--method", "fdk", "--object-motion", "field.h5"]
-    subprocess.run([sys.executable, "-m", "phyradgs_cl", *command], check=True, cwd=folder, stdout=subprocess.DEVNULL)
-    subprocess.run(
-        [sys.executable, "-m", "phyradgs_cl", "reconstruct", "scan.h5", "-o", "rest.h5", "--method", "fdk"],
-        check=True, cwd=folder, stdout=subprocess.DEVNULL,
-    )  # fmt: skip
+    for name, words in (("volume.h5", ("--object-motion", "field.h5")), ("rest.h5", ())):
+        command = ["reconstruct", "scan.h5", "-o", name, "--method", "fdk", *words]
+        subprocess.run([sys.executable, "-m", "phyradgs_cl", *command], check=True, cwd=folder, stdout=subprocess.DEVNULL)
     volumes = {
         "RTK": theirs, "phyradgs": read_volume(folder / "volume.h5").values,
         "phyradgs, motion ignored": read_volume(folder / "rest.h5").values,
@@ -118,11 +115,8 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         for line in own_test(arguments.peer_python, Path(name)):
-            print(line, flush=True)
             append(arguments.results, line)
-        line = same_field(Runtime(arguments.device), arguments.peer_python, Path(name))
-        print(line, flush=True)
-        append(arguments.results, line)
+        append(arguments.results, same_field(Runtime(arguments.device), arguments.peer_python, Path(name)))
 
 
 if __name__ == "__main__":

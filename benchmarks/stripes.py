@@ -5,14 +5,12 @@
 There is a line per object, number of views, kind of stripes and steps. Lines in the file are not made again. The table is in
 docs/results/prepare.md. ``pip install algotom`` adds its filters, with medians of two widths."""
 
-import argparse
 from dataclasses import replace
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scans import append, read_lines
+from scans import append, read_lines, results_parser
 
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, ParallelGeometry, Scan, Shutter, pixel_centres
 from phyradgs_cl.api import compare, prepare, reconstruct
@@ -83,11 +81,11 @@ def by_algotom(frames: np.ndarray, large: int, small: int) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("results", type=Path, help="a file of one line of JSON per run")
+    parser = results_parser(__doc__)
     parser.add_argument("--views", type=int, nargs="+", default=[180, 720, 1800])
     parser.add_argument("--objects", nargs="+", default=list(OBJECTS), choices=list(OBJECTS))
-    given, rt = parser.parse_args(), Runtime()
+    given = parser.parse_args()
+    rt = Runtime(given.device)
     peers = ALGOTOM if find_spec("algotom") else {}
     done = {(line["object"], line["views"], line["stripes"], line["steps"]) for line in read_lines(given.results)}
     for views in given.views:

@@ -1,7 +1,6 @@
 """Trains the numbers of the prior ``ridge``: one step of a weakly convex ridge regulariser, with the least error.
 
     python benchmarks/train_ridge.py data/ridge.json
-    python benchmarks/train_ridge.py other.json --volumes A.h5 B.h5
 
 The step takes G(v) = Wᵀ g(W v) from a volume v (Goujon, Neumayer and Unser, SIAM J. Imaging Sci. 17 (2024) 91). W is two
 convolutions of 3³ voxels, from 1 to 4 to 16 channels, whose product has zero mean. At noise of deviation σ
@@ -9,8 +8,8 @@ g_i(t) = a_i clip(t, ± σ k_i) − b_i clip(t, ± σ l_i). Σ b_i |Ŵ_i|² ≤ 
 convex. Every cube counts by the logarithm of its squared error. The noise is smooth, as on the smaller voxels of ``fista``,
 which the pixels do not resolve.
 
-Without ``--volumes``, cubes come from procedural volumes that this script draws, and from phantoms: solids with texture,
-foams, vessels, foot, jaw. Needs PyTorch, which the extra ``neural`` installs."""
+Cubes come from procedural volumes that this script draws, and from phantoms: solids with texture, foams, vessels, foot, jaw.
+Needs PyTorch, which the extra ``neural`` installs."""
 
 import argparse
 import json
@@ -23,7 +22,6 @@ import scipy
 import torch
 
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.importers import load_attenuation
 from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.phantoms import make_phantom
 
@@ -94,14 +92,6 @@ def procedural_volumes(seed: int) -> Iterator[np.ndarray]:
     for name in ("foot", "jaw"):
         for size in (64, 96):
             yield make_phantom(name, 1.0, size).voxelise(Grid.cube(size, 2.0))
-
-
-def file_volumes(paths: list[Path]) -> Iterator[np.ndarray]:
-    """Loads volumes, at their own resolution and at half of it."""
-    for path in paths:
-        volume = np.asarray(load_attenuation(path).values, np.float32)
-        yield volume
-        yield block_means(volume, (2, 2, 2))
 
 
 def cubes_of(volume: np.ndarray, count: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
@@ -207,7 +197,6 @@ def smooth_noise(shape: torch.Size, draw: torch.Generator) -> torch.Tensor:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", type=Path)
-    parser.add_argument("--volumes", type=Path, nargs="*", help="HDF5 files instead of procedural volumes")
     parser.add_argument("--cubes", type=int, default=24, help="of a volume")
     parser.add_argument("--sets", type=int, default=2, help="of procedural volumes")
     parser.add_argument("--steps", type=int, default=600)
@@ -216,15 +205,13 @@ def main() -> None:
     before_s, rng = time.process_time(), np.random.default_rng(given.seed)
     torch.set_num_threads(1)
     draw = torch.Generator().manual_seed(given.seed)
-    seeds = range(given.seed, given.seed + given.sets)
-    sets = [file_volumes(given.volumes)] if given.volumes else [procedural_volumes(seed) for seed in seeds]
+    sets = [procedural_volumes(seed) for seed in range(given.seed, given.seed + given.sets)]
     drawn = [cube for volumes in sets for volume in volumes for cube in cubes_of(volume, given.cubes, rng)]
     cubes = torch.from_numpy(np.array(drawn, np.float32))[:, None]
     print(f"{len(cubes)} cubes, {time.process_time() - before_s:.0f} s", flush=True)
     ridge = Ridge(given.seed)
     train(ridge, cubes, given.steps, draw)
-    origin = ", ".join(path.stem for path in given.volumes) if given.volumes else "procedural volumes"
-    write(given.output, ridge, f"benchmarks/train_ridge.py, seed {given.seed}, {origin}")
+    write(given.output, ridge, f"benchmarks/train_ridge.py, seed {given.seed}, procedural volumes")
     with torch.no_grad():
         for noise in NOISES:
             left = errors(ridge, cubes[::10], torch.full((len(cubes[::10]), 1, 1, 1, 1), noise), draw)

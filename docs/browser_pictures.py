@@ -132,13 +132,12 @@ def shown_iteration(page_file: Path) -> int:
 
 def take_report(browser: Any, page_file: Path, *, has_webgl: bool) -> None:
     desktop = opened(browser, page_file, DESKTOP)
-    if has_webgl:
-        for name, width, height in (("../report_desktop", 1280, 1330), ("../report_phone", 390, 1250)):  # for docs/report.md
-            page = opened(browser, page_file, {"width": width, "height": 800})
-            save(name, page.screenshot(clip={"x": 0, "y": 0, "width": width, "height": height}, full_page=True))
-    else:
+    if not has_webgl:
         save("report_without_webgl", desktop.screenshot(clip={"x": 0, "y": 0, "width": 1000, "height": 900}, full_page=True))
         return
+    for name, width, height in (("../report_desktop", 1280, 1330), ("../report_phone", 390, 1250)):  # for docs/report.md
+        page = opened(browser, page_file, {"width": width, "height": 800})
+        save(name, page.screenshot(clip={"x": 0, "y": 0, "width": width, "height": height}, full_page=True))
     at_rest(desktop, "space-surface")
     save("report_space", desktop.locator("#volume").screenshot())
     phone = opened(browser, page_file, PHONE, "dark")

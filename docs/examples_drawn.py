@@ -29,9 +29,7 @@ def methods_figure() -> Figure:
     figure = Figure(figsize=(10.5, 4.1), layout="constrained")
     axes = figure.subplots(2, 3).ravel()
     for each, method in zip(axes, ("fdk", "sirt", "fista-tv", "fista", "phyradgs"), strict=False):
-        motion = "exact" if method == "phyradgs" else "per-row"
-        volume = reconstruct(scan, method, motion=motion).volume
-        _draw_slice(each, volume, scan, method)
+        _draw_slice(each, reconstruct(scan, method).volume, scan, method)
     _draw_slice(axes[-1], scan.reference, scan, "truth")
     return figure
 

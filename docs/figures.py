@@ -49,9 +49,6 @@ def save(figure: Figure, name: str) -> None:
     figure.savefig(IMAGES / name, dpi=110, metadata={"Software": None})
 
 
-# --- the shutter ----------------------------------------------------------------------------------
-
-
 def shutter_figure() -> None:
     exposure, readout, strips, sub_intervals = 1.0, 0.86, 8, 5
     figure = Figure(figsize=(11, 3.8), layout="constrained")
@@ -124,9 +121,6 @@ def _bracket(axes: Axes, start: float, stop: float, height: float, text: str) ->
     )
 
 
-# --- the splat ------------------------------------------------------------------------------------
-
-
 def splat_figure() -> None:
     """Draws one row of pixels through a wide Gaussian half-way to the edge of the volume."""
     columns, scale = 257, 0.25
@@ -168,9 +162,6 @@ def _quadrature(row: np.ndarray, pose: np.ndarray, columns: int) -> np.ndarray:
     return row[10] * np.exp(-q / 2).mean(axis=1) * np.linalg.norm(ray, axis=1)
 
 
-# --- sampling in time -----------------------------------------------------------------------------
-
-
 def sampling_figure() -> None:
     """Draws the relative RMS error of one frame against 1536 times per line: Shepp-Logan, rapid protocol."""
     count = 96
@@ -205,24 +196,12 @@ def sampling_figure() -> None:
     axes.set(xscale="log", yscale="log", xlabel="times per line (N)", ylabel="relative RMS error of a frame")
     axes.legend(fontsize=7)
     save(figure, "time_sampling.png")
-    print(
-        f"time sampling: static {static:.2%}; per line "
-        + ", ".join(f"N={n} {e:.3%}" for n, e in zip(samples, per_line, strict=True))
-    )
-    for m, values in strips.items():
-        print(f"  M={m}: " + ", ".join(f"N={n} {e:.3%}" for n, e in zip(samples, values, strict=False)))
-
-
-# --- the plots of the Python API ----------------------------------------------------------------------
 
 
 def api_figures() -> None:
     scan = simulate("foot", size=48, detector=72, noise="tigre")
     save(scan.plot(3), "scan_plot.png")
     save(reconstruct(scan, "fista-tv", motion="per-row", iterations=60).plot(scan, frame=3), "result_plot.png")
-
-
-# --- the moving picture of the README -------------------------------------------------------------------
 
 
 def motion_figure() -> None:

@@ -12,7 +12,7 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from browser_pictures import SECTION
@@ -44,13 +44,11 @@ class Result:
     commands: str
     volumes: dict[str, str]
     scan: str = "scan.h5"
-    height: float = 0.5
-    """Height of the drawn slice over the volume's height."""
-    detail: tuple[float, float, float, float] = field(default=(0.0, 1.0, 0.0, 1.0))
-    """Part of the slice that is drawn, along y and x, as shares."""
+    part: tuple[float, float, float, float, float] = (0.5, 0.0, 1.0, 0.0, 1.0)
+    """What is drawn, as shares of the volume: the slice's height, and from where to where along y and x."""
 
 
-FOOT = (0.25, 1.0, 0.3, 0.72)
+FOOT = (0.28, 0.25, 1.0, 0.3, 0.72)
 RESULTS = {
     "motion": Result(
         "The motion of the gantry",
@@ -61,8 +59,7 @@ RESULTS = {
         phyradgs reconstruct scan.h5 -o known.h5
         """,
         {"motion ignored": "static.h5", "motion known": "known.h5"},
-        height=0.28,
-        detail=FOOT,
+        part=FOOT,
     ),
     "splats": Result(
         "Gaussians that move during the exposure",
@@ -73,8 +70,7 @@ RESULTS = {
         phyradgs reconstruct scan.h5 --method phyradgs --preset quick -o exact.h5
         """,
         {"at rest": "static.h5", "exact in time": "exact.h5"},
-        height=0.28,
-        detail=FOOT,
+        part=FOOT,
     ),
     "views": Result(
         "Few views",
@@ -92,8 +88,8 @@ RESULTS = {
         "Line integrals up to 6, which the panel averages as intensity: modelled as line integrals, then as intensity.",
         """
         phyradgs simulate --phantom shepp-logan --size 48 --detector 72 --peak 6 --detector-model intensity -o scan.h5
-        phyradgs reconstruct scan.h5 --method fista-tv --motion per-row --detector-model log -o log.h5
-        phyradgs reconstruct scan.h5 --method fista-tv --motion per-row -o intensity.h5
+        phyradgs reconstruct scan.h5 --method fista-tv --detector-model log -o log.h5
+        phyradgs reconstruct scan.h5 --method fista-tv -o intensity.h5
         """,
         {"line integrals": "log.h5", "intensity": "intensity.h5"},
     ),
@@ -102,7 +98,7 @@ RESULTS = {
         "300 photons per pixel: SIRT, and the default, whose prior follows the noise of the projections.",
         """
         phyradgs simulate --phantom jaw --size 48 --detector 96 --noise beer --dose 300 -o scan.h5
-        phyradgs reconstruct scan.h5 --method sirt --motion per-row -o sirt.h5
+        phyradgs reconstruct scan.h5 --method sirt -o sirt.h5
         phyradgs reconstruct scan.h5 -o fista.h5
         """,
         {"sirt": "sirt.h5", "fista": "fista.h5"},
@@ -118,8 +114,7 @@ RESULTS = {
         phyradgs reconstruct fixed.h5 -o mended.h5
         """,
         {"as stated": "stated.h5", "after check": "mended.h5"},
-        height=0.28,
-        detail=FOOT,
+        part=FOOT,
     ),
     "readout": Result(
         "A readout time that is wrong",
@@ -132,8 +127,7 @@ RESULTS = {
         phyradgs reconstruct calibrated.h5 -o found.h5
         """,
         {"as stated": "stated.h5", "calibrated": "found.h5"},
-        height=0.28,
-        detail=FOOT,
+        part=FOOT,
     ),
     "rings": Result(
         "Rings and sparks",
@@ -141,8 +135,8 @@ RESULTS = {
         """
         phyradgs simulate --phantom jaw --size 48 --detector 72 --views 180 --exposure-deg 1.6 --noise beer --dose 1e5 \\
             --rings 0.02 --sparks 0.001 -o scan.h5
-        phyradgs reconstruct scan.h5 --method fdk --motion per-row -o before.h5
-        phyradgs reconstruct scan.h5 --method fdk --motion per-row --steps sparks,dead,rings -o after.h5
+        phyradgs reconstruct scan.h5 --method fdk -o before.h5
+        phyradgs reconstruct scan.h5 --method fdk --steps sparks,dead,rings -o after.h5
         """,
         {"as recorded": "before.h5", "sparks, dead, rings": "after.h5"},
     ),
@@ -152,8 +146,8 @@ RESULTS = {
         """
         phyradgs simulate --phantom jaw --size 32 --detector 48 --views 60 --exposure-deg 4.8 --noise beer --dose 1e5 \\
             --peak 3 --scatter 0.3 -o scan.h5
-        phyradgs reconstruct scan.h5 --method fista-tv --motion per-row -o before.h5
-        phyradgs reconstruct scan.h5 --method fista-tv --motion per-row --steps scatter -o after.h5
+        phyradgs reconstruct scan.h5 --method fista-tv -o before.h5
+        phyradgs reconstruct scan.h5 --method fista-tv --steps scatter -o after.h5
         """,
         {"as recorded": "before.h5", "scatter removed": "after.h5"},
     ),
@@ -163,8 +157,8 @@ RESULTS = {
         """
         phyradgs simulate --phantom jaw --size 32 --detector 48 --views 60 --exposure-deg 4.8 --noise beer --dose 1e5 \\
             --peak 3 --kvp 120 -o scan.h5
-        phyradgs reconstruct scan.h5 --method fdk --motion per-row -o before.h5
-        phyradgs reconstruct scan.h5 --method fdk --motion per-row --steps hardening --set hardening.kvp=120 -o after.h5
+        phyradgs reconstruct scan.h5 --method fdk -o before.h5
+        phyradgs reconstruct scan.h5 --method fdk --steps hardening --set hardening.kvp=120 -o after.h5
         """,
         {"as recorded": "before.h5", "hardening removed": "after.h5"},
     ),
@@ -174,8 +168,8 @@ RESULTS = {
         """
         phyradgs simulate --phantom shepp-logan --size 48 --detector 96 --views 60 --exposure-deg 4.8 \\
             --truncation 0.5 -o scan.h5
-        phyradgs reconstruct scan.h5 --method fdk --motion per-row -o cut.h5
-        phyradgs reconstruct scan.h5 --method fdk --motion per-row --set extrapolate=cylinder -o cylinder.h5
+        phyradgs reconstruct scan.h5 --method fdk -o cut.h5
+        phyradgs reconstruct scan.h5 --method fdk --set extrapolate=cylinder -o cylinder.h5
         """,
         {"rows end": "cut.h5", "rows continued": "cylinder.h5"},
     ),
@@ -209,14 +203,10 @@ def main() -> None:
             print(f"{name}: {seconds:.0f} s", flush=True)
 
 
-def command_lines(commands: str) -> list[str]:
-    return commands.replace("\\\n", " ").strip().splitlines()
-
-
 def run(commands: str, folder: Path) -> float:
     """Runs commands in a folder. Returns the processor seconds of all. Status 10 of `check` is no failure."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    for line in command_lines(commands):
+    for line in commands.replace("\\\n", " ").strip().splitlines():
         program, *words = shlex.split(line)
         module = ["-m", "phyradgs_cl"] if program == "phyradgs" else []
         done = subprocess.run([sys.executable, *module, *words], cwd=folder, check=False, capture_output=True, text=True)
@@ -229,16 +219,11 @@ def run(commands: str, folder: Path) -> float:
 def draw(result: Result, folder: Path, path: Path) -> None:
     """Draws one slice of the truth and of every volume, on the grey scale of the truth."""
     truth = load_reference(folder / result.scan)[0].values
-    y0, y1, x0, x1 = result.detail
-    shape = truth.shape
-    part = (
-        round(result.height * shape[0]),
-        slice(round(y0 * shape[1]), round(y1 * shape[1])),
-        slice(round(x0 * shape[2]), round(x1 * shape[2])),
-    )
+    nz, ny, nx = truth.shape
+    z, y0, y1, x0, x1 = result.part
+    part = round(z * nz), slice(round(y0 * ny), round(y1 * ny)), slice(round(x0 * nx), round(x1 * nx))
     wide = truth[part].shape[0] > 1.3 * truth[part].shape[1]
-    slices = {"truth": truth}
-    slices.update({label: read_volume(folder / name).values for label, name in result.volumes.items()})
+    slices = {"truth": truth, **{label: read_volume(folder / name).values for label, name in result.volumes.items()}}
     figure = Figure(figsize=(2.5 * len(slices), 1.65 if wide else 2.75), layout="constrained")
     for axes, (label, volume) in zip(figure.subplots(1, len(slices)), slices.items(), strict=True):
         image = volume[part]
@@ -257,7 +242,7 @@ def write(name: str, seconds: float) -> None:
     commands = "\n".join(line[8:] for line in result.commands.strip("\n").splitlines()).strip()
     sections[result.title] = (
         f"\n{result.text} {seconds:.0f} seconds.\n\n```sh\n{commands}\n```\n\n"
-        f"![{result.title}](images/gallery/{name}.png)\n\n"
+        f"![{name}](images/gallery/{name}.png)\n\n"
     )
     ordered = [f"## {one.title}\n{sections[one.title].rstrip()}\n" for one in RESULTS.values() if one.title in sections]
     PAGE.write_text("\n".join([HEAD, *ordered, SECTION]), encoding="utf-8")

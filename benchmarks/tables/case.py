@@ -1,8 +1,6 @@
 """Cases: one object scanned by one protocol with one seed, by a moving gantry and by one at rest, and their scores."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol as Interface
 
 import numpy as np
 
@@ -15,28 +13,6 @@ from phyradgs_cl.simulation import FrameSource, Scene, SimulationOptions, Volume
 from tables.metrics import compare_projections
 
 FLY, STILL = "fly-scan", "stop-and-shoot"
-Images = list[np.ndarray]
-Measure = Callable[[], dict[str, float]]
-
-
-class Case(Interface):
-    """The parts that a run needs: a scan, the truth, and the numbers of a result (z, y, x)."""
-
-    truth: np.ndarray
-
-    def scan(self, acquisition: str) -> Scan: ...
-
-    def measure(self, volume: np.ndarray) -> dict[str, float]: ...
-
-    def slices(self, volume: np.ndarray) -> Images: ...
-
-    def references(self) -> dict[str, Measure]:
-        """Returns what results are compared with, where its own numbers are worth a line."""
-        ...
-
-    def warn_of_inverse_crime(self) -> None:
-        """Warns where the projected object is no finer than the reconstructed grid."""
-        ...
 
 
 def stop_and_shoot(protocol: Protocol) -> Protocol:
@@ -110,15 +86,6 @@ class SyntheticCase:
             where = (self._geometry, self._scene.grid, self._protocol, self._axis)
             self._views = HeldOutViews(self._rt, self._scene.source, *where)
         return {**compare(volume, self.truth), **self._views.measure(volume)}
-
-    def slices(self, volume: np.ndarray) -> Images:
-        """Returns the middle axial and coronal slice."""
-        nz, ny, _ = volume.shape
-        return [volume[nz // 2], volume[:, ny // 2]]
-
-    def references(self) -> dict[str, Measure]:
-        """Returns nothing: the truth is exact."""
-        return {}
 
     def warn_of_inverse_crime(self) -> None:
         """Warns where the volume's file has no more voxels than the benchmark's grid."""

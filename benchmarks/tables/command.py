@@ -1,137 +1,77 @@
 """The command line: methods compared on volumes, as in the paper's tables."""
 
-from enum import Enum
+import argparse
 from pathlib import Path
-from typing import Annotated, Literal
-
-import typer
 
 from phyradgs_cl import signals
 from phyradgs_cl.acquisition.shutter import AXES
-from phyradgs_cl.commands.console import complain, file_parser, say
-from phyradgs_cl.commands.options import Device
+from phyradgs_cl.commands.console import complain, say
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.settings import device_wish
-from tables import (
-    KINDS,
-    RESULTS,
-    SIZES,
-    BenchJob,
-    BenchProgress,
-    listed,
-    listed_seeds,
-    remake_tables,
-    result_text,
-    run_bench,
-)
+from tables.job import BenchJob, BenchProgress
+from tables.rows import KINDS
+from tables.run import RESULTS, remake_tables, run_bench
+from tables.sizes import SIZES
 
 EXAMPLE = (
-    "Example: python benchmarks/tables table1 --volumes VOLUMES -o results --size S --seeds 0,1,2\n\n"
-    "Runs that the results file in the folder has already are not made again: interrupt and repeat at will."
+    "Example: python benchmarks/tables table1 --volumes VOLUMES -o results --size S --seeds 0,1,2. Runs that the folder's "
+    "results file has already are not made again: interrupt and repeat at will."
 )
-BenchKind = Enum("BenchKind", {name: name for name in KINDS}, type=str)  # type: ignore[misc]
-SizeName = Enum("SizeName", {name: name for name in SIZES}, type=str)  # type: ignore[misc]
 
 
-def bench_command(
-    kind: Annotated[
-        BenchKind,  # type: ignore[valid-type]
-        typer.Argument(
-            help="table1: all methods, 25 and 50 views; table2: PhyRadGS over M and N; phantom: the paper's sphere "
-            "phantom against a pseudo-truth.",
-        ),
-    ],
-    volumes: Annotated[
-        Path | None,
-        typer.Option(
-            parser=file_parser("--volumes"),
-            metavar="DIR",
-            help="Folder of HDF5 files NAME_COUNT.h5 or NAME.h5 with a dataset /volume; each is projected at its own "
-            "resolution.",
-            show_default="the built-in foot and jaw",
-        ),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            parser=file_parser("-o"),
-            metavar="DIR",
-            help=f"Folder for {RESULTS} (one line per run), tables, figures and slices.",
-            show_default="bench-results",
-        ),
-    ] = None,
-    size: Annotated[
-        SizeName | None,  # type: ignore[valid-type]
-        typer.Option(
-            help="; ".join(
-                f"{s.name}: {s.voxels}³ from {s.pixels}², {s.iterations:,} iterations" for s in SIZES.values()
-            ),
-            show_default="S; M for phantom",
-        ),
-    ] = None,
-    names: Annotated[str | None, typer.Option(help="Volumes, with commas.", show_default="all")] = None,
-    rows: Annotated[
-        str | None,
-        typer.Option(
-            help="Rows by their label in the table, with commas; a wrong one lists all.", show_default="all"
-        ),
-    ] = None,
-    protocols: Annotated[
-        str | None,
-        typer.Option(
-            help="rapid (25 views) and standard (50), with commas.",
-            show_default="both for table1, else rapid",
-        ),
-    ] = None,
-    seeds: Annotated[
-        str | None,
-        typer.Option(
-            help="Seeds of noise, jitter, cloud and frame order, with commas.",
-            show_default="0; with --table-only all",
-        ),
-    ] = None,
-    iterations: Annotated[
-        int | None, typer.Option(help="Iterations of the splatting methods.", show_default="the size's")
-    ] = None,
-    readout: Annotated[Literal[AXES], typer.Option(help="What is read out at one time.")] = "rows",
-    table_only: Annotated[
-        bool,
-        typer.Option(
-            "--table-only",
-            help="Make tables and figures from the results file, of --names and --seeds or all; run nothing.",
-        ),
-    ] = False,
-    device: Device = None,
-) -> None:
-    """Compares methods on volumes: a results file that grows, tables in Markdown and CSV, figures of slices."""
-    chosen_seeds = None if seeds is None else listed_seeds("--seeds", seeds)
-    job = BenchJob(
-        kind.value,  # type: ignore[attr-defined]
-        output or Path("bench-results"),
-        volumes,
-        size.value if size else None,  # type: ignore[attr-defined]
-        listed("--names", names),
-        listed("--protocols", protocols),
-        listed("--rows", rows),
-        (0,) if chosen_seeds is None else chosen_seeds,
-        iterations,
-        readout,
-    )
-    wish = device_wish(device)
-    interrupted = (
-        f"interrupted: finished runs are in {job.output / RESULTS}; repeat the command to continue, "
-        "with --table-only for their tables"
-    )
+def parser() -> argparse.ArgumentParser:
+    """Returns the parser of the command's words."""
+    text = "Compares methods on volumes: a results file that grows, tables in Markdown and CSV."
+    parser = argparse.ArgumentParser(prog="tables", description=text, epilog=EXAMPLE)
+    kinds = "table1: all methods, 25 and 50 views; table2: PhyRadGS over M and N; phantom: the paper's sphere phantom"
+    parser.add_argument("kind", choices=KINDS, help=f"{kinds} against a pseudo-truth")
+    volumes = "folder of HDF5 files NAME_COUNT.h5 or NAME.h5 with a dataset /volume, each projected at its own resolution"
+    parser.add_argument("--volumes", type=Path, metavar="DIR", help=f"{volumes} (default: the built-in foot and jaw)")
+    output = f"folder for {RESULTS} (one line per run) and tables (default: bench-results)"
+    parser.add_argument("-o", "--output", type=Path, metavar="DIR", default=Path("bench-results"), help=output)
+    sizes = "; ".join(f"{s.name}: {s.voxels}³ from {s.pixels}², {s.iterations:,} iterations" for s in SIZES.values())
+    parser.add_argument("--size", choices=SIZES, help=f"{sizes} (default: S; M for phantom)")
+    parser.add_argument("--names", type=_words, help="volumes, with commas (default: all)")
+    parser.add_argument("--rows", type=_words, help="rows by their label, with commas; a wrong one lists all (default: all)")
+    protocols = "rapid (25 views) and standard (50), with commas (default: both for table1, else rapid)"
+    parser.add_argument("--protocols", type=_words, help=protocols)
+    seeds = "of noise, jitter, cloud and frame order, with commas (default: 0; with --table-only all)"
+    parser.add_argument("--seeds", type=_numbers, help=seeds)
+    parser.add_argument("--iterations", type=int, help="of the splatting methods (default: the size's)")
+    parser.add_argument("--readout", choices=AXES, default="rows", help="what is read out at one time")
+    only = "make tables from the results file, of --names and --seeds or all; run nothing"
+    parser.add_argument("--table-only", action="store_true", help=only)
+    parser.add_argument("--device", help="as for phyradgs")
+    return parser
+
+
+def _words(text: str) -> list[str]:
+    return [part.strip() for part in text.split(",")]
+
+
+def _numbers(text: str) -> list[int]:
+    return [int(part) for part in text.split(",")]
+
+
+def compare_methods(asked: argparse.Namespace) -> int:
+    """Runs what the words ask for, and prints the files that it wrote. Returns the exit status."""
+    seeds = (0,) if asked.seeds is None else asked.seeds
+    chosen = asked.names, asked.protocols, asked.rows, seeds, asked.iterations, asked.readout
+    job = BenchJob(asked.kind, asked.output, asked.volumes, asked.size, *chosen)
+    wish = device_wish(asked.device)
     try:
-        written = remake_tables(job, chosen_seeds) if table_only else run_bench(job, lambda: Runtime(wish), BenchTicker())
+        if asked.table_only:
+            written = remake_tables(job, asked.seeds)
+        else:
+            written = run_bench(job, lambda: Runtime(wish), BenchTicker())
     except KeyboardInterrupt:
-        complain(interrupted)
-        raise typer.Exit(signals.exit_status()) from None
+        done = f"interrupted: finished runs are in {job.output / RESULTS}"
+        remedy = "repeat the command to continue, with --table-only for their tables"
+        return complain(f"{done}; {remedy}", signals.exit_status())
     for path in written:
         say(str(path))
+    return 0
 
 
 class BenchTicker:
@@ -146,8 +86,20 @@ class BenchTicker:
             self.title = p.title
             self.ticker = Ticker(f"{p.number}/{p.runs} {p.title}: iteration")
         if p.line is not None:
-            with self.ticker:  # this ends the line that the ticker rewrites
-                pass
+            self.ticker.end_line()
             say(result_text(p))
         elif p.iterations:
             self.ticker.show(p.iteration, p.iterations)
+
+
+def result_text(progress: BenchProgress) -> str:
+    """Returns the result of a finished run."""
+    line = progress.line or {}
+    numbers = line.get("metrics")
+    if numbers is None:
+        found = f"failed: {line.get('error')}"
+    else:
+        psnr = numbers.get("psnr_db")
+        found = f"PSNR {'inf' if psnr is None else format(psnr, '.2f')} dB, SSIM {numbers['ssim']:.3f}"
+        found += f"{' to the truth' if 'psnr_db_pseudo' in numbers else ''}, {line['seconds']:.1f} s"
+    return f"{progress.number}/{progress.runs} {progress.title}: {found}"

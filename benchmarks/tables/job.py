@@ -32,7 +32,7 @@ class BenchJob:
     """Which table, of which volumes, at which size.
 
     - kind: table1, table2 or phantom.
-    - output: folder of the results file, tables, figures and slices. It is made where it is missing.
+    - output: folder of the results file and tables. It is made where it is missing.
     - volumes: folder of HDF5 volumes, not for phantom. None takes the built-in phantoms foot and jaw.
     - size: XS, S, M, L, XL or a size of one's own; by default the kind's.
     - names: volumes by name. protocols: rapid (25 views), standard (50). rows: labels of rows. Defaults: all volumes and
@@ -82,7 +82,7 @@ class BenchJob:
 
     @property
     def stem(self) -> str:
-        """Returns the beginning of the names of tables and figures: one for each set of results."""
+        """Returns the beginning of the names of tables: one for each set of results."""
         size = self.bench_size
         own = self.iterations in (None, replace(self, iterations=None).bench_size.iterations)
         parts = self.kind, size.name, "" if own else f"i{size.iterations}", "" if self.axis == "rows" else self.axis
@@ -224,4 +224,3 @@ class BenchProgress:
     iteration: int = 0
     iterations: int = 0
     line: Line | None = None
-    left_s: float | None = None

@@ -1,4 +1,4 @@
-"""The Markdown of a benchmark's tables: means of every row, and volumes one by one."""
+"""The Markdown of a benchmark's tables: means of every row."""
 
 from collections.abc import Callable, Sequence
 
@@ -13,7 +13,7 @@ Cell = Callable[[Summary], str]
 
 
 def markdown(job: BenchJob, lines: Sequence[Line]) -> str:
-    """Returns a block for each protocol: the means of every row, and the volumes one by one."""
+    """Returns a block for each protocol: the means of every row."""
     size = job.bench_size
     text = [
         f"# {_TITLES[job.kind]}: {size.voxels}³ voxels, {size.pixels}² pixels", "", *_notes(job, lines), ""
@@ -22,9 +22,6 @@ def markdown(job: BenchJob, lines: Sequence[Line]) -> str:
         block = [line for line in lines if line["protocol"] == protocol]
         if block:
             text += [f"## {protocol}: {block[0]['views']} views", "", *_means(job, protocol, block), ""]
-            volumes = sorted({line["volume"] for line in block})
-            if len(volumes) > 1:
-                text += [*_by_volume(job, block, volumes), ""]
     return "\n".join(text)
 
 
@@ -112,16 +109,6 @@ def _paper_cell(label: str, column: str) -> str:
     return f"{cell.psnr_db:.2f} / {cell.ssim:.3f}" if cell is not None else ""
 
 
-def _by_volume(job: BenchJob, lines: Sequence[Line], volumes: Sequence[str]) -> list[str]:
-    text = [_row_text(["PSNR (dB) / SSIM", *volumes]), "|---" * (len(volumes) + 1) + "|"]
-    for row in job.chosen_rows:
-        found = [x for x in lines if x["run"] == row.run and x["acquisition"] == FLY]
-        if found:
-            each = [summarise([x for x in found if x["volume"] == volume]) for volume in volumes]
-            text.append(_row_text([row.label, *(_both(s) if s is not None else "" for s in each)]))
-    return text
-
-
 def _row_text(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
@@ -130,12 +117,11 @@ def _notes(job: BenchJob, lines: Sequence[Line]) -> list[str]:
     size = job.bench_size
     seeds = sorted({line["seed"] for line in lines})
     last = lines[-1]
-    scan = _PHANTOM_NOTE if job.study == PHANTOM else _SYNTHETIC_NOTE
     machines = sorted({f"{line['device']} ({line['platform']})" for line in lines})
     return [
-        f"{scan} Readout along {job.axis}. Seeds {', '.join(map(str, seeds))}: numbers are means over volumes, ± is "
-        "the standard deviation over seeds of the mean over those volumes that were run with all of them. "
-        "What the columns are: docs/benchmarks.md.",
+        f"Readout along {job.axis}. Seeds {', '.join(map(str, seeds))}: numbers are means over volumes, ± is the standard "
+        "deviation over seeds of the mean over those volumes that were run with all of them. What the scans and columns "
+        "are: docs/benchmarks.md; the sphere phantom: docs/results/quality.md.",
         "",
         f"All splatting rows start with {job.gaussians:,} Gaussians (or one for every voxel that attenuates, where "
         f"those are fewer) and run {size.iterations:,} iterations of one frame each.",
@@ -143,14 +129,3 @@ def _notes(job: BenchJob, lines: Sequence[Line]) -> list[str]:
         f"Device {', '.join(machines)}; phyradgs-cl {last['version']}, Python {last['python']}, NumPy {last['numpy']}, "
         f"pyopencl {last['pyopencl']}, PoCL {last['pocl'] or 'none'}.",
     ]
-
-
-_SYNTHETIC_NOTE = (
-    "Volumes projected at their own resolution on R2-Gaussian's scanner (DSO 5, DSD 7, panel 4 × 4, box 2³), TIGRE's "
-    "noise with 10,000 photons and σ 10."
-)
-_PHANTOM_NOTE = (
-    "Double-layer sphere phantom in a 200 mm box on a C-arm (DSO 785 mm, DSD 1200 mm, shifted panel), averaged in "
-    "intensity, raw counts with 50,000 photons and σ 10, corrected by flats and darks; the gantry wanders by 0.1° and "
-    "the encoder knows. The pseudo-truth is R2-Gaussian from 64 stop-and-shoot projections."
-)

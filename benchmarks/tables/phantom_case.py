@@ -16,7 +16,7 @@ from phyradgs_cl.metrics import compare
 from phyradgs_cl.phantoms import EllipsoidPhantom, sphere_phantom
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
-from tables.case import FLY, HeldOutViews, Images, Measure, stop_and_shoot
+from tables.case import FLY, HeldOutViews, stop_and_shoot
 from tables.metrics import Bead, edge_sharpness, regional_bias, roundness
 from tables.raw_counts import Panel, measured_attenuation
 from tables.sizes import BenchSize
@@ -77,18 +77,9 @@ class PhantomCase:
             "bias_holder": bias.get(HOLDER, np.nan),
         }
 
-    def slices(self, volume: np.ndarray) -> Images:
-        """Returns the axial slice through the upper layer of beads, and the middle coronal slice."""
-        layer_mm = max(bead.centre_mm[2] for bead in beads_of(self.phantom))
-        z_mm = self.grid.axes_mm()[0]
-        return [volume[int(np.abs(z_mm - layer_mm).argmin())], volume[:, volume.shape[1] // 2]]
-
-    def references(self) -> dict[str, Measure]:
+    def references(self) -> dict[str, Callable[[], dict[str, float]]]:
         """Returns the truth's own shape, which voxels limit, and the pseudo-truth's distance from it."""
         return {"truth": lambda: self.shape(self.truth), PSEUDO: self._measure_pseudo}
-
-    def warn_of_inverse_crime(self) -> None:
-        """Does nothing: the phantom's line integrals are closed forms."""
 
     def _measure_pseudo(self) -> dict[str, float]:
         numbers = self.measure(self._pseudo_truth())

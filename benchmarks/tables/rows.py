@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from typing import Any
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.neural import NeuralOptions, has_torch
 from phyradgs_cl.reconstructors import METHODS, method_options
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
+from phyradgs_cl.text import suggest_name
 
 _MOST_NEURAL_VOXELS = 128  # per side, on a CPU: beyond it a run takes hours
 KINDS = ("table1", "table2", "phantom")
@@ -43,19 +43,12 @@ class Row:
 
     def options(self, gaussians: int, iterations: int) -> Any:
         """Returns the method's options. Splatting methods all get the same first cloud and iterations."""
-        if self.method not in METHODS:
-            expected = f"one of {', '.join(METHODS)}"
-            raise InputError(f"row {self.label!r}", f"the method {self.method!r}", expected, "choose others with --rows")
         changes: dict[str, Any] = {"motion": self.motion, **self.changes}
         if self.motion in _WITH_COUNTS:
             changes |= {"strips": self.strips, "sub_intervals": self.sub_intervals}
         if self.is_splatting:
             changes |= {"gaussians": gaussians, "iterations": iterations}
-        try:
-            return method_options(self.method, None, changes)
-        except InputError as error:
-            subject = f"row {self.label!r}: {error.subject}"
-            raise InputError(subject, error.found, error.expected, "choose other rows with --rows") from error
+        return method_options(self.method, None, changes)
 
     @property
     def is_splatting(self) -> bool:
@@ -73,8 +66,7 @@ class Row:
         return "needs a GPU" if voxels > _MOST_NEURAL_VOXELS and torch_device("auto").type == "cpu" else ""
 
     def _has(self, options: type) -> bool:
-        method = METHODS.get(self.method)
-        return method is not None and isinstance(next(iter(method.presets.values())), options)
+        return isinstance(next(iter(METHODS[self.method].presets.values())), options)
 
 
 def _micro_views(label: str, method: str, strips: int, sub_intervals: int, still: str) -> Row:
@@ -118,14 +110,6 @@ def _table1() -> tuple[Row, ...]:
     return (*_FDK, *static, *exact, *_NEURAL, *_SPLATTING)
 
 
-def _extras() -> tuple[Row, ...]:
-    """Returns rows that are run only when they are asked for by name."""
-    known = {row.method for row in (*_table1(), *_FUSED)}
-    others = [name for name in METHODS if name not in known]  # methods that users have added to the registry
-    per_row = [Row(f"{name} per-row", name, "per-row", still=name) for name in others]
-    return (*_FUSED, *(Row(name, name) for name in others), *per_row)
-
-
 def _table2() -> tuple[Row, ...]:
     counts = [(m, 5) for m in (1, 4, 8, 16)] + [(8, n) for n in (1, 3, 7)]
     return (*(_micro_views(f"M={m} N={n}", "phyradgs", m, n, "PhyRadGS w/o ST") for m, n in counts), _CENTRES)
@@ -139,8 +123,8 @@ def rows_of(kind: str) -> tuple[Row, ...]:
 
 
 def candidate_rows(kind: str) -> tuple[Row, ...]:
-    """Returns every row that a kind may have. Extras are at the end."""
-    return (*rows_of(kind), *(() if kind == "table2" else _extras()))
+    """Returns every row that a kind may have. Rows that are run only when they are asked for by name are at the end."""
+    return (*rows_of(kind), *(() if kind == "table2" else _FUSED))
 
 
 def choose_rows(kind: str, labels: Sequence[str] | None) -> tuple[Row, ...]:
@@ -154,8 +138,7 @@ def choose_rows(kind: str, labels: Sequence[str] | None) -> tuple[Row, ...]:
     for label in labels:
         name = label.strip().casefold()
         if name not in by_name:
-            close = get_close_matches(name, by_name, n=1)
-            remedy = f"did you mean {by_name[close[0]].label!r}?" if close else ""
-            raise InputError("--rows", repr(label), "; ".join(row.label for row in candidates), remedy)
+            known = [row.label for row in candidates]
+            raise InputError("--rows", repr(label), "; ".join(known), suggest_name(label, known, ""))
         wanted.add(name)
     return tuple(row for name, row in by_name.items() if name in wanted)

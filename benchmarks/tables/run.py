@@ -4,6 +4,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
@@ -21,8 +22,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.device import environment
 from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.simulation import Scene, phantom_scene, volume_scene
-from tables.case import Case, SyntheticCase
-from tables.figures import truth_of, write_figures, write_slices
+from tables.case import SyntheticCase
 from tables.identity import refuse_other_objects
 from tables.job import PHANTOM, BenchJob, BenchProgress, PlannedRun, Report, plan_runs
 from tables.phantom_case import PhantomCase
@@ -32,6 +32,7 @@ from tables.summary import REFERENCE
 from tables.tables import write_tables
 
 RESULTS = "results.jsonl"
+Case = SyntheticCase | PhantomCase
 # R2-Gaussian's scanner: distances and sides in scene units.
 _TO_AXIS, _TO_DETECTOR, _PANEL_SIDE, _BOX_SIDE = 5.0, 7.0, 4.0, 2.0
 log = logging.getLogger(__name__)
@@ -41,7 +42,7 @@ log = logging.getLogger(__name__)
 def run_bench(
     job: BenchJob, make_runtime: Callable[[], Runtime], report: Report = lambda progress: None
 ) -> list[Path]:
-    """Makes the runs that the results file lacks, then tables and figures. Returns the files written.
+    """Makes the runs that the results file lacks, then tables. Returns the files written.
 
     A run is in the file once it is done. An interruption (KeyboardInterrupt) loses only the present run, and the same job
     continues from there. job: all of it is checked before the first run. make_runtime: called once, if there is anything to
@@ -60,14 +61,14 @@ def run_bench(
         missing = [run for run in plan if not present.has(run.facts)]
         _check_volumes(missing)
         if missing:
-            batch = Batch(job, results, lines, missing, len(plan), report, make_runtime())
+            batch = Batch(job, results, lines, len(plan) - len(missing), len(plan), report, make_runtime())
             for _, group in groupby(missing, key=lambda run: run.case):
                 batch.run_case(list(group))
-        return _write_tables_and_figures(job, lines)
+        return _write_tables(job, lines)
 
 
 def remake_tables(job: BenchJob, seeds: Sequence[int] | None = None) -> list[Path]:
-    """Writes tables and figures from the present results file. Returns the files written.
+    """Writes tables from the present results file. Returns the files written.
 
     The job's names, if it has any, and ``seeds`` restrict what is read."""
     lines = read_lines(job.output / RESULTS)
@@ -76,14 +77,14 @@ def remake_tables(job: BenchJob, seeds: Sequence[int] | None = None) -> list[Pat
         for name in job.names:
             checks.one_of("--names", name, held)
     chosen = [line for line in lines if not job.names or line.get("volume") in job.names]
-    return _write_tables_and_figures(job, [x for x in chosen if seeds is None or x.get("seed") in seeds])
+    return _write_tables(job, [x for x in chosen if seeds is None or x.get("seed") in seeds])
 
 
-def _write_tables_and_figures(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
+def _write_tables(job: BenchJob, lines: Sequence[Line]) -> list[Path]:
     if not lines:
         raise InputError(str(job.output / RESULTS), "no results", "a results file", "run the benchmark first")
     with finish_despite_interrupt():
-        return [*write_tables(job, lines), *write_figures(job, lines)]
+        return write_tables(job, lines)
 
 
 def _name_rows_left_out(job: BenchJob) -> None:
@@ -95,15 +96,15 @@ def _name_rows_left_out(job: BenchJob) -> None:
 
 
 class Batch:
-    """The ``missing`` runs of ``total``, one case after the other. ``lines`` are those of the results file, and grow."""
+    """The runs after the first ``done`` of ``total``, one case after the other. ``lines`` are those of the results file, and
+    grow."""
 
     def __init__(
-        self, job: BenchJob, results: Path, lines: list[Line], missing: Sequence[PlannedRun], total: int,
-        report: Report, rt: Runtime,
+        self, job: BenchJob, results: Path, lines: list[Line], done: int, total: int, report: Report, rt: Runtime
     ) -> None:
         self.job, self.results, self.report, self.rt = job, results, report, rt
         self.lines, self.present = lines, Present(lines)
-        self.left, self.total = list(missing), total
+        self.done, self.total = done, total
         self.warned: set[str] = set()
 
     def keep(self, line: Line) -> None:
@@ -113,47 +114,31 @@ class Batch:
         self.present.add(line)
         self.lines.append(line)
 
-    def finish(self, run: PlannedRun, line: Line) -> None:
-        """Reports the result of a run, and how long the others will take."""
-        number = self.total - len(self.left) + 1
-        self.left.remove(run)
-        self.report(BenchProgress(number, self.total, run.title, line=line, left_s=self._left_s()))
-
-    def _left_s(self) -> float | None:
-        """Returns the seconds that the missing runs will take, from the same runs on other objects; None if unknown."""
-        total = 0.0
-        for run in self.left:
-            like = [line["seconds"] for line in self.lines if "seconds" in line and _is_like(line, run)]
-            if not like:
-                return None
-            total += float(np.mean(like))
-        return total
-
     def run_case(self, runs: Sequence[PlannedRun]) -> None:
         """Makes all missing runs of one case."""
         title = f"reference of seed {runs[0].seed}"
-        first = BenchProgress(self.total - len(self.left) + 1, self.total, title)
+        first = BenchProgress(self.done + 1, self.total, title)
         case = make_case(self.job, self.rt, runs[0], _forwarded(self.report, first))
-        if runs[0].volume not in self.warned:
+        if isinstance(case, PhantomCase):
+            for line in reference_lines(self.job, runs[0], case, self.rt, self.present):
+                self.keep(line)
+        elif runs[0].volume not in self.warned:
             self.warned.add(runs[0].volume)
             case.warn_of_inverse_crime()
-        write_slices(self.job.output, truth_of(runs[0].facts), case.slices(case.truth))
-        for line in reference_lines(self.job, runs[0], case, self.rt, self.present):
-            self.keep(line)
         for run in runs:
-            number = self.total - len(self.left) + 1
-            started = BenchProgress(number, self.total, run.title)
+            self.done += 1
+            started = BenchProgress(self.done, self.total, run.title)
             self.report(started)
             with keep_finished_work():  # a finished run is measured and kept, then the benchmark stops
-                line = one_run(self.job, run, case, self.rt, _forwarded(self.report, started))
+                line = one_run(run, case, self.rt, _forwarded(self.report, started))
                 self.keep(line)
-            self.finish(run, line)
+            self.report(replace(started, line=line))
 
 
 def reference_lines(
-    job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, present: Present
+    job: BenchJob, run: PlannedRun, case: PhantomCase, rt: Runtime, present: Present
 ) -> Iterator[Line]:
-    """Returns lines about what results are compared with, where the case has any that are missing."""
+    """Returns lines about what results are compared with, where any are missing."""
     same = {"acquisition": REFERENCE, "method": None, "options": {}, "iterations": job.bench_size.iterations}
     for name, measure in case.references().items():
         facts = {**run.facts, **same, "run": name, "label": name}
@@ -162,8 +147,8 @@ def reference_lines(
             yield {**facts, "metrics": metrics, **environment(rt.device)}
 
 
-def one_run(job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, progress: ProgressReport) -> Line:
-    """Makes a run and keeps its slices. Where numbers overflowed, the line has the error."""
+def one_run(run: PlannedRun, case: Case, rt: Runtime, progress: ProgressReport) -> Line:
+    """Makes a run. Where numbers overflowed, the line has the error."""
     scan = case.scan(run.acquisition)
     started, used = time.perf_counter(), time.process_time()
     try:
@@ -173,7 +158,6 @@ def one_run(job: BenchJob, run: PlannedRun, case: Case, rt: Runtime, progress: P
         return {**run.facts, "error": str(error), **environment(rt.device)}
     seconds, processor_s = time.perf_counter() - started, time.process_time() - used
     refuse_interrupted(result)
-    write_slices(job.output, run.facts, case.slices(result.volume))
     return {
         **run.facts,
         "metrics": {name: _number(value) for name, value in case.measure(result.volume).items()},
@@ -214,11 +198,6 @@ def _forwarded(report: Report, started: BenchProgress) -> ProgressReport:
         report(BenchProgress(started.number, started.runs, started.title, p.iteration, p.iterations))
 
     return forward
-
-
-def _is_like(line: Line, run: PlannedRun) -> bool:
-    same = ("run", "voxels", "pixels", "iterations", "views")
-    return all(line.get(name) == run.facts[name] for name in same)
 
 
 def _check_volumes(runs: Sequence[PlannedRun]) -> None:

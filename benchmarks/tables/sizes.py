@@ -16,8 +16,6 @@ class BenchSize:
     iterations: int
 
     def __post_init__(self) -> None:
-        checks.within("voxels of a benchmark size", self.voxels, 2, 4096)
-        checks.within("pixels of a benchmark size", self.pixels, 2, 32_000)
         checks.within("--iterations", self.iterations, 0, 10_000_000)
 
 

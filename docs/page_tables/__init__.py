@@ -34,9 +34,23 @@ def facts_of(name: str) -> Any:
     return json.loads((RESULTS / name).read_text(encoding="utf-8"))
 
 
-def lines_of(name: str) -> list[dict[str, Any]]:
+def lines_of(name: str) -> list[Scores]:
     """Returns the lines of a JSONL file in docs/results."""
     return [json.loads(line) for line in (RESULTS / name).read_text(encoding="utf-8").splitlines()]
+
+
+def grouped(lines: Iterable[Scores], *keys: str) -> dict[tuple[Any, ...], list[Scores]]:
+    """Returns the lines by their values of ``keys``, in the order in which these come first."""
+    groups: dict[tuple[Any, ...], list[Scores]] = {}
+    for line in lines:
+        groups.setdefault(tuple(line[key] for key in keys), []).append(line)
+    return groups
+
+
+def span(values: Sequence[float], form: str) -> str:
+    """Returns the least and the largest value, or the only one. A minus would be lost beside a dash."""
+    least, most = (f"{value:{form}}" for value in (min(values), max(values)))
+    return least if least == most else f"{least} to {most}" if min(values) < 0 else f"{least}–{most}"
 
 
 def rows_of(name: str) -> dict[tuple[str, str, str], Row]:

@@ -3,18 +3,16 @@
 from statistics import mean
 from typing import Any
 
-from page_tables import facts_of, lines_of, markdown, table
+from page_tables import Scores, facts_of, grouped, lines_of, markdown, table
 
 
 @table("motion_models")
 def motion_models() -> str:
     """Returns whole reconstructions by the motion models of the splats, as means over the volumes."""
     lines = [line for line in lines_of("motion_models_pruned.jsonl") if line["size"] == 64 and line["iterations"] == 3000]
-    found: dict[str, dict[str, Any]] = {}
-    for line in lines:
-        found.setdefault(line["volume"], {})[line["motion"]] = line
+    found = [{line["motion"]: line for line in of} for of in grouped(lines, "volume").values()]
     models = {"static": "static", "8x5": "8 × 5", "exact 0.005": "exact, bound 0.005"}
-    whole = [by for by in found.values() if all(model in by for model in models)]
+    whole = [by for by in found if all(model in by for model in models)]
     text = []
     for model, name in models.items():
         psnr, ssim = (mean(by[model][key] for by in whole) for key in ("psnr_db", "ssim"))
@@ -30,22 +28,11 @@ ONE_FRAME = {"static": "static", "centres": "centres", "8x5": "8 × 5", "exact":
 @table("centres_distance")
 def centres_distance() -> str:
     """Returns errors of a frame of single Gaussians, by motion model and distance from the axis."""
-    lines = [line for line in lines_of("centres_only.jsonl") if "gaussians" in line]
+    lines = [line for line in lines_of("centres_only.jsonl") if line.get("distance") in (0.0, 0.4, 0.8)]
     text = [
         [line["gaussians"], str(line["distance"]), *(f"{100 * line[name]:.2g} %" for name in ONE_FRAME)] for line in lines
     ]
     return markdown(["Gaussians", "distance", *ONE_FRAME.values()], text)
-
-
-@table("centres_object")
-def centres_object() -> str:
-    """Returns errors of a frame of whole objects, by motion model, from the least to the largest."""
-    lines = [line for line in lines_of("centres_only.jsonl") if "volume" in line]
-    text = []
-    for protocol in ("rapid", "standard"):
-        errors = {name: [100 * line[name] for line in lines if line["protocol"] == protocol] for name in ONE_FRAME}
-        text.append([protocol, *(f"{min(of):.2g}–{max(of):.2g} %" for of in errors.values())])
-    return markdown(["protocol", *ONE_FRAME.values()], text)
 
 
 @table("detector_models")
@@ -53,11 +40,10 @@ def detector_models() -> str:
     """Returns the gain of each method from modelling a detector's effect: modelled PSNR, and its excess over ignoring it."""
     lines = lines_of("detector_models.jsonl")
     methods = list(dict.fromkeys(line["method"] for line in lines))
-    effects = list(dict.fromkeys(line["effect"] for line in lines))
-    cell = {(line["effect"], line["method"]): line for line in lines}
     text = []
-    for effect in effects:
-        of_effect = [cell.get((effect, method)) for method in methods]
+    for (effect,), of in grouped(lines, "effect").items():
+        cells = {line["method"]: line for line in of}
+        of_effect = [cells.get(method) for method in methods]
         shown = [f"{x['modelled_db']:.1f} ({x['modelled_db'] - x['ignored_db']:+.2f})" if x else "" for x in of_effect]
         text.append([effect, *shown])
     return markdown(["effect", *methods], text)
@@ -65,23 +51,24 @@ def detector_models() -> str:
 
 @table("times_per_exposure")
 def times_per_exposure() -> str:
-    """Returns PSNR and time of ``per-row`` by the times in an exposure, as means over the volumes with the same numbers."""
-    by_volume: dict[tuple[Any, ...], dict[int, dict[str, Any]]] = {}
+    """Returns PSNR and time of ``fista`` by the times in an exposure, as means over the volumes with the same numbers."""
+    by_volume: dict[tuple[Any, ...], dict[int, Scores]] = {}
     for one in lines_of("times_per_exposure.jsonl"):
-        key = one["size"], one["views"], one["moved_voxels"], one["method"], one["volume"]
-        by_volume.setdefault(key, {})[one["times"]] = one
-    scans: dict[tuple[Any, ...], list[dict[int, dict[str, Any]]]] = {}
+        if one["method"] == "fista":
+            key = one["size"], one["views"], one["moved_voxels"], one["volume"]
+            by_volume.setdefault(key, {})[one["times"]] = one
+    scans: dict[tuple[Any, ...], list[dict[int, Scores]]] = {}
     for (*scan, volume), runs in by_volume.items():
         scans.setdefault((*scan, volume == "spheres", tuple(sorted(runs))), []).append(runs)
     counts, rows = (1, 2, 3, 5, 6, 9, 17), []
-    for (size, views, moved, method, _, made), of in sorted(scans.items()):
+    for (size, views, moved, _, made), of in sorted(scans.items()):
         cells = {n: f"{mean(runs[n]['psnr_db'] for runs in of):.2f}" for n in made}
         for n in made:
             seconds = [runs[n]["processor_s"] for runs in of if runs[n]["processor_s"]]
             cells[n] += f" ({mean(seconds):.0f} s)" if len(seconds) == len(of) else ""
         names = ", ".join(sorted(next(iter(runs.values()))["volume"].partition("_")[0] for runs in of))
-        rows.append([f"{size}³, {views}", f"{moved:.1f}", names, f"`{method}`", *(cells.get(n, "") for n in counts)])
-    return markdown(["voxels, views", "rim moves", "volumes", "method", *(f"N = {n}" for n in counts)], rows)
+        rows.append([f"{size}³, {views}", f"{moved:.1f}", names, *(cells.get(n, "") for n in counts)])
+    return markdown(["voxels, views", "rim moves", "volumes", *(f"N = {n}" for n in counts)], rows)
 
 
 @table("beside_rtk")

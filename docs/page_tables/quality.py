@@ -6,24 +6,16 @@ from typing import Any
 
 from page_tables import Row, Scores, lines_of, markdown, rows_of, table
 
-CENTRES = "PhyRadGS centres only (as GS-on-the-Move)"
 DEFAULT = "**`fista`, the default**"
 METHODS = (
     # Label of the page; rows with the motion ignored, with the motion known, and of the still scan.
-    ("FDK", "FDK", "FDK per-row", "FDK"),
-    ("SART", "SART", "SART per-row", "SART"),
-    ("OS-SART", "OS-SART", "OS-SART per-row", "OS-SART"),
-    ("SIRT", "SIRT", "SIRT per-row", "SIRT"),
-    ("CGLS", "CGLS", "CGLS per-row", "CGLS"),
-    ("ASD-POCS", "ASD-POCS", "ASD-POCS per-row", "ASD-POCS"),
-    ("FISTA-TV", "FISTA-TV", "FISTA-TV per-row", "FISTA-TV"),
+    *((name, name, f"{name} per-row", name) for name in ("FDK", "SART", "OS-SART", "SIRT", "CGLS", "ASD-POCS", "FISTA-TV")),
     ("`fista --prior dct`, on one grid", "", "FISTA with DCT on one grid per-row", "FISTA with DCT on one grid"),
     ("`fista --prior dct`", "", "FISTA with DCT per-row", "FISTA with DCT"),
     (DEFAULT, "", "FISTA with ridge per-row", "FISTA with ridge"),
     ("R2-Gaussian", "R2-Gaussian", "R2-Gaussian w/ ST", "R2-Gaussian"),
     ("PhyRadGS, 8 × 5 (the paper's)", "PhyRadGS w/o ST", "PhyRadGS", "PhyRadGS w/o ST"),
     ("PhyRadGS, exact in time", "PhyRadGS w/o ST", "PhyRadGS exact in time", "PhyRadGS w/o ST"),
-    (CENTRES, "PhyRadGS w/o ST", CENTRES, "PhyRadGS w/o ST"),
 )
 
 
@@ -109,7 +101,7 @@ def phantom() -> str:
             continue
         for kind, name in (("ignored", ignored), ("known", known)):
             row = rows.get(("rapid", name, "fly-scan"))
-            if row is None or (label.startswith(("PhyRadGS, exact", CENTRES)) and kind == "ignored"):
+            if row is None or (label.startswith("PhyRadGS, exact") and kind == "ignored"):
                 continue
             shape = [f"{100 * number(row, 'roundness'):.1f}", f"{number(row, 'centre_shift_mm'):.2f}"]
             shape += [f"{number(row, 'edge_rise_mm'):.2f}", f"{100 * number(row, 'bias_balls'):.1f}"]

@@ -2,9 +2,8 @@
 
 from collections.abc import Sequence
 from statistics import mean
-from typing import Any
 
-from page_tables import facts_of, lines_of, markdown, table
+from page_tables import Scores, facts_of, grouped, lines_of, markdown, span, table
 
 
 @table("prepare")
@@ -12,22 +11,17 @@ def prepared() -> str:
     """Returns the decibels that an effect costs, and the percentage that ``prepare`` regains, by effect and size.
 
     Both are ranges from the least to the largest of all volumes."""
-    cells: dict[tuple[str, int], dict[str, list[dict[str, Any]]]] = {}
-    for line in _prepared_lines():
-        by_method = cells.setdefault((line["effect"], line["size"]), {})
-        by_method.setdefault(line["method"], []).append(line)
+    methods = ("fdk", "fista-tv", "phyradgs")
     text = []
-    for (effect, size), by_method in sorted(cells.items()):
-        volumes = len({line["phantom"] for lines in by_method.values() for line in lines})
-        shown = [_losses(by_method.get(method, [])) for method in PREPARED_METHODS]
+    for (effect, size), lines in sorted(grouped(_prepared_lines(), "effect", "size").items()):
+        by_method = grouped(lines, "method")
+        volumes = len(grouped(lines, "phantom"))
+        shown = [_losses(by_method.get((method,), [])) for method in methods]
         text.append([effect, f"{size}³", str(volumes), *shown])
-    return markdown(["effect", "voxels", "volumes", *PREPARED_METHODS], text)
+    return markdown(["effect", "voxels", "volumes", *methods], text)
 
 
-PREPARED_METHODS = ("fdk", "fista-tv", "phyradgs")
-
-
-def _prepared_lines() -> list[dict[str, Any]]:
+def _prepared_lines() -> list[Scores]:
     """Returns the lines of all runs of ``prepare``, each with the size of its volume."""
     found = []
     for name in ("prepare", "prepare_volumes", "prepare_fresh", "prepare_64"):
@@ -36,53 +30,48 @@ def _prepared_lines() -> list[dict[str, Any]]:
     return [line for line in found if not line["effect"].startswith("a third")]
 
 
-def _losses(lines: Sequence[dict[str, Any]]) -> str:
+def _losses(lines: Sequence[Scores]) -> str:
     """Returns the loss in dB and the part of it that returns. The part of a loss below 0.1 dB means nothing."""
     if not lines:
         return ""
     losses_db = [line["clean"] - line["spoilt"] for line in lines]
     parts = [100 * line["regained"] for line, lost_db in zip(lines, losses_db, strict=True) if lost_db > 0.1]
-    return _range(losses_db, ".2f") + (f"; {_range(parts, '.0f')} %" if parts else "")
-
-
-def _range(values: Sequence[float], form: str) -> str:
-    least, most = (f"{value:{form}}" for value in (min(values), max(values)))
-    return least if least == most else f"{least} to {most}" if min(values) < 0 else f"{least}–{most}"
+    return span(losses_db, ".2f") + (f"; {span(parts, '.0f')} %" if parts else "")
 
 
 @table("prepare_clean")
 def clean_scans() -> str:
-    """Returns what the usual steps change in clean scans, and the part of rings that returns."""
-    text = []
+    """Returns the part of rings that returns, and below the table what the usual steps change in clean scans."""
     lines = lines_of("prepare_clean.jsonl")
-    for method, views in sorted({(line["method"], line["views"]) for line in lines}):
-        cell = [line for line in lines if (line["method"], line["views"]) == (method, views)]
-        clean = [line for line in cell if "lost_db" in line]
-        changed = sum(not line["unchanged"] for line in clean)
-        rings = [[line["regained"] for line in cell if line["steps"] == f"rings {spread}"] for spread in (0.01, 0.02, 0.05)]
-        ranges = [f"{100 * min(parts):.0f}–{100 * max(parts):.0f} %" if parts else "" for parts in rings]
-        lost = f"{changed} of {len(clean)}, {max((line['lost_db'] for line in clean), default=0):.3f} dB"
-        text.append([method, str(views), str(len({line["phantom"] for line in cell})), lost, *ranges])
-    heads = ["method", "views", "volumes", "clean: changed, most lost", "rings of 1 %", "2 %", "5 %"]
-    return markdown(heads, text)
+    text = []
+    for (method, views), cell in sorted(grouped(lines, "method", "views").items()):
+        by_step = grouped((line for line in cell if "regained" in line), "steps")
+        rings = [[100 * line["regained"] for line in by_step.get((f"rings {spread}",), [])] for spread in (0.01, 0.02, 0.05)]
+        if any(rings):
+            text.append([method, str(views), *(f"{span(parts, '.0f')} %" for parts in rings)])
+    clean = [line for line in lines if "lost_db" in line]
+    changed = [line for line in clean if not line["unchanged"]]
+    views = ", ".join(str(views) for (views,) in sorted(grouped(changed, "views")))
+    lost = f"all from {views} views, by at most {max(line['lost_db'] for line in changed):.3f} dB"
+    table = markdown(["method", "views", "rings of 1 %", "2 %", "5 %"], text)
+    return f"{table}\nOf {len(clean)} clean scans {len(changed)} change, {lost}.\n"
 
 
 @table("stripes")
 def stripes() -> str:
     """Returns PSNR with stripes, and after steps of ``prepare``, at the most views. Rows "none" are the clean scan."""
-    cells: dict[tuple[str, str], dict[str, float]] = {}
     lines = lines_of("stripes.jsonl")
     views = max(line["views"] for line in lines)
-    for line in lines:
-        if line["views"] == views:
-            cells.setdefault((line["stripes"], line["object"]), {})[line["steps"]] = line["psnr_db"]
     steps = ["", "dead,rings", "stripes", "dead,rings,stripes", "every column", "algotom", "algotom, narrow"]
-    text = [[*key, *(f"{by_steps[name]:.2f}" for name in steps)] for key, by_steps in cells.items()]
+    text = []
+    for key, of in grouped((line for line in lines if line["views"] == views), "stripes", "object").items():
+        psnr_db = {line["steps"]: f"{line['psnr_db']:.2f}" for line in of}
+        text.append([*key, *(psnr_db[name] for name in steps)])
     titles = ["no step", *(f"`{name}`" for name in steps[1:4]), "`stripes`, `ratio=0`", *steps[5:]]
     return markdown(["stripes", "object", *titles], text)
 
 
-def calibrate_lines() -> list[dict[str, Any]]:
+def calibrate_lines() -> list[Scores]:
     """Returns the recorded calibrations of every case on its finest grid."""
     lines = lines_of("calibrate.jsonl")
     finest = {line["case"]: max(other["size"] for other in lines if other["case"] == line["case"]) for line in lines}
@@ -92,35 +81,31 @@ def calibrate_lines() -> list[dict[str, Any]]:
 @table("calibrated_parameters")
 def calibrated_parameters() -> str:
     """Returns the worst error of every parameter with two runs or more, the stated σ, and how often 2 σ held the truth."""
-    cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for line in calibrate_lines():
-        for one in line["parameters"]:
-            if one.get("error") is not None:
-                key = (line["case"], line["size"], one["name"], one["unit"])
-                cells.setdefault(key, []).append(one)
+    found = [
+        {**one, "case": line["case"], "size": line["size"]}
+        for line in calibrate_lines() for one in line["parameters"] if one.get("error") is not None
+    ]  # fmt: skip
     text = []
-    for (case, size, name, unit), found in cells.items():
-        if len(found) < 2:
-            continue
-        worst = max(abs(one["error"]) for one in found)
-        inside = sum(abs(one["z"]) <= 2 for one in found)
-        sigma = mean(one["deviation"] for one in found)
-        text.append([case, f"{size}³", name, f"{worst:.2g} {unit}", f"{sigma:.2g}", f"{inside}/{len(found)}"])
+    for (case, size, name, unit), of in grouped(found, "case", "size", "name", "unit").items():
+        if len(of) > 1 and case != "right":  # with nothing planted errors are those of the case panel
+            worst = max(abs(one["error"]) for one in of)
+            inside = sum(abs(one["z"]) <= 2 for one in of)
+            sigma = mean(one["deviation"] for one in of)
+            text.append([case, f"{size}³", name, f"{worst:.2g} {unit}", f"{sigma:.2g}", f"{inside}/{len(of)}"])
     return markdown(["case", "voxels", "parameter", "worst error", "σ stated", "within 2 σ"], text)
 
 
 @table("calibrated_psnr")
 def calibrated_psnr() -> str:
     """Returns PSNR with the stated, the calibrated and the right geometry."""
-    cells: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for line in calibrate_lines():
-        if "stated" in line.get("psnr_db", {}) and not line["case"].startswith("draw"):
-            cells.setdefault((line["case"], f"{line['size']}, {line['views']}"), []).append(line["psnr_db"])
     text = []
-    for (case, size), found in cells.items():
+    for (case, size, views), of in grouped(calibrate_lines(), "case", "size", "views").items():
+        found = [line["psnr_db"] for line in of if "stated" in line.get("psnr_db", {})]
+        if not found or case.startswith("draw"):
+            continue
         means = [f"{mean(one[key] for one in found):.2f}" for key in ("stated", "calibrated", "right")]
         worst = min(one["calibrated"] - one["right"] for one in found)
-        text.append([case, size, *means, f"{worst:+.3f}", str(len(found))])
+        text.append([case, f"{size}, {views}", *means, f"{worst:+.3f}", str(len(found))])
     return markdown(["case", "voxels, views", "stated", "calibrated", "right", "worst difference", "runs"], text)
 
 
@@ -144,17 +129,13 @@ def fbp_peers() -> str:
 @table("parallel_fly")
 def parallel_fly() -> str:
     """Returns PSNR and modulation at rim and centre of parallel fly-scans: a row per scan, a column per method."""
-    cells: dict[tuple[Any, ...], dict[tuple[str, str], str]] = {}
-    for one in lines_of("parallel_fly.jsonl"):
-        scan = cells.setdefault((one["views"], one["blur_px"], one["dose"]), {})
-        scan[one["method"], one["motion"]] = f"{one['psnr_db']:.1f}, {one['rim']:.2f}, {one['centre']:.2f}"
     columns = [("fbp", "ignored"), ("fbp", "deblurred"), ("fbp", "deblurred ten times")]
     columns += [("fista", "ignored"), ("fista", "known")]
-    text = [
-        [str(views), f"{blur:g}", f"{dose:g}", *(by.get(column, "–") for column in columns)]
-        for (views, blur, dose), by in sorted(cells.items())
-        if (views < 1800 or dose > 1e4) and (views == 180 or blur > 1)
-    ]
+    text = []
+    for (views, blur, dose), of in sorted(grouped(lines_of("parallel_fly.jsonl"), "views", "blur_px", "dose").items()):
+        if (views < 1800 or dose > 1e4) and (views == 180 or blur > 1):
+            by = {(x["method"], x["motion"]): f"{x['psnr_db']:.1f}, {x['rim']:.2f}, {x['centre']:.2f}" for x in of}
+            text.append([str(views), f"{blur:g}", f"{dose:g}", *(by.get(column, "–") for column in columns)])
     labels = {"deblurred": "`deblur=0.03`", "deblurred ten times": "`deblur=0.003`"}
     heads = (f"`{method}`, {labels.get(motion, motion)}" for method, motion in columns)
     return markdown(["views", "blur", "photons", *heads], text)
@@ -162,13 +143,13 @@ def parallel_fly() -> str:
 
 @table("fan_fly")
 def fan_fly() -> str:
-    """Returns NMSE of a fan beam's fly-scan."""
-    rows = [
-        [f"{one['side']}²", f"`{one['method']}`", one["model"]]
-        + [f"{one['nmse']:.4f}", f"{one['best']:.4f} ({one['best_at']})"]
-        for one in lines_of("fan_fly.jsonl")
-    ]
-    return markdown(["voxels", "method", "motion", "NMSE", "smallest (pass)"], rows)
+    """Returns NMSE of a fan beam's fly-scan: a row per method, a column per size and way to average."""
+    sizes = (175, 350, 700)
+    rows = []
+    for (method, model), of in grouped(lines_of("fan_fly.jsonl"), "method", "model").items():
+        nmse = {one["side"]: f"{one['nmse']:.4f}" for one in of}
+        rows.append([f"`{method}`", model, *(nmse[side] for side in sizes)])
+    return markdown(["method", "motion", *(f"{side}²" for side in sizes)], rows)
 
 
 @table("parallel_memory")

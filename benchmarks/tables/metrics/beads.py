@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from phyradgs_cl.checks import finite, positive, shape
 from phyradgs_cl.fields import Grid
 
 Array = NDArray[np.float64]
@@ -19,17 +18,10 @@ SMALLEST_RADIUS_VOXELS = 2.5
 
 @dataclass(frozen=True)
 class Bead:
-    """A homogeneous bead at ``centre_mm`` (x, y, z) in homogeneous surroundings (out to ``REACH`` radii).
-
-    Raises InputError for a centre that is not three finite numbers, and for a radius that is not positive."""
+    """A homogeneous bead at ``centre_mm`` (x, y, z) in homogeneous surroundings (out to ``REACH`` radii)."""
 
     centre_mm: tuple[float, float, float]
     radius_mm: float
-
-    def __post_init__(self) -> None:
-        shape("bead centre", self.centre_mm, (3,))
-        finite("bead centre", self.centre_mm)
-        positive("bead radius", self.radius_mm)
 
 
 def resolved(beads: Sequence[Bead], grid: Grid) -> list[Bead]:

@@ -12,7 +12,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from phyradgs_cl.checks import finite, shape
 from phyradgs_cl.fields import Grid
 from tables.metrics.beads import Array, Bead, levels, resolved, surroundings
 
@@ -21,21 +20,16 @@ RISE_PER_SIGMA = 2.5631031310892007  # from the 10th to the 90th percentile of a
 
 @dataclass(frozen=True)
 class Edge:
-    """The edge of one bead: its 10–90 % rise and radius in mm, its levels in the volume's unit."""
+    """The edge of one bead: its 10–90 % rise and radius in mm."""
 
     rise_mm: float
     radius_mm: float
-    inside: float
-    outside: float
 
 
 def edge_sharpness(volume: NDArray[np.floating], grid: Grid, beads: Sequence[Bead]) -> dict[str, float]:
     """Returns edge_rise_mm, the mean 10–90 % rise over the beads that the grid resolves, and edge_balls, their number.
 
-    volume: (z, y, x) on ``grid``. beads: known centres and radii. The rise is NaN where no bead could be measured. Raises
-    InputError for a volume of another shape than the grid, NaN or infinity."""
-    shape("volume", volume, grid.shape)
-    finite("volume", volume)
+    volume: (z, y, x) on ``grid``. beads: known centres and radii. The rise is NaN where no bead could be measured."""
     rises = [bead_edge(volume, grid, bead).rise_mm for bead in resolved(beads, grid)]
     known = [rise for rise in rises if np.isfinite(rise)]
     return {"edge_rise_mm": float(np.mean(known)) if known else np.nan, "edge_balls": float(len(known))}
@@ -46,7 +40,7 @@ def bead_edge(volume: NDArray[np.floating], grid: Grid, bead: Bead) -> Edge:
     distance, values = surroundings(volume, grid, bead)
     inside, outside = levels(distance, values, bead.radius_mm)
     if not (np.isfinite(inside) and np.isfinite(outside)) or inside == outside:
-        return Edge(np.nan, np.nan, inside, outside)
+        return Edge(np.nan, np.nan)
     contrast, voxel_mm = inside - outside, min(grid.voxel_size_mm)
 
     def residual(p: Array) -> Array:
@@ -55,11 +49,10 @@ def bead_edge(volume: NDArray[np.floating], grid: Grid, bead: Bead) -> Edge:
 
     start = (1.0, min(0.5 * voxel_mm / bead.radius_mm, 0.9), 1.0, 0.0)
     bounds = ((0.5, 0.02 * voxel_mm / bead.radius_mm, -5.0, -5.0), (1.5, 1.0, 5.0, 5.0))
-    radius, sigma, share, base = scipy.optimize.least_squares(residual, start, bounds=bounds).x
+    radius, sigma, share, _ = scipy.optimize.least_squares(residual, start, bounds=bounds).x
     if share <= 0:
-        return Edge(np.nan, np.nan, inside, outside)
-    levels_found = outside + contrast * (base + share), outside + contrast * base
-    return Edge(RISE_PER_SIGMA * sigma * bead.radius_mm, radius * bead.radius_mm, *levels_found)
+        return Edge(np.nan, np.nan)
+    return Edge(RISE_PER_SIGMA * sigma * bead.radius_mm, radius * bead.radius_mm)
 
 
 def blurred_ball(distance_mm: Array, radius_mm: float, sigma_mm: float) -> Array:

@@ -11,7 +11,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from phyradgs_cl.checks import finite, shape
 from phyradgs_cl.fields import Grid
 from tables.metrics.beads import REACH, Array, Bead, levels, resolved, surroundings
 
@@ -37,9 +36,7 @@ def roundness(volume: NDArray[np.floating], grid: Grid, beads: Sequence[Bead]) -
 
     roundness is (r_max − r_min)/r_mean; roundness_rms is RMS deviation/r_mean; centre_shift_mm is the distance of the
     contour's centre from the true one; round_sections is the number of sections found. They are NaN where there are none.
-    volume: (z, y, x) on ``grid``. Raises InputError for a volume of another shape than the grid, NaN or infinity."""
-    shape("volume", volume, grid.shape)
-    finite("volume", volume)
+    volume: (z, y, x) on ``grid``."""
     found = [
         section for bead in resolved(beads, grid) for section in bead_sections(volume, grid, bead).values()
     ]
