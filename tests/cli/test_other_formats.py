@@ -88,7 +88,7 @@ def test_a_result_in_hounsfield_units_is_converted_once(cli, refused, files, tmp
     assert cli.run([str(word) for word in (*start, "--initial", noted)]) == 0
     assert "first volume: noted.nii from HU (water 0.002" in capfd.readouterr().out
     refused([*start, "--initial", bare], "bare.nii: found values from", "--mu-water-per-mm")
-    refused([*start, "--mu-water-per-mm", "0.02"], "--mu-water-per-mm: found given without --initial")
+    refused([*start, "--mu-water-per-mm", "0.02"], "--mu-water-per-mm: given without --initial")
     refused([*start, "--initial", volume, "--mu-water-per-mm", "0.02"], "expected a volume in Hounsfield units")
     assert load_volume(noted).values == pytest.approx(values, abs=1e-6)
 
@@ -104,9 +104,9 @@ def test_export_fits_hounsfield_units_and_says_so(cli, refused, files, tmp_path,
     assert "air 0.001 ± " in told and "(1512 voxels of the lowest peak), water 0.02 ± " in told and "(216 voxels" in told
     hu = sitk.GetArrayFromImage(sitk.ReadImage(str(tmp_path / "box.nii")))
     np.testing.assert_allclose([hu.min(), hu.max()], [-1000, 0], atol=0.01)
-    refused([*words, tmp_path / "x.ply"], "--hu: found with --to ply")
+    refused([*words, tmp_path / "x.ply"], "--hu: given with --to ply")
     refused([*words, tmp_path / "x.nii", "--mu-water-per-mm", "0.02"], "one of the two")
-    refused(["export", volume, "-o", tmp_path / "x.ply", "--insert-hu", "40"], "--hu: found with --to ply")
+    refused(["export", volume, "-o", tmp_path / "x.ply", "--insert-hu", "40"], "--hu: given with --to ply")
     refused([*words, tmp_path / "x.nii", "--air-mm", "1,2"], "--air-mm: found shape (2,)")
     assert not (tmp_path / "x.nii").exists()
 
