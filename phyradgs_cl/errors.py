@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from phyradgs_cl.text import plain_text
 
 _OPTION = re.compile(r"(?<!\w)'[^']*'|--set |(?<![\w-])--([a-z][a-z-]*)")  # quoted text matches whole, and stays
+_STATES = ("given ", "not ")  # begin a state of the subject, which reads without "found"
 _OTHER_NAMES = {"with": "others", "readout": "readout_axis", "air-mm": "air", "water-mm": "water", "hu": "hounsfield"}
 """By option, without dashes: the argument in Python, where it has another name."""
 
@@ -29,7 +30,7 @@ class PhyradgsError(Exception):
         self.remedy = remedy
 
     def __str__(self) -> str:
-        found = f"found {self.found}" if self.found else ""
+        found = f"found {self.found}" if self.found and not self.found.startswith(_STATES) else self.found
         expected = f"expected {self.expected}" if self.expected else ""
         details = "; ".join(part for part in (found, expected, self.remedy) if part)
         text = f"{self.subject}: {details}" if details else self.subject

@@ -1,10 +1,14 @@
-"""Makes text of files, users and other programs printable, compares names with known ones, and formats numbers and times."""
+"""Makes text of files, users and other programs printable, compares names with known ones, formats numbers and times, and
+keeps warnings from being repeated."""
 
 import difflib
+import logging
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 # Control characters except tab and line feed move a terminal's cursor or end a string. Half surrogate pairs stand in Python
@@ -69,3 +73,26 @@ def clock(seconds: float) -> str:
     """Returns a time in s as minutes:seconds, or hours:minutes:seconds from an hour on."""
     minutes, rest = divmod(int(seconds + 0.5), 60)
     return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"
+
+
+def _is_new(said: set[str], record: logging.LogRecord) -> bool:
+    """Returns False for a warning of this package in words that are in ``said``, which it adds to."""
+    if record.levelno < logging.WARNING or not record.name.startswith(f"{__package__}."):
+        return True
+    before = len(said)
+    said.add(record.getMessage())
+    return len(said) > before
+
+
+@contextmanager
+def each_warning_once() -> Iterator[None]:
+    """Drops warnings of this package that the body repeats word for word: stages of a run meet the same scan."""
+    handlers = [*logging.getLogger(__package__).handlers, *logging.getLogger().handlers, logging.lastResort]
+    filters = [(handler, partial(_is_new, set())) for handler in handlers if handler is not None]
+    for handler, is_new in filters:
+        handler.addFilter(is_new)
+    try:
+        yield
+    finally:
+        for handler, is_new in filters:
+            handler.removeFilter(is_new)

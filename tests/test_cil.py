@@ -207,5 +207,5 @@ def test_wrong_geometries_are_refused(rt) -> None:
         ProjectionOperator(image)
     with pytest.raises(InputError, match="data: found another geometry"):
         FBP(image, frames, device=rt)(frames.copy().set_angles(np.arange(60) * 3.0).allocate(0))
-    with pytest.raises(InputError, match="shutter: found given for cone_flex"):
+    with pytest.raises(InputError, match="shutter: given for cone_flex"):
         ProjectionOperator(image, _frames("flex"), shutter=Shutter(1.0), device=rt)

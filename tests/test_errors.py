@@ -17,6 +17,8 @@ def test_message_names_subject_found_expected_and_remedy_on_one_line() -> None:
         (("dose", "-1"), "dose: found -1"),
         (("dose", "", "a number"), "dose: expected a number"),
         (("dose", "", "", "give one"), "dose: give one"),
+        (("--dose", "given with --noise none"), "--dose: given with --noise none"),  # a state, which is not found
+        (("napari", "not installed"), "napari: not installed"),
     ):
         assert str(PhyradgsError(*arguments)) == text  # missing parts leave no trace
 

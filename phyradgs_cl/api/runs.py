@@ -121,14 +121,14 @@ def save_volume(
         raise InputError("result", checks.short_repr(result), "a Reconstruction", remedy)
     file = _checked_path(path)
     if hu and result.scale is None:
-        raise InputError("hu", "a result without a scale", "one", "result.hounsfield(air, water) fits one")
+        raise InputError("hu", "a result without a scale", "a scale", "result.hounsfield(air, water) fits one")
     if foreign_suffix(file) is not None:
         checks.finite("volume", result.volume)
         if metrics is not None:
             raise InputError("metrics", f"some for {file.name}", "a file that has a place for them, as volume.h5")
         stored, form = Volume(result.volume, result.grid, {}, result.gaussians), format_of(file, "path")
         if hu and form in CLOUDS:
-            raise InputError("hu", f"given for {file.name}", "voxels", "Gaussians stay in 1/mm")
+            raise InputError("hu", f"given for {file.name}", "a format of voxels", "leave it out: Gaussians stay in 1/mm")
         export_stored(stored, form, file, "result", (lambda _: result.scale) if hu else None)
         return
     facts = {**result.facts, "program": f"phyradgs-cl {__version__}", "record": result.record}

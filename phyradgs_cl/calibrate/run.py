@@ -310,7 +310,7 @@ def _check(scans: Sequence[Scan], request: Request, phantom: EllipsoidPhantom | 
     for scan in scans:
         scan.check_sight()
     if per_view and phantom is not None:
-        raise InputError(f"--what {per_view}", "with a phantom", "parameters of all views", "leave one of the two out")
+        raise InputError(f"--what {per_view}", "given with a phantom", "parameters of all views", "leave one of the two out")
     if per_view and len(scans) > 1:
         expected = "one scan, because views differ from scan to scan"
         raise InputError(f"--what {per_view}", "a second scan", expected, "leave --with out")

@@ -138,6 +138,11 @@ def _value_of(parameter: Any, arguments: Sequence[str]) -> str | None:
     return None
 
 
+_KINDS = {" <Path>": "", " <path>": " PATH", " <str>": " TEXT", " <list[str]>": " TEXT"}
+_KINDS |= {" <int>": " N", " <int range>": " N", " <float>": " NUMBER"}
+"""Python's types, as Typer names them in a help, in a reader's words."""
+
+
 class GroupedCommand(TyperCommand):
     """A command whose help lists its options under headings. ``groups``: names of parameters by heading.
 
@@ -153,7 +158,10 @@ class GroupedCommand(TyperCommand):
         for parameter in sorted(self.get_params(ctx), key=lambda p: order.index(p.name) if p.name in order else len(order)):
             usual = "Arguments" if parameter.param_type_name == "argument" else "Options"
             if (record := parameter.get_help_record(ctx)) is not None:
-                sections[headings.get(parameter.name or "", usual)].append(record)
+                name, text = record
+                for kind, word in _KINDS.items():
+                    name = name.replace(kind, word)
+                sections[headings.get(parameter.name or "", usual)].append((name, text))
         for name, records in sections.items():
             if records:
                 with formatter.section(name):

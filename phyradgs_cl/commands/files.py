@@ -93,7 +93,8 @@ def export_command(
     form, labels = to or format_of(output), DicomLabels(patient, title, description, date)
     moves = object_motion is not None or states is not None or during is not None
     if doubt and moves:
-        raise InputError("--doubt", "given with an object that moves", "one volume", "leave --states and --during out")
+        remedy = "leave --object-motion, --states and --during out"
+        raise InputError("--doubt", "given with an object that moves", "one volume, which alone has error bars", remedy)
     scales: list[Hounsfield | None] = []
     hu = hu or air_mm is not None or water_mm is not None or insert_hu != 0
 

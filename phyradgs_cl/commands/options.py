@@ -84,7 +84,11 @@ _MOTION = (
     "line (per-row), or, for splats, integrals over time (exact), or M×N that move only centres (centres)."
 )
 _MOTIONS = tuple(name for name in MOTIONS if f"--motion {name}" not in REMOVED)
-_PRIOR = f"Prior, for fista: {' or '.join(', '.join(PRIORS).rsplit(', ', 1))}; MODULE:NAME: a denoiser of your own."
+_PRIORS = ", ".join(PRIORS).replace("piccs", "piccs (with --initial)")
+_PRIOR = (
+    f"Prior, for fista: {' or '.join(_PRIORS.rsplit(', ', 1))}; MODULE:NAME: a denoiser of your own, a tenth of its change "
+    "at 50 × the noise that it is given (docs: methods.md)."
+)
 _PRESET = "Constants: default, quick, paper (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
 _CONFIG = "TOML file of options, with underscores for dashes (docs: formats.md); the command line wins."
 _SET = "An option of the method by name: --set tv_weight=0.002 (docs: methods.md)."

@@ -37,11 +37,12 @@ def prepare_command(
     preprocessing = settings.preprocessing({"steps": DEFAULT_STEPS})
     with Ticker("step") as ticker, settings.naming_origins():
         ticker.stage(f"preparing {scan.name}")
-        step_facts = run_preparation(scan, output, preprocessing, settings.runtime, config)
+        done, before = run_preparation(scan, output, preprocessing, settings.runtime, config)
     if as_json:
-        say(json.dumps({"scan": str(scan), "output": str(output), "steps": step_facts}))
+        say(json.dumps({"scan": str(scan), "output": str(output), "steps": done, "steps_before": before}))
     else:
-        say("\n".join([*map(_line, step_facts), str(output)]))
+        earlier = [f"done before  {', '.join(before)}"] if before else []
+        say("\n".join([*earlier, *map(_line, done), str(output)]))
 
 
 def _line(step: dict[str, Any]) -> str:

@@ -126,9 +126,7 @@ def reconstruct_command(
     if profile:
         say(profile_text(runtimes[-1].kernel_uses(), float(result.facts["seconds"])))
     if result.state is not None:
-        at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
-        run = f" of run {result.facts[DOUBT]['interrupted_in_run']}" if DOUBT in result.facts else ""
-        complain(f"interrupted at iteration {at} of {asked}{run}: repeat the command with --resume to continue")
+        complain(f"interrupted at {result.interrupted_at}: repeat the command with --resume to continue")
         raise typer.Exit(signals.exit_status())
 
 
@@ -136,8 +134,7 @@ def _finish(page: "report.LivePage", result: Reconstruction, scan: Path, output:
     """Turns the live page of a complete run into its report, and ends that of an interrupted one. A run in slabs gets no
     report, since its frames may exceed the memory."""
     if result.state is not None:
-        at, asked = result.facts["interrupted_at"], result.facts["options"]["iterations"]
-        page.end(f"Interrupted at iteration {at} of {asked}: repeat the command with --resume to continue.")
+        page.end(f"Interrupted at {result.interrupted_at}: repeat the command with --resume to continue.")
     elif "slabs" in result.facts:
         page.end("The run is complete. 'phyradgs report' makes its report.", is_complete=True)
     else:

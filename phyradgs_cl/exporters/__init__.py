@@ -50,12 +50,13 @@ def export_volume(
     Raises InputError for an unknown format, a damaged volume or one without Gaussians, a suffix of another format, and
     labels with another format. Raises OutputError where the output cannot be written."""
     named = Path(path).with_name(f"{Path(path).stem}.doubt.h5") if doubt else Path(path)
+    if doubt and to in (*CLOUDS, OWN):
+        raise InputError("--doubt", f"given with the format {to}", "a format of voxels", "use nii or mha")
+    if doubt and (scale_of is not None or mu_water_per_mm is not None):
+        raise InputError("--doubt", "given with Hounsfield units", "values in 1/mm", "leave --hu and options of HU out")
     target, scale_of = _checked(named, to, output, mu_water_per_mm, labels, scale_of)
     stored, unit = read_volume(path), _PLAIN
     if doubt:
-        if to in (*CLOUDS, OWN) or scale_of is not None:
-            found = f"given with {'Hounsfield units' if scale_of is not None and to != OWN else to}"
-            raise InputError("--doubt", found, "a format of voxels, in 1/mm", "use nii or mha, without --hu")
         if stored.doubt is None:
             raise InputError(str(path), "no error bars", "a volume of 'reconstruct --doubt'", "run it again with --doubt")
         stored, unit = replace(stored, values=stored.doubt), "error bars (68 %) in 1/mm"
@@ -92,9 +93,9 @@ def _checked(
     refuse_overwriting("output", target, path)
     if to in CLOUDS and scale_of is not None:
         option = "--hu" if mu_water_per_mm is None else "--mu-water-per-mm"
-        raise InputError(option, f"with --to {to}", "voxels", "Gaussians stay in 1/mm")
+        raise InputError(option, f"given with --to {to}", "a format of voxels", "leave it out: Gaussians stay in 1/mm")
     if to != "dicom" and labels is not None and labels.given:
-        raise InputError(f"--{next(iter(labels.given))}", f"with --to {to}", "--to dicom", "leave it out")
+        raise InputError(f"--{next(iter(labels.given))}", f"given with --to {to}", "--to dicom", "leave it out")
     return target, scale_of
 
 
@@ -130,7 +131,8 @@ def export_states(
     a file, or a folder, for each state: NAME_01.SUFFIX and so on. Other arguments and errors are those of
     ``export_volume``. Raises InputError also for a format of Gaussians, and for a deformation beside the volume's grid."""
     if to in (*CLOUDS, OWN):
-        raise InputError("--states", f"with --to {to}", "a format of voxels", "use nii, mha, nrrd, tiff, npy, zarr or dicom")
+        remedy = f"use {', '.join(VOXELS)}, zarr or dicom"
+        raise InputError("--states", f"given with --to {to}", "a format of voxels", remedy)
     target, scale_of = _checked(Path(path), to, output, mu_water_per_mm, labels, scale_of)
     volume = read_volume(path)
     grid, scale = volume.required_grid, None if scale_of is None else scale_of(volume)

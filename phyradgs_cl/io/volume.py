@@ -206,19 +206,28 @@ def file_kind(path: str | Path) -> str:
 def _read_provenance(source: Hdf5Source) -> dict[str, object]:
     """Reads a volume's provenance; {} where the file has none. Warns, once per file, of an interrupted run."""
     provenance = _read_facts(source, "provenance", PROVENANCE) or {}
-    if where := interruption(provenance):
-        of = "" if where["iterations_asked"] is None else f" of {where['iterations_asked']}"
-        _warn_once(source.path, f"interrupted at iteration {where['interrupted_at']}{of}")
+    if where := place_of(interruption(provenance)):
+        _warn_once(source.path, f"interrupted at {where}")
     return provenance
 
 
-def interruption(provenance: Mapping[str, object]) -> dict[str, int | None]:
-    """Returns ``interrupted_at`` and ``iterations_asked`` of an interrupted run; an empty dict for a complete one."""
-    at, options = provenance.get("interrupted_at"), provenance.get("options")
+def interruption(provenance: Mapping[str, object]) -> dict[str, object]:
+    """Returns ``interrupted_at`` and ``iterations_asked`` of an interrupted run, and ``interrupted_in_run`` where it has
+    several for error bars; an empty dict for a complete one."""
+    at, options, doubt = (provenance.get(name) for name in ("interrupted_at", "options", "doubt"))
     if type(at) is not int:  # a bool is an int too
         return {}
     asked = options.get("iterations") if isinstance(options, Mapping) else None
-    return {"interrupted_at": at, "iterations_asked": asked if type(asked) is int else None}
+    run = doubt.get("interrupted_in_run") if isinstance(doubt, Mapping) else None
+    in_run = {} if run is None else {"interrupted_in_run": run}
+    return {"interrupted_at": at, "iterations_asked": asked if type(asked) is int else None, **in_run}
+
+
+def place_of(stop: Mapping[str, object]) -> str:
+    """Returns an ``interruption`` in words, as "iteration 3 of 40 of run 2 of 3"; nothing for that of a complete run."""
+    asked, run = stop.get("iterations_asked"), stop.get("interrupted_in_run")
+    of = "" if asked is None else f" of {asked}"
+    return f"iteration {stop['interrupted_at']}{of}{'' if run is None else f' of run {run}'}" if stop else ""
 
 
 @cache

@@ -204,7 +204,7 @@ class ObjectMotion:
 class RunPlan:
     """What to run on a scan. method: a name as from ``method_name``, or a function of the user's own. options: the
     method's, checked. preprocessing: changes of the frames before the method. Raises InputError for a seed out of range,
-    and for an object that moves with a method that takes objects at rest only."""
+    an object that moves with a method that takes objects at rest only, and error bars of runs that cannot differ."""
 
     method: "str | Callable[..., Any]"
     options: Any
@@ -220,6 +220,14 @@ class RunPlan:
             names = ", ".join(name for name, method in METHODS.items() if method.takes_deformation)
             expected = f"a method whose object may move: {names}"
             raise InputError("--object-motion", f"--method {self.method_name}", expected, "choose one of them")
+        if not self.preprocessing.doubt:
+            return
+        if self.initial is not None:
+            found, remedy = "a first volume, whose errors all runs would share", "leave --doubt or --initial out"
+            raise InputError("--doubt", found, "runs that start without one", remedy)
+        if getattr(self.options, "iterations", 1) == 0:
+            expected, remedy = "iterations, in which the runs come to differ", "leave --doubt out, or raise --iterations"
+            raise InputError("--doubt", "--iterations 0", expected, remedy)
 
     @property
     def method_name(self) -> str:

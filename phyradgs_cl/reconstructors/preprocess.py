@@ -17,6 +17,7 @@ from phyradgs_cl.prepare import STEP_FIELDS, Model, PrepareOptions, prepare
 from phyradgs_cl.prepare.chain import one_by_one
 from phyradgs_cl.prepare.step import Facts
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.text import each_warning_once
 
 MOST_HELD_OUT = 50.0
 
@@ -47,10 +48,11 @@ class Preprocessing(PrepareOptions, GridChoice):
     def check_written(self) -> None:
         """Raises InputError for options that mean nothing in a scan that is written to a file."""
         for name in [name for name in ("holdout", "margin_mm", "doubt") if getattr(self, name)]:
-            found, remedy = f"{getattr(self, name)}, without a method", "give it to the reconstruction"
-            raise InputError(f"--{name.replace('_', '-')}", found, "none where a scan is prepared", remedy)
+            flag, found = f"--{name.replace('_', '-')}", "given where a scan is prepared, without a method"
+            raise InputError(flag, found, "a reconstruction", "leave it out here, and give it to the reconstruction")
 
 
+@each_warning_once()
 def prepared(scan: Scan, options: Preprocessing, rt: Runtime | None = None) -> Scan:
     """Returns the scan for a method, on a grid with its margin; the scan itself if there is nothing to do.
 

@@ -12,6 +12,7 @@ from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.fields import Deformation, Gaussians, Grid, Hounsfield, States
 from phyradgs_cl.fields.hounsfield import Box, fitted, of_facts
+from phyradgs_cl.io.volume import interruption, place_of
 from phyradgs_cl.reconstructors.checkpoint import State
 
 if TYPE_CHECKING:
@@ -66,14 +67,18 @@ class Reconstruction:
     def __repr__(self) -> str:
         voxels, sides = (" × ".join(f"{n:g}" for n in three) for three in (self.grid.shape, self.grid.size_mm))
         of = f" of {self.gaussians.count} Gaussians" if self.gaussians is not None else ""
-        at = self.facts.get("interrupted_at")
-        way = f", interrupted at iteration {at}" if at is not None else self.early_stop
+        way = f", interrupted at {self.interrupted_at}" if self.interrupted_at else self.early_stop
         return f"Reconstruction({self.facts.get('method', 'a volume')}{of}, {voxels} voxels in {sides} mm{way})"
 
     @property
     def moves(self) -> Deformation | States | None:
         """How the object moves, or changes, as the method has found it."""
         return self.deformation if self.states is None else self.states
+
+    @property
+    def interrupted_at(self) -> str:
+        """Where the run was interrupted, as "iteration 3 of 40", or nothing."""
+        return place_of(interruption(self.facts))
 
     @property
     def early_stop(self) -> str:
@@ -129,7 +134,7 @@ class Reconstruction:
         Raises InputError for a scale or states that the result does not have, and where xarray is not installed."""
         scale, of_times = self.scale, self.states
         if hu and scale is None:
-            raise InputError("hu", "a result without a scale", "one", "result.hounsfield(air, water) fits one")
+            raise InputError("hu", "a result without a scale", "a scale", "result.hounsfield(air, water) fits one")
         if states and of_times is None:
             raise InputError("states", "a result without states", "one of method changing", "leave it out")
         values = self.volume if not states or of_times is None else of_times.volumes
@@ -155,10 +160,11 @@ def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
     """Returns a KeyboardInterrupt whose attribute ``partial`` is the result so far, or None if there is no volume yet.
 
     Not a subclass: only for KeyboardInterrupt itself does Python end by the signal, so that shells stop too."""
-    at = None if partial is None else partial.facts.get("interrupted_at")
-    when = "at its end" if at is None else f"after iteration {at}"
-    kept = f"{when}; the volume so far is the error's partial"
-    error = KeyboardInterrupt(f"interrupted {'before there was a volume' if partial is None else kept}")
+    kept = "before there was a volume"
+    if partial is not None:
+        when = f"after {partial.interrupted_at}" if partial.interrupted_at else "at its end"
+        kept = f"{when}; the volume so far is the error's partial"
+    error = KeyboardInterrupt(f"interrupted {kept}")
     error.partial = partial  # type: ignore[attr-defined]
     return error
 

@@ -40,6 +40,7 @@ from phyradgs_cl.reconstructors.result import (
     ignore_progress,
 )
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.text import each_warning_once
 
 log = logging.getLogger(__name__)
 
@@ -53,6 +54,7 @@ _DEVICE_SHARE = 0.9
 _ROUND = 8  # voxels
 
 
+@each_warning_once()
 def reconstruct(
     scan: Scan, plan: RunPlan, rt: Runtime, *, report: ProgressReport = ignore_progress,
     resume: State | None = None,
@@ -70,7 +72,7 @@ def reconstruct(
     with report.through(run.shown), _naming_size_that_fits(rt, run.scan, plan), naming_host_memory():
         if plan.preprocessing.doubt:
             kind = "iterative" if hasattr(run.options, "iterations") else "analytic"
-            _check_doubt(plan, kind, run.scan.grid)
+            _warn_of_doubt(plan, kind, run.scan.grid)
             doubter = Doubter(rt, run.visible, run.scan, run.hidden, run.deformation, plan.seed, kind)
             result = doubter.run(once, report, state)
         else:
@@ -78,12 +80,8 @@ def reconstruct(
     return run.finished(result)
 
 
-def _check_doubt(plan: RunPlan, kind: str, grid: Grid) -> None:
-    """Raises InputError for error bars of a run from a first volume, which all three runs would share with its errors. Warns
-    of methods and grids to which the bars were not fitted."""
-    if plan.initial is not None:
-        found, expected = "given with a first volume, whose errors all runs share", "one of both"
-        raise InputError("--doubt", found, expected, "leave --initial out")
+def _warn_of_doubt(plan: RunPlan, kind: str, grid: Grid) -> None:
+    """Warns of methods and grids to which error bars were not fitted."""
     if plan.method not in FITTED:
         text = "error bars were fitted to %s: of %s they may be far too narrow; --holdout 2 widens them in part"
         log.warning(text, ", ".join(FITTED), plan.method)

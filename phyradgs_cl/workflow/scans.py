@@ -79,9 +79,10 @@ def run_simulation(
 @np.errstate(all="ignore")
 def run_preparation(
     source: Path, output: Path, options: Preprocessing, make_runtime: Callable[[], Runtime], config: Path | None = None
-) -> list[dict[str, Any]]:
+) -> tuple[list[dict[str, Any]], list[str]]:
     """Writes the scan ``source`` after the steps of ``options`` as line integrals, with bad pixels masked and interpolated.
-    Returns what each step did, in order, as the file's provenance states too. Raises InputError and OutputError."""
+    Returns what each step did, in order, as the file's provenance states too, and the names of the steps that ``source``
+    had been through before. Raises InputError and OutputError."""
     if not options.chosen and options.flats == "mean":
         raise InputError("--steps", "none", f"some of {', '.join(STEPS)}", "leave it out for the usual ones")
     options.check_written()
@@ -94,5 +95,6 @@ def run_preparation(
         clean = prepared(scan, options, make_runtime())
         with finish_despite_interrupt():
             write_scan(output, replace(clean, provenance={**clean.provenance, **origin}))
-    step_facts: Any = clean.provenance.get(PREPARED_KEY, [])
-    return list(step_facts)
+    before: Any = scan.provenance.get(PREPARED_KEY) or []
+    done: Any = clean.provenance.get(PREPARED_KEY) or []
+    return done[len(before) :], [step["step"] for step in before]

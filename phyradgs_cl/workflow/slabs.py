@@ -26,6 +26,7 @@ from phyradgs_cl.io.files import host_bytes
 from phyradgs_cl.io.output import beside, written_beside
 from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.text import each_warning_once
 from phyradgs_cl.workflow.files import load_scan
 
 log = logging.getLogger(__name__)
@@ -73,6 +74,7 @@ def rows_of(text: str) -> tuple[int, int]:
     return int(first), int(stop)
 
 
+@each_warning_once()
 def reconstruct_slabs(
     plan: methods.RunPlan, path: Path, output: Path, slabs: list[tuple[int, int]], rt: Runtime,
     report: methods.ProgressReport, *, resume: bool,

@@ -32,7 +32,8 @@ from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_picture, load_reference, load_result
 
 log = logging.getLogger(__name__)
-_LITTLE = 0.5 - 1e-6  # least fraction of either box that both share: less is most often a wrong size or offset
+_LITTLE = 0.5 - 1e-6  # least fraction of either box that both share: less is often a wrong size or offset
+_ALIKE = 0.65  # least correlation where they share so little: at most 0.6 under wrong sizes and offsets, 0.55 to 0.9 else
 
 
 @np.errstate(all="ignore")
@@ -74,7 +75,7 @@ def run_evaluation(
         facts, curve = provenance.get("doubt"), picture.with_name(f"{picture.stem}.doubt.png")
         stated = facts.get("multiple_95") if isinstance(facts, Mapping) else None
         multiple_95 = stated if isinstance(stated, float) else 1.96  # that of a normal law
-        bar = _on_one_grid(volume_path, reference_path, (result.doubt, grid), truth).volume
+        bar = volume if (of_bars := aligned(result.doubt, grid, *truth)) is None else of_bars.volume
         with finish_despite_interrupt(), written_beside(curve) as temporary:
             reliability_png(temporary, bar, volume, reference, multiple_95)
         metrics |= {**coverage(bar, volume, reference, multiple_95), "reliability": str(curve)}
@@ -147,7 +148,8 @@ def _grid_of(path: Path, reference: np.ndarray, grid: Grid | None, voxel_mm: obj
 def _on_one_grid(
     volume_path: Path, reference_path: Path, result: tuple[np.ndarray, Grid], truth: tuple[np.ndarray, Grid]
 ) -> Aligned:
-    """Returns both volumes on one grid. Raises InputError where they have no object in common; warns of little overlap."""
+    """Returns both volumes on one grid. Raises InputError where they have no object in common. Warns of little overlap,
+    unless the volume's voxels are the reference's, or both look alike there."""
     pair = aligned(*result, *truth)
     if pair is None:
         found = f"{in_words(result[1])}, which has no voxel of the reference, {in_words(truth[1])}"
@@ -156,7 +158,8 @@ def _on_one_grid(
         found = f"nothing in the {100 * pair.share:.3g} % of it that lie in {volume_path}"
         raise InputError(str(reference_path), found, "an object in the part that is compared")
     of_volume, of_reference = overlap(result[1], truth[1])
-    if min(of_volume, of_reference) < _LITTLE:
+    is_little = min(of_volume, of_reference) < _LITTLE and pair.grid != result[1]
+    if is_little and not np.corrcoef(pair.volume.ravel(), pair.reference.ravel())[0, 1] >= _ALIKE:
         text = "%s and %s share %.3g %% of the first box and %.3g %% of the second: unless one is a part on purpose, "
         text += "correct voxel size or offset"
         log.warning(text, volume_path, reference_path, 100 * of_volume, 100 * of_reference)

@@ -53,11 +53,11 @@ def test_hounsfield_units_are_kept_by_files(rt, scan, tmp_path) -> None:
     for name in ("v.mha", "v.ply", "v.h5"):
         with pytest.raises(InputError, match="hu: found a result without a scale"):
             api.save_volume(tmp_path / name, result, hu=True)
-    with pytest.raises(InputError, match="hu: found given for v.ply"):
+    with pytest.raises(InputError, match="hu: given for v.ply"):
         api.save_volume(tmp_path / "v.ply", scaled, hu=True)
     with pytest.raises(InputError, match="^air: found shape"):
         result.hounsfield((1.0, 2.0))
-    with pytest.raises(InputError, match="mu_water_per_mm: found given for .*v.h5, which is in 1/mm"):
+    with pytest.raises(InputError, match="mu_water_per_mm: given for .*v.h5, which is in 1/mm"):
         api.load_volume(tmp_path / "v.h5", mu_water_per_mm=0.02)
 
 
@@ -79,7 +79,7 @@ def test_xarray_has_the_places_of_voxels_in_mm(monkeypatch) -> None:
     with pytest.raises(InputError, match="states: found a result without states"):
         api.Reconstruction(values, grid).to_xarray(states=True)
     monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(InputError, match="xarray: found not installed; .*pip install 'xarray'"):
+    with pytest.raises(InputError, match="xarray: not installed; .*pip install 'xarray'"):
         result.to_xarray()
 
 

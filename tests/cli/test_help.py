@@ -1,6 +1,7 @@
 """The help as a manual page: every command in the list with its whole sentence, and the Tab key."""
 
 import os
+import re
 import subprocess
 import sys
 
@@ -41,6 +42,7 @@ def test_help_is_whole_everywhere(cli, told, monkeypatch) -> None:
     for name, command in commands.items():
         text = told(name, "--help")
         assert text == told(name, "-h") and "-h, --help" in text and f"Example: phyradgs {name}" in text
+        assert not re.search(r"<(str|int|float|list|path)\b", text, re.IGNORECASE), f"{name} shows a type of Python"
         for parameter in command.params:
             if parameter.param_type_name == "argument":
                 assert parameter.metavar.isupper()
@@ -56,7 +58,7 @@ def test_the_defaults_are_those_of_the_default_method(told) -> None:
     assert f"Defaults are those of {DEFAULT_METHOD}." in text
     shown = {"motion": options.motion.name, "iterations": options.iterations, "prior": options.prior}
     for name, value in {"method": DEFAULT_METHOD, **shown}.items():
-        assert f"[default: ({value})]" in text.split(f" --{name} ")[1].split(" --")[0], name
+        assert f"[default: ({value})]" in text.split(f" --{name} ")[1].split("  --")[0], name
 
 
 def test_the_tab_key_in_bash() -> None:

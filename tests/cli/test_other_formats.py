@@ -14,6 +14,7 @@ from phyradgs_cl.exporters import export_volume
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import load_volume
 from phyradgs_cl.io import read_scan, write_scan, write_volume
+from phyradgs_cl.metrics import resampled
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("fast_pictures")]
 FORMATS = {"v.mha": "mha", "v.nii.gz": "nii", "v.nrrd": "nrrd", "v.npy": "npy", "v.tif": "tiff"}
@@ -88,7 +89,7 @@ def test_a_result_in_hounsfield_units_is_converted_once(cli, refused, files, tmp
     assert cli.run([str(word) for word in (*start, "--initial", noted)]) == 0
     assert "first volume: noted.nii from HU (water 0.002" in capfd.readouterr().out
     refused([*start, "--initial", bare], "bare.nii: found values from", "--mu-water-per-mm")
-    refused([*start, "--mu-water-per-mm", "0.02"], "--mu-water-per-mm: found given without --initial")
+    refused([*start, "--mu-water-per-mm", "0.02"], "--mu-water-per-mm: given without --initial")
     refused([*start, "--initial", volume, "--mu-water-per-mm", "0.02"], "expected a volume in Hounsfield units")
     assert load_volume(noted).values == pytest.approx(values, abs=1e-6)
 
@@ -104,9 +105,9 @@ def test_export_fits_hounsfield_units_and_says_so(cli, refused, files, tmp_path,
     assert "air 0.001 ± " in told and "(1512 voxels of the lowest peak), water 0.02 ± " in told and "(216 voxels" in told
     hu = sitk.GetArrayFromImage(sitk.ReadImage(str(tmp_path / "box.nii")))
     np.testing.assert_allclose([hu.min(), hu.max()], [-1000, 0], atol=0.01)
-    refused([*words, tmp_path / "x.ply"], "--hu: found with --to ply")
+    refused([*words, tmp_path / "x.ply"], "--hu: given with --to ply")
     refused([*words, tmp_path / "x.nii", "--mu-water-per-mm", "0.02"], "one of the two")
-    refused(["export", volume, "-o", tmp_path / "x.ply", "--insert-hu", "40"], "--hu: found with --to ply")
+    refused(["export", volume, "-o", tmp_path / "x.ply", "--insert-hu", "40"], "--hu: given with --to ply")
     refused([*words, tmp_path / "x.nii", "--air-mm", "1,2"], "--air-mm: found shape (2,)")
     assert not (tmp_path / "x.nii").exists()
 
@@ -118,10 +119,17 @@ def test_boxes_with_little_in_common_are_warned_of(cli, files, tmp_path, caplog)
     ))  # fmt: skip
     for name, other, first, second in (("small", small, 100, 34.3), ("aside", aside, 60, 60)):
         caplog.clear()
-        write_volume(tmp_path / f"{name}.h5", values, other, {})
+        write_volume(tmp_path / f"{name}.h5", values, other, {}, doubt=np.ones_like(values))
         assert cli.run(["evaluate", str(tmp_path / f"{name}.h5"), "--reference", str(scan)]) == 0
-        said = f"share {first} % of the first box and {second} % of the second" in caplog.text
+        said = caplog.text.count(f"share {first} % of the first box and {second} % of the second")
         assert said == (min(first, second) < 50), (name, caplog.text)
+    caplog.clear()
+    part, wide = grid.part((2, 3, 2), (5, 5, 5)), Grid.cube(11, 1.4 * grid.size_mm[0])
+    write_volume(tmp_path / "part.h5", np.full((5, 5, 5), 0.1, np.float32), part, {})  # a region of interest, and a bad one
+    write_volume(tmp_path / "wide.h5", resampled(values, grid, wide)[0], wide, {})  # the truth, in the whole field of view
+    for name in ("part", "wide"):
+        assert cli.run(["evaluate", str(tmp_path / f"{name}.h5"), "--reference", str(scan)]) == 0
+    assert "of the first box" not in caplog.text
 
 
 def test_how_another_grid_is_compared_is_said_in_the_line_and_the_json(cli, files, tmp_path, capsys) -> None:

@@ -52,6 +52,11 @@ def test_a_configuration_file_says_the_same(cli, simulated, tmp_path, capsys) ->
     assert cli.run(command) == 0
     (step,) = json.loads(capsys.readouterr().out.splitlines()[-1])["steps"]
     assert step["options"] == {"window": 5}
+    again = ["prepare", str(tmp_path / "clean.h5"), "-o", str(tmp_path / "cleaner.h5"), "--steps", "dead"]
+    assert cli.run(again) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split("  ")[0] for line in lines] == ["done before", "dead", str(tmp_path / "cleaner.h5")]
+    assert lines[0].split()[2:] == ["rings"]
 
 
 def test_bad_input_is_one_line_and_loses_nothing(refused, simulated, tmp_path) -> None:

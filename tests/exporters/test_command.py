@@ -52,7 +52,7 @@ def test_a_series_says_whose_it_is(run, volume_file, tmp_path) -> None:
     assert not plain.StudyDate and not plain.PatientID and "StudyDescription" not in plain
     assert named.StudyInstanceUID != plain.StudyInstanceUID and named.SOPInstanceUID != plain.SOPInstanceUID
     for name, value in labels.items():
-        with pytest.raises(InputError, match=f"^--{name}: found with --to nii; expected --to dicom"):
+        with pytest.raises(InputError, match=f"^--{name}: given with --to nii; expected --to dicom"):
             raise run(volume_file, "--to", "nii", f"--{name}", value).exception
     for name, value in {"patient": "x" * 65, "title": "a\\b", "description": "two\nlines", "date": "31.3.2026"}.items():
         with pytest.raises(InputError, match=f"^--{name}: found"):

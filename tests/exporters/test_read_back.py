@@ -66,7 +66,7 @@ def test_a_volume_file_keeps_its_scale_and_all_else(volume_file, stored, tmp_pat
     assert again.provenance["method"] == "phyradgs"
     kept = load_volume(export_volume(path, "nii", tmp_path / "own.nii", scale_of=hu_scale))
     assert (kept.scale.water_per_mm, kept.scale.air_per_mm) == (0.02, 0.001)
-    with pytest.raises(InputError, match="--hu: found not given"):
+    with pytest.raises(InputError, match="--hu: not given"):
         export_volume(volume_file, "h5", tmp_path / "none.h5")
 
 

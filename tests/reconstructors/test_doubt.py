@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.api import reconstruct, simulate
+from phyradgs_cl.api import reconstruct, simulate, static_scan
 from phyradgs_cl.detector.noise_level import noise_map
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import read_checkpoint, write_checkpoint
@@ -16,7 +16,7 @@ from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.reconstructors import doubt
 from phyradgs_cl.reconstructors.doubt import Doubter, Law, finer, spread
 from phyradgs_cl.reconstructors.projected import held_out
-from phyradgs_cl.reconstructors.result import DOUBT
+from phyradgs_cl.reconstructors.result import DOUBT, interrupted
 
 FEW = {"method": "sirt", "iterations": 4, "report": False}
 LAW = Law(1.0, 1.0, 0.0, 3.0)
@@ -128,6 +128,8 @@ def test_a_run_goes_on_with_the_same_bits_from_each_of_its_three_parts(rt, scan,
         partial = reconstruct(scan, device=rt, **usual)
         assert partial.doubt is None and partial.facts["interrupted_at"] == (iteration - 1) % 4 + 1
         assert partial.facts.get(DOUBT, {}).get("interrupted_in_run") == {2: "1 of 3", 6: "2 of 3", 11: "3 of 3"}[iteration]
+        place = f"iteration {(iteration - 1) % 4 + 1} of 4 of run {partial.facts[DOUBT]['interrupted_in_run']}"
+        assert repr(partial).endswith(f"interrupted at {place})") and place in str(interrupted(partial))
         write_checkpoint(tmp_path / "state.h5", partial.state)
         partial = replace(partial, state=read_checkpoint(tmp_path / "state.h5"))
         result = reconstruct(scan, device=rt, doubt=True, holdout=3.0, resume=partial, **FEW)
@@ -187,6 +189,15 @@ def test_runs_whose_bars_would_not_hold_have_none_or_a_warning(rt, scan, caplog)
     with pytest.raises(InputError) as refused:
         reconstruct(scan, device=rt, doubt=True, initial=scan.reference, **FEW)
     assert refused.value.subject == "doubt"
+    with pytest.raises(InputError, match="doubt: found iterations 0; .* raise iterations"):
+        reconstruct(scan, device=rt, doubt=True, **{**FEW, "iterations": 0})
     caplog.clear()
     still = reconstruct(scan, lambda scan, options, rt: scan.reference, device=rt, doubt=True, report=False)
     assert still.doubt is None and "same volume" in caplog.text and "may be far too narrow" in caplog.text
+
+
+def test_the_three_runs_warn_of_a_scan_once_and_the_next_command_warns_again(rt, scan, caplog) -> None:
+    one_angle = static_scan(scan.projections[:4], scan.geometry, np.zeros(4), grid=scan.grid)
+    for count in (1, 2):
+        reconstruct(one_angle, "fdk", device=rt, report=False, doubt=True)
+        assert caplog.text.count("all views are from one angle") == caplog.text.count("fitted to grids") == count

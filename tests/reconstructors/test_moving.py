@@ -245,7 +245,7 @@ def test_phases_of_a_file_or_of_the_scan_are_followed(rt, scan, tmp_path) -> Non
     path.write_text("phase\n" + "0.5\n" * scan.frames)
     with pytest.raises(InputError, match=r"phase\.csv: found the same value 0\.5 throughout"):
         loaded(path, scan)
-    with pytest.raises(InputError, match="gating: found scan, which states neither"):
+    with pytest.raises(InputError, match="gating: found scan, and no gating"):
         run(rt, scan, options={"gating": "scan"})
 
 

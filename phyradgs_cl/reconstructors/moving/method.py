@@ -307,7 +307,7 @@ def _signal_of(scan: Scan, gating: str) -> MotionSignal:
     if gating == "scan":
         if scan.gating is None:
             remedy = "take --set gating=auto, or a file NAME.csv"
-            raise InputError("gating", "scan, which states neither", "a signal or a phase in phyradgs/gating", remedy)
+            raise InputError("gating", "scan, and no gating in the scan", "a signal or a phase in phyradgs/gating", remedy)
         return signal_of(scan.gating, scan, "gating scan")
     if gating.endswith(".csv"):
         return signal_of(load_gating(gating, scan), scan, f"gating {gating}")
