@@ -1,24 +1,18 @@
-"""One interface for everything that projects: values, transposes, frames, SciPy and PyTorch; arrays on host or device."""
+"""The runtime of an operator, and operators as functions that PyTorch can differentiate."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.sparse.linalg import LinearOperator as ScipyOperator
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.runtime import DeviceArray, Runtime, adopted, is_cl_array, lent
+from phyradgs_cl.operators.public import LinearOperator, Operator
+from phyradgs_cl.runtime import Runtime
 
 Device = str | Runtime | None
 """The argument ``device``: what ``--device`` takes, or a Runtime."""
-Values = np.ndarray | DeviceArray
-"""float32 in C order, on the host or on the device."""
-Map = Callable[[Any], Any]
-"""A function from ``Values`` to ``Values``; its result is on the host or the device, where its argument is."""
-Shape = tuple[int | None, ...]
 
 
 def runtime_of(device: Device) -> Runtime:
@@ -32,207 +26,6 @@ def runtime_of(device: Device) -> Runtime:
 def _runtime_by_name(name: str | None) -> Runtime:
     """Returns the one Runtime of a device's name, so that programs are built once."""
     return Runtime(name)
-
-
-def to_user_array(rt: Runtime, values: Values) -> Any:
-    """Returns a result in the caller's kind of array: NumPy's, or pyopencl's on the device."""
-    return lent(values, rt.queue) if isinstance(values, DeviceArray) else values
-
-
-def moved_to(rt: Runtime, values: Values, on_device: bool) -> Any:
-    """Returns values on the device or on the host, copied only if they are elsewhere."""
-    if isinstance(values, DeviceArray):
-        return values if on_device else rt.download(values)
-    return rt.upload(values) if on_device else values
-
-
-def computed(rt: Runtime, on_device: bool, function: Callable[[Any], Values], values: Values) -> Values:
-    """Applies a function that needs its argument on the device, or on the host. Returns the result where ``values`` are."""
-    return moved_to(rt, function(moved_to(rt, values, on_device)), isinstance(values, DeviceArray))
-
-
-def on_host(name: str, values: Any) -> np.ndarray:
-    """Returns numbers as NumPy's float32 in C order. Other libraries' arrays on the host enter by DLPack, without a copy.
-    Raises InputError about ``name`` for anything else."""
-    has_dlpack = hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray)
-    try:
-        array = np.from_dlpack(values) if has_dlpack else np.asarray(values)
-        if array.dtype.kind not in "fiub":
-            raise TypeError(f"numbers of type {array.dtype}")
-        return np.ascontiguousarray(array, np.float32)
-    except (BufferError, RuntimeError, TypeError, ValueError) as error:
-        expected = "an array of real numbers on the host, or pyopencl's"
-        raise InputError(name, f"{type(values).__name__} ({error})", expected, "of tensors: detach().cpu()") from error
-
-
-class Operator:
-    """A differentiable map between arrays of two shapes, on a device: ``y = A(x)``, and ``A.derivative(x).T(y)``.
-
-    domain_shape, range_shape: shapes of x and y; None is any length. ``A.frames([3, 7])`` is the operator of some frames;
-    ``A.intensity`` is the operator of a detector that averages photons.
-
-    Host arrays (NumPy's, or others' by DLPack) give NumPy's float32 arrays. pyopencl Arrays (float32, C order, on
-    ``queue``) give such Arrays, and nothing is copied between host and device. An operator, its transpose and its frames
-    share their memory on the device: use one at a time.
-
-    Operators come from ``ray_operator``, ``splat_operator`` and ``voxel_operator``. To write another one: rt is its
-    Runtime; domain and range_ are (name, shape); at maps x to (y, the function from dL/dy to dL/dx); frames and intensity
-    make the operators of some frames and of averaged photons, where they exist.
-
-    Raises InputError, before anything is computed, for arrays of another shape, type or device."""
-
-    _instead = "derivative(x).T is the transpose at x, and vjp(x) also has the value"
-
-    def __init__(
-        self, rt: Runtime, domain: tuple[str, Shape], range_: tuple[str, Shape],
-        at: "Callable[[Values], tuple[Values, Map]]", *, frames: Callable[[list[int]], Any] | None = None,
-        intensity: "Callable[[], Operator] | None" = None,
-    ) -> None:
-        self.rt = rt
-        self._domain, self._range = domain, range_
-        self._at, self._frames, self._intensity = at, frames, intensity
-
-    @property
-    def domain_shape(self) -> Shape:
-        """Shape of x: (nz, ny, nx) of a volume in 1/mm, (11, None) of parameter rows of Gaussians."""
-        return self._domain[1]
-
-    @property
-    def range_shape(self) -> Shape:
-        """Shape of y: (F, rows, columns) of line integrals, or (nz, ny, nx) in 1/mm."""
-        return self._range[1]
-
-    @property
-    def queue(self) -> Any:
-        """The pyopencl.CommandQueue (in order) of the Arrays that the operator takes."""
-        return self.rt.queue
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(size of y, size of x) of a ``LinearOperator``, for SciPy. Raises InputError for any other operator."""
-        raise self._not_linear()
-
-    def __matmul__(self, x: Any) -> Any:
-        raise self._not_linear()
-
-    def _not_linear(self) -> InputError:
-        return InputError(repr(self), "an operator that is not linear in x", "a LinearOperator", self._instead)
-
-    def to_device(self, values: Any) -> Any:
-        """Copies an x or a y, or a stack of them, to a pyopencl Array, float32, on ``queue``, to start a loop there.
-
-        Raises InputError for anything but an array of real numbers, and for last axes that are neither those of x nor of y.
-        """
-        array = on_host("values", values)
-        sides = self.domain_shape, self.range_shape
-        if not any(_ends_with(array.shape, side) for side in sides):
-            expected = " or ".join(_text(side) for side in sides)
-            raise InputError("values", f"shape {array.shape}", f"{expected}, or a stack of such")
-        return to_user_array(self.rt, self.rt.upload(array))
-
-    def __call__(self, x: Any) -> Any:
-        """Returns y = A(x): from ``domain_shape`` to ``range_shape``, on the device where x is."""
-        return to_user_array(self.rt, self._value(x)[0])
-
-    def vjp(self, x: Any) -> tuple[Any, Callable[[Any], Any]]:
-        """Returns A(x), and the function from dL/dy to dL/dx at this x, which later calls do not change."""
-        y, back = self._value(x)
-
-        def by_x(by_y: Any) -> Any:
-            return to_user_array(self.rt, back(self._to_array(self._range, by_y)))
-
-        return to_user_array(self.rt, y), by_x
-
-    def derivative(self, x: Any) -> Any:
-        """Returns the derivative at x, whose ``T`` maps dL/dy (range_shape) to dL/dx (domain_shape). It computes A(x)."""
-        return Derivative(self.vjp(x)[1])
-
-    @property
-    def T(self) -> "LinearOperator":  # noqa: N802
-        """The exact transpose of a ``LinearOperator``; InputError for any other operator."""
-        raise self._not_linear()
-
-    def frames(self, chosen: Sequence[int]) -> Any:
-        """Returns the operator of some of the frames, by their numbers from 0, in this order. It shares all memory.
-
-        Raises InputError for numbers of missing frames, for no number, and for an operator without frames."""
-        if self._frames is None:
-            raise InputError("frames", repr(self), "an operator from something to frames")
-        count = self._range[1][0] or 0
-        numbers = list(chosen) if isinstance(chosen, Sequence | np.ndarray) else []
-        if not numbers or not all(_is_index(number, count) for number in numbers):
-            raise InputError("frames", checks.short_repr(chosen), f"at least one whole number from 0 to {count - 1}")
-        return self._frames([int(f) for f in numbers])
-
-    @cached_property
-    def intensity(self) -> "Operator":
-        """The operator of a detector that averages photons over an exposure: −ln Σ w exp(−p) over a line's times.
-
-        Without it a line is Σ w p. Raises InputError where it does not exist (transposes, voxels)."""
-        if self._intensity is None:
-            raise InputError("intensity", repr(self), "an operator from something to line integrals")
-        return self._intensity()
-
-    def __repr__(self) -> str:
-        domain, range_ = (f"{name} {_text(shape)}" for name, shape in (self._domain, self._range))
-        return f"{type(self).__name__}({domain} to {range_} on {self.rt.device.name})"
-
-    def _value(self, x: Any) -> tuple[Values, Map]:
-        return self._at(self._to_array(self._domain, x))
-
-    def _to_array(self, side: tuple[str, Shape], values: Any) -> Values:
-        """Returns an x or a y as float32 in C order, on the host or the device where it is; copied only if it must be."""
-        array = adopted(side[0], values, self.queue) if is_cl_array(values) else on_host(side[0], values)
-        checks.shape(side[0], array, side[1])  # type: ignore[arg-type]
-        return array
-
-
-@dataclass(frozen=True)
-class Derivative:
-    """The derivative of an operator at one x. T: the function from dL/dy to dL/dx, whatever is computed later."""
-
-    T: Map
-
-
-class LinearOperator(Operator, ScipyOperator):
-    """An ``Operator`` that is linear, and therefore a scipy.sparse.linalg.LinearOperator too.
-
-    ``A.T`` is the exact transpose, at any time. For SciPy, ``A.shape`` is (size of y, size of x), and vectors are flat,
-    float32, in C order: ``scipy.sparse.linalg.lsqr(A, y.ravel())``, ``A @ x.ravel()``, ``A.T @ A``.
-
-    rt, domain, range_, parts: those of ``Operator``. forward, adjoint: the two functions of values. Raises InputError as
-    ``Operator`` does."""
-
-    def __init__(
-        self, rt: Runtime, domain: tuple[str, Shape], range_: tuple[str, Shape], forward: Map, adjoint: Map,
-        **parts: Any,
-    ) -> None:
-        Operator.__init__(self, rt, domain, range_, lambda x: (forward(x), adjoint), **parts)
-        ScipyOperator.__init__(self, np.float32, (_size(range_), _size(domain)))
-        self._pair = forward, adjoint
-
-    shape = (0, 0)  # SciPy's attribute, in place of the property: each instance sets it
-    __matmul__ = ScipyOperator.__matmul__
-
-    @property
-    def T(self) -> "LinearOperator":  # noqa: N802
-        """The exact transpose: frames (F, rows, columns) to x, by the forward weights."""
-        return LinearOperator(self.rt, self._range, self._domain, *self._pair[::-1])
-
-    def derivative(self, x: Any) -> "LinearOperator":
-        """Returns the operator itself: it is linear."""
-        return self
-
-    def _matvec(self, x: np.ndarray) -> np.ndarray:
-        return self(np.reshape(x, self.domain_shape)).ravel()
-
-    def _rmatvec(self, y: np.ndarray) -> np.ndarray:
-        return self.T(np.reshape(y, self.range_shape)).ravel()
-
-    def _transpose(self) -> "LinearOperator":
-        return self.T
-
-    _adjoint = _transpose  # of real numbers
 
 
 def as_torch(operator: Operator) -> Callable[..., Any]:
@@ -282,21 +75,3 @@ def as_torch(operator: Operator) -> Callable[..., Any]:
         return (Linear if isinstance(of, LinearOperator) else Curved).apply(x, of)
 
     return function
-
-
-def _is_index(number: object, count: int) -> bool:
-    is_whole = isinstance(number, int | np.integer) and not isinstance(number, bool)
-    return is_whole and 0 <= number < count  # type: ignore[operator]
-
-
-def _text(shape: Shape) -> str:
-    return f"({', '.join('any' if n is None else str(n) for n in shape)})"
-
-
-def _ends_with(shape: tuple[int, ...], side: Shape) -> bool:
-    last = shape[len(shape) - len(side) :]
-    return len(shape) >= len(side) and all(n in (None, size) for n, size in zip(side, last, strict=True))
-
-
-def _size(side: tuple[str, Shape]) -> int:
-    return int(np.prod([n or 1 for n in side[1]], dtype=np.int64))
