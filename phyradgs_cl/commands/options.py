@@ -7,14 +7,13 @@ from dataclasses import Field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
-from phyradgs_cl.acquisition import MOTIONS
+from phyradgs_cl.acquisition.motion import MODELS
 from phyradgs_cl.acquisition.readout import SIDES
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.commands.console import file_argument, file_option, numbers, option, pair_of
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS, Preprocessing
 from phyradgs_cl.reconstructors.voxels.priors import PRIORS
-from phyradgs_cl.removed import REMOVED
 from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
 from phyradgs_cl.settings import Settings, read_settings
 from phyradgs_cl.text import flag_of
@@ -77,42 +76,26 @@ def _of_field(one: Field[Any], makers: Mapping[str, Callable[[str, str, Any], An
     return Annotated[kind if default is not None else kind | None, option(help, usual, *flags, **more)], default
 
 
-_OF_FRAMES = of_fields(Preprocessing)
-_OF_GRID = of_fields(GridChoice)
-# Names of parameters by heading of the help. A command shows those that it has.
-RUN_GROUPS = {
-    "Basics": ("output", "method", "motion", "size", "iterations"),
-    "Volume": (*(name for name in _OF_GRID if name != "size"), "initial", "mu_water_per_mm", "rows", "slab"),
-    "Motion": ("object_motion", "strips", "sub_intervals", "segments", "time_error", "detector_model"),
-    "Quality": (
-        *("prior", "preset", "assignments"),
-        *(name for name in _OF_FRAMES if name not in _OF_GRID),
-        *("gaussians", "seed"),
-    ),
-    "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
-    "Under mpiexec (docs: cluster.md)": ("batch",),
-}
+OF_FRAMES = of_fields(Preprocessing)
+OF_GRID = of_fields(GridChoice)
+_MODELS = [model for model in MODELS if model.poses]
+_POSES = ", ".join(f"{model.poses} ({model.name})" for model in _MODELS)
+_MOTION = f"Every method takes the scan's motion; static ignores it. Poses of a frame: {_POSES}."
+OF_MOTION = {name: kind for model in MODELS for name, (kind, _) in of_fields(model).items()}
+
 _METHOD = "fdk: analytic; phyradgs, r2: splats; naf, sax-nerf: neural fields; the others: voxels (docs: methods.md)."
-_MOTION = (
-    "Every method takes the scan's motion; static ignores it. Poses of a frame: one (static), M×N micro-views, one per "
-    "line (per-row), or, for splats, integrals over time (exact), or M×N that move only centres (centres)."
-)
-_MOTIONS = tuple(name for name in MOTIONS if f"--motion {name}" not in REMOVED)
 _PRIOR = f"Prior, for fista: {' or '.join(', '.join(PRIORS).rsplit(', ', 1))}; MODULE:NAME: a denoiser of your own."
 _PRESET = "Constants: default, quick, paper (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
 _CONFIG = "TOML file of options, with underscores for dashes (docs: formats.md); the command line wins."
 _SET = "An option of the method by name: --set tv_weight=0.002 (docs: methods.md)."
 RUN_OPTIONS: dict[str, Any] = {
     "method": _asked(str, _METHOD, DEFAULT_METHOD, metavar=f"{'|'.join(METHODS)}|MODULE:NAME"),
-    "motion": _asked(Literal[_MOTIONS], _MOTION, "per-row"),
-    "strips": _asked(int, "Strips M of a frame; means micro-views.", "8"),
-    "sub_intervals": _asked(int, "Sub-intervals N of an exposure; for phyradgs means micro-views.", "by arc and voxels"),
-    "segments": _asked(int, "Segments of a frame (exact); 0: by --time-error.", "0"),
-    "time_error": _asked(float, "Relative error of averaging over time (exact).", "0.005"),
+    "motion": _asked(Literal[tuple(model.name for model in _MODELS)], _MOTION, "per-row"),
+    **OF_MOTION,
     "iterations": _asked(int, "Iterations: of voxels all frames each, of splats one frame (then 3000).", "35"),
     "prior": _asked(str, _PRIOR, "ridge", metavar="NAME|MODULE:NAME"),
     "gaussians": _asked(int, "Gaussians at the start, for splats.", "from the grid"),
-    **{name: kind for name, (kind, _) in _OF_FRAMES.items()},
+    **{name: kind for name, (kind, _) in OF_FRAMES.items()},
     "seed": _asked(int, "Seed of the random numbers.", "0"),
     "preset": _asked(str, _PRESET, "the method's first"),
     "batch": _asked(int, "Frames per step, for splats.", "as many as ranks", metavar="B"),
