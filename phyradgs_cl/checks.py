@@ -72,6 +72,16 @@ def fields_within(named: str | Callable[[str], str], options: object) -> None:
                 (whole if one.type is int else within)(subject, number, *known["range"])
 
 
+class Checked:
+    """Options as a dataclass whose fields are checked when it is made. PREFIX: what comes before a field's name in
+    messages."""
+
+    PREFIX = ""
+
+    def __post_init__(self) -> None:
+        fields_within(self.PREFIX, self)
+
+
 def one_of(subject: str, value: object, allowed: Iterable[object]) -> None:
     """Raises InputError unless ``value`` is among ``allowed``, which the message lists."""
     choices = list(allowed)
@@ -105,6 +115,14 @@ def numbers(subject: str, value: ArrayLike, expected: Sequence[int | None] | Non
         shape(subject, array, expected)
     finite(subject, array)
     return array.astype(np.float64)
+
+
+def rising(subject: str, value: ArrayLike) -> NDArray[np.float64]:
+    """Returns times (n,) as float64. Raises InputError unless there is one at least, and they rise."""
+    times = numbers(subject, value, (None,))
+    if len(times) == 0 or (np.diff(times) <= 0).any():
+        raise InputError(subject, short_repr(times.tolist()), "at least one time, rising")
+    return times
 
 
 def real_array(subject: str, value: ArrayLike) -> np.ndarray:

@@ -68,15 +68,12 @@ def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int
     return scan.trajectory, scan.shutter, frame, float(scan.frame_start_s[frame]), scan.lines
 
 
-class _Model:
+class _Model(checks.Checked):
     """What help, checks and reports know about a model of this module."""
 
     poses: ClassVar[str] = ""  # in the help of --motion: a frame's poses; without it the command line lacks the model
     counts: ClassVar[str] = ""  # its numbers in words, after its name
     is_implied: ClassVar[bool] = True  # whether a number of its own, such as --strips, means the model
-
-    def __post_init__(self) -> None:
-        checks.fields_within("", self)
 
 
 @dataclass(frozen=True)
@@ -288,6 +285,17 @@ def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
         raise InputError("--motion", checks.short_repr(motion), "a model with cells(scan, frame)")
     if isinstance(motion, MODELS) and type(motion) not in {type(model) for model in taken}:
         raise InputError("--motion", repr(motion), f"one of {', '.join(map(repr, taken))}, or a class of your own")
+
+
+class MotionOptions(checks.Checked):
+    """Options of a method, whose motion is one of ``MOTIONS`` or of a class of the user's own."""
+
+    MOTIONS: ClassVar[tuple[Motion, ...]]
+    motion: Motion
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_motion(self.motion, self.MOTIONS)
 
 
 def check_own_motion(motion: Motion | None, scan: Scan) -> None:

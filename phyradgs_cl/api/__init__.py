@@ -20,8 +20,8 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps, PoseTable, Trajectory
 from phyradgs_cl.api.calibration import calibrate, move_views, pose_gradient
-from phyradgs_cl.api.operators import as_torch
 from phyradgs_cl.api.projectors import (
+    as_torch,
     initial_gaussians,
     ray_operator,
     splat_operator,

@@ -15,7 +15,7 @@ from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.motion import MODELS, RAYS, SPLATS, motions_for
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid, triple
-from phyradgs_cl.reconstructors.method import DEFAULT_METHOD, METHODS, method_name, method_of
+from phyradgs_cl.reconstructors.method import DEFAULT_METHOD, METHODS, check_able, method_name, method_of
 from phyradgs_cl.reconstructors.preprocess import Preprocessing
 from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.removed import refuse_removed
@@ -215,10 +215,8 @@ class RunPlan:
     def __post_init__(self) -> None:
         checks.whole("--seed", self.seed, 0, LARGEST_SEED)
         object.__setattr__(self, "seed", int(self.seed))
-        if self.object_motion is not None and not method_of(self.method).takes_deformation:
-            names = ", ".join(name for name, method in METHODS.items() if method.takes_deformation)
-            expected = f"a method whose object may move: {names}"
-            raise InputError("--object-motion", f"--method {self.method_name}", expected, "choose one of them")
+        if self.object_motion is not None:
+            check_able("--object-motion", self.method, "takes_deformation", "a method whose object may move")
 
     @property
     def method_name(self) -> str:
