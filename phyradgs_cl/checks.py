@@ -2,10 +2,10 @@
 
 import importlib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import field
 from types import ModuleType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,19 +40,46 @@ def within(subject: str, value: float, lowest: float, highest: float) -> None:
         raise InputError(subject, short_repr(value), f"a number from {lowest} to {highest}")
 
 
+def option(default: T, help: str = "", usual: bool | str = True, **known: Any) -> T:
+    """Returns a dataclass's field with what its checks and the command line know about it.
+
+    usual: in words, the value of an option that is not given; True is the default. known: for ``fields_within`` its
+    ``range`` (lowest, highest), the ``words`` that it may be, ``is_positive``, and its ``subject`` in messages."""
+    return field(default=default, metadata={"help": help, "usual": usual, **known})
+
+
 def ranged(default: T, lowest: float, highest: float, subject: str = "") -> T:
-    """Returns a dataclass's field with a default. ``fields_within`` reads its bounds, and its name in messages."""
-    return field(default=default, metadata={"range": (lowest, highest), "subject": subject})
+    """Returns a dataclass's field with a default, whose bounds ``fields_within`` checks."""
+    return option(default, range=(lowest, highest), subject=subject)
 
 
-def fields_within(prefix: str, options: object) -> None:
-    """Raises InputError for a ``ranged`` field of a dataclass, or of a base class, out of its bounds. Numbers in tuples are
-    checked one by one. ``prefix`` comes before a field's name in messages."""
+def fields_within(named: str | Callable[[str], str], options: object) -> None:
+    """Raises InputError for a field of a dataclass, or of a base class, that is not what ``option`` says; None passes.
+    Numbers in tuples are checked one by one. ``named``: what comes before a field's name in messages, or a function of
+    the name."""
     own = [one for kind in reversed(type(options).__mro__) for one in getattr(kind, "__dataclass_fields__", {}).values()]
-    for name, known in {one.name: one.metadata for one in own if "range" in one.metadata}.items():
-        value = getattr(options, name)
+    for name, one in {one.name: one for one in own if one.metadata}.items():
+        known, value = one.metadata, getattr(options, name)
+        if value is None:
+            continue
+        subject = known.get("subject") or (named + name if isinstance(named, str) else named(name))
+        if "words" in known:
+            one_of(subject, value, known["words"])
         for number in value if isinstance(value, tuple) else (value,):
-            within(known["subject"] or prefix + name, number, *known["range"])
+            if "is_positive" in known:
+                positive(subject, number)
+            elif "range" in known:
+                (whole if one.type is int else within)(subject, number, *known["range"])
+
+
+class Checked:
+    """Options as a dataclass whose fields are checked when it is made. PREFIX: what comes before a field's name in
+    messages."""
+
+    PREFIX = ""
+
+    def __post_init__(self) -> None:
+        fields_within(self.PREFIX, self)
 
 
 def one_of(subject: str, value: object, allowed: Iterable[object]) -> None:
@@ -88,6 +115,14 @@ def numbers(subject: str, value: ArrayLike, expected: Sequence[int | None] | Non
         shape(subject, array, expected)
     finite(subject, array)
     return array.astype(np.float64)
+
+
+def rising(subject: str, value: ArrayLike) -> NDArray[np.float64]:
+    """Returns times (n,) as float64. Raises InputError unless there is one at least, and they rise."""
+    times = numbers(subject, value, (None,))
+    if len(times) == 0 or (np.diff(times) <= 0).any():
+        raise InputError(subject, short_repr(times.tolist()), "at least one time, rising")
+    return times
 
 
 def real_array(subject: str, value: ArrayLike) -> np.ndarray:

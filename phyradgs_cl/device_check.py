@@ -183,7 +183,7 @@ def _plain_splats(rt: Runtime) -> Iterator[Comparison]:
     rows[QUATERNION] *= 1.7
     for axis in ("rows", "columns"):
         table = static_cells(ORBIT, Shutter(0.8, 0.6, axis), 0, 0.2, SHAPE[axis == "columns"])
-        operator = operators.SplatOperator(rt, SHAPE, [table], 0.7, cutoff_sigma=0.0)
+        operator = operators.SplatProjection(rt, SHAPE, [table], 0.7, cutoff_sigma=0.0)
         point = operator.rows.enter(rt.upload(rows, np.float32))
         yield rt.download(operator.forward(point))[0], splat_frame(rows, table, SHAPE), VALUE
         found = rt.download(operator.back(point, rt.upload(h)))
@@ -191,7 +191,7 @@ def _plain_splats(rt: Runtime) -> Iterator[Comparison]:
     ones = rows.copy()
     ones[DENSITY] = 1
     densities = rt.upload(ones[DENSITY], np.float32)
-    found = rt.download(operators.DensityOperator(operator, point).forward(densities))
+    found = rt.download(operator.forward(operator.rows.with_densities(point, densities)))
     yield found[0], splat_frame(ones, table, SHAPE), VALUE
 
 

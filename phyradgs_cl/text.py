@@ -21,6 +21,11 @@ def plain_text(text: str) -> str:
     return _UNPRINTABLE.sub("\ufffd", text)
 
 
+def flag_of(name: str) -> str:
+    """Returns the option of the command line for a field or an argument: ``--start-deg`` for ``start_deg``."""
+    return "--" + name.replace("_", "-")
+
+
 def suggest_name(name: object, known_names: Iterable[str], otherwise: str) -> str:
     """Returns the advice to use the known name that is most similar, or ``otherwise``."""
     close = difflib.get_close_matches(str(name)[:200], list(known_names), n=1)

@@ -28,6 +28,7 @@ _MOST_TIMES = 100  # most times per exposure that ``PerRow`` chooses for fast mo
 _FINE_STEP_VOXELS = 0.3  # travel of the volume's rim, in voxels, for which ``PerRow`` takes one time
 _OBJECT_STEP_VOXELS = 0.7  # travel of the object's fastest part, in voxels, for one time: the rest of it travels less
 _COARSE_STEP_VOXELS = 3.6  # travel of rim or object, in voxels, for one time where _USUAL_TIMES are too few
+_SUB_INTERVALS = "Sub-intervals N of an exposure; for phyradgs means micro-views."
 _WEIGHT_TOLERANCE = 1e-3  # largest difference from 1 of the sum of a line's weights in a user-defined model
 
 
@@ -67,11 +68,20 @@ def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int
     return scan.trajectory, scan.shutter, frame, float(scan.frame_start_s[frame]), scan.lines
 
 
+class _Model(checks.Checked):
+    """What help, checks and reports know about a model of this module."""
+
+    poses: ClassVar[str] = ""  # in the help of --motion: a frame's poses; without it the command line lacks the model
+    counts: ClassVar[str] = ""  # its numbers in words, after its name
+    is_implied: ClassVar[bool] = True  # whether a number of its own, such as --strips, means the model
+
+
 @dataclass(frozen=True)
-class Static:
+class Static(_Model):
     """One pose per frame, at the middle of its lit span, in which any line is open. This model ignores the motion of the
     gantry."""
 
+    poses: ClassVar = "one"
     operators: ClassVar = (RAYS, SPLATS, LINE_POSES)
     name: str = field(default="static", init=False, repr=False)
 
@@ -81,7 +91,7 @@ class Static:
 
 
 @dataclass(frozen=True)
-class StaticStart:
+class StaticStart(_Model):
     """One pose per frame, at first light. The volume comes out rotated by half the lit span's arc against that of
     ``static``."""
 
@@ -94,17 +104,15 @@ class StaticStart:
 
 
 @dataclass(frozen=True)
-class MicroViews:
+class MicroViews(_Model):
     """M ``strips`` of lines × N ``sub_intervals`` poses per frame (paper, Eq. 2). Raises InputError for counts below 1."""
 
+    poses: ClassVar = "M×N"
+    counts: ClassVar = " {strips} × {sub_intervals}"
     operators: ClassVar = (RAYS, SPLATS)
     name: str = field(default="micro-views", init=False, repr=False)
-    strips: int = 8
-    sub_intervals: int = 5
-
-    def __post_init__(self) -> None:
-        checks.whole("strips", self.strips, 1, 10_000)
-        checks.whole("sub_intervals", self.sub_intervals, 1, 10_000)
+    strips: int = checks.option(8, "Strips M of a frame; means micro-views.", "8", range=(1, 10_000))
+    sub_intervals: int = checks.option(5, _SUB_INTERVALS, "by arc and voxels", range=(1, 10_000))
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """Returns the ``TimeCells`` of one frame: strips × sub-intervals cells."""
@@ -120,6 +128,8 @@ class Centres(MicroViews):
     ``strips`` of lines × ``sub_intervals`` poses per frame move the centres. Conics, extents and densities on the panel are
     those of the middle of the frame's lit span. Raises InputError for counts below 1."""
 
+    poses: ClassVar = "M×N for centres of splats"
+    is_implied: ClassVar = False
     operators: ClassVar = (SPLATS,)  # type: ignore[assignment]
     name: str = field(default="centres", init=False, repr=False)
 
@@ -131,18 +141,17 @@ class Centres(MicroViews):
 
 
 @dataclass(frozen=True)
-class PerRow:
+class PerRow(_Model):
     """Every line averages over its own window. Lines of a frame take their poses from one grid of times.
 
     ``sub_intervals`` counts the times in an exposure; 0 takes as many as the scan needs (``of``). The weight of a line in
     a cell is the fraction of its window that lies there. Raises InputError for a count below 0."""
 
+    poses: ClassVar = "one per line"
+    counts: ClassVar = ", times per exposure: {sub_intervals}"
     operators: ClassVar = (RAYS,)
     name: str = field(default="per-row", init=False, repr=False)
-    sub_intervals: int = 0
-
-    def __post_init__(self) -> None:
-        checks.whole("sub_intervals", self.sub_intervals, 0, 10_000)
+    sub_intervals: int = checks.ranged(0, 0, 10_000)
 
     def of(self, scan: Scan, object_mm_per_s: float = 0.0) -> "PerRow":
         """Returns the model with as many times as the scan needs; a stated number stays. object_mm_per_s: speed of the
@@ -168,16 +177,14 @@ class PerRow:
 
 
 @dataclass(frozen=True)
-class OwnTimes:
+class OwnTimes(_Model):
     """Every line has ``sub_intervals`` poses in its own exposure, as in the simulator. ``per-row`` is faster and as exact.
     Raises InputError for a count below 1."""
 
     operators: ClassVar = (RAYS,)
     name: str = field(default="own-times", init=False, repr=False)
-    sub_intervals: int = 5
-
-    def __post_init__(self) -> None:
-        checks.whole("sub_intervals", self.sub_intervals, 1, 10_000)
+    counts: ClassVar = ", times per line: {sub_intervals}"
+    sub_intervals: int = checks.ranged(5, 1, 10_000)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """Returns the ``TimeCells`` of one frame: ``sub_intervals`` cells for every line."""
@@ -187,7 +194,7 @@ class OwnTimes:
 
 
 @dataclass(frozen=True)
-class LineMiddles:
+class LineMiddles(_Model):
     """One pose per line, at the middle of its exposure: the model ``per-row`` of filtered backprojection."""
 
     operators: ClassVar = (LINE_POSES,)
@@ -199,20 +206,17 @@ class LineMiddles:
 
 
 @dataclass(frozen=True)
-class Exact:
+class Exact(_Model):
     """``segments`` of a frame's time, in which splats move. Every line integrates over its own window.
 
     0 segments takes as many as keep a frame's error below ``time_error``, relative to the frame's RMS. ``time_error``
     also bounds the error of quadrature over time. Raises InputError for numbers out of range."""
 
+    poses: ClassVar = "integrals over time, of splats"
     operators: ClassVar = (SPLATS,)
     name: str = field(default="exact", init=False, repr=False)
-    segments: int = 0
-    time_error: float = 0.005
-
-    def __post_init__(self) -> None:
-        checks.whole("segments (0 chooses from the time error)", self.segments, 0, 1000)
-        checks.within("time_error", self.time_error, 1e-6, 1)
+    segments: int = checks.option(0, "Segments of a frame (exact); 0: by --time-error.", "0", range=(0, 1000))
+    time_error: float = checks.option(0.005, "Relative error of averaging over time (exact).", "0.005", range=(1e-6, 1))
 
     def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
         """Returns the ``TimeCells`` of one frame, one per segment. intensity_peak: as in ``segments_for``."""
@@ -257,6 +261,13 @@ def motion_facts(motion: Motion) -> dict[str, object]:
     return {"name": str(getattr(motion, "name", type(motion).__name__)), **plain}
 
 
+def motion_in_words(facts: Mapping[str, object]) -> str:
+    """Returns a model's name and numbers in words, from its facts."""
+    name = str(facts.get("name"))
+    having = [model for model in MODELS if model.name == name and all(f.name in facts for f in fields(model))]
+    return name + (having[0].counts.format(**facts) if having else "")
+
+
 def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
     """Inverts ``motion_facts``. Returns None for a user-defined model. Values out of range raise InputError or TypeError."""
     for model in MODELS:
@@ -274,6 +285,17 @@ def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
         raise InputError("--motion", checks.short_repr(motion), "a model with cells(scan, frame)")
     if isinstance(motion, MODELS) and type(motion) not in {type(model) for model in taken}:
         raise InputError("--motion", repr(motion), f"one of {', '.join(map(repr, taken))}, or a class of your own")
+
+
+class MotionOptions(checks.Checked):
+    """Options of a method, whose motion is one of ``MOTIONS`` or of a class of the user's own."""
+
+    MOTIONS: ClassVar[tuple[Motion, ...]]
+    motion: Motion
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_motion(self.motion, self.MOTIONS)
 
 
 def check_own_motion(motion: Motion | None, scan: Scan) -> None:

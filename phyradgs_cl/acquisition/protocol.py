@@ -11,7 +11,9 @@ from phyradgs_cl.acquisition.readout import Named
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.text import flag_of
 
+_PULSE = "When the beam is on, in exposures after a frame's start."
 _FEWEST_TURNS = 1e-3  # least number of turns in either direction
 _MOST_TURNS = 10_000  # largest number of turns in either direction
 
@@ -24,24 +26,21 @@ class Protocol:
     ``exposure_s`` is T_exp. ``pulse``: (start, length) of the time that the beam is on, in exposures after a frame's start;
     None: always. Raises InputError for values out of range."""
 
-    views: int = 25
-    exposure_deg: float = 14.4
-    readout_ratio: float = 0.86
-    start_deg: float = 0.0
+    views: int = checks.option(25, "Frames of the scan.", "protocol's", range=(1, 100_000))
+    exposure_deg: float = checks.option(14.4, "Arc of one exposure, degrees.", "protocol's", range=(0, 3600))
+    readout_ratio: float = checks.ranged(0.86, 0, 1000)
+    start_deg: float = checks.option(0.0, "Gantry angle at the start, degrees.", "0", range=(-1e6, 1e6))
     exposure_s: float = 1.0
     is_fly: bool = True
-    pulse: tuple[float, float] | None = None
-    turns: float = 1.0
+    pulse: tuple[float, float] | None = checks.option(None, _PULSE, "scanner's: always on")
+    turns: float = checks.option(1.0, "Turns over which the frames are spread; below 0 clockwise.", "1")
 
     def __post_init__(self) -> None:
-        checks.whole("--views", self.views, 1, 100_000)
+        checks.fields_within(flag_of, self)
         object.__setattr__(self, "views", int(self.views))
         if not (checks.is_number(self.turns) and _FEWEST_TURNS <= abs(self.turns) <= _MOST_TURNS):
             expected = f"a number from {_FEWEST_TURNS} to {_MOST_TURNS}, negative for a clockwise gantry"
             raise InputError("--turns", checks.short_repr(self.turns), expected)
-        checks.within("--start-deg", self.start_deg, -1e6, 1e6)
-        checks.within("--exposure-deg", self.exposure_deg, 0, 3600)
-        checks.within("--readout-ratio", self.readout_ratio, 0, 1000)
         if self.pulse is not None:
             self._check_pulse(*self.pulse)
 

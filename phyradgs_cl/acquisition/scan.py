@@ -33,6 +33,7 @@ from phyradgs_cl.fields import Gating, Grid, GridChoice, Metal, MovingTruth
 
 log = logging.getLogger(__name__)
 DETECTOR_MODELS = ("log", "intensity")
+MODELS_OF_METHODS = ("scan", *DETECTOR_MODELS)  # "scan": that of the scan
 APPLIED = ("flats_applied", "darks_applied")
 """The provenance's keys of the numbers of flats and darks that were applied to the counts."""
 _TITLE = "cone-beam scan"

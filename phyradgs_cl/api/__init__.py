@@ -20,8 +20,8 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps, PoseTable, Trajectory
 from phyradgs_cl.api.calibration import calibrate, move_views, pose_gradient
-from phyradgs_cl.api.operators import LinearOperator, Operator, as_torch
 from phyradgs_cl.api.projectors import (
+    as_torch,
     initial_gaussians,
     ray_operator,
     splat_operator,
@@ -44,6 +44,7 @@ from phyradgs_cl.calibrate import Calibration
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Deformation, Gating, Gaussians, Grid, States, deformed
 from phyradgs_cl.metrics import compare
+from phyradgs_cl.operators.public import LinearOperator, Operator
 from phyradgs_cl.reconstructors import Progress, Reconstruction
 from phyradgs_cl.simulation import ObjectMotion
 

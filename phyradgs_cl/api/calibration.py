@@ -8,9 +8,8 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Views, perturb
-from phyradgs_cl.api.operators import Device, runtime_of
 from phyradgs_cl.api.projectors import ray_operator, splat_operator
-from phyradgs_cl.api.runs import check_scan
+from phyradgs_cl.api.runs import Device, check_scan, runtime_of
 from phyradgs_cl.calibrate import Calibration
 from phyradgs_cl.calibrate import calibrate as run_calibration
 from phyradgs_cl.calibrate.per_view import WobbleParameters, units_of_views

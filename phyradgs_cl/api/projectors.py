@@ -1,4 +1,4 @@
-"""Operators of whole scans: from voxels or Gaussians to frames, and from Gaussians to voxels."""
+"""Operators of whole scans: from voxels or Gaussians to frames, and from Gaussians to voxels; for PyTorch too."""
 
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -10,23 +10,12 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, OwnTimes, PerRow, Scan
 from phyradgs_cl.acquisition import motion as models
-from phyradgs_cl.api.operators import (
-    Device,
-    LinearOperator,
-    Map,
-    Operator,
-    Shape,
-    Values,
-    computed,
-    moved_to,
-    runtime_of,
-)
-from phyradgs_cl.api.runs import check_scan
+from phyradgs_cl.api.runs import Device, check_scan, runtime_of
 from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.fields import Gaussians, Grid
-from phyradgs_cl.fields.gaussians import QUATERNION, ROWS, SCALE
-from phyradgs_cl.operators import DensityOperator, RayOperator, SplatOperator, VoxelOperator
+from phyradgs_cl.operators import RayOperator, SplatProjection, VoxelOperator
 from phyradgs_cl.operators import voxelise as voxelise_rows
+from phyradgs_cl.operators.public import LinearOperator, Map, Operator, Values, computed
 from phyradgs_cl.operators.rays.intensity import IntensityOperator
 from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, DEFAULT_TIME_ERROR
@@ -35,7 +24,7 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.splats.step import tables_of
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
-_FRAMES, _VOLUME, _ROWS, _DENSITY = "frames", "volume", "rows", "density"
+_FRAMES, _VOLUME = "frames", "volume"
 
 
 @naming_arguments()
@@ -95,7 +84,7 @@ def _in_new_memory(rt: Runtime, function: Callable[..., Any], values: Values, sh
 def splat_operator(
     scan: Scan, motion: str | Motion = "exact", *, affine: bool = False,
     cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, device: Device = None,
-) -> "SplatProjection":
+) -> SplatProjection:
     """Returns a scan's projector Φ (PhyRadGS, Eq. 3): ``Gaussians`` or rows (11, G) to frames (F, rows, columns).
 
     The rows are mean x y z and three scales in mm, quaternion w x y z of any length, density in 1/mm. motion: a model of
@@ -110,79 +99,15 @@ def splat_operator(
     _check_cutoff(cutoff_sigma)
     rt = runtime_of(device)
 
-    def engine(detector: str, chosen: Sequence[int]) -> SplatOperator:
+    def projection(detector: str, chosen: Sequence[int], **average: Any) -> SplatProjection:
         tables, merges = tables_of(scan, model, detector)
-        return SplatOperator(
+        return SplatProjection(
             rt, scan.geometry.detector_shape, [tables[f] for f in chosen], scan.grid.half_longest_mm,
             intensity=merges, affine=affine, cutoff_sigma=cutoff_sigma,
-            time_error=getattr(model, "time_error", DEFAULT_TIME_ERROR),
+            time_error=getattr(model, "time_error", DEFAULT_TIME_ERROR), **average,
         )
 
-    everything = range(scan.frames)
-    return SplatProjection(engine("log", everything), everything, partial(engine, "intensity"))
-
-
-class GaussianOperator(Operator):
-    """An ``Operator`` on Gaussians, or on their parameter rows (11, G)."""
-
-    def __init__(self, engine: SplatOperator | VoxelOperator, range_: tuple[str, Shape], **parts: Any) -> None:
-        self._engine = engine
-        super().__init__(engine.rt, (_ROWS, (ROWS, None)), range_, self._at_rows, **parts)
-
-    def _at_rows(self, rows: Values) -> tuple[Values, Map]:
-        rt, engine = self.rt, self._engine
-        point = engine.rows.enter(moved_to(rt, rows, True))
-        y = moved_to(rt, engine.forward(point), isinstance(rows, DeviceArray))
-        return y, partial(computed, rt, True, partial(engine.back, point))
-
-    def _to_array(self, side: tuple[str, Shape], values: Any) -> Values:
-        array = super()._to_array(side, values.rows() if isinstance(values, Gaussians) else values)
-        if isinstance(array, np.ndarray) and side is self._domain:
-            _check_rows(array)
-        return array
-
-
-class SplatProjection(GaussianOperator):
-    """The ``Operator`` from Gaussians to frames that ``splat_operator`` returns."""
-
-    _instead = f"of_densities(gaussians) is linear in densities; {Operator._instead}"
-
-    def __init__(
-        self, engine: SplatOperator, chosen: Sequence[int], intensity: Callable[[Sequence[int]], SplatOperator] | None
-    ) -> None:
-        """Takes an engine for the ``chosen`` frames; ``intensity`` makes one that averages photons in given frames."""
-        self._splats = engine
-        super().__init__(
-            engine, (_FRAMES, engine.frames_shape),
-            frames=lambda few: SplatProjection(engine.subset(few), [chosen[f] for f in few], intensity),
-            intensity=None if intensity is None else lambda: SplatProjection(intensity(chosen), chosen, None),
-        )
-
-    def by_poses(self, gaussians: Any, by_frames: Any) -> np.ndarray:
-        """Returns dL/d(turn in rad, shifts along columns and rows in pixels), (F, 3), from dL/dframes (F, rows, columns).
-        Raises InputError for an operator that averages intensities."""
-        rt, engine = self.rt, self._splats
-        if engine.is_layered:
-            raise InputError("by_poses", "averages of intensity", "averages of line integrals")
-        point = engine.rows.enter(moved_to(rt, self._to_array(self._domain, gaussians), True))
-        return engine.by_poses(point, moved_to(rt, self._to_array(self._range, by_frames), True))
-
-    def of_densities(self, gaussians: Gaussians) -> LinearOperator:
-        """Returns the linear operator from densities (G,) in 1/mm to frames; centres and shapes are those of ``gaussians``.
-        Raises InputError for an operator that averages intensities, which is not linear."""
-        rt, engine, rows = self.rt, self._splats, self._to_array(self._domain, gaussians)
-        if engine.is_layered:
-            raise InputError("of_densities", "averages of intensity", "averages of line integrals, which are linear")
-        linear = DensityOperator(engine, engine.rows.enter(moved_to(rt, rows, True)))
-        return _densities(rt, linear, rows.shape[1], engine.frames_shape)
-
-
-def _densities(rt: Runtime, engine: DensityOperator, count: int, frames_shape: Shape) -> LinearOperator:
-    return LinearOperator(
-        rt, (_DENSITY, (count,)), (_FRAMES, frames_shape), partial(computed, rt, True, engine.forward),
-        partial(computed, rt, True, engine.adjoint),
-        frames=lambda few: _densities(rt, engine.subset(few), count, (len(few), *frames_shape[1:])),
-    )
+    return projection("log", range(scan.frames), average=partial(projection, "intensity"))
 
 
 @naming_arguments()
@@ -194,8 +119,7 @@ def voxel_operator(grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, de
 
     Raises InputError for anything but a Grid, and for a cutoff out of range."""
     _check_cutoff(cutoff_sigma)
-    engine = VoxelOperator(runtime_of(device), _a_grid(grid), cutoff_sigma=cutoff_sigma)
-    return GaussianOperator(engine, (_VOLUME, grid.shape))
+    return VoxelOperator(runtime_of(device), _a_grid(grid), cutoff_sigma=cutoff_sigma)
 
 
 @naming_arguments()
@@ -234,6 +158,55 @@ def initial_gaussians(scan: Scan, count: int = 0, *, seed: int = 0, device: Devi
     return Gaussians.from_rows(rows).scaled(scale.length_mm, scale.density_per_mm)
 
 
+def as_torch(operator: Operator) -> Callable[..., Any]:
+    """Returns the operator as a function of tensors that PyTorch can differentiate: ``f(x)``, or ``f(x, frames=[3])``.
+
+    x (domain_shape) may be on any device and of any floating type; y (range_shape) is like it. The work is done in float32
+    on the operator's device; float32 tensors on the host are not copied, by DLPack. Linear operators can be differentiated
+    any number of times, others once. ``backward`` does not project x again.
+
+    Raises InputError where PyTorch is not installed, for anything but an operator or a tensor, and as the operator does."""
+    torch: Any = checks.package("torch", "for as_torch", "torch")
+    if not isinstance(operator, Operator):
+        expected = "what ray_operator, splat_operator or voxel_operator gives"
+        raise InputError("operator", type(operator).__name__, expected)
+
+    def array(tensor: Any) -> np.ndarray:  # DLPack works with any pair of versions of torch and numpy
+        return np.from_dlpack(tensor.detach().to("cpu", torch.float32).contiguous())
+
+    def tensor(values: np.ndarray, like: Any) -> Any:
+        return torch.from_dlpack(values).to(like.device, like.dtype)
+
+    class Linear(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, x: Any, of: LinearOperator) -> Any:
+            ctx.of = of
+            return tensor(of(array(x)), x)
+
+        @staticmethod
+        def backward(ctx: Any, by_y: Any) -> tuple[Any, None]:
+            return Linear.apply(by_y, ctx.of.T), None
+
+    class Curved(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx: Any, x: Any, of: Operator) -> Any:
+            y, ctx.back = of.vjp(array(x))
+            return tensor(y, x)
+
+        @staticmethod
+        @torch.autograd.function.once_differentiable
+        def backward(ctx: Any, by_y: Any) -> tuple[Any, None]:
+            return tensor(ctx.back(array(by_y)), by_y), None
+
+    def function(x: Any, frames: Sequence[int] | None = None) -> Any:
+        if not isinstance(x, torch.Tensor):
+            raise InputError("x", checks.short_repr(x), "a tensor", "of a cloud, torch.tensor(cloud.rows())")
+        of = operator if frames is None else operator.frames(frames)
+        return (Linear if isinstance(of, LinearOperator) else Curved).apply(x, of)
+
+    return function
+
+
 def _checked(scan: Scan, motion: str | Motion, *kinds: str) -> Motion:
     """Returns the motion model that a name or object means. Raises InputError where scan or operators do not suit it."""
     check_scan(scan)
@@ -251,10 +224,3 @@ def _a_grid(grid: Grid) -> Grid:
 
 def _check_cutoff(cutoff_sigma: float) -> None:
     checks.within("cutoff_sigma (0 cuts nothing off)", cutoff_sigma, 0, 100)
-
-
-def _check_rows(rows: np.ndarray) -> None:
-    """Raises InputError for rows whose rendering would be NaN."""
-    checks.finite(_ROWS, rows)
-    if (rows[SCALE] <= 0).any() or not rows[QUATERNION].any(axis=0).all():
-        raise InputError(_ROWS, "a scale or a quaternion's length of 0 or less", "scales and lengths above 0")

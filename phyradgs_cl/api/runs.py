@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import lru_cache
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,6 @@ import numpy as np
 
 from phyradgs_cl import __version__, checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.api.operators import Device, runtime_of
 from phyradgs_cl.errors import InputError, naming_arguments
 from phyradgs_cl.exporters import CLOUDS, export_stored, foreign_suffix, format_of
 from phyradgs_cl.fields import Deformation, Grid
@@ -36,9 +36,26 @@ from phyradgs_cl.reconstructors import reconstruct as run_method
 from phyradgs_cl.reconstructors.plan import InitialVolume, plan_run
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.reconstructors.result import ProgressReport, ignore_progress, interrupted
+from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.signals import keep_finished_work
 from phyradgs_cl.simulation import OPTION_NAMES, scanner_for, scanner_options, simulated_scan
 from phyradgs_cl.text import suggest_name
+
+Device = str | Runtime | None
+"""The argument ``device``: what ``--device`` takes, or a Runtime."""
+
+
+def runtime_of(device: Device) -> Runtime:
+    """Returns the Runtime for the argument ``device``; None is the best device."""
+    if isinstance(device, Runtime):
+        return device
+    return _runtime_by_name(None if device is None else str(device))
+
+
+@lru_cache(maxsize=4)
+def _runtime_by_name(name: str | None) -> Runtime:
+    """Returns the one Runtime of a device's name, so that programs are built once."""
+    return Runtime(name)
 
 
 @naming_arguments()

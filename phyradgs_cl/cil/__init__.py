@@ -12,7 +12,7 @@ from cil.optimisation.operators import BlockOperator, LinearOperator
 
 from phyradgs_cl.acquisition.scans_from import poses_of_astra
 from phyradgs_cl.api import Grid, Motion, Scan, Shutter, ray_operator, reconstruct
-from phyradgs_cl.api.operators import Device
+from phyradgs_cl.api.runs import Device
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import triple
 

@@ -1,22 +1,21 @@
 """The command import: turns a scan of another program into a scan file."""
 
 from contextlib import suppress
-from dataclasses import Field, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.scan import APPLIED
 from phyradgs_cl.commands.console import file_argument, file_option, option, remark, say
-from phyradgs_cl.commands.options import RoiMm, Size, VoxelMm, lengths, pitches, with_options
+from phyradgs_cl.commands.options import lengths, of_fields, pitches, with_options
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.importers import FORMATS, ImportOptions, import_scan, recognise
 from phyradgs_cl.importers.formats.tiff_folder import TEMPLATE
 from phyradgs_cl.importers.frames import TAKEN
-from phyradgs_cl.importers.options import WORDS, option_name
+from phyradgs_cl.importers.options import option_name
 from phyradgs_cl.io import file_kind, only_run, refuse_overwriting, write_scan
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import check_output
@@ -46,36 +45,27 @@ GROUPS = {
 }
 
 
-def _annotated(one: Field[Any]) -> tuple[Any, Any]:
-    words = one.metadata["help"], one.metadata["usual"]
-    if one.name in _PAIRS:
-        return Annotated[Any, _PAIRS[one.name](option_name(one.name), *words)], None
-    flag = "--" + one.name.replace("_", "-")
-    kind: Any = Literal[WORDS[one.name]] if one.name in WORDS else list[str] if one.name == "at" else one.type
-    return Annotated[kind if one.default is not None else kind | None, option(*words, flag)], one.default
-
-
 _PAIRS = {"pixel_size_mm": pitches, "detector_offset_mm": lengths}
-_OPTIONS = {one.name: _annotated(one) for one in fields(ImportOptions) if one.metadata}
 
 
-@with_options("options", _OPTIONS, lambda given: ImportOptions(**given, named=option_name))
+_OF_GRID = {name: known for name, known in of_fields(GridChoice).items() if name != "margin_mm"}
+
+
+@with_options("grid", _OF_GRID, lambda given: GridChoice(**given))
+@with_options("options", of_fields(ImportOptions, _PAIRS), lambda given: ImportOptions(**given, named=option_name))
 def import_command(
     source: Annotated[Path, file_argument("SRC", "File or folder of another program (docs: import.md).")],
     options: ImportOptions,
+    grid: GridChoice,
     output: Annotated[Path | None, file_option("Scan file to write; an existing one is replaced.", "--output", "-o")] = None,
     template: Annotated[bool, option(_TEMPLATE, True, "--template")] = False,
     form: Annotated[FormatName | None, option("Format of SRC.", "recognised", "--format")] = None,  # type: ignore[valid-type]
-    size: Size = None,
-    voxel_mm: VoxelMm = None,
-    roi_mm: RoiMm = None,
 ) -> None:
     if template:
         say(TEMPLATE)
         return
     if output is None:
         raise InputError("--output", "nothing", "a scan file to write", "say -o scan.h5")
-    grid = GridChoice(size, voxel_mm, roi_mm)
     _refuse_overwriting(source, output)
     check_output(output)
     format_name = form or recognise(source)

@@ -3,19 +3,20 @@
 import functools
 import inspect
 from collections.abc import Callable, Mapping
+from dataclasses import Field, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args, get_origin
 
-from phyradgs_cl.acquisition import MOTIONS
+from phyradgs_cl.acquisition.motion import MODELS
 from phyradgs_cl.acquisition.readout import SIDES
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.commands.console import file_argument, file_option, numbers, option, pair_of
-from phyradgs_cl.prepare import DEFAULT_STEPS, STEPS
-from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS
+from phyradgs_cl.fields import GridChoice
+from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS, Preprocessing
 from phyradgs_cl.reconstructors.voxels.priors import PRIORS
-from phyradgs_cl.removed import REMOVED
 from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
 from phyradgs_cl.settings import Settings, read_settings
+from phyradgs_cl.text import flag_of
 
 LARGEST_MM = 1e6  # largest size of lengths in mm that an option takes
 First = Literal[SIDES]  # type: ignore[valid-type]
@@ -31,14 +32,9 @@ Memory = Annotated[str | None, option(_MEMORY, "what the device has", metavar="S
 _OBJECT_MOTION = "Deformation file, or simulated scan, with the motion of the object during the scan (docs: moving.md)."
 ObjectMotion = Annotated[Path | None, file_option(_OBJECT_MOTION, "--object-motion")]
 
-IgnoreLag = Annotated[bool, option("Leave the scan's lag in the frames.", True, "--ignore-lag")]
 _CHECKPOINT = "Seconds from checkpoint to checkpoint of a run, which continues from its last; 0: on Ctrl-C only."
 CheckpointEvery = Annotated[float, option(_CHECKPOINT, metavar="SECONDS")]
 CHECKPOINT_EVERY_S = 600.0  # default time between checkpoints
-
-_STEPS = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
-STEPS_OF_PREPARE = option(_STEPS, DEFAULT_STEPS, metavar="NAME,...")
-Steps = Annotated[str | None, option(_STEPS, "none", metavar="NAME,...")]
 
 
 def lengths(flag: str, help: str, default: str) -> Any:
@@ -56,34 +52,38 @@ def _asked(kind: Any, help: str, default: str, *flags: str, **more: Any) -> Any:
     return Annotated[kind | None, option(help, default, *flags, **more)]
 
 
-def _numbers(help: str, metavar: str, *flags: str, default: str = "the scan's") -> Any:
-    """Returns an option of numbers with commas between, which are checked where they are used."""
-    return Annotated[Any, option(help, default, *flags, parser=numbers, metavar=metavar)]
+_NONE: Mapping[str, Any] = {}
 
 
-Size = _numbers("Voxels of the volume; a single number: along its longest side. The box stays.", "N|Z,Y,X")
-VoxelMm = _numbers("Sides of a voxel, mm; the box stays.", "D|Z,Y,X")
-_ROI = "Box of the volume about the axis, mm, or its sides about the scan's middle; the voxels stay."
-RoiMm = _numbers(_ROI, "D|Z,Y,X|Z0,Z1,Y0,Y1,X0,X1", "--roi-mm", "--roi")
-_MARGIN = "Width around the box, mm, that is reconstructed and discarded: for objects larger than box or panel."
+def of_fields(kind: type, makers: Mapping[str, Callable[[str, str, Any], Any]] = _NONE) -> dict[str, tuple[Any, Any]]:
+    """Returns the options of a command, (annotation, default) by name, for the fields of a dataclass that have a help text.
 
-# Names of parameters by heading of the help. A command shows those that it has.
-RUN_GROUPS = {
-    "Basics": ("output", "method", "motion", "size", "iterations"),
-    "Volume": ("voxel_mm", "roi_mm", "margin_mm", "initial", "mu_water_per_mm", "rows", "slab"),
-    "Motion": ("object_motion", "strips", "sub_intervals", "segments", "time_error", "detector_model"),
-    "Quality": (
-        *("prior", "preset", "assignments", "holdout", "doubt", "steps", "ignore_lag", "gaussians", "seed"),
-    ),
-    "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
-    "Under mpiexec (docs: cluster.md)": ("batch",),
-}
+    makers: functions of (flag, help, usual) that return an option, by field, for values of forms of their own. Other
+    fields of tuples take numbers with commas between, which are checked where they are used."""
+    return {one.name: _of_field(one, makers) for one in fields(kind) if one.metadata.get("help")}
+
+
+def _of_field(one: Field[Any], makers: Mapping[str, Callable[[str, str, Any], Any]]) -> tuple[Any, Any]:
+    known = one.metadata
+    help, usual, flags = known["help"], known["usual"], [flag_of(one.name), *([known["flag"]] if "flag" in known else [])]
+    default = one.default if usual is True else None
+    if one.name in makers:
+        return Annotated[Any, makers[one.name](flags[-1], help, usual)], default
+    more: dict[str, Any] = {"metavar": known["metavar"]} if "metavar" in known else {}
+    kind: Any = Literal[known["words"]] if "words" in known else known.get("kind", one.type)
+    if any(get_origin(part) is tuple for part in get_args(kind)):
+        return Annotated[Any, option(help, usual, *flags, parser=numbers, **more)], default
+    return Annotated[kind if default is not None else kind | None, option(help, usual, *flags, **more)], default
+
+
+OF_FRAMES = of_fields(Preprocessing)
+OF_GRID = of_fields(GridChoice)
+_MODELS = [model for model in MODELS if model.poses]
+_POSES = ", ".join(f"{model.poses} ({model.name})" for model in _MODELS)
+_MOTION = f"Every method takes the scan's motion; static ignores it. Poses of a frame: {_POSES}."
+OF_MOTION = {name: kind for model in MODELS for name, (kind, _) in of_fields(model).items()}
+
 _METHOD = "fdk: analytic; phyradgs, r2: splats; naf, sax-nerf: neural fields; the others: voxels (docs: methods.md)."
-_MOTION = (
-    "Every method takes the scan's motion; static ignores it. Poses of a frame: one (static), M×N micro-views, one per "
-    "line (per-row), or, for splats, integrals over time (exact), or M×N that move only centres (centres)."
-)
-_MOTIONS = tuple(name for name in MOTIONS if f"--motion {name}" not in REMOVED)
 _PRIORS = ", ".join(PRIORS).replace("piccs", "piccs (with --initial)")
 _PRIOR = (
     f"Prior, for fista: {' or '.join(_PRIORS.rsplit(', ', 1))}; MODULE:NAME: a denoiser of your own, a tenth of its change "
@@ -92,32 +92,20 @@ _PRIOR = (
 _PRESET = "Constants: default, quick, paper (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
 _CONFIG = "TOML file of options, with underscores for dashes (docs: formats.md); the command line wins."
 _SET = "An option of the method by name: --set tv_weight=0.002 (docs: methods.md)."
-_DOUBT = "Run twice more, for an error bar of every voxel: dataset doubt of the volume file (docs: methods.md)."
-_HOLDOUT = "Pixels hidden from the method, to measure its error on them."
 RUN_OPTIONS: dict[str, Any] = {
     "method": _asked(str, _METHOD, DEFAULT_METHOD, metavar=f"{'|'.join(METHODS)}|MODULE:NAME"),
-    "motion": _asked(Literal[_MOTIONS], _MOTION, "per-row"),
-    "strips": _asked(int, "Strips M of a frame; means micro-views.", "8"),
-    "sub_intervals": _asked(int, "Sub-intervals N of an exposure; for phyradgs means micro-views.", "by arc and voxels"),
-    "segments": _asked(int, "Segments of a frame (exact); 0: by --time-error.", "0"),
-    "time_error": _asked(float, "Relative error of averaging over time (exact).", "0.005"),
+    "motion": _asked(Literal[tuple(model.name for model in _MODELS)], _MOTION, "per-row"),
+    **OF_MOTION,
     "iterations": _asked(int, "Iterations: of voxels all frames each, of splats one frame (then 3000).", "35"),
     "prior": _asked(str, _PRIOR, "ridge", metavar="NAME|MODULE:NAME"),
     "gaussians": _asked(int, "Gaussians at the start, for splats.", "from the grid"),
-    "size": Size,
-    "voxel_mm": VoxelMm,
-    "roi_mm": RoiMm,
-    "margin_mm": _numbers(_MARGIN, "D|Z,Y,X", default="0"),
+    **{name: kind for name, (kind, _) in OF_FRAMES.items()},
     "seed": _asked(int, "Seed of the random numbers.", "0"),
     "preset": _asked(str, _PRESET, "the method's first"),
     "batch": _asked(int, "Frames per step, for splats.", "as many as ranks", metavar="B"),
     "config": Annotated[Path | None, file_option(_CONFIG, "--config")],
     "assignments": Annotated[list[str] | None, option(_SET, True, "--set", metavar="NAME=VALUE")],
     "detector_model": _asked(DetectorModel, "An exposure averages line integrals (log) or intensity.", "the scan's"),
-    "ignore_lag": IgnoreLag,
-    "steps": Steps,
-    "holdout": _asked(float, _HOLDOUT, "0", metavar="PERCENT"),
-    "doubt": Annotated[bool, option(_DOUBT, True, "--doubt")],
     "device": Device,
     "memory": Memory,
 }
@@ -127,14 +115,16 @@ def with_run_options(*without: str) -> Callable[[Callable[..., Any]], Callable[.
     """Returns a decorator that gives a command the options of a reconstruction, except ``without``, in place of its
     parameter ``settings``."""
 
-    def settings(options: dict[str, Any]) -> Settings:
-        given = {name: None if value is False else value for name, value in options.items()}  # False: a flag not given
-        config, assignments = given.pop("config"), given.pop("assignments") or []
-        return read_settings(config, given, assignments)
-
     kinds = {name: kind for name, kind in RUN_OPTIONS.items() if name not in without}
     options = {name: (kind, False if get_args(kind)[0] is bool else None) for name, kind in kinds.items()}
-    return with_options("settings", options, settings)
+    return with_options("settings", options, settings_of)
+
+
+def settings_of(options: dict[str, Any]) -> Settings:
+    """Returns the settings of a command with options ``config`` and ``assignments``."""
+    given = {name: None if value is False else value for name, value in options.items()}  # False: a flag not given
+    config, assignments = given.pop("config"), given.pop("assignments") or []
+    return read_settings(config, given, assignments)
 
 
 def with_options(

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from phyradgs_cl.commands.console import AsJson, file_option, option, say
-from phyradgs_cl.commands.options import STEPS_OF_PREPARE, Device, IgnoreLag, Memory, Output, Scan
-from phyradgs_cl.prepare import DEFAULT_STEPS
+from phyradgs_cl.commands.options import RUN_OPTIONS, Device, Memory, Output, Scan, settings_of, with_options
+from phyradgs_cl.prepare.chain import DEFAULT_STEPS, STEPS_HELP
 from phyradgs_cl.progress import Ticker
-from phyradgs_cl.settings import read_settings
+from phyradgs_cl.settings import Settings
 from phyradgs_cl.workflow import run_preparation
 
 EXAMPLES = {"prepare": "Example: phyradgs prepare scan.h5 -o clean.h5 --steps sparks,dead,rings --set rings.window=11"}
@@ -22,22 +22,26 @@ _CONFIG = "TOML file of steps and their tables; the command line wins."
 _SET = "An option of a step, as --set rings.window=11 (docs: prepare.md)."
 
 
-def prepare_command(
-    scan: Scan, output: Output, steps: Annotated[str | None, STEPS_OF_PREPARE] = None,
-    config: Annotated[Path | None, file_option(_CONFIG, "--config")] = None,
-    assignments: Annotated[list[str] | None, option(_SET, True, "--set", metavar="NAME=VALUE")] = None,
-    ignore_lag: IgnoreLag = False, as_json: AsJson = False, device: Device = None, memory: Memory = None,
-) -> None:
+_OPTIONS = {
+    "steps": (Annotated[str | None, option(STEPS_HELP, DEFAULT_STEPS, metavar="NAME,...")], None),
+    "config": (Annotated[Path | None, file_option(_CONFIG, "--config")], None),
+    "assignments": (Annotated[list[str] | None, option(_SET, True, "--set", metavar="NAME=VALUE")], None),
+    "ignore_lag": (RUN_OPTIONS["ignore_lag"], False),
+    "device": (Device, None),
+    "memory": (Memory, None),
+}
+
+
+@with_options("settings", _OPTIONS, settings_of)
+def prepare_command(scan: Scan, output: Output, settings: Settings, as_json: AsJson = False) -> None:
     """Correct the effects of panel and beam in a scan: write line integrals and a mask, and print each step's numbers.
 
     The same steps are options of reconstruct; this command keeps the corrected scan. The default steps find out by
     themselves whether there is something to correct."""
-    given = {"steps": steps, "ignore_lag": ignore_lag or None, "device": device, "memory": memory}
-    settings = read_settings(config, given, assignments or [])
     preprocessing = settings.preprocessing({"steps": DEFAULT_STEPS})
     with Ticker("step") as ticker, settings.naming_origins():
         ticker.stage(f"preparing {scan.name}")
-        done, before = run_preparation(scan, output, preprocessing, settings.runtime, config)
+        done, before = run_preparation(scan, output, preprocessing, settings.runtime, settings.config)
     if as_json:
         say(json.dumps({"scan": str(scan), "output": str(output), "steps": done, "steps_before": before}))
     else:

@@ -13,7 +13,9 @@ from phyradgs_cl.acquisition.plausible import blur_line
 from phyradgs_cl.commands.console import complain, file_option, last_words, option, say, scores
 from phyradgs_cl.commands.options import (
     CHECKPOINT_EVERY_S,
-    RUN_GROUPS,
+    OF_FRAMES,
+    OF_GRID,
+    OF_MOTION,
     CheckpointEvery,
     ObjectMotion,
     Output,
@@ -40,7 +42,19 @@ EXAMPLES = {
     ),
     "estimate": "Example: phyradgs estimate scan.h5 --method fista-tv --motion per-row",
 }
-GROUPS = {"reconstruct": RUN_GROUPS, "estimate": RUN_GROUPS}
+_GROUPS = {
+    "Basics": ("output", "method", "motion", "size", "iterations"),
+    "Volume": (*(name for name in OF_GRID if name != "size"), "initial", "mu_water_per_mm", "rows", "slab"),
+    "Motion": ("object_motion", *OF_MOTION, "detector_model"),
+    "Quality": (
+        *("prior", "preset", "assignments"),
+        *(name for name in OF_FRAMES if name not in OF_GRID),
+        *("gaussians", "seed"),
+    ),
+    "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
+    "Under mpiexec (docs: cluster.md)": ("batch",),
+}
+GROUPS = {"reconstruct": _GROUPS, "estimate": _GROUPS}  # a command shows the parameters that it has
 _ROWS = "Detector rows of a parallel scan to read and reconstruct; row 0 is the lowest."
 _SLAB = "Rows of a parallel scan at a time: slabs, kept on disk as they are done."
 _WATER = "Attenuation of water in 1/mm, for --initial in Hounsfield units that does not state its scale."

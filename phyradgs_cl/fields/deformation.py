@@ -48,9 +48,7 @@ class Deformation:
         spacing_mm = checks.numbers("deformation spacing_mm", np.broadcast_to(self.spacing_mm, 3), (3,))
         if (spacing_mm <= 0).any():
             raise InputError("deformation spacing_mm", str(self.spacing_mm), "lengths above 0")
-        times_s = checks.numbers("deformation times_s", self.times_s, (None,))
-        if len(times_s) == 0 or (np.diff(times_s) <= 0).any():
-            raise InputError("deformation times_s", checks.short_repr(times_s.tolist()), "at least one time, rising")
+        times_s = checks.rising("deformation times_s", self.times_s)
         weights = checks.numbers("deformation weights", self.weights, (len(times_s), len(control_mm)))
         object.__setattr__(self, "control_mm", control_mm)
         object.__setattr__(self, "origin_mm", tuple(origin_mm.tolist()))

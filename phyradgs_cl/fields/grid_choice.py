@@ -7,9 +7,15 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl import checks
+from phyradgs_cl.checks import option
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import MOST_VOXELS, Grid, triple
 
+_SIZE = "Voxels of the volume; a single number: along its longest side. The box stays."
+_VOXEL = "Sides of a voxel, mm; the box stays."
+_ROI = "Box of the volume about the axis, mm, or its sides about the scan's middle; the voxels stay."
+_MARGIN = "Width around the box, mm, that is reconstructed and discarded: for objects larger than box or panel."
+_SCAN = "the scan's"
 _LARGEST_MM = 1e9  # upper limit in mm of a length that an option takes; the lower limit of widths is 1e-9 mm
 _ROUNDING = 1e-6  # a box's end and a voxel's face at most this far apart, in voxels, count as one place
 # a typed box's end and a face of the scan's voxels at most this far apart, in voxels, count as one place: the voxels' sides
@@ -29,10 +35,10 @@ class GridChoice:
 
     Raises InputError for other values, a box that ends before it begins, and all of size, voxel_mm and roi_mm."""
 
-    size: int | tuple[int, ...] | None = None
-    voxel_mm: float | tuple[float, ...] | None = None
-    roi_mm: tuple[float, ...] | None = None
-    margin_mm: float | tuple[float, ...] | None = None
+    size: int | tuple[int, ...] | None = option(None, _SIZE, _SCAN, metavar="N|Z,Y,X")
+    voxel_mm: float | tuple[float, ...] | None = option(None, _VOXEL, _SCAN, metavar="D|Z,Y,X")
+    roi_mm: tuple[float, ...] | None = option(None, _ROI, _SCAN, metavar="D|Z,Y,X|Z0,Z1,Y0,Y1,X0,X1", flag="--roi")
+    margin_mm: float | tuple[float, ...] | None = option(None, _MARGIN, "0", metavar="D|Z,Y,X", of_method=True)
 
     def __post_init__(self) -> None:
         if self.size is not None:

@@ -30,10 +30,7 @@ class States:
     volumes: np.ndarray
 
     def __post_init__(self) -> None:
-        times_s = checks.numbers("times of states", self.times_s, (None,))
-        if len(times_s) == 0 or (np.diff(times_s) <= 0).any():
-            raise InputError("times of states", checks.short_repr(times_s.tolist()), "at least one time, rising")
-        object.__setattr__(self, "times_s", times_s)
+        object.__setattr__(self, "times_s", checks.rising("times of states", self.times_s))
         checks.shape("states", self.volumes, (len(self.times_s), None, None, None))
         checks.finite("states", self.volumes)
 
@@ -73,9 +70,7 @@ class Gating:
     is_phase: bool = False
 
     def __post_init__(self) -> None:
-        times_s = checks.numbers("gating times_s", self.times_s, (None,))
-        if len(times_s) == 0 or (np.diff(times_s) <= 0).any():
-            raise InputError("gating times_s", checks.short_repr(times_s.tolist()), "at least one time, rising")
+        times_s = checks.rising("gating times_s", self.times_s)
         object.__setattr__(self, "times_s", times_s)
         object.__setattr__(self, "values", checks.numbers("gating values", self.values, times_s.shape))
 

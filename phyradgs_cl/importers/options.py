@@ -15,23 +15,9 @@ from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.text import read_angles_rad
 from phyradgs_cl.io.files import regular_file
+from phyradgs_cl.text import flag_of
 
 T = TypeVar("T")
-WORDS: dict[str, tuple[str, ...]] = {
-    "part": ("train", "test", "all"),
-    "angle_at": ("start", "middle"),
-    "quantity": ("attenuation", "transmission", "counts"),
-    "rotates": ("gantry", "sample"),
-    "row_0": ("top", "bottom"),
-    "column_0": ("left", "right"),
-    "readout_axis": AXES,
-    "first": SIDES,
-    "detector_model": DETECTOR_MODELS,
-    "flats": ("median", "time"),
-    "frames": ("stated", "found"),
-}
-_POSITIVE = ("frame_time_s", "source_to_axis_mm", "source_to_detector_mm", "flat_value", "unit_mm", "pixel_size_mm")
-_RANGES = {"exposure_s": (0, 1e6), "readout_s": (0, 1e6), "first_view": (0, 1e6), "detector_offset_mm": (-1e6, 1e6)}
 _FILE, _FORMAT = "the file's", "the format's"
 DETECTOR_OFFSET = "Shift V,U of the panel's centre, mm: V > 0 up (rows), U > 0 right (columns), seen from the source."
 _AT = (
@@ -39,14 +25,17 @@ _AT = (
     "axes=v,frame,u: their order."
 )
 _STEPS = re.compile(r"\s*([-+]?\d+(?:\.\d+)?)\s*(,|\.\.)\s*([-+]?\d+(?:\.\d+)?)\s*")
+_ANGLE_AT = "A frame's angle: at its first line's start or middle."
 _ANGLES = "Angles in degrees: a text file, FIRST,STEP or FIRST..LAST."
 _FRAMES = "Where a description states more frames than there are: refuse (stated), or take those found."
+_FLATS = "Flats: their median, or interpolated in time."
+_MODEL = "An exposure averages line integrals (log) or intensity."
+_PART = "Projections of a benchmark folder (r2, phyradgs, naf)."
 _FIRST_VIEW = "First view of this scan in a JSON of several (phyradgs-real)."
 
 
-def _option(help: str, usual: str | bool = _FILE, default: Any = None) -> Any:
-    """Returns a field with its help text. usual: in words, the value of an option that is not given."""
-    return field(default=default, metadata={"help": help, "usual": usual})
+def _option(help: str, usual: str | bool = _FILE, default: Any = None, **known: Any) -> Any:
+    return checks.option(default, help, usual, **known)
 
 
 @dataclass(frozen=True)
@@ -58,47 +47,39 @@ class ImportOptions:
     help are computed from these words. ``named`` returns the name of a field in messages. Raises InputError for values
     out of range, and for contradictions."""
 
-    exposure_s: float | None = _option("Exposure of a line, s, in place of --exposure-ms.")
-    readout_s: float | None = None
-    frame_time_s: float | None = None
-    angle_at: str | None = _option("A frame's angle: at its first line's start or middle.", "start")
-    readout_axis: str | None = None
-    readout_direction: int | None = None
-    source_to_axis_mm: float | None = _option("Source to rotation axis, mm.")
-    source_to_detector_mm: float | None = _option("Source to detector, mm.")
-    pixel_size_mm: tuple[float, float] | None = _option("Pixel's side, or height and width, mm.")
-    detector_offset_mm: tuple[float, float] | None = _option(DETECTOR_OFFSET)
-    unit_mm: float = _option("Length of a scene unit in mm (r2, phyradgs).", True, 1.0)
-    rotates: str | None = _option("The part that the stored angles turn.", _FORMAT)
-    row_0: str | None = _option("Place of the first stored row.", _FORMAT)
-    column_0: str | None = _option("Place of the first stored column.", "left")
-    quantity: str | None = _option("Quantity in the pixels.")
+    exposure_s: float | None = _option("Exposure of a line, s, in place of --exposure-ms.", range=(0, 1e6))
+    readout_s: float | None = checks.option(None, range=(0, 1e6))
+    frame_time_s: float | None = checks.option(None, is_positive=True)
+    angle_at: str | None = _option(_ANGLE_AT, "start", words=("start", "middle"))
+    readout_axis: str | None = checks.option(None, words=AXES)
+    readout_direction: int | None = checks.option(None, words=(1, -1))
+    source_to_axis_mm: float | None = _option("Source to rotation axis, mm.", is_positive=True)
+    source_to_detector_mm: float | None = _option("Source to detector, mm.", is_positive=True)
+    pixel_size_mm: tuple[float, float] | None = _option("Pixel's side, or height and width, mm.", is_positive=True)
+    detector_offset_mm: tuple[float, float] | None = _option(DETECTOR_OFFSET, range=(-1e6, 1e6), flag="--detector-offset")
+    unit_mm: float = _option("Length of a scene unit in mm (r2, phyradgs).", True, 1.0, is_positive=True)
+    rotates: str | None = _option("The part that the stored angles turn.", _FORMAT, words=("gantry", "sample"))
+    row_0: str | None = _option("Place of the first stored row.", _FORMAT, words=("top", "bottom"))
+    column_0: str | None = _option("Place of the first stored column.", "left", words=("left", "right"))
+    quantity: str | None = _option("Quantity in the pixels.", words=("attenuation", "transmission", "counts"))
     angles: str | None = _option(_ANGLES)
-    frames: str | None = _option(_FRAMES, "stated")
-    flats: str | None = _option("Flats: their median, or interpolated in time.", "time if the file states it, else median")
-    flat_value: float | None = _option("Counts without an object, in place of flat frames.")
-    detector_model: str | None = _option("An exposure averages line integrals (log) or intensity.", "log")
-    part: str = _option("Projections of a benchmark folder (r2, phyradgs, naf).", True, "train")
-    first_view: int | None = _option(_FIRST_VIEW, "all")
-    first: str | None = _option("Line that is read first, seen from the source.", _FORMAT)
+    frames: str | None = _option(_FRAMES, "stated", words=("stated", "found"))
+    flats: str | None = _option(_FLATS, "time if the file states it, else median", words=("median", "time"))
+    flat_value: float | None = _option("Counts without an object, in place of flat frames.", is_positive=True)
+    detector_model: str | None = _option(_MODEL, "log", words=DETECTOR_MODELS)
+    part: str = _option(_PART, True, "train", words=("train", "test", "all"))
+    first_view: int | None = _option(_FIRST_VIEW, "all", range=(0, 1e6))
+    first: str | None = _option("Line that is read first, seen from the source.", _FORMAT, words=SIDES)
     fps: float | None = _option("Frames per second of a gantry that never stops.", f"{_FILE}, else at rest")
     exposure_ms: float | None = _option("Exposure of a line, ms.")
     readout_ms: float | None = _option("From the first line's opening to the last line's, ms.")
     entry: str | None = _option("Address of the scan in an HDF5 file of several, as /entry1/tomo_entry.")
-    at: tuple[str, ...] | None = _option(_AT, _FORMAT)
+    at: tuple[str, ...] | None = _option(_AT, _FORMAT, kind=list[str])
     linked_folder: Path | None = _option("Folder with the files that an HDF5 file links to.", "that of SRC")
     named: Named = field(default=str, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        words = {**WORDS, "readout_direction": (1, -1)}
-        for name, value in ((name, getattr(self, name)) for name in FIELDS if getattr(self, name) is not None):
-            if name in words:
-                checks.one_of(self.named(name), value, words[name])
-            for number in value if isinstance(value, tuple) else (value,):
-                if name in _POSITIVE:
-                    checks.positive(self.named(name), number)
-                elif name in _RANGES:
-                    checks.within(self.named(name), number, *_RANGES[name])
+        checks.fields_within(self.named, self)
         axis, direction = readout_order(self.first, self.readout_axis, self.readout_direction, self.named)
         stated = {  # converted to the fields that every format reads
             "readout_axis": axis, "readout_direction": direction,
@@ -155,6 +136,8 @@ _WORD_OF = {
     "readout_s": "readout_ms",
 }  # fmt: skip
 _DEFAULTS = {item.name: item.default for item in fields(ImportOptions) if item.name != "named"}
+WORDS = {item.name: item.metadata["words"] for item in fields(ImportOptions) if "words" in item.metadata}
+"""The words that an option may be, by field."""
 FIELDS = tuple(_DEFAULTS)
 """The names of the options, without ``named``."""
 
@@ -170,10 +153,8 @@ OF_BARE_FRAMES = (
 )
 OF_FOLDERS = (*OF_BARE_FRAMES, "frames")
 OF_HDF5 = (*OF_BARE_FRAMES, "entry", "at", "linked_folder")
-_OPTIONS = {"detector_offset_mm": "--detector-offset"}
 
 
 def option_name(field: str) -> str:
     """Returns the option of the command line for a field of ImportOptions."""
-    return _OPTIONS.get(field, "--" + _WORD_OF.get(field, field).replace("_", "-"))
-
+    return "--detector-offset" if field == "detector_offset_mm" else flag_of(_WORD_OF.get(field, field))

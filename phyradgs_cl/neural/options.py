@@ -6,8 +6,8 @@ from typing import ClassVar
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, PerRow
-from phyradgs_cl.acquisition.motion import RAYS, check_motion, motions_for
-from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
+from phyradgs_cl.acquisition.motion import RAYS, MotionOptions, motions_for
+from phyradgs_cl.acquisition.scan import MODELS_OF_METHODS
 from phyradgs_cl.errors import InputError
 
 JITTERS = ("ray", "sample", "none")
@@ -23,7 +23,7 @@ _FINEST = 2**24  # most cells of a level along a side: with more, float32 coordi
 
 
 @dataclass(frozen=True)
-class NeuralOptions:
+class NeuralOptions(MotionOptions):
     """A field on a hash encoding and a small network, fitted to rays.
 
     - iterations: passes over all frames, with one step per frame. rays: pixels per step.
@@ -45,11 +45,11 @@ class NeuralOptions:
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)
 
     motion: Motion = PerRow()
-    detector_model: str = "scan"
+    detector_model: str = checks.option("scan", words=MODELS_OF_METHODS)
     iterations: int = checks.ranged(30, 0, 1_000_000)
     rays: int = checks.ranged(512, 1, 1_000_000)
     samples: int = checks.ranged(0, 0, 100_000)
-    jitter: str = "ray"
+    jitter: str = checks.option("ray", words=JITTERS)
     times: int = checks.ranged(0, 0, 10_000)
     positive_only: bool = False
     voxel_points: int = checks.ranged(2, 1, 16)
@@ -60,26 +60,21 @@ class NeuralOptions:
     table_log2: int = checks.ranged(19, 4, 28)
     layers: int = checks.ranged(4, 2, 64)
     width: int = checks.ranged(32, 1, 4096)
-    last_activation: str = "sigmoid"
+    last_activation: str = checks.option("sigmoid", words=LAST_ACTIVATIONS)
     density_bound: float = checks.ranged(2.0, 1e-3, 1e6)
     first_share: float = checks.ranged(0.05, 1e-6, 0.999)
     rate: float = checks.ranged(1e-2, 1e-9, 10)
     rate_factor: float = checks.ranged(0.3, 1e-9, 1)
     rate_step: int = checks.ranged(0, 0, 1_000_000)
-    torch_device: str = "auto"
+    torch_device: str = checks.option("auto", words=TORCH_DEVICES)
 
     def __post_init__(self) -> None:
-        checks.fields_within("", self)
-        checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
-        checks.one_of("jitter", self.jitter, JITTERS)
-        checks.one_of("last_activation", self.last_activation, LAST_ACTIVATIONS)
-        checks.one_of("torch_device", self.torch_device, TORCH_DEVICES)
+        super().__post_init__()
         finest = self.base_resolution * self.level_growth ** max(self.levels - 1, 0)
         if finest > _FINEST:
             found = f"a finest level of {finest:.3g} cells along a side"
             remedy = "take fewer levels or a smaller level_growth"
             raise InputError("levels", found, f"at most {_FINEST}", remedy)
-        check_motion(self.motion, self.MOTIONS)
 
     def levels_for(self, longest_voxels: int) -> int:
         """Returns the number of levels of the encoding, for the voxels along a volume's longest side."""

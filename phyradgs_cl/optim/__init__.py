@@ -17,19 +17,18 @@ _RANGE = (1e-12, 10)  # limits of a learning rate: 0 could not decay, and 1e-12 
 
 
 @dataclass(frozen=True)
-class Rates:
+class Rates(checks.Checked):
     """The (first, last) learning rate of each type of parameter, in internal units (half-sides of the volume).
 
     The default rates are two to ten times the published ones, which are made for 20,000 iterations and more. In 3,000
     iterations, the published rates end 1 to 2 dB lower (docs/results/settings.md)."""
 
+    PREFIX = "rates."
+
     position: tuple[float, float] = checks.ranged((2e-3, 2e-4), *_RANGE)
     scale: tuple[float, float] = checks.ranged((2e-2, 2e-3), *_RANGE)
     rotation: tuple[float, float] = checks.ranged((1e-2, 1e-3), *_RANGE)
     density: tuple[float, float] = checks.ranged((6e-2, 6e-3), *_RANGE)
-
-    def __post_init__(self) -> None:
-        checks.fields_within("rates.", self)
 
     def at(self, progress: float) -> np.ndarray:
         """Returns the rates (11,) per parameter row, at ``progress`` (0 to 1) of the run."""
@@ -111,13 +110,15 @@ class DeviceAdam:
 
 
 @dataclass(frozen=True)
-class DensityControl:
+class DensityControl(checks.Checked):
     """When and which Gaussians to clone, split and prune. Lengths are in half-sides of the volume, times in fractions of a
     run.
 
     ``every``: iterations between two rounds; 0 keeps the first population. Gaussians whose longest scale is more than
     ``prune_aspect`` times their shortest are removed (0: never). Such thin sheets and needles lie between the rays, where no
     measurement constrains them, and are visible in the volume."""
+
+    PREFIX = "control."
 
     every: int = checks.ranged(100, 0, 1_000_000_000)
     start_iteration: int = checks.ranged(500, 0, 1_000_000_000)
@@ -128,9 +129,6 @@ class DensityControl:
     prune_density: float = checks.ranged(1e-5, 0, 1e6)
     prune_aspect: float = checks.ranged(50.0, 0, 1e9)
     max_gaussians: int = checks.ranged(500_000, 1, 100_000_000)
-
-    def __post_init__(self) -> None:
-        checks.fields_within("control.", self)
 
     def allows(self, scale: np.ndarray) -> np.ndarray:
         """Returns which Gaussians of scales (3, G) are not too thin, bool (G,)."""

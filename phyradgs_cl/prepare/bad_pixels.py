@@ -35,26 +35,24 @@ _LINE = 0.9  # fraction of a line's pixels above which the whole line is dead
 
 
 @dataclass(frozen=True)
-class SparkOptions:
+class SparkOptions(checks.Checked):
     """threshold: least height of a spark in local standard deviations (``find_sparks``). least: least height in line
     integrals, dimensionless. pixels: largest number of touching pixels that count as one spark."""
+
+    PREFIX = "sparks."
 
     threshold: float = checks.ranged(5.0, 1, 1e3)
     least: float = checks.ranged(0.1, 0, 10)
     pixels: int = checks.ranged(6, 1, 100)
 
-    def __post_init__(self) -> None:
-        checks.fields_within("sparks.", self)
-
 
 @dataclass(frozen=True)
-class DeadOptions:
+class DeadOptions(checks.Checked):
     """deviations: least difference of a pixel from its neighbours, in robust deviations of all pixels of the panel."""
 
-    deviations: float = _DEVIATIONS
+    PREFIX = "dead."
 
-    def __post_init__(self) -> None:
-        checks.within("dead.deviations", self.deviations, 1, 1e3)
+    deviations: float = checks.ranged(_DEVIATIONS, 1, 1e3)
 
 
 def mask_sparks(scan: Scan, options: SparkOptions, make_model: MakeModel) -> tuple[Scan, Facts]:

@@ -34,6 +34,7 @@ STEPS: Mapping[str, Step] = {
 }
 """The steps by name, in the order in which they run, in whatever order the user names them."""
 DEFAULT_STEPS = "sparks,dead,rings"
+STEPS_HELP = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 PREPARED_KEY = "prepared"
 """The provenance's key of the list of applied steps."""
 
@@ -43,8 +44,8 @@ class PrepareOptions:
     """flats: one of ``light.WAYS``, used when a file is read. steps: names of ``STEPS``, separated by commas. The other
     fields hold the options of each step. Raises InputError for unknown steps, and for options of a step not named."""
 
-    flats: str = "mean"
-    steps: str = ""
+    flats: str = checks.option("mean", words=WAYS)
+    steps: str = checks.option("", STEPS_HELP, "none", metavar="NAME,...")
     sparks: SparkOptions = SparkOptions()
     dead: DeadOptions = DeadOptions()
     scatter: ScatterOptions = ScatterOptions()
@@ -56,7 +57,7 @@ class PrepareOptions:
     phase: PhaseOptions = PhaseOptions()
 
     def __post_init__(self) -> None:
-        checks.one_of("flats", self.flats, WAYS)
+        checks.fields_within("", self)
         for name in self.steps.split(",") if self.steps.strip() else ():
             if name.strip() not in STEPS:
                 remedy = suggest_name(name.strip(), STEPS, "leave it out")

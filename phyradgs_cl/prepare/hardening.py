@@ -43,11 +43,13 @@ _NONE: Polynomial = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class HardeningOptions:
+class HardeningOptions(checks.Checked):
     """polynomial: coefficients of p², p³ and p⁴. kvp: tube voltage in kV, for its spectrum; 0: none. Without both, a
     polynomial is fitted to one material. With kvp, bone_per_mm: attenuation in 1/mm from which a voxel is bone; 0:
     candidates are tried. filter_mm: thickness of aluminium. anode_deg: angle of a tungsten anode, for SpekPy's spectrum; 0:
     Kramers' law. Raises InputError for values out of range or in contradiction."""
+
+    PREFIX = "hardening."
 
     polynomial: Polynomial = checks.ranged(_NONE, -_LARGEST, _LARGEST)
     kvp: float = 0.0
@@ -56,7 +58,7 @@ class HardeningOptions:
     anode_deg: float = checks.ranged(0.0, 0, 45)
 
     def __post_init__(self) -> None:
-        checks.fields_within("hardening.", self)
+        super().__post_init__()
         if self.kvp != 0:
             checks.within("hardening.kvp", self.kvp, LOWEST_KVP, HIGHEST_KVP)
         for name in ("bone_per_mm", "filter_mm", "anode_deg"):

@@ -114,15 +114,14 @@ def _least_variation(frame: np.ndarray, components: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class AirOptions:
+class AirOptions(checks.Checked):
     """below: fraction of the scan's largest line integral below which a pixel may be air, if it is connected with a side of
     the panel. least: least fraction of air in every frame."""
 
+    PREFIX = "air."
+
     below: float = checks.ranged(0.05, 1e-4, 0.5)
     least: float = checks.ranged(0.01, 0, 1)
-
-    def __post_init__(self) -> None:
-        checks.fields_within("air.", self)
 
 
 def normalise_air(scan: Scan, options: AirOptions, make_model: MakeModel) -> tuple[Scan, Facts]:

@@ -20,13 +20,12 @@ _MOST, _OBJECT = 0.5, 0.02  # of the object's pixels, which are those with so mu
 
 
 @dataclass(frozen=True)
-class MetalOptions:
+class MetalOptions(checks.Checked):
     """above_per_mm: attenuation of a first volume from which a voxel is metal; 0: found."""
 
-    above_per_mm: float = checks.ranged(0.0, 0, 1e3)
+    PREFIX = "metal."
 
-    def __post_init__(self) -> None:
-        checks.fields_within("metal.", self)
+    above_per_mm: float = checks.ranged(0.0, 0, 1e3)
 
 
 def mask_metal(scan: Scan, options: MetalOptions, make_model: MakeModel) -> tuple[Scan, Facts]:

@@ -22,27 +22,26 @@ from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 WAVELENGTH_MM_KEV = 1.239841984e-6  # wavelength in mm times energy in keV: Planck's constant times the speed of light
 _REACHES = 8  # margin around a frame in decay lengths of the filter: exp(−8) of an edge wraps around
-_RANGES = {"energy_kev": (1, 1000), "distance_mm": (0, 1e6), "delta_beta": (0, 1e6), "delta": (0, 1), "beta": (0, 1)}
 
 
 @dataclass(frozen=True)
-class PhaseOptions:
+class PhaseOptions(checks.Checked):
     """energy_kev: the beam's energy. distance_mm: from object to panel; None: from the axis to the panel, by the geometry.
     delta_beta: δ/β of the object's material; or delta and beta themselves. Raises InputError for values out of range or in
     contradiction."""
 
-    energy_kev: float | None = None
-    distance_mm: float | None = None
-    delta_beta: float | None = None
-    delta: float | None = None
-    beta: float | None = None
+    PREFIX = "phase."
+
+    energy_kev: float | None = checks.ranged(None, 1, 1000)
+    distance_mm: float | None = checks.ranged(None, 0, 1e6)
+    delta_beta: float | None = checks.ranged(None, 0, 1e6)
+    delta: float | None = checks.ranged(None, 0, 1)
+    beta: float | None = checks.ranged(None, 0, 1)
 
     def __post_init__(self) -> None:
-        given = [name for name in _RANGES if getattr(self, name) is not None]
-        for name in given:
-            checks.within(f"phase.{name}", getattr(self, name), *_RANGES[name])
-        both = {"delta", "beta"} & set(given)
-        if "delta_beta" in given and both:
+        super().__post_init__()
+        both = {name for name in ("delta", "beta") if getattr(self, name) is not None}
+        if self.delta_beta is not None and both:
             raise InputError("phase.delta_beta", f"given with phase.{min(both)}", "δ/β, or δ and β", "leave one out")
         if len(both) == 1:
             missing = min({"delta", "beta"} - both)

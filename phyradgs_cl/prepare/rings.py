@@ -44,13 +44,12 @@ _EQUALLY_FAR = 1.15  # largest over smallest distance of the sources from their 
 
 
 @dataclass(frozen=True)
-class RingOptions:
+class RingOptions(checks.Checked):
     """window: side in pixels of the blocks of cosines; wider patterns are not removed."""
 
-    window: int = 10
+    PREFIX = "rings."
 
-    def __post_init__(self) -> None:
-        checks.within("rings.window", self.window, 3, 999)
+    window: int = checks.ranged(10, 3, 999)
 
 
 @dataclass(frozen=True)

@@ -40,16 +40,15 @@ _BISECTIONS = 20  # number of steps of the bisection for the height
 
 
 @dataclass(frozen=True)
-class ScatterOptions:
+class ScatterOptions(checks.Checked):
     """Options of the scatter step. to_primary: ratio of scatter to primary light behind the object; 0: the kernel is
     fitted to air. reach: standard deviation of the kernel over the panel's longer side; 0: fitted, or 0.18 where
     to_primary is stated."""
 
+    PREFIX = "scatter."
+
     to_primary: float = checks.ranged(0.0, 0, 5)
     reach: float = checks.ranged(0.0, 0, 2)
-
-    def __post_init__(self) -> None:
-        checks.fields_within("scatter.", self)
 
 
 def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel) -> tuple[Scan, Facts]:

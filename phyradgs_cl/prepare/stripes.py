@@ -31,16 +31,14 @@ _SMALLEST = 1e-6  # least spread in line integrals, for division: a stuck pixel 
 
 
 @dataclass(frozen=True)
-class StripeOptions:
+class StripeOptions(checks.Checked):
     """width: width of the median in columns; stripes are narrower than half of it. ratio: least deviation of a stripe over
     that of the columns at both sides; 0 replaces every column, as the paper does."""
 
-    width: int = 5
-    ratio: float = checks.ranged(3.0, 0, 100)
+    PREFIX = "stripes."
 
-    def __post_init__(self) -> None:
-        checks.whole("stripes.width", self.width, 3, 999)
-        checks.fields_within("stripes.", self)
+    width: int = checks.ranged(5, 3, 999)
+    ratio: float = checks.ranged(3.0, 0, 100)
 
 
 def remove_stripes(

@@ -183,6 +183,13 @@ def method_name(method: object) -> str:
     return method
 
 
+def check_able(option: str, method: object, ability: str, kind: str, remedy: str = "choose one of them") -> None:
+    """Raises InputError about an option for a method without the ability that it needs, a field of ``Method``."""
+    if not getattr(method_of(method), ability):
+        names = ", ".join(name for name, one in METHODS.items() if getattr(one, ability))
+        raise InputError(option, f"--method {method_name(method)}", f"{kind}: {names}", remedy)
+
+
 def method_of(method: object) -> Method:
     """Returns the method for a name, or for the user's own function, given as such or as ``package.module:name``.
 

@@ -12,14 +12,14 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan
-from phyradgs_cl.acquisition.motion import MODELS, RAYS, SPLATS, Centres, motions_for
+from phyradgs_cl.acquisition.motion import MODELS, RAYS, SPLATS, motions_for
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid, triple
-from phyradgs_cl.reconstructors.method import DEFAULT_METHOD, METHODS, method_name, method_of
+from phyradgs_cl.reconstructors.method import DEFAULT_METHOD, METHODS, check_able, method_name, method_of
 from phyradgs_cl.reconstructors.preprocess import Preprocessing
 from phyradgs_cl.reconstructors.result import option_facts
 from phyradgs_cl.removed import refuse_removed
-from phyradgs_cl.text import suggest_name
+from phyradgs_cl.text import flag_of, suggest_name
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
 """The fields of motion models, by which options name them."""
@@ -93,7 +93,7 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
         raise InputError("--motion", checks.short_repr(name), f"one of {', '.join(models)} for --method {method}")
     model = models[name]
     for key, value in counts.items():
-        option = "--" + key.replace("_", "-")
+        option = flag_of(key)
         if not _has(model, key):
             having = " or ".join(n for n, other in models.items() if _has(other, key))
             found = f"--motion {name} for --method {method}"
@@ -104,13 +104,12 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
 
 
 def _implied_motion(usual: str, counts: Mapping[str, Any], models: Mapping[str, Any]) -> str:
-    """Returns the name of the usual model, or of the only other model with the given counts of strips and times.
-    ``centres`` must be named.
+    """Returns the name of the usual model, or of the only other model that the given counts of strips and times mean.
 
     A method whose usual model is static stays static unless ``motion`` is given."""
     if usual.startswith("static") or all(_has(models[usual], key) for key in counts):
         return usual
-    having = [name for name, m in models.items() if name != Centres.name and all(_has(m, key) for key in counts)]
+    having = [name for name, m in models.items() if m.is_implied and all(_has(m, key) for key in counts)]
     return having[0] if len(having) == 1 else usual
 
 
@@ -216,10 +215,8 @@ class RunPlan:
     def __post_init__(self) -> None:
         checks.whole("--seed", self.seed, 0, LARGEST_SEED)
         object.__setattr__(self, "seed", int(self.seed))
-        if self.object_motion is not None and not method_of(self.method).takes_deformation:
-            names = ", ".join(name for name, method in METHODS.items() if method.takes_deformation)
-            expected = f"a method whose object may move: {names}"
-            raise InputError("--object-motion", f"--method {self.method_name}", expected, "choose one of them")
+        if self.object_motion is not None:
+            check_able("--object-motion", self.method, "takes_deformation", "a method whose object may move")
         if not self.preprocessing.doubt:
             return
         if self.initial is not None:

@@ -17,9 +17,11 @@ from phyradgs_cl.prepare import STEP_FIELDS, Model, PrepareOptions, prepare
 from phyradgs_cl.prepare.chain import one_by_one
 from phyradgs_cl.prepare.step import Facts
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.text import each_warning_once
+from phyradgs_cl.text import each_warning_once, flag_of
 
 MOST_HELD_OUT = 50.0
+_HOLDOUT = "Pixels hidden from the method, to measure its error on them."
+_DOUBT = "Run twice more, for an error bar of every voxel: dataset doubt of the volume file (docs: methods.md)."
 
 
 @dataclass(frozen=True)
@@ -30,14 +32,13 @@ class Preprocessing(PrepareOptions, GridChoice):
     synthesised scans too, for error bars of voxels. steps and a table for each:
     as in ``PrepareOptions``."""
 
-    ignore_lag: bool = False
-    holdout: float = 0.0
-    doubt: bool = False
+    ignore_lag: bool = checks.option(False, "Leave the scan's lag in the frames.")
+    holdout: float = checks.option(0.0, _HOLDOUT, "0", metavar="PERCENT", range=(0, MOST_HELD_OUT), of_method=True)
+    doubt: bool = checks.option(False, _DOUBT, of_method=True)
 
     def __post_init__(self) -> None:
         GridChoice.__post_init__(self)
         PrepareOptions.__post_init__(self)
-        checks.within("holdout", self.holdout, 0, MOST_HELD_OUT)
 
     def facts(self) -> dict[str, object]:
         """Returns ``ignore_lag``, and the other options that differ from their defaults, by name."""
@@ -47,9 +48,9 @@ class Preprocessing(PrepareOptions, GridChoice):
 
     def check_written(self) -> None:
         """Raises InputError for options that mean nothing in a scan that is written to a file."""
-        for name in [name for name in ("holdout", "margin_mm", "doubt") if getattr(self, name)]:
-            flag, found = f"--{name.replace('_', '-')}", "given where a scan is prepared, without a method"
-            raise InputError(flag, found, "a reconstruction", "leave it out here, and give it to the reconstruction")
+        for one in (one for one in fields(self) if "of_method" in one.metadata and getattr(self, one.name)):
+            found, remedy = "a scan that is prepared, without a method", "leave it out here, and give it to the reconstruction"
+            raise InputError(flag_of(one.name), found, "a reconstruction", remedy)
 
 
 @each_warning_once()

@@ -20,7 +20,7 @@ from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import State, with_identity, without_identity
 from phyradgs_cl.reconstructors.doubt import FITTED, FITTED_SIDE, Doubter
-from phyradgs_cl.reconstructors.method import METHODS, method_of
+from phyradgs_cl.reconstructors.method import METHODS, check_able, method_of
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan, check_object_motion, preprocessing_of
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.reconstructors.projected import (
@@ -159,9 +159,7 @@ class _Prepared:
 
 def check_resumable(plan: RunPlan) -> None:
     """Raises InputError for a method without checkpoints."""
-    if not method_of(plan.method).is_resumable:
-        names = ", ".join(name for name, method in METHODS.items() if method.is_resumable)
-        raise InputError("--resume", f"--method {plan.method_name}", f"a method with checkpoints: {names}", "leave it out")
+    check_able("--resume", plan.method, "is_resumable", "a method with checkpoints", "leave it out")
 
 
 def _with_defaults(identity: dict[str, Any]) -> dict[str, Any]:
@@ -173,9 +171,7 @@ def _with_defaults(identity: dict[str, Any]) -> dict[str, Any]:
 
 def _initial(plan: RunPlan, initial: InitialVolume, grid: Grid) -> np.ndarray:
     """Returns the first volume on the scan's ``grid``. Raises InputError for a method that cannot start from one."""
-    if not method_of(plan.method).takes_initial:
-        names = ", ".join(name for name, method in METHODS.items() if method.takes_initial)
-        raise InputError("--initial", f"--method {plan.method_name}", f"one of {names}", "leave --initial out")
+    check_able("--initial", plan.method, "takes_initial", "a method that starts from a volume", "leave --initial out")
     if initial.grid == grid:
         return initial.values
     volume, share = resampled(initial.values, initial.grid, grid)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.acquisition.altered.angles import middle_poses
-from phyradgs_cl.acquisition.motion import LineMiddles, MicroViews, Motion, OwnTimes, PerRow, StaticStart
+from phyradgs_cl.acquisition.motion import Motion
 from phyradgs_cl.acquisition.plot import draw_windows
 from phyradgs_cl.drawing import ACCENT, BOX, EDGE, INK, SAMPLE, SOFT, round_length
 from phyradgs_cl.report.charts import SIZE, chart, note
@@ -21,7 +21,6 @@ _MOST_FRAMES = 180  # number of marked source positions, about, where there are 
 _ARC_SAMPLES = 24  # number of poses along the first frame's arc
 _FIRST_FRAMES = 4  # most frames in the chart of successive frames
 _MOST_DOTS = 600  # most dots for the times at which a model projects lines
-_MOST_CELLS = 100_000  # most time cells of a frame of which dots are drawn
 _LINES_WITH_DOTS = 12  # most lines with dots
 _BESIDE = 0.75  # drawn distance of sources and panels of a parallel beam from the volume's middle, over its diagonal
 _ROOM = 0.06  # margin around the data, as a fraction of their range
@@ -202,32 +201,28 @@ def shutter_words(scan: Scan) -> str:
 
 def _draw_samples(axes: "Axes", scan: Scan, motion: Motion) -> None:
     """Draws the times of the run's poses: dots on lines, or vertical lines for poses that all lines share."""
-    if isinstance(motion, MicroViews | OwnTimes | LineMiddles) and scan.is_fly:
-        axes.plot(*sample_times(scan, motion).T, ".", color=SAMPLE, ms=5)
+    times_s, lines = pose_times(scan, motion)
+    if lines is not None:
+        axes.plot(times_s, lines, ".", color=SAMPLE, ms=5)
         return
-    first_s, last_s = scan.shutter.lit_span_s
-    cells = motion.cells(scan, 0)
-    times_s: Sequence[float] | Points = [first_s if isinstance(motion, StaticStart) else scan.shutter.middle_s]
-    if isinstance(motion, PerRow) and scan.is_fly:
-        times_s = cells.time_s - float(scan.frame_start_s[0])
-    elif cells.is_moving:
-        times_s = np.linspace(first_s, last_s, cells.count + 1)
     for time_s in times_s:
         axes.axvline(time_s, color=ACCENT, ls="--", lw=1.2)
 
 
-def sample_times(scan: Scan, motion: Motion) -> Points:
-    """Returns (time in s after the frame's start, line) of poses, (N, 2); of some lines where every line has its own
-    poses, and of none for too many cells."""
-    rows = min(motion.strips, scan.lines) if isinstance(motion, MicroViews) else scan.lines
-    if rows * getattr(motion, "sub_intervals", 1) > _MOST_CELLS:
-        return np.empty((0, 2))
+def pose_times(scan: Scan, motion: Motion) -> tuple[Points, Points | None]:
+    """Returns the times (N,) of the first frame's poses in s after its start, and their lines (N,), of some lines if there
+    are many; None for the lines where all share the poses. Of cells with motion it returns their ends."""
     cells = motion.cells(scan, 0)
+    if cells.is_moving:
+        return np.linspace(*scan.shutter.lit_span_s, cells.count + 1), None
+    times_s = cells.time_s - float(scan.frame_start_s[0])
+    if cells.count == 1 or cells.line_share is not None:
+        return times_s, None
     line = (cells.line_start + cells.line_stop - 1) / 2
-    shown = np.ones(cells.count, bool)
-    if not isinstance(motion, MicroViews):
-        shown = np.isin(line, np.unique(np.linspace(0, scan.lines - 1, _LINES_WITH_DOTS).round()))
-    return np.stack([cells.time_s - float(scan.frame_start_s[0]), line], -1)[shown][:_MOST_DOTS]
+    several = np.unique(line)
+    some = several[np.linspace(0, len(several) - 1, min(len(several), _LINES_WITH_DOTS)).round().astype(int)]
+    shown = np.flatnonzero(np.isin(line, some))[:_MOST_DOTS]
+    return times_s[shown], line[shown]
 
 
 def _draw_span(axes: "Axes", times_s: tuple[float, float], line: float, words: str, shift: float) -> None:

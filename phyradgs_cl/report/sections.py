@@ -4,8 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from phyradgs_cl.acquisition import Exact, LineMiddles, MicroViews, Motion, OwnTimes, PerRow, Scan
-from phyradgs_cl.acquisition.motion import motion_facts
+from phyradgs_cl.acquisition import Motion, Scan
+from phyradgs_cl.acquisition.motion import motion_facts, motion_in_words
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.reconstructors.projected import TIMES_PER_LINE, FramePair
 from phyradgs_cl.report import images
@@ -14,7 +14,14 @@ from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, prof
 from phyradgs_cl.report.markup import Markup, element, joined, label, number, shown, unit
 from phyradgs_cl.report.motion import frame_in_motion, object_in_motion
 from phyradgs_cl.report.run import Change, Run
-from phyradgs_cl.report.scan_charts import frames_chart, orbit_chart, shutter_chart, shutter_words, side_chart
+from phyradgs_cl.report.scan_charts import (
+    frames_chart,
+    orbit_chart,
+    pose_times,
+    shutter_chart,
+    shutter_words,
+    side_chart,
+)
 from phyradgs_cl.report.viewer import stills, viewer
 from phyradgs_cl.text import flattened, to_digits_of
 
@@ -131,7 +138,7 @@ def shutter_section(run: Run, scan: Scan) -> Markup | None:
     words = shutter_words(scan)
     caption = f"{words[0].upper()}{words[1:]}."
     if run.motion is not None:
-        caption += f" {_motion_words(run.motion)}"
+        caption += f" {_motion_words(scan, run.motion)}"
     charts, motion = [(caption, shutter_chart(scan, run.motion))], None
     if scan.is_fly:
         charts.append(("The first frames on one axis of time.", frames_chart(scan)))
@@ -258,21 +265,15 @@ def facts_table(facts: Mapping[str, object]) -> Markup:
     return element("table", element("tbody", *lines))
 
 
-def _motion_words(motion: Motion) -> str:
-    match motion:
-        case MicroViews():
-            words = f"dots are the poses of {motion.strips} strips × {motion.sub_intervals} sub-intervals"
-        case PerRow():
-            words = f"dashed lines are the times that all lines share, {motion.sub_intervals} to an exposure"
-        case OwnTimes():
-            words = f"dots are the {motion.sub_intervals} poses of some of the lines"
-        case LineMiddles():
-            words = "dots are the poses of some of the lines"
-        case Exact():
-            words = "dashed lines bound the segments in which Gaussians move"
-        case _:
-            words = "the dashed line is the one pose of a frame"
-    return f"The run's motion is {motion_facts(motion)['name']}: {words}."
+def _motion_words(scan: Scan, motion: Motion) -> str:
+    times_s, lines = pose_times(scan, motion)
+    if motion.cells(scan, 0).is_moving:
+        words = "dashed lines bound the segments in which Gaussians move"
+    elif lines is not None:
+        words = "dots are the poses of some of the lines"
+    else:
+        words = "dashed lines are the times of poses of all lines" if len(times_s) > 1 else "the dashed line is the one pose"
+    return f"The run's motion is {motion_in_words(motion_facts(motion))}: {words}."
 
 
 def _tables(value: object) -> list[Mapping[str, object]]:

@@ -2,7 +2,7 @@
 
 Breathing follows A. E. Lujan et al., Med. Phys. 26, 715-720 (1999): a(φ) = 1 − cos⁴(π φ) at the phase φ of a breath."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +30,7 @@ Array = np.ndarray
 
 
 @dataclass(frozen=True)
-class ObjectMotion:
+class ObjectMotion(checks.Checked):
     """A known motion of the object, by a preset.
 
     kind: "breathing" lowers the object, most at its top and not at its base, and moves it along y a little later. "drying"
@@ -46,26 +46,18 @@ class ObjectMotion:
 
     Raises InputError for an unknown kind and for numbers out of range."""
 
-    kind: str
-    amplitude_mm: float | None = None
+    PREFIX = "motion of the object: "
+
+    kind: str = field(metadata={"words": tuple(_KEYS)})
+    amplitude_mm: float | None = checks.ranged(None, 0, 1e9)
     amplitude: float = checks.ranged(0.15, 0, 1)
     period_s: float = checks.ranged(4.0, 1e-6, 1e9)
     jitter: float = checks.ranged(0.1, 0, 1)
     hysteresis: float = checks.ranged(0.1, 0, 0.5)
-    settling_s: float | None = None
+    settling_s: float | None = checks.option(None, is_positive=True)
     radius: float = checks.ranged(0.4, 0.05, 1)
     seed: int = checks.ranged(0, 0, 2**63)
     states: int = checks.ranged(10, 1, 1000)
-
-    def __post_init__(self) -> None:
-        checks.one_of("motion of the object: kind", self.kind, _KEYS)
-        checks.fields_within("motion of the object: ", self)
-        checks.whole("motion of the object: states", self.states, 1, 1000)
-        checks.whole("motion of the object: seed", self.seed, 0, 2**63)
-        if self.amplitude_mm is not None:
-            checks.within("motion of the object: amplitude_mm", self.amplitude_mm, 0, 1e9)
-        if self.settling_s is not None:
-            checks.positive("motion of the object: settling_s", self.settling_s)
 
     def deformation(self, box: Grid, first_s: float, last_s: float) -> Deformation:
         """Returns the field for an object in ``box``, from a scan's first light to its last.

@@ -14,8 +14,9 @@ from phyradgs_cl.acquisition import Protocol, Scan, make_protocol
 from phyradgs_cl.acquisition.cells import per_line_cells, static_cells
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.acquisition.readout import check_readout, readout_order
-from phyradgs_cl.acquisition.scan import LARGEST_LAG
+from phyradgs_cl.acquisition.scan import DETECTOR_MODELS, LARGEST_LAG
 from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.checks import option
 from phyradgs_cl.detector import effects, tube_spectrum
 from phyradgs_cl.detector.attenuation import HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError, NumericalError
@@ -26,12 +27,17 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.object_motion import ObjectMotion, load_object_motion
 from phyradgs_cl.simulation.scenes import Scene, phantom_scene, volume_scene
 from phyradgs_cl.simulation.sources import FrameSource
+from phyradgs_cl.text import flag_of
 
 _LARGEST_GRID = 4096  # most voxels along a side of the volume
 _SMALLEST_PHANTOM = 2  # least number of voxels along a side: procedural phantoms need 4 and are drawn on twice as many
 _STATES = 8  # number of stored states of a phantom whose bodies move
 log = logging.getLogger(__name__)
-_NOISES = ("none", "tigre", "beer")
+_PEAK = "Largest line integral, by scaling the attenuation; 0: unscaled."
+_NOISE = "tigre: TIGRE's rescaled Poisson; beer: Beer-Lambert counts."
+_ELECTRONIC = "Standard deviation of electronic noise, counts."
+_JITTER = "Wander of the gantry (std, degrees), in the encoder table."
+_MOTION = "TOML file of how the object moves: breathing, drying or sliding; the truth of some states is stored."
 # Limits of options: far beyond any scanner, and far below an overflow of float32 or of a sampler.
 _LARGEST_PEAK = 1e4  # upper limit of the largest line integral
 _LARGEST_NOISE = 1e9  # upper limit of the electronic noise in counts
@@ -55,26 +61,24 @@ class SimulationOptions:
     protocol: Protocol = Protocol()
     readout_axis: str = "rows"
     readout_direction: int = 1
-    detector_model: str = "log"
-    peak: float = checks.ranged(0.0, 0, _LARGEST_PEAK)
-    noise: str = "none"
-    dose: float = checks.ranged(1e4, _SMALLEST_DOSE, _LARGEST_DOSE, "--dose (photons per pixel)")
-    electronic_noise: float = checks.ranged(10.0, 0, _LARGEST_NOISE, "--electronic-noise (counts)")
-    jitter_deg: float = checks.ranged(0.0, 0, 360, "--jitter-deg")
-    lag: float = checks.ranged(0.0, 0, LARGEST_LAG)
-    time_samples: int = checks.ranged(0, 0, 10_000, "--time-samples")
-    seed: int = checks.ranged(0, 0, 2**63)
-    rings: float = checks.ranged(0.0, 0, 0.5)
-    sparks: float = checks.ranged(0.0, 0, 0.1)
-    drift: float = checks.ranged(0.0, 0, 0.5)
-    scatter: float = checks.ranged(0.0, 0, 10)
-    kvp: float = 0.0
-    motion_of_object: ObjectMotion | None = None
+    detector_model: str = option("log", "An exposure averages line integrals (log) or intensity.", words=DETECTOR_MODELS)
+    peak: float = option(0.0, _PEAK, range=(0, _LARGEST_PEAK))
+    noise: str = option("none", _NOISE, words=("none", "tigre", "beer"))
+    dose: float = option(1e4, "Photons per pixel without object.", "10000", range=(_SMALLEST_DOSE, _LARGEST_DOSE))
+    electronic_noise: float = option(10.0, _ELECTRONIC, "10", range=(0, _LARGEST_NOISE))
+    jitter_deg: float = option(0.0, _JITTER, "0", range=(0, 360))
+    lag: float = option(0.0, "Fraction of a frame's signal from the frames before.", "scanner's: 0", range=(0, LARGEST_LAG))
+    time_samples: int = option(0, "Times of a line's exposure; 0: by the motion.", range=(0, 10_000))
+    seed: int = option(0, "Seed of phantom, noise and jitter.", range=(0, 2**63))
+    rings: float = option(0.0, "Spread of the pixels' gains (std), seen as rings.", "0", range=(0, 0.5))
+    sparks: float = option(0.0, "Fraction of all pixels that a spark hits.", "0", range=(0, 0.1))
+    drift: float = option(0.0, "Largest change of the tube's light from frame to flat.", "0", range=(0, 0.5))
+    scatter: float = option(0.0, "Scatter over primary light behind the object.", "0", range=(0, 10))
+    kvp: float = option(0.0, "Tube voltage, kV: a beam that hardens.", "0: one energy")
+    motion_of_object: ObjectMotion | None = option(None, _MOTION, True)
 
     def __post_init__(self) -> None:
-        if self.noise not in _NOISES:
-            raise InputError("--noise", repr(self.noise), f"one of {', '.join(_NOISES)}")
-        checks.fields_within("--", self)
+        checks.fields_within(flag_of, self)
         if not isinstance(self.motion_of_object, ObjectMotion | None):
             expected = "an ObjectMotion, or the path of a TOML file"
             raise InputError("--motion-of-object", checks.short_repr(self.motion_of_object), expected)
@@ -127,12 +131,16 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
         return f"{scanner.name} [readout] {name}" if is_scanner_s else _flag(name)
 
     check_readout(values.get("readout_ms"), values.get("readout_ratio"), values.get("fps"), named)
-    if unknown := sorted(set(values) - OPTION_NAMES):
-        expected = f"one of {', '.join(sorted(OPTION_NAMES))}"
-        raise InputError(f"simulate: option {unknown[0]}", "no such option", expected)
     timing = {key: values.pop(key) for key in _TIMING if key in values}
     sheet = {key: values.pop(key, None) for key in _DATA_SHEET}
     timed = make_protocol(protocol, **timing)
+    if given.get("jitter_deg") and not timed.is_fly:  # its gantry rests at the mid-window poses of a fly-scan
+        found, remedy = f"{given['jitter_deg']} with --protocol {protocol}", "leave it out, or choose a fly-scan"
+        raise InputError("--jitter-deg", found, "0", remedy)
+    unused = [name for name in ("dose", "electronic_noise") if name in given and given.get("noise", "none") == "none"]
+    if unused:
+        subject = f"{_flag(unused[0])} {checks.short_repr(given[unused[0]])}"
+        raise InputError(subject, "--noise none", "a model of noise with it", "add --noise tigre or beer")
     if sheet["fps"] is not None:
         timed = timed.at_rate(sheet["fps"], sheet["readout_ms"], named)
     if isinstance(values.get("motion_of_object"), str | Path):
@@ -141,7 +149,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
 
 
 def _flag(name: str) -> str:
-    return {"readout_axis": "--readout"}.get(name, "--" + name.replace("_", "-"))
+    return {"readout_axis": "--readout"}.get(name, flag_of(name))
 
 
 def simulated_scan(

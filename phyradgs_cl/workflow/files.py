@@ -7,6 +7,7 @@ from typing import Any
 
 from phyradgs_cl import importers
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.motion import motion_in_words
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import foreign_suffix
 from phyradgs_cl.fields import MovingTruth
@@ -154,12 +155,7 @@ def _options_in_words(options: object) -> dict[str, object]:
     told: dict[str, object] = {}
     motion = options.get("motion")
     if isinstance(motion, Mapping):
-        strips, sub_intervals = motion.get("strips"), motion.get("sub_intervals")
-        counts = dict.fromkeys(("micro-views", "centres"), f" {strips} × {sub_intervals}")
-        if sub_intervals is not None:  # FDK has one time per line
-            times = f"{sub_intervals} time{'s' if sub_intervals != 1 else ''}"
-            counts |= {"per-row": f", {times} per exposure", "own-times": f", {times} per line"}
-        told["motion"] = f"{motion.get('name')}{counts.get(str(motion.get('name')), '')}"
+        told["motion"] = motion_in_words(motion)
     if "iterations" in options:
         told["iterations_asked"] = options["iterations"]
     return told

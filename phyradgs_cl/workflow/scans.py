@@ -1,6 +1,6 @@
 """Writes scan files: simulations of a phantom or a volume, and scans corrected for effects of panel and beam."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl import __version__, checks
-from phyradgs_cl.acquisition import PROTOCOLS, Scan
+from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import load_attenuation, load_beads
 from phyradgs_cl.io import Scanner, Volume, hashing, only_run, write_scan
@@ -23,21 +23,6 @@ from phyradgs_cl.text import suggest_name
 from phyradgs_cl.workflow.files import check_output, expecting, load_scan
 
 _TOML = ".toml"
-
-
-def refuse_jitter(protocol: str, jitter_deg: float | None) -> None:
-    """Raises InputError for jitter with a stop-and-shoot protocol: its gantry rests at the mid-window poses of a
-    fly-scan."""
-    if jitter_deg and not PROTOCOLS[protocol].is_fly:
-        remedy = "leave it out, or choose a fly-scan"
-        raise InputError("--jitter-deg", f"{jitter_deg} with --protocol {protocol}", "0", remedy)
-
-
-def refuse_noise_options(noise: str, given: Mapping[str, float | None]) -> None:
-    """Raises InputError for photons or electronic noise ``given``, by option, without a model of noise."""
-    stated = [f"{option} {value:g}" for option, value in given.items() if value is not None]
-    if noise == "none" and stated:
-        raise InputError(stated[0], "--noise none", "a model of noise with it", "add --noise tigre or beer")
 
 
 def phantom_of(name: str) -> str | EllipsoidPhantom:

@@ -36,10 +36,9 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.device_probes import PAIRS, carried, pair_error
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.operators import (
-    DensityOperator,
     DeviceCells,
     RayOperator,
-    SplatOperator,
+    SplatProjection,
     SplatProjector,
     VoxelOperator,
     backproject,
@@ -126,11 +125,11 @@ def splats(rt: Runtime, model: str, options: str) -> None:
 def operators(rt: Runtime) -> None:
     """Splats from and to plain arrays, as the Python API has them."""
     orbit, shutter = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.6)), Shutter(0.5, 0.4, "columns", -1)
-    frames = SplatOperator(rt, SHAPE, [micro_view_cells(orbit, shutter, f, 0.0, SHAPE[1], 2, 2) for f in (0, 1)], 0.7)
+    frames = SplatProjection(rt, SHAPE, [micro_view_cells(orbit, shutter, f, 0.0, SHAPE[1], 2, 2) for f in (0, 1)], 0.7)
     point = frames.rows.enter(rt.upload(cloud(3), np.float32))
     frames.back(point, frames.forward(point))
-    densities = DensityOperator(frames, point)
-    densities.adjoint(densities.forward(rt.upload(np.ones(3, np.float32))))
+    ones = frames.rows.with_densities(point, rt.upload(np.ones(3, np.float32)))
+    frames.rows.densities(frames.back(point, frames.forward(ones)))
     voxels = VoxelOperator(rt, GRID)
     point = voxels.rows.enter(rt.upload(cloud(3), np.float32))
     voxels.back(point, voxels.forward(point))

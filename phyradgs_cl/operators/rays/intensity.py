@@ -59,7 +59,7 @@ class IntensityOperator:
         weights."""
         return 2, 2 * len(self._operators) + 3
 
-    def expected(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
+    def expected(self, volume: SameArray, out: DeviceArray | None = None) -> SameArray:
         """Returns I(x), (F, rows, columns) float32, of a volume (nz, ny, nx) in 1/mm, and sets J to the derivative there."""
         self._shares = []  # frees their memory
         frames: Array
@@ -74,7 +74,7 @@ class IntensityOperator:
             self._shares = [share.astype(np.float32) for share in shares]
         return cast(SameArray, self._given(frames, out))
 
-    def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
+    def forward(self, volume: SameArray, out: DeviceArray | None = None) -> SameArray:
         """Returns J d, frames (F, rows, columns) float32, for a change d of the volume (nz, ny, nx)."""
         space = self._space(volume)
         total: Any = None
@@ -83,7 +83,7 @@ class IntensityOperator:
             total = space.multiply(part, share) if total is None else space.add_product(total, part, share)
         return cast(SameArray, self._given(total, out))
 
-    def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
+    def adjoint(self, frames: SameArray, out: DeviceArray | None = None) -> SameArray:
         """Returns Jᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
         space = self._space(frames)
         total: Any = None
@@ -111,14 +111,10 @@ class IntensityOperator:
     def _space(self, like: Array) -> Space[Any]:
         return self._device if isinstance(like, DeviceArray) else _HOST
 
-    def _given(self, result: Any, out: SameArray | None) -> Any:
-        if out is None:
-            return result
-        if isinstance(out, DeviceArray):
+    def _given(self, result: Any, out: DeviceArray | None) -> Any:
+        if out is not None:
             self._device.rt.copy(result, out)
-        else:
-            out[...] = result
-        return out
+        return result if out is None else out
 
     def _shares_for(self, like: Array) -> list[Any]:
         """Returns the softmax weights of each layer where ``like`` lies: device or host."""

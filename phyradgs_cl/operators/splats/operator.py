@@ -1,27 +1,32 @@
 """Splats as operators in mm and 1/mm: a cloud to the frames of a scan or to a grid, each with its transposed derivative.
 
 ``rows.enter`` converts a cloud once; it can then be rendered and differentiated any number of times. ``back`` renders
-nothing: it projects the Gaussians again (``prepare``), unless ``forward`` has just done so. All arrays lie on the device,
-without padding.
+nothing: it projects the Gaussians again (``prepare``), unless ``forward`` has just done so.
 
 ``by_pose`` converts dL/d(Gaussians) to dL/d(pose). A rotation of the gantry equals one of the object the other way. A shift
 of the panel equals a shift of the projected centres the other way, and changes the rays' lengths."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
-from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, ROWS
+from phyradgs_cl.fields import Gaussians, Grid
+from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, ROWS, SCALE
+from phyradgs_cl.operators.public import LinearOperator, Map, Operator, Shape, Values, computed, moved_to
 from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians, stride_of
 from phyradgs_cl.operators.splats.projector import DEFAULT_CUTOFF_SIGMA, DEFAULT_TIME_ERROR, SplatProjector
 from phyradgs_cl.operators.splats.voxelise import Voxeliser
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of
+
+_FRAMES, _VOLUME, _ROWS, _DENSITY = "frames", "volume", "rows", "density"
 
 
 @dataclass(eq=False)
@@ -111,46 +116,94 @@ class PlainImages:
         return Strides.plain(self._plain, (number, 0, 0))
 
 
-class SplatOperator:
-    """Maps parameter rows (11, G) to frames (F, rows, columns) of line integrals.
+class GaussianOperator(Operator):
+    """An ``Operator`` on Gaussians, or on their parameter rows (11, G). ``rows`` converts them to clouds; a derived class
+    has ``forward`` and ``back`` at a cloud, both on the device."""
 
-    tables: the time cells of each frame in mm, all read out along one axis. intensity: the detector averages intensities
-    over a line's cells, not line integrals. length_mm: the kernels' unit of length, in which the scene should have a size
-    of about 1. Subsets share all memory: use them one at a time."""
+    def __init__(self, rows: PlainRows, range_: tuple[str, Shape], **parts: Any) -> None:
+        self.rows = rows
+        super().__init__(rows.rt, (_ROWS, (ROWS, None)), range_, self._at_rows, **parts)
+
+    def forward(self, point: SplatPoint) -> DeviceArray:
+        """Returns y float32 of a cloud."""
+        raise NotImplementedError
+
+    def back(self, point: SplatPoint, by_y: DeviceArray) -> DeviceArray:
+        """Returns dL/d(rows), (11, G) float32 at a cloud, from dL/dy."""
+        raise NotImplementedError
+
+    def _at_rows(self, rows: Values) -> tuple[Values, Map]:
+        point = self._entered(rows)
+        y = moved_to(self.rt, self.forward(point), isinstance(rows, DeviceArray))
+        return y, partial(computed, self.rt, True, partial(self.back, point))
+
+    def _entered(self, rows: Values) -> SplatPoint:
+        return self.rows.enter(moved_to(self.rt, rows, True))
+
+    def _to_array(self, side: tuple[str, Shape], values: Any) -> Values:
+        array = super()._to_array(side, values.rows() if isinstance(values, Gaussians) else values)
+        if isinstance(array, np.ndarray) and side is self._domain:
+            _check_rows(array)
+        return array
+
+
+class SplatProjection(GaussianOperator):
+    """The ``Operator`` from Gaussians to frames (F, rows, columns) of line integrals.
+
+    tables: the time cells of each frame in mm, all read out along one axis. length_mm: the kernels' unit of length, in
+    which the scene should have a size of about 1. average: for an operator of line integrals, makes the one of frames with
+    given numbers that averages intensities over a line's cells; with None, this is that one. Parts share all memory: use
+    them one at a time."""
+
+    _instead = f"of_densities(gaussians) is linear in densities; {Operator._instead}"
 
     def __init__(
         self, rt: Runtime, detector_shape: tuple[int, int], tables: Sequence[TimeCells], length_mm: float, *,
         intensity: bool = False, affine: bool = False, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
-        time_error: float = DEFAULT_TIME_ERROR,
+        time_error: float = DEFAULT_TIME_ERROR, average: "Callable[[Sequence[int]], SplatProjection] | None" = None,
     ) -> None:
         readout = tables[0].readout
-        self.rt, self.is_layered, self._affine = rt, intensity, affine
+        self._is_layered, self._affine, self._average = intensity, affine, average
         self._projector = SplatProjector(
             rt, *readout.shape(detector_shape), affine=affine, cutoff_sigma=cutoff_sigma, time_error=time_error,
             intensity_unit=1.0 if intensity else None,
         )
-        self.rows = PlainRows(rt, length_mm, line_integrals=True)
         self._images = PlainImages(rt, self._projector.lines, self._projector.width, turned=readout.axis != "rows")
-        self._cells = [DeviceCells.upload(rt, table.scaled(1 / length_mm)) for table in tables]
+        self._tables = [DeviceCells.upload(rt, table.scaled(1 / length_mm)) for table in tables]
         self._poses = [table.pose[table.count // 2] for table in tables]
-        self._ready: list[object] = []  # cloud and cells for which the kernels' buffers are ready; subsets share it
-        self.frames_shape = (len(tables), *detector_shape)
+        self._ready: list[object] = []  # cloud and cells for which the kernels' buffers are ready; parts share it
+        self._detector_shape = detector_shape
+        self._choose(range(len(tables)), PlainRows(rt, length_mm, line_integrals=True))
+
+    def _choose(self, chosen: Sequence[int], rows: PlainRows) -> None:
+        self._chosen, average = list(chosen), self._average
+        self._cells = [self._tables[f] for f in chosen]
+        super().__init__(
+            rows, (_FRAMES, (len(chosen), *self._detector_shape)), frames=self._part,
+            intensity=None if average is None else lambda: average(self._chosen),
+        )
+
+    def _part(self, few: Sequence[int]) -> "SplatProjection":
+        part = copy(self)
+        part.__dict__.pop("intensity", None)  # that of all frames
+        part._choose([self._chosen[f] for f in few], self.rows)
+        return part
 
     def forward(self, point: SplatPoint) -> DeviceArray:
         """Renders a cloud to frames (F, rows, columns) float32."""
-        frames = self.rt.empty(self.frames_shape)
+        frames = self.rt.empty((len(self._cells), *self._detector_shape))
         self._ready.clear()  # before the buffers change: a failure may leave them half written
         for number, cells in enumerate(self._cells):
             self._images.leave(self._projector.forward(point.gaussians, cells), frames, number)
         self._ready[:] = point, self._cells[-1]
         return frames
 
-    def back(self, point: SplatPoint, by_frames: DeviceArray) -> DeviceArray:
+    def back(self, point: SplatPoint, by_y: DeviceArray) -> DeviceArray:
         """Returns dL/d(rows), (11, G) float32 at a cloud, from dL/d(frames), (F, rows, columns)."""
         rt, gaussians = self.rt, point.gaussians
         by_rows, gradients = rt.empty((ROWS, gaussians.count)), rt.empty((ROWS + 2, gaussians.stride))
         for number, cells in enumerate(self._cells):
-            self._differentiate(point, cells, self._images.enter(by_frames, number), gradients)
+            self._differentiate(point, cells, self._images.enter(by_y, number), gradients)
             self.rows.leave(gradients, point, by_rows, add=number > 0)
         return by_rows
 
@@ -161,89 +214,88 @@ class SplatOperator:
         is_ready = self._ready == [point, cells]
         self._ready.clear()
         if not is_ready:
-            see = self._projector.forward if self.is_layered else self._projector.prepare
+            see = self._projector.forward if self._is_layered else self._projector.prepare
             see(point.gaussians, cells)  # the derivative of merged intensities depends on every layer
         self._projector.backward(point.gaussians, cells, by_image, gradients)
 
-    def by_poses(self, point: SplatPoint, by_frames: DeviceArray) -> np.ndarray:
-        """Returns (F, 3) float64 from dL/d(frames), (F, rows, columns): for each frame dL/d(gantry angle about z) per
-        rad, and dL/d(panel shift) per pixel, along columns and along rows. Not for the intensity model."""
+    def by_poses(self, gaussians: Any, by_frames: Any) -> np.ndarray:
+        """Returns dL/d(turn in rad, shifts along columns and rows in pixels), (F, 3), from dL/dframes (F, rows, columns).
+        Raises InputError for an operator that averages intensities."""
+        if self._is_layered:
+            raise InputError("by_poses", "averages of intensity", "averages of line integrals")
+        point = self._entered(self._to_array(self._domain, gaussians))
+        by_frames = moved_to(self.rt, self._to_array(self._range, by_frames), True)
         cloud, found = point.gaussians, np.empty((len(self._cells), 3))
         rows, gradients = self.rt.download(cloud.rows), self.rt.empty((ROWS + 2, cloud.stride))
         weighed = self.rt.download(self.forward(point)) * self.rt.download(by_frames)
-        for number, (cells, pose) in enumerate(zip(self._cells, self._poses, strict=True)):
+        for number, cells in enumerate(self._cells):
             self._differentiate(point, cells, self._images.enter(by_frames, number), gradients)
             by_rows = self.rt.download(gradients)[:, : cloud.count]
             turn, along, across = by_pose(rows[:, : cloud.count], by_rows)
             shifts = [across / (self._projector.lines / 2), along / (self._projector.width / 2)]
             found[number] = turn, *(shifts[::-1] if self._images.turned else shifts)
             if not (self._affine or cells.is_parallel):  # there all rays have the length of the central ray
-                found[number, 1:] += by_length(pose, weighed[number])
+                found[number, 1:] += by_length(self._poses[self._chosen[number]], weighed[number])
         return found
 
-    def subset(self, frames: Sequence[int]) -> "SplatOperator":
-        """Returns the operator for the frames with the numbers ``frames``, in the order given; it copies no memory.
-        Raises InputError for no frames."""
-        part = copy(self)
-        part._cells, part._poses = [self._cells[f] for f in frames], [self._poses[f] for f in frames]
-        if not part._cells:
-            raise InputError("subset", "no frames", "at least one frame")
-        part.frames_shape = (len(part._cells), *self.frames_shape[1:])
-        return part
+    def of_densities(self, gaussians: Gaussians) -> LinearOperator:
+        """Returns the linear operator from densities (G,) in 1/mm to frames; centres and shapes are those of ``gaussians``.
+        Raises InputError for an operator that averages intensities, which is not linear."""
+        if self._is_layered:
+            raise InputError("of_densities", "averages of intensity", "averages of line integrals, which are linear")
+        return self._of_densities(self._entered(self._to_array(self._domain, gaussians)))
+
+    def _of_densities(self, point: SplatPoint) -> LinearOperator:
+        def forward(density: DeviceArray) -> DeviceArray:
+            return self.forward(self.rows.with_densities(point, density))
+
+        def adjoint(frames: DeviceArray) -> DeviceArray:
+            return self.rows.densities(self.back(point, frames))
+
+        return LinearOperator(
+            self.rt, (_DENSITY, (point.gaussians.count,)), self._range, partial(computed, self.rt, True, forward),
+            partial(computed, self.rt, True, adjoint), frames=lambda few: self.frames(few)._of_densities(point),
+        )
 
 
-class DensityOperator:
-    """Maps the densities (G,) in 1/mm of a cloud, whose other parameters stay fixed, to frames: the linear part of
-    ``SplatOperator``."""
-
-    def __init__(self, operator: SplatOperator, point: SplatPoint) -> None:
-        self._operator, self._point = operator, point
-
-    def forward(self, density: DeviceArray) -> DeviceArray:
-        """Returns the frames (F, rows, columns) float32 of densities (G,) in 1/mm."""
-        return self._operator.forward(self._operator.rows.with_densities(self._point, density))
-
-    def adjoint(self, frames: DeviceArray) -> DeviceArray:
-        """Returns the transpose of ``forward``: densities (G,) from frames (F, rows, columns), both float32."""
-        return self._operator.rows.densities(self._operator.back(self._point, frames))
-
-    def subset(self, frames: Sequence[int]) -> "DensityOperator":
-        """Returns the operator for the frames with the numbers ``frames``, in the order given."""
-        return DensityOperator(self._operator.subset(frames), self._point)
-
-
-class VoxelOperator:
-    """Maps parameter rows (11, G) to the field (nz, ny, nx) in 1/mm at the centres of a grid's voxels."""
+class VoxelOperator(GaussianOperator):
+    """The ``Operator`` from Gaussians to their volume (nz, ny, nx) in 1/mm at the centres of a grid's voxels."""
 
     def __init__(self, rt: Runtime, grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA) -> None:
         nz, ny, nx = grid.shape
         length_mm = grid.half_longest_mm
-        self.rt, self.volume_shape = rt, grid.shape
+        super().__init__(PlainRows(rt, length_mm, line_integrals=False), (_VOLUME, grid.shape))
         self._inside = grid.scaled(1 / length_mm)
         self._voxeliser = Voxeliser(rt, grid.shape, cutoff_sigma=cutoff_sigma)
-        self.rows = PlainRows(rt, length_mm, line_integrals=False)
         self._images = PlainImages(rt, nz * ny, nx)
-        self._ready: list[object] = []  # this and the cloud for which the kernels' buffers are ready
+        self._ready: list[object] = []  # the cloud for which the kernels' buffers are ready
 
     def forward(self, point: SplatPoint) -> DeviceArray:
         """Returns the field (nz, ny, nx) float32 of a cloud."""
-        volume = self.rt.empty(self.volume_shape)
+        volume = self.rt.empty(self._inside.shape)
         self._ready.clear()
         self._images.leave(self._voxeliser.forward(point.gaussians, self._inside), volume)
-        self._ready[:] = point, self
+        self._ready[:] = [point]
         return volume
 
-    def back(self, point: SplatPoint, by_volume: DeviceArray) -> DeviceArray:
+    def back(self, point: SplatPoint, by_y: DeviceArray) -> DeviceArray:
         """Returns dL/d(rows), (11, G) float32 at a cloud, from dL/d(volume), (nz, ny, nx)."""
         rt, gaussians = self.rt, point.gaussians
         by_rows, gradients = rt.empty((ROWS, gaussians.count)), rt.empty((ROWS + 2, gaussians.stride))
-        if self._ready != [point, self]:
+        if self._ready != [point]:
             self._ready.clear()
             self._voxeliser.prepare(gaussians, self._inside, (0, 0, 0))
-        self._voxeliser.backward(gaussians, self._inside, self._images.enter(by_volume), gradients, add=False)
+        self._voxeliser.backward(gaussians, self._inside, self._images.enter(by_y), gradients, add=False)
         self.rows.leave(gradients, point, by_rows)
-        self._ready[:] = point, self
+        self._ready[:] = [point]
         return by_rows
+
+
+def _check_rows(rows: np.ndarray) -> None:
+    """Raises InputError for rows whose rendering would be NaN."""
+    checks.finite(_ROWS, rows)
+    if (rows[SCALE] <= 0).any() or not rows[QUATERNION].any(axis=0).all():
+        raise InputError(_ROWS, "a scale or a quaternion's length of 0 or less", "scales and lengths above 0")
 
 
 def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, float]:

@@ -60,7 +60,7 @@ class WarpedOperator:
         ]
         self.frames_shape = (len(tables), *detector_shape)
 
-    def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
+    def forward(self, volume: SameArray, out: DeviceArray | None = None) -> SameArray:
         """Returns A x for a volume (nz, ny, nx) in 1/mm: frames (F, rows, columns) float32."""
         return self._on_device(self._forward, volume, self.frames_shape, out)
 
@@ -87,7 +87,7 @@ class WarpedOperator:
         """The numbers of the states that this operator's frames use."""
         return [part.state for part in self._parts]
 
-    def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
+    def adjoint(self, frames: SameArray, out: DeviceArray | None = None) -> SameArray:
         """Returns Aᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
         return self._on_device(self._adjoint, frames, self.volume_shape, out)
 
@@ -99,7 +99,7 @@ class WarpedOperator:
 
     def _on_device(
         self, function: Callable[[DeviceArray, DeviceArray], None], values: SameArray, shape: tuple[int, ...],
-        out: SameArray | None,
+        out: DeviceArray | None,
     ) -> SameArray:  # fmt: skip
         """Calls ``function(values, result)`` on the device. Returns the result where ``values`` lie. Raises
         OutOfMemoryError where the whole volume does not fit."""
@@ -108,15 +108,9 @@ class WarpedOperator:
             expected = "room for the whole volume, which an object that moves needs"
             raise OutOfMemoryError("device memory", found, expected, "allow more with --memory")
         is_there = isinstance(values, DeviceArray)
-        result = out if isinstance(out, DeviceArray) else self.rt.empty(shape)
+        result = self.rt.empty(shape) if out is None else out
         function(values if isinstance(values, DeviceArray) else self.rt.upload(values, np.float32), result)
-        if is_there:
-            return cast(SameArray, result)
-        on_host = self.rt.download(result)
-        if out is None:
-            return cast(SameArray, on_host)
-        np.copyto(cast(np.ndarray, out), on_host)
-        return out
+        return cast(SameArray, result if is_there else self.rt.download(result))
 
     def subset(self, frames: Sequence[int]) -> "WarpedOperator":
         """Returns the operator for the frames with the numbers ``frames``, in the order given. Keep it to use it again,

@@ -17,7 +17,7 @@ import scipy
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan, Static
 from phyradgs_cl.acquisition.altered.angles import azimuth_rad
-from phyradgs_cl.acquisition.motion import LINE_POSES, LineMiddles, check_motion, motions_for
+from phyradgs_cl.acquisition.motion import LINE_POSES, LineMiddles, MotionOptions, motions_for
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.operators import backproject, backproject_lines
@@ -66,7 +66,7 @@ WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 @dataclass(frozen=True)
-class FdkOptions:
+class FdkOptions(MotionOptions):
     """Options of FDK. window: window of the ramp filter, one of ``WINDOWS``. extrapolate: how rows continue beyond the
     panel, one of ``WAYS``.
 
@@ -75,14 +75,9 @@ class FdkOptions:
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(LINE_POSES)
 
-    window: str = "ram-lak"
+    window: str = checks.option("ram-lak", words=WINDOWS, subject="FDK window")
     motion: Motion = LineMiddles()
-    extrapolate: str = "none"
-
-    def __post_init__(self) -> None:
-        checks.one_of("FDK window", self.window, WINDOWS)
-        checks.one_of("option extrapolate", self.extrapolate, WAYS)
-        check_motion(self.motion, self.MOTIONS)
+    extrapolate: str = checks.option("none", words=WAYS)
 
 
 @dataclass(frozen=True)
@@ -91,12 +86,8 @@ class FbpOptions(FdkOptions):
     signal, such as 0.01; 0 does not sharpen. circle: sets voxels to 0 outside of the circle that the panel's wider side
     reaches, unless rows are extrapolated."""
 
-    deblur: float = 0.0
+    deblur: float = checks.ranged(0.0, 0, 1)
     circle: bool = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.within("option deblur", self.deblur, 0, 1)
 
 
 def fdk(

@@ -5,8 +5,8 @@ from typing import ClassVar
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Exact, MicroViews, Motion, Static
-from phyradgs_cl.acquisition.motion import SPLATS, check_motion, motions_for
-from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
+from phyradgs_cl.acquisition.motion import SPLATS, MotionOptions, motions_for
+from phyradgs_cl.acquisition.scan import MODELS_OF_METHODS
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Activation, Grid
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
@@ -19,7 +19,7 @@ _COARSE_ERROR = 0.1  # lower limit of ``time_error`` in the other coarse iterati
 
 
 @dataclass(frozen=True, repr=False)
-class SplatOptions:
+class SplatOptions(MotionOptions):
     """Options of a splatting run; lengths in half-sides of the volume, densities relative to FDK's 99.9th percentile.
 
     - gaussians: size of the first cloud; 0 chooses it from the grid. The weights are Eq. 4's λ. tv_edge: edge in voxels
@@ -35,7 +35,7 @@ class SplatOptions:
 
     motion: Motion = Exact()
     affine: bool = False
-    detector_model: str = "scan"
+    detector_model: str = checks.option("scan", words=MODELS_OF_METHODS)
     iterations: int = checks.ranged(3000, 0, 1_000_000_000, "--iterations")
     gaussians: int = checks.ranged(0, 0, 100_000_000, "--gaussians (0 chooses from the grid)")
     ssim_weight: float = checks.ranged(0.2, 0, 1e6)
@@ -59,11 +59,9 @@ class SplatOptions:
     __repr__ = repr_of_changes
 
     def __post_init__(self) -> None:
-        checks.fields_within("", self)
-        checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
+        super().__post_init__()
         if self.scale_max <= self.scale_min:
             raise InputError("scale_max", f"{self.scale_max:g}", f"more than scale_min ({self.scale_min:g})")
-        check_motion(self.motion, self.MOTIONS)
 
     def activation(self, grid: Grid) -> Activation:
         """Returns the map from raw to actual parameters, with its bounds of the scales on ``grid`` (in internal units)."""

@@ -11,8 +11,8 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, PerRow, Scan
-from phyradgs_cl.acquisition.motion import RAYS, check_motion, motions_for
-from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
+from phyradgs_cl.acquisition.motion import RAYS, MotionOptions, motions_for
+from phyradgs_cl.acquisition.scan import MODELS_OF_METHODS
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.loop import Loop, Stepwise
@@ -27,7 +27,7 @@ _SYSTEM_FRAMES = 6
 
 
 @dataclass(frozen=True)
-class IterativeOptions:
+class IterativeOptions(MotionOptions):
     """Options of every iterative method.
 
     motion: static, micro-views, or per-row (every line at its own times). iterations: passes over all frames.
@@ -47,12 +47,7 @@ class IterativeOptions:
     iterations: int = checks.ranged(20, 0, MOST_ITERATIONS)
     nonnegative: bool = True
     tolerance: float = checks.ranged(0.0, 0, 1)
-    detector_model: str = "scan"
-
-    def __post_init__(self) -> None:
-        checks.fields_within("", self)
-        checks.one_of("detector_model", self.detector_model, ("scan", *DETECTOR_MODELS))
-        check_motion(self.motion, self.MOTIONS)
+    detector_model: str = checks.option("scan", words=MODELS_OF_METHODS)
 
 
 class Algorithm:

@@ -1,8 +1,8 @@
-"""One interface for everything that projects: values, transposes, frames, SciPy and PyTorch; arrays on host or device."""
+"""The interface of operators for programs: values, transposes, frames, SciPy; arrays on host or device."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,26 +12,11 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import DeviceArray, Runtime, adopted, is_cl_array, lent
 
-Device = str | Runtime | None
-"""The argument ``device``: what ``--device`` takes, or a Runtime."""
 Values = np.ndarray | DeviceArray
 """float32 in C order, on the host or on the device."""
 Map = Callable[[Any], Any]
 """A function from ``Values`` to ``Values``; its result is on the host or the device, where its argument is."""
 Shape = tuple[int | None, ...]
-
-
-def runtime_of(device: Device) -> Runtime:
-    """Returns the Runtime for the argument ``device``; None is the best device."""
-    if isinstance(device, Runtime):
-        return device
-    return _runtime_by_name(None if device is None else str(device))
-
-
-@lru_cache(maxsize=4)
-def _runtime_by_name(name: str | None) -> Runtime:
-    """Returns the one Runtime of a device's name, so that programs are built once."""
-    return Runtime(name)
 
 
 def to_user_array(rt: Runtime, values: Values) -> Any:
@@ -46,7 +31,7 @@ def moved_to(rt: Runtime, values: Values, on_device: bool) -> Any:
     return rt.upload(values) if on_device else values
 
 
-def computed(rt: Runtime, on_device: bool, function: Callable[[Any], Values], values: Values) -> Values:
+def computed(rt: Runtime, on_device: bool, function: Callable[[Any], Values], values: Values) -> Any:
     """Applies a function that needs its argument on the device, or on the host. Returns the result where ``values`` are."""
     return moved_to(rt, function(moved_to(rt, values, on_device)), isinstance(values, DeviceArray))
 
@@ -194,7 +179,7 @@ class Derivative:
     T: Map
 
 
-class LinearOperator(Operator, ScipyOperator):
+class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy has no types
     """An ``Operator`` that is linear, and therefore a scipy.sparse.linalg.LinearOperator too.
 
     ``A.T`` is the exact transpose, at any time. For SciPy, ``A.shape`` is (size of y, size of x), and vectors are flat,
@@ -223,65 +208,16 @@ class LinearOperator(Operator, ScipyOperator):
         """Returns the operator itself: it is linear."""
         return self
 
-    def _matvec(self, x: np.ndarray) -> np.ndarray:
+    def _matvec(self, x: np.ndarray) -> Any:
         return self(np.reshape(x, self.domain_shape)).ravel()
 
-    def _rmatvec(self, y: np.ndarray) -> np.ndarray:
+    def _rmatvec(self, y: np.ndarray) -> Any:
         return self.T(np.reshape(y, self.range_shape)).ravel()
 
     def _transpose(self) -> "LinearOperator":
         return self.T
 
     _adjoint = _transpose  # of real numbers
-
-
-def as_torch(operator: Operator) -> Callable[..., Any]:
-    """Returns the operator as a function of tensors that PyTorch can differentiate: ``f(x)``, or ``f(x, frames=[3])``.
-
-    x (domain_shape) may be on any device and of any floating type; y (range_shape) is like it. The work is done in float32
-    on the operator's device; float32 tensors on the host are not copied, by DLPack. Linear operators can be differentiated
-    any number of times, others once. ``backward`` does not project x again.
-
-    Raises InputError where PyTorch is not installed, for anything but an operator or a tensor, and as the operator does."""
-    torch: Any = checks.package("torch", "for as_torch", "torch")
-    if not isinstance(operator, Operator):
-        expected = "what ray_operator, splat_operator or voxel_operator gives"
-        raise InputError("operator", type(operator).__name__, expected)
-
-    def array(tensor: Any) -> np.ndarray:  # DLPack works with any pair of versions of torch and numpy
-        return np.from_dlpack(tensor.detach().to("cpu", torch.float32).contiguous())
-
-    def tensor(values: np.ndarray, like: Any) -> Any:
-        return torch.from_dlpack(values).to(like.device, like.dtype)
-
-    class Linear(torch.autograd.Function):
-        @staticmethod
-        def forward(ctx: Any, x: Any, of: LinearOperator) -> Any:
-            ctx.of = of
-            return tensor(of(array(x)), x)
-
-        @staticmethod
-        def backward(ctx: Any, by_y: Any) -> tuple[Any, None]:
-            return Linear.apply(by_y, ctx.of.T), None
-
-    class Curved(torch.autograd.Function):
-        @staticmethod
-        def forward(ctx: Any, x: Any, of: Operator) -> Any:
-            y, ctx.back = of.vjp(array(x))
-            return tensor(y, x)
-
-        @staticmethod
-        @torch.autograd.function.once_differentiable
-        def backward(ctx: Any, by_y: Any) -> tuple[Any, None]:
-            return tensor(ctx.back(array(by_y)), by_y), None
-
-    def function(x: Any, frames: Sequence[int] | None = None) -> Any:
-        if not isinstance(x, torch.Tensor):
-            raise InputError("x", checks.short_repr(x), "a tensor", "of a cloud, torch.tensor(cloud.rows())")
-        of = operator if frames is None else operator.frames(frames)
-        return (Linear if isinstance(of, LinearOperator) else Curved).apply(x, of)
-
-    return function
 
 
 def _is_index(number: object, count: int) -> bool:
