@@ -295,7 +295,7 @@ def table(rows: list[dict[str, object]]) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="cones and every third parallel beam, each by one method in turn")
+    parser.add_argument("--quick", action="store_true", help="cones and a third of parallel beams, each by one method")
     parser.add_argument("--case", default="", help="only geometries whose names hold this")
     parser.add_argument("--method", choices=METHODS, help="only this method")
     parser.add_argument("--json", type=Path, help="lines of results; those that are there are not run again")

@@ -93,7 +93,8 @@ def test_a_cache_that_cannot_be_written_costs_a_warning(tiny, tmp_path: Path) ->
     usual = {name: os.environ[name] for name in os.environ.keys() - {"POCL_CACHE_DIR", "XDG_CACHE_HOME"}}
     output = tmp_path / "scan.h5"
     for where, words in (
-        ({"HOME": "/dev/null"}, ("devices",)), ({"POCL_CACHE_DIR": "/dev/null/cache"}, ("simulate", *tiny, "-o", str(output))),
+        ({"HOME": "/dev/null"}, ["devices"]),
+        ({"POCL_CACHE_DIR": "/dev/null/cache"}, ["simulate", *tiny, "-o", str(output)]),
     ):
         done = run(*words, **usual | {"TMPDIR": str(tmp_path)} | where)
         told = [line for line in done.stderr.splitlines() if not line.startswith("frame ")]
