@@ -141,13 +141,6 @@ def test_an_object_on_bent_paths_gets_more_segments(rt, make_cloud, make_geometr
     assert count > 2 and several < 0.1 * one
 
 
-@pytest.mark.slow
-def test_results_repeat_bit_for_bit(two_rt, make_cloud, make_geometry) -> None:
-    rows, table, h = make_cloud(40, 48), frame_cells("exact", make_geometry(*SHAPE)), random_weights(SHAPE)
-    frames = [gradients(two_rt, rows, table, deformation(), h, cutoff_sigma=3.7) for _ in range(2)]
-    np.testing.assert_array_equal(*frames)
-
-
 def test_cells_that_do_not_fit_are_refused(make_geometry) -> None:
     with pytest.raises(InputError, match="--motion centres"):
         states_of(frame_cells("centres", make_geometry(*SHAPE)), deformation())

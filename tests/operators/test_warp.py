@@ -75,11 +75,6 @@ def test_warps_have_exact_transposes(rt) -> None:
     assert abs(np.vdot(forward, y) - np.vdot(x.astype(np.float64), adjoint(warp, 0, y))) <= ADJOINT * size
 
 
-def test_sums_repeat(rt) -> None:
-    warp, values = VolumeWarp(rt, states_of(deformation(0.3))), noise(GRID.shape)
-    np.testing.assert_array_equal(adjoint(warp, 0, values), adjoint(warp, 0, values))
-
-
 def warped(rt: Runtime, one: Deformation, cells: list[TimeCells]) -> WarpedOperator:
     operator = projector_of(rt, GRID, cells, one)(rt, GRID, SHAPE, cells)
     assert isinstance(operator, WarpedOperator)
