@@ -4,7 +4,7 @@ import numpy as np
 
 import phyradgs_cl.api as phy
 
-PASSES, BATCH, LOGS = 14, 6, [3, 4, 5, 10]
+PASSES, BATCH, LOGS = 10, 6, [3, 4, 5, 10]
 RATES = np.repeat([0.004, 0.03, 0.02, 0.03], [3, 3, 4, 1])[:, None]  # of mean (mm), log scale, quaternion, log density
 
 
@@ -38,7 +38,7 @@ def refine(scan, pixels):
 
 
 if __name__ == "__main__":
-    scan = phy.simulate("foot", size=16, detector=32, views=48, exposure_deg=6.0)
+    scan = phy.simulate("foot", size=16, detector=32, views=30, exposure_deg=6.0)
     pitch_mm = scan.geometry.pixel_size_mm[0]
     pixels = np.array([2 * pitch_mm / scan.grid.size_mm[0], pitch_mm, pitch_mm])
     wrong = np.random.default_rng(1).normal(size=(scan.frames, 3)) * pixels

@@ -47,6 +47,11 @@ def pytest_configure(config: pytest.Config) -> None:
         Runtime.__init__ = lambda *args, **given: own(*args, **(given if "lanes" in given else shape | given))  # type: ignore
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files of this folder go first: their tests are the longest, and one that starts last leaves other processes idle."""
+    items.sort(key=lambda item: item.path.parent != HERE)
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Leaves out files whose tests are all slow: every process of a run imports what it collects."""
     if config.getoption("markexpr") != "not slow" or collection_path.suffix != ".py":
@@ -83,25 +88,23 @@ def banded_rt() -> Runtime:
     return Runtime(lanes=8, pixel_items=False)
 
 
-OTHER_BUILDS = [pytest.param(build, marks=pytest.mark.slow) for build in ("lanes 1", "float pairs")]
-"""Beside those that run on a CPU and on a GPU: half of the time of all kernels' tests, and rarely wrong alone."""
+BUILDS = {"own lanes": {}, "work-items as lanes": {"lanes": 1, "pixel_items": True}}
+OTHER_BUILDS = {"lanes 1": {"lanes": 1}, "float pairs": {"fp64": False}}
+"""Beside those that run on a CPU and on a GPU: rarely wrong alone."""
 
 
-@pytest.fixture(scope="session", params=["own lanes", "work-items as lanes", *OTHER_BUILDS])
-def any_rt(request: pytest.FixtureRequest) -> Runtime:
-    """Every way in which kernels are built: the device's own vectors, scalars, a GPU's work-groups, no float64."""
-    if request.param == "lanes 1":
-        return Runtime(lanes=1)
-    if request.param == "float pairs":
-        return Runtime(fp64=False)
-    if request.param == "work-items as lanes":  # a GPU's kernels and group sizes, whatever the device
-        return Runtime(lanes=1, pixel_items=True)
-    return Runtime()
-
-
-@pytest.fixture(scope="session", params=[{}, {"lanes": 1, "pixel_items": True}], ids=["own lanes", "work-items as lanes"])
+@pytest.fixture(scope="session", params=BUILDS.values(), ids=BUILDS)
 def two_rt(request: pytest.FixtureRequest) -> Runtime:
-    """As a CPU is driven and as a GPU is: for what hosts decide, whatever the kernels are built for."""
+    """As a CPU is driven and as a GPU is."""
+    return Runtime(**request.param)
+
+
+@pytest.fixture(
+    scope="session", ids=[*BUILDS, *OTHER_BUILDS],
+    params=[*BUILDS.values(), *(pytest.param(build, marks=pytest.mark.slow) for build in OTHER_BUILDS.values())],
+)  # fmt: skip
+def any_rt(request: pytest.FixtureRequest) -> Runtime:
+    """Scalars and no float64 too: for a test or two of each kernel. tests/test_device_check.py asks all of them so."""
     return Runtime(**request.param)
 
 

@@ -5,6 +5,7 @@ import re
 import struct
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -33,15 +34,19 @@ HERE = [row[:3] for row in TARGETS if WHEEL is not None and row[3] in pocl._cpu_
 """The targets that this processor can execute, the widest first."""
 
 
-def built(target: str, library: str, lanes: int, tmp_path: Path, *checks: str) -> list[tuple[str, Path]]:
+def built(
+    target: str, library: str, lanes: int, tmp_path: Path, *checks: str, cache: Path | None = None
+) -> list[tuple[str, Path]]:
     """Names and objects of the kernels that ``check_device`` runs, or some of its checks, built for a target.
 
-    A copy of PoCL's files, in which every library is that of the target, stands for a machine with such a processor."""
-    vendors = copy_of_pocl(Path(WHEEL.origin).parents[1], library, tmp_path)
-    environment = {**os.environ, "POCL_CACHE_DIR": str(tmp_path / "cache"), "OCL_ICD_VENDORS": str(vendors)}
-    command = [sys.executable, "-c", BUILD, target, str(lanes), *checks]
+    A copy of PoCL's files, in which every library is that of the target, stands for a machine with such a processor.
+    cache: a folder of PoCL's that may hold them already."""
+    vendors, cache = copy_of_pocl(Path(WHEEL.origin).parents[1], library, tmp_path), cache or tmp_path / "cache"
+    environment = {**os.environ, "POCL_CACHE_DIR": str(cache), "OCL_ICD_VENDORS": str(vendors)}
+    command, started_s = [sys.executable, "-c", BUILD, target, str(lanes), *checks], time.time() - 1
     subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
-    return [(path.parent.parent.name, path) for path in (tmp_path / "cache").rglob("*.so")]
+    used = [path.parent for path in cache.glob("*/*/last_accessed") if path.stat().st_mtime >= started_s]
+    return [(path.parent.parent.name, path) for program in used for path in program.rglob("*.so")]
 
 
 def copy_of_pocl(site: Path, library: str, tmp_path: Path) -> Path:

@@ -21,7 +21,11 @@ KERNELS = Path(__file__).resolve().parent.parent / "cl"
 GPU_ONLY = {"splat_forward_pixels", "splat_backward_group"}
 GPU_ONLY |= {"bin_count_group", "bin_within_group", "bin_starts_group", "bin_fill_group"}
 GPU_ONLY |= {"warp_adjoint_fixed", "warp_adjoint_sum"}
-SHAPES = {"CPU": ({"pixel_items": False}, GPU_ONLY), "GPU": ({"lanes": 1, "pixel_items": True}, CPU_ONLY)}
+SHAPES = {
+    "CPU": ({"pixel_items": False}, GPU_ONLY), "GPU": ({"lanes": 1, "pixel_items": True}, CPU_ONLY),
+    "lanes 1": ({"lanes": 1, "pixel_items": False}, GPU_ONLY),
+    "float pairs": ({"fp64": False, "pixel_items": False}, GPU_ONLY),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("launch_shape", "others"), SHAPES.values(), ids=SHAPES)

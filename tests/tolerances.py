@@ -60,11 +60,6 @@ COMMON_TIMES = 1e-3  # relative RMS of 5 times to an exposure of 14.4 degrees; m
 RAYS_BACK = 3e-5  # measured 1.2e-5
 BRICKS = 2e-6  # of the largest: a ray's samples are summed brick by brick, in another order (4e-7)
 ADJOINT = 1e-5  # goal of the design; sums in float32 in two different orders
-# Joseph's bilinear samples smooth: second order in voxel over σ. 48 voxels over 4, σ ≥ 0.12 are σ ≥ 1.4 voxels.
-DISCRETISATION_GAUSSIANS = 0.05
-DISCRETISATION_ORDER = 3.0  # of 4 that second order gives for half the voxel
-DISCRETISATION_ELLIPSOID = 0.05  # relative L2 at 48³: the edge of one ellipsoid (0.037; 0.062 at 24³)
-DISCRETISATION_SHEPP_LOGAN = 0.1  # the same with a skull as thin as a voxel (0.084; 0.14 at 24³)
 
 # --- rays through a neural field ---------------------------------------------------------------------------------
 RAY_SAMPLES = 1e-3  # goal; of the peak (smooth fields, one draw) or of the norm (sharp edge, mean of draws)

@@ -49,7 +49,7 @@ class Preprocessing(PrepareOptions, GridChoice):
     def check_written(self) -> None:
         """Raises InputError for options that mean nothing in a scan that is written to a file."""
         for one in (one for one in fields(self) if "of_method" in one.metadata and getattr(self, one.name)):
-            found, remedy = "a scan that is prepared, without a method", "leave it out here, and give it to the reconstruction"
+            found, remedy = "a scan that is prepared, without a method", "give it to the reconstruction instead"
             raise InputError(flag_of(one.name), found, "a reconstruction", remedy)
 
 

@@ -98,9 +98,9 @@ def test_distances_in_another_unit_are_no_offset(rt, aside) -> None:
 def test_frames_that_are_turned_do_not_fit_and_mirrored_ones_are_named(rt, aside) -> None:
     """A mirror in u turns the offset round, and that is no second finding."""
     in_the_middle = aside.geometry.detector_offset_mm[1] == 0
-    change = (lambda p: p.swapaxes(1, 2)) if in_the_middle else (lambda p: np.rot90(p, axes=(1, 2)))
-    said = only_alarm(check(imported(aside, change), rt))
-    assert "cause not found" in said and "orientation of the frames" in said
+    if in_the_middle:
+        said = only_alarm(check(imported(aside, lambda p: np.rot90(p, axes=(1, 2))), rt))
+        assert "cause not found" in said and "orientation of the frames" in said
     said = only_alarm(check(imported(aside, lambda p: p[:, :, ::-1]), rt))
     assert "mirrored in u" in said and "--column-0" in said
     assert ("look the same" in said) == in_the_middle

@@ -1,8 +1,6 @@
 """The help as a manual page: every command in the list with its whole sentence, and the Tab key."""
 
-import os
 import re
-import subprocess
 import sys
 
 import pytest
@@ -13,9 +11,6 @@ from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, method_options
 
 pytestmark = pytest.mark.slow
-
-PROGRAM = "import sys; sys.argv[0] = 'phyradgs'; from phyradgs_cl.__main__ import main; sys.exit(main())"
-
 
 @pytest.fixture
 def told(cli, capsys):
@@ -61,7 +56,11 @@ def test_the_defaults_are_those_of_the_default_method(told) -> None:
         assert f"[default: ({value})]" in text.split(f" --{name} ")[1].split("  --")[0], name
 
 
-def test_the_tab_key_in_bash() -> None:
+def test_the_tab_key_in_bash(cli, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["phyradgs"])  # from both, Typer finds the program's name
+    monkeypatch.setattr(sys.modules["__main__"], "__package__", "")
+    monkeypatch.setenv("_PHYRADGS_COMPLETE", "complete_bash")
+    monkeypatch.setattr(cli, "give_up_stdout", lambda: None)
     for words, expected in {
         "phyradgs re": {"reconstruct", "report"},
         "phyradgs export v.h5 --to n": {"nii", "nrrd", "npy", "npz"},
@@ -69,8 +68,8 @@ def test_the_tab_key_in_bash() -> None:
         "phyradgs reconstruct s.h5 --motion ": {*MOTIONS} - {"own-times", "static-start"},
         "phyradgs simulate --phantom ": {*PHANTOMS},
     }.items():
-        asked = {"COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
-        command = [sys.executable, "-c", PROGRAM]
-        environment = {**os.environ, **asked, "_PHYRADGS_COMPLETE": "complete_bash"}
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-        assert set(done.stdout.split()) == expected, (words, done.stderr)
+        monkeypatch.setenv("COMP_WORDS", words)
+        monkeypatch.setenv("COMP_CWORD", str(words.count(" ")))
+        capsys.readouterr()
+        assert cli.run([]) == 0
+        assert set(capsys.readouterr().out.split()) == expected, words

@@ -11,18 +11,18 @@ SHAPES = [(5, 6, 7), (4, 4, 33), (17, 4, 20), (9, 11, 16), (3, 8, 8), (1, 1, 1)]
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_the_kernel_is_its_twin(any_rt, shape) -> None:
+def test_the_kernel_is_its_twin(two_rt, shape) -> None:
     volume = np.random.default_rng(1).normal(size=shape).astype(np.float32)
-    prox, on_device = DctProx(any_rt, shape), any_rt.upload(volume)
+    prox, on_device = DctProx(two_rt, shape), two_rt.upload(volume)
     for turn in range(4):
-        found, nonnegative = any_rt.empty(shape), turn % 2 == 0
+        found, nonnegative = two_rt.empty(shape), turn % 2 == 0
         assert prox(on_device, 0.4, turn, nonnegative=nonnegative, out=found) is found
         np.testing.assert_allclose(
-            any_rt.download(found), dct_prox(volume, 0.4, turn, nonnegative=nonnegative), rtol=0, atol=FLOAT32
+            two_rt.download(found), dct_prox(volume, 0.4, turn, nonnegative=nonnegative), rtol=0, atol=FLOAT32
         )
-    np.testing.assert_array_equal(prox(volume, 0.4, turn, nonnegative=nonnegative), any_rt.download(found))
+    np.testing.assert_array_equal(prox(volume, 0.4, turn, nonnegative=nonnegative), two_rt.download(found))
     prox(on_device, 0.4, turn, nonnegative=nonnegative, out=on_device)  # in place, the same bits
-    np.testing.assert_array_equal(any_rt.download(on_device), any_rt.download(found))
+    np.testing.assert_array_equal(two_rt.download(on_device), two_rt.download(found))
 
 
 def mean_of_turns(volume: np.ndarray, threshold: float) -> np.ndarray:

@@ -48,10 +48,10 @@ def assert_same(found: tuple[float, np.ndarray], expected: tuple[float, np.ndarr
 
 @pytest.mark.parametrize(("weight", "data"), TERMS, ids=str)
 @pytest.mark.parametrize("shape", SHAPES)
-def test_kernel_is_its_twin(any_rt, shape, weight, data) -> None:
+def test_kernel_is_its_twin(two_rt, shape, weight, data) -> None:
     rendered, measured = images(shape)
     for mask in (mask_of(shape, "all"), mask_of(shape, "some")):
-        value, gradient = on_device(any_rt, rendered, measured, mask, weight, **data)
+        value, gradient = on_device(two_rt, rendered, measured, mask, weight, **data)
         expected, by_image = image_loss(rendered, measured, mask, weight, **data)
         assert abs(value - expected) <= IMAGE_VALUE * max(expected, 1)
         assert_near(gradient, by_image, IMAGE_GRADIENT)

@@ -23,7 +23,7 @@ def test_values_by_hand() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 5, 16, 21])
-def test_kernel_chains_them_to_raw_numbers(any_rt, make_cloud, finite_differences, count) -> None:
+def test_kernel_chains_them_to_raw_numbers(two_rt, make_cloud, finite_differences, count) -> None:
     activation = Activation(0.01, 0.6)
     raw = activation.invert(make_cloud(count, 72, scale=(0.03, 0.3))).astype(np.float32).astype(float)
     raw[6:10] *= 1.7  # raw quaternions need not be unit
@@ -31,17 +31,17 @@ def test_kernel_chains_them_to_raw_numbers(any_rt, make_cloud, finite_difference
     padded = np.zeros((11, stride), np.float32)
     padded[6] = 1.0
     padded[:, :count] = raw
-    adam, device_raw = DeviceAdam(any_rt, activation), any_rt.upload(padded)
-    parameters, gradients = any_rt.zeros((11, stride)), any_rt.zeros((13, stride))
-    statistics = any_rt.zeros((2, stride))
+    adam, device_raw = DeviceAdam(two_rt, activation), two_rt.upload(padded)
+    parameters, gradients = two_rt.zeros((11, stride)), two_rt.zeros((13, stride))
+    statistics = two_rt.zeros((2, stride))
     adam.activate(device_raw, parameters, count, stride)
-    active = any_rt.download(parameters)[:, :count]
+    active = two_rt.download(parameters)[:, :count]
     np.testing.assert_allclose(active, activation.apply(raw), rtol=FLOAT32, atol=FLOAT32)
     adam.chain(device_raw, parameters, gradients, statistics, count, stride, density_weight=WEIGHT)
-    found = any_rt.download(gradients)[:11, :count]
+    found = two_rt.download(gradients)[:11, :count]
     expected = finite_differences(lambda r: mean_density(activation.apply(r), WEIGHT)[0], raw)
     assert_near(found, expected, PARAMETER_GRADIENT)
-    np.testing.assert_array_equal(any_rt.download(statistics), 0)  # nothing was in view
+    np.testing.assert_array_equal(two_rt.download(statistics), 0)  # nothing was in view
 
 
 def test_statistics_gather_norms_and_sightings(any_rt, make_cloud) -> None:

@@ -58,22 +58,22 @@ def noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_the_kernels_are_their_twin(any_rt, shape) -> None:
+def test_the_kernels_are_their_twin(two_rt, shape) -> None:
     volume, ridge = noise(shape, 1).astype(np.float32), any_ridge()
-    step, on_device = RidgeStep(any_rt, shape, ridge), any_rt.upload(volume)
+    step, on_device = RidgeStep(two_rt, shape, ridge), two_rt.upload(volume)
     for nonnegative in (True, False):
-        descended = any_rt.empty(shape)
+        descended = two_rt.empty(shape)
         assert step(on_device, SIGMA, 0.3, nonnegative=nonnegative, out=descended) is descended
         expected = ridge_step(volume, SIGMA, 0.3, ridge=ridge, nonnegative=nonnegative)
-        np.testing.assert_allclose(any_rt.download(descended), expected, rtol=0, atol=FLOAT32)
+        np.testing.assert_allclose(two_rt.download(descended), expected, rtol=0, atol=FLOAT32)
     assert (abs(expected - volume).max() > 0.01) == (min(shape) >= 5)
-    np.testing.assert_array_equal(step(volume, SIGMA, 0.3, nonnegative=False), any_rt.download(descended))
+    np.testing.assert_array_equal(step(volume, SIGMA, 0.3, nonnegative=False), two_rt.download(descended))
     for sigma, length in ((0.0, 0.3), (SIGMA, 0.0)):  # no noise, no change
         np.testing.assert_array_equal(step(volume, sigma, length, nonnegative=False), volume)
     scaled = step(8 * volume, 8 * SIGMA, 0.3, nonnegative=False)  # no unit: the same bits, eight times as large
-    np.testing.assert_array_equal(scaled, 8 * any_rt.download(descended))
+    np.testing.assert_array_equal(scaled, 8 * two_rt.download(descended))
     step(on_device, SIGMA, 0.3, nonnegative=False, out=on_device)  # in place
-    np.testing.assert_array_equal(any_rt.download(on_device), any_rt.download(descended))
+    np.testing.assert_array_equal(two_rt.download(on_device), two_rt.download(descended))
 
 
 def test_correlations_are_scipy_s_and_transposes_are_theirs() -> None:

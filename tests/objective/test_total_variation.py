@@ -12,10 +12,10 @@ SHAPES = [(5, 6, 7), (4, 3, 33), (1, 8, 16), (8, 1, 5), (6, 7, 1), (1, 1, 1)]
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_kernel_is_its_twin(any_rt, shape) -> None:
+def test_kernel_is_its_twin(two_rt, shape) -> None:
     volume = random_weights(shape)
-    tv = TotalVariation(any_rt, shape, pitch_of(shape[2]))
-    flat = any_rt.download(tv.evaluate(any_rt.upload(pad_rows(volume))))
+    tv = TotalVariation(two_rt, shape, pitch_of(shape[2]))
+    flat = two_rt.download(tv.evaluate(two_rt.upload(pad_rows(volume))))
     value, gradient = total_variation(volume)
     assert abs(tv.value() - value) <= TV_VALUE * max(value, 1)
     np.testing.assert_allclose(unpad_rows(flat, shape), gradient, rtol=0, atol=TV_GRADIENT)
@@ -33,8 +33,8 @@ def test_twin_is_the_mean_difference_along_every_axis(finite_differences) -> Non
         np.testing.assert_allclose(total_variation(volume)[1], expected, rtol=0, atol=TWIN_GRADIENT)
 
 
-def test_a_constant_volume_has_none(any_rt) -> None:
-    tv = TotalVariation(any_rt, (4, 5, 6), pitch_of(6))
-    gradient = any_rt.download(tv.evaluate(any_rt.upload(pad_rows(np.full((4, 5, 6), 2.5)))))
+def test_a_constant_volume_has_none(two_rt) -> None:
+    tv = TotalVariation(two_rt, (4, 5, 6), pitch_of(6))
+    gradient = two_rt.download(tv.evaluate(two_rt.upload(pad_rows(np.full((4, 5, 6), 2.5)))))
     np.testing.assert_array_equal(gradient, 0)
     assert tv.value() == 0

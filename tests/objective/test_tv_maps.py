@@ -21,10 +21,10 @@ STATES = [(3, 5, 6, 7), (2, 1, 8, 17), (5, 1, 1, 1), (1, 4, 3, 33)]
 
 @pytest.mark.parametrize("shape", SHAPES + STATES)
 @pytest.mark.parametrize("nonnegative", [True, False])
-def test_proximal_kernels_are_their_twin(any_rt, shape, nonnegative) -> None:
+def test_proximal_kernels_are_their_twin(two_rt, shape, nonnegative) -> None:
     """Of a volume, and of states of one."""
     volume, weights = random_weights(shape), SKEWED if len(shape) == 3 else (2.0, *SKEWED)
-    found = TvProx(any_rt, shape, weights)(volume.astype(np.float32), 0.3, 12, nonnegative=nonnegative)
+    found = TvProx(two_rt, shape, weights)(volume.astype(np.float32), 0.3, 12, nonnegative=nonnegative)
     expected = tv_prox(volume, 0.3, 12, nonnegative=nonnegative, axis_weights=weights)
     np.testing.assert_allclose(found, expected, rtol=0, atol=TV_MAP)
 
@@ -90,9 +90,9 @@ def test_no_weight_only_clips_and_a_flat_volume_stays(rt) -> None:
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_descent_kernel_is_its_twin(any_rt, shape) -> None:
+def test_descent_kernel_is_its_twin(two_rt, shape) -> None:
     volume = random_weights(shape)
-    before, descent = volume.copy(), TvDescent(any_rt, shape)
+    before, descent = volume.copy(), TvDescent(two_rt, shape)
     np.testing.assert_allclose(descent.gradient(volume), tv_gradient(volume), rtol=0, atol=TV_MAP)
     np.testing.assert_allclose(descent(volume, 0.05, 5), tv_descent(volume, 0.05, 5), rtol=0, atol=TV_MAP)
     np.testing.assert_array_equal(volume, before)  # the caller keeps his
@@ -111,9 +111,9 @@ def test_descent_twin_is_differentiated_right(finite_differences) -> None:
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("step, share", [(1e-6, 1 / 2), (3e-6, 3 / 4), (0.01, 1.0)])
-def test_steps_of_the_size_of_rounding_count_less_in_every_unit(any_rt, unit, step, share) -> None:
+def test_steps_of_the_size_of_rounding_count_less_in_every_unit(two_rt, unit, step, share) -> None:
     """The length of a difference is counted 1e-6 of the volume's RMS too long."""
     volume = np.zeros((1, 1, 40))
     volume[..., :20], volume[..., 20:22] = 1.0, (0.0, step / np.sqrt(2))
-    for gradient in (tv_gradient(unit * volume), TvDescent(any_rt, volume.shape).gradient(unit * volume)):
+    for gradient in (tv_gradient(unit * volume), TvDescent(two_rt, volume.shape).gradient(unit * volume)):
         assert gradient[0, 0, 22] == pytest.approx(-share, rel=2e-4)

@@ -39,14 +39,14 @@ def assert_same(found: np.ndarray, expected: np.ndarray, scale: float = 1.0, lea
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_frames(any_rt, make_geometry: Geometries, shape) -> None:
+def test_frames(two_rt, make_geometry: Geometries, shape) -> None:
     """Upright and leaning detectors have kernels of their own; others take the general one. Some voxels miss the panel."""
     frames, weight = random_frames(shape)
     for tilt in (0.0, 0.02, 0.05):
         pose = make_geometry(*shape, offset=(0.1, 0.2)).pose(ANGLES)
         pose[:, 9:12] += tilt * pose[:, 6:9]
         expected = backprojection(frames, pose, weight, GRID)
-        assert_same(backproject(any_rt, frames, pose, weight, GRID), expected)
+        assert_same(backproject(two_rt, frames, pose, weight, GRID), expected)
 
 
 def test_by_the_first_power_of_the_distance(any_rt, make_geometry: Geometries) -> None:
@@ -64,7 +64,7 @@ def test_by_the_first_power_of_the_distance(any_rt, make_geometry: Geometries) -
         assert_same(backproject_lines(any_rt, frames, pose, weight, GRID, axis, power=1), expected, 2)
 
 
-LANES = [8, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4, 16))]
+LANES = [8, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 16))]
 
 
 @pytest.mark.parametrize("lanes", LANES)
@@ -79,7 +79,7 @@ def test_panels_rolled_and_tilted_to_either_side(lanes) -> None:
         assert_same(backproject(rt, frames, pose, weight, grid), backprojection(frames, pose, weight, grid), 5)
 
 
-def test_rows_that_run_downwards_and_tall_detectors(any_rt, make_geometry: Geometries) -> None:
+def test_rows_that_run_downwards_and_tall_detectors(two_rt, make_geometry: Geometries) -> None:
     """v falls with z; so many rows that a column of voxels is cut into blocks."""
     shape, grid = (1500, 7), Grid((11, 3, 5), (0.12, 0.3, 0.3))
     frames, weight = random_frames(shape)
@@ -88,7 +88,7 @@ def test_rows_that_run_downwards_and_tall_detectors(any_rt, make_geometry: Geome
     pose[:, 9:12] *= -1
     smooth = np.cumsum(frames, axis=1, dtype=np.float64).astype(np.float32) / 40  # 1e-5 pixels matter less
     expected = backprojection(smooth, pose, weight, grid)
-    assert_same(backproject(any_rt, smooth, pose, weight, grid), expected, 5)
+    assert_same(backproject(two_rt, smooth, pose, weight, grid), expected, 5)
 
 
 @pytest.mark.parametrize("lanes", LANES)
@@ -105,51 +105,51 @@ def test_columns_of_many_voxels_at_any_pitch(lanes, voxel_mm, rows, make_geometr
         assert_same(backproject(Runtime(lanes=lanes, pixel_items=False), frames, pose, weight, grid), expected, 4)
 
 
-def test_voxels_behind_the_source_receive_nothing(any_rt, make_geometry: Geometries) -> None:
+def test_voxels_behind_the_source_receive_nothing(two_rt, make_geometry: Geometries) -> None:
     weight = random_frames((13, 18))[1]
     frames = np.ones((4, 13, 18), np.float32)  # a position is ill-conditioned beside the source
     grid = Grid((3, 5, 21), (0.4, 0.4, 1.1))  # ±11 mm along x, sources at a radius of 5
     pose = make_geometry(13, 18).pose(ANGLES)
     expected = backprojection(frames, pose, weight, grid)
     near = 2 * np.abs(expected).max()  # 1/z² is large beside the source
-    assert_same(backproject(any_rt, frames, pose, weight, grid), expected, near)
+    assert_same(backproject(two_rt, frames, pose, weight, grid), expected, near)
     lines = line_poses(make_geometry(13, 18), 13, 0.1)
     expected = lines_backprojection(frames, lines, weight, grid)
-    assert_same(backproject_lines(any_rt, frames, lines, weight, grid), expected, near)
+    assert_same(backproject_lines(two_rt, frames, lines, weight, grid), expected, near)
 
 
-def test_single_lines_of_pixels(any_rt, make_geometry: Geometries) -> None:
+def test_single_lines_of_pixels(two_rt, make_geometry: Geometries) -> None:
     """A voxel's centre is seldom exactly on a single line; on the mid-plane of this grid it is."""
     grid = Grid((1, 1, 1), (0.1, 0.1, 0.1))
     for shape in ((1, 9), (9, 1), (1, 1)):
         frames, weight = random_frames(shape)
         pose = make_geometry(*shape).pose(np.zeros(4))
         expected = backprojection(frames, pose, weight, grid)
-        assert_same(backproject(any_rt, frames, pose, weight, grid), expected, least=0)
+        assert_same(backproject(two_rt, frames, pose, weight, grid), expected, least=0)
 
 
 @pytest.mark.parametrize("axis", ["rows", "columns"])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_lines(any_rt, make_geometry: Geometries, shape, axis) -> None:
+def test_lines(two_rt, make_geometry: Geometries, shape, axis) -> None:
     """Turning either way, and at rest, where they are frames."""
     frames, weight = random_frames(shape)
     geometry, lines = make_geometry(*shape, offset=(0.1, 0.2)), shape[axis == "columns"]
     for turn_rad in (0.15, -0.15):
         pose = line_poses(geometry, lines, turn_rad)
         expected = lines_backprojection(frames, pose, weight, GRID, axis)
-        found = backproject_lines(any_rt, frames, pose, weight, GRID, axis)
+        found = backproject_lines(two_rt, frames, pose, weight, GRID, axis)
         assert_same(found, expected, 2)  # the line is rounded too
     expected = backprojection(frames, geometry.pose(ANGLES), weight, GRID)
-    at_rest = backproject_lines(any_rt, frames, line_poses(geometry, lines, 0.0), weight, GRID, axis)
+    at_rest = backproject_lines(two_rt, frames, line_poses(geometry, lines, 0.0), weight, GRID, axis)
     assert_same(at_rest, expected, 2)
 
 
-def test_many_views_go_to_the_device_in_parts(any_rt, make_geometry: Geometries) -> None:
+def test_many_views_go_to_the_device_in_parts(two_rt, make_geometry: Geometries) -> None:
     rng = np.random.default_rng(65)
     frames, weight = rng.uniform(-1, 1, (131, 5, 6)).astype(np.float32), rng.uniform(0.5, 1, 131) / 131
     pose = make_geometry(5, 6).pose(np.arange(131) * 2 * np.pi / 131)
     grid = Grid((3, 4, 5), (0.3, 0.3, 0.3))
     expected = backprojection(frames, pose, weight, grid)
-    assert_same(backproject(any_rt, frames, pose, weight, grid), expected)
+    assert_same(backproject(two_rt, frames, pose, weight, grid), expected)
     lines = np.repeat(pose[:, None], 5, axis=1)
-    assert_same(backproject_lines(any_rt, frames, lines, weight, grid), expected)
+    assert_same(backproject_lines(two_rt, frames, lines, weight, grid), expected)

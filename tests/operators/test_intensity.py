@@ -33,9 +33,9 @@ def tables(motion: str, axis: str = "rows", frames: int = 2) -> list[TimeCells]:
 
 @AXES
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_what_is_expected_is_the_twin(any_rt, motion, axis) -> None:
+def test_what_is_expected_is_the_twin(two_rt, motion, axis) -> None:
     cells, x = tables(motion, axis), noise(GRID.shape, 1)
-    found = IntensityOperator(any_rt, GRID, SHAPE, cells).expected(x)
+    found = IntensityOperator(two_rt, GRID, SHAPE, cells).expected(x)
     expected = np.stack([ray_frame(x, GRID, table, SHAPE, "intensity") for table in cells])
     assert expected.max() > 4
     assert_near(found, expected, RAYS)
@@ -50,10 +50,10 @@ def derivative(x: np.ndarray, d: np.ndarray, table: TimeCells) -> np.ndarray:
 
 @AXES
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_derivative_and_transpose_are_the_twins(any_rt, motion, axis) -> None:
+def test_derivative_and_transpose_are_the_twins(two_rt, motion, axis) -> None:
     cells = tables(motion, axis)
     x, d, y = noise(GRID.shape, 2), noise(GRID.shape, 3), noise((2, *SHAPE), 4)
-    operator = IntensityOperator(any_rt, GRID, SHAPE, cells)
+    operator = IntensityOperator(two_rt, GRID, SHAPE, cells)
     operator.expected(x)
     expected = np.stack([derivative(x, d, table) for table in cells])
     assert_near(operator.forward(d), expected, 3 * RAYS)

@@ -13,8 +13,8 @@ GRID = Grid.cube(18, 2.0)
 
 
 @pytest.mark.parametrize("what", ["static", "exact", "intensity", "voxels"])
-def test_lists_that_do_not_fit_give_the_same_bits(any_rt, make_cloud, make_geometry, what) -> None:
-    rt, rows = any_rt, make_cloud(40, 7)
+def test_lists_that_do_not_fit_give_the_same_bits(two_rt, make_cloud, make_geometry, what) -> None:
+    rt, rows = two_rt, make_cloud(40, 7)
     gaussians = DeviceGaussians.upload(rt, rows)
     if what == "voxels":
         operator = Voxeliser(rt, GRID.shape)

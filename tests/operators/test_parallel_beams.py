@@ -82,21 +82,21 @@ def cells_of(trajectory, motion: str, axis: str = "rows", shape: tuple[int, int]
         ("rolled", "common", "columns"), ("rising", "own", "rows"), ("upright", "common", "rows"),
     ],
 )  # fmt: skip
-def test_rays_and_their_adjoint_are_the_twins(any_rt, beam: str, motion: str, axis: str) -> None:
+def test_rays_and_their_adjoint_are_the_twins(two_rt, beam: str, motion: str, axis: str) -> None:
     tables, volume, frames = cells_of(BEAMS[beam], motion, axis), noise(GRID.shape, 1), noise((2, *SHAPE), 2)
-    operator = RayOperator(any_rt, GRID, SHAPE, tables)
+    operator = RayOperator(two_rt, GRID, SHAPE, tables)
     there, back = operator.forward(volume), operator.adjoint(frames)
     assert_near(there, np.stack([ray_frame(volume, GRID, table, SHAPE) for table in tables]), RAYS)
     assert_near(back, sum(ray_volume(y, GRID, table) for y, table in zip(frames, tables, strict=True)), RAYS_BACK)
 
 
 @pytest.mark.parametrize("angle_deg", [45, 135, 225, 315])
-def test_rays_along_a_diagonal_of_voxels(any_rt, angle_deg: int) -> None:
+def test_rays_along_a_diagonal_of_voxels(two_rt, angle_deg: int) -> None:
     """Which axis is the main one, float64 and float32 must answer alike: at 135° cosine and sine differ in the last bit."""
     grid, volume, frames = Grid((12, 11, 11), (0.16,) * 3), noise((12, 11, 11), 1), noise((1, *SHAPE), 2)
     orbit = CircularOrbit(GEOMETRY, ConstantSpeed(np.deg2rad(angle_deg), 0.0))
     table = static_cells(orbit, Shutter(0.4, 0.3), 0, 0.1, SHAPE[0])
-    operator = RayOperator(any_rt, grid, SHAPE, [table])
+    operator = RayOperator(two_rt, grid, SHAPE, [table])
     assert_near(operator.forward(volume)[0], ray_frame(volume, grid, table, SHAPE), RAYS)
     assert_near(operator.adjoint(frames), ray_volume(frames[0], grid, table), RAYS_BACK)
 
@@ -124,10 +124,10 @@ def test_an_ellipsoids_projection_halves_its_error_with_the_voxel(rt) -> None:
 @pytest.mark.parametrize(
     ("beam", "motion"), [("laminography", "static"), ("upright", "micro-views"), ("rising", "exact")]
 )
-def test_splats_and_their_gradients_are_the_twins(any_rt, make_cloud, beam: str, motion: str) -> None:
+def test_splats_and_their_gradients_are_the_twins(two_rt, make_cloud, beam: str, motion: str) -> None:
     rows, (table, _), h = make_cloud(4), cells_of(BEAMS[beam], motion), noise(SHAPE, 5)
-    projector = SplatProjector(any_rt, *SHAPE, cutoff_sigma=0.0, time_error=1e-6)
-    cells, twin = DeviceCells.upload(any_rt, table), moving_frame if motion == "exact" else splat_frame
+    projector = SplatProjector(two_rt, *SHAPE, cutoff_sigma=0.0, time_error=1e-6)
+    cells, twin = DeviceCells.upload(two_rt, table), moving_frame if motion == "exact" else splat_frame
     limit = SPLAT_MOVING if motion == "exact" else SPLAT_AFFINE
     assert_near(projector.project(rows, cells), twin(rows, table, SHAPE), limit)
     by_rows = projector.project_adjoint(rows, cells, h)
@@ -137,12 +137,12 @@ def test_splats_and_their_gradients_are_the_twins(any_rt, make_cloud, beam: str,
     assert abs((2 * by_rows * step).sum() - change) <= 2e-5 * size
 
 
-def test_backprojections_are_the_twins(any_rt) -> None:
+def test_backprojections_are_the_twins(two_rt) -> None:
     frames, weight, angles = noise((3, *SHAPE), 7), np.array([0.5, 0.8, 1.0]), np.array([0.0, 1.3, 2.9])
     pose = GEOMETRY.pose(angles)
     expected = backprojection(frames, pose, weight, GRID, True)
-    assert_near(backproject(any_rt, frames, pose, weight, GRID, is_parallel=True), expected, RAYS_BACK)
+    assert_near(backproject(two_rt, frames, pose, weight, GRID, is_parallel=True), expected, RAYS_BACK)
     for axis, lines in (("rows", SHAPE[0]), ("columns", SHAPE[1])):
         poses = np.stack([GEOMETRY.pose(a + np.linspace(-0.1, 0.1, lines)) for a in angles])
         expected = lines_backprojection(frames, poses, weight, GRID, axis, True)
-        assert_near(backproject_lines(any_rt, frames, poses, weight, GRID, axis, is_parallel=True), expected, RAYS_BACK)
+        assert_near(backproject_lines(two_rt, frames, poses, weight, GRID, axis, is_parallel=True), expected, RAYS_BACK)

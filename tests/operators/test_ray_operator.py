@@ -42,23 +42,23 @@ def test_frames_and_volumes_are_the_twins(any_rt, motion) -> None:
         ("per line", (3, 40), "parallel"), ("per line at one time", (3, 40), "parallel"), ("common", (3, 40), "parallel"),
     ],
 )  # fmt: skip
-def test_columns_of_few_rows(any_rt, motion, shape, beam) -> None:
+def test_columns_of_few_rows(two_rt, motion, shape, beam) -> None:
     """Vectors run over columns that have weights of their own, and over the ends of their cells."""
-    operator = RayOperator(any_rt, GRID, shape, tables(motion, shape, "columns", -1, 2, beam=beam))
+    operator = RayOperator(two_rt, GRID, shape, tables(motion, shape, "columns", -1, 2, beam=beam))
     check_twins(operator)
     volume = noise(GRID.shape, 75)
-    again = RayOperator(any_rt, GRID, shape, operator.tables, memory=operator.memory)
+    again = RayOperator(two_rt, GRID, shape, operator.tables, memory=operator.memory)
     np.testing.assert_array_equal(again.forward(volume), operator.forward(volume))
     expected = np.stack([ray_frame(volume, GRID, table, shape, "intensity") for table in operator.tables])
-    found = IntensityOperator(any_rt, GRID, shape, operator.tables).expected(volume)
+    found = IntensityOperator(two_rt, GRID, shape, operator.tables).expected(volume)
     assert np.abs(found - expected).max() <= RAYS * expected.max()
 
 
 @pytest.mark.parametrize("motion", ["static", "per line at one time"])
-def test_volumes_of_several_bricks(any_rt, motion) -> None:
+def test_volumes_of_several_bricks(two_rt, motion) -> None:
     """Samples between two owners count once; vectors of rays with two main axes; a detector of several vectors."""
     grid, shape = Grid((17, 70, 37), (0.11, 0.03, 0.05), (0.05, 0.1, -0.1)), (7, 37)
-    check_twins(RayOperator(any_rt, grid, shape, tables(motion, shape, frames=2)))
+    check_twins(RayOperator(two_rt, grid, shape, tables(motion, shape, frames=2)))
 
 
 def pointing(axis: int) -> TimeCells:
@@ -76,9 +76,9 @@ def test_rays_along_each_axis(rt, axis) -> None:
 
 @pytest.mark.parametrize("source_mm", [0.4, 0.9, 1.3])
 @pytest.mark.parametrize("motion", ["static", "micro-views"])
-def test_source_inside_or_close_to_the_volume(any_rt, motion, source_mm) -> None:
+def test_source_inside_or_close_to_the_volume(two_rt, motion, source_mm) -> None:
     """Planes behind the source do not count, and no bound exists for bricks that its plane cuts."""
-    check_twins(RayOperator(any_rt, Grid.cube(26, 2.0), SHAPE, tables(motion, frames=1, source_mm=source_mm)))
+    check_twins(RayOperator(two_rt, Grid.cube(26, 2.0), SHAPE, tables(motion, frames=1, source_mm=source_mm)))
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 20), (17, 5), (31, 27)])
@@ -87,8 +87,8 @@ def test_odd_detectors(rt, shape) -> None:
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (1, 16, 1), (3, 1, 33), (24, 25, 24)])
-def test_odd_volumes(any_rt, shape) -> None:
-    check_twins(RayOperator(any_rt, Grid(shape, (0.9, 0.11, 0.13)), SHAPE, tables("per line")))
+def test_odd_volumes(two_rt, shape) -> None:
+    check_twins(RayOperator(two_rt, Grid(shape, (0.9, 0.11, 0.13)), SHAPE, tables("per line")))
 
 
 def test_volumes_out_of_sight_and_other_arrays_than_float32_in_c_order(rt) -> None:
@@ -137,11 +137,11 @@ def test_a_gpus_launches_of_bounded_length_have_the_bits_of_one(monkeypatch) -> 
         assert found == ["rays_adjoint"] * (4 // frames_of_launch) + ["rays_forward"] * (4 // frames_of_launch)
 
 
-def test_one_launch_is_the_frames_one_by_one_and_bits_repeat(any_rt) -> None:
+def test_one_launch_is_the_frames_one_by_one_and_bits_repeat(two_rt) -> None:
     cells, x = tables("micro-views", frames=4), noise(GRID.shape, 78)
-    operator = RayOperator(any_rt, GRID, SHAPE, cells)
+    operator = RayOperator(two_rt, GRID, SHAPE, cells)
     y = noise(operator.frames_shape, 80)
-    singles = np.concatenate([RayOperator(any_rt, GRID, SHAPE, [table]).forward(x) for table in cells])
+    singles = np.concatenate([RayOperator(two_rt, GRID, SHAPE, [table]).forward(x) for table in cells])
     for _ in range(2):
         np.testing.assert_array_equal(operator.forward(x), singles)
     np.testing.assert_array_equal(operator.adjoint(y), operator.adjoint(y))
@@ -174,9 +174,9 @@ def test_stacks_larger_than_an_allocation(rt, monkeypatch) -> None:
     np.testing.assert_array_equal(parts.adjoint(y), expected[1])
 
 
-def test_indices_of_64_bits(any_rt, monkeypatch) -> None:
+def test_indices_of_64_bits(two_rt, monkeypatch) -> None:
     """What volumes of 2^31 floats need; bit for bit the same on a small one."""
-    operator = RayOperator(any_rt, GRID, SHAPE, tables("micro-views"))
+    operator = RayOperator(two_rt, GRID, SHAPE, tables("micro-views"))
     x, y = noise(GRID.shape, 85), noise(operator.frames_shape, 86)
     short = operator.forward(x), operator.adjoint(y)
     monkeypatch.setattr(rays, "_LONG_FROM", 0)

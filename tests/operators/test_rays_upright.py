@@ -26,7 +26,7 @@ TALL_PANEL = (85, 7)
 PLANNED = 0.9  # share of free memory that is planned with
 
 
-@pytest.fixture(scope="module", params=[8, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4, 16))])
+@pytest.fixture(scope="module", params=[8, pytest.param(16, marks=pytest.mark.slow)])
 def cpu_rt(request: pytest.FixtureRequest) -> Runtime:
     return Runtime(lanes=request.param, pixel_items=False)
 

@@ -72,14 +72,14 @@ def error_of_peak(image: np.ndarray, rows: np.ndarray, pose: np.ndarray) -> floa
     ],
     ids=["compact", "needles", "below a pixel"],
 )
-def test_single_gaussians_on_512_pixels(any_rt, one_cell, smallest_px, aspects, tolerance) -> None:
+def test_single_gaussians_on_512_pixels(two_rt, one_cell, smallest_px, aspects, tolerance) -> None:
     rng = np.random.default_rng(11)
-    projector = SplatProjector(any_rt, SIDE, SIDE, cutoff_sigma=0.0)
+    projector = SplatProjector(two_rt, SIDE, SIDE, cutoff_sigma=0.0)
     for aspect in aspects:
         for _ in range(6):
             pose = LARGE.pose(rng.uniform(0, 2 * np.pi))
             rows = random_gaussian(rng, smallest_px, aspect)
-            image = projector.project(rows, DeviceCells.upload(any_rt, one_cell(pose, SIDE)))
+            image = projector.project(rows, DeviceCells.upload(two_rt, one_cell(pose, SIDE)))
             assert error_of_peak(image, rows, pose) <= tolerance, rows[:, 0]
 
 
@@ -122,38 +122,38 @@ def cut_images(rows: np.ndarray, pose: np.ndarray, shape: tuple[int, int], edge:
 
 
 @pytest.mark.parametrize("affine", [False, True])
-def test_cutoff_means_the_same_as_in_the_twin(any_rt, one_cell, make_cloud, make_geometry, affine) -> None:
+def test_cutoff_means_the_same_as_in_the_twin(two_rt, one_cell, make_cloud, make_geometry, affine) -> None:
     rows, pose, shape = make_cloud(9, 2, scale=(0.02, 0.3)), make_geometry(61, 77).pose(1.1), (61, 77)
-    image = render(any_rt, rows, one_cell(pose, 61), shape, affine=affine)
+    image = render(two_rt, rows, one_cell(pose, 61), shape, affine=affine)
     low, high = cut_images(rows, pose, shape, CUTOFF_EDGE_SIGMA, affine)
     assert_between(image, low, high, SPLAT_CLOUD * high.max())
     assert (high > 0).mean() < 1  # the cutoff leaves pixels without any splat
 
 
-def test_no_gaussian_gives_an_empty_frame(any_rt, one_cell, make_geometry) -> None:
+def test_no_gaussian_gives_an_empty_frame(two_rt, one_cell, make_geometry) -> None:
     pose = make_geometry(9, 11).pose(0.0)
-    image = render(any_rt, np.zeros((11, 0)), one_cell(pose, 9), (9, 11))
+    image = render(two_rt, np.zeros((11, 0)), one_cell(pose, 9), (9, 11))
     np.testing.assert_array_equal(image, np.zeros((9, 11), np.float32))
 
 
-def test_off_the_detector_only_the_tail_is_seen(any_rt, one_cell, make_cloud, make_geometry) -> None:
+def test_off_the_detector_only_the_tail_is_seen(two_rt, one_cell, make_cloud, make_geometry) -> None:
     rows, pose = make_cloud(1, 5, scale=(0.1, 0.1)), make_geometry(20, 20).pose(0.0)
     rows[:3, 0] = 0.0, 1.6, 0.0  # the detector sees up to 1.37 at the axis
-    tail = render(any_rt, rows, one_cell(pose, 20), (20, 20))
+    tail = render(two_rt, rows, one_cell(pose, 20), (20, 20))
     expected = splat_image(rows, pose, (20, 20), DEFAULT_CUTOFF_SIGMA)
     assert expected.max() > 0
     assert_near(tail, expected, SPLAT_CLOUD, rows[10, 0])
     rows[1, 0] = 3.0
-    np.testing.assert_array_equal(render(any_rt, rows, one_cell(pose, 20), (20, 20)), 0)
+    np.testing.assert_array_equal(render(two_rt, rows, one_cell(pose, 20), (20, 20)), 0)
 
 
 @pytest.mark.parametrize("affine", [False, True])
-def test_behind_the_source_nothing_is_seen(any_rt, one_cell, make_cloud, make_geometry, affine) -> None:
+def test_behind_the_source_nothing_is_seen(two_rt, one_cell, make_cloud, make_geometry, affine) -> None:
     rows, pose = make_cloud(2, 6), make_geometry(20, 20).pose(0.0)
     rows[:3, 1] = 9.0, 0.1, 0.2  # the source is at x = 5
     for cutoff_sigma in (0.0, DEFAULT_CUTOFF_SIGMA):
         both, alone = (
-            render(any_rt, some, one_cell(pose, 20), (20, 20), cutoff_sigma=cutoff_sigma, affine=affine)
+            render(two_rt, some, one_cell(pose, 20), (20, 20), cutoff_sigma=cutoff_sigma, affine=affine)
             for some in (rows, rows[:, :1])
         )
         np.testing.assert_array_equal(both, alone)
@@ -161,7 +161,7 @@ def test_behind_the_source_nothing_is_seen(any_rt, one_cell, make_cloud, make_ge
 
 
 def test_an_ellipsoid_across_the_source_plane_stays_finite(
-    any_rt, one_cell, make_cloud, make_geometry
+    two_rt, one_cell, make_cloud, make_geometry
 ) -> None:
     """At 3.7 σ those nearer than 1.85 contain a point at the source's own depth: they are not drawn."""
     rows, pose = make_cloud(1, 7, scale=(0.5, 0.5)), make_geometry(20, 20).pose(0.0)
@@ -169,29 +169,29 @@ def test_an_ellipsoid_across_the_source_plane_stays_finite(
         rows[:3, 0] = x, 0.05, -0.03
         expected = splat_image(rows, pose, (20, 20), DEFAULT_CUTOFF_SIGMA)
         assert (expected.max() > 0) == (x == 3.0)
-        image = render(any_rt, rows, one_cell(pose, 20), (20, 20))
+        image = render(two_rt, rows, one_cell(pose, 20), (20, 20))
         assert_near(image, expected, SPLAT_CLOUD, max(expected.max(), 1.0))
-        assert np.all(np.isfinite(render(any_rt, rows, one_cell(pose, 20), (20, 20), cutoff_sigma=0.0))), x
+        assert np.all(np.isfinite(render(two_rt, rows, one_cell(pose, 20), (20, 20), cutoff_sigma=0.0))), x
 
 
-def test_needle_bounding_boxes_hold_their_ellipse(any_rt, one_cell) -> None:
+def test_needle_bounding_boxes_hold_their_ellipse(two_rt, one_cell) -> None:
     """A needle at 22.5° across the detector: the box must reach its far ends, every tile in between too."""
     turn = (*np.cos([np.pi / 16, np.pi * 7 / 16]), 0, 0)
     rows = np.array([[0.01, 0.02, -0.01, 0.0005, 0.25, 0.0005, *turn, 1.0]]).T
     pose = LARGE.pose(0.0)
-    image = render(any_rt, rows, one_cell(pose, SIDE), (SIDE, SIDE))
+    image = render(two_rt, rows, one_cell(pose, SIDE), (SIDE, SIDE))
     low, high = cut_images(rows, pose, (SIDE, SIDE), CUTOFF_EDGE_NEEDLE)
     columns = np.flatnonzero(high.any(axis=0))
     assert columns.size > 150 and np.ptp(columns) > 300  # long, and thinner than a pixel
     assert_between(image, low, high, SPLAT_NEEDLE * high.max())
 
 
-def test_padding_stays_zero(any_rt, one_cell, make_cloud, make_geometry) -> None:
+def test_padding_stays_zero(two_rt, one_cell, make_cloud, make_geometry) -> None:
     """Other kernels read past the ends of lines and count on zeros there."""
     shape = (11, 21)
-    projector = SplatProjector(any_rt, *shape)
+    projector = SplatProjector(two_rt, *shape)
     rows, pose = make_cloud(6, 8), make_geometry(*shape).pose(0.3)
-    image = projector.project(rows, DeviceCells.upload(any_rt, one_cell(pose, 11)))
-    flat = any_rt.download(projector.image)
+    image = projector.project(rows, DeviceCells.upload(two_rt, one_cell(pose, 11)))
+    flat = two_rt.download(projector.image)
     assert np.count_nonzero(flat) == np.count_nonzero(image) > 0
     np.testing.assert_array_equal(unpad_rows(flat, shape), image)

@@ -86,18 +86,18 @@ ROUNDED = [("static", {}), ("micro-views", {"affine": True}), ("exact", {}), ("e
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("motion", "options"), ROUNDED, ids=str)
-def test_rounding_does_not_turn_a_round_gaussian(any_rt, make_cloud, make_geometry, motion, options) -> None:
+def test_rounding_does_not_turn_a_round_gaussian(two_rt, make_cloud, make_geometry, motion, options) -> None:
     """Its torque is a difference that cancels; Adam would make whole steps of what rounding leaves of it."""
     rows, h = make_cloud(5, 22, scale=(0.05, 0.3)), random_weights(SHAPE)
     table = frame_cells(motion, make_geometry(*SHAPE))
     rows[SCALE] = rows[SCALE][:1] * ROUNDING
-    found = device_gradients(any_rt, rows, table, h, **options)[:11]
+    found = device_gradients(two_rt, rows, table, h, **options)[:11]
     assert not found[QUATERNION].any() and found[SCALE].all()
     rows[SCALE] *= 1 + 1e-4 * np.array([[1.0], [0.0], [0.0]])
-    assert device_gradients(any_rt, rows, table, h, **options)[QUATERNION].any()
+    assert device_gradients(two_rt, rows, table, h, **options)[QUATERNION].any()
 
 
-def test_with_cutoff_only_drawn_pixels_pull(any_rt, make_cloud, make_geometry, finite_differences) -> None:
+def test_with_cutoff_only_drawn_pixels_pull(two_rt, make_cloud, make_geometry, finite_differences) -> None:
     """The set of drawn pixels is held fixed: the cutoff's edge itself has no gradient."""
     table, rows = frame_cells("static", make_geometry(*SHAPE)), make_cloud(4, 24, scale=(0.05, 0.25))
     h, expected = random_weights(SHAPE), np.zeros((11, 4))
@@ -107,14 +107,14 @@ def test_with_cutoff_only_drawn_pixels_pull(any_rt, make_cloud, make_geometry, f
     for g, (drawn, _) in enumerate(masks):
         expected[:, g : g + 1] = expected_gradients(finite_differences, rows[:, g : g + 1], table, h * drawn)
         assert not drawn.all()
-    assert_classes(device_gradients(any_rt, rows, table, h), expected, GRADIENT)
+    assert_classes(device_gradients(two_rt, rows, table, h), expected, GRADIENT)
 
 
-def test_what_is_not_drawn_has_no_gradient(any_rt, make_cloud, make_geometry, one_cell) -> None:
+def test_what_is_not_drawn_has_no_gradient(two_rt, make_cloud, make_geometry, one_cell) -> None:
     table = one_cell(make_geometry(*SHAPE).pose(0.0), SHAPE[0])
     rows = make_cloud(3, 25, scale=(0.05, 0.1))
     rows[0, 1], rows[1, 2] = 9.0, 4.0  # behind the source; off the detector
-    found = device_gradients(any_rt, rows, table, random_weights(SHAPE))
+    found = device_gradients(two_rt, rows, table, random_weights(SHAPE))
     np.testing.assert_array_equal(found[:, 1:], 0)
     assert np.all(np.isfinite(found)) and np.any(found[:, 0])
 

@@ -62,11 +62,11 @@ def projector(rt: Runtime, table: TimeCells, **options: object) -> SplatProjecto
 
 @MOTIONS
 @READOUTS
-def test_every_build_is_the_twin(any_rt, make_cloud, make_table, motion, axis, direction) -> None:
+def test_frames_are_the_twins(two_rt, make_cloud, make_table, motion, axis, direction) -> None:
     rows, table = make_cloud(5, 61, scale=(0.05, 0.2)), make_table(motion, axis, direction)
     found, mean = (
         table.readout.frames(
-            projector(any_rt, table, **unit).project(rows, DeviceCells.upload(any_rt, table))
+            projector(two_rt, table, **unit).project(rows, DeviceCells.upload(two_rt, table))
         )
         for unit in ({}, {"intensity_unit": None})
     )
@@ -81,11 +81,11 @@ def test_every_build_is_the_twin(any_rt, make_cloud, make_table, motion, axis, d
     ("motion", "affine"),
     [("static", False), ("micro-views", True), ("exact", False), ("exact", True), ("per-row", False)],
 )
-def test_gradients(any_rt, make_cloud, make_table, finite_differences, motion, affine) -> None:
+def test_gradients(two_rt, make_cloud, make_table, finite_differences, motion, affine) -> None:
     """Shares depend on all Gaussians together, so that differences are taken of the whole cloud."""
     rows, table, h = make_cloud(2, 62, scale=(0.08, 0.3)), make_table(motion), random_weights(SHAPE)
-    cells = DeviceCells.upload(any_rt, table)
-    found = projector(any_rt, table, affine=affine).project_adjoint(rows, cells, h.astype(np.float32))
+    cells = DeviceCells.upload(two_rt, table)
+    found = projector(two_rt, table, affine=affine).project_adjoint(rows, cells, h.astype(np.float32))
     expected = finite_differences(lambda r: float((h * twin(r, table, affine=affine)).sum()), rows)
     assert_classes(found, expected, GRADIENT)
 

@@ -30,28 +30,28 @@ def test_rows_there_and_gradients_back(any_rt, make_cloud, line_integrals) -> No
     assert np.allclose(any_rt.download(total), 2 * units * gradients[:11, :21], rtol=FLOAT32)
 
 
-def test_densities_alone(any_rt, make_cloud) -> None:
+def test_densities_alone(two_rt, make_cloud) -> None:
     rows = make_cloud(5).astype(np.float32)
-    plain = PlainRows(any_rt, LENGTH_MM, line_integrals=True)
-    before = plain.enter(any_rt.upload(rows))
+    plain = PlainRows(two_rt, LENGTH_MM, line_integrals=True)
+    before = plain.enter(two_rt.upload(rows))
     density = np.arange(5, dtype=np.float32)
-    after = plain.with_densities(before, any_rt.upload(density)).gaussians
-    expected = any_rt.download(before.gaussians.rows)
+    after = plain.with_densities(before, two_rt.upload(density)).gaussians
+    expected = two_rt.download(before.gaussians.rows)
     expected[10, :5] = density * LENGTH_MM
-    assert np.array_equal(any_rt.download(after.rows), expected)
-    assert np.array_equal(any_rt.download(plain.densities(any_rt.upload(rows))), rows[10])
+    assert np.array_equal(two_rt.download(after.rows), expected)
+    assert np.array_equal(two_rt.download(plain.densities(two_rt.upload(rows))), rows[10])
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_images_there_and_back(any_rt, turned) -> None:
+def test_images_there_and_back(two_rt, turned) -> None:
     images = np.random.default_rng(0).normal(size=(3, 5, 37)).astype(np.float32)
     by_line = images.swapaxes(1, 2) if turned else images
     lines, width = by_line.shape[1:]
-    plain = PlainImages(any_rt, lines, width, turned=turned)
-    there, back = any_rt.upload(images), any_rt.zeros(images.shape)
+    plain = PlainImages(two_rt, lines, width, turned=turned)
+    there, back = two_rt.upload(images), two_rt.zeros(images.shape)
     for number in (2, 0, 1):
         image = plain.enter(there, number)
-        assert np.array_equal(any_rt.download(image), pad_rows(by_line[number]))
-        assert np.array_equal(unpad_rows(any_rt.download(image), (lines, width)), by_line[number])
+        assert np.array_equal(two_rt.download(image), pad_rows(by_line[number]))
+        assert np.array_equal(unpad_rows(two_rt.download(image), (lines, width)), by_line[number])
         plain.leave(image, back, number)
-    assert np.array_equal(any_rt.download(back), images)
+    assert np.array_equal(two_rt.download(back), images)

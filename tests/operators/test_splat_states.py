@@ -56,12 +56,12 @@ def check_frame_and_gradients(rt, finite_differences, rows, table, one, affine=F
 
 
 @pytest.mark.parametrize("count", [0, 1, 3, 37])
-def test_a_cloud_in_every_state_is_its_twin(any_rt, make_cloud, make_geometry, count) -> None:
+def test_a_cloud_in_every_state_is_its_twin(two_rt, make_cloud, make_geometry, count) -> None:
     """Also outside of the control points, where it rests."""
     rows, one = make_cloud(count, 3, spread=1.5), deformation()
     table = frame_cells("micro-views", make_geometry(*SHAPE))
-    cells, gaussians = DeviceCells.upload(any_rt, table, states_of(table, one)), DeviceGaussians.upload(any_rt, rows)
-    moved = any_rt.download(CloudStates(any_rt, one).forward(gaussians, cells.shares))
+    cells, gaussians = DeviceCells.upload(two_rt, table, states_of(table, one)), DeviceGaussians.upload(two_rt, rows)
+    moved = two_rt.download(CloudStates(two_rt, one).forward(gaussians, cells.shares))
     weights = one.weights_at(np.unique(table.time_s))
     assert moved.shape == (len(weights), STATE_ROWS, gaussians.stride)
     for state, expected in zip(moved[..., :count], weights, strict=True):
@@ -139,13 +139,6 @@ def test_an_object_on_bent_paths_gets_more_segments(rt, make_cloud, make_geometr
     many = render(rt, rows, per_line_cells(*where, 30), swing)
     one, several = (np.linalg.norm(render(rt, rows, exact_cells(*where, n), swing) - many) for n in (1, count))
     assert count > 2 and several < 0.1 * one
-
-
-@pytest.mark.slow
-def test_results_repeat_bit_for_bit(any_rt, make_cloud, make_geometry) -> None:
-    rows, table, h = make_cloud(40, 48), frame_cells("exact", make_geometry(*SHAPE)), random_weights(SHAPE)
-    frames = [gradients(any_rt, rows, table, deformation(), h, cutoff_sigma=3.7) for _ in range(2)]
-    np.testing.assert_array_equal(*frames)
 
 
 def test_cells_that_do_not_fit_are_refused(make_geometry) -> None:

@@ -70,10 +70,10 @@ def fast_cloud(seed: int, count: int) -> np.ndarray:
 
 @MODELS
 @pytest.mark.parametrize("speed", [1e-3, 0.5, 2.0])
-def test_every_build_is_the_quadrature(any_rt, make_cloud, make_geometry, speed, affine) -> None:
+def test_frames_are_the_quadrature(two_rt, make_cloud, make_geometry, speed, affine) -> None:
     rows = make_cloud(4, 41, scale=(0.05, 0.3))
     table = table_of(make_geometry(*SHAPE, offset=(0.15, -0.25)), Shutter(0.8, 0.6), speed, 3)
-    frame = render(any_rt, rows, table, SHAPE, affine=affine, cutoff_sigma=0.0, time_error=CLOSED_ONLY)
+    frame = render(two_rt, rows, table, SHAPE, affine=affine, cutoff_sigma=0.0, time_error=CLOSED_ONLY)
     assert_near(frame, moving_frame(rows, table, SHAPE, affine=affine), SPLAT_MOVING)
 
 
@@ -91,12 +91,12 @@ def test_any_readout_and_lines_that_open_for_a_moment(
 
 
 @pytest.mark.parametrize("speed", [0.05, 0.4, 1.5])
-def test_cutoff_is_the_outline_of_the_path(any_rt, speed) -> None:
+def test_cutoff_is_the_outline_of_the_path(two_rt, speed) -> None:
     """Boxes and the spans of lines hold all that is drawn, and nothing else is drawn."""
     rows = fast_cloud(43, 8)
     rows[3, :2], rows[4, :2] = 0.002, 0.2  # two needles
     table = table_of(fast_geometry(), Shutter(0.8, 0.6), speed, 2)
-    frame = render(any_rt, rows, table, WIDE, time_error=CLOSED_ONLY)
+    frame = render(two_rt, rows, table, WIDE, time_error=CLOSED_ONLY)
     low, high = (
         moving_frame(rows, table, WIDE, DEFAULT_CUTOFF_SIGMA + edge)
         for edge in (-CUTOFF_EDGE_MOVING, CUTOFF_EDGE_MOVING)
@@ -192,10 +192,10 @@ def test_slow_motion_is_almost_the_static_picture(rt, make_cloud, make_geometry)
     assert_near(*frames, STANDING_PICTURE)
 
 
-def test_behind_the_source_at_any_time_nothing_is_seen(any_rt, make_cloud, make_geometry) -> None:
+def test_behind_the_source_at_any_time_nothing_is_seen(two_rt, make_cloud, make_geometry) -> None:
     rows, table = make_cloud(2, 53), table_of(make_geometry(*SHAPE), Shutter(0.8, 0.6), 0.5, 2)
     rows[:3, 1] = 9.0, 3.0, 0.2  # the source is 5 from the axis, near the x axis
-    alone = render(any_rt, rows[:, :1], table, SHAPE)
-    np.testing.assert_array_equal(render(any_rt, rows, table, SHAPE), alone)
-    found = gradients(any_rt, rows, table, weights(SHAPE))
+    alone = render(two_rt, rows[:, :1], table, SHAPE)
+    np.testing.assert_array_equal(render(two_rt, rows, table, SHAPE), alone)
+    found = gradients(two_rt, rows, table, weights(SHAPE))
     assert np.all(np.isfinite(found)) and not np.any(found[:, 1])

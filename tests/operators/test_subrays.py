@@ -37,8 +37,8 @@ def mismatch(operator) -> float:
     ("motion", "grid", "beam"),
     [("static", UPRIGHT, "cone"), ("static", GRID, "parallel"), ("micro-views", GRID, "cone"), ("common", UPRIGHT, "cone")],
 )
-def test_a_pixel_is_the_mean_over_a_finer_panel(any_rt, motion, grid, beam, axis) -> None:
-    operator = of(any_rt, motion, axis, grid, beam=beam)
+def test_a_pixel_is_the_mean_over_a_finer_panel(two_rt, motion, grid, beam, axis) -> None:
+    operator = of(two_rt, motion, axis, grid, beam=beam)
     rows, columns = SHAPE
     fine = [table.finer(*PAIR) for table in operator.tables]
     x, y = noise(grid.shape, 5), noise(operator.frames_shape, 6)
@@ -91,11 +91,11 @@ def test_intensity_averages_the_times_of_a_line_and_not_its_rays(any_rt) -> None
 
 
 @pytest.mark.slow
-def test_an_object_that_moves(any_rt) -> None:
+def test_an_object_that_moves(two_rt) -> None:
     control_mm = 0.1 * noise((1, 4, 4, 4, 3), 12)
     motion = Deformation(control_mm, (-1.0, -1.0, -1.0), 0.7, np.array([0.0, 6.0]), np.array([[0.0], [1.0]]))
     cells = tables("static", SHAPE, frames=3)
-    moving = projector_of(any_rt, GRID, cells, motion)(any_rt, GRID, SHAPE, cells, subrays=PAIR)
+    moving = projector_of(two_rt, GRID, cells, motion)(two_rt, GRID, SHAPE, cells, subrays=PAIR)
     assert mismatch(moving) <= ADJOINT
     assert moving.memory.layout.subrays == PAIR
 

@@ -28,17 +28,17 @@ def cut_fields(rows: np.ndarray, grid: Grid, edge: float) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("grid", GRIDS, ids=IDS)
-def test_field_is_the_sum_of_gaussians(any_rt, make_cloud, grid) -> None:
+def test_field_is_the_sum_of_gaussians(two_rt, make_cloud, grid) -> None:
     rows = make_cloud(9, 41)
-    volume = Voxeliser(any_rt, grid.shape, cutoff_sigma=0.0).voxelise(rows, grid)
+    volume = Voxeliser(two_rt, grid.shape, cutoff_sigma=0.0).voxelise(rows, grid)
     assert_near(volume, voxel_field(rows, *grid.axes_mm()), VOXEL, rows[DENSITY].max())
 
 
 @pytest.mark.parametrize("grid", GRIDS[:2], ids=IDS[:2])
-def test_cutoff_means_the_same_as_in_the_twin(any_rt, make_cloud, grid) -> None:
+def test_cutoff_means_the_same_as_in_the_twin(two_rt, make_cloud, grid) -> None:
     rows = make_cloud(9, 42, scale=(0.03, 0.2))
     low, high = cut_fields(rows, grid, CUTOFF_EDGE_SIGMA)
-    assert_between(voxelise(any_rt, rows, grid), low, high, VOXEL * rows[DENSITY].max())
+    assert_between(voxelise(two_rt, rows, grid), low, high, VOXEL * rows[DENSITY].max())
     assert (high > 0).mean() < 1
 
 
@@ -51,18 +51,18 @@ def test_nothing_is_written_beside_a_whole_number_of_vectors(monkeypatch, make_c
         voxeliser.voxelise_adjoint(make_cloud(16, 49, scale=(0.1, 0.3)), grid, np.ones(grid.shape, np.float32))
 
 
-def test_bricks_parts_of_a_grid_and_no_gaussian(any_rt, make_cloud) -> None:
+def test_bricks_parts_of_a_grid_and_no_gaussian(two_rt, make_cloud) -> None:
     """Slabs of one voxel, some that divide the height badly, and a part in the middle."""
     rows, grid = make_cloud(30, 43), GRIDS[0]
-    whole = voxelise(any_rt, rows, grid)
+    whole = voxelise(two_rt, rows, grid)
     assert whole.max() > 0.5
     for brick_bytes in (1, 4 * 14 * 48 * 2, 4 * 14 * 48 * 5):
-        np.testing.assert_array_equal(voxelise(any_rt, rows, grid, brick_bytes=brick_bytes), whole)
+        np.testing.assert_array_equal(voxelise(two_rt, rows, grid, brick_bytes=brick_bytes), whole)
     start, shape = (2, 3, 5), (4, 6, 7)
-    part = Voxeliser(any_rt, shape).forward(DeviceGaussians.upload(any_rt, rows), grid, start)
+    part = Voxeliser(two_rt, shape).forward(DeviceGaussians.upload(two_rt, rows), grid, start)
     inside = tuple(slice(s, s + n) for s, n in zip(start, shape, strict=True))
-    np.testing.assert_array_equal(unpad_rows(any_rt.download(part), shape), whole[inside])
-    np.testing.assert_array_equal(voxelise(any_rt, np.zeros((11, 0)), GRIDS[0]), 0)
+    np.testing.assert_array_equal(unpad_rows(two_rt.download(part), shape), whole[inside])
+    np.testing.assert_array_equal(voxelise(two_rt, np.zeros((11, 0)), GRIDS[0]), 0)
 
 
 def test_needles_keep_their_digits_and_their_boxes(any_rt) -> None:
@@ -79,10 +79,10 @@ def test_needles_keep_their_digits_and_their_boxes(any_rt) -> None:
 
 
 @pytest.mark.parametrize("grid", GRIDS[:4], ids=IDS[:4])
-def test_gradients(any_rt, make_cloud, finite_differences, grid) -> None:
+def test_gradients(two_rt, make_cloud, finite_differences, grid) -> None:
     rows, axes = make_cloud(3, 45, scale=(0.1, 0.3)), grid.axes_mm()
     h = np.random.default_rng(6).normal(size=grid.shape).astype(np.float32).astype(np.float64)
-    found = Voxeliser(any_rt, grid.shape, cutoff_sigma=0.0).voxelise_adjoint(rows, grid, h)
+    found = Voxeliser(two_rt, grid.shape, cutoff_sigma=0.0).voxelise_adjoint(rows, grid, h)
     expected = by_gaussian(finite_differences, lambda r: (h * voxel_field(r, *axes)).sum(), rows)
     assert_classes(found, expected, GRADIENT)
 
@@ -99,11 +99,11 @@ def test_a_group_sums_what_one_item_sums(banded_rt, make_cloud, cutoff_sigma) ->
     assert_classes(group, one, SERIAL_SUM)
 
 
-def test_rounding_does_not_turn_a_round_gaussian(any_rt, make_cloud) -> None:
+def test_rounding_does_not_turn_a_round_gaussian(two_rt, make_cloud) -> None:
     rows, grid = make_cloud(5, 48, scale=(0.1, 0.3)), GRIDS[0]
     rows[SCALE] = rows[SCALE][:1] * (1 + 3e-6 * np.array([[1.0], [0.0], [-1.0]]))
     h = np.random.default_rng(9).normal(size=grid.shape).astype(np.float32)
-    voxeliser = Voxeliser(any_rt, grid.shape)
+    voxeliser = Voxeliser(two_rt, grid.shape)
     found = voxeliser.voxelise_adjoint(rows, grid, h)
     assert not found[QUATERNION].any() and found[SCALE].any()
     rows[SCALE] *= 1 + 1e-4 * np.array([[1.0], [0.0], [0.0]])

@@ -1,6 +1,5 @@
 """Each step on a scan of 180 views of 32² pixels: it leaves a clean scan alone, and removes a fault that was planted."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +10,6 @@ from phyradgs_cl.api import prepare
 from phyradgs_cl.detector import tube_spectrum
 from phyradgs_cl.detector.effects import add_scatter, beer_lambert_noise, drifting_light
 from phyradgs_cl.prepare import PREPARED_KEY, find_dead, water_polynomial
-
-Make = Callable[..., Scan]
 
 
 @pytest.fixture(scope="module")

@@ -80,9 +80,9 @@ def test_each_line_sees_the_state_of_its_own_time(rt) -> None:
     np.testing.assert_array_equal(border[-1], second[-1])
 
 
-def test_transpose_subsets_and_equal_states(any_rt) -> None:
+def test_transpose_subsets_and_equal_states(two_rt) -> None:
     scan, rng = empty_scan(12), np.random.default_rng(1)
-    operator, alone = operators(any_rt, scan, np.array([1.0, 6.0, 11.0]))
+    operator, alone = operators(two_rt, scan, np.array([1.0, 6.0, 11.0]))
     stack = rng.random((3, *GRID.shape)).astype(np.float32)
     frames = rng.random((12, *SHAPE)).astype(np.float32)
     forward, back = operator.forward(stack), operator.adjoint(frames)
