@@ -19,7 +19,7 @@ from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import State, with_identity, without_identity
-from phyradgs_cl.reconstructors.doubt import FITTED, FITTED_SIDE, Doubter
+from phyradgs_cl.reconstructors.doubt import FITTED_SIDE, MEASURED, Doubter
 from phyradgs_cl.reconstructors.method import METHODS, check_able, method_of
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan, check_object_motion, preprocessing_of
 from phyradgs_cl.reconstructors.preprocess import prepared
@@ -81,10 +81,10 @@ def reconstruct(
 
 
 def _warn_of_doubt(plan: RunPlan, kind: str, grid: Grid) -> None:
-    """Warns of methods and grids to which error bars were not fitted."""
-    if plan.method not in FITTED:
-        text = "error bars were fitted to %s: of %s they may be far too narrow; --holdout 2 widens them in part"
-        log.warning(text, ", ".join(FITTED), plan.method)
+    """Warns of methods and grids on which error bars were not measured."""
+    if plan.method not in MEASURED:
+        text = "error bars were measured for %s: those of %s may be far too narrow; --holdout 2 widens them in part"
+        log.warning(text, ", ".join(MEASURED), plan.method)
     elif kind == "analytic" and grid.shape[2] < FITTED_SIDE and not plan.preprocessing.holdout:
         text = "error bars of %s were fitted to grids of 64³ voxels: on smaller ones they are 2 to 3 times too narrow; give "
         log.warning(text + "--holdout 2", plan.method)
