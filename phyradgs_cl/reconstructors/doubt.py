@@ -26,7 +26,7 @@ from phyradgs_cl.reconstructors.projected import FRAMES_AT_A_TIME, FramePair, fr
 from phyradgs_cl.reconstructors.result import DOUBT, Progress, Reconstruction, Report
 from phyradgs_cl.runtime import Runtime
 
-MEASURED = ("fista", "fista-tv", "fdk", "asd-pocs", "cgls", "os-sart", "sart", "sirt")  # the law is fitted to the first three
+MEASURED = ("fista", "fista-tv", "fdk", "asd-pocs", "cgls", "os-sart", "sart", "sirt")  # the law is fitted to the first 3
 FITTED_SIDE = 48  # voxels in x: on smaller grids bars of analytic methods were 2 to 3 times too narrow; fitted at 64
 RUNS = 3  # of the method: that of the scan, and two of synthesised scans
 PARTS = 2  # of a voxel along each side, for projections: the projector blurs by a voxel, which the scan did not
