@@ -107,7 +107,6 @@ WHOLE_GRADIENT = 1e-4
 LAUNCH_SHAPE = 1e-3  # a few iterations in another order of sums; Adam enlarges what is near 0 (3e-5)
 SCALE_LAW = 1e-2  # 30 steps: rounding decides signs of L1 near its kink (1.1e-3); powers of two are exact
 # counts are divided in float64 but come out float32 (0 here); one last place would act as above
-GAIN_LAW = 1e-2
 CLOUD_VOLUME = 2e-3  # a voxel at the cutoff's edge (0.1 % of a peak) may fall on the other side
 
 # --- iterative methods ---------------------------------------------------------------------------------------
