@@ -15,11 +15,11 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.angles import has_opposite_views, start_azimuths_rad, wrapped
 from phyradgs_cl.acquisition.altered.coarse import some_frames
-from phyradgs_cl.acquisition.altered.variants import reversed_rotation, shifted
+from phyradgs_cl.acquisition.altered.variants import altered_trajectory, reversed_rotation, shifted
 from phyradgs_cl.check import hypotheses
 from phyradgs_cl.check.finding import CANNOT_TELL, FEWEST_COLUMNS, OK, SUSPICIOUS, Finding
 from phyradgs_cl.check.hypotheses import Hypothesis, frame_number
-from phyradgs_cl.detector import robust_deviation
+from phyradgs_cl.detector import noise_level, robust_deviation
 from phyradgs_cl.reconstructors.fits import axis
 from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares, t_statistic
 from phyradgs_cl.runtime import Runtime
@@ -34,9 +34,9 @@ _FEWEST_PIXELS = 32  # scans with fewer valid coarse pixels per frame cannot be 
 _CLEAR = 0.5  # a hypothesis must leave less than this fraction of the stated scan's squared residual
 _NEARLY = 1.5  # rough fits with up to this many times the least mean squared residual are refined
 _ERRORS = 4.0  # least advantage of a hypothesis over the stated scan, in standard errors
-# Frames look the same from every angle where a random order leaves a residual within both of these limits.
-_SYMMETRIC = 2.0  # largest ratio of the residual in a random order to that in the stated order
+# Frames look the same from every angle where a random order leaves a residual within one of these limits.
 _SAME = 0.03  # largest ratio of the residual in a random order to the standard deviation of the line integrals
+_NOISY = 1.6  # largest ratio of the residual in a random order to the noise: round objects had up to 1.3, others 2.3 or more
 _MOST_REFINED = 2  # most hypotheses about the whole scan for which the panel's shift is refined
 _SHIFT_PENALTY = 1.5  # factor on the squared residual per coarse pixel of the panel's shift: stated offsets are mostly right
 # A frame is odd where its mean line integral differs from its neighbours' by more than both of these.
@@ -110,8 +110,7 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
         return Consistency(finding, frames, is_sound, sees_angles)
 
     about_frames = "exclude these frames (image_key 3), or correct them; further answers do not use them" if notes else ""
-    spread = float(np.asarray(best.projections, np.float64).var()) * best.frames
-    if ratio * _SYMMETRIC >= 1 and coarse.random_total <= _SAME**2 * spread:
+    if ratio > _LARGEST and coarse.random_total <= best.frames * _unseen(best, as_stated) ** 2:
         text = "the frames look the same from every angle: their order and angles leave no trace"
         return answer(SUSPICIOUS if notes else CANNOT_TELL, text, about_frames, True, sees_angles=False)
     text = f"residual {ratio:.2g} of that of the frames in a random order"
@@ -129,6 +128,14 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
         advice = f"compare order and orientation of the frames, angles, {doubtful} with the scanner's log"
         return answer(SUSPICIOUS, f"frames do not fit together, cause not found: {text}", advice, False)
     return answer(SUSPICIOUS if notes else OK, text, about_frames, True)
+
+
+def _unseen(scan: Scan, as_stated: Scan) -> float:
+    """Returns the residual of a coarse ``scan`` in a random order up to which its frames tell nothing of their angles."""
+    # noise differs from ray to ray, which raises that of fine pixels, and edges raise that of coarse ones
+    levels = [noise_level(one.projections, np.broadcast_to(one.valid, one.projections.shape)) for one in (scan, as_stated)]
+    noise = min(levels[0], levels[1] / float(np.prod(altered_trajectory(scan).blocks)) ** 0.5)
+    return max(_SAME * float(np.asarray(scan.projections, np.float64).std()), _NOISY * noise)
 
 
 def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:

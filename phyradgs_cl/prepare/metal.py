@@ -15,6 +15,7 @@ from phyradgs_cl.prepare.step import Facts, MakeModel
 
 _DENSER = 6.0  # times the object's main material: bone and enamel have up to 5 times water's attenuation, titanium 7 or more
 _FEWEST = 4  # voxels that touch: fewer are noise
+_BLIND = 2  # voxels around metal that only masked rays meet
 _VOXELS = 128  # along the longest side of the volume that fills the shadow
 _MOST, _OBJECT = 0.5, 0.02  # of the object's pixels, which are those with so much of the largest line integral
 
@@ -48,14 +49,22 @@ def mask_metal(scan: Scan, options: MetalOptions, make_model: MakeModel) -> tupl
         raise InputError("--steps metal", found, f"at most {100 * _MOST:.0f} %", remedy)
     metal = Metal(np.where(is_metal, volume, 0).astype(np.float32), scan.grid)
     masked = step.with_masked(scan, shadow)
-    return replace(masked, projections=_completed(masked, shadow, make_model), metal=metal), facts
+    return replace(masked, projections=_completed(masked, shadow, is_metal, make_model), metal=metal), facts
 
 
-def _completed(masked: Scan, shadow: np.ndarray, make_model: MakeModel) -> np.ndarray:
+def _completed(masked: Scan, shadow: np.ndarray, is_metal: np.ndarray, make_model: MakeModel) -> np.ndarray:
     """Returns the frames (F, v, u) with the shadow as a volume of the other pixels projects into it. What the projection
-    misses beside the shadow is interpolated across it, so that no edge is left."""
+    misses beside the shadow is interpolated across it, so that no edge is left.
+
+    No ray but masked ones meets voxels in and beside metal, so they stay near 0: they get the density around them."""
     model, _ = step.coarse_model(masked, make_model, _VOXELS)
-    computed = model.frames(model.regularised(masked.projections))
+    volume = model.regularised(masked.projections)
+    factors = np.divide(volume.shape, is_metal.shape)
+    blind = scipy.ndimage.zoom(is_metal.astype(np.float32), factors, order=1, mode="nearest", grid_mode=True) > 0
+    blind = scipy.ndimage.binary_dilation(blind, iterations=_BLIND)
+    nearest = scipy.ndimage.distance_transform_edt(blind, return_distances=False, return_indices=True)
+    volume = np.where(blind, scipy.ndimage.median_filter(volume, 3)[tuple(nearest)], volume)
+    computed = model.frames(volume)
     missed = step.fill_masked(masked.projections - computed, shadow)
     return np.where(shadow, computed + missed, masked.projections).astype(np.float32)
 

@@ -6,6 +6,7 @@ import pytest
 
 from phyradgs_cl.acquisition import ConeGeometry, Scan, make_protocol
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.phantoms import EllipsoidPhantom
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
 
@@ -14,7 +15,8 @@ def scan_of(rt) -> Callable[..., Scan]:
     """A noisy fly-scan of a phantom with this cone; keywords go to the protocol."""
 
     def make(
-        geometry: ConeGeometry, phantom: str = "jaw", size: int = 24, axis: str = "rows", **protocol: object
+        geometry: ConeGeometry, phantom: str | EllipsoidPhantom = "jaw", size: int = 24, axis: str = "rows",
+        **protocol: object,
     ) -> Scan:
         scene = phantom_scene(rt, phantom, geometry, Grid.cube(size, 2.0), size, axis, 0)
         options = SimulationOptions(

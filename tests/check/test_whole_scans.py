@@ -13,6 +13,7 @@ from phyradgs_cl.check import CANNOT_TELL, OK, SUSPICIOUS, check, consistency
 from phyradgs_cl.check.coverage import check_coverage
 from phyradgs_cl.check.orbit import find_orbit
 from phyradgs_cl.check.run import quick_scan
+from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.reconstructors.fits.axis import AxisShift
 
 pytestmark = pytest.mark.slow
@@ -166,3 +167,20 @@ def test_an_object_that_looks_the_same_from_every_angle_raises_no_alarm(rt, clea
     p = disc + 0.01 * rng.normal(size=(32, 32)) + 0.01 * rng.normal(size=clean.projections.shape)
     found = check(replace(clean, projections=p.astype(np.float32)), rt)
     assert found.suspicious == [] and verdicts(found)["sign of rotation"] == CANNOT_TELL
+
+
+@pytest.mark.parametrize(
+    ("longer", "noise", "verdict"), [(1.02, 0.01, CANNOT_TELL), (1.1, 0.1, CANNOT_TELL), (1.5, 0.1, SUSPICIOUS)]
+)
+def test_views_that_differ_by_less_than_their_noise_tell_nothing_and_an_oblong_object_tells(
+    rt, scan_of, longer, noise, verdict
+) -> None:
+    """A nearly round object was suspected with right frames. The oblong one has its frames in a wrong order."""
+    body = EllipsoidPhantom((Ellipsoid((0, 0, 0), (0.6 * longer, 0.6, 0.6), 1.0),), "body")
+    geometry = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125))
+    scan = scan_of(geometry, body, views=15, exposure_deg=24.0, readout_ratio=0.5)
+    random = np.random.default_rng(1)
+    frames = scan.projections[random.permutation(15)] if verdict == SUSPICIOUS else scan.projections
+    noisy = replace(scan, projections=(frames + noise * random.normal(size=frames.shape)).astype(np.float32))
+    finding = consistency.check_consistency(rt, quick_scan(noisy), noisy).finding
+    assert finding.verdict == verdict and finding.value > finding.threshold, finding
