@@ -111,7 +111,7 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
 
     about_frames = "exclude these frames (image_key 3), or correct them; further answers do not use them" if notes else ""
     if ratio > _LARGEST and coarse.random_total <= best.frames * _unseen(best, as_stated) ** 2:
-        text = "the frames look the same from every angle: their order and angles leave no trace"
+        text = "the frames differ too little from angle to angle: a wrong order or wrong angles would not show"
         return answer(SUSPICIOUS if notes else CANNOT_TELL, text, about_frames, True, sees_angles=False)
     text = f"residual {ratio:.2g} of that of the frames in a random order"
     hypothesis = _explanation(rt, some_frames(scan, frames), as_stated, coarse)

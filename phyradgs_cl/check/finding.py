@@ -36,4 +36,4 @@ def too_narrow(question: str, unit: str) -> Finding:
 
 def same_from_everywhere(question: str) -> Finding:
     """Returns the answer "cannot tell" to a question about angles, for an object that looks the same from every angle."""
-    return Finding(question, CANNOT_TELL, 0.0, 0.0, "", "the object looks the same from every angle")
+    return Finding(question, CANNOT_TELL, 0.0, 0.0, "", "the object looks too much the same from every angle")

@@ -46,7 +46,7 @@ _WATER = "Attenuation of water in 1/mm; the values are then Hounsfield units, wi
 _HU = "Hounsfield units by the volume's own scale, else fitted to air and water. An output .h5 keeps 1/mm and the scale."
 _AIR = "Box of air, for Hounsfield units."
 _WATER_BOX = "Box of water, or of the insert, for Hounsfield units."
-_DOUBT = "The error bars σ of 'reconstruct --doubt' in 1/mm, by default to VOLUME.doubt with the suffix."
+_DOUBT = "The error bars σ of 'reconstruct --doubt' in 1/mm; with --to, by default to VOLUME.doubt with the suffix."
 _INSERT = "HU of the second point, where it is not water."
 
 

@@ -27,7 +27,7 @@ from phyradgs_cl.reconstructors.result import DOUBT, Progress, Reconstruction, R
 from phyradgs_cl.runtime import Runtime
 
 MEASURED = ("fista", "fista-tv", "fdk", "asd-pocs", "cgls", "os-sart", "sart", "sirt")  # the law is fitted to the first 3
-FITTED_SIDE = 48  # voxels in x: on smaller grids bars of analytic methods were 2 to 3 times too narrow; fitted at 64
+FITTED_SIDE = 48  # voxels in x: on smaller grids bars of analytic methods were 2 to 5 times too narrow; fitted at 64
 RUNS = 3  # of the method: that of the scan, and two of synthesised scans
 PARTS = 2  # of a voxel along each side, for projections: the projector blurs by a voxel, which the scan did not
 NEAR = 0.55  # voxels: standard deviation of the Gaussian that smooths squares of differences; chosen with the law
@@ -190,8 +190,8 @@ def _warn_of(residual_square: float, noise_square: float, square: float, mean: f
         text += "part, and may be too narrow; give --holdout 2, and run 'phyradgs check'"
         log.warning(text, unexplained)
     if noisy > _NOISY:
-        text = "the noise is %.2g %% of the object's line integrals: error bars do not hold soft texture that it hides, and "
-        log.warning(text + "half of the voxels may be outside of σ", 100 * noisy)
+        text = "the noise is %.2g %% of the object's line integrals: error bars do not hold soft texture that it hides"
+        log.warning(text, 100 * noisy)
 
 
 def _counted(progress: Progress, results: list[Reconstruction]) -> Progress:

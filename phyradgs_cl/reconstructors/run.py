@@ -86,8 +86,8 @@ def _warn_of_doubt(plan: RunPlan, kind: str, grid: Grid) -> None:
         text = "error bars were measured for %s: those of %s may be far too narrow; --holdout 2 widens them in part"
         log.warning(text, ", ".join(MEASURED), plan.method)
     elif kind == "analytic" and grid.shape[2] < FITTED_SIDE and not plan.preprocessing.holdout:
-        text = "error bars of %s were fitted to grids of 64³ voxels: on smaller ones they are 2 to 3 times too narrow; give "
-        log.warning(text + "--holdout 2", plan.method)
+        text = "error bars of %s were fitted to grids of 64³ voxels: on smaller ones they were up to 5 times too narrow; "
+        log.warning(text + "give --holdout 2", plan.method)
 
 
 class _Prepared:

@@ -54,7 +54,7 @@ def doubt_section(run: Run) -> Markup | None:
     z, y = (n // 2 for n in stored.values.shape[:2])
     truth = None if run.reference is None else run.reference[z, y]
     drawing = profile_chart(stored.required_grid.axes_mm()[2], stored.values[z, y], stored.doubt[z, y], truth)
-    words = "About 68 % of the object's voxels are within σ of the truth. This holds over a volume, not for one strange "
+    words = "Made so that 68 % of the object's voxels are within σ of the truth: over a volume, not for one strange "
     words += "detail; what no ray sees is the prior's belief. Among the slices σ is the layer Error bar."
     caption = f"Along x through the middle, with a band of one σ{'' if truth is None else '; dashed, the truth'}."
     return section("doubt", "Error bars", note(words), _charts([(caption, drawing)]))
