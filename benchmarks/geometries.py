@@ -154,7 +154,7 @@ class Case:
             return fly_scan(frames, self.geometry(), self.angles_deg, exposure_deg=arc, readout_ratio=ratio, grid=grid)
         if not self.exposure_deg:
             return Scan.from_poses(frames, self.poses(self.angles_deg), grid, is_parallel=self.is_parallel)
-        # Exposure and readout take a second each, so the table goes on for two seconds after each frame's start.
+        # Exposure and readout take a second each: the table ends two seconds after the last frame's start.
         step_deg = self.exposure_deg
         start_s = (self.angles_deg - self.angles_deg[0]) / step_deg
         time_s = np.arange(0, start_s[-1] + 2.1, 0.05)

@@ -67,7 +67,7 @@ def started(rt: Runtime, gaussians: int, pixels: int, batch: int) -> SplatRun:
 
 
 class Clock:
-    """Seconds of this rank by part. On a processor they are seconds of its own threads, which other programs do not change.
+    """Seconds of this rank by part. On a CPU this is processor time, which other programs do not change.
 
     Kernels take the seconds of all threads but this one. On other devices, events time the kernels and the clock times the
     rest."""
@@ -165,7 +165,7 @@ def slowest(facts: Facts, name: str) -> float:
 
 
 def exchange_share(facts: Facts) -> float:
-    """Returns the sums over ranks, with all that prepares them, as a share of a step without waiting."""
+    """Returns the time of sums over ranks, with their preparation, divided by that of a step without waiting."""
     parts = {name: slowest(facts, name) for name in PARTS}
     return parts["sum_ms"] / (parts["kernels_ms"] + parts["host_ms"] + parts["sum_ms"])
 

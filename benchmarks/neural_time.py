@@ -4,7 +4,7 @@
 
 Scans are those of scans.py. A run's volume is scored each time that a third more time has passed. Scoring, and making the
 volume for it, is not counted. Seconds are processor seconds of all threads in this process. With --threads 1, the default,
-they are what an idle core would take, also on a busy machine. They begin with the call, and include FDK and kernel builds. A
+a busy machine hardly changes them. They begin with the call, and include FDK and kernel builds. A
 run is in the file once it is done; runs in the file are not made again."""
 
 import argparse

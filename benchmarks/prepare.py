@@ -35,8 +35,8 @@ GAUSSIANS = 1000  # at least, in a box of any size
 
 @dataclass(frozen=True)
 class Effect:
-    """What is planted, the steps that undo it, and their options. part: the share of the grid's sides about the middle that
-    is reconstructed and compared. margin: the share of these filled at each side and discarded."""
+    """What is planted, the steps that undo it, and their options. part: the reconstructed
+    fraction of each side of the grid, about its middle. margin: the fraction added at each side, and discarded."""
 
     planted: dict[str, float]
     steps: str
@@ -116,7 +116,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=60)
     parser.add_argument("--dose", type=float, default=1e5)
     parser.add_argument("--phantoms", nargs="+", default=["jaw", "foot"], help="names, or files of volumes")
-    parser.add_argument("--seed", type=int, default=0, help="of noise and of what is planted")
+    parser.add_argument("--seed", type=int, default=0, help="of the random numbers of noise and effects")
     parser.add_argument("--methods", nargs="+", default=USUAL, choices=list(METHODS))
     parser.add_argument("--effects", nargs="+", default=list(EFFECTS), choices=list(EFFECTS))
     parser.add_argument("--figure", type=Path, help="draw slices of the jaw into this file, run nothing else")

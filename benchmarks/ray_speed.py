@@ -1,4 +1,4 @@
-"""Measures the speed of the ray-driven projector and its adjoint, beside RTK's Joseph projectors and by motion model.
+"""Compares the speed of the ray-driven projector and its adjoint with RTK's Joseph projectors, and between motion models.
 
     python -m venv PEER && PEER/bin/pip install itk-rtk numpy
     python benchmarks/ray_speed.py --peer-python PEER/bin/python [--json docs/results/ray_speed.json] [--device D]
