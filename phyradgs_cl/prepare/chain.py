@@ -37,6 +37,7 @@ DEFAULT_STEPS = "sparks,dead,rings"
 STEPS_HELP = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 PREPARED_KEY = "prepared"
 """The provenance's key of the list of applied steps."""
+_ONCE = ("scatter", "hardening", "phase")  # a second time would take out again what is no longer there
 
 
 @dataclass(frozen=True)
@@ -102,8 +103,11 @@ def one_by_one(
         raise InputError("option flats", "a scan of line integrals", expected, "leave it out")
     for name in options.chosen:
         step_options = getattr(options, name)
-        scan, numbers = STEPS[name](scan, step_options, make_model)
         earlier: Any = scan.provenance.get(PREPARED_KEY) or []
+        if name in _ONCE and any(entry["step"] == name for entry in earlier):
+            remedy = "leave it out, or start from the scan before that step"
+            raise InputError("--steps", f"{name}, which this scan has had", "other steps: this one is right only once", remedy)
+        scan, numbers = STEPS[name](scan, step_options, make_model)
         entry = {"step": name, **numbers, "options": asdict(step_options)}
         scan = replace(scan, provenance={**scan.provenance, PREPARED_KEY: [*earlier, entry]})
         log.info("%s: %s", name, numbers)

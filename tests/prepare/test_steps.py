@@ -148,6 +148,7 @@ def test_steps_keep_their_order_and_are_told(rt, planted) -> None:
 def test_what_is_no_step_or_no_option_of_one(rt, planted) -> None:
     empty, falling = replace(planted(), projections=0 * planted().projections), {"polynomial": [-5, 0, 0]}
     full = replace(planted(), projections=planted().projections + 1)
+    straight = replace(planted(), provenance={**planted().provenance, PREPARED_KEY: [{"step": "hardening"}]})
     cases = (
         (lambda: preprocessing_of({"steps": "rings", "rings": {"window": 1}}), "rings.window: found 1"),
         (lambda: preprocessing_of({"steps": "rings", "rings": {"window": 2}}), "rings.window"),
@@ -159,6 +160,7 @@ def test_what_is_no_step_or_no_option_of_one(rt, planted) -> None:
         (lambda: preprocessing_of({"steps": "hardening", "hardening": {"kvp": 5}}), "hardening.kvp"),
         (lambda: preprocessing_of({"steps": "hardening", "hardening": {"kvp": 80, "polynomial": [1, 0, 0]}}), "one of the"),
         (lambda: prepared(full, Preprocessing(steps="hardening")), "without a device"),
+        (lambda: prepared(straight, Preprocessing(steps="sparks,hardening"), rt), "hardening, which this scan has had"),
     )
     for call, told in cases:
         with pytest.raises(InputError, match=told):
