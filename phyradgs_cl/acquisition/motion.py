@@ -215,8 +215,8 @@ class Exact(_Model):
     poses: ClassVar = "integrals over time, of splats"
     operators: ClassVar = (SPLATS,)
     name: str = field(default="exact", init=False, repr=False)
-    segments: int = checks.option(0, "Segments of a frame (exact); 0: by --time-error.", "0", range=(0, 1000))
-    time_error: float = checks.option(0.005, "Relative error of averaging over time (exact).", "0.005", range=(1e-6, 1))
+    segments: int = checks.ranged(0, 0, 1000)
+    time_error: float = checks.ranged(0.005, 1e-6, 1)
 
     def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
         """Returns the ``TimeCells`` of one frame, one per segment. intensity_peak: as in ``segments_for``."""

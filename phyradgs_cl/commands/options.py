@@ -102,7 +102,6 @@ RUN_OPTIONS: dict[str, Any] = {
     **{name: kind for name, (kind, _) in OF_FRAMES.items()},
     "seed": _asked(int, "Seed of the random numbers.", "0"),
     "preset": _asked(str, _PRESET, "the method's first"),
-    "batch": _asked(int, "Frames per step, for splats.", "as many as ranks", metavar="B"),
     "config": Annotated[Path | None, file_option(_CONFIG, "--config")],
     "assignments": Annotated[list[str] | None, option(_SET, True, "--set", metavar="NAME=VALUE")],
     "detector_model": _asked(DetectorModel, "An exposure averages line integrals (log) or intensity.", "the scan's"),

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from phyradgs_cl.commands.console import AsJson, file_option, option, say
-from phyradgs_cl.commands.options import RUN_OPTIONS, Device, Memory, Output, Scan, settings_of, with_options
+from phyradgs_cl.commands.options import Device, Memory, Output, Scan, settings_of, with_options
 from phyradgs_cl.prepare.chain import DEFAULT_STEPS, STEPS_HELP
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.settings import Settings
@@ -15,7 +15,7 @@ EXAMPLES = {"prepare": "Example: phyradgs prepare scan.h5 -o clean.h5 --steps sp
 GROUPS = {
     "prepare": {
         "Basics": ("output", "steps", "assignments", "as_json"),
-        "Run": ("config", "ignore_lag", "device", "memory"),
+        "Run": ("config", "device", "memory"),
     }
 }
 _CONFIG = "TOML file of steps and their tables; the command line wins."
@@ -26,7 +26,6 @@ _OPTIONS = {
     "steps": (Annotated[str | None, option(STEPS_HELP, DEFAULT_STEPS, metavar="NAME,...")], None),
     "config": (Annotated[Path | None, file_option(_CONFIG, "--config")], None),
     "assignments": (Annotated[list[str] | None, option(_SET, True, "--set", metavar="NAME=VALUE")], None),
-    "ignore_lag": (RUN_OPTIONS["ignore_lag"], False),
     "device": (Device, None),
     "memory": (Memory, None),
 }

@@ -52,7 +52,6 @@ _GROUPS = {
         *("gaussians", "seed"),
     ),
     "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
-    "Under mpiexec (docs: cluster.md)": ("batch",),
 }
 GROUPS = {"reconstruct": _GROUPS, "estimate": _GROUPS}  # a command shows the parameters that it has
 _ROWS = "Detector rows of a parallel scan to read and reconstruct; row 0 is the lowest."

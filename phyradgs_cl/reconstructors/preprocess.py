@@ -32,7 +32,7 @@ class Preprocessing(PrepareOptions, GridChoice):
     synthesised scans too, for error bars of voxels. steps and a table for each:
     as in ``PrepareOptions``."""
 
-    ignore_lag: bool = checks.option(False, "Leave the scan's lag in the frames.")
+    ignore_lag: bool = False
     holdout: float = checks.option(0.0, _HOLDOUT, "0", metavar="PERCENT", range=(0, MOST_HELD_OUT), of_method=True)
     doubt: bool = checks.option(False, _DOUBT, of_method=True)
 

@@ -85,11 +85,11 @@ def test_columns_intensity_jitter_pulse_and_lag_are_simulated(cli, reconstructed
         assert (own["pulse_start"][()], own["pulse_length"][()], own["lag"][()]) == (0.86, 0.14, 0.1)
         assert "kinematics" in own
     reconstructed(path, "--iterations", "5")
-    for words in ([], ["--ignore-lag"], ["--holdout", "20"], ["--set", "holdout=20"]):
+    for words in ([], ["--set", "ignore_lag=true"], ["--holdout", "20"], ["--set", "holdout=20"]):
         with h5py.File(reconstructed(path, "--method", "fdk", *words)) as file:
             volumes.append(file["entry/reconstruction/volume"][()])
             facts = json.loads(file["entry/provenance/json"][()])
-        assert facts["input"]["ignore_lag"] == ("--ignore-lag" in words)
+        assert facts["input"]["ignore_lag"] == ("ignore_lag=true" in words)
     assert np.abs(volumes[0] - volumes[1]).max() > 0 and np.abs(volumes[0] - volumes[2]).max() > 0
     np.testing.assert_array_equal(volumes[2], volumes[3])
     micro_views, sart = ["--motion", "micro-views"], ["--method", "sart"]

@@ -137,8 +137,8 @@ def test_the_words_of_reconstruct(cli, refused, scan, monkeypatch) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("phyradgs_cl.commands.reconstruct.estimate", fake)
-    before = ["--detector-model", "intensity", "--holdout", "3", "--ignore-lag"]
-    for words in (["--strips", "2", "--sub-intervals", "1"], ["--segments", "2", "--time-error", "0.01"]):
+    before = ["--detector-model", "intensity", "--holdout", "3", "--set", "ignore_lag=true"]
+    for words in (["--strips", "2", "--sub-intervals", "1"], ["--set", "segments=2", "--set", "time_error=0.01"]):
         cli.run(["estimate", str(scan), "--method", "phyradgs", *words, *before])
     for plan in plans:
         assert plan.options.detector_model == "intensity"

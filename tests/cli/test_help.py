@@ -42,9 +42,6 @@ def test_help_is_whole_everywhere(cli, told, monkeypatch) -> None:
             if parameter.param_type_name == "argument":
                 assert parameter.metavar.isupper()
             assert getattr(parameter, "help", None), f"{name}: {parameter.name} says nothing"
-    for name in ("reconstruct", "estimate"):
-        usual, at_the_end = told(name, "-h").split("Under mpiexec (docs: cluster.md):\n")
-        assert "--batch" in at_the_end and "--batch" not in usual and "--help" in usual
 
 
 def test_the_defaults_are_those_of_the_default_method(told) -> None:

@@ -68,7 +68,7 @@ def test_the_same_volume_on_1_to_4_ranks(made: Made, size: int) -> None:
 
 
 def command(size: int, scan: Path, output: Path, *more: str) -> list[str]:
-    options = ["--method", "phyradgs", "--iterations", "400", "--batch", "4", "--gaussians", "300"]
+    options = ["--method", "phyradgs", "--iterations", "400", "--set", "batch=4", "--gaussians", "300"]
     options += ["--checkpoint-every", "0.05"]
     return [MPIEXEC, "-n", str(size), *PHYRADGS, "reconstruct", str(scan), "-o", str(output), *options, *more]
 
@@ -183,7 +183,7 @@ def test_what_is_wrong_is_said_once(scan_file, tmp_path) -> None:
     for more, status, line in (
         (["--method", "fdk"], 2, "--method fdk: found 3 ranks"),
         (["--device", "99"], 2, "--device: found '99'"),
-        (["--method", "phyradgs", "--batch", "2"], 2, "--batch: found 2 for 3 ranks"),
+        (["--method", "phyradgs", "--set", "batch=2"], 2, "batch: found 2 for 3 ranks"),
         (["--memory", "100K"], 6, "memory of"),
     ):
         words = ["reconstruct", str(scan_file), "-o", str(tmp_path / "v.h5"), *more]

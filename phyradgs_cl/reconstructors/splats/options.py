@@ -52,7 +52,7 @@ class SplatOptions(MotionOptions):
     scale_min_voxels: float = checks.ranged(0.0, 0, 100)
     scale_max: float = checks.ranged(1.0, 1e-6, 100)
     exact_from: float = checks.ranged(0.73, 0, 1)
-    batch: int = checks.ranged(0, 0, 1_000_000, "--batch (0: as many as ranks)")
+    batch: int = checks.ranged(0, 0, 1_000_000, "batch (0: as many as ranks)")
     rates: Rates = Rates()
     control: DensityControl = DensityControl()
 
@@ -87,7 +87,7 @@ class SplatOptions(MotionOptions):
         """Returns the frames per step: the option or, where it is 0, one for every rank. Raises InputError for more than
         the scan has."""
         if self.batch > frames:
-            raise InputError("--batch", str(self.batch), f"no more than the scan's {frames} frames")
+            raise InputError("batch", str(self.batch), f"no more than the scan's {frames} frames")
         return self.batch or min(ranks, frames)
 
     @property

@@ -255,5 +255,5 @@ def sharing_of(ranks: Communicator, batch: int) -> Alone:
     """Returns how ``ranks`` share steps of ``batch`` frames. Raises InputError where some rank would have no frame."""
     if ranks.size > batch:
         found = f"{batch} for {ranks.size} ranks"
-        raise InputError("--batch", found, "a frame for every rank", "raise it, or take fewer ranks")
+        raise InputError("batch", found, "a frame for every rank", "raise it, or take fewer ranks")
     return SharedFrames(ranks) if batch > 1 else Alone()
