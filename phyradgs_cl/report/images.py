@@ -22,7 +22,7 @@ Volume = NDArray[np.floating]
 
 def png_bytes(image: NDArray[np.uint8], colours: NDArray[np.uint8] | None = None) -> bytes:
     """Returns a PNG of an image (rows, columns) uint8, row 0 at the top. colours: (256, 3) uint8, None for grey."""
-    from PIL import Image  # here, since the import takes a tenth of a second and most commands need no picture
+    from PIL import Image  # here, since most commands draw no picture and the import takes 0.1 s
 
     picture = Image.fromarray(image)
     if colours is not None:

@@ -1,4 +1,4 @@
-"""Writes a page about a run while it goes on, again every few seconds. After the run the page becomes the report.
+"""Writes a page about a run every few seconds. After the run the page becomes the report.
 
 ``Status`` and ``Snapshot`` are the page's words and pictures; ``LivePage`` writes it."""
 

@@ -18,7 +18,7 @@ from phyradgs_cl.report.scan_charts import box_corners, with_sources
 from phyradgs_cl.report.viewer import decimals_of, picture, place, slider
 
 _TIMES = 49  # times at which the page has the scanner's pose; the script interpolates between them
-_MOST_LINES = 64  # more detector lines could not be told apart in the picture
+_MOST_LINES = 64  # more detector lines would merge in the picture
 _FRAME_STEPS = 500  # steps of the slider for the time within a frame
 _LOOK_DEG = 125  # the viewer stands this far around the axis from the source: behind the panel, to one side
 _TILT_DEG = 28  # and looks down by this angle
