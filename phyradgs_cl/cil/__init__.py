@@ -151,8 +151,7 @@ def _at_zero(frames: AcquisitionGeometry) -> np.ndarray:
 
 
 def _panel(frames: AcquisitionGeometry, detector: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns a panel's middle, and the steps to the next column and row of the data, whose first pixel is at the origin
-    that CIL states."""
+    """Returns a panel's middle, and the steps to the data's next column and row. CIL's origin is the data's first pixel."""
     panel, along_y = frames.config.panel, getattr(detector, "direction_y", _FLAT)
     step_x, step_y = panel.pixel_size[0] * detector.direction_x, panel.pixel_size[1] * along_y
     return detector.position, -step_x if "right" in panel.origin else step_x, -step_y if "top" in panel.origin else step_y
@@ -182,8 +181,7 @@ def _places(geometry: Any) -> list[int]:
 
 
 def _shape(geometry: Any) -> tuple[int, int, int]:
-    """Returns the shape (slices, rows, columns) of an image, or (frames, rows, columns). CIL leaves out dimensions of
-    length 1; they are 1 here."""
+    """Returns (slices, rows, columns) of an image, or (frames, rows, columns). Dimensions that CIL leaves out become 1."""
     if isinstance(geometry, ImageGeometry):
         return geometry.voxel_num_z or 1, geometry.voxel_num_y, geometry.voxel_num_x
     return geometry.num_projections, int(geometry.config.panel.num_pixels[1]), int(geometry.config.panel.num_pixels[0])

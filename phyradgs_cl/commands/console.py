@@ -128,7 +128,6 @@ def usage_text(error: Any, arguments: Sequence[str]) -> str:
 
 
 def _value_of(parameter: Any, arguments: Sequence[str]) -> str | None:
-    """Returns the value given to an option among the arguments; None if the option is not there."""
     for flag in (name for name in getattr(parameter, "opts", ()) if name.startswith("-")):
         for word, following in zip(arguments, [*arguments[1:], None], strict=True):
             if word == flag:

@@ -124,8 +124,7 @@ def export_command(
 
 
 def _short(value: Any, is_inside: bool = False) -> str:
-    """Returns a value as text, with six significant digits. is_inside: the value is in a container, where text gets
-    quotes."""
+    """Returns a value as text, with six significant digits. is_inside: it is in a container, where text gets quotes."""
     match value:
         case float():
             return f"{value:.6g}"

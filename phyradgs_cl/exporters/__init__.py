@@ -77,8 +77,7 @@ def _checked(
     path: Path, to: str, output: str | Path | None, mu_water_per_mm: float | None, labels: DicomLabels | None,
     scale_of: ScaleOf | None,
 ) -> tuple[Path, ScaleOf | None]:  # fmt: skip
-    """Returns the path to write, and the function that gives the scale, or None. Raises InputError for options that do
-    not fit the format."""
+    """Returns the path to write and the function that gives the scale. Raises InputError for options of other formats."""
     checks.one_of("--to", to, (*EXPORTS, OWN))
     if mu_water_per_mm is not None and scale_of is not None:
         raise InputError("--mu-water-per-mm", "given with --hu", "one of the two", "leave one out")

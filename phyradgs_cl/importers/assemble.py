@@ -223,8 +223,7 @@ def _check_turn(trajectory: CircularOrbit | PoseTable, middle_s: np.ndarray, sub
 
 
 def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
-    """Returns the geometry with its lengths replaced by those that the options give. Raises InputError for distances of a
-    parallel beam."""
+    """Replaces a geometry's lengths by those that options give. Raises InputError for distances of a parallel beam."""
     return (parallel if isinstance(geometry, ParallelGeometry) else cone)(options, *astuple(geometry))
 
 

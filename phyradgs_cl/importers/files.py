@@ -1,5 +1,4 @@
-"""Reads other programs' files safely: no name leads out of the folder, and no header makes us allocate more than the
-file can hold."""
+"""Reads other programs' files safely: names stay in the folder, and headers cannot claim more data than the file has."""
 
 import re
 from collections.abc import Iterator, Sequence

@@ -92,8 +92,7 @@ def median(stack: np.ndarray) -> np.ndarray:
 def _times(
     subject: str, flats: int, count: int, options: ImportOptions, at: np.ndarray | None
 ) -> tuple[np.ndarray, str]:
-    """Returns when flats were taken (n,), as in ``places``, and a text about what was assumed. Equal times make their
-    median be used."""
+    """Returns when flats were taken (n,), as in ``places`` (all equal: use the median), and a text about assumptions."""
     if options.flats != "time":
         return np.zeros(flats) if at is None or options.flats else at, ""
     if flats < 2 or (at is not None and np.ptp(at) == 0):

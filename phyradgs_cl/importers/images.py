@@ -58,8 +58,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def image_times_s(path: Path) -> list[float]:
-    """Returns the times in s of a file's volumes along its fourth axis; [] for a single volume. Raises InputError for a
-    damaged file."""
+    """Returns the times in s of volumes along a file's fourth axis; [] without one. Raises InputError for a damaged file."""
     with _opened(path) as (_, reader):
         count = reader.GetSize()[3] if reader.GetDimension() > 3 else 1
         return [reader.GetOrigin()[3] + k * reader.GetSpacing()[3] for k in range(count if count > 1 else 0)]

@@ -185,8 +185,7 @@ def _read_npy(path: Path) -> Volume:
 
 
 def _read_tiff(path: Path) -> Volume:
-    """Reads a TIFF's pages as slices from the lowest up, row 0 at the smallest y, and the voxel sizes that ImageJ and OME
-    write."""
+    """Reads a TIFF's pages as slices from the lowest up, row 0 at the smallest y, with voxel sizes of ImageJ or OME."""
     values = tiff.read_tiffs([path])
     size_mm, origin, note = tiff.calibration(path)
     if size_mm is None:

@@ -1,5 +1,4 @@
-"""Reads texts of scanners and other programs: numbers with decimal commas or units, tables of angles, and lines of names and
-values that describe a scan."""
+"""Reads texts of scanners and other programs: numbers with decimal commas or units, tables of angles, lines NAME = VALUE."""
 
 import logging
 import re

@@ -90,8 +90,7 @@ def read_numbered(
 
 
 def stack_shape(paths: list[Path]) -> tuple[int, int, int]:
-    """Returns the shape (frames, rows, columns) that ``read_tiffs`` would read, from headers alone. Rows and columns are
-    the first file's."""
+    """Returns the shape (frames, rows, columns) that ``read_tiffs`` would read; reads only headers, sizes from the first."""
     headers = [_header(path) for path in paths]
     return sum(count for count, _ in headers), *headers[0][1][0]
 

@@ -1,5 +1,4 @@
-"""Reads and writes this package's files: scans, volumes and scanner descriptions. Outputs are written completely or not at
-all."""
+"""Reads and writes files of scans, volumes and scanner descriptions. Outputs are written completely or not at all."""
 
 import lazy_loader
 

@@ -133,7 +133,6 @@ def _target(path: str | Path) -> Path:
 
 
 def _create_beside(target: Path, suffix: str = "") -> Path:
-    """Creates an empty temporary file in the target's folder. Raises OutputError if that fails."""
     temporary = temporary_name(target, suffix)
     try:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -240,8 +239,7 @@ def write_checkpoint(path: str | Path, state: Mapping[str, np.ndarray]) -> None:
 
 
 def read_checkpoint(path: str | Path) -> dict[str, np.ndarray]:
-    """Returns a checkpoint's arrays by name. Raises InputError for a missing or damaged file, or one of another
-    version."""
+    """Returns a checkpoint's arrays by name. Raises InputError for a missing, damaged or other version's file."""
     if not Path(path).is_file():
         raise InputError("--resume", f"no checkpoint {path}", "one left by an interrupted run", _RESTART)
     try:

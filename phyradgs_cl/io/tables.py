@@ -35,8 +35,7 @@ PROVENANCE: dict[str, tuple[type, ...]] = {
 
 
 def read_toml(path: Path, subject: str = "") -> dict[str, Any]:
-    """Parses a TOML file. Raises InputError, about ``subject`` or the path, for a missing file and for text that is not
-    TOML."""
+    """Parses a TOML file. Raises InputError, about ``subject`` or the path, for a missing file and for wrong TOML."""
     subject = subject or str(path)
     try:
         return tomllib.loads(decoded(read_regular(path, subject, _MOST_TOML_BYTES, "a TOML file")))

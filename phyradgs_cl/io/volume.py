@@ -158,8 +158,7 @@ def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
 
 
 def volume_summary(path: str | Path) -> dict[str, Any]:
-    """Returns what 'phyradgs info' prints about a volume file, by name; does not read the voxels. Raises InputError for a
-    damaged file."""
+    """Returns what 'phyradgs info' prints about a volume file, without its voxels. Raises InputError for a damaged file."""
     with open_hdf5(path) as source:
         _, grid = _dataset_and_grid(source)
         means = source.optional(f"{_GAUSSIANS}/mean") if source.optional_group(_GAUSSIANS) else None

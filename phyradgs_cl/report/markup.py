@@ -59,7 +59,6 @@ def _attribute(key: str, value: object) -> str:
 
 
 def _plain(value: object) -> str:
-    """Returns a value as text; floats have two decimals at most."""
     return f"{value:.2f}".rstrip("0").rstrip(".") if isinstance(value, float) else plain_text(str(value))
 
 

@@ -124,8 +124,7 @@ def fitting(deformation: Deformation, grid: Grid) -> Deformation:
 
 
 def _data(deformation: Deformation, grid: Grid, span_s: tuple[float, float]) -> dict[str, object]:
-    """Returns the deformation for the script, axes x, y, z. Control points are 16-bit fractions of each field's largest
-    value."""
+    """Returns the deformation for the script, axes x, y, z. Control points are 16-bit fractions of their largest value."""
     control_mm = deformation.control_mm
     largest_mm = np.abs(control_mm).max(axis=(1, 2, 3, 4))
     units_mm = np.where(largest_mm > 0, largest_mm, 1.0) / _LARGEST

@@ -157,7 +157,6 @@ def napari_layer(path: Path) -> Layer:
 
 
 def _look_of_volume(stored: Volume, name: str) -> dict[str, Any]:
-    """Returns the arguments of napari's add_image for a volume."""
     grid = stored.required_grid
     return {
         "name": f"{name} (1/mm)", "scale": grid.voxel_size_mm, "translate": grid.first_centre_mm,

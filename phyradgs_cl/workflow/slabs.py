@@ -129,8 +129,7 @@ def _slab(
 def _named(
     report: methods.ProgressReport, number: int, count: int, rows: tuple[int, int]
 ) -> Callable[[methods.Progress], None]:
-    """Returns a function that passes progress on to ``report`` with the slab's name in front. It drops the state, since a
-    slab has no checkpoint."""
+    """Returns a function that passes progress on under the slab's name. It drops the state: a slab has no checkpoint."""
     label = f"slab {number + 1} of {count}, rows {rows[0]}:{rows[1]}: "
 
     def passed_on(progress: methods.Progress) -> None:

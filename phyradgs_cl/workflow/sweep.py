@@ -1,6 +1,5 @@
-"""Reconstructs many scans with many settings and seeds, as a TOML file lists them. The file is checked before any run. Runs
-are made one after the other or by Dask's workers. Each adds a line to one results file; a table has means over scans and
-seeds."""
+"""Reconstructs many scans with many settings and seeds, listed in a TOML file that is checked before any run. Runs are made
+one by one or by Dask's workers. Each adds a line to one results file; a table has the means over scans and seeds."""
 
 import functools
 import glob

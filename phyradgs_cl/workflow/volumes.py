@@ -133,8 +133,7 @@ def _with_our_axes(volume: Volume) -> Volume:
 
 
 def _grid_of(path: Path, reference: np.ndarray, grid: Grid | None, voxel_mm: object, volume_path: Path) -> Grid:
-    """Returns the reference's own grid, or one with voxels of ``voxel_mm`` centred on the axis. Raises InputError if both
-    or neither are known."""
+    """Returns the reference's grid, or voxels of ``voxel_mm`` centred on the axis. Raises InputError for both or neither."""
     if voxel_mm is not None:
         if grid is not None:
             expected = f"a reference without a scale; {path} has {in_words(grid)}"

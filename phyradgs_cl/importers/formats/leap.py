@@ -72,8 +72,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 def _turning(
     scan: Settings, shape: tuple[int, int, int], options: ImportOptions, timing: assemble.Timing
 ) -> tuple[CircularOrbit | PoseTable, Geometry]:
-    """Returns trajectory and geometry of a cone or parallel beam that turns about z. Raises InputError for a helix, a tilt
-    and a curved panel."""
+    """Returns trajectory and geometry of a beam that turns about z. Raises InputError for a helix, tilt or curved panel."""
     for name in ("helicalPitch", "tiltAngle"):
         if scan.number(name, 0.0):
             raise scan.error(name, f"{scan.number(name):g}", "0", "write it with convert_to_modularbeam()")

@@ -158,8 +158,7 @@ def _view_poses(
     view: Fields, source_mm: np.ndarray, detector: tuple[np.ndarray, np.ndarray], centre: np.ndarray,
     panel: tuple[int, int], pitch: tuple[float, float],
 ) -> np.ndarray:
-    """Returns poses (T, 12) of one view. Its matrix holds at one angle of the gantry; the panel is rotated from there
-    about +z."""
+    """Returns poses (T, 12) of one view. The panel is rotated about +z from the angle at which its matrix holds."""
     rotation, stands_at = _matrix(view)
     angle_rad, centre_mm = detector
     turned_rad = angle_rad - np.arctan2(stands_at[1] - centre[1], stands_at[0] - centre[0])

@@ -124,8 +124,7 @@ def read_grid(scanner: Fields, unit_mm: float) -> Grid:
 
 
 def _pitches(scanner: Fields, what: str, counts: tuple[int, ...]) -> np.ndarray:
-    """Returns the size of a pixel or voxel along each axis: the table's d<what>, else its total size s<what> over the
-    count."""
+    """Returns a pixel's or voxel's size along each axis: d<what>, else the total size s<what> over the count."""
     if scanner.has(f"d{what}"):
         return scanner.lengths(f"d{what}", len(counts))
     return scanner.lengths(f"s{what}", len(counts)) / np.array(counts)

@@ -122,8 +122,7 @@ def _type(scan: Streams, name: str, default: float | None = None) -> str:
 
 
 def _stage(scan: Streams, at: np.ndarray, panel: tuple[int, int], options: ImportOptions) -> RotaryStage:
-    """Returns a stage whose panel is shifted in every image as the alignment says. at (F,): numbers of the images, from
-    0."""
+    """Returns a stage whose panel is shifted in every image as the alignment says. at (F,): the images' numbers."""
     is_cone = not scan.has(f"{_INFO}/XrayGeometry") or scan.first_of(f"{_INFO}/XrayGeometry") == 1
 
     def pixel_mm(magnification: float = 1.0) -> tuple[float, float]:

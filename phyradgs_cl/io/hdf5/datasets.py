@@ -230,8 +230,7 @@ def read_grid(source: Hdf5Source, address: str) -> Grid:
 
 @contextmanager
 def new_hdf5(path: str | Path, size_bytes: int) -> Iterator[h5py.File]:
-    """Yields a new HDF5 file for arrays of ``size_bytes``. It replaces ``path`` only on success, as ``written_beside``
-    describes."""
+    """Yields a new HDF5 file for arrays of ``size_bytes``. It replaces ``path`` only on success; see ``written_beside``."""
     with written_beside(path, size_bytes) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
         yield file

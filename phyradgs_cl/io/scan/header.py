@@ -142,8 +142,7 @@ def _read_saturation(source: Hdf5Source, entry: str) -> Saturation | None:
 
 
 def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
-    """Returns the dataset of frames (F, v, u), whose pixels are not read yet, and their quantity: "attenuation",
-    "transmission" or "counts"."""
+    """Returns the dataset of frames (F, v, u), not read yet, and their quantity: "attenuation", "transmission", "counts"."""
     address = f"{entry}/{schema.DETECTOR}/data"
     data, subject = source.dataset(address), source.name(address)
     if data.ndim != 3 or min(data.shape) < 1:

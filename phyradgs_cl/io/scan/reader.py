@@ -74,8 +74,7 @@ def _read_metal(source: Hdf5Source, address: str) -> Metal | None:
 
 
 def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, object]:
-    """Returns what 'phyradgs info' prints about a scan file, by name. Checks all but its pixels. sha256: the file's, if
-    known already."""
+    """Returns what 'phyradgs info' prints about a scan file. Checks all but its pixels. sha256: the file's, if known."""
     with open_hdf5(path) as source:
         header = read_header(source)
     scan, key = header.scan, header.image_key
