@@ -23,14 +23,14 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.removed import refuse_removed
 
 log = logging.getLogger(__name__)
-# What messages call values of a Scan whose argument of ``fly_scan`` has another name.
+# Arguments of ``fly_scan`` by the names of the same values in a Scan's checks, for messages.
 _ARGUMENTS = {
     "angles": "angles_deg", "exposure_s": "exposure_deg", "frame_time_s": "exposure_s", "readout_s": "readout_ratio",
     "readout_axis": "readout",
     "source_to_axis_mm": "geometry.source_to_axis_mm", "source_to_detector_mm": "geometry.source_to_detector_mm",
 }  # fmt: skip
 _SLACK = 1e-3  # relative tolerance of steps and arcs, since users round angles
-_AIR_SLACK = 0.2  # by noise a transmission of 1 in air may differ by this
+_AIR_SLACK = 0.2  # noise may change a transmission of 1, in air, by this
 _CLEAR_STEP_DEG = 90.0  # between views this far apart or more, the gantry may have turned either way
 
 

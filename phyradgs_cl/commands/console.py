@@ -109,7 +109,7 @@ def give_up_stdout() -> None:
 
 def scores(metrics: Mapping[str, float | None]) -> str:
     """Returns a run's metrics, and its errors on held-out pixels, as text with a comma before each."""
-    from phyradgs_cl.metrics import HELD_OUT, printed  # loads SciPy
+    from phyradgs_cl.metrics import HELD_OUT, printed  # here, because it loads SciPy, which takes time
 
     words = [*printed(metrics), *printed(metrics, HELD_OUT)]
     return "".join(f", {title} {value}" for title, value in words)

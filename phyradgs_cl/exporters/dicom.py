@@ -96,7 +96,7 @@ def _rescale_slope(values: np.ndarray, unit: str) -> str:
     peak = float(np.abs(values).max())
     if unit == "HU" and peak <= _LARGEST:
         return "1"
-    return f"{max(peak, 1e-30) / _LARGEST * (1 + 1e-8):.9e}"  # 16 characters at most; 1e-8 outweighs rounding down
+    return f"{max(peak, 1e-30) / _LARGEST * (1 + 1e-8):.9e}"  # 1e-8 more, so that rounding cannot make it too small
 
 
 def _common(pydicom: Any, shape: tuple[int, ...], unit: str, slope: str, uid: dict[str, str]) -> Any:

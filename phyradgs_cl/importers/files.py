@@ -87,8 +87,8 @@ class SafeFolder:
         return (self.root / name).exists()
 
     def glob(self, pattern: str, *suffixes: str) -> list[Path]:
-        """Returns the files that match a pattern, upper case or lower, in natural order. With ``suffixes``, wildcards match
-        only files with one of these suffixes that are not hidden."""
+        """Returns the files that match a pattern, upper case or lower, in natural order. If ``suffixes`` are given,
+        wildcards match only files with one of them, and no hidden files."""
         name = PurePosixPath(pattern).name.lower()
         paths = [path for path in _files((self.root / pattern).parent) if fnmatchcase(path.name.lower(), name)]
         is_plain = not suffixes or not set(name) & set("*?[")

@@ -22,13 +22,13 @@ _log = logging.getLogger(__name__)
 _PIXELS = 1 << 16  # pixels of a frame that are compared with other frames; all would take long and tell little more
 
 # A flat or dark is left out if its median differs from the others' by more than this fraction of the flats' median.
-_TOGETHER = 0.1  # among flats of one time: the tube is steadier
-_APART = 0.3  # among flats of several times, between which the tube may drift
-_DARK = 0.02  # among darks
+_TOGETHER = 0.1  # largest difference among flats of one time, in which the tube hardly drifts
+_APART = 0.3  # largest difference among flats of several times, between which the tube may drift
+_DARK = 0.02  # largest difference among darks
 
-# It is left out too if its pixels differ from the others', in the mean, by more than the sum of these two.
-_PATTERN = 0.02  # as a fraction of the flats' median
-_TIMES = 5.0  # in units of the frames' median deviation
+# It is left out too if its pixels differ from the others', in the mean, by more than the sum of these two parts.
+_PATTERN = 0.02  # allowed difference, as a fraction of the flats' median
+_TIMES = 5.0  # allowed difference, in units of the frames' median deviation
 _BLOCK_BYTES = 1 << 26  # memory of a block of rows whose median is taken: a float64 copy of all frames would be large
 Mask = np.ndarray | None
 TAKEN = "taken"

@@ -114,7 +114,7 @@ class Places:
         types of frames (projection, flat, dark, invalid). Separate flats and darks replace those among the projections.
         Raises InputError without projections, and for arrays that do not fit them."""
         if self.source is not None and "projections" not in self.stated:
-            self.source.dataset(projections)  # raises an error that says what is there
+            self.source.dataset(projections)  # if it is missing, the error says what the file has instead
         if (stored := self.stack("projections", [projections])) is None:
             raise InputError(self.subject, "no place of the projections", "one of them")
         frames, panel = stored[0], (stored[0].shape[1], stored[0].shape[2])
@@ -245,7 +245,7 @@ def beam(
         return None
 
     def pitch_mm() -> tuple[float, float]:
-        """Returns a pixel's sides (v, u) in mm on a panel, at the detector's distance, that sees the same without optics."""
+        """Returns a pixel's sides (v, u) in mm on the equivalent panel without optics, at the detector's distance."""
         at_sample, on_panel = sides_mm(lengths.at_sample), sides_mm(lengths.on_panel)
         if at_sample is None and on_panel is not None and lengths.optics and source.find(lengths.optics) is not None:
             times = h5.read_length(source, lengths.optics, _TIMES)

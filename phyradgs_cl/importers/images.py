@@ -30,8 +30,8 @@ from phyradgs_cl.io.volume import Volume, finite_float32, shares_of_maximum
 _log = logging.getLogger(__name__)
 STACKS = (".mha", ".mhd")
 _SPACES = ("left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las", "")
-_HEAD_BYTES = 1 << 16  # bytes at a file's beginning that are searched for its header
-_VOXEL_BYTES = 8  # memory per voxel while a file is read
+_HEAD_BYTES = 1 << 16  # bytes at a file's start in which its header ends
+_VOXEL_BYTES = 8  # bytes of memory per voxel while a file is read
 _NOTE = "ITK_FileNotes"  # SimpleITK's name for a file's comment, which is NIfTI's field descrip
 _READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", ".nrrd": "Nrrd"}
 _DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$", re.M)
@@ -176,7 +176,7 @@ def read_zarr(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | N
         note = str((facts.get("metadata") or {}).get("values", ""))
     except InputError:
         raise
-    except Exception as error:  # zarr and its stores pass on errors of every kind
+    except Exception as error:  # zarr and its stores raise errors of every kind
         found = f"{type(error).__name__}: {str(error)[:150]}"
         raise InputError(subject, found, "an OME-Zarr with real numbers of one volume along z, y and x") from error
     in_mm = np.array([units[name] for name in "zyx"], np.float64)  # None becomes NaN

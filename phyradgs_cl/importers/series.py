@@ -20,12 +20,12 @@ _NUMBER = re.compile(r"([-+]?)(\d+)(?:[.,](\d+))?")
 _DATE = r"(?<!\d)((?:19|20)\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])"
 _TIME = re.compile(_DATE + r"[-_ T.]*([01]\d|2[0-3])[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d)(?!\d)")
 _DEGREES, _ANGLE = re.compile(r"[ _]?(deg|°|grad)", re.I), re.compile(r"(deg|angle|ang|theta|phi|rot)[ _=]*$", re.I)
-# A step between neighbouring numbers is regular if it is like the usual step: the most frequent one.
+# A step from one number to the next is regular if it is near the usual step, the most frequent one.
 _STEADY = 0.25  # largest difference from the usual step, as a fraction of it
 _GAP = 1.5  # a step between angles or times of this many usual steps shows a missing frame
 _USUAL = 0.5  # a series is regular if at least this fraction of its steps is
 _STEADY_ANGLES = 0.75  # angles or times with fewer regular steps are uneven: no gap shows a missing frame
-_SMALL = 0.25  # files whose words are rarer than this fraction of the most frequent words are no frames
+_SMALL = 0.25  # fewer files than this fraction of the largest group with common words are no frames
 _BEFORE, _AFTER = (re.compile(rf"(?<![a-z])({words})(?![a-z])", re.I) for words in ("before|pre|start", "after|post|end"))
 _STAMP = 10**7  # numbers from here on are times in milliseconds, not indices
 _MOST_NAMES = 8  # names of files that a message lists

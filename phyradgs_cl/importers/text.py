@@ -173,12 +173,12 @@ class Settings(Fields):
 def read_settings(
     path: Path, names: Collection[str], separator: str = "=", sections: Collection[str] = ()
 ) -> Settings:
-    """Reads the lines NAME ``separator`` VALUE for the given ``names``; ignores other lines, and upper or lower case.
+    """Reads the lines NAME ``separator`` VALUE for the given ``names``, in upper or lower case; ignores other lines.
 
     sections: the only [sections] that are read; () reads all. If two sections have a name, the first counts. Raises
     InputError for a file with none of the names, and for a section that gives a name two values."""
     spelt, wanted = {name.lower(): name for name in names}, {section.lower() for section in sections}
-    values: dict[tuple[str, str], str] = {}  # by section and name
+    values: dict[tuple[str, str], str] = {}  # keys are (section, name)
     others: list[str] = []
     section = ""
     for line in map(str.strip, read_text(path).splitlines()):

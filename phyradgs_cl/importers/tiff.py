@@ -23,7 +23,7 @@ from phyradgs_cl.io.hdf5.datasets import LENGTH
 SUFFIXES = (".tif", ".tiff")
 _log = logging.getLogger(__name__)
 _RESULT_BYTES = 5  # bytes of memory per pixel of the result: a line integral in float32, and its mask
-_NO_SPACE = {"C": "channels", "T": "times"}  # axes of a stack that a volume does not have
+_NO_SPACE = {"C": "channels", "T": "times"}  # axes that TIFF stacks may have, but volumes must not
 _OME_SIZES = re.compile(r'PhysicalSize([XYZ](?:Unit)?)="([^"]*)"')
 _OF_SIZE = ("unit", "spacing")
 _ORIENTATION = 274  # TIFF's tag Orientation; 1 means row 0 at the top, column 0 on the left

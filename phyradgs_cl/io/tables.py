@@ -39,7 +39,7 @@ def read_toml(path: Path, subject: str = "") -> dict[str, Any]:
     subject = subject or str(path)
     try:
         return tomllib.loads(decoded(read_regular(path, subject, _MOST_TOML_BYTES, "a TOML file")))
-    except (ValueError, RecursionError) as error:  # raised also for too many digits, and for deep tables
+    except (ValueError, RecursionError) as error:  # RecursionError: tables nested too deep
         raise InputError(subject, f"text that is not TOML ({error})", "a TOML file") from error
 
 

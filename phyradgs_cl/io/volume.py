@@ -55,8 +55,7 @@ class Volume:
         return deformed(self.values, self.required_grid, field, field.weights_at(time_s)[0])
 
     def moved_by(self, deformation: Deformation, subject: str) -> "Volume":
-        """Returns the volume with another deformation. Raises InputError, which names ``subject``, for a volume with
-        states."""
+        """Returns the volume with another deformation. Raises InputError, which names ``subject``, if it has states."""
         if self.states is not None:
             found, expected = f"{subject}, which holds its states", "a volume whose object does not change"
             raise InputError("--object-motion", found, expected, "leave it out")
@@ -213,7 +212,7 @@ def interruption(provenance: Mapping[str, object]) -> dict[str, object]:
     """Returns where a run was interrupted: ``interrupted_at`` and ``iterations_asked``. If it consists of several runs, for
     error bars, adds ``interrupted_in_run``. Returns an empty dict for a complete run."""
     at, options, doubt = (provenance.get(name) for name in ("interrupted_at", "options", "doubt"))
-    if type(at) is not int:  # a bool is an int too
+    if type(at) is not int:  # not isinstance, which accepts True
         return {}
     asked = options.get("iterations") if isinstance(options, Mapping) else None
     run = doubt.get("interrupted_in_run") if isinstance(doubt, Mapping) else None
@@ -298,7 +297,7 @@ def _grid_of_axes(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
             raise source.error(f"{_DATA}/{name}", "values that do not rise evenly", expected)
         steps_mm.append(step_mm if count > 1 else None)
         centres_mm.append(float(axis_mm[0] + axis_mm[-1]) / 2)
-    usual = next((step for step in steps_mm if step is not None), 1.0)  # an axis of one voxel has no spacing
+    usual = next((step for step in steps_mm if step is not None), 1.0)  # for axes of one voxel, which show no spacing
     return Grid(triple(shape), triple(usual if s is None else s for s in steps_mm), triple(centres_mm))
 
 

@@ -21,7 +21,7 @@ _TIMES = 49  # times at which the page has the scanner's pose; the script interp
 _MOST_LINES = 64  # more detector lines would merge in the picture
 _FRAME_STEPS = 500  # steps of the slider for the time within a frame
 _LOOK_DEG = 125  # the viewer stands this far around the axis from the source: behind the panel, to one side
-_TILT_DEG = 28  # and looks down by this angle
+_TILT_DEG = 28  # the viewer looks down by this angle
 _FRAME_HELP = (
     "Lines that wait are thin and grey, exposed ones gold, with the rays of the first and the last. A line that has been "
     "read is blue, and stays where the panel was in the middle of its exposure. Drag, or press arrow keys here, to turn."
@@ -111,7 +111,7 @@ def fitting(deformation: Deformation, grid: Grid) -> Deformation:
         spacing_mm *= 1.25
         origin_mm, counts = control_points(grid, spacing_mm)
         axes_mm = [
-            np.clip(first_mm + spacing_mm * np.arange(n), centres_mm[0], centres_mm[-1])  # fields may end at the box
+            np.clip(first_mm + spacing_mm * np.arange(n), centres_mm[0], centres_mm[-1])  # a field may end at the edge
             for first_mm, n, centres_mm in zip(origin_mm[::-1], counts, grid.axes_mm(), strict=True)
         ]
         points_mm = np.stack(np.meshgrid(*axes_mm, indexing="ij")[::-1], -1).reshape(-1, 3)

@@ -177,7 +177,7 @@ def _made_here(runs: Sequence[SweepRun], device: str | None, report: ProgressRep
 
 def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None, page: Path) -> Iterator[Line]:
     """Yields the runs' lines as they finish, and writes Dask's report to ``page``. Raises InputError without a scheduler."""
-    os.environ.setdefault("DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION", "1.0")  # else a death blames queued runs too
+    os.environ.setdefault("DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION", "1.0")  # else a dead worker fails queued runs
     dask = checks.package("distributed", "the package that --workers needs", "phyradgs-cl[cluster]")
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # the InputError below says it already
     count, where = int(workers) if workers.isdigit() else None, {"address": workers, "timeout": _CONNECT_S}
@@ -190,7 +190,7 @@ def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None,
             if count is not None:
                 client.register_worker_callbacks(functools.partial(_begin, device))
                 client.cluster.adapt(minimum=count, maximum=count)  # else Dask does not replace a worker that dies early
-                device = None  # each worker has its own device
+                device = None  # _begin has set each worker's device
             run_of = {client.submit(make_run, run, device=device, retries=_RETRIES, pure=False): run for run in runs}
             for future in dask.as_completed(list(run_of)):
                 run = run_of.pop(future)

@@ -26,7 +26,7 @@ from phyradgs_cl.io.hdf5.datasets import ANGLE, LENGTH, TIME
 from phyradgs_cl.io.scan.header import find_entry, read_duration
 
 _log = logging.getLogger(__name__)
-_NOWHERE = "/no entry"  # an address that no file has: no metadata is read for bare arrays, whose geometry is in options
+_NOWHERE = "/no entry"  # an address that no file has, for bare arrays: all metadata then come from options
 _EXCHANGE = "/exchange"
 _INSTRUMENT = "/measurement/instrument"
 _DETECTOR, _OPTICS = f"{_INSTRUMENT}/detector", f"{_INSTRUMENT}/detection_system/objective"

@@ -45,7 +45,7 @@ def _descriptions(path: Path) -> list[Path]:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder of frames with one file of parameters. ``path`` may also be the file of parameters in it."""
+    """Imports a folder of frames with one file of LEAP's parameters. ``path`` may also be that file."""
     options.refuse_unused("leap", OF_BARE_FRAMES)
     folder, descriptions = SafeFolder(path if path.is_dir() else path.parent), _descriptions(path)
     if len(descriptions) != 1:

@@ -32,7 +32,7 @@ from phyradgs_cl.io.files import read_regular, regular_file
 from phyradgs_cl.io.tables import Fields, described
 
 OPTIONS = (*TIMING, "detector_model", "part")
-_PER_MM = 1e-3  # 1/mm in 1/m
+_PER_MM = 1e-3  # NAF's volumes are in 1/m
 _PARTS = {"train": ("train",), "test": ("val",), "all": ("train", "val")}
 TIGRE_MODULE, _END_BYTES = "tigre.utilities.geometry", 1 << 18
 OPTIONS_OF_TIGRE = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
@@ -118,7 +118,7 @@ class PlainUnpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         """Returns our function for an allowed name. Raises InputError for any other name."""
         functions: dict[str, Any] = {  # made again at each call, since a pickle can set attributes of a function
-            "numpy.ndarray": object,  # an argument of _reconstruct
+            "numpy.ndarray": object,  # only passed to _reconstruct, which ignores it
             "numpy.dtype": lambda code, *_: _Type(code),
             "numpy.core.multiarray._reconstruct": lambda *_: _Array((0,)),
             "numpy.core.multiarray.scalar": lambda dtype, raw: _plain_array(raw, dtype, ()).item(),

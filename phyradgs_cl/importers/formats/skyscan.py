@@ -90,7 +90,7 @@ def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOp
         return width_mm / next((scan.length(name) for name in _RATIOS if scan.has(name)), 1.0), width_mm
 
     pitch_mm = options.taken("pixel_size_mm", stored_mm)
-    # an image that was cropped at the camera may not contain the central ray; more than its height away is an error
+    # a cropped image may not contain the central ray, but more than its own height away must be an error
     up_mm = (panel[0] / 2 - scan.number("Optical Axis (line)", panel[0] / 2, -panel[0], 2 * panel[0])) * pitch_mm[0]
     if options.detector_offset_mm is None:
         settings.say_missing(scan, {"place of the axis": "the middle of the panel; check --fix-offset or calibrate find it"})

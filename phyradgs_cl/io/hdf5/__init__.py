@@ -59,7 +59,7 @@ def open_hdf5(path: str | Path, linked_folder: Path | None = None) -> "Iterator[
 
 @dataclass(frozen=True, eq=False)
 class Hdf5Source:
-    """An open HDF5 file. path: its name in messages. folders: where files may lie to which it links."""
+    """An open HDF5 file. path: its name in messages. folders: where files that it links to may lie."""
 
     file: h5py.File
     path: Path
