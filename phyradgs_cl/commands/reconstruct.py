@@ -1,4 +1,4 @@
-"""The commands reconstruct, from a scan file to a volume file, and estimate, for the time and memory that this takes."""
+"""The commands reconstruct, which makes a volume file from a scan file, and estimate, which predicts its time and memory."""
 
 import time
 from contextlib import ExitStack

@@ -126,7 +126,7 @@ def _column(path: Path, names: list[str], table: list[list[float]], count: int, 
 
 
 def file_of_angles(folder: SafeFolder, name: str, *ends: str) -> Path | None:
-    """Returns the file ``name`` + end, or the only file with this end, for the first of ``ends`` that has one."""
+    """Tries the ``ends`` in order: returns the file called ``name`` + end, else the only file with that end; or None."""
     for end in ends:
         files = folder.glob(f"*{end}")
         own = [file for file in files if file.name.lower() == f"{name}{end}".lower()]

@@ -20,7 +20,7 @@ else:
     import tomli as tomllib
 
 LARGEST = 1e12  # no angle, time or count is larger, and sums of such numbers stay finite
-LARGEST_LENGTH = 1e9  # largest length in mm; one over it is the smallest above 0
+LARGEST_LENGTH = 1e9  # no length is larger in mm, and none smaller than its inverse except 0
 _MOST_TOML_BYTES = 16 << 20  # larger files are no descriptions, and would take long to parse
 _COUNTS = {2: "two", 3: "three"}
 _log = logging.getLogger(__name__)
@@ -175,7 +175,7 @@ class Fields:
         return value
 
     def tables(self, key: str) -> "Iterator[Fields]":
-        """Returns the tables of a list with at least one entry."""
+        """Returns the tables in a list, which must have at least one entry."""
         entries = self.get(key)
         if not isinstance(entries, list) or not entries:
             raise self.error(key, described(entries), "a list with at least one entry")

@@ -73,7 +73,7 @@ class Volume:
 
     @property
     def required_grid(self) -> Grid:
-        """The grid. Raises InputError for a bare array."""
+        """The grid. Raises InputError if the volume has none."""
         if self.grid is None:
             raise InputError("volume", "values without voxel sizes", "a volume with its grid in mm")
         return self.grid

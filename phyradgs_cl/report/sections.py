@@ -62,7 +62,7 @@ def doubt_section(run: Run) -> Markup | None:
 
 
 def states_section(run: Run) -> Markup | None:
-    """Shows the middle slices of an object that changes, at some of its times."""
+    """Shows the middle slices of a changing object at some times."""
     if (states := run.stored.states) is None:
         return None
     high = images.windows_of(run.stored.values, run.reference)["result"].high

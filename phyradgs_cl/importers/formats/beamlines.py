@@ -171,7 +171,7 @@ def recognises_exchange(path: Path) -> bool:
 
 
 def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
-    """Imports the projections of /exchange, with its flats and darks before and after."""
+    """Imports the projections of /exchange, with the flats and darks taken before and after them."""
     options.refuse_unused("data-exchange", OF_HDF5)
     with open_hdf5(path, options.linked_folder) as source:
         places, theta = hdf5.places_of(options, source), f"{_EXCHANGE}/theta"

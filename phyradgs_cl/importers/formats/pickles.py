@@ -43,7 +43,7 @@ _COPIES = 3  # bytes of memory for every byte of the file: the file, its arrays,
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a pickle, by its suffix, in which TIGRE's geometry is not named."""
+    """Returns whether ``path`` is a pickle (by its suffix) without TIGRE's geometry."""
     return path.is_file() and path.suffix.lower() in (".pickle", ".pkl") and not names_tigre(path)
 
 
@@ -182,7 +182,7 @@ class TigreUnpickler(PlainUnpickler):
 
 
 def recognises_tigre(path: Path) -> bool:
-    """Returns whether ``path`` is a pickle, by its suffix, in which TIGRE's geometry is named."""
+    """Returns whether ``path`` is a pickle (by its suffix) with TIGRE's geometry."""
     return path.is_file() and path.suffix.lower() in (".pickle", ".pkl") and names_tigre(path)
 
 
