@@ -105,7 +105,7 @@ def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Recon
 def load_deformation(path: str | Path) -> Deformation:
     """Reads how an object moves from a file (docs/formats.md), or from a scan simulated with a motion of its object.
 
-    path: the HDF5 file. Raises InputError, which names the HDF5 path of the wrong value, also for motion that folds matter."""
+    path: the HDF5 file. Raises InputError, which names the HDF5 path of the wrong value, also if the motion folds matter."""
     return read_deformation(_checked_path(path))
 
 
