@@ -144,7 +144,7 @@ class Turned:
         return array[..., ::-1] if self.columns else array
 
     def poses(self, pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-        """Returns poses (..., 12) of flipped images from those of the stored images on a ``panel`` of (rows, columns)."""
+        """Converts poses (..., 12) of the stored images to those of the flipped ones. panel: (rows, columns)."""
         pose = np.array(pose, np.float64)
         sides = (self.rows, panel[0], slice(9, 12)), (self.columns, panel[1], slice(6, 9))
         for count, step in ((count, step) for is_flipped, count, step in sides if is_flipped):

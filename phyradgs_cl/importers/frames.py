@@ -62,7 +62,8 @@ def light_of(
 ) -> Light:
     """Returns the flats and dark for ``count`` projections, from flats and darks (n, v, u). Of three or more, those that do
     not fit the others are left out, with a warning. at (n,): when flats were taken, as in ``places``; None: not stated.
-    names: of the single "flats" and "darks". Raises InputError for the option flats "time" with flats of one time."""
+    names: what messages call each of the "flats" and "darks". Raises InputError for the option flats "time" with flats of
+    one time."""
     at, assumed = _times(subject, len(flats), count, options, at)
     light = max(float(np.median(_levels(flats)[1])), 1e-30)
     times = [np.flatnonzero(at == time) for time in np.unique(at)]

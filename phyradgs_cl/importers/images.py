@@ -35,7 +35,7 @@ _VOXEL_BYTES = 8  # bytes of memory per voxel while a file is read
 _NOTE = "ITK_FileNotes"  # SimpleITK's name for a file's comment, which is NIfTI's field descrip
 _READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", ".nrrd": "Nrrd"}
 _DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$", re.M)
-_OBLIQUE = 1e-3  # sine of a tilt of the image's axes (0.06°) up to which it is taken for rounding
+_OBLIQUE = 1e-3  # an axis that is tilted by less than this (the sine of 0.06°) counts as straight
 
 
 @contextmanager
@@ -106,7 +106,7 @@ def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
         path, start = SafeFolder(path.parent).file(name, f"{path} data file"), 0
     if not re.search(rb"^CompressedData *= *True", head, re.I | re.M):
         return None if is_nrrd else path.stat().st_size - start
-    if not re.search(rb"^CompressedDataSize *= *\d", head, re.M):  # SimpleITK returns undefined voxels then
+    if not re.search(rb"^CompressedDataSize *= *\d", head, re.M):  # without it SimpleITK returns undefined voxels
         raise InputError(f"{path} CompressedDataSize", "nothing", "the bytes of packed voxels", "write it unpacked")
     return len(zlib.decompress(path.read_bytes()[start:]))
 

@@ -156,5 +156,5 @@ OF_HDF5 = (*OF_BARE_FRAMES, "entry", "at", "linked_folder")
 
 
 def option_name(field: str) -> str:
-    """Returns the option of the command line for a field of ImportOptions."""
+    """Returns the command line's option for a field of ImportOptions: --fps for "frame_time_s"."""
     return "--detector-offset" if field == "detector_offset_mm" else flag_of(_WORD_OF.get(field, field))

@@ -44,7 +44,7 @@ def number_at_start(text: str, comma_is_decimal: bool = False) -> tuple[float, s
 
 
 def commas_are_decimal(texts: list[str]) -> bool:
-    """Returns whether the texts use decimal commas: in some number the comma must be decimal, and no number has a point."""
+    """Returns whether numbers in the texts have decimal commas: some comma cannot mean thousands, and there is no point."""
     commas = any(_ONE_COMMA.fullmatch(text) and not _EITHER.fullmatch(text) for text in texts)
     return commas and not any(re.fullmatch(r"[-+]?\d*\.\d+", text) for text in texts)
 

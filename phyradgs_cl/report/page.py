@@ -25,7 +25,7 @@ _SCRIPT = ("common", "shaders", "render", "space", "motion", "slices", "rows")
 _SCRIPTED = ("volume",)  # sections that are hidden until the script shows them
 
 
-@np.errstate(all="ignore")  # values of a file may overflow
+@np.errstate(all="ignore")  # a file's values may overflow; the page shows what it can
 def write_report(
     volume: Path, output: Path, make_runtime: Callable[[], Runtime], *, scan: Path | None = None,
     views: int = DEFAULT_VIEWS,

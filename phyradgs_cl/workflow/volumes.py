@@ -33,7 +33,7 @@ from phyradgs_cl.workflow.files import check_picture, load_reference, load_resul
 
 log = logging.getLogger(__name__)
 _LITTLE = 0.5 - 1e-6  # boxes that share less than this fraction of either often have a wrong size or offset
-_ALIKE = 0.65  # unless volumes correlate this much there: wrong sizes and offsets gave at most 0.6, right ones 0.55 to 0.9
+_ALIKE = 0.65  # least correlation in the shared part that clears the doubt: wrong ones had at most 0.6, right 0.55 to 0.9
 
 
 @np.errstate(all="ignore")
@@ -76,7 +76,7 @@ def run_evaluation(
     if result.doubt is not None and grid is not None:
         facts, curve = provenance.get("doubt"), picture.with_name(f"{picture.stem}.doubt.png")
         stated = facts.get("multiple_95") if isinstance(facts, Mapping) else None
-        multiple_95 = stated if isinstance(stated, float) else 1.96  # a normal distribution's
+        multiple_95 = stated if isinstance(stated, float) else 1.96  # 95 % of a normal distribution
         bar = volume if (of_bars := aligned(result.doubt, grid, *truth)) is None else of_bars.volume
         with finish_despite_interrupt(), written_beside(curve) as temporary:
             reliability_png(temporary, bar, volume, reference, multiple_95)

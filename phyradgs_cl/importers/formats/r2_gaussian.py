@@ -27,7 +27,7 @@ ROW_0 = "top"
 OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 OPTIONS_WITH_TIMES = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
 _KEYS = ("first_line_start", "first_line_end", "last_line_end")
-_SAME = 1e-3  # frames' ratios of readout to exposure may differ by this, or by this fraction where they are above 1
+_SAME = 1e-3  # readout over exposure may differ by this between frames, or by this fraction of a ratio above 1
 
 
 @dataclass(frozen=True, eq=False)

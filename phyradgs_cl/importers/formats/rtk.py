@@ -100,7 +100,7 @@ def stack_of(
 ) -> Stack:
     """Returns projections (F, v, u) with ITK's origin and spacing (3,) in mm and its direction (3, 3). Raises InputError
     unless the third axis, which counts frames, is perpendicular to the others."""
-    steps_mm = direction * spacing_mm  # columns: along u, v and the frames
+    steps_mm = direction * spacing_mm  # its columns are the steps along u, along v and to the next frame
     if np.abs([*steps_mm[:2, 2], *steps_mm[2, :2]]).max() > 1e-9 * np.abs(steps_mm).max():
         raise InputError(subject, str(steps_mm.tolist())[:80], "axes of a stack: columns, rows, frames")
     return Stack(frames, np.array(origin_mm[:2]), steps_mm[:2, 0], steps_mm[:2, 1])
