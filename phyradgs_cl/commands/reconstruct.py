@@ -120,7 +120,7 @@ def reconstruct_command(
         if page is not None:
             _finish(page, result, scan, output, runtimes[-1])
     written = output if result.state is None else partial_path(output)
-    used_s = time.process_time()  # of the whole command; unlike the clock's, it does not depend on other programs
+    used_s = time.process_time()  # of the whole command; unlike clock time, it does not depend on other programs
     motion = getattr(plan.options, "motion", None)
     method = plan.method_name if motion is None else f"{plan.method_name}, motion {motion_facts(motion)['name']}"
     how = f"{method}{result.early_stop}, {result.facts['seconds']:.1f} s ({used_s:.1f} s of processor time)"

@@ -234,7 +234,7 @@ def beam(
     for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):
         if source.find(address) is not None and not h5.read_attribute(source, address, "units"):
             pixel = h5.read_values(source, address, source.dataset(address)).ravel()
-            if pixel.size and abs(float(pixel[0])) < _LEAST_MM:  # less than 0.1 µm
+            if pixel.size and abs(float(pixel[0])) < _LEAST_MM:
                 quantity = replace(LENGTH, assumed="m")
 
     def sides_mm(pairs: Sequence[tuple[str, str]]) -> tuple[float, float] | None:

@@ -25,8 +25,8 @@ log = logging.getLogger(__name__)
 
 def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Volume:
     """Returns ``volume`` after a check that it can be projected. Raises InputError about ``subject`` for values beyond 1e9.
-    Raises it also where negative values sum to at least as much as positive ones, as in Hounsfield units. Warns from a
-    tenth on, unless ``warn`` is False."""
+    Raises it also if negative values sum to at least as much as positive ones, as in Hounsfield units. Warns if they sum to
+    more than a tenth, unless ``warn`` is False."""
     values = volume.values
     if (size := float(np.abs(values).max())) > h5.ATTENUATION.largest:
         expected = f"attenuation of at most {h5.ATTENUATION.largest:g} 1/mm"

@@ -1,9 +1,9 @@
 """Scans of Nikon's XT H systems: a .xtekct file and 16-bit TIFFs of counts, corrected for darks and flats by the scanner.
 
 Signs are as in the readers of CIL and TIGRE: row 0 on top, column 0 on the right seen from the source, a sample that turns
-clockwise seen from above. ObjectOffsetX above 0 puts the axis to the left. Without it, a mean above 0 does so of
-CentreOfRotationTop and CentreOfRotationBottom, which are measured on the panel. ObjectRoll above 0 leans the axis' top to
-the right, ObjectTilt above 0 towards the panel. Lengths are in mm, angles in degrees."""
+clockwise seen from above. ObjectOffsetX above 0 puts the axis to the left. Without it, the mean of CentreOfRotationTop and
+CentreOfRotationBottom, measured on the panel, takes its place. ObjectRoll above 0 leans the axis' top to the right,
+ObjectTilt above 0 towards the panel. Lengths are in mm, angles in degrees."""
 
 import logging
 import math
