@@ -113,8 +113,7 @@ def load_deformation(path: str | Path) -> Deformation:
 def save_deformation(path: str | Path, deformation: Deformation) -> None:
     """Writes ``deformation``, how an object moves, to a file, completely or not at all.
 
-    path: the HDF5 file; an existing one is replaced. Raises InputError for anything but a Deformation, OutputError if the
-    file cannot be written."""
+    path: the HDF5 file; an existing one is replaced. Raises InputError for another object, OutputError if writing fails."""
     if not isinstance(deformation, Deformation):
         raise InputError("deformation", checks.short_repr(deformation), "a Deformation")
     write_deformation(_checked_path(path), deformation)
@@ -200,8 +199,8 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
 
     steps: names of steps in docs/prepare.md, with commas. device: what ``--device`` takes, or a Runtime. options: a step's
     options as a table (``rings={"window": 11}``), and other options of preprocessing. The scan's provenance lists under
-    ``prepared`` what each step did. Raises InputError for an unknown step or option, and for a scan that lacks what a step
-    needs to find the effect."""
+    ``prepared`` what each step did. Raises InputError for unknown steps and options, and for a scan that a step cannot
+    correct."""
     check_scan(scan)
     before = preprocessing_of({"steps": steps, **options})
     before.check_written()

@@ -97,8 +97,8 @@ def _arcs_deg(angles_deg: np.ndarray, exposure_deg: float) -> np.ndarray:
     """Returns how far the gantry turns in each frame's exposure (F,), in degrees, with the sign of its turn.
 
     Unwrapped angles (F,) that rise and fall belong to a gantry that swings back and forth. In each frame it turns towards
-    the next frame's angle, but at a reversal it may still turn the other way. If steps are too large to show a direction,
-    all frames turn as stated."""
+    the next frame's angle, but at a reversal it may still turn the other way. With steps too large to show this, all frames
+    turn as stated."""
     steps_deg = np.diff(angles_deg)
     arcs_deg = np.full(len(angles_deg), exposure_deg)
     is_clear = (np.abs(steps_deg) < _CLEAR_STEP_DEG).all() and (steps_deg > 0).any() and (steps_deg < 0).any()

@@ -142,8 +142,7 @@ def _angles_rad(frames: AcquisitionGeometry) -> np.ndarray:
 
 
 def _at_zero(frames: AcquisitionGeometry) -> np.ndarray:
-    """Returns ASTRA's vectors (4, 3) of the gantry at angle 0: source (or direction of rays), the panel's middle, and the
-    steps to the next column and row."""
+    """Returns ASTRA's vectors (4, 3) at angle 0: source or rays' direction, panel's middle, steps to next column and row."""
     system = frames.copy().config.system
     system.align_reference_frame("cil")
     origin = system.ray.direction if frames.geom_type == "parallel" else system.source.position

@@ -110,8 +110,7 @@ RUN_OPTIONS: dict[str, Any] = {
 
 
 def with_run_options(*without: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Returns a decorator that replaces a command's parameter ``settings`` by the options of a reconstruction, except those
-    in ``without``."""
+    """Returns a decorator that replaces the parameter ``settings`` by a reconstruction's options, except ``without``."""
 
     kinds = {name: kind for name, kind in RUN_OPTIONS.items() if name not in without}
     options = {name: (kind, False if get_args(kind)[0] is bool else None) for name, kind in kinds.items()}

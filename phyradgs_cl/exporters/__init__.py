@@ -66,8 +66,7 @@ def export_volume(
 
 
 def hu_scale(volume: Volume, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0) -> Hounsfield | None:
-    """Returns the scale of Hounsfield units that a volume file has. If it has none, or a box or an insert is given, fits
-    a scale to the values."""
+    """Returns the volume's scale of Hounsfield units; fits a new one if it has none, or if a box or insert is given."""
     if (stored := volume.scale) is not None and air is None and water is None and insert_hu == 0:
         return replace(stored, fitted=f"{stored.line}, as stored")
     return volume.hounsfield(air, water, insert_hu).scale
@@ -161,8 +160,7 @@ def export_stored(
     volume: Volume, to: str, target: Path, subject: str, scale_of: ScaleOf | None = None,
     labels: DicomLabels | None = None, unit: str = _PLAIN,
 ) -> None:  # fmt: skip
-    """Writes a volume to ``target`` as ``export_volume`` does. subject: names the volume in messages. unit: the note of
-    values without a scale."""
+    """Writes a volume as ``export_volume`` does. subject: names it in messages. unit: the note of values without a scale."""
     if to in CLOUDS:
         CLOUDS[to](target, writers.gaussians_of(volume, subject))
         return
@@ -190,8 +188,7 @@ def _write_own(target: Path, volume: Volume, path: str, scale: Hounsfield | None
 
 
 def foreign_suffix(output: str | Path) -> str | None:
-    """Returns a path's suffix if it belongs to another program's format, else None. HDF5 must not be written to such a
-    name."""
+    """Returns a path's suffix if another program's format has it, so that HDF5 must not be written there; else None."""
     suffixes = (*(suffix for to in EXPORTS for suffix in _suffixes(to)), ".mhd", ".dcm", ".png")
     return next((suffix for suffix in suffixes if Path(output).name.lower().endswith(suffix)), None)
 

@@ -27,9 +27,8 @@ _LONGEST = 64  # DICOM's limit in characters for names (PN) and descriptions (LO
 
 @dataclass(frozen=True)
 class DicomLabels:
-    """Labels by which viewers and archives list a series; None writes none. patient: used as name (Family^Given) and as
-    ID. title, date (YYYY-MM-DD): of the study. description: of the series. Raises InputError for text that DICOM cannot
-    hold."""
+    """Labels by which viewers and archives list a series; None writes none. patient: name (Family^Given) and ID. title, date
+    (YYYY-MM-DD): of the study. description: of the series. Raises InputError for text that DICOM cannot hold."""
 
     patient: str | None = None
     title: str | None = None

@@ -87,8 +87,7 @@ def write_npy(path: Path, volume: Volume, note: str) -> None:
 def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None, unit: str = "values in 1/mm") -> None:
     """Writes OME-Zarr 0.5: a new folder of chunks at full and at repeatedly halved resolution, which viewers load as
     needed. Halving takes means of 2×2×2 voxels. Besides the volume (nz, ny, nx) in 1/mm, memory holds at most 128 slices.
-    scale: writes Hounsfield units; None writes 1/mm with the note ``unit``. Raises OutputError as ``folder_written_beside``
-    does."""
+    scale: writes Hounsfield units; None writes 1/mm, with the note ``unit``. Raises OutputError for a folder with files."""
     of_extra = "the package that this export needs", "phyradgs-cl[zarr]"
     writer, zarr = (checks.package(name, *of_extra) for name in ("ome_zarr.writer", "zarr"))
     grid, levels = volume.required_grid, list[dict[str, Any]]()

@@ -274,8 +274,7 @@ class RotaryStage:
     shift_mm: np.ndarray | None = None
 
     def poses(self, angle_rad: np.ndarray, shift_mm: np.ndarray | float = 0.0) -> np.ndarray:
-        """Returns poses (T, 12) in the sample's coordinates at gantry angles (T,). shift_mm (T, 2): shifts (v, u) of the
-        panel."""
+        """Returns poses (T, 12) at gantry angles (T,), in the sample's frame. shift_mm (T, 2): the panel's shifts (v, u)."""
         upright = self.geometry.pose(0.0).reshape(4, 3)  # x to the source, y to the right, z up
         is_parallel = isinstance(self.geometry, ParallelGeometry)
         parts = np.repeat(upright[None], len(angle_rad), axis=0)

@@ -99,8 +99,7 @@ class SafeFolder:
         return [path for path in _files(self.root) if _is_one_of(path, suffixes)]
 
     def only(self, what: str, *suffixes: str) -> Path:
-        """Returns the only file with one of the suffixes. what: its role, for messages. Raises InputError for none or
-        several."""
+        """Returns the only file with one of the suffixes. Raises InputError for none or several; ``what`` names its role."""
         paths = self.matching(*suffixes)
         if len(paths) != 1:
             names = ", ".join(path.name for path in paths[:5]) or "none"
@@ -121,8 +120,7 @@ def _is_one_of(path: Path, suffixes: tuple[str, ...]) -> bool:
 
 
 def checked_name(name: object, subject: str) -> str:
-    """Returns ``name`` with forward slashes. Raises InputError about ``subject`` unless it is a relative path without
-    ".."."""
+    """Returns ``name`` with forward slashes. Raises InputError about ``subject`` for an absolute path, and for ".."."""
     text = name.replace("\\", "/") if isinstance(name, str) else ""
     leads_out = PureWindowsPath(text).drive or text.startswith("/") or ".." in PurePosixPath(text).parts
     if not text.strip() or "\0" in text or leads_out:

@@ -78,8 +78,7 @@ class Places:
         self, name: str, usual: Sequence[str] = (), panel: tuple[int, int] | None = None
     ) -> tuple[np.ndarray, dict[str, int]] | None:
         """Reads frames (n, v, u) in their own type from the stated addresses, else from the format's (``usual``). Returns
-        them and the number of frames at each address; None if there is no address. Raises InputError for other shapes or
-        panels."""
+        them and the number of frames at each address; None if there is no address. Raises InputError for other shapes."""
         stacks: dict[str, np.ndarray] = {}
         for text in self._at(name, usual):
             with self.opened(name, str(text)) as (source, address):
@@ -153,8 +152,7 @@ class Places:
         return np.full(frames, schema.PROJECTION)
 
     def angles_rad(self, used: np.ndarray, options: ImportOptions, usual: str = "", unit: str = "deg") -> np.ndarray:
-        """Reads the angles in rad, with the stored sign, of the frames marked in ``used``, bool (F,). unit: assumed where
-        the file states none."""
+        """Reads angles in rad, sign as stored, of the frames in ``used``, bool (F,). unit: assumed if the file states none."""
         quantity = replace(ANGLE, assumed=unit)
         asked = [options.angles] if options.angles and is_address(options.angles) else self.stated.get("angles", ())
         for text in asked:
@@ -227,9 +225,8 @@ class Lengths:
 def beam(
     source: Hdf5Source, lengths: Lengths, options: ImportOptions, panel: tuple[int, int], axis_columns: float = 0.0
 ) -> Geometry:
-    """Returns the geometry from the options' numbers, else the file's. Where neither states the source's distance, it is a
-    parallel beam, with a warning. axis_columns: columns from the axis to the panel's middle. Raises InputError for
-    impossible lengths."""
+    """Returns the geometry from the options' numbers, else the file's. If neither states the source's distance, it is a
+    parallel beam, with a warning. axis_columns: from the axis to the panel's middle. Raises InputError for wrong lengths."""
     quantity = LENGTH
     for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):
         if source.find(address) is not None and not h5.read_attribute(source, address, "units"):

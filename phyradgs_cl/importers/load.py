@@ -109,8 +109,7 @@ def _check_there(path: Path) -> None:
 
 
 def recognise(path: Path) -> str:
-    """Finds the format of a file or folder by its content, a key of ``FORMATS``. Raises InputError where none or several
-    fit."""
+    """Finds the format, a key of ``FORMATS``, by a file's or folder's content. Raises InputError if none or several fit."""
     _check_there(path)
     expected = "one of the formats of docs/import.md"
     names = [name for name in FORMATS if _function("recognises", name)(path)]

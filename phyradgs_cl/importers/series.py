@@ -33,8 +33,7 @@ _MOST_NAMES = 8  # names of files that a message lists
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Files in the order of the scan. numbers (F,): in their names; None if names have none. said: a text about which files
-    were taken."""
+    """Files in the order of the scan. numbers (F,): in their names, or None. said: a text about which files were taken."""
 
     paths: list[Path]
     numbers: np.ndarray | None
@@ -76,8 +75,7 @@ class _Column:
 
     @property
     def rank(self) -> tuple[bool, bool, bool]:
-        """Sort key of the numbers that may give the order: regular first, then indices before angles, whole numbers
-        before decimals."""
+        """Sort key of numbers that may give the order: regular first, indices before angles, whole ones before decimals."""
         return self.regular < _USUAL, self.is_angle, self.values.dtype.kind == "f"
 
 

@@ -1,5 +1,4 @@
-"""Reads grey TIFF images, one or many per file, with tifffile. Without imagecodecs, tifffile cannot read some compressed
-files; Pillow then reads them."""
+"""Reads grey TIFF images, one or many per file, by tifffile; compressed ones by Pillow if imagecodecs is not installed."""
 
 import logging
 import math

@@ -82,8 +82,7 @@ def sha256_of(path: str | Path, given_up: threading.Event | None = None) -> str:
 
 @contextmanager
 def hashing(path: str | Path) -> Iterator[Callable[[], str]]:
-    """Hashes a file in a thread while the caller reads it, so that the disk is read once. Yields a function that returns
-    the SHA-256."""
+    """Hashes a file while the caller reads it, so that the disk is read once. Yields a function that returns the SHA-256."""
     given_up = threading.Event()
     with ThreadPoolExecutor(1) as pool:
         try:

@@ -58,8 +58,7 @@ def load_scanner(name_or_path: str | Path, data_dir: Path) -> Scanner:
 
 
 def with_detector_count(geometry: Geometry, rows: int, columns: int) -> Geometry:
-    """Returns the geometry with other numbers of pixels on a panel of the same size and position. Raises InputError for
-    numbers below 1."""
+    """Returns the geometry with other numbers of pixels on the same panel. Raises InputError for numbers below 1."""
     if min(rows, columns) < 1:
         raise InputError("detector count", f"{rows} × {columns}", "at least 1 row and 1 column")
     (nv, nu), (pitch_v, pitch_u) = geometry.detector_shape, geometry.pixel_size_mm
@@ -86,8 +85,7 @@ def _describes_scanner(path: Path) -> bool:
 
 
 def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
-    """Returns the scanner that ``content``, read from the TOML file ``path``, describes. Raises InputError as
-    ``load_scanner`` does."""
+    """Returns the scanner that ``content`` of the TOML file ``path`` describes. Raises InputError as ``load_scanner``."""
     refuse_unknown(str(path), content, (*TABLES, *_WORDS), "a table")
     tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in TABLES.items()}
     geometry = _geometry(tables["source"], tables["detector"])

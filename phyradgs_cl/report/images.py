@@ -72,8 +72,7 @@ def diverging() -> NDArray[np.uint8]:
 
 
 def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
-    """Returns the values of black and white: 0 and a high percentile of the volume. If nothing is above 0, they are the
-    extremes."""
+    """Returns the values of black and white: 0 and a high percentile of the volume, or its extremes if none is above 0."""
     high = float(np.percentile(volume, _PERCENTILE))
     if high > 0:
         return 0.0, high
@@ -94,8 +93,7 @@ class Window:
 
     @classmethod
     def of(cls, low: float, high: float, *volumes: Volume) -> "Window":
-        """Returns a window whose stored levels go beyond black and white by up to a quarter of their distance, if values
-        do."""
+        """Returns a window whose levels go beyond black and white, if values do, by up to a quarter of their distance."""
         room = _ROOM * (high - low)
         lowest, highest = (float(f([f(v) for v in volumes])) for f in (np.min, np.max))
         least, most = min(low, max(lowest, low - room)), max(high, min(highest, high + room))
@@ -169,8 +167,7 @@ def planes_of(
 
 
 def middle_planes(slices: Sequence[Volume], grid: Grid, window: tuple[float, float]) -> list[Plane]:
-    """Returns planes that show only three middle slices (axial, coronal, sagittal) of a volume on ``grid``. window: the
-    values of black and white."""
+    """Returns planes of a volume's middle slices (axial, coronal, sagittal) on ``grid``. window: values of black and white."""
     planes = []
     for (name, axis, letter, right, up), image in zip(PLANES, slices, strict=True):
         still = grey_png(block_means(image, LONGEST_EDGE), *window)

@@ -162,8 +162,7 @@ def projections_section(scan: Scan, views: Sequence[FramePair]) -> Markup | None
 
 
 def frame_pictures(views: Sequence[FramePair], style: str | None = None) -> tuple[str, list[Markup]]:
-    """Returns the legend of frames, and a row of pictures for each. style: CSS of the pictures, for pixels that are not
-    square."""
+    """Returns the legend of frames, and a row of pictures for each. style: CSS, for pixels that are not square."""
     low = min(0.0, *(float(v.measured.min()) for v in views))
     high = max(float(v.measured.max()) for v in views)
     limit = max(float(np.percentile(np.abs(v.residual), 99.5)) for v in views) or 1.0

@@ -83,8 +83,7 @@ def check_output(output: Path, *inputs: Path | None, remedy: str = "write scan.h
 
 
 def check_picture(option: str, picture: Path, *others: Path | None, suffixes: Sequence[str] = (".png",)) -> None:
-    """Raises InputError for a picture or page that is one of the other files or has none of the suffixes. Raises OutputError
-    if it cannot be written."""
+    """Raises InputError for a picture that is one of ``others`` or has a wrong suffix, OutputError if it is not writable."""
     refuse_overwriting(option, picture, *others)
     if picture.suffix.lower() not in suffixes:
         raise InputError(option, str(picture), f"a file name that ends in {suffixes[0]}")

@@ -69,8 +69,7 @@ class SweepRun:
 def plan_sweep(path: Path, folder: Path, checkpoint_every_s: float = 600.0) -> list[SweepRun]:
     """Returns every run of the sweep's file ``path``, scan by scan. Volumes will be written to ``folder``/volumes. Patterns
     of scans are relative to the folder of ``path``. A run's name depends on its scan (path, size, time of change), setting
-    and seed. Raises InputError for all that would stop a run: unknown keys, values out of range, patterns without a match,
-    files that are no scans."""
+    and seed. Raises InputError for what would stop a run: unknown keys, wrong values, patterns that match no scan."""
     document = read_toml(path, f"GRID {path}")
     refuse_unknown(f"{path}:", document, ("scans", "seeds", "options", "grid", "runs"))
     patterns = _list(document.get("scans"), str, f"{path}: scans", 'a list of files or patterns, as ["scans/*.h5"]')
@@ -107,9 +106,8 @@ def _files(pattern: str, path: Path) -> list[Path]:
 
 
 def _settings(document: Mapping[str, Any], path: Path) -> Iterator[dict[str, Any]]:
-    """Yields the options of every setting, by dotted name. Each [[runs]] is one setting; each [[grid]] gives all
-    combinations of its lists. [options] are added to all. Raises InputError for a file without [[grid]] and [[runs]], and
-    for an empty list."""
+    """Yields the options of every setting, by dotted name: each [[runs]], and all combinations of the lists in each
+    [[grid]]. [options] are added to all. Raises InputError for a file with neither table, and for an empty list."""
     keys = [key for key in ("grid", "runs") if key in document]
     if not keys:
         remedy = "write for example [[grid]] with method = ['fdk', 'sirt']"

@@ -45,8 +45,7 @@ _MOVES = ("x_translation", "y_translation", "z_translation")
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is an HDF5 file without Data Exchange's group. Raises InputError for this package's
-    volumes."""
+    """Returns whether ``path`` is an HDF5 file but no Data Exchange. Raises InputError for this package's volumes."""
     if not path.is_file() or not h5py.is_hdf5(path):
         return False
     with open_hdf5(path) as source:

@@ -65,8 +65,7 @@ class Circle:
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a .json file with a name that no other format uses, or a folder with such a file and
-    TIFF frames."""
+    """Returns whether ``path`` is a .json file of no other format, or a folder with such a file and TIFF frames."""
     others = (synthetic.META, synthetic.META_WITH_TIMES)
     if not path.is_dir():
         return path.suffix.lower() == ".json" and path.name not in others
@@ -77,8 +76,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder with one JSON and TIFF frames, which may be in a subfolder ``projections``. ``path`` may also be
-    the JSON in it."""
+    """Imports a folder with one JSON and TIFF frames, in it or in its folder ``projections``. ``path`` may be the JSON."""
     options.refuse_unused("phyradgs-real", OPTIONS)
     checks.one_of(options.called("readout_axis"), options.readout_axis or "rows", ("rows",))
     description = path if path.is_file() else SafeFolder(path).only("description of the views", ".json")
@@ -143,8 +141,7 @@ def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> Impo
 
 
 def _timing(subject: str, detector: Circle, options: ImportOptions) -> tuple[Shutter, np.ndarray]:
-    """Returns shutter and opening times (F,) in s. Frames that would overlap in time are moved apart, because the pose
-    table has one pose at a time."""
+    """Returns shutter and opening times (F,) in s. Moves overlapping frames apart: a pose table has one pose at a time."""
     exposure_s = synthetic.exposure_of_blurred_s(options)
     first, closed, done = np.unwrap(detector.angle_rad, axis=1).T
     ratio = synthetic.readout_ratio(subject, closed - first, done - closed)

@@ -41,8 +41,7 @@ class R2Folder:
 
     @classmethod
     def opened(cls, given: Path, usual: str, unit_mm: float) -> "R2Folder":
-        """Reads the description: the file ``given``, or the file called ``usual`` in the folder ``given``. unit_mm: the
-        scene's unit of length in mm."""
+        """Reads the description: the file ``given``, or ``usual`` in the folder ``given``. unit_mm: the scene's unit."""
         folder = SafeFolder(given if given.is_dir() else given.parent)
         name = usual if given.is_dir() else given.name
         path = folder.file(name, str(folder.root / name))

@@ -58,8 +58,7 @@ class Streams(Fields):
         return values[:count]
 
     def steady(self, name: str) -> float:
-        """Returns a length in mm, without its sign, that is the same in all images. Raises InputError where it differs or
-        is 0."""
+        """Returns a length in mm without its sign, the same in all images. Raises InputError if it differs or is 0."""
         lengths = np.abs(self.numbers(name))
         lengths = lengths[lengths > 0]
         if not len(lengths) or np.ptp(lengths) > _STEADY * lengths[0]:

@@ -1,5 +1,4 @@
-"""Reads and writes motion in a scan file. The scanner's is a pose table, an encoder table or two angles per frame. A moving
-object's is a gating signal."""
+"""Reads and writes motion in a scan file: the scanner's as poses, encoder table or angles, the object's as gating signal."""
 
 import logging
 import math
@@ -58,8 +57,7 @@ def read_trajectory(
 
 
 def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> np.ndarray:
-    """Reads gantry angles (P,) in rad of the frames marked in ``used``, bool (F,). name: the dataset, rotation_angle or
-    rotation_angle_end."""
+    """Reads gantry angles (P,) in rad of frames in ``used``, bool (F,). name: rotation_angle or rotation_angle_end."""
     address = f"{entry}/{schema.SAMPLE}/{name}"
     angle_rad = h5.read_array(source, address, used.shape, h5.ANGLE)[used]
     # an end angle that does not say whether gantry or sample turns means the same as the start angle
@@ -145,8 +143,7 @@ def _read_table_times(source: Hdf5Source, address: str) -> np.ndarray:
 
 
 def _sense(source: Hdf5Source, address: str, absent: float) -> float:
-    """Returns the sign that makes an angle the gantry's: +1 if its attribute "rotates" says gantry, −1 for sample, and
-    ``absent`` without the attribute."""
+    """Returns the sign that makes an angle the gantry's: +1 if @rotates is gantry, −1 if sample, ``absent`` if missing."""
     rotates = h5.read_attribute(source, address, "rotates")
     if rotates is None:
         return absent

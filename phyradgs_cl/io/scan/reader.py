@@ -26,8 +26,7 @@ ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.nda
 
 
 def read_scan_header(path: str | Path) -> Scan:
-    """Reads and checks all of a scan file but its large arrays. The projections are zeros that take no memory. Raises
-    InputError as ``read_scan`` does."""
+    """Reads and checks a scan file as ``read_scan``, but not its large arrays: projections are zeros that take no memory."""
     with open_hdf5(path) as source:
         return read_header(source).scan
 
@@ -150,8 +149,7 @@ def _read_mask(source: Hdf5Source, header: ScanHeader, rows: slice | None) -> np
 def _read_frames(
     source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None, rows: slice | None
 ) -> np.ndarray:
-    """Reads all stored frames (F, v, u), or only their ``rows``. Raises InputError for NaN and infinity, except at masked
-    pixels and in invalid frames."""
+    """Reads all stored frames (F, v, u), or their ``rows``. Raises InputError for NaN and infinity that are not masked."""
     address = f"{header.entry}/{schema.DATA}"
     data = read_values(source, address, source.dataset(address), rows=rows)
     if data.dtype.kind == "f":
@@ -189,8 +187,7 @@ def _convert(
 
 
 def united(mask: np.ndarray | None, bad: np.ndarray | None) -> np.ndarray | None:
-    """Returns the union of two masks, each (v, u), (P, v, u) or None. Without a masked pixel in ``bad`` it returns
-    ``mask`` unchanged."""
+    """Returns the union of two masks, each (v, u), (P, v, u) or None; ``mask`` itself if ``bad`` masks no pixel."""
     if bad is None or not np.any(bad):
         return mask
     return np.asarray(bad, bool) if mask is None else mask | np.asarray(bad, bool)
