@@ -152,7 +152,7 @@ class Places:
         return np.full(frames, schema.PROJECTION)
 
     def angles_rad(self, used: np.ndarray, options: ImportOptions, usual: str = "", unit: str = "deg") -> np.ndarray:
-        """Reads angles in rad, sign as stored, of the frames in ``used``, bool (F,). unit: assumed if the file states none."""
+        """Reads angles in rad, sign as stored, of the frames in ``used``, bool (F,). unit: if the file states none."""
         quantity = replace(ANGLE, assumed=unit)
         asked = [options.angles] if options.angles and is_address(options.angles) else self.stated.get("angles", ())
         for text in asked:

@@ -167,7 +167,7 @@ def planes_of(
 
 
 def middle_planes(slices: Sequence[Volume], grid: Grid, window: tuple[float, float]) -> list[Plane]:
-    """Returns planes of a volume's middle slices (axial, coronal, sagittal) on ``grid``. window: values of black and white."""
+    """Returns planes of a volume's middle slices (axial, coronal, sagittal). window: the values of black and white."""
     planes = []
     for (name, axis, letter, right, up), image in zip(PLANES, slices, strict=True):
         still = grey_png(block_means(image, LONGEST_EDGE), *window)

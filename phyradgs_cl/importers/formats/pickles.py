@@ -48,7 +48,7 @@ def recognises(path: Path) -> bool:
 
 
 def names_tigre(path: Path) -> bool:
-    """Returns whether a file names TIGRE's geometry in its first or last 256 KiB. Frames between would take long to search."""
+    """Returns whether a file names TIGRE's geometry in its first or last 256 KiB; the frames between are not searched."""
     with open(path, "rb") as file:
         head = file.read(_END_BYTES)
         file.seek(max(0, os.fstat(file.fileno()).st_size - _END_BYTES))
