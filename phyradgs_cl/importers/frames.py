@@ -26,7 +26,7 @@ _TOGETHER = 0.1  # largest difference among flats of one time, in which the tube
 _APART = 0.3  # largest difference among flats of several times, between which the tube may drift
 _DARK = 0.02  # largest difference among darks
 
-# It is left out too if its pixels differ from the others', in the mean, by more than the sum of these two parts.
+# A flat or dark is left out too if its pixels differ from the others', in the mean, by more than the sum of these two.
 _PATTERN = 0.02  # allowed difference, as a fraction of the flats' median
 _TIMES = 5.0  # allowed difference, in units of the frames' median deviation
 _BLOCK_BYTES = 1 << 26  # memory of a block of rows whose median is taken: a float64 copy of all frames would be large

@@ -28,7 +28,7 @@ _STEADY_ANGLES = 0.75  # angles or times with fewer regular steps are uneven: no
 _SMALL = 0.25  # groups of files with the same words below this fraction of the largest group are no frames
 _BEFORE, _AFTER = (re.compile(rf"(?<![a-z])({words})(?![a-z])", re.I) for words in ("before|pre|start", "after|post|end"))
 _STAMP = 10**7  # numbers from here on are times in milliseconds, not indices
-_MOST_NAMES = 8  # names of files that a message lists
+_MOST_NAMES = 8  # of files, in a message
 
 
 @dataclass(frozen=True, eq=False)

@@ -62,7 +62,7 @@ def read_facts(subject: str, text: str, types: Mapping[str, tuple[type, ...]]) -
 
 
 def _fits(value: object) -> bool:
-    """Returns whether a list has only tables as entries, or a number is finite and fits 64 bits; True for other types."""
+    """Returns whether a value is usable: lists must have only tables as entries, and numbers be finite and fit 64 bits."""
     if isinstance(value, list):
         return all(isinstance(line, dict) for line in value)
     return not isinstance(value, (int, float)) or abs(value) < 2**63

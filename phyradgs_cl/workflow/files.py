@@ -98,8 +98,8 @@ def load_result(path: Path, mu_water_per_mm: float | None = None) -> Volume:
 
 
 def load_reference(path: Path, mu_water_per_mm: float | None = None) -> tuple[Volume, MovingTruth | None]:
-    """Reads a scan's true volume and, if the object moves, its true volumes at several times; of a volume file, the volume
-    and None. mu_water_per_mm: as in ``load_result``. Raises InputError for a scan without a true volume."""
+    """Reads a true volume to compare with, and its states at several times if a scan file has them, else None. The file is
+    a scan or a volume. mu_water_per_mm: as in ``load_result``. Raises InputError for a scan without a true volume."""
     if importers.foreign_volume(path) is None and file_kind(path) == "scan":
         scan = load_scan(path)
         if scan.reference is None:

@@ -215,7 +215,7 @@ def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: st
         return _failed(run, error)
     except Exception as error:
         runtime_of_process.cache_clear()  # the device may have failed: the next run opens it again
-        time.sleep(_BUSY_S if isinstance(error, BusyError) else 0)  # a worker that lost contact may still write
+        time.sleep(_BUSY_S if isinstance(error, BusyError) else 0)  # a worker that lost contact may be writing it
         raise
     if not is_complete(result):
         raise KeyboardInterrupt

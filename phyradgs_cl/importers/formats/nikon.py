@@ -45,7 +45,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder with one .xtekct file and its TIFFs. ``path`` may also be the .xtekct file in it."""
+    """Imports a folder with one .xtekct file and its TIFFs. ``path`` may also be the .xtekct file."""
     options.refuse_unused("nikon", OF_FOLDERS)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("description of the scan", ".xtekct")
