@@ -1,4 +1,4 @@
-"""Loads scans, true volumes and volumes after a look at what the file holds, and summarises files."""
+"""Loads scans, volumes and true volumes, by what their file holds, and summarises files."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
