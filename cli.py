@@ -1,4 +1,4 @@
-"""The command line, with all commands. Every error gives one line on stderr and the exit status of its kind."""
+"""The command line with all commands. An error prints one line on stderr; its kind gives the exit status."""
 
 import importlib
 from collections import UserDict
@@ -15,7 +15,7 @@ from phyradgs_cl.removed import removal
 
 _CLICK_ERROR: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 HELP = {"help_option_names": ["-h", "--help"]}
-# By name: the module of commands/ that has NAME_command, and the command's help in the list.
+# Command NAME: the module in commands/ that defines NAME_command, and the help in the list of commands.
 COMMANDS = {
     "simulate": ("simulate", "Simulate a fly-scan of a phantom or a volume."),
     "import": ("import_scan", "Turn the scan of another program into a scan file."),
@@ -35,11 +35,11 @@ COMMANDS = {
 
 
 class Interrupted(Exception):
-    """Carries Ctrl-C past Typer, which would end the program without a message."""
+    """Stands for Ctrl-C. Typer would end the program at KeyboardInterrupt, without a message."""
 
 
 class Loaded(UserDict[str, Any]):
-    """Typer's commands by name. Each is imported when it is used, since imports take time."""
+    """Typer's commands by name. Each is imported only when it is used, since imports take time."""
 
     def __getitem__(self, name: str) -> Any:
         module_name, summary = COMMANDS[name]
@@ -53,7 +53,6 @@ class Loaded(UserDict[str, Any]):
 
 
 class Commands(TyperGroup):
-    """The group of all commands."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
@@ -116,10 +115,10 @@ def run(arguments: list[str], program: typer.Typer = app) -> int:
             return complain(str(error), error.exit_code)
         except _CLICK_ERROR as error:
             return complain(usage_text(error, arguments))
-        except OSError as error:  # one that no function of ours has caught
+        except OSError as error:  # from a call that no function here handles
             text = f"{error.filename or 'operating system'}: {error.strerror or error}"
             return complain(text, OutputError.exit_code if error.errno in NO_SPACE else 2)
-        except SystemExit:  # Typer raises it where the reader of its help has closed the pipe, as `| head` does
+        except SystemExit:  # Typer raises it if the reader of its help closes the pipe, as `| head` does
             give_up_stdout()
             return 0
         except (Interrupted, KeyboardInterrupt, typer.Abort):

@@ -1,9 +1,9 @@
-"""The toolkit from Python, in the paper's words: scans, reconstructions, and projectors that others can use.
+"""The toolkit from Python: scans, reconstructions, and projectors for other packages' algorithms.
 
     scan = simulate("foot", size=32)
     result = reconstruct(scan, method="phyradgs", iterations=500)
 
-Everything is documented with runnable examples in docs/api.md. ``device`` is what ``--device`` takes, or a Runtime."""
+docs/api.md explains everything with runnable examples. ``device`` is what ``--device`` takes, or a Runtime."""
 
 from phyradgs_cl.acquisition import (
     Centres,

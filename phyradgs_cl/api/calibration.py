@@ -1,4 +1,4 @@
-"""Estimates a scan's geometry and timing from its frames: calibration, moved views, and the gradient dL/dviews."""
+"""Estimates a scan's geometry and timing from its frames; moves views, and computes a loss' gradient by their poses."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ from phyradgs_cl.fields import Gaussians
 from phyradgs_cl.fields.gaussians import ROWS
 from phyradgs_cl.importers import load_beads
 
-_STEP_PX = 0.25  # step of central differences at the image's edge: voxels' errors hide smaller ones, curvature larger ones
+_STEP_PX = 0.25  # central differences move the image's edge this far: less drowns in voxels' errors, more is nonlinear
 
 
 @naming_arguments()
@@ -28,20 +28,21 @@ def calibrate(
 ) -> Calibration:
     """Estimates geometry and timing from the frames (docs/calibrate.md). Values that frames cannot show stay as stated.
 
-    what: names with commas. None is ``offset,roll,tilt``, and ``readout,exposure`` too of a fly-scan. More names are
+    what: names with commas. None means ``offset,roll,tilt``, for a fly-scan also ``readout,exposure``. More names are
     ``distance``, ``direction``, ``motion`` and ``wobble`` (each view separately).
     others: more scans of the same object in the same place, with the same panel; they share the errors of ``scan``.
     phantom: a TOML file of beads and wires (docs/formats.md) that describes the scanned object, at any place.
     splines: number of splines over time, at least 4, that describe a ``wobble``; 0 estimates every view separately.
     device: what ``--device`` takes, or a Runtime.
 
-    The result has ``scan``, corrected; ``parameters``, each stated and found with its deviation in its unit (mm, deg, s)
-    and a verdict (corrected, agrees, cannot tell); ``alike``, combinations that leave no trace; ``residual_rms`` of
-    line integrals before and after; ``before`` and ``after``, the residuals (F, rows, columns) of the coarsened frames;
-    ``per_view()``, the corrections of every view by name and unit (F,); and ``plot()``, a figure of all that.
+    The result has:
+    ``scan``, corrected; ``parameters``, each as stated and as found, with its standard deviation in its unit (mm, deg, s)
+    and a verdict (corrected, agrees, cannot tell); ``alike``, combinations of parameters that change no frame;
+    ``residual_rms`` of line integrals, before and after; ``before`` and ``after``, residuals (F, rows, columns) of the
+    coarsened frames; ``per_view()``, corrections (F,) of every view by name and unit; and ``plot()``, a figure of them.
 
-    Raises InputError for unknown names, the timing of a gantry that stops, and fewer than 8 frames or 12 columns; also for
-    other scans that do not fit the first, and a phantom that the frames do not show."""
+    Raises InputError for unknown names, the timing of a gantry that stops, and fewer than 8 frames or 12 columns. Raises it
+    also for other scans that do not fit the first, and for a phantom that the frames do not show."""
     check_scan(scan)
     scan.check_timing()
     if not (what is None or isinstance(what, str)):
@@ -56,12 +57,12 @@ def calibrate(
 
 @naming_arguments()
 def move_views(scan: Scan, views: np.ndarray, *, without_gauges: bool = False) -> Scan:
-    """Returns the scan with other poses of its views and the same frames.
+    """Returns the scan with the same frames and other poses of its views.
 
     views: (F, 3), for each view the gantry's turn about the axis in rad, counterclockwise seen from above, and the panel's
-    shifts along its columns and its rows in mm; they hold for all times of a view. without_gauges: leave out the part of
-    ``views`` that a turned or shifted object explains as well (docs/calibrate.md). A file has one pose at a time: where
-    frames overlap in time, ``save_scan`` refuses the result.
+    shifts along u and v in mm. They hold for all times of a view. without_gauges: leaves out the part of ``views`` that a
+    turned or shifted object explains as well (docs/calibrate.md). If frames overlap in time, ``save_scan`` refuses the
+    result, because a file has one pose at a time.
 
     Raises InputError for anything but a Scan, and for other shapes."""
     check_scan(scan)
@@ -77,13 +78,13 @@ def pose_gradient(
     scan: Scan, x: Gaussians | np.ndarray, by_frames: np.ndarray, motion: str | Motion | None = None, *,
     device: Device = None,
 ) -> np.ndarray:
-    """Returns dL/dviews (F, 3) float64 for ``move_views``, per rad and mm, from dL/dframes (F, rows, columns).
+    """Returns the derivative (F, 3) float64 of a loss by the ``views`` of ``move_views``, per rad and mm (Choi et al. 2026).
 
-    x: the object. ``Gaussians`` use the chain rule through the poses of every line; a volume (nz, ny, nx) in 1/mm on the
-    scan's grid uses central differences of a quarter of a pixel. by_frames: dL/dframes; for half the squared misfit, the
-    frames of x minus those of the scan. Line integrals are averaged, whatever the detector. motion: that of
-    ``splat_operator`` or ``ray_operator``, with their defaults. device: what ``--device`` takes, or a Runtime. After Choi et
-    al. 2026.
+    x: the object. For ``Gaussians`` it is the chain rule through the poses of every line. For a volume (nz, ny, nx) in 1/mm
+    on the scan's grid it is central differences of a quarter of a pixel. by_frames (F, rows, columns): the loss' derivative
+    by the frames; for half the squared misfit, frames of x minus frames of the scan. Exposures average line integrals,
+    whatever the scan's detector model. motion: as in ``splat_operator`` or ``ray_operator``. device: what ``--device``
+    takes, or a Runtime.
 
     Raises InputError as the operators do."""
     check_scan(scan)

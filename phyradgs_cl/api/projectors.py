@@ -1,4 +1,4 @@
-"""Operators of whole scans: from voxels or Gaussians to frames, and from Gaussians to voxels; for PyTorch too."""
+"""Operators for whole scans: from voxels or Gaussians to frames, and from Gaussians to voxels. PyTorch can use them."""
 
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -31,11 +31,11 @@ _FRAMES, _VOLUME = "frames", "volume"
 def ray_operator(
     scan: Scan, motion: str | Motion = "per-row", *, grid: Grid | None = None, device: Device = None
 ) -> LinearOperator:
-    """Returns Joseph's projector of a scan: volumes (nz, ny, nx) in 1/mm to frames (F, rows, columns), and its transpose.
+    """Returns Joseph's projector of a scan, from volumes (nz, ny, nx) in 1/mm to frames (F, rows, columns), with transpose.
 
-    motion: the motion model of docs/methods.md, any except ``exact``, or an object of your class. grid: the voxels; None
-    is the scan's grid. device: what ``--device`` takes, or a Runtime. ``intensity`` of the result is for detectors that
-    average photons. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192.
+    motion: a motion model of docs/methods.md except ``exact``, or an object of your own class. grid: the voxels; None takes
+    the scan's grid. device: what ``--device`` takes, or a Runtime. The result's ``intensity`` is the operator for detectors
+    that average photons instead of line integrals. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192.
 
     Raises InputError for anything but a Scan or a Grid, for an unknown motion, and for one that only splats support."""
     model, voxels = _checked(scan, motion, models.RAYS), scan.grid if grid is None else _a_grid(grid)
@@ -63,7 +63,7 @@ def _rays(engine: RayOperator) -> LinearOperator:
 
 def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
     def at(volume: Values) -> tuple[Values, Map]:
-        own, on_device = copy(engine), isinstance(volume, DeviceArray)  # the copy keeps the derivative at this volume
+        own, on_device = copy(engine), isinstance(volume, DeviceArray)  # a copy, so that a later call keeps this derivative
 
         def adjoint(frames: Values) -> Values:
             return _in_new_memory(rt, own.adjoint, frames, engine.volume_shape)
@@ -76,7 +76,7 @@ def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
 
 
 def _in_new_memory(rt: Runtime, function: Callable[..., Any], values: Values, shape: tuple[int, ...]) -> Values:
-    """Returns ``function(values)`` in a new array: the engine reuses its memory while views of it may exist."""
+    """Returns ``function(values)`` in a new array on the device. The engine's own array is overwritten by its next call."""
     return function(values, rt.empty(shape)) if isinstance(values, DeviceArray) else function(values)
 
 
@@ -85,16 +85,16 @@ def splat_operator(
     scan: Scan, motion: str | Motion = "exact", *, affine: bool = False,
     cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, device: Device = None,
 ) -> SplatProjection:
-    """Returns a scan's projector Φ (PhyRadGS, Eq. 3): ``Gaussians`` or rows (11, G) to frames (F, rows, columns).
+    """Returns a scan's projector Φ (PhyRadGS, Eq. 3), from ``Gaussians`` or rows (11, G) to frames (F, rows, columns).
 
     The rows are mean x y z and three scales in mm, quaternion w x y z of any length, density in 1/mm. motion: a model of
-    docs/methods.md that splats support. affine: use R2-Gaussian's approximation. cutoff_sigma: the Mahalanobis radius at
-    which a Gaussian ends; 0 never cuts. device: what ``--device`` takes, or a Runtime. ``of_densities(gaussians)`` of the
-    result is its linear part: densities (G,) to frames.
+    docs/methods.md that splats support. affine: use R2-Gaussian's approximation of the projection. cutoff_sigma: the
+    Mahalanobis radius at which a Gaussian ends; 0 never cuts. device: what ``--device`` takes, or a Runtime. The result's
+    ``of_densities(gaussians)`` is its linear part, from densities (G,) to frames.
 
     Raises InputError for anything but a Scan, for an unknown motion, and for a cutoff out of range."""
     model = _checked(scan, motion, models.RAYS, models.SPLATS)
-    if type(model) is PerRow:  # splats cannot weigh the lines of a cell differently: each line gets cells of its own
+    if type(model) is PerRow:  # rays share poses between lines with weights; splats cannot, so each line has its own
         model = OwnTimes(model.of(scan).sub_intervals)
     _check_cutoff(cutoff_sigma)
     rt = runtime_of(device)
@@ -112,10 +112,10 @@ def splat_operator(
 
 @naming_arguments()
 def voxel_operator(grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, device: Device = None) -> Operator:
-    """Returns the operator from Gaussians, or parameter rows (11, G), to their volume (nz, ny, nx) in 1/mm on ``grid``.
+    """Returns the operator from Gaussians, or parameter rows (11, G), to a volume (nz, ny, nx) in 1/mm on ``grid``.
 
-    The field is evaluated at the voxels' centres in mm, and the device holds the whole volume. cutoff_sigma, device: those
-    of ``splat_operator``.
+    Values are those at the voxels' centres in mm. The whole volume must fit on the device. cutoff_sigma, device: as in
+    ``splat_operator``.
 
     Raises InputError for anything but a Grid, and for a cutoff out of range."""
     _check_cutoff(cutoff_sigma)
@@ -126,13 +126,13 @@ def voxel_operator(grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, de
 def voxelise(
     gaussians: Gaussians, grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, device: Device = None
 ) -> np.ndarray:
-    """Returns the field of a cloud at the centres of a grid's voxels: (nz, ny, nx) float32, 1/mm.
+    """Returns the sum of Gaussians at the centres of a grid's voxels: (nz, ny, nx) float32, 1/mm.
 
-    gaussians: in mm and 1/mm. grid: of any size, since the device holds one brick at a time. cutoff_sigma: the Mahalanobis
-    radius at which a Gaussian ends; 0 never cuts. device: what ``--device`` takes, or a Runtime. ``voxel_operator`` also
-    has the gradient.
+    gaussians: in mm and 1/mm. grid: of any size, since only a part of the volume is on the device at a time. cutoff_sigma:
+    the Mahalanobis radius at which a Gaussian ends; 0 never cuts. device: what ``--device`` takes, or a Runtime. For the
+    gradient use ``voxel_operator``.
 
-    Raises InputError for anything but a cloud and a Grid, and for a cutoff out of range."""
+    Raises InputError for anything but Gaussians and a Grid, and for a cutoff out of range."""
     _check_cutoff(cutoff_sigma)
     length_mm = _a_grid(grid).half_longest_mm  # float32 kernels are most accurate for lengths near 1
     if not isinstance(gaussians, Gaussians):
@@ -143,10 +143,10 @@ def voxelise(
 
 @naming_arguments()
 def initial_gaussians(scan: Scan, count: int = 0, *, seed: int = 0, device: Device = None) -> Gaussians:
-    """Returns the cloud in mm and 1/mm from which ``phyradgs`` starts: Gaussians drawn from an FDK volume.
+    """Returns the Gaussians, in mm and 1/mm, from which ``phyradgs`` starts. They are drawn from an FDK volume.
 
-    count: their number; 0 derives it from the scan's grid, and there are fewer where too few voxels attenuate. seed: of
-    the random draw. The result has mean and scale (G, 3). device: what ``--device`` takes, or a Runtime.
+    count: their number; 0 derives it from the scan's grid. There are fewer if too few voxels attenuate. seed: of the random
+    draw. The result has mean and scale (G, 3). device: what ``--device`` takes, or a Runtime.
 
     Raises InputError for anything but a Scan, and for a count or a seed below 0."""
     check_scan(scan)
@@ -161,17 +161,17 @@ def initial_gaussians(scan: Scan, count: int = 0, *, seed: int = 0, device: Devi
 def as_torch(operator: Operator) -> Callable[..., Any]:
     """Returns the operator as a function of tensors that PyTorch can differentiate: ``f(x)``, or ``f(x, frames=[3])``.
 
-    x (domain_shape) may be on any device and of any floating type; y (range_shape) is like it. The work is done in float32
-    on the operator's device; float32 tensors on the host are not copied, by DLPack. Linear operators can be differentiated
-    any number of times, others once. ``backward`` does not project x again.
+    x (domain_shape) may be on any device and of any floating type; the result (range_shape) is like it. The operator works
+    in float32 on its own device. DLPack spares a copy of float32 tensors on the host. Linear operators can be
+    differentiated any number of times, others once. ``backward`` does not project x again.
 
-    Raises InputError where PyTorch is not installed, for anything but an operator or a tensor, and as the operator does."""
+    Raises InputError if PyTorch is not installed, for anything but an operator or a tensor, and as the operator does."""
     torch: Any = checks.package("torch", "for as_torch", "torch")
     if not isinstance(operator, Operator):
         expected = "what ray_operator, splat_operator or voxel_operator gives"
         raise InputError("operator", type(operator).__name__, expected)
 
-    def array(tensor: Any) -> np.ndarray:  # DLPack works with any pair of versions of torch and numpy
+    def array(tensor: Any) -> np.ndarray:  # by DLPack, which does not depend on the versions of torch and numpy
         return np.from_dlpack(tensor.detach().to("cpu", torch.float32).contiguous())
 
     def tensor(values: np.ndarray, like: Any) -> Any:
@@ -208,7 +208,7 @@ def as_torch(operator: Operator) -> Callable[..., Any]:
 
 
 def _checked(scan: Scan, motion: str | Motion, *kinds: str) -> Motion:
-    """Returns the motion model that a name or object means. Raises InputError where scan or operators do not suit it."""
+    """Returns the motion model that a name or object stands for. Raises InputError unless scan and operators support it."""
     check_scan(scan)
     model = models.motion_of(motion)
     models.check_motion(model, models.motions_for(*kinds))

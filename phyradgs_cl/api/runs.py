@@ -42,7 +42,7 @@ from phyradgs_cl.simulation import OPTION_NAMES, scanner_for, scanner_options, s
 from phyradgs_cl.text import suggest_name
 
 Device = str | Runtime | None
-"""The argument ``device``: what ``--device`` takes, or a Runtime."""
+"""The argument ``device`` of the API: what ``--device`` takes, or a Runtime."""
 
 
 def runtime_of(device: Device) -> Runtime:
@@ -54,7 +54,7 @@ def runtime_of(device: Device) -> Runtime:
 
 @lru_cache(maxsize=4)
 def _runtime_by_name(name: str | None) -> Runtime:
-    """Returns the one Runtime of a device's name, so that programs are built once."""
+    """Returns always the same Runtime for a device's name, so that kernels are built only once."""
     return Runtime(name)
 
 
@@ -68,11 +68,11 @@ def load_scan(path: str | Path, flats: str = "mean") -> Scan:
 
 
 def save_scan(path: str | Path, scan: Scan) -> None:
-    """Writes a complete scan file, or nothing: line integrals (F, rows, columns), lengths in mm, times in s.
+    """Writes a scan file, completely or not at all: line integrals (F, rows, columns), lengths in mm, times in s.
 
-    path: the HDF5 file; an existing one is replaced. scan: a trajectory of a user-defined class is sampled into a table of
-    poses. Raises InputError for anything but a Scan, and for a scan that the format cannot express; OutputError where
-    the file cannot be written."""
+    path: the HDF5 file; an existing one is replaced. scan: a trajectory of your own class is sampled into a table of poses.
+    Raises InputError for anything but a Scan, and for a scan that the format cannot express; OutputError if the file cannot
+    be written."""
     check_scan(scan)
     write_scan(_checked_path(path), scan)
 
@@ -80,10 +80,10 @@ def save_scan(path: str | Path, scan: Scan) -> None:
 @naming_arguments()
 def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Reconstruction:
     """Reads a volume file: volume (nz, ny, nx) in 1/mm, grid, Gaussians, record, facts, state, deformation, states, doubt.
-
     Only an interrupted run has a state.
-    path: the HDF5 file, or a file of ``phyradgs export`` (docs/export.md), which has a volume and a grid only.
-    mu_water_per_mm: water's attenuation, for such a file in Hounsfield units that does not state its scale. Raises
+
+    path: the HDF5 file, or a file of ``phyradgs export`` (docs/export.md), which has only a volume and a grid.
+    mu_water_per_mm: water's attenuation, for an exported file in Hounsfield units that does not state it. Raises
     InputError, which names the HDF5 path of the wrong value, also for Hounsfield units without a scale."""
     file = _checked_path(path)
     if foreign_volume(file) is not None:
@@ -105,16 +105,16 @@ def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Recon
 def load_deformation(path: str | Path) -> Deformation:
     """Reads how an object moves from a file (docs/formats.md), or from a scan simulated with a motion of its object.
 
-    path: the HDF5 file. Raises InputError, which names the HDF5 path of the wrong value, also where matter would fold."""
+    path: the HDF5 file. Raises InputError, which names the HDF5 path of the wrong value, also if the motion folds matter."""
     return read_deformation(_checked_path(path))
 
 
 @naming_arguments()
 def save_deformation(path: str | Path, deformation: Deformation) -> None:
-    """Writes ``deformation``, how an object moves, to a file, whole or not at all.
+    """Writes ``deformation``, how an object moves, to a file, completely or not at all.
 
-    path: the HDF5 file; an existing one is replaced. Raises InputError for anything but a Deformation, OutputError where the
-    file cannot be written."""
+    path: the HDF5 file, replaced if it exists. Raises InputError for anything but a Deformation, OutputError if writing
+    fails."""
     if not isinstance(deformation, Deformation):
         raise InputError("deformation", checks.short_repr(deformation), "a Deformation")
     write_deformation(_checked_path(path), deformation)
@@ -124,15 +124,15 @@ def save_deformation(path: str | Path, deformation: Deformation) -> None:
 def save_volume(
     path: str | Path, result: Reconstruction, metrics: Mapping[str, object] | None = None, hu: bool = False
 ) -> None:
-    """Writes a complete volume file, or nothing: volume (nz, ny, nx) in 1/mm, lengths in mm.
+    """Writes a volume file, completely or not at all: volume (nz, ny, nx) in 1/mm, lengths in mm.
 
-    path: the HDF5 file; an existing one is replaced. A suffix of ``phyradgs export`` (.nii, .mha, .nrrd, .tif, .npy; .ply
-    and .npz of the Gaussians) writes that format, which holds the volume or the Gaussians only. result: what
-    ``reconstruct`` returns; the file of an interrupted run can be resumed. metrics: the result of ``compare``, stored too.
-    hu: another format holds Hounsfield units, by the scale of ``Reconstruction.hounsfield``; a volume file keeps 1/mm and
-    the scale.
+    path: the HDF5 file; an existing one is replaced. The suffixes .nii, .mha, .nrrd, .tif and .npy write only the volume,
+    .ply and .npz only the Gaussians, as ``phyradgs export`` does. result: what ``reconstruct`` returns; an interrupted run
+    can be resumed from its file. metrics: what ``compare`` returns, stored too. hu: writes Hounsfield units to another
+    format, by the scale of ``Reconstruction.hounsfield``; a volume file keeps 1/mm and stores the scale.
+
     Raises InputError for anything but a result, a suffix that cannot be written, and ``hu`` without a scale; OutputError
-    where the file cannot be written."""
+    if the file cannot be written."""
     if not isinstance(result, Reconstruction):
         remedy = "for an array, Reconstruction(volume, grid)"
         raise InputError("result", checks.short_repr(result), "a Reconstruction", remedy)
@@ -159,16 +159,17 @@ def simulate(
     detector: int | None = None, detector_offset_mm: tuple[float, float] | None = None,
     truncation: float = 0.0, pixel_samples: int = 0, device: Device = None, **options: Any,
 ) -> Scan:
-    """Simulates a fly-scan of a phantom, or a stop-and-shoot scan with ``protocol="static"``; its truth is the reference.
+    """Simulates a fly-scan of a phantom, or with ``protocol="static"`` a stop-and-shoot scan. ``reference`` is its truth.
 
-    phantom: a name, the path of a volume file (docs/formats.md) with (z, y, x) in 1/mm, or of a .toml of beads and wires.
+    phantom: a name, or the path of a volume file (docs/formats.md), (z, y, x) in 1/mm, or of a .toml of beads and wires.
     scanner: a name, or a TOML file. protocol: "rapid", "standard" or "static".
-    size: number of voxels along the longest side of grid and reference. detector: number of columns; rows in proportion.
-    detector_offset_mm: position of the panel's centre (v, u). truncation: the fraction of the columns that is cut off, half
-    of it at each side. pixel_samples: number of rays along each side of a pixel; 0: by the voxels. device: what
-    ``--device`` takes, or a Runtime. options: those of ``phyradgs simulate`` with underscores (views, exposure_deg,
+    size: voxels along the longest side of grid and truth. detector: number of columns; rows are in proportion.
+    detector_offset_mm: position of the panel's centre (v, u). truncation: fraction of the columns that are cut off, half at
+    each side. pixel_samples: rays along each side of a pixel; 0 chooses them by the voxels' size. device: what
+    ``--device`` takes, or a Runtime. options: of ``phyradgs simulate``, with underscores (views, exposure_deg,
     readout_ratio, start_deg, pulse, readout_axis, noise, dose, detector_model, peak, lag, jitter_deg, seed …).
-    motion_of_object: an ``ObjectMotion``, or the path of its TOML file; the scan then has ``moving_truth``, true states.
+    motion_of_object: an ``ObjectMotion``, or the path of its TOML file. The scan then has ``moving_truth``, the true volume
+    at several times.
 
     Raises InputError for unknown names and for values out of range."""
     if not isinstance(phantom, str | Path):
@@ -195,12 +196,12 @@ def simulate(
 
 @naming_arguments()
 def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **options: Any) -> Scan:
-    """Corrects a scan's line integrals (F, rows, columns), dimensionless, for effects of the panel and the beam.
+    """Corrects a scan's line integrals (F, rows, columns), dimensionless, for effects of panel and beam.
 
-    steps: the steps of docs/prepare.md, names with commas. device: what ``--device`` takes, or a Runtime. options: tables
-    of options of a step (``rings={"window": 11}``), and the other options of preprocessing. The scan's provenance lists the
-    facts of each step under ``prepared``. Raises InputError for an unknown step or option, and for a scan that does not
-    show the effect of a step."""
+    steps: names of steps in docs/prepare.md, with commas. device: what ``--device`` takes, or a Runtime. options: a step's
+    options as a table (``rings={"window": 11}``), and other options of preprocessing. The scan's provenance lists under
+    ``prepared`` what each step did. Raises InputError for unknown steps and options, and for a scan that a step cannot
+    correct."""
     check_scan(scan)
     before = preprocessing_of({"steps": steps, **options})
     before.check_written()
@@ -217,27 +218,34 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstructs the volume (nz, ny, nx) of a scan in 1/mm, and with splats the Gaussians in mm.
 
-    method: a name of docs/methods.md, "package.module:name", or a function ``(scan, options, rt, ...)`` of yours
-    (docs/api.md). options: the options of the method by name. ``motion``, ``strips``, ``sub_intervals`` and so on choose the
-    motion model; nested options are dicts (``control={"every": 50}``). preset: the values from which they start.
+    method: a name of docs/methods.md, "package.module:name", or your own function ``(scan, options, rt, ...)``
+    (docs/api.md). options: the method's options by name. ``motion``, ``strips``, ``sub_intervals`` and so on choose the
+    motion model; nested options are dicts (``control={"every": 50}``). preset: the values that options replace.
 
-    grid: the voxel grid, in place of the scan's. Or ``size``, ``voxel_mm`` and ``roi_mm`` change parts of that, and
-    ``margin_mm`` adds a margin that is filled and discarded (docs/methods.md#the-grid).
-    holdout: percentage of the pixels that the method does not see; the facts of the result have the error there
+    grid: the voxel grid; None takes the scan's. The options ``size``, ``voxel_mm`` and ``roi_mm`` change parts of it, and
+    ``margin_mm`` adds a margin that is reconstructed and discarded (docs/methods.md#the-grid).
+
+    holdout: percentage of the pixels that the method does not see; the result's facts have the error there
     (docs/methods.md#quality-without-a-truth).
-    doubt: True runs the method on two synthesised scans too, for the σ ``doubt`` (nz, ny, nx) in 1/mm of every voxel
-    (docs/methods.md#error-bars).
+
+    doubt: True also reconstructs two synthesised scans, which give the error bar σ (nz, ny, nx) in 1/mm of every voxel, the
+    result's ``doubt`` (docs/methods.md#error-bars).
+
     seed: of all random numbers; the same seed on the same device gives the same bits.
 
-    report: a function that gets every ``Progress``: every iteration of voxels, and every 50 iterations or ten seconds of
-    splats. True: a line with rate and remaining time, in a terminal or a notebook. False: nothing. A function that raises
-    KeyboardInterrupt ends the run like Ctrl-C.
-    resume: the partial result of an interrupted run of the same scan, options, seed and first volume.
-    initial: the volume from which an iterative or splatting method starts: a result, resampled to this grid, or an array
-    (nz, ny, nx) in 1/mm on the scan's grid.
-    object_motion: how the object moves, for methods of voxels and fdk; the volume is its reference (docs/moving.md).
-    on_interrupt: what Ctrl-C or a notebook's stop button does after the present iteration: "raise" a KeyboardInterrupt
-    whose attribute ``partial`` is the result so far, or None; "return" that result.
+    report: a function that is called with each ``Progress``: after every iteration of voxels, and every 50 iterations or
+    ten seconds of splats. True shows a line with rate and remaining time, in a terminal or a notebook; False shows nothing.
+    A function that raises KeyboardInterrupt ends the run like Ctrl-C.
+
+    resume: the partial result of an interrupted run with the same scan, options, seed and first volume.
+
+    initial: the volume from which an iterative or splatting method starts. It is a result, which is resampled to the grid,
+    or an array (nz, ny, nx) in 1/mm on the scan's grid.
+
+    object_motion: how the object moves, for methods of voxels and fdk, relative to the resulting volume (docs/moving.md).
+
+    on_interrupt: what Ctrl-C or a notebook's stop button does after the present iteration. "raise": a KeyboardInterrupt
+    whose attribute ``partial`` is the result so far, or None. "return": returns that result.
     device: what ``--device`` takes, or a Runtime.
 
     Raises:
@@ -300,7 +308,7 @@ def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt:
 
 @contextmanager
 def _reporting(report: ProgressReport | bool) -> Iterator[tuple[ProgressReport, Callable[[str], None]]]:
-    """Yields the function that gets every ``Progress``, and one that ends its line in the terminal with a text."""
+    """Yields the function to call with each ``Progress``, and one that ends the line in the terminal with a text."""
     if not isinstance(report, bool):
         yield report, lambda text: None
     elif not (report and has_reader()):

@@ -23,15 +23,15 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.removed import refuse_removed
 
 log = logging.getLogger(__name__)
-# The names in messages of values of a Scan that have another name among the arguments of ``fly_scan``.
+# Arguments of ``fly_scan`` by the names of the same values in a Scan's checks, for messages.
 _ARGUMENTS = {
     "angles": "angles_deg", "exposure_s": "exposure_deg", "frame_time_s": "exposure_s", "readout_s": "readout_ratio",
     "readout_axis": "readout",
     "source_to_axis_mm": "geometry.source_to_axis_mm", "source_to_detector_mm": "geometry.source_to_detector_mm",
 }  # fmt: skip
-_SLACK = 1e-3  # relative tolerance of steps and arcs: angles come rounded
-_AIR_SLACK = 0.2  # tolerance of a transmission of 1 in air, for noise
-_CLEAR_STEP_DEG = 90.0  # steps of angles below this limit show which way the gantry turns
+_SLACK = 1e-3  # relative tolerance of steps and arcs, since users round angles
+_AIR_SLACK = 0.2  # noise may change a transmission of 1, in air, by this
+_CLEAR_STEP_DEG = 90.0  # between views this far apart or more, the gantry may have turned either way
 
 
 def fly_scan(
@@ -46,18 +46,19 @@ def fly_scan(
     geometry: of a cone or a parallel beam, in mm.
     angles_deg: (F,) the gantry's angle in degrees when a frame's first line opens; 0 with the source on +x,
     counterclockwise seen from above (+z). A sample that turns has the opposite sign.
-    exposure_deg: the arc of one line's exposure, below 0 for a clockwise gantry: degrees per second times exposure_s.
-    readout_ratio: readout over exposure time, from the opening of the first line to that of the last; 0 is a global
-    shutter. readout: the lines that are read one after the other, "rows" or "columns". readout_direction: 1 reads index 0
-    (the lowest row, the left column) first, -1 last. exposure_s: of one line, in s; None is 1.
-    flats, darks: (n, rows, columns) counts without an object, and without a beam (None is 0).
+    exposure_deg: how far the gantry turns while a line is exposed, degrees per second times exposure_s; below 0 if it turns
+    clockwise. readout_ratio: readout over exposure time; readout lasts from the opening of the first line to that of the
+    last, and 0 is a global shutter. readout: which lines are read one after the other, "rows" or "columns".
+    readout_direction: 1 reads index 0 (the lowest row, the left column) first, -1 last. exposure_s: of one line, in s; None
+    means 1.
+    flats, darks: (n, rows, columns) counts without an object, and without a beam (None means 0).
     mask: (rows, columns) or (F, rows, columns), non-zero for pixels that must not be used.
-    quantity: of ``frames``, "attenuation", "transmission" or "counts", where ``flats`` do not tell.
-    grid: None is the cube that a full turn sees, as high as the panel sees, in voxels of one pixel at the axis.
+    quantity: of ``frames``, "attenuation", "transmission" or "counts"; None takes counts if there are ``flats``.
+    grid: None takes what a full turn sees, as high as the panel sees, in voxels of one pixel's size at the axis.
     others: ``detector_model`` ("log", "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``, as in ``Scan``.
 
     Raises InputError for shapes that do not fit, numbers out of range or implausible, contradictory arguments, and angles
-    whose sense differs from the exposure's."""
+    that turn the other way than ``exposure_deg``."""
     for name in others:
         refuse_removed(f"fly_scan.{name}", name)
     check_others(others, _keywords(fly_scan))
@@ -93,11 +94,11 @@ def fly_scan(
 
 
 def _arcs_deg(angles_deg: np.ndarray, exposure_deg: float) -> np.ndarray:
-    """Returns the arc (F,) in degrees of each frame's exposure, with the sign of the gantry's turn in that frame.
+    """Returns how far the gantry turns in each frame's exposure (F,), in degrees, with the sign of its turn.
 
-    Unwrapped angles (F,) that rise and fall are of a gantry that swings back. Its frames sweep towards the next frame's
-    angle, except at turning points before the next angle is reached. Where steps are too large to show a sense, all arcs
-    are as stated."""
+    Unwrapped angles (F,) that rise and fall belong to a gantry that swings back and forth. In each frame it turns towards
+    the next frame's angle, but at a reversal it may still turn the other way. With steps too large to show this, all frames
+    turn as stated."""
     steps_deg = np.diff(angles_deg)
     arcs_deg = np.full(len(angles_deg), exposure_deg)
     is_clear = (np.abs(steps_deg) < _CLEAR_STEP_DEG).all() and (steps_deg > 0).any() and (steps_deg < 0).any()
@@ -119,7 +120,7 @@ def static_scan(
     """Returns a scan whose gantry stops for every frame, from arrays.
 
     frames: (F, rows, columns), row 0 the lowest. geometry: of a cone or a parallel beam, in mm. angles_deg: (F,) the
-    gantry's angle from +x, counterclockwise seen from above. flats, darks, mask, quantity, grid, others: those of
+    gantry's angle from +x, counterclockwise seen from above. flats, darks, mask, quantity, grid, others: as in
     ``fly_scan``.
 
     Raises InputError for shapes that do not fit and numbers out of range."""
@@ -132,7 +133,7 @@ def static_scan(
 
 
 def _warn_of_transmission(frames: np.ndarray) -> None:
-    """Warns of frames (F, rows, columns) that look like transmissions: 1 at the left and right borders, less between."""
+    """Warns of frames (F, rows, columns) that look like transmissions: near 1 at left and right borders, less between."""
     border, brighter = np.median(frames[..., [0, -1]]), np.count_nonzero(frames > 1 + _AIR_SLACK)
     if abs(border - 1) < _AIR_SLACK and brighter < 0.01 * frames.size and np.min(frames) < 1 - _AIR_SLACK:
         log.warning('frames: 1 at their borders, and less within: are they transmissions? quantity="transmission"')
@@ -146,7 +147,7 @@ def _pixels(
     frames: "ArrayLike", geometry: object, flats: "ArrayLike | None", darks: "ArrayLike | None",
     mask: "ArrayLike | None", quantity: str | None,
 ) -> LineIntegrals:
-    """Returns frames of any quantity as line integrals, with the mask of unusable pixels. Raises InputError for shapes that
+    """Converts frames of any quantity to line integrals, with the mask of unusable pixels. Raises InputError for shapes that
     do not fit, an unclear quantity, and a mask of all pixels."""
     if not isinstance(geometry, GEOMETRIES):
         raise InputError("geometry", checks.short_repr(geometry), "a ConeGeometry or a ParallelGeometry")
@@ -190,7 +191,7 @@ def _scan(
 
 
 def _stack(name: str, frames: "ArrayLike", panel: tuple[int, int]) -> np.ndarray:
-    """Returns frames (n, rows, columns) of real numbers. Raises InputError for other shapes, types, and for no frame."""
+    """Checks frames (n, rows, columns) of real numbers. Raises InputError for other shapes and types, and for no frame."""
     stack = checks.real_array(name, frames)
     checks.shape(name, stack, (None, *panel))
     if len(stack) == 0:

@@ -1,7 +1,7 @@
 """A plug-in for CIL, the Core Imaging Library (Jørgensen et al., Phil. Trans. R. Soc. A 379 (2021) 20200192): projector and
 filtered backprojection on any OpenCL device, also for a gantry that turns during an exposure.
 
-CIL's lengths have any one unit, which stands for mm here. The object turns by initial angle + angle about z."""
+CIL does not fix a unit of length; here it is taken as mm. The object turns by initial angle + angle about z."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,17 +17,17 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import triple
 
 _ORDER = ("channel", "angle", "projection", "vertical", "horizontal_y", "horizontal_x", "horizontal")
-_FLAT = np.array([0.0, 0.0, 1e-3])  # the step between rows of a scan in 2D, whose rays lie in its plane
+_FLAT = np.array([0.0, 0.0, 1e-3])  # step to the next row in 2D, where there is only one: out of the plane, and small
 
 
 class ProjectionOperator(LinearOperator):
     """Joseph's projector from CIL's image geometry to its acquisition geometry, with its exact transpose.
 
-    image_geometry: None takes CIL's own. acquisition_geometry: cone, parallel or cone_flex, in 3D or 2D, with any offset or
-    tilt, order of dimensions, origin of the panel and channels. A BlockGeometry gives a BlockOperator.
+    image_geometry: None takes CIL's default. acquisition_geometry: cone, parallel or cone_flex, in 3D or 2D, with any
+    offset or tilt, order of dimensions, origin of the panel and channels. A BlockGeometry gives a BlockOperator.
 
-    shutter, deg_per_s: of a fly-scan. Each line is open as ``Shutter`` says, while the object turns so fast in the sense of
-    the angles. These are those at the middle of each frame's window. motion: a model of docs/methods.md except ``exact``.
+    shutter, deg_per_s: of a fly-scan: when each line is exposed, and how fast the object turns, positive if angles rise.
+    The geometry's angles then hold in the middle of each frame. motion: a model of docs/methods.md except ``exact``.
     device: what ``--device`` takes, or a Runtime.
 
     Raises InputError for a grid that no ray meets, an unknown motion, and a shutter with cone_flex."""
@@ -46,18 +46,18 @@ class ProjectionOperator(LinearOperator):
         self.rays = ray_operator(scan_of(image, frames, shutter=shutter, deg_per_s=deg_per_s), motion, device=device)
 
     def direct(self, x: DataContainer, out: DataContainer | None = None) -> DataContainer:
-        """Returns the line integrals of an image, in ``out`` where it is given."""
+        """Returns the line integrals of an image, in ``out`` if given."""
         return _mapped(self.rays, x, self.domain_geometry(), self.range_geometry(), out)
 
     def adjoint(self, x: DataContainer, out: DataContainer | None = None) -> DataContainer:
-        """Returns the transpose of ``direct`` applied to line integrals, in ``out`` where it is given."""
+        """Applies the transpose of ``direct`` to line integrals; returns it in ``out`` if given."""
         return _mapped(self.rays.T, x, self.range_geometry(), self.domain_geometry(), out)
 
 
 class FBP(DataProcessor):
-    """Filtered backprojection: FDK of cone beams, FBP of parallel ones; ``FBP(image_geometry, data.geometry)(data)``.
+    """Filtered backprojection: FDK for cone beams, FBP for parallel ones; ``FBP(image_geometry, data.geometry)(data)``.
 
-    shutter, deg_per_s: those of ``ProjectionOperator``. options: device, and those of the methods fdk and fbp, as
+    shutter, deg_per_s: as in ``ProjectionOperator``. options: device, and options of the methods fdk and fbp, such as
     window="hann". Raises InputError for data of another geometry, and for orbits that are far from a circle about z."""
 
     def __init__(
@@ -69,7 +69,7 @@ class FBP(DataProcessor):
         super().__init__(image_geometry=image, acquisition_geometry=frames, way=way, options=options)
 
     def check_input(self, dataset: DataContainer) -> bool:
-        """Returns True. Raises InputError for data of another geometry."""
+        """Raises InputError for data of another geometry; otherwise returns True, as CIL expects."""
         if dataset.geometry != self.acquisition_geometry:
             raise InputError("data", "another geometry", "that of the processor", "FBP(image_geometry, data.geometry)")
         return True
@@ -78,7 +78,7 @@ class FBP(DataProcessor):
         self._shape_out = self.image_geometry.shape
 
     def process(self, out: DataContainer | None = None) -> DataContainer:
-        """Returns the volume, in ``out`` where it is given."""
+        """Returns the volume, in ``out`` if given."""
         between = self.image_geometry, self.acquisition_geometry
         method = "fbp" if between[1].geom_type == "parallel" else "fdk"
 
@@ -89,7 +89,7 @@ class FBP(DataProcessor):
 
 
 class _Turning:
-    """The trajectory of a gantry that turns while frames are taken."""
+    """The trajectory of a gantry that turns at constant speed during each frame."""
 
     def __init__(self, frames: AcquisitionGeometry, shutter: Shutter, rad_per_s: float) -> None:
         self._at_zero, self._angles_rad, self._rad_per_s = _at_zero(frames), _angles_rad(frames), rad_per_s
@@ -107,8 +107,8 @@ def scan_of(
     image: ImageGeometry, frames: AcquisitionGeometry, values: np.ndarray | None = None, *,
     shutter: Shutter | None = None, deg_per_s: float = 0.0,
 ) -> Scan:  # fmt: skip
-    """Returns the scan of two geometries of CIL. values (F, rows, columns): line integrals; None: zeros. shutter, deg_per_s,
-    InputError: as in ``ProjectionOperator``."""
+    """Returns the scan that two geometries of CIL describe. values (F, rows, columns): line integrals; None takes zeros.
+    shutter, deg_per_s, InputError: as in ``ProjectionOperator``."""
     system, is_flex = frames.config.system, frames.geom_type == "cone_flex"
     if is_flex and shutter is not None:
         raise InputError("shutter", "given for cone_flex", "a geometry with angles", "leave it out")
@@ -142,8 +142,7 @@ def _angles_rad(frames: AcquisitionGeometry) -> np.ndarray:
 
 
 def _at_zero(frames: AcquisitionGeometry) -> np.ndarray:
-    """Returns ASTRA's vectors (4, 3) of the gantry at an angle of 0: source or direction of rays, the panel's middle, and
-    the steps to the next column and row."""
+    """Returns ASTRA's vectors (4, 3) at angle 0: source or rays' direction, panel's middle, steps to next column and row."""
     system = frames.copy().config.system
     system.align_reference_frame("cil")
     origin = system.ray.direction if frames.geom_type == "parallel" else system.source.position
@@ -151,14 +150,14 @@ def _at_zero(frames: AcquisitionGeometry) -> np.ndarray:
 
 
 def _panel(frames: AcquisitionGeometry, detector: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the middle of a panel, and the steps to the next column and row of the data, which begin at its origin."""
+    """Returns a panel's middle, and the steps to the data's next column and row. CIL's origin is the data's first pixel."""
     panel, along_y = frames.config.panel, getattr(detector, "direction_y", _FLAT)
     step_x, step_y = panel.pixel_size[0] * detector.direction_x, panel.pixel_size[1] * along_y
     return detector.position, -step_x if "right" in panel.origin else step_x, -step_y if "top" in panel.origin else step_y
 
 
 def _turned(at_zero: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
-    """Returns ASTRA's vectors (F, 12) for angles (F,) of the object, against which the gantry turns."""
+    """Returns ASTRA's vectors (F, 12) for angles (F,) of the object; the gantry turns the other way."""
     (x, y, z), cos, sin = at_zero.T, np.cos(angles_rad)[:, None], np.sin(angles_rad)[:, None]
     return np.stack([cos * x + sin * y, cos * y - sin * x, z + 0 * cos], -1).reshape(-1, 12)
 
@@ -166,7 +165,7 @@ def _turned(at_zero: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
 def _mapped(
     function: Callable[[np.ndarray], np.ndarray], x: DataContainer, of: Any, to: Any, out: DataContainer | None
 ) -> DataContainer:
-    """Returns ``function`` of each channel of data with geometry ``of``, as data with geometry ``to``."""
+    """Applies ``function`` to each channel of data with geometry ``of``; returns data with geometry ``to``."""
     channels = np.transpose(x.as_array(), np.argsort(_places(of))).reshape(of.channels, *_shape(of))
     mapped, places = np.stack([function(np.ascontiguousarray(one)) for one in channels]), _places(to)
     out = to.allocate(None) if out is None else out
@@ -175,13 +174,13 @@ def _mapped(
 
 
 def _places(geometry: Any) -> list[int]:
-    """Returns the place of each dimension among those in our order: channels, frames or slices, rows, columns."""
+    """Returns for each of CIL's dimensions its index in our order: channels, frames or slices, rows, columns."""
     present = [name for name in _ORDER if name in geometry.dimension_labels]
     return [present.index(name) for name in geometry.dimension_labels]
 
 
 def _shape(geometry: Any) -> tuple[int, int, int]:
-    """Returns (slices, rows, columns) of an image, or (frames, rows, columns), also where CIL leaves one of 1 out."""
+    """Returns (slices, rows, columns) of an image, or (frames, rows, columns). Dimensions that CIL leaves out become 1."""
     if isinstance(geometry, ImageGeometry):
         return geometry.voxel_num_z or 1, geometry.voxel_num_y, geometry.voxel_num_x
     return geometry.num_projections, int(geometry.config.panel.num_pixels[1]), int(geometry.config.panel.num_pixels[0])

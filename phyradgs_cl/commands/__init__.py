@@ -1,1 +1,1 @@
-"""The commands. Each reads options, makes one call into the library and prints a result. cli.py lists them."""
+"""The commands, which cli.py lists. Each reads options, calls one function of the library and prints the result."""

@@ -83,7 +83,7 @@ def calibrate_command(
 
 
 def _check_storable(scan: Loaded, names: list[str]) -> None:
-    """Raises InputError for a wobble of frames that overlap in time: a scan file has one pose at a time."""
+    """Raises InputError for a wobble of frames that overlap in time, since a scan file has one pose at a time."""
     if WOBBLE not in names:
         return
     period_s = float(np.diff(np.sort(scan.frame_start_s)).min(initial=np.inf))

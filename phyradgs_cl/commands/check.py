@@ -19,7 +19,7 @@ from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import check_output, expecting
 
 EXAMPLES = {"check": "Example: phyradgs check scan.h5"}
-SUSPICIOUS_STATUS = 10  # exit status of a check with a suspicious finding
+SUSPICIOUS_STATUS = 10  # exit status if something is suspicious
 _NOT_ASKED = "not asked: which end of the panel is up (row 0; --row-0 of import), because no frame shows it"
 _FIX_OFFSET = "Write a copy of the scan (-o) whose panel is shifted along u to the centre of rotation that was found."
 

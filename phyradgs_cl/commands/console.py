@@ -1,4 +1,4 @@
-"""What commands share with the console: options and arguments, output lines, exit statuses, help, ranks under mpiexec."""
+"""What all commands share: makers of options and arguments, printing, exit statuses, help, and ranks under mpiexec."""
 
 import math
 import os
@@ -21,12 +21,11 @@ from phyradgs_cl.text import plain_text
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 SHARED_BY_RANKS = ("reconstruct",)
-"""Commands whose work all ranks share. Rank 0 alone runs the others."""
+"""Commands whose work is shared by all ranks. All other commands run on rank 0 only."""
 
 
 def numbers(text: str) -> float | list[float] | str:
-    """Returns the number in a text, or several with commas between. Returns other text unchanged: a later check refuses
-    it."""
+    """Parses a number, or several with commas between. Returns other text unchanged, which a later check refuses."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -35,7 +34,8 @@ def numbers(text: str) -> float | list[float] | str:
 
 
 def option(help: str, default: bool | str = True, *flags: str, **more: Any) -> Any:
-    """Returns a Typer option with its help. A text as ``default`` stands in the help in place of the default's value."""
+    """Returns a Typer option with its help. default: True shows the default's value in the help, a text is shown instead
+    of it, and False shows none."""
     return typer.Option(*flags, help=help, show_default=default, **more)
 
 
@@ -50,8 +50,8 @@ def file_argument(name: str, help: str) -> Any:
 def pair_of(
     flag: str, form: str, example: str, largest: float = math.inf
 ) -> Callable[[str], tuple[float, float]]:
-    """Returns a parser of two finite numbers with a comma between, of absolute value at most ``largest``. It raises
-    InputError about ``flag``, with ``form`` and ``example``, for other text."""
+    """Returns a parser of two numbers with a comma between, each at most ``largest`` in size. For other text it raises
+    InputError about ``flag``, which shows ``form`` and ``example``."""
 
     def pair(text: str) -> tuple[float, float]:
         try:
@@ -66,7 +66,7 @@ def pair_of(
 
 
 def file_parser(subject: str) -> Callable[[str], Path]:
-    """Returns a parser of paths that raises InputError for an empty name, which would mean the current folder."""
+    """Returns a parser of paths. It raises InputError for an empty name, which Path would take as the current folder."""
 
     def file(text: str) -> Path:
         if not text.strip():
@@ -77,10 +77,10 @@ def file_parser(subject: str) -> Callable[[str], Path]:
 
 
 def say(text: str) -> None:
-    """Prints a result on stdout. Raises OutputError where that fails; a reader that has closed the pipe is no error."""
+    """Prints a result on stdout. Raises OutputError if that fails. A pipe that its reader has closed is no error."""
     try:
         typer.echo(plain_text(text))
-    except BrokenPipeError:  # the reader has closed the pipe, as `| head` does
+    except BrokenPipeError:  # as after `| head`
         give_up_stdout()
     except OSError as error:
         give_up_stdout()
@@ -100,7 +100,7 @@ def remark(text: str) -> None:
 
 
 def give_up_stdout() -> None:
-    """Discards unwritten output. The interpreter would try to write it at its end, and fail with a traceback."""
+    """Discards unwritten output. Otherwise Python would try to write it at its end, and fail with a traceback."""
     with suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
@@ -108,16 +108,16 @@ def give_up_stdout() -> None:
 
 
 def scores(metrics: Mapping[str, float | None]) -> str:
-    """Returns the metrics of a run, and its errors on held-out pixels, with a comma before each."""
-    from phyradgs_cl.metrics import HELD_OUT, printed  # loads SciPy
+    """Returns a run's metrics, and its errors on held-out pixels, as text with a comma before each."""
+    from phyradgs_cl.metrics import HELD_OUT, printed  # here, because it loads SciPy, which takes time
 
     words = [*printed(metrics), *printed(metrics, HELD_OUT)]
     return "".join(f", {title} {value}" for title, value in words)
 
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:
-    """Returns Typer's message about wrong arguments, with the value that it could not read; for words of earlier versions,
-    the replacement."""
+    """Returns Typer's message about wrong arguments, with the value that it could not read. For options of earlier versions
+    it returns what replaces them."""
     flag, param = str(getattr(error, "option_name", "")), getattr(error, "param", None)
     value = _value_of(param, arguments)
     words = [(flag, ""), (flag.lstrip("-").replace("-", "_"), flag), *((f"{name} {value}", "") for name in getattr(param, "opts", ()))]
@@ -128,7 +128,6 @@ def usage_text(error: Any, arguments: Sequence[str]) -> str:
 
 
 def _value_of(parameter: Any, arguments: Sequence[str]) -> str | None:
-    """Returns the value that follows an option among the arguments; None where it is not there, as for positional ones."""
     for flag in (name for name in getattr(parameter, "opts", ()) if name.startswith("-")):
         for word, following in zip(arguments, [*arguments[1:], None], strict=True):
             if word == flag:
@@ -140,13 +139,12 @@ def _value_of(parameter: Any, arguments: Sequence[str]) -> str | None:
 
 _KINDS = {" <Path>": "", " <path>": " PATH", " <str>": " TEXT", " <list[str]>": " TEXT"}
 _KINDS |= {" <int>": " N", " <int range>": " N", " <float>": " NUMBER"}
-"""Python's types, as Typer names them in a help, in a reader's words."""
+"""Names of types in Typer's help, and the words that are shown instead."""
 
 
 class GroupedCommand(TyperCommand):
-    """A command whose help lists its options under headings. ``groups``: names of parameters by heading.
-
-    ``help`` is the last option of the first group. Options without a group are listed under "Options"."""
+    """A command whose help lists options under headings. groups: by heading, the names of parameters. Options without a
+    group are listed under "Options"; ``--help`` is the last of the first group."""
 
     groups: Mapping[str, Sequence[str]] = {}
 
@@ -169,15 +167,15 @@ class GroupedCommand(TyperCommand):
 
 
 def takes_part(arguments: Sequence[str]) -> bool:
-    """True if this process takes part in the command. Turns off the output of ranks other than 0."""
+    """Returns whether this process takes part in the command. Turns off the output of all ranks but 0."""
     if launched().rank == 0:
         return True
-    sys.stdout = sys.stderr = None  # as in a process without a console: writers check for None
+    sys.stdout = sys.stderr = None  # as in programs without a console, so libraries check for it
     return any(arguments[:1] == [name] for name in SHARED_BY_RANKS)
 
 
 def last_words(error: BaseException) -> int:
-    """Writes to stderr the error with which a rank ends all ranks. Returns the exit status."""
+    """Prints the error with which a rank ends all ranks, and returns the exit status."""
     rank = launched().rank
     if isinstance(error, KeyboardInterrupt):
         text, status = signals.farewell(), signals.exit_status()

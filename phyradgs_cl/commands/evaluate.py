@@ -31,8 +31,8 @@ def evaluate_command(
     picture: Annotated[Path | None, file_option(_PICTURE, "--picture", default="v.evaluated.png for v.h5")] = None,
 ) -> None:
     """Measure a volume against the truth: 3D PSNR and SSIM, and a picture of slices."""
-    stem = volume.stem if volume.suffix in ("", ".h5") else volume.name  # v.h5 and v.nii may be in one folder: two names
-    usual = volume.with_name(f"{stem}.evaluated.png")  # v.png may be the run's preview
+    stem = volume.stem if volume.suffix in ("", ".h5") else volume.name  # v.h5 and v.nii in one folder need two pictures
+    usual = volume.with_name(f"{stem}.evaluated.png")  # not v.png, which may be the run's preview
     facts = run_evaluation(
         volume, reference, picture or usual, reference_voxel_mm, object_motion, rtk_reference, mu_water_per_mm
     )
@@ -57,7 +57,7 @@ def evaluate_command(
 
 
 def _without_infinity(value: Any) -> Any:
-    """Returns facts, also nested ones, with None for infinity, which JSON does not have."""
+    """Replaces infinity by None in facts, also nested ones, because JSON has no infinity."""
     if isinstance(value, dict):
         return {key: _without_infinity(part) for key, part in value.items()}
     if isinstance(value, list):

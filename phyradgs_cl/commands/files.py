@@ -39,7 +39,7 @@ _MOTION = "Deformation of the object: the volume is written at several states."
 _STATES = "Number of states, at the middles of equal parts of the time; nii has them in one file."
 _DURING = "Time that the states cover, s."
 _PEAK, _BOX = "the volume's own peak", "Z0,Z1,Y0,Y1,X0,X1"
-_LONGEST = 2000  # most characters of a value that are printed
+_LONGEST = 2000  # longer values are cut after this many characters
 _OUTPUT = "File to write, or for dicom and zarr a new folder; nii.gz is compressed."
 _TO = f"{', '.join(VOXELS)}, zarr and dicom (folders): the voxels; {', '.join(CLOUDS)}: the Gaussians."
 _WATER = "Attenuation of water in 1/mm; the values are then Hounsfield units, with air at 0."
@@ -124,7 +124,7 @@ def export_command(
 
 
 def _short(value: Any, is_inside: bool = False) -> str:
-    """Returns a value as text, its numbers with six significant digits. ``is_inside``: text in containers gets quotes."""
+    """Returns a value as text, with six significant digits. is_inside: it is in a container, where text gets quotes."""
     match value:
         case float():
             return f"{value:.6g}"

@@ -1,4 +1,4 @@
-"""Options that several commands share, such as those of a reconstruction, and the parsers of their values."""
+"""Options that several commands share, such as those of a reconstruction, and how their values are parsed."""
 
 import functools
 import inspect
@@ -18,7 +18,7 @@ from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
 from phyradgs_cl.settings import Settings, read_settings
 from phyradgs_cl.text import flag_of
 
-LARGEST_MM = 1e6  # largest size of lengths in mm that an option takes
+LARGEST_MM = 1e6  # no scanner has longer lengths
 First = Literal[SIDES]  # type: ignore[valid-type]
 DetectorModel = Literal[DETECTOR_MODELS]  # type: ignore[valid-type]
 
@@ -34,16 +34,15 @@ ObjectMotion = Annotated[Path | None, file_option(_OBJECT_MOTION, "--object-moti
 
 _CHECKPOINT = "Seconds from checkpoint to checkpoint of a run, which continues from its last; 0: on Ctrl-C only."
 CheckpointEvery = Annotated[float, option(_CHECKPOINT, metavar="SECONDS")]
-CHECKPOINT_EVERY_S = 600.0  # default time between checkpoints
+CHECKPOINT_EVERY_S = 600.0  # a killed run loses at most this much, and writing takes a small part of it
 
 
 def lengths(flag: str, help: str, default: str) -> Any:
-    """Returns an option that takes two lengths V,U in mm."""
     return option(help, default, flag, parser=pair_of(flag, "V,U in mm", "0,12.5", LARGEST_MM), metavar="V,U")
 
 
 def pitches(flag: str, help: str, default: str) -> Any:
-    """Returns an option that takes the pitches V,U of a pixel in mm, or one number for square pixels."""
+    """Returns an option for a pixel's height and width V,U in mm, or one number for square pixels."""
     pair = pair_of(flag, "V,U in mm, or one for square pixels", "0.148 or 0.3,0.15", LARGEST_MM)
     return option(help, default, flag, parser=lambda text: pair(text if "," in text else f"{text},{text}"), metavar="D|V,U")
 
@@ -56,10 +55,9 @@ _NONE: Mapping[str, Any] = {}
 
 
 def of_fields(kind: type, makers: Mapping[str, Callable[[str, str, Any], Any]] = _NONE) -> dict[str, tuple[Any, Any]]:
-    """Returns the options of a command, (annotation, default) by name, for the fields of a dataclass that have a help text.
-
-    makers: functions of (flag, help, usual) that return an option, by field, for values of forms of their own. Other
-    fields of tuples take numbers with commas between, which are checked where they are used."""
+    """Returns options of a command, (annotation, default) by name, for those fields of a dataclass that have a help text.
+    makers: by field, a function of (flag, help, usual) that returns the option, for values that need a special parser.
+    Other fields of tuples take numbers with commas between, which are checked later."""
     return {one.name: _of_field(one, makers) for one in fields(kind) if one.metadata.get("help")}
 
 
@@ -111,8 +109,7 @@ RUN_OPTIONS: dict[str, Any] = {
 
 
 def with_run_options(*without: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Returns a decorator that gives a command the options of a reconstruction, except ``without``, in place of its
-    parameter ``settings``."""
+    """Returns a decorator that replaces the parameter ``settings`` by a reconstruction's options, except ``without``."""
 
     kinds = {name: kind for name, kind in RUN_OPTIONS.items() if name not in without}
     options = {name: (kind, False if get_args(kind)[0] is bool else None) for name, kind in kinds.items()}
@@ -120,8 +117,8 @@ def with_run_options(*without: str) -> Callable[[Callable[..., Any]], Callable[.
 
 
 def settings_of(options: dict[str, Any]) -> Settings:
-    """Returns the settings of a command with options ``config`` and ``assignments``."""
-    given = {name: None if value is False else value for name, value in options.items()}  # False: a flag not given
+    """Returns a command's settings from its options, of which ``config`` and ``assignments`` give further ones."""
+    given = {name: None if value is False else value for name, value in options.items()}  # False: flag not given
     config, assignments = given.pop("config"), given.pop("assignments") or []
     return read_settings(config, given, assignments)
 
@@ -129,8 +126,10 @@ def settings_of(options: dict[str, Any]) -> Settings:
 def with_options(
     slot: str, options: Mapping[str, tuple[Any, Any]], make: Callable[[dict[str, Any]], Any]
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Returns a decorator that gives a command ``options``, each (annotation, default), in place of its parameter ``slot``.
-    Typer reads a command's signature, so the signature lists them. The command gets ``make(values by name)``."""
+    """Returns a decorator that replaces a command's parameter ``slot`` by ``options``, each (annotation, default).
+
+    The command is called with ``make(values by name)`` for ``slot``. Its signature lists the options, because Typer reads
+    them there."""
 
     def decorated(command: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(command)

@@ -1,4 +1,4 @@
-"""The commands reconstruct, from a scan file to a volume file, and estimate, for the time and memory that this takes."""
+"""The commands reconstruct, which makes a volume file from a scan file, and estimate, which predicts its time and memory."""
 
 import time
 from contextlib import ExitStack
@@ -119,7 +119,7 @@ def reconstruct_command(
         if page is not None:
             _finish(page, result, scan, output, runtimes[-1])
     written = output if result.state is None else partial_path(output)
-    used_s = time.process_time()  # of the whole command so far; other programs do not change it
+    used_s = time.process_time()  # of the whole command; unlike clock time, it does not depend on other programs
     motion = getattr(plan.options, "motion", None)
     method = plan.method_name if motion is None else f"{plan.method_name}, motion {motion_facts(motion)['name']}"
     how = f"{method}{result.early_stop}, {result.facts['seconds']:.1f} s ({used_s:.1f} s of processor time)"
@@ -144,8 +144,8 @@ def reconstruct_command(
 
 
 def _finish(page: "report.LivePage", result: Reconstruction, scan: Path, output: Path, rt: Runtime) -> None:
-    """Turns the live page of a complete run into its report, and ends that of an interrupted one. A run in slabs gets no
-    report, since its frames may exceed the memory."""
+    """Turns the live page of a complete run into its report; on that of an interrupted run it says how to continue. A run
+    in slabs gets no report, since its frames may exceed the memory."""
     if result.state is not None:
         page.end(f"Interrupted at {result.interrupted_at}: repeat the command with --resume to continue.")
     elif "slabs" in result.facts:
@@ -161,7 +161,7 @@ def estimate_command(scan: Scan, settings: Settings, object_motion: ObjectMotion
     plan = settings.plan(object_motion=object_motion)
     loaded = load_scan(scan, plan.preprocessing.flats)
     rt = settings.runtime()
-    before_s = time.process_time()  # a run starts and reads the scan as this command did
+    before_s = time.process_time()  # a run takes as long as this command did to start and read the scan
 
     def around(result: Reconstruction) -> float:
         return before_s + seconds_around(scan, loaded, result)

@@ -1,4 +1,4 @@
-"""The commands report, a reconstruction as an HTML page, and view, a volume in napari."""
+"""The commands report, which writes an HTML page about a reconstruction, and view, which opens a volume in napari."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,7 +14,7 @@ EXAMPLES = {
     "report": "Example: phyradgs report volume.h5 -o report.html",
     "view": "Example: phyradgs view volume.h5",
 }
-MOST_VIEWS = 24  # largest number of frames that --views takes
+MOST_VIEWS = 24  # more frames would make the page very large
 _SCAN_DEFAULT = "the one that the volume file names, if unchanged"
 _VIEWS = "Frames to compute from the volume and compare with the measurement."
 

@@ -1,4 +1,4 @@
-"""The command sweep: reconstructs scans × settings × seeds."""
+"""The command sweep: reconstructs many scans with many settings and seeds."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -32,7 +32,7 @@ def sweep_command(
 
         def tell(done: int, line: dict[str, Any]) -> None:
             ticker.end_line()
-            ticker.first = None  # the next run's rate starts anew
+            ticker.first = None  # the next run has its own rate
             outcome = f"failed: {line['error']}" if "error" in line else f"{line['seconds']:.1f} s{scores(line['metrics'])}"
             say(f"{done}/{len(runs)} {line['run']} ({line['label']}): {outcome}")
 

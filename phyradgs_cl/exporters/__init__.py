@@ -29,23 +29,24 @@ VOXELS: dict[str, Callable[[Path, Volume, str], None]] = {
 CLOUDS = {"ply": writers.write_ply, "npz": writers.write_npz}
 EXPORTS = (*VOXELS, "dicom", *CLOUDS, "zarr")
 OWN = "h5"
-"""The format of this package's volume files, which store a scale of Hounsfield units; their values stay in 1/mm."""
+"""This package's volume files. Their values stay in 1/mm; a scale of Hounsfield units is stored next to them."""
 ScaleOf = Callable[[Volume], Hounsfield | None]
 _SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": (), "zarr": (".ome.zarr", ".zarr")}
-_PLAIN = "values in 1/mm"  # note of the unit in files of other programs
+_PLAIN = "values in 1/mm"  # written into files of other programs, which have no field for this unit
 
 
 def export_volume(
     path: str | Path, to: str, output: str | Path | None = None, mu_water_per_mm: float | None = None,
     labels: DicomLabels | None = None, scale_of: ScaleOf | None = None, doubt: bool = False,
 ) -> Path:  # fmt: skip
-    """Writes a volume file in another format, whole or not at all, and returns the path of the output.
+    """Writes a volume file in another format, completely or not at all. Returns the path of the output.
 
-    to: one of ``EXPORTS``; ply and npz take the Gaussians, all others the voxels. Or ``OWN``, a volume file with its scale.
-    output: a file, or a folder for dicom and zarr; None takes the folder of ``path``, and NAME.doubt for error bars.
+    to: one of ``EXPORTS``: ply and npz write the Gaussians, all others the voxels. ``OWN`` writes a volume file and adds a
+    scale of Hounsfield units.
+    output: a file, or a folder for dicom and zarr. None writes next to ``path``, error bars under NAME.doubt.
     mu_water_per_mm: water's attenuation; the values are then written in Hounsfield units.
-    scale_of: in place of it, a function from the volume to its scale of Hounsfield units, as ``hu_scale``.
-    labels: patient, study and series, for dicom only. doubt: whether the voxels are the error bars σ in 1/mm.
+    scale_of: instead of water's attenuation, a function from the volume to its scale, such as ``hu_scale``.
+    labels: patient, study and series, for dicom only. doubt: write the error bars σ in 1/mm in place of the values.
 
     Raises InputError for an unknown format, a damaged volume or one without Gaussians, a suffix of another format, and
     labels with another format. Raises OutputError where the output cannot be written."""
@@ -65,8 +66,7 @@ def export_volume(
 
 
 def hu_scale(volume: Volume, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0) -> Hounsfield | None:
-    """Returns the scale of Hounsfield units that a volume holds. Fits a scale where it holds none, or where a box or an
-    insert is given."""
+    """Returns the volume's scale of Hounsfield units; fits a new one if it has none, or if a box or insert is given."""
     if (stored := volume.scale) is not None and air is None and water is None and insert_hu == 0:
         return replace(stored, fitted=f"{stored.line}, as stored")
     return volume.hounsfield(air, water, insert_hu).scale
@@ -76,8 +76,7 @@ def _checked(
     path: Path, to: str, output: str | Path | None, mu_water_per_mm: float | None, labels: DicomLabels | None,
     scale_of: ScaleOf | None,
 ) -> tuple[Path, ScaleOf | None]:  # fmt: skip
-    """Returns the path to write, and the function to the scale or None. Raises InputError for options that do not fit the
-    format."""
+    """Returns the path to write and the function that gives the scale. Raises InputError for options of other formats."""
     checks.one_of("--to", to, (*EXPORTS, OWN))
     if mu_water_per_mm is not None and scale_of is not None:
         raise InputError("--mu-water-per-mm", "given with --hu", "one of the two", "leave one out")
@@ -87,7 +86,7 @@ def _checked(
     if to == OWN and scale_of is None:
         raise InputError("--hu", f"not given for {output}", "another format, or a scale to store", "add --hu")
     target = default_output(path, to) if output is None else Path(output)
-    suffixes = _suffixes(to)  # programs infer the format from it
+    suffixes = _suffixes(to)  # programs recognise the format by the suffix
     if suffixes and not target.name.lower().endswith(suffixes):
         raise InputError(f"output of --to {to}", str(target), f"a name that ends in {' or '.join(suffixes)}")
     refuse_overwriting("output", target, path)
@@ -100,15 +99,15 @@ def _checked(
 
 
 def _in_unit(values: np.ndarray, scale: Hounsfield | None, unit: str = _PLAIN) -> tuple[np.ndarray, str]:
-    """Returns values (z, y, x) float32 in 1/mm, or in Hounsfield units where there is a scale, and a note of their unit."""
+    """Returns values (z, y, x) float32, in Hounsfield units if there is a scale, else in 1/mm, and a note of the unit."""
     plain = np.ascontiguousarray(values, np.float32)
     return (plain, unit) if scale is None else (scale.of(plain), scale.note)
 
 
 def state_times_s(moves: Deformation | States, count: int, during_s: tuple[float, float] | None = None) -> list[float]:
-    """Returns times (count,) in s: the middles of equal parts of ``during_s``, by default of the motion's span; without it,
-    the stored times of as many states. Raises InputError for a count outside 1 to 1000, and for a span that ends before it
-    begins or does not meet the motion's."""
+    """Returns times (count,) in s: middles of equal parts of ``during_s``, by default the motion's whole time. If a file
+    stores ``count`` states and no ``during_s`` is given, it returns their times. Raises InputError for a count outside 1
+    to 1000, and for a ``during_s`` that ends before it begins or lies outside the motion's time."""
     checks.whole("--states", count, 1, 1000)
     if isinstance(moves, States) and during_s is None and count == len(moves.times_s):
         return moves.times_s.tolist()
@@ -126,10 +125,10 @@ def export_states(
     output: str | Path | None = None, mu_water_per_mm: float | None = None, labels: DicomLabels | None = None,
     scale_of: ScaleOf | None = None,
 ) -> list[Path]:  # fmt: skip
-    """Writes the object of a volume file at each of evenly spaced times in s, and returns the paths. ``deformation``: how it
-    moves; None where the file holds its states. NIfTI holds all states in one file of four dimensions. The other formats get
-    a file, or a folder, for each state: NAME_01.SUFFIX and so on. Other arguments and errors are those of
-    ``export_volume``. Raises InputError also for a format of Gaussians, and for a deformation beside the volume's grid."""
+    """Writes the object of a volume file at evenly spaced times in s, and returns the paths. deformation: how the object
+    moves; None if the file has the object at several times. NIfTI has all times in one file of four dimensions. Other
+    formats have a file or folder for each: NAME_01.SUFFIX and so on. See ``export_volume`` for other arguments and errors.
+    Raises InputError also for a format of Gaussians, and for a deformation that moves nothing in the volume's grid."""
     if to in (*CLOUDS, OWN):
         remedy = f"use {', '.join(VOXELS)}, zarr or dicom"
         raise InputError("--states", f"given with --to {to}", "a format of voxels", remedy)
@@ -161,8 +160,7 @@ def export_stored(
     volume: Volume, to: str, target: Path, subject: str, scale_of: ScaleOf | None = None,
     labels: DicomLabels | None = None, unit: str = _PLAIN,
 ) -> None:  # fmt: skip
-    """Writes a volume to ``target`` as ``export_volume`` does; ``subject`` names the volume in messages. unit: of values
-    without a scale, for the file."""
+    """Writes a volume as ``export_volume`` does. subject: names it in messages. unit: the note of values without a scale."""
     if to in CLOUDS:
         CLOUDS[to](target, writers.gaussians_of(volume, subject))
         return
@@ -190,19 +188,19 @@ def _write_own(target: Path, volume: Volume, path: str, scale: Hounsfield | None
 
 
 def foreign_suffix(output: str | Path) -> str | None:
-    """Returns a path's suffix if it is that of another program's format, which must not hold HDF5; else None."""
+    """Returns a path's suffix if another program's format has it, so that HDF5 must not be written there; else None."""
     suffixes = (*(suffix for to in EXPORTS for suffix in _suffixes(to)), ".mhd", ".dcm", ".png")
     return next((suffix for suffix in suffixes if Path(output).name.lower().endswith(suffix)), None)
 
 
 def default_output(path: Path, to: str) -> Path:
-    """Returns the volume's path with the suffix of the format; for DICOM a folder."""
+    """Returns the volume's path with the format's suffix; for DICOM, NAME_dicom, a folder."""
     return path.with_name(f"{path.stem}_dicom") if to == "dicom" else path.with_suffix(_suffixes(to)[0])
 
 
 def format_of(output: str | Path | None, subject: str = "--to") -> str:
-    """Returns the format, of ``EXPORTS`` or ``OWN``, that an output's suffix means. Raises InputError for other suffixes
-    and for None."""
+    """Returns the format, one of ``EXPORTS`` or ``OWN``, to which an output's suffix belongs. Raises InputError for other
+    suffixes and for None."""
     for to in (*EXPORTS, OWN):
         if output is not None and _suffixes(to) and Path(output).name.lower().endswith(_suffixes(to)):
             return to

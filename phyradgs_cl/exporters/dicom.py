@@ -1,4 +1,4 @@
-"""Writes a DICOM series, an image per slice: CT Image module of PS3.3 (A.3, C.8.2), LPS, 16 bits, HU or 1/mm."""
+"""Writes a DICOM series of CT images (PS3.3, A.3 and C.8.2), one per slice, with 16 bits, in HU or 1/mm."""
 
 import datetime
 import hashlib
@@ -22,14 +22,13 @@ from phyradgs_cl.io.volume import Volume
 _CT_IMAGE = "1.2.840.10008.5.1.4.1.1.2"
 _EXPLICIT_LITTLE = "1.2.840.10008.1.2.1"
 _LARGEST = 32_767  # largest signed number of 16 bits
-_LONGEST = 64  # most characters of a text in DICOM's value representations PN and LO
+_LONGEST = 64  # DICOM's limit in characters for names (PN) and descriptions (LO)
 
 
 @dataclass(frozen=True)
 class DicomLabels:
-    """Labels by which viewers and archives list a series; None where not stated. patient: name (Family^Given) and ID.
-    title, date (YYYY-MM-DD): those of the study. description: that of the series. Raises InputError for text that DICOM
-    cannot hold."""
+    """Labels by which viewers and archives list a series; None writes none. patient: name (Family^Given) and ID. title, date
+    (YYYY-MM-DD): of the study. description: of the series. Raises InputError for text that DICOM cannot hold."""
 
     patient: str | None = None
     title: str | None = None
@@ -69,13 +68,13 @@ class DicomLabels:
 
 
 def write_dicom(path: Path, volume: Volume, note: str, labels: DicomLabels) -> None:
-    """Writes a new folder with 0001.dcm for the lowest slice and so on. ``note``: "values in 1/mm", or "values in HU" with
-    their scale. Raises OutputError for a folder that holds files or cannot be written."""
+    """Writes a new folder with 0001.dcm for the lowest slice, and so on upwards. note: "values in 1/mm", or "values in HU"
+    with their scale. Raises OutputError for a folder that has files or cannot be written."""
     pydicom = checks.package("pydicom", "the package that this export needs", "phyradgs-cl[formats]")
     unit = "HU" if of_note(note)[0] else "1/mm"
     slope, grid = _rescale_slope(volume.values, unit), volume.required_grid
     content = volume.values.tobytes() + repr((grid.voxel_size_mm[::-1], grid.first_centre_mm[::-1])).encode()
-    content += repr(labels.given).encode() if labels.given else b""  # other labels make another study
+    content += repr(labels.given).encode() if labels.given else b""  # with other labels it must be another study
     seed, generate = hashlib.sha256(content).hexdigest(), pydicom.uid.generate_uid
     uid = {n: generate(entropy_srcs=[seed, unit, n]) for n in ("study", "series", "frame")}
     with folder_written_beside(path) as folder:
@@ -91,12 +90,12 @@ def write_dicom(path: Path, volume: Volume, note: str, labels: DicomLabels) -> N
 
 
 def _rescale_slope(values: np.ndarray, unit: str) -> str:
-    """Returns the value of one stored integer step as a decimal string: 1 HU where 16 bits hold the range, else the least
-    step with which they do."""
+    """Returns, as a decimal string, the value of one step of the stored integers: 1 HU if 16 bits can hold the range, else
+    the smallest step with which they can."""
     peak = float(np.abs(values).max())
     if unit == "HU" and peak <= _LARGEST:
         return "1"
-    return f"{max(peak, 1e-30) / _LARGEST * (1 + 1e-8):.9e}"  # at most 16 characters, never rounded below
+    return f"{max(peak, 1e-30) / _LARGEST * (1 + 1e-8):.9e}"  # 1e-8 more, so that rounding cannot make it too small
 
 
 def _common(pydicom: Any, shape: tuple[int, ...], unit: str, slope: str, uid: dict[str, str]) -> Any:
@@ -124,7 +123,7 @@ def _common(pydicom: Any, shape: tuple[int, ...], unit: str, slope: str, uid: di
 
 
 def _place(image: Any, grid: Grid, index: int) -> None:
-    """Sets the number, position and spacing of slice ``index`` in mm. PixelSpacing has the step from row to row first."""
+    """Sets number, position and spacing of slice ``index``, in mm. PixelSpacing has the distance of rows first."""
     (dz, dy, dx), (z, y, x) = grid.voxel_size_mm, grid.first_centre_mm
     image.InstanceNumber = index + 1
     image.ImageOrientationPatient = [1, 0, 0, 0, 1, 0]
@@ -141,8 +140,8 @@ def _decimal(number: float) -> str:
 
 @contextmanager
 def folder_written_beside(path: Path) -> Iterator[Path]:
-    """Yields a new folder that becomes ``path`` on success and is removed otherwise. Raises OutputError where ``path`` is a
-    file or a folder with files, or cannot be written."""
+    """Yields a temporary folder, which is renamed to ``path`` on success and removed after an error. Raises OutputError
+    where ``path`` is a file or a folder with files, or cannot be written."""
     target = Path(os.path.abspath(path))
     if target.is_symlink() or (target.exists() and (not target.is_dir() or any(target.iterdir()))):
         found = "an existing file or folder"

@@ -1,8 +1,8 @@
 """Writes voxels as NIfTI, NRRD and MetaImage (by SimpleITK), as TIFF like ImageJ's, as NumPy and as OME-Zarr; Gaussians as
 PLY and NumPy.
 
-The world's x, y, z are left, posterior, superior (LPS, the frame of DICOM and ITK). So the rotation axis, z, is up in every
-viewer, and a slice looks the same in viewers that know directions and in those that show row 0 at the top."""
+The world's x, y, z are written as left, posterior, superior (LPS, the frame of DICOM and ITK). So z, the rotation axis, is
+up in every viewer. A slice looks the same in viewers that know directions and in viewers that show row 0 at the top."""
 
 import json
 from collections.abc import Sequence
@@ -19,18 +19,18 @@ from phyradgs_cl.io.output import written_beside
 from phyradgs_cl.io.volume import Volume
 
 _WRITERS = {".mha": "MetaImageIO", ".nii": "NiftiImageIO", ".nii.gz": "NiftiImageIO", ".nrrd": "NrrdImageIO"}
-_MOST_NIFTI_VOXELS = 32_767  # most voxels along one axis in NIfTI
-_MOST_IMAGEJ_BYTES = 4_000_000_000  # from this size on volumes become BigTIFF: offsets of ImageJ's TIFF have 32 bits
-_CHUNK = 64  # most voxels of a chunk along each axis; a level of OME-Zarr with no more along all axes is the last
+_MOST_NIFTI_VOXELS = 32_767  # NIfTI's limit along one axis
+_MOST_IMAGEJ_BYTES = 4_000_000_000  # from this size on BigTIFF is written: offsets in ImageJ's TIFF have 32 bits
+_CHUNK = 64  # voxels of a chunk along each axis; halving of the resolution ends when all fits into one chunk
 _PLY_NAMES = (
     *("x", "y", "z", "scale_0", "scale_1", "scale_2"), *("rot_0", "rot_1", "rot_2", "rot_3", "density")
 )
 
 
 def write_image(path: Path, volume: Volume, note: str, times_s: Sequence[float] = (), states: Sequence[Volume] = ()) -> None:
-    """Writes NIfTI, NRRD or MetaImage, by the suffix. ``note``: "values in 1/mm" or "values in HU" with their scale.
-    ``states``: volumes that are written as one of four dimensions in place of ``volume``, at evenly spaced ``times_s``.
-    Raises InputError for too many voxels for NIfTI."""
+    """Writes NIfTI, NRRD or MetaImage, by the suffix. note: "values in 1/mm", or "values in HU" with their scale. states:
+    the object at evenly spaced ``times_s``, written in place of ``volume`` as one file of four dimensions. Raises
+    InputError for more voxels than NIfTI allows."""
     sitk = checks.package("SimpleITK", "the package that this export needs", "phyradgs-cl[formats]")
     suffix = next(suffix for suffix in reversed(_WRITERS) if path.name.lower().endswith(suffix))
     if suffix.startswith(".nii") and max(volume.values.shape) > _MOST_NIFTI_VOXELS:
@@ -52,8 +52,8 @@ def write_image(path: Path, volume: Volume, note: str, times_s: Sequence[float] 
 
 
 def write_tiff(path: Path, volume: Volume, note: str) -> None:
-    """Writes a TIFF with a page per slice from the lowest up, row 0 at the smallest y, with sizes in mm and the origin in
-    pixels. Files beyond 4 GB are BigTIFF, which ImageJ opens through Bio-Formats."""
+    """Writes a TIFF with a page per slice from the lowest up, row 0 at the smallest y. Sizes are in mm, the origin in
+    pixels. Volumes of 4 GB and more become BigTIFF, which ImageJ opens through Bio-Formats."""
     tifffile = checks.package("tifffile", "the package that this export needs", "phyradgs-cl[formats]")
     dx, dy, dz = volume.required_grid.voxel_size_mm[::-1]
     first_mm = volume.required_grid.first_centre_mm[::-1]
@@ -72,7 +72,7 @@ def write_tiff(path: Path, volume: Volume, note: str) -> None:
 
 
 def write_npy(path: Path, volume: Volume, note: str) -> None:
-    """Writes the values (z, y, x) float32 to ``path``, and their grid to a .json file of the same name."""
+    """Writes the values (z, y, x) float32 to ``path``, and the grid to a .json file of the same name."""
     facts = {
         "axes": ["z", "y", "x"], "shape": list(volume.values.shape),
         "voxel_size_mm": list(volume.required_grid.voxel_size_mm),
@@ -81,14 +81,13 @@ def write_npy(path: Path, volume: Volume, note: str) -> None:
     with written_beside(path.with_suffix(".json")) as temporary:
         temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     with written_beside(path) as temporary, open(temporary, "wb") as file:
-        np.save(file, volume.values)  # given a name, it would add a suffix
+        np.save(file, volume.values)  # a file, since np.save would add a suffix to a name
 
 
 def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None, unit: str = "values in 1/mm") -> None:
-    """Writes OME-Zarr 0.5: a new folder of chunks, at full and at successively halved resolution, which viewers load as
-    needed. Besides the volume (nz, ny, nx) in 1/mm, memory holds at most 128 slices. A level's voxels are means of 2×2×2
-    voxels of the level before. scale: that of Hounsfield units to write; None writes ``unit``. Raises OutputError as
-    ``folder_written_beside`` does."""
+    """Writes OME-Zarr 0.5: a new folder of chunks at full and at repeatedly halved resolution, which viewers load as
+    needed. Halving takes means of 2×2×2 voxels. Besides the volume (nz, ny, nx) in 1/mm, memory holds at most 128 slices.
+    scale: writes Hounsfield units; None writes 1/mm, with the note ``unit``. Raises OutputError for a folder with files."""
     of_extra = "the package that this export needs", "phyradgs-cl[zarr]"
     writer, zarr = (checks.package(name, *of_extra) for name in ("ome_zarr.writer", "zarr"))
     grid, levels = volume.required_grid, list[dict[str, Any]]()
@@ -100,7 +99,7 @@ def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None, unit: str =
             shape, name = tuple((np.array(before.shape) // step).tolist()), f"s{len(levels)}"
             level = group.create_array(
                 name, shape=shape, chunks=tuple(min(n, _CHUNK) for n in shape), dtype="float32",
-                dimension_names=list("zyx"), config={"write_empty_chunks": True},  # so that a missing chunk means a lost one
+                dimension_names=list("zyx"), config={"write_empty_chunks": True},  # else readers cannot see a lost chunk
             )  # fmt: skip
             for start in range(0, shape[0], _CHUNK):
                 stop = min(start + _CHUNK, shape[0])
@@ -116,22 +115,22 @@ def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None, unit: str =
 
 
 def _means(slab: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Returns the means of a slab (z, y, x) over blocks of ``step`` (3,) voxels. Voxels that fill no block are left out."""
+    """Returns means of slices (z, y, x) over blocks of ``step`` (3,) voxels. Voxels left over at the end are dropped."""
     (nz, ny, nx), (z, y, x) = np.array(slab.shape) // step, step
     cut = slab[: nz * z, : ny * y, : nx * x]
     return cut.reshape(nz, z, ny, y, nx, x).mean((1, 3, 5), dtype=np.float32)
 
 
 def _places(grid: Grid, factors: np.ndarray) -> list[dict[str, object]]:
-    """Returns OME's scale and translation in mm of voxels ``factors`` (3,) times as large as the grid's."""
+    """Returns OME's scale and translation in mm for voxels that are ``factors`` (3,) times as large as the grid's."""
     first_mm = grid.first_centre_mm + (factors - 1) / 2 * grid.voxel_size_mm
     sizes = {"type": "scale", "scale": (factors * grid.voxel_size_mm).tolist()}
     return [sizes, {"type": "translation", "translation": first_mm.tolist()}]
 
 
 def gaussians_of(volume: Volume, subject: str) -> dict[str, np.ndarray]:
-    """Returns a volume's Gaussians by name: mean (G, 3) and scale (G, 3) in mm, quaternion (G, 4) w x y z, density (G,) in
-    1/mm, float32. Raises InputError for a volume without."""
+    """Returns a volume's Gaussians, float32: mean (G, 3) and scale (G, 3) in mm, quaternion (G, 4) w x y z, density (G,) in
+    1/mm. Raises InputError for a volume without Gaussians."""
     if volume.gaussians is None:
         remedy = "reconstruct with --method phyradgs or r2"
         raise InputError(f"{subject}:/entry/gaussians", "nothing there", "Gaussians", remedy)

@@ -1,5 +1,6 @@
-"""Reads scans and volumes in other programs' formats, checks them and converts them to this package's conventions.
-`import_scan` and `load_volume` are the entries; each format of scans has a module in formats/."""
+"""Reads scans and volumes of other programs, checks them and converts them to this package's conventions.
+
+Call ``import_scan`` for a scan and ``load_volume`` for a volume. Each format of scans has a module in formats/."""
 
 import lazy_loader
 

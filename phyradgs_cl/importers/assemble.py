@@ -1,6 +1,6 @@
-"""The last steps of every importer: shutter, opening times and trajectory are made from angles or poses and the known
-times. These, the line integrals, the geometry and the options make a scan. ``RotaryStage`` is for a sample that turns
-between a source and a panel at rest; its axis may be off the central ray."""
+"""The last steps of every importer: computes shutter, opening times and trajectory, and makes the scan.
+
+``RotaryStage`` describes a sample that turns between a source and a panel at rest. Its axis may be off the central ray."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -27,15 +27,15 @@ _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_di
 Length = float | Callable[[], float]
 Pitch = tuple[float, float] | Callable[[], tuple[float, float]]
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_VIEW_DIGITS = 5  # views count as one where their angles, or their scaled poses, agree to this many decimals
-_SLACK = 1e-6  # extension of a pose table beyond the times that are needed, as a fraction of a frame's span
+_VIEW_DIGITS = 5  # decimals to which two views' angles, or scaled poses, must agree to count as the same view
+_SLACK = 1e-6  # fraction of a frame's span by which pose tables are extended, so that rounding leaves no time outside
 
 
 @dataclass(frozen=True, eq=False)
 class Timing:
     """When frames were taken. start_s (F,): times in s at which each frame's first line opens. is_fly: the gantry never
-    stops. angle_at: a stored angle belongs to the "start" or "middle" of the first line's exposure. assumed: values that
-    neither file nor user stated, by their names in ``acquisition/plausible.py``."""
+    stops. angle_at: a stored angle belongs to the "start" or "middle" of the first line's exposure. assumed: names, as in
+    ``acquisition/plausible.py``, of values that neither file nor user stated."""
 
     shutter: Shutter
     start_s: np.ndarray
@@ -45,14 +45,14 @@ class Timing:
 
     @property
     def angle_time_s(self) -> np.ndarray:
-        """The times (F,) in s of the stored angles."""
+        """The times (F,) in s at which the stored angles hold."""
         return self.start_s + (self.shutter.exposure_s / 2 if self.angle_at == "middle" else 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class StoredTiming:
-    """The timing that a file states; None for missing values. start_s (F,): opening times of a gantry that did not stop.
-    written: names of the values that the user wrote in a description, so not those of a scanner's header."""
+    """The timing that a file states; None for missing values. start_s (F,): opening times in s of a fly-scan's frames.
+    written: names of values that the user wrote into a description; a scanner's header has none."""
 
     exposure_s: float | None = None
     readout_s: float | None = None
@@ -68,10 +68,10 @@ class StoredTiming:
 def make_timing(
     subject: str, frames: int | np.ndarray, options: ImportOptions, stored: StoredTiming | None = None
 ) -> Timing:
-    """Returns the timing of ``frames`` frames, or of frames with these numbers (F,). Options replace stored values. With
-    start times, or a time from frame to frame, the gantry turned continuously; without, every frame was at rest.
+    """Returns the timing of ``frames``: their count, or their numbers (F,). Options replace stored values. With start
+    times, or a time from frame to frame, the scan is a fly-scan. Without them, every frame was taken at rest.
 
-    Raises InputError for a continuous turn without an exposure or with fewer than two rising start times, and for options
+    Raises InputError for a fly-scan without an exposure or without two rising start times. Raises it also for options
     about the exposure or readout of frames at rest."""
     stored, place = stored or StoredTiming(), np.arange(frames) if isinstance(frames, int) else frames
     exposure_s, readout_s, frame_time_s = (
@@ -107,8 +107,8 @@ def make_timing(
 
 
 def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> CircularOrbit:
-    """Returns a circular orbit through gantry angles (F,) in rad. Within a frame the gantry turns at the angles' slope
-    over time, by central differences, one-sided at both ends; a frame at rest does not turn."""
+    """Returns a circular orbit through gantry angles (F,) in rad. Central differences of the angles over time give the
+    gantry's speed within a frame; differences are one-sided at both ends. A frame at rest does not turn."""
     angle_rad = np.asarray(angle_rad, np.float64)
     exposure_s = timing.shutter.exposure_s
     if not timing.is_fly:
@@ -120,8 +120,7 @@ def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> Circul
 
 
 def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
-    """Raises InputError for options about a turn without a time from frame to frame. Warns that a file's exposure is then
-    not used."""
+    """Raises InputError for options that only a fly-scan has. Warns that the file's exposure is not used."""
     turns = [name for name in options.given(_OF_A_TURN) if name != "exposure_s" or stored.exposure_s is None]
     frame_time = " or ".join(dict.fromkeys(map(options.named, ("frame_time_s", "fps"))))
     for name in (*map(options.called, turns), *stored.written):
@@ -134,18 +133,18 @@ def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: 
 
 @dataclass(frozen=True)
 class Turned:
-    """Flips of stored images after which v points up and u to the right, seen from the source."""
+    """Which flips make a stored image's v point up and its u to the right, seen from the source."""
 
     rows: bool
     columns: bool
 
     def frames(self, array: np.ndarray) -> np.ndarray:
-        """Returns frames or masks (..., v, u), flipped."""
+        """Returns flipped frames or masks (..., v, u)."""
         array = array[..., ::-1, :] if self.rows else array
         return array[..., ::-1] if self.columns else array
 
     def poses(self, pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-        """Returns the poses (..., 12) of the flipped images."""
+        """Converts poses (..., 12) of the stored images to those of the flipped ones. panel: (rows, columns)."""
         pose = np.array(pose, np.float64)
         sides = (self.rows, panel[0], slice(9, 12)), (self.columns, panel[1], slice(6, 9))
         for count, step in ((count, step) for is_flipped, count, step in sides if is_flipped):
@@ -155,7 +154,7 @@ class Turned:
 
 
 def turn_of(pose: np.ndarray) -> Turned:
-    """Returns the flips of a stored image that put row 0 below and column 0 left, from one of its poses (12,)."""
+    """Finds, from a stored image's pose (12,), the flips that put row 0 at the bottom and column 0 on the left."""
     source, step_u, step_v = pose[:3], pose[6:9], pose[9:12]
     right = np.array([-source[1], source[0], 0.0])
     return Turned(rows=bool(step_v[2] < 0), columns=bool(step_u @ right < 0))
@@ -164,8 +163,8 @@ def turn_of(pose: np.ndarray) -> Turned:
 def table_over_time(
     pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, subject: str, is_parallel: bool = False
 ) -> PoseTable:
-    """Returns a pose table that covers every frame's window. pose_at: returns poses (T, 12) at frame positions (T,),
-    where 2.5 is halfway from frame 2 to 3. A gantry at rest keeps each frame's pose through its window."""
+    """Returns a pose table from the first line's opening to the last line's closing of every frame. pose_at: returns poses
+    (T, 12) at frame positions (T,), where 2.5 is halfway from frame 2 to 3. A gantry at rest keeps one pose per frame."""
     if not timing.is_fly:
         at_s = np.asarray(timing.start_s) + timing.shutter.middle_s
         poses = pose_at(np.arange(len(at_s), dtype=np.float64))
@@ -184,9 +183,9 @@ def assemble_scan(
     options: ImportOptions, *, title: str, source: str, grid: Grid | None = None,
     reference: np.ndarray | None = None, lag: float = 0.0, names: Mapping[str, str] | None = None, said: str = "",
 ) -> Scan:
-    """Returns the scan of line integrals with row 0 the lowest. grid: None takes ``grid_of_scan``. names: the file's
-    names of its values, for messages. said: in words, which frames were taken. Raises InputError for implausible values,
-    and where more than half of the views are equal."""
+    """Returns a scan of line integrals whose row 0 is the lowest. grid: None takes ``grid_of_scan``. names: what the file
+    calls its values, for messages. said: a text that says which frames were read. Raises InputError for implausible
+    values, and where more than half of the views are equal."""
     assumed = [*timing.assumed, *([] if options.detector_model else ["average"])] if timing.is_fly else []
     scan = Scan(
         projections=integrals.values, geometry=geometry, trajectory=trajectory, shutter=timing.shutter,
@@ -202,14 +201,14 @@ def assemble_scan(
     )
     subjects = {"grid": f"{source} grid", "angles": f"{source} angles", **(names or {})}
     _check_turn(trajectory, scan.frame_start_s + timing.shutter.middle_s, options.called("angles", subjects))
-    is_timed = "exposure" not in assumed  # by convention an exposure of 1 s: the frame rate means nothing then
+    is_timed = "exposure" not in assumed  # an assumed exposure is 1 s, from which no real frame rate follows
     check_plausible(scan, lambda name: options.called(name, subjects), is_timed)
     scan.warn_of_near_panel()
     return scan
 
 
 def _check_turn(trajectory: CircularOrbit | PoseTable, middle_s: np.ndarray, subject: str) -> None:
-    """Raises InputError where most views, at times (F,) in s, have one angle: the stored angles are missing or wrong."""
+    """Raises InputError where most views, at times (F,) in s, have one angle: the stored angles must then be wrong."""
     if isinstance(trajectory, PoseTable):
         views = trajectory.pose(0, middle_s)
         views = views / np.abs(views).max(axis=0, initial=1e-9)
@@ -224,15 +223,14 @@ def _check_turn(trajectory: CircularOrbit | PoseTable, middle_s: np.ndarray, sub
 
 
 def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
-    """Returns a geometry with the options' lengths, where given. Raises InputError for distances of a parallel beam."""
+    """Replaces a geometry's lengths by those that options give. Raises InputError for distances of a parallel beam."""
     return (parallel if isinstance(geometry, ParallelGeometry) else cone)(options, *astuple(geometry))
 
 
 def parallel(
     options: ImportOptions, panel: tuple[int, int], pitch_mm: Pitch, offset_mm: tuple[float, float]
 ) -> ParallelGeometry:
-    """Returns a parallel beam with the options' numbers, else the file's. Raises InputError for options that give
-    distances."""
+    """Returns a parallel beam from the options' numbers, else the file's. Raises InputError for a distance as option."""
     for name in options.given(_DISTANCES):
         expected, remedy = "no distance: this file has a parallel beam", "leave it out"
         raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
@@ -243,9 +241,9 @@ def cone(
     options: ImportOptions, to_axis_mm: Length, to_detector_mm: Length, panel: tuple[int, int], pitch_mm: Pitch,
     offset_mm: tuple[float, float], names: Mapping[str, str] | None = None,
 ) -> ConeGeometry:
-    """Returns a cone beam with the options' numbers, else the file's. A function that reads a number is called only where
-    the option is not given. names: what the file calls the numbers, for messages. Raises InputError unless the panel
-    stands behind the axis."""
+    """Returns a cone beam from the options' numbers, else the file's. Where a number comes as a function, the function is
+    called only if no option replaces it, so that a file may lack it. names: what the file calls the numbers, for messages.
+    Raises InputError unless the panel stands behind the axis."""
     axis_mm, detector_mm = map(partial(_taken, options), _DISTANCES, (to_axis_mm, to_detector_mm))
     if detector_mm <= axis_mm:
         axis, detector = (options.called(name, names) for name in _DISTANCES)
@@ -258,7 +256,7 @@ def cone(
 
 
 def _taken(options: ImportOptions, name: str, stored: Any) -> Any:
-    """Returns the option ``name`` where it is given, else ``stored``, which is a value or a function that reads it."""
+    """Returns the option ``name`` if given, else ``stored``: a value, or a function that reads it."""
     return options.taken(name, stored if callable(stored) else lambda: stored)
 
 
@@ -266,7 +264,7 @@ def _taken(options: ImportOptions, name: str, stored: Any) -> Any:
 class RotaryStage:
     """A source and a panel of ``geometry`` at rest, and an axis of rotation that may be off the central ray.
 
-    axis_u_mm: the distance of the axis to the right of the central ray, seen from the source. roll_rad: the axis' top
+    axis_u_mm: how far the axis lies to the right of the central ray, seen from the source. roll_rad: how far the axis' top
     leans to the right; tilt_rad: towards the panel. shift_mm (F, 2): the panel's shifts (v, u) per frame."""
 
     geometry: Geometry
@@ -276,8 +274,7 @@ class RotaryStage:
     shift_mm: np.ndarray | None = None
 
     def poses(self, angle_rad: np.ndarray, shift_mm: np.ndarray | float = 0.0) -> np.ndarray:
-        """Returns poses (T, 12) in the sample's coordinates at gantry angles (T,). shift_mm (T, 2): the panel's shifts
-        (v, u)."""
+        """Returns poses (T, 12) at gantry angles (T,), in the sample's frame. shift_mm (T, 2): the panel's shifts (v, u)."""
         upright = self.geometry.pose(0.0).reshape(4, 3)  # x to the source, y to the right, z up
         is_parallel = isinstance(self.geometry, ParallelGeometry)
         parts = np.repeat(upright[None], len(angle_rad), axis=0)
@@ -290,8 +287,8 @@ class RotaryStage:
     def turned(
         self, angle_rad: np.ndarray, timing: Timing, subject: str
     ) -> tuple[CircularOrbit | PoseTable, Geometry]:
-        """Returns the trajectory of gantry angles (F,) in rad and the nearest circular geometry. It is a circular orbit
-        where the axis crosses the central ray at a right angle, else a pose table."""
+        """Returns the trajectory of gantry angles (F,) in rad, and the nearest circular geometry. The trajectory is a
+        circular orbit where the axis crosses the central ray at a right angle, else a pose table."""
         if self.axis_u_mm == self.roll_rad == self.tilt_rad == 0 and self.shift_mm is None:
             return turning(self.geometry, angle_rad, timing), self.geometry
         unwrapped = np.unwrap(angle_rad)
@@ -311,12 +308,12 @@ def scan_on_stage(
     angle_rad: np.ndarray, places: np.ndarray, names: dict[str, str], said: str, *, stored: StoredTiming | None = None,
     flats: np.ndarray | None = None, darks: np.ndarray | None = None, flat_value: float | None = None,
 ) -> Scan:
-    """Returns the scan of a sample on a stage, with counts ``frames`` (F, v, u) that the file ``path`` describes. Options
+    """Returns the scan of a sample on a stage. frames (F, v, u) are counts; the file ``path`` describes them. Options
     replace values of the file.
 
     - sides: where row 0 and column 0 are, such as ("top", "left"). angle_rad (F,): gantry angles. places (F,): the
       frames' numbers from 0 on. names, said: see ``assemble_scan``. stored: the file's timing.
-    - flats, darks (n, v, u): None where the scanner has applied them. flat_value: the file's counts of air."""
+    - flats, darks (n, v, u): None where the scanner has applied them. flat_value: counts of air that the file states."""
     timing = make_timing(str(path), places, options, stored)
     trajectory, geometry = stage.turned(angle_rad, timing, str(path))
     images = (None if one is None else oriented(one, options, *sides) for one in (frames, flats, darks))
@@ -330,8 +327,7 @@ def scan_on_stage(
 
 
 def along(values: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Returns values (F, ...) interpolated linearly at frame positions (T,), (T, ...), also beyond the first and last
-    frame."""
+    """Interpolates values (F, ...) linearly at frame positions (T,), and extrapolates beyond the ends: (T, ...)."""
     if len(values) == 1:
         return np.repeat(values, len(position), axis=0)
     left = np.clip(np.floor(position).astype(int), 0, len(values) - 2)

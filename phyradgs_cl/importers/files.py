@@ -1,4 +1,4 @@
-"""Safe reading of foreign files: names stay inside the folder, and texts and arrays are bounded by the file's size."""
+"""Reads other programs' files safely: names stay in the folder, and headers cannot claim more data than the file has."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -13,11 +13,11 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.files import HOST_SHARE, decoded, host_bytes, read_regular, regular_file
 from phyradgs_cl.io.tables import read_facts
 
-_MOST_TEXT_BYTES = 64 << 20  # most bytes of a text that describes a scan
+_MOST_TEXT_BYTES = 64 << 20  # larger files are images, not a text that describes a scan
 
 
 def check_room(subject: str, needed_bytes: int) -> None:
-    """Raises InputError where ``needed_bytes`` are more than the fraction ``HOST_SHARE`` of this machine's memory."""
+    """Raises InputError where ``needed_bytes`` exceed the fraction ``HOST_SHARE`` of this machine's memory."""
     found, most = (f"{n / 2**30:.3g} GiB" for n in (needed_bytes, HOST_SHARE * host_bytes()))
     if needed_bytes > HOST_SHARE * host_bytes():
         remedy = "import fewer frames at a time, or bin them"
@@ -26,8 +26,7 @@ def check_room(subject: str, needed_bytes: int) -> None:
 
 @contextmanager
 def naming_damage(path: Path, found: str, expected: str, remedy: str = "") -> Iterator[None]:
-    """Turns any exception in the body but MemoryError into InputError, because libraries may raise any for a damaged
-    file."""
+    """Turns every exception except MemoryError into InputError. Libraries may raise any kind for a damaged file."""
     try:
         yield
     except (InputError, MemoryError):
@@ -56,7 +55,7 @@ def read_npy(path: Path, ndim: int) -> np.ndarray:
     subject = str(path)
     regular_file(path, subject)
     with naming_damage(path, "a damaged .npy file", "a NumPy array"):
-        values = np.load(path, mmap_mode="r", allow_pickle=False)  # maps no bytes that the file does not have
+        values = np.load(path, mmap_mode="r", allow_pickle=False)  # mapping fails where the header announces too much
         dtype, shape = values.dtype, values.shape
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         raise InputError(subject, f"type {dtype}", "plain real numbers")
@@ -67,8 +66,8 @@ def read_npy(path: Path, ndim: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SafeFolder:
-    """A folder that the user named. Its methods accept only names inside the folder, without an absolute path or "..".
-    They follow links in it, because the user has put them there. Raises InputError for what is no folder."""
+    """A folder that the user named. Methods accept only names inside it: no absolute path, no "..". They follow links in
+    the folder, because the user has put them there. Raises InputError for a path that is no folder."""
 
     root: Path
 
@@ -78,8 +77,8 @@ class SafeFolder:
             raise InputError(str(self.root), found, "a folder", "check the path")
 
     def file(self, name: object, subject: str) -> Path:
-        """Returns the path of the file ``name`` below the folder; ``subject``: what states the name. Raises InputError for a
-        name that leads outside, and for what is no regular file."""
+        """Returns the path of the file ``name`` in the folder or below. subject: where the name stands, for messages.
+        Raises InputError for a name that leads outside, and for anything but a regular file."""
         path = self.root / checked_name(name, subject)
         regular_file(path, subject)
         return path
@@ -88,21 +87,19 @@ class SafeFolder:
         return (self.root / name).exists()
 
     def glob(self, pattern: str, *suffixes: str) -> list[Path]:
-        """Returns the files below the folder that match a pattern, in any case, in natural order of their names. A pattern
-        with wildcards matches only names that are not hidden and end in one of the ``suffixes``, if any are given."""
+        """Returns the files that match a pattern, upper case or lower, in natural order. If ``suffixes`` are given,
+        wildcards match only files with one of them, and no hidden files."""
         name = PurePosixPath(pattern).name.lower()
         paths = [path for path in _files((self.root / pattern).parent) if fnmatchcase(path.name.lower(), name)]
         is_plain = not suffixes or not set(name) & set("*?[")
         return [path for path in paths if is_plain or _is_one_of(path, suffixes)]
 
     def matching(self, *suffixes: str) -> list[Path]:
-        """Returns the files with one of the suffixes, in upper or lower case, without hidden files, in natural order of
-        their names."""
+        """Returns the folder's files with one of the suffixes, upper case or lower, in natural order; no hidden files."""
         return [path for path in _files(self.root) if _is_one_of(path, suffixes)]
 
     def only(self, what: str, *suffixes: str) -> Path:
-        """Returns the only file with one of the suffixes. Raises InputError for none or several. what: the file's role,
-        for messages."""
+        """Returns the only file with one of the suffixes. Raises InputError for none or several; ``what`` names its role."""
         paths = self.matching(*suffixes)
         if len(paths) != 1:
             names = ", ".join(path.name for path in paths[:5]) or "none"
@@ -112,7 +109,8 @@ class SafeFolder:
 
 
 def _files(folder: Path) -> list[Path]:
-    """Returns the regular files of a folder, and links that lead nowhere, in natural order of their names."""
+    """Returns a folder's files in natural order. Links that lead nowhere stay in: reading them gives an error, while
+    leaving them out would lose a frame unseen."""
     paths = folder.iterdir() if folder.is_dir() else ()
     return in_natural_order([path for path in paths if path.is_file() or (path.is_symlink() and not path.exists())])
 
@@ -122,8 +120,7 @@ def _is_one_of(path: Path, suffixes: tuple[str, ...]) -> bool:
 
 
 def checked_name(name: object, subject: str) -> str:
-    """Returns ``name``, a relative path without "..", with forward slashes. Raises InputError about ``subject`` for any
-    other."""
+    """Returns ``name`` with forward slashes. Raises InputError about ``subject`` for an absolute path, and for ".."."""
     text = name.replace("\\", "/") if isinstance(name, str) else ""
     leads_out = PureWindowsPath(text).drive or text.startswith("/") or ".." in PurePosixPath(text).parts
     if not text.strip() or "\0" in text or leads_out:

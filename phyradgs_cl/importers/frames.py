@@ -1,7 +1,7 @@
-"""Converts frames of any origin to line integrals, with row 0 the lowest and bad pixels masked. Leaves out flats and darks
-that do not fit the others, and takes medians of the rest.
+"""Converts frames of any format to line integrals, with row 0 the lowest and bad pixels masked. Flats and darks that do not
+fit the others are left out; the others' median is used.
 
-Flats of several times, such as before and after the scan, are interpolated linearly in time, which frame numbers count."""
+Flats of several times, such as before and after the scan, are interpolated linearly over the frames' numbers."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -19,26 +19,28 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
-_PIXELS = 1 << 16  # most pixels of a frame from which levels and patterns are computed
-# Largest differences of a frame's level from the usual level, as fractions of the flats' level; other frames are left out.
-_TOGETHER = 0.1  # largest difference among flats of one time
-_APART = 0.3  # largest difference among flats of several times
+_PIXELS = 1 << 16  # pixels of a frame that are compared with other frames; all would take long and tell little more
+
+# A flat or dark is left out if its median differs from the others' by more than this fraction of the flats' median.
+_TOGETHER = 0.1  # largest difference among flats of one time, in which the tube hardly drifts
+_APART = 0.3  # largest difference among flats of several times, between which the tube may drift
 _DARK = 0.02  # largest difference among darks
-# A frame is left out too where its pattern's mean deviation exceeds the sum of these two.
-_PATTERN = 0.02  # deviation as a fraction of the flats' level
-_TIMES = 5.0  # deviation as a multiple of the frames' median deviation
-_BLOCK_BYTES = 1 << 26  # most bytes of a block of rows whose median is taken
+
+# A flat or dark is left out too if its pixels differ from the others', in the mean, by more than the sum of these two.
+_PATTERN = 0.02  # allowed difference, as a fraction of the flats' median
+_TIMES = 5.0  # allowed difference, in units of the frames' median deviation
+_BLOCK_BYTES = 1 << 26  # memory of a block of rows whose median is taken: a float64 copy of all frames would be large
 Mask = np.ndarray | None
 TAKEN = "taken"
 """The provenance's key of a text that says which frames and flats were used."""
-_AIR = 0.2  # largest size of the median line integral at the frames' borders that counts as air
-_SAME = 1e-3  # a flat at most this fraction above the saturation level counts as clipped too
+_AIR = 0.2  # a median line integral up to this size at the frames' borders is air
+_SAME = 1e-3  # flats up to this fraction above the saturation level are clipped too
 
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Flats (G, v, u) at G times, the dark (1, v, u) or None, and each projection's place (P,) among the times: 0.5 is
-    halfway from the first to the second. used: numbers of flats and darks in use. said: these numbers in words."""
+    """Flats (G, v, u) at G times, and the dark (1, v, u) or None. place (P,): the time of each projection, counted in
+    flats: 0.5 is halfway from the first to the second. used: how many flats and darks are used. said: the same as text."""
 
     flats: np.ndarray
     dark: np.ndarray | None
@@ -48,7 +50,7 @@ class Light:
 
 
 def places(is_flat: np.ndarray, is_projection: np.ndarray) -> np.ndarray:
-    """Returns the places (n,) of n flats among the projections: −0.5 is before the first, 9.5 between numbers 9 and 10.
+    """Returns when n flats were taken (n,), counted in projections: −0.5 is before the first, 9.5 between 9 and 10.
     is_flat, is_projection: bool (F,), for frames in the order in which they were taken."""
     return np.cumsum(is_projection)[is_flat] - 0.5
 
@@ -58,8 +60,8 @@ def light_of(
     at: np.ndarray | None = None, names: Mapping[str, Sequence[str]] | None = None,
 ) -> Light:
     """Returns the flats and dark for ``count`` projections, from flats and darks (n, v, u). Of three or more, those that do
-    not fit the others are left out, with a warning. ``at`` (n,): the flats' places as in ``places``; None: not stated.
-    ``names``: of each of the "flats" and "darks". Raises InputError for the option flats "time" with flats of one time."""
+    not fit the others are left out, with a warning. at (n,): when flats were taken, as in ``places``; None: not stated.
+    names: of the "flats" and "darks", for messages. Raises InputError for the option flats "time" if all are of one time."""
     at, assumed = _times(subject, len(flats), count, options, at)
     light = max(float(np.median(_levels(flats)[1])), 1e-30)
     times = [np.flatnonzero(at == time) for time in np.unique(at)]
@@ -80,8 +82,7 @@ def light_of(
 
 
 def median(stack: np.ndarray) -> np.ndarray:
-    """Returns the median (v, u) float64 of frames (n, v, u), computed by blocks of rows. A NaN affects its own pixel
-    only."""
+    """Returns the median (v, u) float64 of frames (n, v, u). It is NaN at pixels where a frame is NaN, and only there."""
     rows = max(1, _BLOCK_BYTES // max(1, 8 * stack[:, 0].size))
     starts = range(0, stack.shape[1], rows)
     return np.concatenate([np.median(stack[:, start : start + rows].astype(np.float64), axis=0) for start in starts])
@@ -90,7 +91,7 @@ def median(stack: np.ndarray) -> np.ndarray:
 def _times(
     subject: str, flats: int, count: int, options: ImportOptions, at: np.ndarray | None
 ) -> tuple[np.ndarray, str]:
-    """Returns the places (n,) of flats, all equal where their median is wanted, and the assumption made, in words."""
+    """Returns when flats were taken (n,), as in ``places`` (all equal: use the median), and a text about assumptions."""
     if options.flats != "time":
         return np.zeros(flats) if at is None or options.flats else at, ""
     if flats < 2 or (at is not None and np.ptp(at) == 0):
@@ -101,8 +102,7 @@ def _times(
 
 
 def _levels(stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns k pixels (n, k) float64 of each of n frames, with 0 for pixels that are not finite, and their medians
-    (n,)."""
+    """Returns every m-th pixel (n, k) float64 of n frames and the medians (n,). Pixels that are not finite become 0."""
     pixels = stack.reshape(len(stack), -1)
     some = np.nan_to_num(pixels[:, :: -(-pixels.shape[1] // _PIXELS)].astype(np.float64), posinf=0.0, neginf=0.0)
     return some, np.median(some, axis=1)
@@ -112,12 +112,12 @@ def _fitting(
     kind: str, stack: np.ndarray, group: np.ndarray, tolerance: float, subject: str, light: float,
     names: Mapping[str, Sequence[str]],
 ) -> np.ndarray:
-    """Returns which frames, bool (k,), of a group (k,) of indices into ``stack`` fit the others in level and pattern. All
-    fit where no majority shows which are right. light: the flats' level in counts. Warns of each that does not fit."""
+    """Returns which frames, bool (k,), are like the others in median and pattern. group (k,): their indices in ``stack``.
+    All are kept if no majority shows which are right. light: the flats' median counts. Warns of each that is unlike."""
     some, level = _levels(stack[group])
     usual = float(np.median(level))
     is_odd = np.abs(level - usual) > tolerance * light
-    if tolerance != _APART:  # between several times the pattern of the beam may change
+    if tolerance != _APART:  # the beam's pattern may change from one time to another
         if kind == "flats":
             some *= np.divide(usual, level, out=np.ones_like(level), where=level > 0)[:, None]
         pattern = np.abs(some - np.median(some, axis=0)).mean(axis=1)
@@ -137,8 +137,8 @@ def _fitting(
 
 @dataclass(frozen=True, eq=False)
 class LineIntegrals:
-    """Line integrals (P, v, u) float32 with the mask of unusable pixels, (v, u) or (P, v, u), or None. saturation: that
-    of the raw counts, or None. applied: the provenance's entries about flats and darks."""
+    """Line integrals (P, v, u) float32 and the mask of unusable pixels: (v, u), (P, v, u) or None. saturation: of the raw
+    counts, or None. applied: entries about flats and darks for the provenance."""
 
     values: np.ndarray
     mask: Mask
@@ -151,12 +151,12 @@ def line_integrals(
     darks: np.ndarray | None = None, convention: str | None = None, is_corrected: bool = False,
     flats_at: np.ndarray | None = None, names: Mapping[str, Sequence[str]] | None = None,
 ) -> LineIntegrals:
-    """Returns ``frames`` (P, v, u) of any real type as line integrals. Masks clipped counts and values that no object
-    has, with a warning.
+    """Converts ``frames`` (P, v, u) of any real type to line integrals. Masks clipped counts and values that no object
+    can have, with a warning.
 
-    - subject: names the file. flats, darks: (n, v, u) or None. flats_at, names: ``at``, ``names`` of ``light_of``.
-    - convention: the quantity of the format or file, unless the options state one. Without either, frames with flats, or
-      with a flat value, are counts. is_corrected: the scanner has subtracted the darks.
+    - subject: names the file. flats, darks: (n, v, u) or None. flats_at, names: see ``at``, ``names`` of ``light_of``.
+    - convention: the quantity of the format or file; the options' comes first. Without both, frames with flats or a flat
+      value are counts. is_corrected: the scanner has subtracted the darks.
 
     Raises InputError for an unknown quantity, counts without flats, and flats or darks of another size."""
     has_flats = flats is not None and len(flats) > 0
@@ -202,8 +202,7 @@ def line_integrals(
 
 
 def _refuse_logarithms(subject: str, frames: np.ndarray, flat: np.ndarray, options: ImportOptions) -> None:
-    """Raises InputError for flats of 1 with frames that are near 0 at their borders: these hold line integrals, not
-    counts."""
+    """Raises InputError for flats of ones with frames near 0 at their borders: these are line integrals, not counts."""
     border = np.concatenate([frames[..., 0].ravel(), frames[..., -1].ravel()])
     if (flat == 1).all() and abs(float(np.median(border))) < _AIR:
         remedy = f"say {options.named('quantity')} attenuation, and leave the flats out"
@@ -214,11 +213,11 @@ def _refuse_logarithms(subject: str, frames: np.ndarray, flat: np.ndarray, optio
 def _mask_clipped(
     subject: str, frames: np.ndarray, flat: np.ndarray, saturation: Saturation, unusable: np.ndarray, air: str
 ) -> None:
-    """Sets ``unusable`` (P, v, u) at each frame's clipped pixels where the flat is brighter: even air would read as an
-    object there. air: the reason in words.
+    """Sets ``unusable`` (P, v, u) at clipped pixels where the flat is brighter: even air would look like an object there.
+    air: the reason why other clipped pixels count as air, as a text.
 
-    Where the flat is clipped too, the integral is 0, which is right for air. Masking those pixels as well would leave no
-    air, and the reconstruction's error would be 2 to 3 times that of losing thin parts."""
+    Where the flat is clipped too, the integral is 0. That is right for air and loses thin parts of the object. Masking
+    these pixels would leave no air, and made the reconstruction's error 2 to 3 times larger than that loss."""
     brighter = flat > saturation.level * (1 + _SAME)
     for frame, bad in zip(frames, unusable, strict=True):
         bad |= (frame == saturation.level) & brighter
@@ -228,16 +227,16 @@ def _mask_clipped(
 
 
 def compact(mask: np.ndarray) -> Mask:
-    """Returns a mask (P, v, u), as (v, u) where all frames agree; None without a masked pixel. Raises InputError if all
-    are masked."""
+    """Returns a mask (P, v, u) in its smallest form: (v, u) if all frames agree, None if nothing is masked. Raises
+    InputError if everything is masked."""
     if mask.all():
         raise InputError("pixels", "no usable value", "frames brighter than the dark", "check flats and darks")
     return None if not mask.any() else mask[0] if all(map(partial(np.array_equal, mask[0]), mask)) else mask
 
 
 def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: str = "left") -> np.ndarray:
-    """Returns frames or a mask (..., v, u) with row 0 the lowest and column 0 on the left, seen from the source. ``row_0``
-    and ``column_0``: their sides in the format, such as "top"; the options' values come first."""
+    """Flips frames or masks (..., v, u) so that row 0 is the lowest and column 0 on the left, seen from the source. row_0,
+    column_0: where the format has them, such as "top"; the options' values come first."""
     if (options.row_0 or row_0) == "top":
         array = array[..., ::-1, :]
     if (options.column_0 or column_0) == "right":
@@ -246,5 +245,6 @@ def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: st
 
 
 def gantry_sign(options: ImportOptions, convention: str) -> float:
-    """Returns the factor from stored angles to the gantry's: +1 where the gantry turns, −1 where the sample does."""
+    """Returns the factor that turns stored angles into the gantry's: +1 for the gantry's angles, −1 for the sample's.
+    convention: the format's, "gantry" or "sample"; the options' comes first."""
     return 1.0 if (options.rotates or convention) == "gantry" else -1.0

@@ -1,4 +1,4 @@
-"""What formats in HDF5 share: arrays, at addresses that the format, the user's options or a TOML state, and the beam."""
+"""What formats in HDF5 share: reads the beam, and arrays at addresses that the format, options or a TOML file state."""
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,8 +28,8 @@ STACKS = ("projections", "flats", "darks", "mask")
 NAMES = (*STACKS, "image_key", "angles", "axes")
 _AXES = ("frame", "v", "u")
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_LIKE = 0.1  # largest relative difference of two stated pixel sizes that agree
-_LEAST_MM = 1e-4  # a pixel size without a unit that would be smaller than this in mm is taken to be in m
+_LIKE = 0.1  # relative difference up to which the two pixel sizes of a file, at the sample and on the panel, agree
+_LEAST_MM = 1e-4  # no pixel is smaller than this: a smaller number without a unit must be in m
 _TIMES = replace(LENGTH, name="magnification", assumed="", factors=MappingProxyType({"": 1.0, "x": 1.0}))
 
 
@@ -40,12 +40,11 @@ def is_address(text: object) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Where the arrays of a scan are.
+    """The addresses in HDF5 of a scan's arrays.
 
-    - stated: for some of ``NAMES`` a list of FILE:/ADDRESS, or of /ADDRESS in ``source``; for "axes" the order of frames'
-      axes. subject: what states them, for messages.
-    - linked_folder: see ``open_hdf5``. folder: the only folder from which files are read; None, for files that users
-      name, allows any."""
+    - stated: by name of the array (one of ``NAMES``), a list of FILE:/ADDRESS, or of /ADDRESS in ``source``. Under "axes"
+      it has the order of the frames' axes. subject: what states the addresses, for messages.
+    - linked_folder: see ``open_hdf5``. folder: the only folder from which files are read; None allows any."""
 
     stated: Mapping[str, Sequence[str]]
     subject: str
@@ -55,8 +54,7 @@ class Places:
 
     @contextmanager
     def opened(self, name: str, text: str) -> Iterator[tuple[Hdf5Source, str]]:
-        """Yields the open file and the address in it for ``text``, FILE:/ADDRESS or /ADDRESS. Raises InputError for other
-        text."""
+        """Yields the open file and the address in it. text: FILE:/ADDRESS or /ADDRESS. Raises InputError for others."""
         file, _, address = text.rpartition(":/")
         subject = f"{self.subject} {name}"
         if self.source is not None and not file and text.startswith("/"):
@@ -72,16 +70,15 @@ class Places:
             yield other, f"/{address}"
 
     def _at(self, name: str, usual: Sequence[str]) -> Sequence[str]:
-        """Returns the places of the array ``name``: those stated, else the ``usual`` addresses that exist."""
+        """Returns the addresses stated for an array, else those of the format (``usual``) that the file has."""
         there = [address for address in usual if self.source is not None and self.source.find(address) is not None]
         return self.stated.get(name, there)
 
     def stack(
         self, name: str, usual: Sequence[str] = (), panel: tuple[int, int] | None = None
     ) -> tuple[np.ndarray, dict[str, int]] | None:
-        """Reads frames (n, v, u) in their own type from the stated places, else from the ``usual`` addresses that exist.
-        Returns them, and the number of frames at each place; None without a place. Raises InputError for other shapes or
-        panels."""
+        """Reads frames (n, v, u) in their own type from the stated addresses, else from the format's (``usual``). Returns
+        them and the number of frames at each address; None if there is no address. Raises InputError for other shapes."""
         stacks: dict[str, np.ndarray] = {}
         for text in self._at(name, usual):
             with self.opened(name, str(text)) as (source, address):
@@ -97,7 +94,7 @@ class Places:
             remedy = "of a stack of sinograms say v,frame,u"
             raise InputError(f"{self.subject} axes", " ".join(order), "frame, v and u in the order of the data", remedy)
         dataset = source.dataset(address)
-        long = [count for count in dataset.shape if count != 1]  # axes of length 1 carry no information
+        long = [count for count in dataset.shape if count != 1]  # a file may have further axes of length 1
         shape = dataset.shape if dataset.ndim <= len(_AXES) or len(long) > len(_AXES) else tuple(long)
         if len(shape) == len(_AXES) - 1 and panel is not None:
             shape = tuple(np.insert(shape, order.index("frame"), 1).tolist())
@@ -112,11 +109,11 @@ class Places:
         self, projections: str = "/", *, key: Sequence[str] = (), flats: Sequence[str] = (), darks: Sequence[str] = (),
         mask: Sequence[str] = (),
     ) -> "Stacks":
-        """Reads all frames at the stated places, else at a format's usual addresses. key: addresses of the frames' types
-        (projection, flat, dark, invalid). Flats and darks with addresses of their own replace those among the frames.
+        """Reads all frames from the stated addresses, else from the format's, which are the arguments. key: address of the
+        types of frames (projection, flat, dark, invalid). Separate flats and darks replace those among the projections.
         Raises InputError without projections, and for arrays that do not fit them."""
         if self.source is not None and "projections" not in self.stated:
-            self.source.dataset(projections)  # raises an error that says what is there
+            self.source.dataset(projections)  # if it is missing, the error says what the file has instead
         if (stored := self.stack("projections", [projections])) is None:
             raise InputError(self.subject, "no place of the projections", "one of them")
         frames, panel = stored[0], (stored[0].shape[1], stored[0].shape[2])
@@ -127,7 +124,7 @@ class Places:
         for name, addresses in (("flats", flats), ("darks", darks), ("mask", mask)):
             if parts := self.stack(name, addresses, panel):
                 stacks[name] = parts[0]
-                at = {"pre": -0.5, "post": int(used.sum()) - 0.5}  # place of flats by the end of their address
+                at = {"pre": -0.5, "post": int(used.sum()) - 0.5}  # time of flats, by how their address ends
                 ends = [text.rpartition("_")[2] for text in parts[1]]
                 if name == "flats":
                     flats_at = np.repeat([at.get(end, np.nan) for end in ends], list(parts[1].values()))
@@ -141,13 +138,13 @@ class Places:
         return Stacks(frames if used.all() else frames[used], stacks["flats"], stacks["darks"], bad, used, flats_at)
 
     def _key(self, usual: Sequence[str], frames: int) -> np.ndarray:
-        """Reads the types (F,) of frames, numbered as in ``io.scan``; without a key all are projections. Raises
+        """Reads the types (F,) of frames, with the numbers of ``io.scan``. Without a key all are projections. Raises
         InputError for other numbers, and where no frame is a projection."""
         for text in self._at("image_key", usual)[:1]:
             with self.opened("image_key", text) as (source, address):
                 key = h5.read_values(source, address, source.dataset(address))
                 checks.shape(source.name(address), key, (frames,))
-                key = np.where(key == -1, schema.INVALID, key)  # -1: frames only for alignment in nxtomo
+                key = np.where(key == -1, schema.INVALID, key)  # the nxtomo package writes −1 for alignment frames
                 if not np.isin(key, range(schema.INVALID + 1)).all() or not np.any(key == schema.PROJECTION):
                     expected = "0 projection, 1 flat, 2 dark or 3 invalid, and at least one 0"
                     raise source.error(address, f"{np.unique(key)[:5]}", expected)
@@ -155,8 +152,7 @@ class Places:
         return np.full(frames, schema.PROJECTION)
 
     def angles_rad(self, used: np.ndarray, options: ImportOptions, usual: str = "", unit: str = "deg") -> np.ndarray:
-        """Reads the angles in rad, with the stored sign, of the frames marked in ``used``, bool (F,). unit: that of
-        angles without a stated unit."""
+        """Reads angles in rad, sign as stored, of the frames in ``used``, bool (F,). unit: if the file states none."""
         quantity = replace(ANGLE, assumed=unit)
         asked = [options.angles] if options.angles and is_address(options.angles) else self.stated.get("angles", ())
         for text in asked:
@@ -172,9 +168,8 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class Stacks:
-    """Projections (P, v, u), flats and darks (n, v, u), and a mask (v, u) or (P, v, u), non-zero for pixels not to be
-    used (None: use all). used, bool (F,): which stored frames are projections. flats_at: as ``at`` of
-    ``frames.light_of``."""
+    """Projections (P, v, u), flats and darks (n, v, u), and a mask (v, u) or (P, v, u) that is non-zero at unusable pixels
+    (None: use all). used, bool (F,): which stored frames are projections. flats_at: see ``at`` of ``frames.light_of``."""
 
     projections: np.ndarray
     flats: np.ndarray
@@ -190,7 +185,7 @@ class Stacks:
     def line_integrals(
         self, subject: str, options: ImportOptions, row_0: str, convention: str | None = None, turn: Turned | None = None
     ) -> LineIntegrals:
-        """Returns the projections as line integrals, after the flips ``turn`` that a file declares. Other arguments: see
+        """Returns the projections as line integrals. turn: flips that the file declares. Other arguments: see
         ``frames.line_integrals`` and ``oriented``."""
         frames, flats, darks, bad = (
             None if one is None else oriented(turn.frames(one) if turn else one, options, row_0)
@@ -204,7 +199,7 @@ class Stacks:
 
 
 def places_of(options: ImportOptions, source: Hdf5Source) -> Places:
-    """Returns the places that the option ``at`` states. Raises InputError for names that are not in ``NAMES``."""
+    """Returns the addresses that the option ``at`` states. Raises InputError for names that are not in ``NAMES``."""
     stated: dict[str, list[str]] = {}
     subject = options.named("at")
     for text in options.at or ():
@@ -217,9 +212,8 @@ def places_of(options: ImportOptions, source: Hdf5Source) -> Places:
 
 @dataclass(frozen=True)
 class Lengths:
-    """Addresses of a scan's lengths: the distances ``source`` and ``detector`` from the axis; pairs (v, u) of a pixel's
-    sides, at the sample and on the panel, of which the first that exists counts; ``optics``, the microscope's
-    magnification."""
+    """Addresses of a scan's lengths. source, detector: distances from the axis. at_sample, on_panel: pairs (v, u) of a
+    pixel's sides, of which the first that the file has is used. optics: the microscope's magnification."""
 
     source: str
     detector: str
@@ -231,14 +225,13 @@ class Lengths:
 def beam(
     source: Hdf5Source, lengths: Lengths, options: ImportOptions, panel: tuple[int, int], axis_columns: float = 0.0
 ) -> Geometry:
-    """Returns a geometry with the options' numbers, else the file's; a parallel beam, with a warning, where neither
-    states the source's distance. axis_columns: columns from axis to panel's middle. Raises InputError for wrong
-    lengths."""
+    """Returns the geometry from the options' numbers, else the file's. If neither states the source's distance, it is a
+    parallel beam, with a warning. axis_columns: from the axis to the panel's middle. Raises InputError for wrong lengths."""
     quantity = LENGTH
     for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):
         if source.find(address) is not None and not h5.read_attribute(source, address, "units"):
             pixel = h5.read_values(source, address, source.dataset(address)).ravel()
-            if pixel.size and abs(float(pixel[0])) < _LEAST_MM:  # less than 0.1 µm
+            if pixel.size and abs(float(pixel[0])) < _LEAST_MM:
                 quantity = replace(LENGTH, assumed="m")
 
     def sides_mm(pairs: Sequence[tuple[str, str]]) -> tuple[float, float] | None:
@@ -249,7 +242,7 @@ def beam(
         return None
 
     def pitch_mm() -> tuple[float, float]:
-        """Returns a pixel's sides (v, u) in mm on a panel at the detector's distance, as if there were no optics."""
+        """Returns a pixel's sides (v, u) in mm on the equivalent panel without optics, at the detector's distance."""
         at_sample, on_panel = sides_mm(lengths.at_sample), sides_mm(lengths.on_panel)
         if at_sample is None and on_panel is not None and lengths.optics and source.find(lengths.optics) is not None:
             times = h5.read_length(source, lengths.optics, _TIMES)
@@ -269,7 +262,7 @@ def beam(
         _log.warning("%s: no source distance: a parallel beam", source.name(lengths.source))
         sides = options.taken("pixel_size_mm", pitch_mm)
         return parallel(options, panel, sides, (0.0, axis_columns * sides[1]))
-    # NeXus gives the distance of the source a minus sign
+    # abs: NeXus counts the source's distance negative
     to_axis_mm = options.taken("source_to_axis_mm", lambda: abs(h5.read_number(source, lengths.source, quantity)))
     if to_axis_mm == 0:
         raise source.error(lengths.source, "0", "a length other than 0", "remove it: without one the beam is parallel")
@@ -281,9 +274,9 @@ def beam(
 
 
 def exposure_s(source: Hdf5Source, address: str, used: np.ndarray, options: ImportOptions) -> float | None:
-    """Returns the exposure in s of the frames that ``used``, bool (F,), marks, or the option's in place of the file's. None
-    where the file has none. Where it differs between frames, a gantry that stops for every frame gets None, with a warning;
-    a fly-scan raises InputError."""
+    """Returns the exposure in s of the frames marked in ``used``, bool (F,), or the option that replaces it; None if the
+    file has none. If it differs between frames, a fly-scan raises InputError. A gantry that stops for every frame does not
+    need it: the result is then None, with a warning."""
     if options.exposure_s is not None:
         return options.exposure_s if source.find(address) is not None else None
     try:

@@ -1,6 +1,8 @@
-"""Reads NIfTI, NRRD and MetaImage files by SimpleITK. Checks and reads also what SimpleITK does not: missing voxels, data in
-another folder, a note of Hounsfield units, and NRRD's units. Reads OME-Zarr of versions 0.4 and 0.5: one volume at full
-resolution, with its voxel sizes and position."""
+"""Reads NIfTI, NRRD and MetaImage files by SimpleITK, and OME-Zarr 0.4 and 0.5 by zarr: one volume at full resolution, with
+its voxel sizes and position.
+
+SimpleITK passes over missing voxels, data in another folder, a note of Hounsfield units, and NRRD's units; these are checked
+and read here."""
 
 import gzip
 import logging
@@ -28,17 +30,17 @@ from phyradgs_cl.io.volume import Volume, finite_float32, shares_of_maximum
 _log = logging.getLogger(__name__)
 STACKS = (".mha", ".mhd")
 _SPACES = ("left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las", "")
-_HEAD_BYTES = 1 << 16  # bytes at a file's beginning that are searched for its header
-_VOXEL_BYTES = 8  # bytes of memory per voxel that reading takes
-_NOTE = "ITK_FileNotes"  # SimpleITK's key of a file's note, in NIfTI the field descrip
+_HEAD_BYTES = 1 << 16  # bytes at a file's start in which its header ends
+_VOXEL_BYTES = 8  # bytes of memory per voxel while a file is read
+_NOTE = "ITK_FileNotes"  # SimpleITK's name for a file's comment, which is NIfTI's field descrip
 _READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", ".nrrd": "Nrrd"}
 _DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$", re.M)
-_OBLIQUE = 1e-3  # largest accepted sine of the angle between an axis of the image and the world's
+_OBLIQUE = 1e-3  # an axis that is tilted by less than this (the sine of 0.06°) counts as straight
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """Yields SimpleITK and its reader of a file, with the header read. Errors of SimpleITK become InputError."""
+    """Yields SimpleITK and its reader, which has read the file's header. Errors of SimpleITK become InputError."""
     subject = str(path)
     regular_file(path, subject)
     sitk = checks.package("SimpleITK", "the package that reads NIfTI, NRRD and MetaImage", "phyradgs-cl[formats]")
@@ -50,22 +52,22 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
         reader.ReadImageInformation()
         yield sitk, reader
     except (RuntimeError, EOFError, gzip.BadGzipFile, zlib.error) as error:
-        text = str(error).rpartition("ERROR: ")[2].partition("Reason:")[0]  # "Reason:" and on: an earlier error
+        text = str(error).rpartition("ERROR: ")[2].partition("Reason:")[0]  # an earlier error follows "Reason:"
         reason = re.sub(r"^\w+\(0x\w+\): ", "", text.strip()).replace(subject, "")[:100]
         raise InputError(subject, f"a damaged file ({reason})", "an image of three axes") from error
 
 
 def image_times_s(path: Path) -> list[float]:
-    """Returns the times in s along a file's fourth axis; [] for a single volume. Raises InputError for a damaged file."""
+    """Returns the times in s of volumes along a file's fourth axis; [] without one. Raises InputError for a damaged file."""
     with _opened(path) as (_, reader):
         count = reader.GetSize()[3] if reader.GetDimension() > 3 else 1
         return [reader.GetOrigin()[3] + k * reader.GetSpacing()[3] for k in range(count if count > 1 else 0)]
 
 
 def read_image(path: Path, state: int | None = None) -> Any:
-    """Reads a SimpleITK image of three axes with one real number per voxel. state: the index along a fourth axis; None
-    for an image without one. Raises InputError for a damaged file, other axes or voxels, and voxels that are missing or
-    in another folder."""
+    """Reads an image of three axes, with one real number per voxel, as SimpleITK's image. state: which volume along a
+    fourth axis; None for a file of three axes. Raises InputError for a damaged file, other axes or voxels, and voxels that
+    are missing or in another folder."""
     subject = str(path)
     with _opened(path) as (sitk, reader):
         counts, axes = reader.GetSize(), reader.GetDimension()
@@ -87,12 +89,12 @@ def read_image(path: Path, state: int | None = None) -> Any:
 
 
 def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
-    """Returns how many bytes of voxels a file holds, unpacked: SimpleITK fills missing voxels of NIfTI, and damaged ones
-    of packed MetaImages, without an error. None for NRRD, which SimpleITK checks. Raises InputError for data outside the
-    folder or in several files."""
+    """Returns how many bytes of voxels a file holds when unpacked. SimpleITK invents missing voxels of NIfTI and damaged
+    ones of packed MetaImages without an error. Returns None for NRRD, which SimpleITK checks. Raises InputError for data
+    outside the folder or in several files."""
     with gzip.open(path) if path.suffix.lower() == ".gz" else open(path, "rb") as file:
         head = file.read(_HEAD_BYTES)
-        if reader.HasMetaDataKey("bitpix"):  # NIfTI, in which scaled integers come out as floats
+        if reader.HasMetaDataKey("bitpix"):  # NIfTI: SimpleITK turns scaled integers into floats of another size
             stored = file.seek(0, os.SEEK_END) - int(float(reader.GetMetaData("vox_offset")))
             return stored * voxel_bytes * 8 // int(reader.GetMetaData("bitpix"))
     is_nrrd = path.suffix.lower() == ".nrrd"
@@ -104,14 +106,14 @@ def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
         path, start = SafeFolder(path.parent).file(name, f"{path} data file"), 0
     if not re.search(rb"^CompressedData *= *True", head, re.I | re.M):
         return None if is_nrrd else path.stat().st_size - start
-    if not re.search(rb"^CompressedDataSize *= *\d", head, re.M):  # SimpleITK returns undefined voxels then
+    if not re.search(rb"^CompressedDataSize *= *\d", head, re.M):  # without it SimpleITK returns undefined voxels
         raise InputError(f"{path} CompressedDataSize", "nothing", "the bytes of packed voxels", "write it unpacked")
     return len(zlib.decompress(path.read_bytes()[start:]))
 
 
 def read_image_volume(path: Path, state: int | None = None) -> Volume:
-    """Reads a volume (z, y, x) float32 with axes that rise with the world's, LPS. A NRRD file without voxel sizes has no
-    grid, and its integers are divided by the maximum of their type. ``state``: see ``read_image``. Raises InputError as
+    """Reads a volume (z, y, x) float32 whose axes point as the world's do (LPS). A NRRD file without voxel sizes has no
+    grid, and its integers are divided by the maximum of their type. state: see ``read_image``. Raises InputError as
     there, and for oblique axes, unknown units and impossible sizes."""
     subject, image = str(path), read_image(path, state)
     note = image.GetMetaData(_NOTE) if image.HasMetaDataKey(_NOTE) else ""
@@ -141,7 +143,7 @@ def read_image_volume(path: Path, state: int | None = None) -> Volume:
 
 
 def _nrrd_header(path: Path) -> dict[str, str]:
-    """Returns the fields of a NRRD file, of which SimpleITK shows only some. Raises InputError for an unknown space."""
+    """Reads the header of a NRRD file; SimpleITK shows only some of it. Raises InputError for an unknown space."""
     with open(path, "rb") as file:
         lines = file.read(_HEAD_BYTES).split(b"\n\n")[0].decode("latin-1").splitlines()
     header = {key.strip().lower(): value.strip() for key, sign, value in (line.partition(":") for line in lines) if sign}
@@ -151,10 +153,10 @@ def _nrrd_header(path: Path) -> dict[str, str]:
 
 
 def read_zarr(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None, str]:
-    """Returns values (z, y, x) in their own type, sizes (3,) of a voxel and the first one's centre (3,), both (z, y, x) in
-    mm, and the folder's note on its values. Sizes and centre are both None, with a warning, where an axis has no unit of
-    length, a number is not finite, or a size is not above 0. Raises InputError for what is no OME-Zarr of real numbers, for
-    damage, for several times or channels, and for more than the machine's memory."""
+    """Returns values (z, y, x) in their own type, a voxel's sizes (3,) and the first voxel's centre (3,), both (z, y, x) in
+    mm, and the folder's note on its values. Sizes and centre are None, with a warning, if an axis has no unit of length, a
+    number is not finite, or a size is not above 0. Raises InputError for anything but an OME-Zarr of real numbers, for
+    damage, several times or channels, and for more than the machine's memory."""
     subject = str(path)
     zarr = checks.package("zarr", "the package that reads OME-Zarr", "phyradgs-cl[zarr]")
     try:
@@ -174,7 +176,7 @@ def read_zarr(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | N
         note = str((facts.get("metadata") or {}).get("values", ""))
     except InputError:
         raise
-    except Exception as error:  # zarr and its stores pass on errors of every kind
+    except Exception as error:  # zarr and its stores raise errors of every kind
         found = f"{type(error).__name__}: {str(error)[:150]}"
         raise InputError(subject, found, "an OME-Zarr with real numbers of one volume along z, y and x") from error
     in_mm = np.array([units[name] for name in "zyx"], np.float64)  # None becomes NaN
@@ -186,7 +188,7 @@ def read_zarr(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | N
 
 
 def _sizes_and_first(facts: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a voxel's sizes and the first voxel's centre, each (count,), at full resolution, in the axes' units."""
+    """Returns a voxel's sizes and the first voxel's centre, each (count,), in the axes' units, at full resolution."""
     sizes, first = np.ones(count), np.zeros(count)
     for change in (*facts["datasets"][0]["coordinateTransformations"], *facts.get("coordinateTransformations", ())):
         if change["type"] not in ("scale", "translation"):

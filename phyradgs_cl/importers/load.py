@@ -1,5 +1,5 @@
-"""Entries that read scans and objects of other programs: scans by a module per format, volumes by their suffix, beads and
-wires from TOML. Known kinds of files that are not read are refused with the way to convert them."""
+"""Reads what other programs wrote: scans by a module per format, volumes by their suffix, beads and wires from TOML. For
+well-known formats that are not read, the error says how to convert them."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -37,12 +37,12 @@ _KINDS = {
     ("fit", "fits"): ("FITS", "convert them to TIFF: astropy.io.fits and tifffile.imwrite"),
     ("xrm", "txm"): ("single images or a volume of Xradia", "import the scan's .txrm, or export TIFFs"),
 }  # fmt: skip
-_MOST_FILES = 1000  # most files of a folder that are looked at for a message about unknown formats
+_MOST_FILES = 1000  # a folder's files that are looked at for an error about its format; more would take long
 
 
 def refuse_unread(path: Path, expected: str) -> None:
-    """Raises InputError for a file of a known kind that is not read, and for a folder with such files. The error tells
-    how to convert them. expected: what the error says was expected."""
+    """Raises InputError, which says how to convert, for a file of a known format that is not read and for a folder of
+    them. expected: what the error says was expected."""
     entries = [path] if path.is_file() else sorted(path.iterdir())[:_MOST_FILES] if path.is_dir() else []
     files = [file for file in entries if file.is_file()]
     suffixes = Counter("dcm" if _is_dicom(file) else file.suffix.lower()[1:] for file in files)
@@ -57,9 +57,9 @@ def _is_dicom(path: Path) -> bool:
         return file.read(132)[128:] == b"DICM"
 
 
-# By the format's name, its module of formats/, loaded when it is needed, and whose scans it has, for the help. The module
-# has two functions for a file or folder: recognises(path) -> bool and import_scan(path, options) -> Scan. MODULE:END stands
-# for recognises_END, import_scan_END.
+# Format: its module in formats/, loaded when it is needed, and whose scans it reads, for the help. The module has
+# recognises(path) -> bool and import_scan(path, options) -> Scan for a file or folder. For MODULE:END they are called
+# recognises_END and import_scan_END.
 FORMATS = {
     "r2": ("r2_gaussian", "R2-Gaussian"),
     "phyradgs": ("r2_gaussian:with_times", "PhyRadGS"),
@@ -77,16 +77,17 @@ FORMATS = {
     "leap": ("leap", "LEAP"),
     "tigre": ("pickles:tigre", "TIGRE"),
 }
-_MOST_BODIES = 1000  # most beads and wires of a phantom
-_LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5  # largest size of coordinates in mm, and of attenuations in 1/mm
+_MOST_BODIES = 1000  # no calibration phantom has more beads and wires
+_LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5  # beyond these, coordinates in mm and attenuations in 1/mm are in wrong units
 _COMMON = "attenuation_per_mm"
 _KEYS = {"bead": ("centre_mm", "radius_mm", _COMMON), "wire": ("from_mm", "to_mm", "radius_mm", _COMMON)}
 
 
 def import_scan(path: str | Path, options: ImportOptions | None = None, form: str | None = None) -> Scan:
     """Imports a file or folder of another program as a scan of line integrals, row 0 the lowest, in mm, s and radians.
-    options: values that the files do not state. form: a key of ``FORMATS``; None recognises the format. Raises InputError
-    for an unknown format, damaged or incomplete files, and options that the format does not use."""
+
+    options: values that the files do not state, or that replace theirs. form: a key of ``FORMATS``; None recognises the
+    format. Raises InputError for an unknown format, damaged or incomplete files, and options that the format ignores."""
     path = Path(path)
     _check_there(path)
     form = form or recognise(path)
@@ -108,7 +109,7 @@ def _check_there(path: Path) -> None:
 
 
 def recognise(path: Path) -> str:
-    """Returns the key in ``FORMATS`` of a file or folder, by its content. Raises InputError where none or several fit."""
+    """Finds the format, a key of ``FORMATS``, by a file's or folder's content. Raises InputError if none or several fit."""
     _check_there(path)
     expected = "one of the formats of docs/import.md"
     names = [name for name in FORMATS if _function("recognises", name)(path)]
@@ -137,10 +138,10 @@ def foreign_volume(path: str | Path) -> str | None:
 
 
 def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Volume:
-    """Reads a volume (nz, ny, nx) float32 in 1/mm of any format. Axes are reordered and flipped to rise with the world's,
+    """Reads a volume (nz, ny, nx) float32 in 1/mm of any format. Axes are reordered and flipped to point as the world's do,
     LPS (docs/export.md).
 
-    Values without a grid are those of a dataset /volume, of files without voxel sizes, and of .npy without its .json.
+    The volume has no grid if the file has no voxel sizes: a bare dataset /volume, .npy without its .json, and others.
     Hounsfield units are converted, see ``in_per_mm``. Raises InputError for a damaged file, oblique axes, Hounsfield
     units without ``mu_water_per_mm``, and values that are not finite."""
     if (reader := _reader(path)) is None:
@@ -158,9 +159,8 @@ def load_states(path: str | Path) -> Iterator[tuple[float, Volume]]:
 
 
 def load_attenuation(path: str | Path, *, warn: bool = True) -> Volume:
-    """Reads a volume (nz, ny, nx) in 1/mm that is to be projected. Raises InputError as ``load_volume`` does, and as
-    ``check_attenuation`` does for values that are no attenuation. warn: whether it may also warn of many negative
-    values."""
+    """Reads a volume (nz, ny, nx) in 1/mm that will be projected. warn: also warn of many negative values. Raises
+    InputError as ``load_volume`` does, and as ``check_attenuation`` does for values that no attenuation has."""
     return check_attenuation(f"volume of {path}", load_volume(path), warn=warn)
 
 
@@ -170,8 +170,7 @@ def _reader(path: str | Path) -> tuple[str, Callable[[Path], Volume]] | None:
 
 
 def _read_npy(path: Path) -> Volume:
-    """Reads an array (nz, ny, nx) with the grid in a .json file of the same name; without that file the volume has no
-    grid."""
+    """Reads an array (nz, ny, nx), and its grid from a .json file of the same name, if there is one."""
     values, beside = read_npy(path, 3), path.with_suffix(".json")
     facts = read_json(beside) if beside.is_file() else {}
     if "voxel_size_mm" not in facts:
@@ -185,8 +184,7 @@ def _read_npy(path: Path) -> Volume:
 
 
 def _read_tiff(path: Path) -> Volume:
-    """Reads a TIFF's pages as slices from the lowest up, row 0 at the smallest y, with the voxel sizes that ImageJ or OME
-    write."""
+    """Reads a TIFF's pages as slices from the lowest up, row 0 at the smallest y, with voxel sizes of ImageJ or OME."""
     values = tiff.read_tiffs([path])
     size_mm, origin, note = tiff.calibration(path)
     if size_mm is None:
@@ -198,9 +196,9 @@ def _read_tiff(path: Path) -> Volume:
 def _on_grid(
     path: Path, values: np.ndarray, size_mm: np.ndarray | None = None, first_mm: np.ndarray | None = None, note: str = ""
 ) -> Volume:
-    """Returns a volume of values (nz, ny, nx) with voxels of ``size_mm`` (3,), the first centred at ``first_mm`` (3,),
-    both (z, y, x). None for ``first_mm`` centres the volume at the origin. Without sizes it has no grid, and integers are
-    divided by the maximum of their type. note: the file's words about its values."""
+    """Returns a volume of values (nz, ny, nx). size_mm (3,): a voxel's sizes; without them the volume has no grid, and
+    integers are divided by the maximum of their type. first_mm (3,): the first voxel's centre; None centres the volume at
+    the origin. Both are (z, y, x). note: the file's words about its values."""
     if size_mm is None:
         return Volume(finite_float32(str(path), shares_of_maximum(values)), None)
     centre_mm = np.zeros(3) if first_mm is None else first_mm + (np.array(values.shape) - 1) / 2 * size_mm
@@ -218,8 +216,8 @@ _READERS: dict[str, tuple[str, Callable[[Path], Volume]]] = {
 
 
 def load_beads(path: Path) -> EllipsoidPhantom:
-    """Reads the beads, then the wires, of a TOML file as a phantom with the file's name. Raises InputError for a file that
-    is no TOML, unknown, missing or wrong keys, no bead, and more than a thousand bodies."""
+    """Reads the beads, then the wires, of a TOML file as a phantom named after the file. Raises InputError for a file that
+    is not TOML, for unknown, missing or wrong keys, no bead, and more than a thousand bodies."""
     content = read_toml(path)
     refuse_unknown(str(path), content, ("title", _COMMON, *_KEYS))
     top, bodies = Fields(str(path), content), list[Ellipsoid | Cylinder]()

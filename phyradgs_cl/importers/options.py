@@ -43,9 +43,9 @@ class ImportOptions:
     """Options of an import. None leaves a value to the file or to the format's convention. Readout axis and direction are
     those of the imported scan: row 0 the lowest, column 0 on the left, seen from the source.
 
-    The command line has the words of a data sheet: ``first``, ``fps``, ``exposure_ms`` and ``readout_ms``. Fields without
-    help are computed from these words. ``named`` returns the name of a field in messages. Raises InputError for values
-    out of range, and for contradictions."""
+    Users may also give timing as data sheets do: ``first``, ``fps``, ``exposure_ms`` and ``readout_ms``. Readout axis and
+    direction, ``frame_time_s``, ``exposure_s`` and ``readout_s`` are computed from these. named: returns what messages call
+    a field. Raises InputError for values out of range, and for contradictions."""
 
     exposure_s: float | None = _option("Exposure of a line, s, in place of --exposure-ms.", range=(0, 1e6))
     readout_s: float | None = checks.option(None, range=(0, 1e6))
@@ -94,8 +94,8 @@ class ImportOptions:
         return [name for name in among if getattr(self, name) != _DEFAULTS[name]]
 
     def taken(self, name: str, stored: Callable[[], T]) -> T:
-        """Returns the option ``name`` where it is given, else the value that ``stored`` reads from the file. An InputError
-        of ``stored`` then names the option as a remedy."""
+        """Returns the option ``name`` if given, else what ``stored`` reads from the file. If reading raises InputError,
+        the error's remedy names the option."""
         value: T | None = getattr(self, name)
         if value is not None:
             return value
@@ -106,7 +106,7 @@ class ImportOptions:
             raise InputError(error.subject, error.found, error.expected, remedy) from error
 
     def angle_rad(self, count: int, stored: Callable[[], np.ndarray]) -> np.ndarray:
-        """Returns angles (count,) in rad: of the option ``angles``, else those that ``stored`` reads."""
+        """Returns angles (count,) in rad: those of the option ``angles``, else what ``stored`` reads."""
         if self.angles is None:
             return self.taken("angles", stored)
         if not (steps := _STEPS.fullmatch(self.angles)):
@@ -116,7 +116,7 @@ class ImportOptions:
         return np.deg2rad(first + last * np.arange(count) if steps[2] == "," else np.linspace(first, last, count))
 
     def called(self, name: str, in_file: Mapping[str, str] | None = None) -> str:
-        """Returns the name of the field ``name`` in messages: its name ``in_file`` where the user gave no option, else the
+        """Returns what messages call a field: the file's name for it (``in_file``) if the user gave no option, else the
         option that was given, such as fps for frame_time_s."""
         if in_file and name in in_file and getattr(self, name, None) is None:
             return in_file[name]
@@ -137,11 +137,11 @@ _WORD_OF = {
 }  # fmt: skip
 _DEFAULTS = {item.name: item.default for item in fields(ImportOptions) if item.name != "named"}
 WORDS = {item.name: item.metadata["words"] for item in fields(ImportOptions) if "words" in item.metadata}
-"""The words that an option may be, by field."""
+"""By field: the words that an option may be."""
 FIELDS = tuple(_DEFAULTS)
-"""The names of the options, without ``named``."""
+"""The names of all options."""
 
-# The options that formats use whose files state little.
+# Groups of options, for formats whose files lack these values.
 TIMING = (
     *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
     *("first", "fps", "exposure_ms", "readout_ms"),
@@ -156,5 +156,5 @@ OF_HDF5 = (*OF_BARE_FRAMES, "entry", "at", "linked_folder")
 
 
 def option_name(field: str) -> str:
-    """Returns the option of the command line for a field of ImportOptions."""
+    """Returns the command line's option for a field of ImportOptions: --fps for "frame_time_s"."""
     return "--detector-offset" if field == "detector_offset_mm" else flag_of(_WORD_OF.get(field, field))

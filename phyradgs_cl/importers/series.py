@@ -1,7 +1,7 @@
 """Finds which files of a folder are a scan's frames, and their order, from the numbers in their names.
 
 A number may be an index, an angle with sign and decimals, or a time. Files whose names have other words than most are left
-out, with a warning. A number that is missing, or there twice, is refused: all later angles would be wrong."""
+out, with a warning. A missing or repeated number is an error: all later frames would get wrong angles."""
 
 import logging
 import re
@@ -20,20 +20,20 @@ _NUMBER = re.compile(r"([-+]?)(\d+)(?:[.,](\d+))?")
 _DATE = r"(?<!\d)((?:19|20)\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])"
 _TIME = re.compile(_DATE + r"[-_ T.]*([01]\d|2[0-3])[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d)(?!\d)")
 _DEGREES, _ANGLE = re.compile(r"[ _]?(deg|°|grad)", re.I), re.compile(r"(deg|angle|ang|theta|phi|rot)[ _=]*$", re.I)
-_STEADY = 0.25  # largest deviation of a regular step from the usual one, in usual steps
-_GAP = 1.5  # least gap between angles or times that counts as a hole, in usual steps
-_USUAL = 0.5  # least fraction of regular steps in a regular series
-_STEADY_ANGLES = 0.75  # least fraction of regular steps in angles or times whose gaps count as holes
-_SMALL = 0.25  # a group of names below this fraction of the largest group's size is no series of frames
+# A step from one number to the next is regular if it is near the usual step, the most frequent one.
+_STEADY = 0.25  # largest difference from the usual step, as a fraction of it
+_GAP = 1.5  # a step between angles or times of this many usual steps shows a missing frame
+_USUAL = 0.5  # a series is regular if at least this fraction of its steps is
+_STEADY_ANGLES = 0.75  # angles or times with fewer regular steps are uneven: no gap shows a missing frame
+_SMALL = 0.25  # groups of files with the same words below this fraction of the largest group are no frames
 _BEFORE, _AFTER = (re.compile(rf"(?<![a-z])({words})(?![a-z])", re.I) for words in ("before|pre|start", "after|post|end"))
-_STAMP = 10**7  # numbers from this one on are times in milliseconds, not frames' indices
-_MOST_NAMES = 8  # most names of files listed in a message
+_STAMP = 10**7  # numbers from here on are times in milliseconds, not indices
+_MOST_NAMES = 8  # of files, in a message
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Files in the order of the scan; their numbers (F,), None where names have none; and in words, which files were
-    taken."""
+    """Files in the order of the scan. numbers (F,): in their names, or None. said: a text about which files were taken."""
 
     paths: list[Path]
     numbers: np.ndarray | None
@@ -42,8 +42,8 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class _Column:
-    """The numbers (F,) at one place of the files' names. place: 1 for the first. is_angle: the words beside them say
-    degrees."""
+    """The numbers (F,) at one position in the files' names. place: the position, 1 for a name's first number. is_angle:
+    words next to the numbers say that they are angles."""
 
     place: int
     values: np.ndarray
@@ -60,7 +60,7 @@ class _Column:
     @cached_property
     def steps(self) -> tuple[float, np.ndarray]:
         """The usual step between the sorted numbers, and each step (F − 1,) in units of it. The usual step is the most
-        frequent one above 0, or the median where none makes up half of the steps."""
+        frequent one above 0. Where none makes up half of the steps, it is their median."""
         steps = np.diff(np.sort(self.values))
         if not len(steps):
             return 1.0, steps
@@ -75,17 +75,16 @@ class _Column:
 
     @property
     def rank(self) -> tuple[bool, bool, bool]:
-        """The sort key of columns: regular ones before others, indices before angles, whole numbers before decimals."""
+        """Sort key of numbers that may give the order: regular first, indices before angles, whole ones before decimals."""
         return self.regular < _USUAL, self.is_angle, self.values.dtype.kind == "f"
 
 
 def series_of(
     paths: Sequence[Path], subject: str, remedy: str, *, order: int | None = None, holes: bool = False, skip: int = 0
 ) -> Series:
-    """Returns the frames among files, in their order. ``subject``: what names them, for messages; ``remedy``: what to do
-    about a hole. ``order``: the place in the names of the number that gives the order, 1 the first; None finds it.
-    ``holes``: numbers may be missing. ``skip``: length of a prefix that all files have. Raises InputError for a hole, one
-    number twice, and several series."""
+    """Returns the frames among files, in order. subject: names the files in messages. remedy: what to do about a missing
+    number. order: which number in the names gives the order, 1 the first; None finds it. holes: numbers may be missing.
+    skip: length of a prefix that all files have. Raises InputError for a missing or repeated number, and several series."""
     paths = list(paths) if skip else _of_one_series(list(paths), subject)
     columns = _columns([path.stem[skip:] for path in paths])
     if order is not None and order not in {column.place for column in columns}:
@@ -99,7 +98,7 @@ def series_of(
     distinct = sorted((column for column in varying if column.is_distinct), key=lambda column: column.rank)
     if order is not None:
         distinct = [column for column in columns if column.place == order][:1]
-    # several numbers count together, such as turn and frame: every combination is there once
+    # two numbers may count together, such as turn and frame; then every combination exists once
     pairs = set(zip(*(column.values.tolist() for column in varying), strict=True))
     are_pairs = len(pairs) == len(paths) == np.prod([len(np.unique(column.values)) for column in varying])
     key = distinct[0] if distinct else max(varying, key=lambda column: len(np.unique(column.values)))
@@ -134,13 +133,12 @@ def _ends(paths: list[Path]) -> str:
 
 
 def _words(name: str) -> tuple[str, ...]:
-    """Returns the words between the numbers of a name."""
     return tuple(_NUMBER.sub("\0", _TIME.sub("\0", name)).lower().split("\0"))
 
 
 def _of_one_series(paths: list[Path], subject: str) -> list[Path]:
-    """Returns the files whose names have the words of most names, or words that alternate with theirs. Raises InputError
-    for several series."""
+    """Returns the files whose names have the most frequent words. Other words that take turns with these, as in a_1, b_2,
+    a_3, belong to the series too. Raises InputError for several series."""
     groups: dict[tuple[str, ...], list[Path]] = {}
     for path in paths:
         groups.setdefault(_words(path.stem), []).append(path)
@@ -160,7 +158,7 @@ def _of_one_series(paths: list[Path], subject: str) -> list[Path]:
 
 
 def _do_alternate(groups: list[list[Path]]) -> bool:
-    """Returns whether the groups' names have equally many numbers, of which one counts through all groups in turn."""
+    """Returns whether the groups take turns, as a_1, b_2, a_3 do: in the order of a number, neighbours often differ."""
     if len({len(_words(group[0].stem)) for group in groups}) > 1:
         return False
     owner = [i for i, group in enumerate(groups) for _ in group]
@@ -172,8 +170,8 @@ def _do_alternate(groups: list[list[Path]]) -> bool:
 
 
 def _columns(names: list[str]) -> list[_Column]:
-    """Returns the numbers in names, by place; a date with a time in all names is one number, in s, if no other is
-    distinct."""
+    """Returns the numbers in names, by position. A date with a time in all names becomes one number, in s, if no other
+    number differs between all files."""
     columns, clocks = _read(names), [_TIME.search(name) for name in names]
     others = _read([_TIME.sub("", name) for name in names])
     if all(clocks) and not any(column.is_distinct for column in others):
@@ -191,11 +189,11 @@ def _read(names: list[str]) -> list[_Column]:
 
 
 def _column(place: int, numbers: tuple[re.Match[str], ...]) -> Iterator[_Column]:
-    """Yields the numbers of one place; two columns for numbers with a point between them that are no decimals."""
+    """Yields the numbers at one position: twice where a point separates two indices, as in 3.12, instead of decimals."""
     befores, afters = ([one.string[: one.start()] for one in numbers], [one.string[one.end() :] for one in numbers])
     is_angle = all(map(_DEGREES.match, afters)) or all(map(_ANGLE.search, befores))
     signs, decimals = [one[1] for one in numbers], [one[3] or "" for one in numbers]
-    # a hyphen in all names stands between two words, but not before an angle behind a space
+    # a hyphen in all names separates words and is no minus, except before angles that follow a space
     is_signed = not all(signs) or (is_angle and not any(before[-1:].isalnum() for before in befores))
     sign = np.array([-1 if is_signed and one == "-" else 1 for one in signs])
     whole = np.array([int(one[2]) for one in numbers])
@@ -209,8 +207,8 @@ def _column(place: int, numbers: tuple[re.Match[str], ...]) -> Iterator[_Column]
 
 
 def flat_places(flats: list[Path], darks: list[Path], series: Series) -> np.ndarray | None:
-    """Returns the places (n,) of flats among the projections, as in ``frames.places``. Words such as "before" in their names
-    say it, or numbers that continue through flats, darks and projections; None where neither does."""
+    """Returns when flats were taken (n,), as in ``frames.places``. Words such as "before" in their names show it, or numbers
+    that continue through flats, darks and projections. Returns None if neither does."""
     ends = [[bool(words.search(path.stem)) for path in flats] for words in (_BEFORE, _AFTER)]
     if flats and all(map(np.logical_xor, *ends)):
         return np.where(ends[0], -0.5, len(series.paths) - 0.5)

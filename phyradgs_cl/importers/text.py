@@ -1,5 +1,4 @@
-"""Reads texts of people, scanners and toolkits: numbers with decimal commas or units, tables of angles, and descriptions of
-scans as lines of names and values."""
+"""Reads texts of scanners and other programs: numbers with decimal commas or units, tables of angles, lines NAME = VALUE."""
 
 import logging
 import re
@@ -20,15 +19,15 @@ _ENGLISH, _GERMAN = (re.compile(rf"[-+]?\d{{1,3}}({k}\d{{3}})+{d}") for k, d in 
 _ONE_COMMA, _EITHER = re.compile(r"[-+]?\d*,\d+"), re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
 _COLUMNS = re.compile(r",\s+|[;:\s]+")
 _ANGLE, _RAD = re.compile(r"angle|theta|phi|rot|deg", re.I), re.compile(r"\brad", re.I)
-_BRIGHTER = 1.2  # pixels above this many times the stated counts of air are too bright: no noise exceeds it
-_FEW = 0.01  # largest fraction of the pixels that may be too bright: they may be broken
-_HEAD_BYTES = 1 << 14  # bytes at a file's beginning that are searched for marks of its format
+_BRIGHTER = 1.2  # a pixel above this many times the stated counts of air is too bright: noise does not reach so far
+_FEW = 0.01  # this fraction of the pixels may be too bright, because they are broken
+_HEAD_BYTES = 1 << 14  # bytes at a file's start in which words of its format are searched
 TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
 
 
 def number_at_start(text: str, comma_is_decimal: bool = False) -> tuple[float, str] | None:
-    """Returns the number at the start of a text, and the text behind it, such as a unit. None without a number, and for a
-    comma that may be decimal or of thousands, as in 1,000; ``comma_is_decimal`` decides these."""
+    """Returns the number at the start of a text, and the text behind it, such as a unit; None without a number. In 1,000
+    the comma may be decimal or separate thousands: it is decimal with ``comma_is_decimal``, else the result is None."""
     if not (found := _BEGINNING.match(text.strip())):
         return None
     digits, power, rest = found[1], found[2] or "", found[3]
@@ -45,21 +44,21 @@ def number_at_start(text: str, comma_is_decimal: bool = False) -> tuple[float, s
 
 
 def commas_are_decimal(texts: list[str]) -> bool:
-    """Returns whether some of the texts are numbers with a comma that must be decimal, and none has a decimal point."""
+    """Returns whether numbers in the texts have decimal commas: some comma cannot mean thousands, and there is no point."""
     commas = any(_ONE_COMMA.fullmatch(text) and not _EITHER.fullmatch(text) for text in texts)
     return commas and not any(re.fullmatch(r"[-+]?\d*\.\d+", text) for text in texts)
 
 
 def read_angles_rad(path: Path, count: int, unit: str | None = None, column: int | None = None) -> np.ndarray:
-    """Reads angles (count,) in rad from a text file: one per line, all in one line, or in a column beside an index, which
-    then gives their order. A line of names may say which column, and rad. The unit is ``unit`` ("deg", "rad"), else that of
-    the names, else degrees. Text after a # is ignored. ``column``: the number of the angles' column, from 0 on. Raises
-    InputError for another count, several columns without names, and lines that are no numbers."""
+    """Reads angles (count,) in rad from a text file: one per line, all on one line, or in a column next to an index that
+    gives their order. A line of column names may name the angles and their unit. The unit is ``unit`` ("deg" or "rad"),
+    else the names', else degrees. Text after a # is ignored. column: where the angles are, from 0 on; None finds them.
+    Raises InputError for another count, several columns without names, and lines that are no numbers."""
     numbered = enumerate(read_text(path).splitlines(), 1)
     lines = [(i, text) for i, line in numbered if (text := line.partition("#")[0].strip())]
     is_header = [not re.search(r"\d", line) or (_cells(line, True) or _cells(line, False)) is None for _, line in lines]
     head = is_header.index(False) if False in is_header else len(lines)
-    if column is not None:  # a maker's file, whose lines above the table may hold numbers too
+    if column is not None:  # a scanner's file, in which lines above the table may look like the table's
         head = max(head, len(lines) - count)
     names, rows = [line for _, line in lines[:head]], lines[head:]
     is_comma = _is_decimal_comma(path, [line for _, line in rows])
@@ -75,7 +74,7 @@ def read_angles_rad(path: Path, count: int, unit: str | None = None, column: int
 
 
 def _cells(line: str, is_comma: bool) -> list[float] | None:
-    """Returns the numbers in a line of a table; None for a line with anything else. ``is_comma``: commas are decimal."""
+    """Returns the numbers on a line of a table; None if it has anything else. is_comma: commas are decimal."""
     parts = [part for part in (_COLUMNS if is_comma else re.compile(r"[,;:\s]+")).split(line) if part]
     try:
         return [float(part.replace(",", ".")) for part in parts]
@@ -84,8 +83,7 @@ def _cells(line: str, is_comma: bool) -> list[float] | None:
 
 
 def _is_decimal_comma(path: Path, lines: list[str]) -> bool:
-    """Returns whether commas in a table are decimal; False where they separate columns. Raises InputError if they may be
-    both."""
+    """Returns whether commas in a table are decimal, else they separate columns. Raises InputError if both are possible."""
     parts = [part for line in lines for part in _COLUMNS.split(line) if "," in part]
     if not all(part.count(",") == 1 and "." not in part for part in parts):
         return False
@@ -102,14 +100,14 @@ def _is_decimal_comma(path: Path, lines: list[str]) -> bool:
 
 
 def _is_index(values: list[float]) -> bool:
-    """Returns whether the values are consecutive numbers from 0 or 1 on, in any order."""
+    """Returns whether the values count from 0 or 1 without a gap, in any order."""
     first = min(values)
     return len(values) > 1 and first in (0, 1) and sorted(values) == [first + i for i in range(len(values))]
 
 
 def _column(path: Path, names: list[str], table: list[list[float]], count: int, column: int | None) -> np.ndarray:
-    """Returns the angles of a table as stored: its only column or row, the column named so, or the one beside an index.
-    An index gives their order. Raises InputError for several columns."""
+    """Returns a table's angles in the stored unit: its only column or row, the column with such a name, or the one next to
+    an index, which gives the order. Raises InputError if several columns may be meant."""
     widths = {len(row) for row in table}
     if widths == {1} or (len(table) == 1 and column is None) or (len(table) < count == sum(map(len, table))):
         return np.array([value for row in table for value in row])
@@ -128,7 +126,7 @@ def _column(path: Path, names: list[str], table: list[list[float]], count: int, 
 
 
 def file_of_angles(folder: SafeFolder, name: str, *ends: str) -> Path | None:
-    """Returns the file ``name`` with the first of the ``ends`` that is there, else the only file with such an end."""
+    """Tries the ``ends`` in order: returns the file called ``name`` + end, else the only file with that end; or None."""
     for end in ends:
         files = folder.glob(f"*{end}")
         own = [file for file in files if file.name.lower() == f"{name}{end}".lower()]
@@ -138,8 +136,8 @@ def file_of_angles(folder: SafeFolder, name: str, *ends: str) -> Path | None:
 
 
 def measured_angles_rad(path: Path, steps_rad: np.ndarray) -> np.ndarray:
-    """Reads measured angles (F,) in rad. Files differ in sign and order: takes those that agree best with equal steps
-    (F,), and warns of the largest difference."""
+    """Reads measured angles (F,) in rad. Files differ in sign and order, so it takes the sign and order that are nearest to
+    equal steps ``steps_rad`` (F,). Warns with the largest difference."""
     listed_rad = np.unwrap(read_angles_rad(path, len(steps_rad), column=1))
     ways = [steps_rad[0] + way - way[0] for way in (listed_rad, listed_rad[::-1], -listed_rad, -listed_rad[::-1])]
     best = min(ways, key=lambda way: float(np.abs(way - steps_rad).max()))
@@ -149,15 +147,14 @@ def measured_angles_rad(path: Path, steps_rad: np.ndarray) -> np.ndarray:
 
 
 class Settings(Fields):
-    """Fields whose values are texts. Methods that return numbers parse them, also with units behind them."""
+    """Fields whose values are texts. Its methods read numbers from them, also those followed by a unit."""
 
     def __init__(self, subject: str, values: Mapping[str, str | list[str]], comma_is_decimal: bool = False) -> None:
         super().__init__(subject, values)
         self.comma_is_decimal = comma_is_decimal
 
     def measured(self, key: str, quantity: Quantity, unit: str) -> float:
-        """Returns a number above 0, in the package's unit of ``quantity``. unit: that of a text without a unit behind its
-        number."""
+        """Returns a number above 0, in the package's unit of ``quantity``. unit: assumed where none follows the number."""
         found = number_at_start(str(self.get(key)), self.comma_is_decimal)
         stated = quantity.factor(found[1]) if found and found[1] else None
         factor = stated or quantity.factor(unit)
@@ -165,7 +162,7 @@ class Settings(Fields):
         return self.length(key) * factor
 
     def listed(self, key: str, count: int) -> np.ndarray:
-        """Returns the numbers (count,) of a text with commas between them."""
+        """Returns the numbers (count,) of a comma-separated text."""
         return Settings(self.subject, {key: self.word(key).split(",")}).numbers(key, count)
 
     def _finite(self, key: str, value: object, largest: float = LARGEST) -> float:
@@ -176,12 +173,12 @@ class Settings(Fields):
 def read_settings(
     path: Path, names: Collection[str], separator: str = "=", sections: Collection[str] = ()
 ) -> Settings:
-    """Reads the lines NAME ``separator`` VALUE whose name is one of ``names``, in any case; other lines are ignored.
+    """Reads the lines NAME ``separator`` VALUE for the given ``names``, in upper or lower case; ignores other lines.
 
-    ``sections``: the only [sections] that are read, in any case; () reads all. Of a name in two sections the first counts.
-    Raises InputError for a file without any of the names, and for one section that gives a name two values."""
+    sections: the only [sections] that are read; () reads all. If two sections have a name, the first counts. Raises
+    InputError for a file with none of the names, and for a section that gives a name two values."""
     spelt, wanted = {name.lower(): name for name in names}, {section.lower() for section in sections}
-    values: dict[tuple[str, str], str] = {}  # by section and name
+    values: dict[tuple[str, str], str] = {}  # keys are (section, name)
     others: list[str] = []
     section = ""
     for line in map(str.strip, read_text(path).splitlines()):
@@ -203,7 +200,7 @@ def read_settings(
 
 
 def head_has(path: Path, *marks: bytes) -> bool:
-    """Returns whether a regular file has all the marks in its first 16 KiB, in upper or lower case."""
+    """Returns whether a regular file has all ``marks`` in its first 16 KiB, upper case or lower."""
     if not path.is_file():
         return False
     with open(path, "rb") as file:
@@ -212,7 +209,7 @@ def head_has(path: Path, *marks: bytes) -> bool:
 
 
 def say_missing(fields: Fields, meanings: Mapping[str, str]) -> None:
-    """Warns, in one line, of names that the description lacks. ``meanings``: by name, the value that is then assumed."""
+    """Warns of names that the description lacks. meanings: by name, the value that is assumed instead."""
     if missing := [f"no {name} ({meaning})" for name, meaning in meanings.items() if not fields.has(name)]:
         _log.warning("%s %s", fields.subject, ", ".join(missing))
 

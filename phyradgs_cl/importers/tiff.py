@@ -1,4 +1,4 @@
-"""Reads grey TIFF images, one or many per file, by tifffile; by Pillow where tifffile would need a missing imagecodecs."""
+"""Reads grey TIFF images, one or many per file, by tifffile; compressed ones by Pillow if imagecodecs is not installed."""
 
 import logging
 import math
@@ -22,16 +22,16 @@ from phyradgs_cl.io.hdf5.datasets import LENGTH
 SUFFIXES = (".tif", ".tiff")
 _log = logging.getLogger(__name__)
 _RESULT_BYTES = 5  # bytes of memory per pixel of the result: a line integral in float32, and its mask
-_NO_SPACE = {"C": "channels", "T": "times"}  # axes of a stack that a volume does not have
+_NO_SPACE = {"C": "channels", "T": "times"}  # axes that TIFF stacks may have, but volumes must not
 _OME_SIZES = re.compile(r'PhysicalSize([XYZ](?:Unit)?)="([^"]*)"')
 _OF_SIZE = ("unit", "spacing")
-_ORIENTATION = 274  # number of the tag; its value 1 means row 0 at the top, column 0 on the left
+_ORIENTATION = 274  # TIFF's tag Orientation; 1 means row 0 at the top, column 0 on the left
 
 
 def read_tiffs(paths: list[Path]) -> np.ndarray:
-    """Reads all images of all files in order: frames (F, v, u) in their own type, row 0 as stored. All headers are read
-    before any pixel, so that the frames are unpacked into one array of known size. Raises InputError for damage, images of
-    several sizes or types, and more than the machine's memory."""
+    """Reads all images of all files in order: frames (F, v, u) in their own type, row 0 as stored. Reads all headers first,
+    so that pixels go into one array and wrong files are found early. Raises InputError for damage, images of several sizes
+    or types, and more than the machine's memory."""
     headers = [_header(path) for path in paths]
     frames, (shape, dtype) = sum(count for count, _ in headers), headers[0][1]
     for path, (_, kind) in zip(paths, headers, strict=True):
@@ -42,7 +42,7 @@ def read_tiffs(paths: list[Path]) -> np.ndarray:
     for path, (count, _) in zip(paths, headers, strict=True):
         with _opened(path) as tiff:
             try:
-                for page in tiff.pages:  # which may be a stack
+                for page in tiff.pages:  # a page may hold a stack of images
                     images = math.prod(page.shape[:-2])
                     page.asarray(maxworkers=1, out=stack[at : at + images].reshape(page.shape))
                     at += images
@@ -59,12 +59,11 @@ def read_numbered(
     folder: SafeFolder, prefix: str, shape: tuple[int | None, ...], subject: str | Sequence[str], options: ImportOptions,
     first: int = 0, pattern: str = r"\d+",
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """Reads the TIFFs of a folder whose names are ``prefix`` and a number: frames (F, v, u) of ``shape`` in the numbers'
-    order; None in a shape accepts any size. Returns them with their places (F,) from 0 on, and which were taken, in words.
-
-    ``pattern``: the form of the number; ``first``: the first frame's number, used where that frame is missing; ``subject``:
-    what states the shape, or each of its three sizes, for messages. Files beyond the stated number are left out with a
-    warning. Raises InputError for fewer, unless the options say to take those found."""
+    """Reads a folder's TIFFs whose names are ``prefix`` and a number. Returns frames (F, v, u) in the numbers' order, their
+    numbers (F,) from 0 on, and a text about which were taken. shape: expected, with None for any size. subject: names
+    what states the shape, or its three sizes, in messages. first: the first frame's number, needed if that frame is
+    missing. pattern: the form of numbers. Files beyond the stated count are left out, with a warning. Raises InputError for
+    fewer, unless the options say to take those found."""
     subjects = [subject] * 3 if isinstance(subject, str) else subject
     name = re.compile(re.escape(prefix) + pattern, re.I)
     paths = [path for path in folder.matching(*SUFFIXES) if name.fullmatch(path.stem)]
@@ -90,18 +89,17 @@ def read_numbered(
 
 
 def stack_shape(paths: list[Path]) -> tuple[int, int, int]:
-    """Returns the shape (frames, rows, columns) that ``read_tiffs`` would read, from headers alone. Rows and columns are
-    those of the first file."""
+    """Returns the shape (frames, rows, columns) that ``read_tiffs`` would read; reads only headers, sizes from the first."""
     headers = [_header(path) for path in paths]
     return sum(count for count, _ in headers), *headers[0][1][0]
 
 
 def _header(path: Path) -> tuple[int, tuple[tuple[int, int], np.dtype]]:
-    """Returns the number of images in one file, and their (shape, type). Raises InputError for images that are not grey,
-    have an orientation other than the usual, differ, or are missing."""
+    """Returns the number of images in one file, and their (shape, type). Raises InputError for no image, and for images
+    that are not grey, differ, or have a tag Orientation other than 1."""
     images, kinds = 0, []
     with _opened(path) as tiff:
-        for page in tiff.pages:  # one of which may be a stack (n, v, u)
+        for page in tiff.pages:  # a page may hold a stack (n, v, u)
             shape, dtype = page.shape[-2:], page.dtype
             grey = len(page.shape) == 2 or (len(page.shape) == 3 and page.axes.endswith("YX"))
             if not grey or min(page.shape) < 1 or dtype is None or dtype.kind not in "iuf":
@@ -117,7 +115,7 @@ def _header(path: Path) -> tuple[int, tuple[tuple[int, int], np.dtype]]:
         raise InputError(str(path), "no page", "at least one image")
     if any(kind != kinds[0] for kind in kinds):
         raise InputError(str(path), "pages of several sizes or types", "one for all frames")
-    if stated_images > images:  # ImageJ writes such files beyond 4 GB
+    if stated_images > images:  # as in ImageJ's files of more than 4 GB
         found, expected = f"{stated_images} images and {images} of them in its directory", "a directory of all images"
         raise InputError(str(path), found, expected, "save it as BigTIFF, or as one file per image")
     return images, kinds[0]
@@ -125,8 +123,8 @@ def _header(path: Path) -> tuple[int, tuple[tuple[int, int], np.dtype]]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Yields an open TIFF. Any error of the library in the body becomes InputError. So do pages beyond the file's end, which
-    the library only logs and leaves out."""
+    """Yields an open TIFF. Errors of tifffile, while it is open, become InputError. So do pages beyond the file's end, which
+    tifffile only logs and leaves out."""
     regular_file(path, str(path))
     tifffile = checks.package("tifffile", "the package that reads TIFF", "phyradgs-cl[formats]")
     logger, said = logging.getLogger("tifffile"), list[str]()
@@ -148,12 +146,11 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def calibration(path: Path) -> tuple[np.ndarray | None, np.ndarray | None, str]:
-    """Returns the voxel sizes (x, y, z) in mm, the origin's place (x, y, z) in voxels and the text "Info" of a stack:
-    ImageJ's, an OME-TIFF, or a BigTIFF of tifffile, which keeps ImageJ's values as JSON.
+    """Returns a stack's voxel sizes (x, y, z) in mm, its origin (x, y, z) in voxels or None, and its text "Info". Reads
+    ImageJ's tags, OME-TIFF, and tifffile's BigTIFF, which has ImageJ's values as JSON.
 
-    Without valid sizes it returns (None, None, ""), with a warning where the file has some of them. A missing origin is
-    None. Raises InputError for a stack with several channels or times. Call ``read_tiffs`` first, which checks the
-    file."""
+    Without valid sizes it returns (None, None, ""), with a warning if the file has some of them. Raises InputError for
+    several channels or times. Call ``read_tiffs`` first, which checks the file."""
     with _opened(path) as tiff:
         series = tiff.series[0]
         long = {axis: n for axis, n in zip(series.axes, series.shape, strict=False) if axis in _NO_SPACE and n > 1}

@@ -1,4 +1,4 @@
-"""Files: scans, volumes, scanner descriptions, and outputs that are written whole or not at all."""
+"""Reads and writes files of scans, volumes and scanner descriptions. Outputs are written completely or not at all."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Values of volumes as attenuation in 1/mm: Hounsfield units are converted, and what no attenuation has is refused."""
+"""Converts volumes in Hounsfield units to attenuation in 1/mm, and refuses values that no attenuation has."""
 
 import logging
 from collections.abc import Mapping
@@ -14,19 +14,19 @@ from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.volume import Volume
 from phyradgs_cl.text import plain_text
 
-_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # limits of attenuation in 1/mm: below is no noise, above not even gold
-_USUAL_PER_MM = 10.0  # values of a larger size are HU, not 1/mm, where the user states water's attenuation
+_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # no noise goes lower, no metal higher
+_USUAL_PER_MM = 10.0  # where the user states water's attenuation, values beyond this are HU, not 1/mm
 VALUES = "values"
-"""The key, in a volume's provenance, of what a file of another format notes of its values."""
+"""The provenance's key for the note that another program's file has about its values."""
 FROM_HU = "1/mm, from HU"
-"""What it says of a volume that ``in_per_mm`` has converted."""
+"""The note of a volume that ``in_per_mm`` has converted."""
 log = logging.getLogger(__name__)
 
 
 def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Volume:
-    """Returns ``volume``, which is to be projected. Raises InputError about ``subject`` for values beyond 1e9, and where
-    the negative values sum to at least the positive ones in size, as in Hounsfield units. Warns where they sum to more
-    than a tenth, unless ``warn`` is False."""
+    """Returns ``volume`` after a check that it can be projected. Raises InputError about ``subject`` for values beyond 1e9.
+    Raises it also if negative values sum to at least as much as positive ones, as in Hounsfield units. Warns if they sum to
+    more than a tenth, unless ``warn`` is False."""
     values = volume.values
     if (size := float(np.abs(values).max())) > h5.ATTENUATION.largest:
         expected = f"attenuation of at most {h5.ATTENUATION.largest:g} 1/mm"
@@ -45,10 +45,9 @@ def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Vol
 
 
 def in_per_mm(subject: str, volume: Volume, mu_water_per_mm: float | None = None) -> Volume:
-    """Returns a volume in 1/mm, with the scale of converted Hounsfield units. Values that the file's note calls
-    Hounsfield units are converted by the note's scale, else by ``mu_water_per_mm``. Values beyond 10 without a note are
-    converted by ``mu_water_per_mm``, if given. Raises InputError about ``subject`` for noted Hounsfield units without
-    either scale."""
+    """Returns a volume in 1/mm; if it was in Hounsfield units, with their scale. A file's note may say that values are in
+    Hounsfield units, and give their scale; else ``mu_water_per_mm`` gives it. Without a note, ``mu_water_per_mm`` converts
+    volumes with values beyond 10. Raises InputError about ``subject`` for noted Hounsfield units without a scale."""
     stated = None if mu_water_per_mm is None else Hounsfield(mu_water_per_mm)
     is_hu, scale = of_note(str(volume.provenance.get(VALUES, "")))
     if scale is None and (is_hu or float(np.abs(volume.values).max()) > _USUAL_PER_MM):
@@ -62,8 +61,8 @@ def in_per_mm(subject: str, volume: Volume, mu_water_per_mm: float | None = None
 
 
 def words_of_hu(volumes: Mapping[Path, Volume], mu_water_per_mm: float | None = None) -> str:
-    """Returns the names and scales of volumes that ``in_per_mm`` has converted, to append to a line of output. Raises
-    InputError for water's attenuation that none of them needed."""
+    """Returns names and scales of the volumes that ``in_per_mm`` has converted, as the end of a line of output. Raises
+    InputError for a ``mu_water_per_mm`` that none of them needed."""
     scales = {path: one.scale for path, one in volumes.items() if one.provenance.get(VALUES) == FROM_HU}
     if mu_water_per_mm is not None and Hounsfield(mu_water_per_mm) not in scales.values():
         found = f"{mu_water_per_mm:g} for {' and '.join(map(str, volumes))}"
@@ -73,8 +72,7 @@ def words_of_hu(volumes: Mapping[Path, Volume], mu_water_per_mm: float | None = 
 
 
 def attenuation_of(subject: str, volume: Volume) -> Volume:
-    """Returns the volume. Raises InputError about ``subject`` for values that are no attenuation in 1/mm, such as Hounsfield
-    units and counts."""
+    """Returns the volume. Raises InputError about ``subject`` for values that cannot be 1/mm, such as Hounsfield units."""
     lowest, highest = float(volume.values.min()), float(volume.values.max())
     if lowest < _LOWEST_PER_MM or highest > _HIGHEST_PER_MM:
         found = f"values from {lowest:g} to {highest:g}, as of Hounsfield units"

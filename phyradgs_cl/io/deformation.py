@@ -1,5 +1,5 @@
-"""Reads and writes deformations, in an HDF5 file of their own or inside a scan file, and the truth of simulated scans: a
-reference volume, and the states and deformation of an object that moves."""
+"""Reads and writes deformations, alone or in a scan file, and the truth of simulated scans: a reference volume, and an
+object's deformation and volumes (states) at several times if it moves."""
 
 from pathlib import Path
 
@@ -20,15 +20,15 @@ _MEANS = "at time t the object has, at point y, the attenuation of the reference
 
 
 def write_deformation(path: str | Path, deformation: Deformation) -> None:
-    """Writes a file with one deformation, whole or not at all. Raises OutputError where the file cannot be written."""
+    """Writes a file with one deformation, completely or not at all. Raises OutputError where it cannot be written."""
     with h5.new_hdf5(path, deformation.control_mm.nbytes + deformation.weights.nbytes) as file:
         write_deformation_group(h5.new_group(file, "entry", "NXentry"), deformation)
 
 
 def read_deformation(path: str | Path) -> Deformation:
-    """Reads a deformation file, or the true deformation of a simulated scan. Raises InputError, about the HDF5 path, for
-    missing values, shapes that do not fit, unknown units, values that are not finite, and a map that folds (a determinant
-    of 0 or less)."""
+    """Reads a deformation file, or the true deformation in a simulated scan. Raises InputError, about the HDF5 path, for
+    missing values, wrong shapes, unknown units, values that are not finite, and a map that folds: one whose Jacobian has a
+    determinant of 0 or less."""
     with open_hdf5(path) as source:
         in_scans = [f"{name}/{schema.DEFORMATION}" for name in source.groups()]
         places = [name for name in (DEFORMATION, *in_scans) if source.find(name) is not None]
@@ -39,13 +39,13 @@ def read_deformation(path: str | Path) -> Deformation:
 
 
 def holds_deformation(path: str | Path) -> bool:
-    """Returns whether a file has a group ``DEFORMATION``, as the volume of an object that moves may have."""
+    """Returns whether a file has a deformation at ``DEFORMATION``, as volumes of moving objects may have."""
     with open_hdf5(path) as source:
         return source.find(DEFORMATION) is not None
 
 
 def deformation_summary(path: str | Path) -> dict[str, object]:
-    """Returns facts about a deformation file by name. Raises InputError as ``read_deformation`` does."""
+    """Returns what 'phyradgs info' prints about a deformation file, by name. Raises InputError as ``read_deformation``."""
     field = read_deformation(path)
     rank, nz, ny, nx, _ = field.control_mm.shape
     return {
@@ -88,7 +88,7 @@ def read_deformation_group(source: Hdf5Source, address: str) -> Deformation:
 
 
 def write_truth(extra: h5py.Group, scan: Scan) -> None:
-    """Writes the group ``reference`` of a scan with a true volume or true states; otherwise nothing."""
+    """Writes a scan's true volume, and its true volumes at several times, into the group ``reference``, if it has them."""
     moving = scan.moving_truth
     if scan.reference is None and moving is None:
         return
@@ -103,8 +103,8 @@ def write_truth(extra: h5py.Group, scan: Scan) -> None:
 
 
 def check_truth(source: Hdf5Source, entry: str, grid: Grid) -> tuple[bool, int]:
-    """Returns whether a scan file has a true volume or states, and the number of states. Raises InputError where their
-    shapes do not fit the grid."""
+    """Returns whether a scan file has a true volume, and at how many times it has the true state of the object. Raises
+    InputError for shapes that do not fit the grid."""
     if source.optional_group(f"{entry}/{schema.REFERENCE}") is None:
         return False, 0
     states, times = (source.optional(f"{entry}/{name}") for name in (schema.STATES, schema.STATE_TIMES))
@@ -120,12 +120,12 @@ def check_truth(source: Hdf5Source, entry: str, grid: Grid) -> tuple[bool, int]:
 
 
 def read_reference(source: Hdf5Source, entry: str) -> np.ndarray:
-    """Reads the reference (nz, ny, nx) float32 in 1/mm. Raises InputError for values not finite, or nowhere above 0."""
+    """Reads the true volume (nz, ny, nx) float32 in 1/mm. Raises InputError for NaN or infinity, or if none is above 0."""
     return _read_volumes(source, f"{entry}/{schema.TRUTH}")
 
 
 def read_moving_truth(source: Hdf5Source, entry: str) -> MovingTruth:
-    """Reads the true states of an object that moves, their times, and its deformation or None. Raises InputError as
+    """Reads the true volumes of an object that moves, their times, and its deformation or None. Raises InputError as
     ``read_reference`` and ``read_deformation`` do."""
     times_s = h5.read_array(source, f"{entry}/{schema.STATE_TIMES}", (None,), h5.TIME)
     volumes = _read_volumes(source, f"{entry}/{schema.STATES}")

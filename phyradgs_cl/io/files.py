@@ -1,4 +1,4 @@
-"""Bounded reading of regular files, their hashes, and the memory of this machine."""
+"""Reads regular files up to a size, computes their hashes, and reports this machine's memory."""
 
 import hashlib
 import os
@@ -17,13 +17,13 @@ except ImportError:  # not POSIX
     resource = None  # type: ignore[assignment]
 
 HOST_SHARE = 0.8
-"""The largest fraction of this machine's memory that one array may take."""
-_BLOCK_BYTES = 1 << 20  # bytes of a file that are read at a time for its checksum
+"""Fraction of this machine's memory that one array may take; larger ones are refused before they are read."""
+_BLOCK_BYTES = 1 << 20  # bytes read at a time for a hash, so that a large file never is in memory
 
 
 def regular_file(path: Path, subject: str, expected: str = "a regular file") -> os.stat_result:
-    """Returns the status of a readable regular file. Raises InputError about ``subject`` for a missing or unreadable file, a
-    folder, a device and a pipe: reading the last two may never end."""
+    """Returns the status of a readable regular file. Raises InputError about ``subject`` for a missing or unreadable file
+    and for a folder. Raises it also for devices and pipes, because reading them may never end."""
     where, remedy = "" if str(path) in subject else f" {path}", "check the path"
     try:
         status = os.stat(path)
@@ -41,7 +41,7 @@ def regular_file(path: Path, subject: str, expected: str = "a regular file") -> 
 
 
 def read_regular(path: Path, subject: str, most_bytes: int, expected: str) -> bytes:
-    """Reads a whole regular file. Raises InputError about ``subject`` for a larger one than ``most_bytes``."""
+    """Reads a whole regular file. Raises InputError about ``subject`` for one of more than ``most_bytes``."""
     if (size := regular_file(path, subject, expected).st_size) > most_bytes:
         raise InputError(subject, f"{size} bytes", f"at most {most_bytes} bytes for {expected}")
     try:
@@ -51,7 +51,7 @@ def read_regular(path: Path, subject: str, most_bytes: int, expected: str) -> by
 
 
 def decoded(data: bytes) -> str:
-    """Returns the text of a file in UTF-8, in UTF-16 as Windows saves it, or in Windows' western code page 1252."""
+    """Decodes a file's text, which may be in UTF-8, in UTF-16 as Windows saves it, or in Windows' code page 1252."""
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return data.decode("utf-16", "replace")
     if data[1:8:2] == bytes(4) or data[:8:2] == bytes(4):  # UTF-16 without a byte order mark
@@ -63,8 +63,8 @@ def decoded(data: bytes) -> str:
 
 
 def sha256_of(path: str | Path, given_up: threading.Event | None = None) -> str:
-    """Returns the SHA-256 of a file, or of the names and files in a folder, as 64 hexadecimal digits. Stops early, with a
-    meaningless result, when ``given_up`` is set. Raises InputError for a file that cannot be read."""
+    """Returns the SHA-256 of a file, or of a folder's names and files, as 64 hexadecimal digits. given_up: when set, ends
+    the computation early; the result then means nothing. Raises InputError for a file that cannot be read."""
     digest, subject = hashlib.sha256(), str(path)
     if (folder := Path(path)).is_dir():
         for part in sorted(part for part in folder.rglob("*") if part.is_file()):
@@ -82,7 +82,7 @@ def sha256_of(path: str | Path, given_up: threading.Event | None = None) -> str:
 
 @contextmanager
 def hashing(path: str | Path) -> Iterator[Callable[[], str]]:
-    """Hashes a file while the body reads it, so that the disk is read once. Yields a function that returns the SHA-256."""
+    """Hashes a file while the caller reads it, so that the disk is read once. Yields a function that returns the SHA-256."""
     given_up = threading.Event()
     with ThreadPoolExecutor(1) as pool:
         try:
@@ -92,7 +92,7 @@ def hashing(path: str | Path) -> Iterator[Callable[[], str]]:
 
 
 def host_bytes() -> float:
-    """Returns this machine's memory in bytes; infinity where the system does not report it."""
+    """Returns this machine's memory in bytes; infinity if the system does not report it."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, OSError, ValueError):
@@ -100,8 +100,8 @@ def host_bytes() -> float:
 
 
 def free_bytes() -> float:
-    """Returns the memory in bytes that this process may still take: what Linux calls available (elsewhere all), at most
-    its limit of address space."""
+    """Returns the memory in bytes that this process may still take: what Linux calls available, elsewhere all memory. A
+    limit of the process' address space lowers it."""
     free = host_bytes()
     with suppress(OSError, ValueError, IndexError):
         free = 1024.0 * int(Path("/proc/meminfo").read_text().partition("MemAvailable:")[2].split()[0])
@@ -110,8 +110,8 @@ def free_bytes() -> float:
 
 
 def in_use_bytes(field: str) -> int:
-    """Returns bytes of memory of this process, from the field of Linux' /proc/self/status: "VmHWM:" for the peak of
-    resident memory, "VmSize:" for the address space. Returns 0 on other systems."""
+    """Returns a field of Linux' /proc/self/status for this process, in bytes: "VmHWM:" is the peak of resident memory,
+    "VmSize:" the address space. Returns 0 on other systems."""
     try:
         return 1024 * int(Path("/proc/self/status").read_text().partition(field)[2].split()[0])
     except (OSError, ValueError, IndexError):

@@ -1,5 +1,5 @@
-"""Writes outputs whole or not at all: under another name first, then renamed. A lock file allows one run per output.
-Checkpoints of interrupted runs are plain arrays in a NumPy archive, never a pickle."""
+"""Writes outputs completely or not at all: first under another name, which is then renamed. A lock file keeps two runs
+from writing one output. Checkpoints of interrupted runs are plain arrays in a NumPy archive, never a pickle."""
 
 import errno
 import glob
@@ -21,33 +21,33 @@ import numpy as np
 from phyradgs_cl.errors import InputError, OutputError
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
-"""Error numbers of the system for a lack of room: on the disk, for one file, of the user's quota."""
-_LONGEST = 50  # most characters of the target's name kept in a temporary name: each may take 4 of a name's 255 bytes
-_LONGEST_BYTES = 255  # most bytes of a file's name in all common file systems
-_SPARE_BYTES = 1 << 16  # bytes of the disk that are reserved beyond the arrays, for headers
+"""Error numbers of a full disk, a file that is too large, and a user's exhausted quota."""
+_LONGEST = 50  # characters of the target's name kept in a temporary one: at 4 bytes each, the name stays below 255 bytes
+_LONGEST_BYTES = 255  # longest file name that common file systems allow
+_SPARE_BYTES = 1 << 16  # room on the disk that is reserved for headers, besides the arrays
 _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part(\.[a-z.]+)?$")
-_FORMAT = 2  # version of the format of checkpoints
+_FORMAT = 2  # version of checkpoints
 _RESTART = "start without --resume"
 
 
 class BusyError(OutputError):
-    """Raised where another run holds the lock of the output."""
+    """Raised if another run is writing the same output."""
 
 
 def check_writable(path: str | Path) -> None:
-    """Raises OutputError where ``path`` could not be written later: creates and removes an empty file in its folder."""
+    """Raises OutputError if ``path`` could not be written later. Tests it by creating an empty file in its folder."""
     _create_beside(_target(path)).unlink()
 
 
 def refuse_overwriting(option: str, output: str | Path, *others: Path | None) -> None:
-    """Raises InputError about ``option`` for an output that is one of the other files of a command."""
+    """Raises InputError about ``option`` if the output is also one of a command's other files."""
     for path in others:
         if path is not None and Path(output).resolve() == path.resolve():
             raise InputError(option, f"{path}, which the command reads or writes", "another file to write")
 
 
 def make_folder(folder: Path, subject: Path) -> None:
-    """Creates a folder and those above it. Raises OutputError about ``subject`` where that fails."""
+    """Creates a folder and its parents. Raises OutputError about ``subject`` if that fails."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -55,14 +55,14 @@ def make_folder(folder: Path, subject: Path) -> None:
 
 
 def lock_path(output: str | Path) -> Path:
-    """Returns the path of the lock file of ``output``. One that a dead process has left locks nothing."""
+    """Returns the path of the lock file of ``output``. A file that a dead process has left does not lock."""
     return beside(Path(os.path.realpath(output)), ".lock", ".")
 
 
 @contextmanager
 def only_run(output: str | Path) -> Iterator[None]:
-    """Holds the lock of ``output``, which the system releases when a process ends. Raises BusyError where another run holds
-    it, and OutputError where it cannot be created."""
+    """Locks ``output`` against other runs. The system releases the lock when a process ends. Raises BusyError if another
+    run has the lock, OutputError if its file cannot be created."""
     from filelock import FileLock, Timeout
 
     path = lock_path(output)
@@ -79,16 +79,17 @@ def only_run(output: str | Path) -> Iterator[None]:
         yield
     finally:
         with suppress(OSError):
-            path.unlink()  # while locked: a waiting process then sees that the file is gone
+            path.unlink()  # before the release: a process that waits then sees that the file is gone
         lock.release()
 
 
 @contextmanager
 def written_beside(path: str | Path, size_bytes: int = 0, suffix: str = "") -> Iterator[Path]:
-    """Yields a temporary path in the target's folder that replaces the target on success, in one step. After an error an
-    existing target has its old content, and system errors of the body become OutputError about ``path``. ``size_bytes``:
-    size of the arrays to be written. Their room is reserved first, since some libraries crash on a full disk or do not
-    notice it. ``suffix``: the ending of the temporary name, from which some libraries infer the format."""
+    """Yields a temporary path in the target's folder. On success it is renamed to the target. After an error an existing
+    target is unchanged, and errors of the system become OutputError about ``path``.
+
+    size_bytes: room on the disk that is reserved first, since some libraries crash on a full disk or do not notice it.
+    suffix: ending of the temporary name, by which some libraries choose the format."""
     target = _target(path)
     temporary = _create_beside(target, suffix)
     try:
@@ -111,7 +112,7 @@ def written_beside(path: str | Path, size_bytes: int = 0, suffix: str = "") -> I
 
 
 def _target(path: str | Path) -> Path:
-    """Returns the file to write, behind any symbolic link. Raises OutputError where it or its folder cannot be written."""
+    """Returns the file to write, to which a symbolic link may point. Raises OutputError if it cannot be written."""
     shown = str(path)
     if not shown or shown.endswith(("/", os.sep)) or os.path.isdir(shown):
         raise OutputError(shown or "output path", "a folder", "a file name", "add a file name to the path")
@@ -132,8 +133,6 @@ def _target(path: str | Path) -> Path:
 
 
 def _create_beside(target: Path, suffix: str = "") -> Path:
-    """Creates an empty temporary file in the target's folder, with the permissions of the user's umask. Raises OutputError
-    where that fails."""
     temporary = temporary_name(target, suffix)
     try:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -145,8 +144,8 @@ def _create_beside(target: Path, suffix: str = "") -> Path:
 
 
 def temporary_name(target: Path, suffix: str = "") -> Path:
-    """Returns a new temporary path in the target's folder, with this process' number in its name. Removes the temporary
-    files that dead processes left for targets with the same stem."""
+    """Returns a new temporary path in the target's folder, whose name has this process' number. Removes temporary files
+    of the same target that dead processes left."""
     for path in target.parent.glob(f".{glob.escape(target.stem[:_LONGEST])}*.part*"):
         writer = _WRITER.search(path.name)
         if writer and writer[1] == _machine() and _is_dead(int(writer[2])):
@@ -157,7 +156,7 @@ def temporary_name(target: Path, suffix: str = "") -> Path:
 
 @cache
 def _machine() -> str:
-    """Returns an identifier of this machine, or of the container on it, in which process numbers are unique."""
+    """Identifies this machine and, on it, the container: within it process numbers are unique."""
     namespace = ""
     with suppress(OSError):
         namespace = os.readlink("/proc/self/ns/pid")
@@ -165,12 +164,12 @@ def _machine() -> str:
 
 
 def _is_dead(process: int) -> bool:
-    if os.name != "posix":  # elsewhere os.kill ends the process
+    if os.name != "posix":  # on Windows os.kill would end the process
         return False
     try:
         os.kill(process, 0)
     except OSError as error:
-        return isinstance(error, ProcessLookupError)  # other errors mean another user's process
+        return isinstance(error, ProcessLookupError)  # any other error: a process of another user, alive
     return False
 
 
@@ -182,7 +181,7 @@ def _discard(path: Path) -> None:
 
 
 def _flush_folder(folder: Path) -> None:
-    """Writes a folder's entries to the disk, so that a renaming survives a power cut, on systems that allow it."""
+    """Writes a folder's list of names to the disk, so that renaming survives a power cut. Not all systems allow it."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -204,7 +203,7 @@ def _output_error(target: Path, error: BaseException) -> OutputError:
 
 
 def shortened(name: str, most_bytes: int) -> str:
-    """Returns ``name``, or, where it is longer than ``most_bytes``, its beginning and a digest of all of it."""
+    """Returns ``name``; if it is longer than ``most_bytes``, its start and a hash of the whole name."""
     raw = os.fsencode(name)
     if len(raw) <= most_bytes:
         return name
@@ -213,7 +212,7 @@ def shortened(name: str, most_bytes: int) -> str:
 
 
 def beside(path: str | Path, ending: str, beginning: str = "") -> Path:
-    """Returns the path ``beginning`` + name + ``ending`` in the same folder, with a name shortened to 255 bytes."""
+    """Returns the path ``beginning`` + name + ``ending`` in the same folder, shortened to 255 bytes if need be."""
     room = _LONGEST_BYTES - len(os.fsencode(beginning + ending))
     path = Path(path)
     return path.with_name(f"{beginning}{shortened(path.name, room)}{ending}")
@@ -224,12 +223,12 @@ def checkpoint_path(output: str | Path) -> Path:
 
 
 def former_checkpoint_path(output: str | Path) -> Path:
-    """Returns the path to which a new run moves the checkpoint of an earlier run of the same output."""
+    """Returns where a new run keeps the checkpoint of an earlier run with the same output."""
     return beside(output, ".checkpoint.npz.bak")
 
 
 def partial_path(output: str | Path) -> Path:
-    """Returns the path of an interrupted run's result: NAME.partial.SUFFIX for ``output`` NAME.SUFFIX."""
+    """Returns where an interrupted run writes its result: NAME.partial.SUFFIX for ``output`` NAME.SUFFIX."""
     path = Path(output)
     return beside(path.with_suffix(""), f".partial{path.suffix}")
 
@@ -240,7 +239,7 @@ def write_checkpoint(path: str | Path, state: Mapping[str, np.ndarray]) -> None:
 
 
 def read_checkpoint(path: str | Path) -> dict[str, np.ndarray]:
-    """Returns the arrays of a checkpoint by name. Raises InputError for a missing or damaged file, or another version's."""
+    """Returns a checkpoint's arrays by name. Raises InputError for a missing, damaged or other version's file."""
     if not Path(path).is_file():
         raise InputError("--resume", f"no checkpoint {path}", "one left by an interrupted run", _RESTART)
     try:

@@ -1,4 +1,4 @@
-"""Reads scanner descriptions: TOML files with the geometry, the volume and the readout of the panel."""
+"""Reads scanner descriptions: TOML files with geometry, volume and readout of the panel."""
 
 import math
 from dataclasses import dataclass, replace
@@ -27,16 +27,16 @@ TABLES: dict[str, tuple[str, ...]] = {
     "readout": ("axis", "direction", "first", "ratio", "fps", "readout_ms"),
 }
 _WORDS = ("title",)
-MOST_LINES = 65_536  # largest number of rows, and of columns, of a panel
+MOST_LINES = 65_536  # no panel has more rows or columns
 
 
 @dataclass(frozen=True)
 class Scanner:
-    """A scanner: geometry, imaged volume, and the default readout of its panel.
+    """A scanner: geometry, imaged volume, and how its panel is read by default.
 
-    readout_ratio: T_ro/T_exp; None takes the protocol's. pulse: start and length of the beam in a frame, in exposures;
-    None for a steady beam. lag: the fraction λ of a frame that stems from earlier frames. fps, readout_ms: frame rate and
-    readout of the data sheet, or None."""
+    readout_ratio: readout over exposure, T_ro/T_exp; None takes the protocol's. pulse: start and length of the beam within
+    a frame, in exposures; None for a steady beam. lag: the fraction λ of a frame that stems from earlier frames. fps,
+    readout_ms: frame rate and readout from a data sheet, or None."""
 
     name: str
     geometry: Geometry
@@ -52,14 +52,13 @@ class Scanner:
 
 def load_scanner(name_or_path: str | Path, data_dir: Path) -> Scanner:
     """Loads a scanner by name (``data_dir``/NAME.toml) or from a path that ends in .toml. Raises InputError for an unknown
-    scanner, text that is not TOML, and unknown, missing or wrong keys, which it names "FILE [table] key"."""
+    scanner and for text that is not TOML. Names unknown, missing and wrong keys as "FILE [table] key"."""
     path = _located(str(name_or_path), data_dir)
     return scanner_from(path, read_toml(path))
 
 
 def with_detector_count(geometry: Geometry, rows: int, columns: int) -> Geometry:
-    """Returns the geometry with a panel of the same size and place but other numbers of pixels. Raises InputError below
-    1."""
+    """Returns the geometry with other numbers of pixels on the same panel. Raises InputError for numbers below 1."""
     if min(rows, columns) < 1:
         raise InputError("detector count", f"{rows} × {columns}", "at least 1 row and 1 column")
     (nv, nu), (pitch_v, pitch_u) = geometry.detector_shape, geometry.pixel_size_mm
@@ -78,7 +77,7 @@ def _located(name: str, data_dir: Path) -> Path:
 
 
 def _describes_scanner(path: Path) -> bool:
-    """Returns whether ``path`` is a TOML file with the table that every scanner has; the folder may hold other files."""
+    """Returns whether a TOML file has a table [source], as every scanner has; the folder may hold other files."""
     try:
         return "source" in read_toml(path)
     except InputError:
@@ -86,7 +85,7 @@ def _describes_scanner(path: Path) -> bool:
 
 
 def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
-    """Returns the scanner that the content of the TOML file ``path`` describes. Raises InputError as ``load_scanner``."""
+    """Returns the scanner that ``content`` of the TOML file ``path`` describes. Raises InputError as ``load_scanner``."""
     refuse_unknown(str(path), content, (*TABLES, *_WORDS), "a table")
     tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in TABLES.items()}
     geometry = _geometry(tables["source"], tables["detector"])
@@ -106,8 +105,8 @@ def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
 
 
 def _order(readout: Fields) -> tuple[str, int]:
-    """Returns readout axis and direction from ``first`` or from their own keys; by default, rows from the lowest up. Raises
-    InputError for contradictions."""
+    """Returns readout axis and direction, from the key ``first`` or from ``axis`` and ``direction``; by default rows from
+    the lowest up. Raises InputError for contradictions."""
     direction = readout.get("direction") if readout.has("direction") else 1
     if isinstance(direction, bool) or direction not in (1, -1):
         expected, remedy = "1 (index 0 first) or -1 (index 0 last)", 'a side in words goes into first, as first = "top"'
@@ -137,7 +136,7 @@ def _geometry(source: Fields, detector: Fields) -> Geometry:
 
 
 def _panel(detector: Fields) -> tuple[tuple[int, int], tuple[float, float], tuple[float, float]]:
-    """Returns a panel's counts, pixel sizes in mm and offset in mm, each (v, u)."""
+    """Returns a panel's numbers of pixels, pixel sizes in mm and offset in mm, each (v, u)."""
     return (
         (detector.count("rows", MOST_LINES), detector.count("columns", MOST_LINES)),
         (detector.length("pixel_size_v_mm"), detector.length("pixel_size_u_mm")),

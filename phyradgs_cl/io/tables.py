@@ -1,4 +1,4 @@
-"""Reads typed values from plain containers (TOML, JSON, pickles). An error names the value by its path in the container."""
+"""Reads and checks single values of TOML, JSON and pickles. Errors name a value by its path in the file."""
 
 import json
 import logging
@@ -19,9 +19,9 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-LARGEST = 1e12  # largest size of any number: no angle, time or count is larger, and sums stay finite
-LARGEST_LENGTH = 1e9  # largest length in mm; its inverse is the smallest length above 0
-_MOST_TOML_BYTES = 16 << 20  # most bytes of a TOML file
+LARGEST = 1e12  # no angle, time or count is larger, and sums of such numbers stay finite
+LARGEST_LENGTH = 1e9  # no length is larger in mm, and none smaller than its inverse except 0
+_MOST_TOML_BYTES = 16 << 20  # larger files are no descriptions, and would take long to parse
 _COUNTS = {2: "two", 3: "three"}
 _log = logging.getLogger(__name__)
 PROVENANCE: dict[str, tuple[type, ...]] = {
@@ -31,21 +31,21 @@ PROVENANCE: dict[str, tuple[type, ...]] = {
     "seconds": (int, float),
     "record": (list,),
 }
-"""The types of the fields of a volume's provenance."""
+"""Types of the fields in a volume's provenance."""
 
 
 def read_toml(path: Path, subject: str = "") -> dict[str, Any]:
-    """Parses a TOML file. Raises InputError, about ``subject`` or the path, for a missing file and for other text."""
+    """Parses a TOML file. Raises InputError, about ``subject`` or the path, for a missing file and for wrong TOML."""
     subject = subject or str(path)
     try:
         return tomllib.loads(decoded(read_regular(path, subject, _MOST_TOML_BYTES, "a TOML file")))
-    except (ValueError, RecursionError) as error:  # raised also for too many digits, and for deep tables
+    except (ValueError, RecursionError) as error:  # RecursionError: tables nested too deep
         raise InputError(subject, f"text that is not TOML ({error})", "a TOML file") from error
 
 
 def read_facts(subject: str, text: str, types: Mapping[str, tuple[type, ...]]) -> dict[str, object]:
-    """Parses a JSON object, such as provenance, which users may edit. A field of another type than in ``types`` is left out,
-    with a warning; null is accepted in every field. Raises InputError for text that is not a JSON object."""
+    """Parses a JSON object that users may have edited, such as provenance. Fields whose type is not in ``types`` are left
+    out, with a warning; null is always accepted. Raises InputError for text that is not a JSON object."""
     try:
         facts = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -62,15 +62,14 @@ def read_facts(subject: str, text: str, types: Mapping[str, tuple[type, ...]]) -
 
 
 def _fits(value: object) -> bool:
-    """Returns whether a list holds tables alone, or a number is finite and has at most 64 bits; True for all other
-    types."""
+    """Returns whether a value is usable: lists must have only tables as entries, and numbers be finite and fit 64 bits."""
     if isinstance(value, list):
         return all(isinstance(line, dict) for line in value)
     return not isinstance(value, (int, float)) or abs(value) < 2**63
 
 
 def refuse_unknown(subject: str, names: Collection[str], allowed: Collection[str], what: str = "a key") -> None:
-    """Raises InputError for the first unknown name, with the allowed name that is close to it."""
+    """Raises InputError for the first unknown name, and suggests a similar allowed one."""
     for key in names:
         if key not in allowed:
             remedy = suggest_name(key, allowed, "remove it")
@@ -78,9 +77,8 @@ def refuse_unknown(subject: str, names: Collection[str], allowed: Collection[str
 
 
 class Fields:
-    """A table whose values are read and checked one at a time. subject: names the table in messages. allowed: the only
-    keys that it may have; None allows any. Methods raise InputError, about "SUBJECT key", for missing and for wrong
-    values."""
+    """A table whose values are read and checked one at a time. subject: names the table in messages. allowed: its possible
+    keys; None allows any. Methods raise InputError, about "SUBJECT key", for missing and for wrong values."""
 
     def __init__(self, subject: str, values: object, allowed: Collection[str] | None = None) -> None:
         if not isinstance(values, Mapping):
@@ -98,7 +96,7 @@ class Fields:
         return InputError(self.name(key), found, expected, remedy)
 
     def has(self, key: str) -> bool:
-        """Returns whether the table has a value for ``key`` that is not None."""
+        """Returns whether the table has a value for ``key``; None counts as missing."""
         return self.values.get(key) is not None
 
     def get(self, key: str) -> object:
@@ -112,7 +110,7 @@ class Fields:
     def number(
         self, key: str, default: float | None = None, lowest: float = -LARGEST, highest: float = LARGEST
     ) -> float:
-        """Returns a finite number from ``lowest`` to ``highest``, or ``default`` where the key is missing."""
+        """Returns a finite number from ``lowest`` to ``highest``, or ``default`` if the key is missing."""
         if default is not None and not self.has(key):
             return default
         value = self._finite(key, self.get(key))
@@ -122,18 +120,18 @@ class Fields:
         return value
 
     def length(self, key: str) -> float:
-        """Returns a number from 1e-9 to 1e9: above 0, and of a size that a scanner may have."""
+        """Returns a number from 1e-9 to 1e9: no scanner has lengths outside."""
         value = self.number(key, highest=LARGEST_LENGTH)
         if value < 1 / LARGEST_LENGTH:
             raise self.error(key, f"{value:g}", "a number above 0")
         return value
 
     def position(self, key: str) -> float:
-        """Returns a number from -1e9 to 1e9; 0 where the key is missing."""
+        """Returns a number from -1e9 to 1e9; 0 if the key is missing."""
         return self.number(key, 0.0, -LARGEST_LENGTH, LARGEST_LENGTH)
 
     def numbers(self, key: str, count: int | None = None, largest: float = LARGEST) -> np.ndarray:
-        """Returns the finite numbers of a list or an array, (count,) float64, each at most ``largest`` in size."""
+        """Returns the finite numbers (count,) float64 of a list or array; none may be larger in size than ``largest``."""
         values = self.get(key)
         if isinstance(values, np.ndarray):
             values = values.tolist() if values.ndim == 1 else None
@@ -166,7 +164,7 @@ class Fields:
         return tuple(int(value) for value in values)
 
     def word(self, key: str, allowed: Sequence[str] | None = None, default: str | None = None) -> str:
-        """Returns a string, one of ``allowed`` where that is given."""
+        """Returns a string, one of ``allowed`` if given."""
         if default is not None and not self.has(key):
             return default
         value = self.get(key)
@@ -177,7 +175,7 @@ class Fields:
         return value
 
     def tables(self, key: str) -> "Iterator[Fields]":
-        """Returns the tables of a list with at least one entry."""
+        """Returns the tables in a list, which must have at least one entry."""
         entries = self.get(key)
         if not isinstance(entries, list) or not entries:
             raise self.error(key, described(entries), "a list with at least one entry")
@@ -192,7 +190,7 @@ class Fields:
 
 
 def described(value: object) -> str:
-    """Returns a short text of a value for messages. A container gives its type and length only, because it may be huge."""
+    """Describes a value in messages. A container is described by type and length only, because it may be huge."""
     if value is None or isinstance(value, (bool, int, float, str, bytes, np.generic)):
         return checks.short_repr(value)
     size = f" of {len(value)}" if isinstance(value, (Mapping, Sequence)) else ""

@@ -1,4 +1,4 @@
-"""Reads and writes volume files in HDF5: NXdata with grid, provenance and Gaussians. Reads also bare arrays /volume."""
+"""Reads and writes volume files: NeXus NXdata in HDF5, with grid, provenance and Gaussians. Also reads bare arrays."""
 
 import json
 import logging
@@ -27,16 +27,15 @@ _VOLUME, _DOUBT, _BARE = f"{_DATA}/volume", f"{_DATA}/doubt", "/volume"
 _AXES = ("z", "y", "x")
 _GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/time_series"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
-_AXIS_TOLERANCE = 1e-3  # largest deviation of a voxel's centre from even spacing, in voxels: axes may be stored in float32
+_AXIS_TOLERANCE = 1e-3  # uneven spacing, in voxels, that rounding to float32 may cause in a stored axis
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Values (nz, ny, nx) float32 in 1/mm and their grid, None for a bare array. A volume file also holds ``provenance``
-    (types as in ``tables.PROVENANCE``), ``gaussians`` float32 in mm and 1/mm, and ``metrics`` by name. deformation: the
-    object's motion, with the volume as reference. states: the object at several times, with the volume as their mean.
-    doubt: σ in 1/mm of each value, in their shape."""
+    """Values (nz, ny, nx) float32 in 1/mm and their grid; None for a bare array. provenance: how they were made, with the
+    types of ``tables.PROVENANCE``. gaussians: float32, in mm and 1/mm. metrics: by name. deformation: the object's motion
+    from this volume. states: the object at several times, whose mean is this volume. doubt: σ (nz, ny, nx) in 1/mm."""
 
     values: np.ndarray
     grid: Grid | None
@@ -48,8 +47,7 @@ class Volume:
     doubt: np.ndarray | None = None
 
     def at(self, time_s: float) -> np.ndarray:
-        """Returns the values (nz, ny, nx) in 1/mm at a time in s; ``values`` where the volume has neither states nor a
-        deformation."""
+        """Returns the values (nz, ny, nx) in 1/mm at a time in s; ``values`` for an object without states and motion."""
         if self.states is not None:
             return self.states.at(time_s)
         if (field := self.deformation) is None:
@@ -57,8 +55,7 @@ class Volume:
         return deformed(self.values, self.required_grid, field, field.weights_at(time_s)[0])
 
     def moved_by(self, deformation: Deformation, subject: str) -> "Volume":
-        """Returns the volume with another deformation. Raises InputError, which names ``subject``, for a volume with
-        states."""
+        """Returns the volume with another deformation. Raises InputError, which names ``subject``, if it has states."""
         if self.states is not None:
             found, expected = f"{subject}, which holds its states", "a volume whose object does not change"
             raise InputError("--object-motion", found, expected, "leave it out")
@@ -66,7 +63,7 @@ class Volume:
 
     @property
     def scale(self) -> Hounsfield | None:
-        """The scale of Hounsfield units that the file holds; None without one."""
+        """The scale of Hounsfield units in the file, or None."""
         return of_facts(self.provenance)
 
     def hounsfield(self, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0) -> "Volume":
@@ -76,7 +73,7 @@ class Volume:
 
     @property
     def required_grid(self) -> Grid:
-        """The grid. Raises InputError for a bare array."""
+        """The grid. Raises InputError if the volume has none."""
         if self.grid is None:
             raise InputError("volume", "values without voxel sizes", "a volume with its grid in mm")
         return self.grid
@@ -88,10 +85,10 @@ def write_volume(
     state: Mapping[str, np.ndarray] | None = None, deformation: Deformation | None = None, states: States | None = None,
     doubt: np.ndarray | None = None,
 ) -> None:
-    """Writes a volume (nz, ny, nx) in 1/mm, whole or not at all. ``provenance`` and ``metrics`` are stored as JSON, plain
-    values also as attributes; ``gaussians`` as float32. ``state``: arrays and texts from which an interrupted run resumes.
-    ``deformation``: how the object moves; ``states``: the object at several times; ``doubt``: σ in 1/mm (nz, ny, nx). Raises
-    InputError where an array is not finite or does not fit the grid, OutputError where the file cannot be written."""
+    """Writes a volume (nz, ny, nx) in 1/mm, completely or not at all. provenance, metrics: stored as JSON, plain values
+    also as attributes. gaussians: stored as float32. state: arrays and texts from which an interrupted run resumes.
+    deformation: how the object moves. states: the object at several times. doubt: σ in 1/mm (nz, ny, nx). Raises InputError
+    if an array is not finite or does not fit the grid, OutputError if the file cannot be written."""
     of_grid = {"volume": volume} if doubt is None else {"volume": volume, "doubt": doubt}
     for name, values in of_grid.items():
         checks.shape(name, values, grid.shape)
@@ -124,9 +121,9 @@ def write_volume(
 
 
 def read_volume(path: str | Path) -> Volume:
-    """Reads a volume file, or a bare array /volume (z, y, x), which has no grid and whose integers are divided by the
-    maximum of their type. Raises InputError, with the HDF5 path, for damage. Warns of provenance of a wrong type, which is
-    left out, and of a run that was interrupted."""
+    """Reads a volume file, or a bare array /volume (z, y, x). A bare array has no grid, and integers are divided by the
+    maximum of their type. Raises InputError, with the HDF5 path, for damage. Warns of an interrupted run, and of provenance
+    of a wrong type, which is left out."""
     with open_hdf5(path) as source:
         if isinstance(source.find(_BARE), h5py.Dataset):
             dataset, subject = source.dataset(_BARE), source.name(_BARE)
@@ -148,8 +145,8 @@ def read_volume(path: str | Path) -> Volume:
 
 
 def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
-    """Reads the state from which an interrupted run resumes, by name. Returns None without a state and, with a warning,
-    for a damaged one. The caller checks the arrays."""
+    """Reads the arrays, by name, from which an interrupted run resumes. Returns None if there are none and, with a warning,
+    if they are damaged. Their shapes are left to the caller to check."""
     with open_hdf5(path) as source:
         try:
             group = source.optional_group(_STATE)
@@ -160,7 +157,7 @@ def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
 
 
 def volume_summary(path: str | Path) -> dict[str, Any]:
-    """Returns facts about a volume file by name, without reading the voxels. Raises InputError for a damaged file."""
+    """Returns what 'phyradgs info' prints about a volume file, without its voxels. Raises InputError for a damaged file."""
     with open_hdf5(path) as source:
         _, grid = _dataset_and_grid(source)
         means = source.optional(f"{_GAUSSIANS}/mean") if source.optional_group(_GAUSSIANS) else None
@@ -174,7 +171,7 @@ def volume_summary(path: str | Path) -> dict[str, Any]:
 
 
 def read_states(path: str | Path) -> States | None:
-    """Reads the states, the object at several times, from a volume file. Returns None where the file has none."""
+    """Reads the object at several times from a volume file; None if the file has a single volume."""
     with open_hdf5(path) as source:
         return _read_states(source, _dataset_and_grid(source)[1].shape)
 
@@ -187,7 +184,7 @@ def _states_summary(source: Hdf5Source, shape: tuple[int, ...]) -> dict[str, obj
 
 
 def file_kind(path: str | Path) -> str:
-    """Returns what an HDF5 file holds: "scan", "volume", "plain-volume" (a bare dataset /volume) or "deformation". Raises
+    """Finds the kind of an HDF5 file: "scan", "volume", "plain-volume" (a bare dataset /volume) or "deformation". Raises
     InputError for any other file."""
     with open_hdf5(path) as source:
         if isinstance(source.find(_DATA), h5py.Group):
@@ -204,7 +201,7 @@ def file_kind(path: str | Path) -> str:
 
 
 def _read_provenance(source: Hdf5Source) -> dict[str, object]:
-    """Reads a volume's provenance; {} where the file has none. Warns, once per file, of an interrupted run."""
+    """Reads a volume's provenance; {} if the file has none. Warns, once per file, of an interrupted run."""
     provenance = _read_facts(source, "provenance", PROVENANCE) or {}
     if where := place_of(interruption(provenance)):
         _warn_once(source.path, f"interrupted at {where}")
@@ -212,10 +209,10 @@ def _read_provenance(source: Hdf5Source) -> dict[str, object]:
 
 
 def interruption(provenance: Mapping[str, object]) -> dict[str, object]:
-    """Returns ``interrupted_at`` and ``iterations_asked`` of an interrupted run, and ``interrupted_in_run`` where it has
-    several for error bars; an empty dict for a complete one."""
+    """Returns where a run was interrupted: ``interrupted_at`` and ``iterations_asked``. If it consists of several runs, for
+    error bars, adds ``interrupted_in_run``. Returns an empty dict for a complete run."""
     at, options, doubt = (provenance.get(name) for name in ("interrupted_at", "options", "doubt"))
-    if type(at) is not int:  # a bool is an int too
+    if type(at) is not int:  # not isinstance, which accepts True
         return {}
     asked = options.get("iterations") if isinstance(options, Mapping) else None
     run = doubt.get("interrupted_in_run") if isinstance(doubt, Mapping) else None
@@ -224,7 +221,7 @@ def interruption(provenance: Mapping[str, object]) -> dict[str, object]:
 
 
 def place_of(stop: Mapping[str, object]) -> str:
-    """Returns an ``interruption`` in words, as "iteration 3 of 40 of run 2 of 3"; nothing for that of a complete run."""
+    """Returns an ``interruption`` as text, such as "iteration 3 of 40 of run 2 of 3"; "" for a complete run."""
     asked, run = stop.get("iterations_asked"), stop.get("interrupted_in_run")
     of = "" if asked is None else f" of {asked}"
     return f"iteration {stop['interrupted_at']}{of}{'' if run is None else f' of run {run}'}" if stop else ""
@@ -288,7 +285,7 @@ def _dataset_and_grid(source: Hdf5Source) -> tuple[h5py.Dataset, Grid]:
 
 
 def _grid_of_axes(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
-    """Derives the grid from the voxels' centres along each axis. Raises InputError where they do not rise evenly."""
+    """Derives the grid from the voxels' centres along each axis. Raises InputError if they do not rise evenly."""
     steps_mm: list[float | None] = []
     centres_mm = []
     for name, count in zip(_AXES, shape, strict=True):
@@ -300,7 +297,7 @@ def _grid_of_axes(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
             raise source.error(f"{_DATA}/{name}", "values that do not rise evenly", expected)
         steps_mm.append(step_mm if count > 1 else None)
         centres_mm.append(float(axis_mm[0] + axis_mm[-1]) / 2)
-    usual = next((step for step in steps_mm if step is not None), 1.0)  # an axis of one voxel has no spacing
+    usual = next((step for step in steps_mm if step is not None), 1.0)  # for axes of one voxel, which show no spacing
     return Grid(triple(shape), triple(usual if s is None else s for s in steps_mm), triple(centres_mm))
 
 
@@ -312,8 +309,8 @@ def _read_states(source: Hdf5Source, shape: tuple[int, ...]) -> States | None:
 
 
 def _states_datasets(source: Hdf5Source, shape: tuple[int, ...]) -> tuple[np.ndarray, h5py.Dataset]:
-    """Returns the times (K,) in s and the dataset (K, nz, ny, nx) of the states. Raises InputError for times that do not
-    rise, and for other shapes."""
+    """Returns times (K,) in s and the dataset (K, nz, ny, nx) of the object at these times. Raises InputError for times
+    that do not rise, and for other shapes."""
     times_s = h5.read_array(source, f"{_STATES}/time_s", (None,), h5.TIME)
     if len(times_s) == 0 or (np.diff(times_s) <= 0).any():
         raise source.error(f"{_STATES}/time_s", checks.short_repr(times_s.tolist()), "at least one time, rising")
@@ -329,7 +326,7 @@ def _read_attenuation(source: Hdf5Source, address: str, dataset: h5py.Dataset) -
 
 
 def shares_of_maximum(values: np.ndarray) -> np.ndarray:
-    """Returns integers divided by the maximum of their type, in float32, and other numbers unchanged."""
+    """Divides integers by the maximum of their type, in float32; returns other numbers unchanged."""
     return values / np.float32(np.iinfo(values.dtype).max) if values.dtype.kind in "iu" else values
 
 
@@ -357,7 +354,7 @@ def _read_facts(source: Hdf5Source, name: str, types: Mapping[str, tuple[type, .
 
 
 def _read_metrics(source: Hdf5Source) -> dict[str, object] | None:
-    """Reads the metrics, numbers by name; other values are left out with a warning. None where the file has none."""
+    """Reads the metrics, which are numbers by name; None if the file has none. Leaves other values out, with a warning."""
     metrics = _read_facts(source, "metrics", {})
     if metrics is None:
         return None

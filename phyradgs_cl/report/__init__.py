@@ -1,4 +1,4 @@
-"""Shows a reconstruction to people: as a page, a picture or a window."""
+"""Shows a reconstruction: as an HTML page, a picture, or a window of napari."""
 
 import lazy_loader
 

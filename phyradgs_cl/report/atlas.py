@@ -1,4 +1,4 @@
-"""Makes the 3D picture of a page: 8-bit voxels in one PNG, the Gaussians' centres, and the controls."""
+"""Makes the 3D picture of a report: 8-bit voxels in one PNG, the Gaussians' centres, and controls."""
 
 import math
 
@@ -10,12 +10,12 @@ from phyradgs_cl.report.images import Window, base64_of, block_means, bytes_of, 
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 from phyradgs_cl.report.viewer import decimals_of, slider
 
-MOST_EDGE = 128  # most voxels along each side of the volume in the page
-MOST_TEXT = 2_000_000  # most characters of base64, for voxels and centres together
-MOST_CENTRES = 20_000  # most centres of Gaussians that are shown
-MOST_ZOOM = 8  # largest zoom
-_TURN_DEG, _TILT_DEG = 325, 20  # initial angles of the view, which put the three marked edges in front and on the left
-_PATIENCE_MS = 1500  # longest time to draw a picture at rest
+MOST_EDGE = 128  # larger volumes are averaged over blocks to this many voxels along each side
+MOST_TEXT = 2_000_000  # characters of base64 for voxels and centres together, so that the page stays small
+MOST_CENTRES = 20_000  # of more Gaussians, evenly chosen ones are shown
+MOST_ZOOM = 8
+_TURN_DEG, _TILT_DEG = 325, 20  # initial view, in which the edges marked x, y, z are in front and on the left
+_PATIENCE_MS = 1500  # the picture at rest becomes finer until drawing takes this long
 _HELP = (
     "Drag to turn; on a touch screen one finger turns and two fingers tilt and zoom. Keys in the picture: arrows turn and "
     "tilt, + and − zoom, Home resets. Ctrl and the wheel zoom. Black and white are those of the slices."
@@ -23,10 +23,8 @@ _HELP = (
 
 
 def space(volume: NDArray[np.floating], grid: Grid, window: Window, gaussians: Gaussians | None) -> Markup | None:
-    """Returns a 3D picture of a volume (nz, ny, nx), its controls and the data of the script.
-
-    Returns None for fewer than two voxels along any side. window: that of the result's slices. gaussians: in mm, or
-    None."""
+    """Returns a 3D picture of a volume (nz, ny, nx) with its controls and the script's data; None for a volume one voxel
+    thick. window: grey values, as in the slices. gaussians: in mm, or None."""
     if not has_depth(volume):
         return None
     cloud = None if gaussians is None or not gaussians.count else gaussians
@@ -52,7 +50,7 @@ def space(volume: NDArray[np.floating], grid: Grid, window: Window, gaussians: G
 
 
 def has_depth(volume: NDArray[np.floating]) -> bool:
-    """Returns whether every side has at least two voxels, so that there is something to show in 3D."""
+    """Returns whether every side has at least two voxels; a flat volume cannot be shown in 3D."""
     return min(volume.shape) >= 2
 
 
@@ -88,7 +86,7 @@ def _controls(threshold: int, cloud: Gaussians | None) -> list[Markup]:
 
 
 def _centres(cloud: Gaussians, grid: Grid) -> dict[str, str]:
-    """Returns evenly chosen centres in base64: places x, y, z in the box as 16 bits, densities as 8 bits of their range."""
+    """Returns evenly chosen centres in base64: positions x, y, z as 16-bit fractions of the box, densities as 8 bits."""
     some = np.unique(np.linspace(0, cloud.count - 1, min(cloud.count, MOST_CENTRES)).round().astype(int))
     low_mm, size_mm = (np.array(three[::-1]) for three in (np.array(grid.box_mm)[:, 0], grid.size_mm))
     share = (cloud.mean[some] - low_mm) / size_mm
@@ -100,9 +98,9 @@ def _centres(cloud: Gaussians, grid: Grid) -> dict[str, str]:
 
 
 def _atlas_within(steps: NDArray[np.uint8], most_text: int) -> tuple[str, int]:
-    """Returns the slices of steps (nz, ny, nx) side by side as PNG in base64, and how many are in a row.
+    """Returns the slices of grey levels (nz, ny, nx) as one PNG in base64, and how many are side by side in it.
 
-    Noise compresses badly: voxels lose their lowest bits until the text has at most ``most_text`` characters."""
+    Noise compresses badly, so lowest bits are dropped until the text has at most ``most_text`` characters."""
     nz, ny, nx = steps.shape
     columns = max(1, min(nz, round(math.sqrt(nz * ny / nx))))
     rows = math.ceil(nz / columns)
@@ -118,13 +116,13 @@ def _atlas_within(steps: NDArray[np.uint8], most_text: int) -> tuple[str, int]:
 
 
 def _between(steps: NDArray[np.uint8]) -> int:
-    """Returns the grey level, from 1 to 255, that divides the levels into two classes. The variance between the classes
-    is the largest (Otsu, IEEE Transactions on Systems, Man, and Cybernetics 9 (1979) 62)."""
+    """Returns Otsu's threshold, from 1 to 255: it maximises the variance between the two classes of grey levels (IEEE
+    Transactions on Systems, Man, and Cybernetics 9 (1979) 62)."""
     counts = np.bincount(steps.ravel(), minlength=256).astype(np.float64)
     below, sums = np.cumsum(counts), np.cumsum(counts * np.arange(256))
     above = below[-1] - below
     with np.errstate(all="ignore"):
         variance = below * above * (sums / below - (sums[-1] - sums) / above) ** 2
     variance = np.nan_to_num(variance)
-    best = np.flatnonzero(variance >= variance.max() * (1 - 1e-9))  # several where no value lies between classes
+    best = np.flatnonzero(variance >= variance.max() * (1 - 1e-9))  # in a gap between the classes all levels are equal
     return int(np.clip(round(best.mean()) + 1, 1, 255))

@@ -1,4 +1,4 @@
-"""Draws charts of a page by matplotlib, as SVG inside the page; the charts that are curves."""
+"""Draws charts by matplotlib as SVG for the report's page. Here are the charts of curves."""
 
 import hashlib
 import io
@@ -18,20 +18,20 @@ from phyradgs_cl.report.markup import Markup, element, label, number, unit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MOST_CHARTS = 3  # most charts of convergence
-SIZE = 440, 320  # width and height of a chart in units in which letters are 13 high
+MOST_CHARTS = 3  # charts of convergence that fit next to each other
+SIZE = 440, 320  # width and height of a chart in points of matplotlib; letters are 13 high
 _STYLE: Any = {"svg.fonttype": "none", "text.parse_math": False, "font.size": 13}
 Chart = tuple[str, Markup]
 """A caption and a drawing."""
 
 
 def chart(draw: "Callable[[Axes], None]", title: str, description: str, size: tuple[float, float] = SIZE) -> Markup:
-    """Returns what ``draw`` draws as an SVG element in the page's colours. title, description: text for screen readers."""
+    """Returns, as an SVG element in the page's colours, what ``draw`` draws. title, description: for screen readers."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(_STYLE), warnings.catch_warnings(), io.StringIO() as stream:
-        warnings.simplefilter("ignore")  # the browser has the letters that matplotlib's font lacks
+        warnings.simplefilter("ignore")  # matplotlib warns of letters that its font lacks; the browser has them
         figure = Figure(figsize=(size[0] / 72, size[1] / 72), layout="constrained")
         axes = figure.add_subplot()
         draw(axes)
@@ -44,7 +44,7 @@ def chart(draw: "Callable[[Axes], None]", title: str, description: str, size: tu
 
 
 def _label_powers(axes: "Axes") -> None:
-    """Labels logarithmic axes with plain numbers: powers of ten and, below four decades, 2 and 5 times these."""
+    """Labels logarithmic axes with powers of ten and, if they span less than four decades, with 2 and 5 times these."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     for axis, scale, (low, high) in (
@@ -57,12 +57,12 @@ def _label_powers(axes: "Axes") -> None:
 
 
 def _inline(svg: str) -> str:
-    """Returns the content of matplotlib's SVG for use inside HTML: no outer element, metadata, styles or clipping."""
+    """Returns matplotlib's SVG for use inside HTML, without its outer element, metadata, styles and clipping."""
     content = svg[svg.index(">") + 1 : svg.rindex("</svg>")]
     content = re.sub(r"<(metadata|style|clipPath)\b.*?</\1>|<!--.*?-->", "", content, flags=re.S)
     content = re.sub(r' clip-path="[^"]*"| font-family: [^;"]*;|font-family: [^;"]*; ', "", content)
     used = set(re.findall(r'xlink:href="#(\w+)"', content))
-    prefix = "c" + hashlib.sha256(content.encode()).hexdigest()[:8]  # ids of SVG elements must be unique in the page
+    prefix = "c" + hashlib.sha256(content.encode()).hexdigest()[:8]  # several charts of a page must not share ids
     content = re.sub(r' id="([^"]*)"', lambda m: f' id="{prefix}{m[1]}"' if m[1] in used else "", content)
     content = content.replace('xlink:href="#', f'href="#{prefix}').replace("#000000", COLOURS["ink"])
     for name, colour in COLOURS.items():
@@ -71,7 +71,7 @@ def _inline(svg: str) -> str:
 
 
 def convergence_charts(record: Sequence[Mapping[str, float]]) -> list[Chart]:
-    """Returns a chart over the iterations for each quantity of a convergence record that changes."""
+    """Returns a chart over the iterations for each recorded quantity that changes."""
     names = dict.fromkeys(key for line in record for key in line if key not in ("iteration", "seconds"))
     charts = []
     for name in names:
@@ -95,8 +95,8 @@ def draw_convergence(axes: "Axes", points: Sequence[tuple[float, float]], words:
 
 
 def views_chart(key: str, values: object) -> Chart | None:
-    """Returns a chart of one correction, by its ``key``, over the views; None for fewer than two values, or values that
-    are no numbers."""
+    """Returns a chart of one correction over the views; None for fewer than two values, or values that are no numbers.
+    key: the correction's name, such as "turn_deg"."""
     if not isinstance(values, list) or len(values) < 2 or not all(map(checks.is_number, values)):
         return None
     words = label(key).capitalize()
@@ -110,7 +110,7 @@ def views_chart(key: str, values: object) -> Chart | None:
 
 
 def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:
-    """Returns a chart of how many line integrals lie between ``edges`` (n + 1,): ``counts`` (2, n), before and after."""
+    """Returns a chart of histograms of line integrals, before and after: ``counts`` (2, n) between ``edges`` (n + 1,)."""
 
     def draw(axes: "Axes") -> None:
         before, after = np.maximum(counts, 0.9)  # a logarithmic axis has no 0
@@ -123,7 +123,7 @@ def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:
 
 
 def profile_chart(x_mm: NDArray[Any], line: NDArray[Any], sigma: NDArray[Any], truth: NDArray[Any] | None) -> Markup:
-    """Returns a chart of a line (n,) of voxels in 1/mm with a band of ± ``sigma``, and that of the truth."""
+    """Returns a chart of a line of voxels (n,) in 1/mm with a band of ± ``sigma``, and of the true values if known."""
 
     def draw(axes: "Axes") -> None:
         axes.fill_between(x_mm, line - sigma, line + sigma, color=SOFT, alpha=0.4, lw=0)
@@ -136,6 +136,6 @@ def profile_chart(x_mm: NDArray[Any], line: NDArray[Any], sigma: NDArray[Any], t
 
 
 def note(axes: "Axes", words: str, point: Any, shift: tuple[float, float], **style: Any) -> None:
-    """Writes words next to a point of a chart. shift: (right, up) in points of the picture, 1/72 inch."""
+    """Writes words next to a point of a chart. shift: (right, up) in 1/72 inch."""
     style = {"ha": "center", "color": INK, **style}
     axes.annotate(words, point, xytext=shift, textcoords="offset points", **style)

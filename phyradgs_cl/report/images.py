@@ -1,4 +1,4 @@
-"""Makes pictures of a page: values as grey or coloured PNG, and the slices of a volume that a page can show."""
+"""Makes pictures for the report: values as grey or coloured PNG, and slices of a volume within the page's size."""
 
 import base64
 import io
@@ -10,19 +10,19 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.fields import Grid
 
-LONGEST_EDGE = 192  # most pixels along each side of a slice in the page
-BUDGET_PIXELS = 16_000_000  # most pixels of all slices together: at worst, for pure noise, a page of some 20 MB
-# Plane, axis of the array (z, y, x) that is cut, its letter, and the world axes to the right and up in the picture.
+LONGEST_EDGE = 192  # larger slices are averaged over blocks to this many pixels along each side
+BUDGET_PIXELS = 16_000_000  # pixels of all slices together: pure noise, the worst case, makes a page of some 20 MB
+# Plane, index and letter of the axis across it, and the world axes to the right and up in the picture.
 PLANES = (("axial", 0, "z", "x", "y"), ("coronal", 1, "y", "x", "z"), ("sagittal", 2, "x", "y", "z"))
-_ROOM = 0.25  # room of the sliders beyond either end of the grey window, as a fraction of its width
+_ROOM = 0.25  # users may move black and white outwards by this fraction of their initial distance
 _BLUE, _WHITE, _RED = (33, 86, 158), (247, 247, 245), (178, 34, 40)
-_PERCENTILE = 99.9  # percentile that becomes white: a few very bright voxels would make all others dark
+_PERCENTILE = 99.9  # this percentile is white, since a few very bright voxels would make all others dark
 Volume = NDArray[np.floating]
 
 
 def png_bytes(image: NDArray[np.uint8], colours: NDArray[np.uint8] | None = None) -> bytes:
     """Returns a PNG of an image (rows, columns) uint8, row 0 at the top. colours: (256, 3) uint8, None for grey."""
-    from PIL import Image  # this import takes a tenth of a second, which most commands do not need
+    from PIL import Image  # here, since most commands draw no picture and the import takes 0.1 s
 
     picture = Image.fromarray(image)
     if colours is not None:
@@ -41,39 +41,38 @@ def base64_of(content: bytes) -> str:
 
 
 def bytes_of(image: NDArray[np.floating], low: float, high: float) -> NDArray[np.uint8]:
-    """Returns values of any shape as 0 to 255 for ``low`` to ``high``, clipped. NaN and infinity become 0."""
+    """Maps ``low`` to ``high`` onto 0 to 255, clipped, for values of any shape. NaN and infinity become 0."""
     span = high - low if high > low else 1.0
     share = np.nan_to_num((image.astype(np.float64) - low) / span)
     return np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)
 
 
 def top_row_first(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Flips an image (rows, columns) whose row 0 is the lowest to a picture whose row 0 is the top."""
+    """Flips an image (rows, columns) whose row 0 is the lowest, since row 0 of a picture file is its top."""
     return np.ascontiguousarray(image[::-1])
 
 
 def grey_png(image: NDArray[np.floating], low: float, high: float) -> bytes:
-    """Returns a PNG of an image (rows, columns) whose row 0 is the lowest, black at ``low`` and white at ``high``."""
+    """Returns a PNG of an image (rows, columns) whose row 0 is the lowest: ``low`` is black, ``high`` white."""
     return png_bytes(top_row_first(bytes_of(image, low, high)))
 
 
 def signed_png(image: NDArray[np.floating], limit: float) -> bytes:
-    """Returns a PNG of differences (rows, columns), blue at −``limit``, red at +``limit``."""
+    """Returns a PNG of differences (rows, columns), row 0 the lowest: −``limit`` is blue, +``limit`` red."""
     return png_bytes(top_row_first(bytes_of(image, -limit, limit)), diverging())
 
 
 def diverging() -> NDArray[np.uint8]:
-    """Returns colours (256, 3) for differences: blue, white in the middle, red."""
+    """Returns colours (256, 3) for differences, from blue over white to red."""
     at = np.linspace(-1, 1, 256)[:, None]
     ends = np.where(at < 0, np.array(_BLUE), np.array(_RED))
-    # The power makes small differences visible on a white page.
+    # the power below 1 makes small differences visible on white
     mixed = np.array(_WHITE) + np.abs(at) ** 0.8 * (ends - np.array(_WHITE))
     return np.rint(mixed).astype(np.uint8)
 
 
 def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
-    """Returns the values of black and white: 0 and a high percentile of the volume; the extremes where nothing is above
-    0."""
+    """Returns the values of black and white: 0 and a high percentile of the volume, or its extremes if none is above 0."""
     high = float(np.percentile(volume, _PERCENTILE))
     if high > 0:
         return 0.0, high
@@ -83,10 +82,8 @@ def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Window:
-    """The initial values of black and white (``low``, ``high``), and the range ``least`` to ``most`` of the 256 grey
-    levels, all in 1/mm.
-
-    beyond: whether the volume has values below ``least``, and above ``most``."""
+    """Grey values in 1/mm. low, high: black and white when the page opens. least, most: the range of the 256 stored
+    levels, within which users may move black and white. beyond: whether values lie below ``least``, and above ``most``."""
 
     low: float
     high: float
@@ -96,7 +93,7 @@ class Window:
 
     @classmethod
     def of(cls, low: float, high: float, *volumes: Volume) -> "Window":
-        """Returns a window whose grey levels extend, as far as values do, to a quarter of its width beyond either side."""
+        """Returns a window whose levels go beyond black and white, if values do, by up to a quarter of their distance."""
         room = _ROOM * (high - low)
         lowest, highest = (float(f([f(v) for v in volumes])) for f in (np.min, np.max))
         least, most = min(low, max(lowest, low - room)), max(high, min(highest, high + room))
@@ -105,11 +102,11 @@ class Window:
 
 @dataclass(frozen=True)
 class Plane:
-    """The slices of one orientation: ``indices`` of those shown, among ``count`` slices.
+    """The slices of one orientation. indices: of the slices in the page, among all ``count``.
 
-    layers: PNGs in base64, by layer (result, truth or difference). first_mm, step_mm: the centre of slice 0 and the
-    distance to the next. size_mm: (width, height). right, up: the world axes in the picture. still: a PNG of the middle
-    slice, for browsers without scripts."""
+    layers: PNGs in base64 for each of result, truth, difference and error bar. first_mm, step_mm: the centre of slice 0 and
+    the distance to the next. size_mm: (width, height). right, up: the world axes in the picture. still: a PNG of the
+    middle slice, for browsers without scripts."""
 
     name: str
     axis: str
@@ -125,7 +122,7 @@ class Plane:
 
     @property
     def middle(self) -> int:
-        """The position in ``indices`` of the middle slice, which ``still`` shows."""
+        """Index into ``indices`` of the middle slice, which ``still`` shows."""
         return len(self.indices) // 2
 
     def position_mm(self, k: int) -> float:
@@ -133,8 +130,8 @@ class Plane:
 
 
 def windows_of(volume: Volume, reference: Volume | None, doubt: Volume | None = None) -> dict[str, Window]:
-    """Returns a window by layer ("result", "truth", "difference"). Result and truth have the truth's range, so that a
-    wrong gain shows."""
+    """Returns the grey values of each layer: "result", "truth", "difference", "doubt" (the error bars). Result and truth
+    share the truth's range, so that a wrong scale of the result shows."""
     if doubt is not None:
         return {**windows_of(volume, reference), "doubt": Window.of(*grey_range(doubt), doubt)}
     if reference is None or not float(reference.max()) > 0:
@@ -148,7 +145,7 @@ def windows_of(volume: Volume, reference: Volume | None, doubt: Volume | None = 
 def planes_of(
     volume: Volume, reference: Volume | None, grid: Grid, windows: Mapping[str, Window], doubt: Volume | None = None
 ) -> list[Plane]:
-    """Returns the three orientations of a volume (nz, ny, nx) in 1/mm, with a layer for each of the windows."""
+    """Returns the three orientations of a volume (nz, ny, nx) in 1/mm, with a picture of every layer in ``windows``."""
     layers: dict[str, Volume] = {"result": volume}
     if reference is not None and "truth" in windows:
         layers |= {"truth": reference, "difference": volume - reference}
@@ -170,9 +167,7 @@ def planes_of(
 
 
 def middle_planes(slices: Sequence[Volume], grid: Grid, window: tuple[float, float]) -> list[Plane]:
-    """Returns planes that have only the stills of three middle slices (axial, coronal, sagittal) of a volume on ``grid``.
-
-    window: the values of black and white."""
+    """Returns planes of a volume's middle slices (axial, coronal, sagittal). window: the values of black and white."""
     planes = []
     for (name, axis, letter, right, up), image in zip(PLANES, slices, strict=True):
         still = grey_png(block_means(image, LONGEST_EDGE), *window)
@@ -188,14 +183,13 @@ def _extent(grid: Grid, axis: int) -> tuple[float, float, tuple[float, float]]:
 
 
 def stills_of(planes: Sequence[Plane], volume: Volume, window: tuple[float, float]) -> list[Plane]:
-    """Returns ``planes`` with the stills of another volume (nz, ny, nx). ``window``: the values of black and white."""
+    """Returns ``planes`` with the middle slices of another volume (nz, ny, nx). window: the values of black and white."""
     pictures = (_picture(volume, axis, plane.indices[plane.middle], *window) for axis, plane in enumerate(planes))
     return [replace(plane, layers={}, still=still) for plane, still in zip(planes, pictures, strict=True)]
 
 
 def _slice_counts(shape: tuple[int, ...], layers: int) -> list[int]:
-    """Returns the number of slices to show along every axis: all, or as many as the page's budget allows for ``layers``
-    layers."""
+    """Returns how many slices the page has along each axis: all, or as many as ``BUDGET_PIXELS`` allows."""
     edges = [min(n, LONGEST_EDGE) for n in shape]
     pixels = [int(np.prod(edges)) // edges[axis] for axis in range(3)]
     most = max(1, BUDGET_PIXELS // (layers * sum(pixels)))
@@ -207,7 +201,7 @@ def _picture(volume: Volume, axis: int, index: int, low: float, high: float) -> 
 
 
 def block_means(values: Volume, most_edge: int) -> Volume:
-    """Returns an array of any shape with at most ``most_edge`` means over blocks along every axis."""
+    """Averages an array over blocks, so that no axis is longer than ``most_edge``."""
     for axis, edge in enumerate(values.shape):
         if edge > most_edge:
             starts = (np.arange(most_edge) * edge) // most_edge

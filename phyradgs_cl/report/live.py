@@ -1,6 +1,6 @@
-"""Writes the page of a run under way, whole and every few seconds. After the run it becomes the report.
+"""Writes a page about a run every few seconds. After the run the page becomes the report.
 
-``Status`` and ``Snapshot`` hold the words and pictures of the page, ``LivePage`` writes it."""
+``Status`` and ``Snapshot`` are the page's words and pictures; ``LivePage`` writes it."""
 
 import logging
 import math
@@ -27,23 +27,23 @@ from phyradgs_cl.report.sections import facts_table, frame_pictures, note, secti
 from phyradgs_cl.report.viewer import stills
 from phyradgs_cl.text import clock
 
-_MOST_POINTS = 400  # most points of the convergence curve
-_SAMPLES = 64  # most samples of the volume along each side from which the grey range is computed
-# a run without news for this time, and for this many intervals between two versions of the page, may have been killed
+_MOST_POINTS = 400  # beyond this many points, every second one of the convergence curve is dropped
+_SAMPLES = 64  # voxels along each side from which grey values are computed, to save time
+# a page that is older than both this time and this many of its intervals says that the run may have been killed
 _LATE_S, _LATE_TIMES = 30.0, 6
-_LOG_RATIO = 20.0  # ratio of largest to smallest value above which the axis is logarithmic
+_LOG_RATIO = 20.0  # the curve's axis is logarithmic if the largest value is more than this many times the smallest
 _CHART = 560, 240  # width and height of the chart in pixels
 _MARGIN = 64, 12, 12, 34  # margins of the chart in pixels: left, top, right, bottom
 EVERY_S = 5.0  # time between two versions of the page
-SHARE = 0.01  # largest fraction of the run's time that pictures may cost
-FRAMES = 2  # number of frames that are computed from the volume and shown
-FRAMES_FROM_S = 60.0  # no frames are computed in runs that are expected to take less time: their report comes soon
+SHARE = 0.01  # fraction of the run's time that making pictures may take
+FRAMES = 2  # frames that are computed from the volume and compared with the measured ones
+FRAMES_FROM_S = 60.0  # shorter runs compute no frames, since their report comes soon
 
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The middle slices (axial, coronal, sagittal) of the volume after an iteration, in 1/mm, and some frames. high: the
-    value of white in 1/mm."""
+    """Middle slices (axial, coronal, sagittal) in 1/mm of the volume after an iteration, and some frames, measured and
+    computed. high: the value of white in 1/mm."""
 
     iteration: int
     slices: tuple[NDArray[np.floating], ...]
@@ -59,7 +59,7 @@ class Snapshot:
 
     @cached_property
     def parts(self) -> list[Markup]:
-        """The sections with pictures."""
+        """The page's sections with pictures."""
         words = note(f"The middle slices after iteration {self.iteration}.")
         pictures = stills(middle_planes(self.slices, self.grid, (0.0, self.high)), "volume", self.high)
         parts = [section("slices", "Slices", words, pictures)]
@@ -71,11 +71,10 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False)
 class Status:
-    """What a page says about a run. Times are seconds since 1970.
+    """The words of a page about a run. Times are seconds since 1970.
 
     - settings: facts by name. stage: what the run does before its first iteration.
-    - ended: the reason why no more news will come. It is no warning if ``is_complete``.
-    - points: (iteration, measure of convergence)."""
+    - ended: why the run has ended; a warning unless ``is_complete``. points: (iteration, measure of convergence)."""
 
     title: str
     settings: Mapping[str, object]
@@ -87,13 +86,14 @@ class Status:
     progress: Progress | None = None
     points: tuple[tuple[int, float], ...] = ()
     first: tuple[int, float] = (0, 0.0)
-    """Iteration, and time in s, of the present stage's first report, from which the rest of its time is estimated."""
+    """Iteration and time in s of the present stage's first report. They give the speed, from which the time left is
+    estimated."""
     reported: float = 0.0
     snapshot: Snapshot | None = None
 
     def after(self, progress: Progress, now: float) -> "Status":
-        """Returns the status after a report at ``now`` (s since 1970). Iterations that start again, as in a trial, start
-        a new curve."""
+        """Returns the status after a report at ``now`` (s since 1970). A new curve begins where iterations start again, as
+        after a trial."""
         last, points, first = self.progress, self.points, self.first
         is_same = last is not None and (last.quantity, last.iterations) == (progress.quantity, progress.iterations)
         if last is None or not is_same or progress.iteration < last.iteration:
@@ -106,20 +106,20 @@ class Status:
 
     @property
     def per_s(self) -> float | None:
-        """Iterations per second, from the second report on; None before."""
+        """Iterations per second; None before the second report."""
         if self.progress is None or self.reported <= self.first[1] or self.progress.iteration <= self.first[0]:
             return None
         return (self.progress.iteration - self.first[0]) / (self.reported - self.first[1])
 
     def left_s(self, now: float) -> float | None:
-        """Returns the time in s from ``now`` to the end of the last iteration; None before two reports."""
+        """Returns the time in s from ``now`` to the end of the last iteration; None before the second report."""
         if self.progress is None or self.per_s is None:
             return None
         return max(0.0, (self.progress.iterations - self.progress.iteration) / self.per_s - (now - self.reported))
 
 
 def live_page(status: Status, now: float) -> str:
-    """Returns the page as text, written at ``now`` in seconds since 1970."""
+    """Returns the page's HTML. now: the time that it shows, in seconds since 1970."""
     pictures = [] if status.snapshot is None else status.snapshot.parts
     curve = [section("convergence", "Convergence", _curve(status))] if len(status.points) > 1 else []
     parts = [*pictures[:1], *curve, *pictures[1:], section("settings", "Settings", _settings(status))]
@@ -190,7 +190,7 @@ def _settings(status: Status) -> Markup:
 
 
 def _curve(status: Status) -> Markup:
-    """Returns the convergence as SVG, drawn without matplotlib: its import would cost more than the run allows."""
+    """Draws the convergence as SVG. It does without matplotlib, whose import would hold up the run."""
     x, y = np.array(status.points, float).T
     words = status.progress.quantity if status.progress is not None else ""
     is_log = 0 < _LOG_RATIO * y.min() < y.max()
@@ -219,20 +219,20 @@ log = logging.getLogger(__name__)
 
 
 class LivePage:
-    """Writes a page about a running method, as a listener to its progress. It is a context around the run.
+    """Writes a page about a run. Use it as a context manager around the run, and call it with each progress report.
 
-    A thread writes the page every ``every_s`` seconds, so that an older page belongs to a run that was killed. Pictures
-    are made between two iterations, as long as their time is below ``SHARE`` of the run's. An error, or Ctrl-C, leaves
-    its reason on the page. An existing file is replaced at the first iteration, so that a refused run does not change it.
-    A page that cannot be written gives one warning, and no error."""
+    A thread writes the page every ``every_s`` seconds; an older page shows that the run was killed. Pictures are made
+    between two iterations, as long as they take less than ``SHARE`` of the run's time. An error or Ctrl-C leaves its
+    reason on the page. An existing file is replaced at the first iteration, so that a refused run does not change it. A
+    page that cannot be written gives one warning, and no error."""
 
     def __init__(self, path: Path, title: str, settings: Mapping[str, object], every_s: float = EVERY_S) -> None:
         self.path, self.every_s = path, every_s
         self.status = Status(title, settings, every_s, time.time())
         self.spent_s = 0.0
-        """The time in s that the run has waited for pictures."""
+        """Time in s that the run has waited for pictures."""
         self._pictured_s = -every_s
-        self._waits = False  # true until the first iteration
+        self._waits = False  # whether nothing is written yet, to keep an existing file until the first iteration
         self._started_s = time.monotonic()
         self._is_over = threading.Event()
         self._writer = threading.Thread(target=self._keep_writing, name="live page", daemon=True)
@@ -257,7 +257,7 @@ class LivePage:
         self.end(f"Stopped by an error: {error}" if isinstance(error, Exception) else "Interrupted.")
 
     def stage(self, text: str) -> None:
-        """Sets the text on the page that says what the run does before its first iteration."""
+        """Says on the page what the run does before its first iteration."""
         self.status = replace(self.status, stage=text)
 
     def __call__(self, progress: Progress) -> None:
@@ -272,14 +272,14 @@ class LivePage:
         self.spent_s += self._pictured_s - used_s
 
     def end(self, reason: str, is_complete: bool = False) -> None:
-        """Writes the page a last time, with the reason why no more news will come. Later calls do nothing."""
+        """Writes the page for the last time, with the reason of the end. Later calls do nothing."""
         if not self._is_over.is_set():
             self._stop()
             self.status = replace(self.status, ended=reason, is_complete=is_complete)
             self._write()
 
     def become(self, write_report: Callable[[Path], object]) -> None:
-        """Replaces the page by the report that ``write_report`` writes. Where that fails, the page says how to make it."""
+        """Replaces the page by the report that ``write_report`` writes. If that fails, the page says how to make it."""
         self.stage("Writing the report")
         try:
             write_report(self.path)
@@ -289,7 +289,7 @@ class LivePage:
             self.end("The run is complete. 'phyradgs report' makes its report.", is_complete=True)
 
     def _snapshot(self, progress: Progress, used_s: float) -> Snapshot:
-        """Returns the present slices and frames. Frames that the device cannot compute are left out."""
+        """Returns the present slices and frames; no frames if the device cannot compute them."""
         assert progress.volume is not None
         frames: list[FramePair] = []
         expected_s = used_s * progress.iterations / max(progress.iteration, 1)

@@ -1,4 +1,4 @@
-"""Builds HTML from elements, so that text of files is always escaped, and formats facts as text."""
+"""Builds HTML in such a way that text from files is always escaped, and formats facts as text."""
 
 import html
 import json
@@ -7,37 +7,37 @@ import math
 from phyradgs_cl.text import plain_text
 
 UNITS = {"_per_mm": "1/mm", "_mm": "mm", "_deg": "°", "_db": "dB", "_s": "s"}
-_RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # resolution of shown values by unit, finer than any scanner's
+_RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # by unit, finer than any scanner's; numbers far below are shown as 0
 _WORDS = {"psnr": "PSNR", "rms": "RMS", "ssim": "SSIM", "sha256": "SHA-256", "tv": "TV", "l1": "L1", "fdk": "FDK"}
-_LONGEST = 400  # most characters of a value that are shown
+_LONGEST = 400  # longer values are cut after this many characters
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 
 class Markup(str):
-    """Text that is HTML already. Other text is escaped when it becomes part of an element."""
+    """Text that is HTML already. All other text is escaped when it becomes part of an element."""
 
 
 VOID = frozenset({"br", "img", "input", "link", "meta"})
 
 
 def element(name: str, /, *children: object, **attributes: object) -> Markup:
-    """Returns ``<name attributes>children</name>``; children that are no Markup are escaped.
+    """Returns ``<name attributes>children</name>``. Children that are not Markup are escaped.
 
-    Attributes that are None or False are left out, and True has no value. Underscores in names become dashes; one at the end
-    is removed (``class_``)."""
+    Attributes that are None or False are left out; True writes the name alone. Underscores in attributes' names become
+    dashes; one at the end is removed (``class_``)."""
     opening = f"<{name}{''.join(_attribute(key, value) for key, value in attributes.items())}>"
     return Markup(opening) if name in VOID else Markup(f"{opening}{joined(*children)}</{name}>")
 
 
 def joined(*children: object) -> Markup:
-    """Returns the children as one text, escaped where they are no Markup. None adds nothing."""
+    """Joins the children to one text. Those that are not Markup are escaped; None adds nothing."""
     shown = (c if isinstance(c, Markup) else html.escape(_plain(c)) for c in children if c is not None)
     return Markup("".join(shown))
 
 
 def raw_text(name: str, content: str, /, **attributes: object) -> Markup:
-    """Returns a ``style`` or ``script`` element of text from this package, which must not be escaped. Raises ValueError for
+    """Returns a ``style`` or ``script`` element of this package's own text, which is not escaped. Raises ValueError for
     text that would end the element."""
     if "</" + name in content.lower():
         raise ValueError(f"{name}: the content would end its element")
@@ -45,7 +45,7 @@ def raw_text(name: str, content: str, /, **attributes: object) -> Markup:
 
 
 def json_block(identifier: str, value: object) -> Markup:
-    """Returns data for the page's script as JSON. No element can begin or end in it."""
+    """Returns an element with data for the page's script, as JSON that cannot begin or end an HTML element."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     safe = text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
     return element("script", Markup(safe), id=identifier, type="application/json")
@@ -59,12 +59,11 @@ def _attribute(key: str, value: object) -> str:
 
 
 def _plain(value: object) -> str:
-    """Returns a value as text, floats with two decimals."""
     return f"{value:.2f}".rstrip("0").rstrip(".") if isinstance(value, float) else plain_text(str(value))
 
 
 def label(key: str) -> str:
-    """Returns a key as words without its unit: ``source_to_axis_mm`` is "source to axis"."""
+    """Returns a key as words without its unit: "source to axis" for ``source_to_axis_mm``."""
     for ending in UNITS:
         if key.endswith(ending) and key != ending:
             key = key[: -len(ending)]
@@ -73,12 +72,12 @@ def label(key: str) -> str:
 
 
 def unit(key: str) -> str:
-    """Returns the unit with which the name of a fact ends; "" without one."""
+    """Returns the unit at the end of a key: "mm" for ``source_to_axis_mm``; "" without one."""
     return next((u for ending, u in UNITS.items() if key.endswith(ending)), "")
 
 
 def shown(value: object, unit_name: str = "") -> str:
-    """Returns a value as text with its unit. A very long text is cut."""
+    """Returns a value with its unit as text, cut after ``_LONGEST`` characters."""
     text = _text(value, _RESOLUTION.get(unit_name, 0.0))
     if len(text) > _LONGEST:
         text = text[:_LONGEST] + "…"
@@ -87,7 +86,7 @@ def shown(value: object, unit_name: str = "") -> str:
 
 
 def number(value: float, resolution: float = 0.0) -> str:
-    """Returns a number as text with at most four significant digits. Values up to a millionth of ``resolution`` become 0."""
+    """Returns a number as text with at most four significant digits; 0 for values below a millionth of ``resolution``."""
     if abs(value) <= 1e-6 * resolution:
         value = 0.0
     if not math.isfinite(value):

@@ -1,8 +1,8 @@
-"""Makes the pictures of motion in a page. One shows the lines of a fly-scan's frame at their own poses. The other shows an
-object that moves, by slices at any time of the scan and arrows of the displacement.
+"""Makes the report's pictures of motion. One shows a fly-scan's frame in which each detector line has its own pose. The
+other shows slices of a moving object at any time of the scan, with arrows of its displacement.
 
-The page has the object's voxels once, as in the 3D picture, and its deformation as control points. The script makes the
-states: v(y + w(y, t)), trilinear."""
+The page has the object's voxels once, at the resolution of the 3D picture, and the deformation as control points. The
+script computes the object at a time t as v(y + w(y, t)), trilinearly."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,19 +17,19 @@ from phyradgs_cl.report.markup import Markup, element, joined, json_block, numbe
 from phyradgs_cl.report.scan_charts import box_corners, with_sources
 from phyradgs_cl.report.viewer import decimals_of, picture, place, slider
 
-_TIMES = 49  # number of times at which the scanner's pose is given; the script interpolates between them
-_MOST_LINES = 64  # most detector lines that are drawn
-_FRAME_STEPS = 500  # number of steps of the slider of a frame's time
-_LOOK_DEG = 125  # angle about the axis from the source to the eye, which is behind the panel and to one side
-_TILT_DEG = 28  # elevation of the eye
+_TIMES = 49  # times at which the page has the scanner's pose; the script interpolates between them
+_MOST_LINES = 64  # more detector lines would merge in the picture
+_FRAME_STEPS = 500  # steps of the slider for the time within a frame
+_LOOK_DEG = 125  # the viewer stands this far around the axis from the source: behind the panel, to one side
+_TILT_DEG = 28  # the viewer looks down by this angle
 _FRAME_HELP = (
     "Lines that wait are thin and grey, exposed ones gold, with the rays of the first and the last. A line that has been "
     "read is blue, and stays where the panel was in the middle of its exposure. Drag, or press arrow keys here, to turn."
 )
-MOST_VALUES = 150_000  # most numbers in the page's control points, of 2 bytes each
-_MOST_TIMES = 2000  # most times at which the page has weights
-_STEPS = 200  # number of steps of the slider of the object's time
-_MOST_LENGTH = 10  # largest factor by which arrows are made longer
+MOST_VALUES = 150_000  # numbers in the page's control points, of 2 bytes each: about 0.4 MB of base64
+_MOST_TIMES = 2000  # times at which the page has the deformation's weights
+_STEPS = 200  # steps of the slider for the object's time
+_MOST_LENGTH = 10  # users may lengthen arrows by up to this factor
 _LARGEST = 32767  # largest signed number of 16 bits
 _HELP = (
     "An arrow ends where matter is, and begins where the same matter is in the reference volume; black parts have none. "
@@ -38,7 +38,7 @@ _HELP = (
 
 
 def frame_in_motion(scan: Scan) -> Markup:
-    """Returns a picture of the first frame of a fly-scan, a slider of its time, and the data of the script."""
+    """Returns a picture of a fly-scan's first frame, a slider for the time within it, and the script's data."""
     first_s, last_s = scan.shutter.lit_span_s
     times_s = np.linspace(first_s, last_s, _TIMES)
     poses = with_sources(scan, scan.trajectory.pose(0, scan.frame_start_s[0] + times_s))
@@ -70,7 +70,7 @@ def frame_in_motion(scan: Scan) -> Markup:
 
 
 def _angles_deg(scan: Scan, times_s: np.ndarray) -> list[list[float]] | None:
-    """Returns the gantry's angle at times (T,) within the first frame, as (T, 1). Returns None for a gantry on no circle."""
+    """Returns the gantry's angle (T, 1) at times (T,) within the first frame; None for a gantry not on a circle."""
     if not isinstance(scan.trajectory, CircularOrbit):
         return None
     return np.rad2deg(scan.trajectory.angle_rad(0, scan.frame_start_s[0] + times_s))[:, None].tolist()
@@ -79,9 +79,9 @@ def _angles_deg(scan: Scan, times_s: np.ndarray) -> list[list[float]] | None:
 def object_in_motion(
     volume: NDArray[np.floating], grid: Grid, window: Window, deformation: Deformation, span_s: tuple[float, float]
 ) -> Markup:
-    """Returns three slices of the object at the first time of ``span_s``, their controls and the data of the script.
+    """Returns three slices of the object at the start of ``span_s``, their controls and the script's data.
 
-    The script shows any time of the span. ``volume`` (nz, ny, nx): the reference, at least two voxels thick."""
+    The script shows any time of the span. volume (nz, ny, nx): the reference, at least two voxels thick."""
     means = block_means(volume, MOST_EDGE)
     small = grid.in_shape(triple(means.shape))
     first = deformed(means, small, deformation, deformation.weights_at(span_s[0])[0])
@@ -103,15 +103,15 @@ def object_in_motion(
 
 
 def fitting(deformation: Deformation, grid: Grid) -> Deformation:
-    """Returns the deformation with at most ``MOST_VALUES`` numbers. A larger one is sampled at control points farther
-    apart, where it keeps its values."""
+    """Returns the deformation with at most ``MOST_VALUES`` numbers. A larger one is interpolated at fewer control points,
+    at which it keeps its values."""
     spacing_mm = float(np.max(deformation.spacing_mm))
     reduced = deformation
     while reduced.control_mm.size > MOST_VALUES and spacing_mm < 2 * max(grid.size_mm):
         spacing_mm *= 1.25
         origin_mm, counts = control_points(grid, spacing_mm)
         axes_mm = [
-            np.clip(first_mm + spacing_mm * np.arange(n), centres_mm[0], centres_mm[-1])  # fields may end beyond the box
+            np.clip(first_mm + spacing_mm * np.arange(n), centres_mm[0], centres_mm[-1])  # a field may end at the edge
             for first_mm, n, centres_mm in zip(origin_mm[::-1], counts, grid.axes_mm(), strict=True)
         ]
         points_mm = np.stack(np.meshgrid(*axes_mm, indexing="ij")[::-1], -1).reshape(-1, 3)
@@ -124,7 +124,7 @@ def fitting(deformation: Deformation, grid: Grid) -> Deformation:
 
 
 def _data(deformation: Deformation, grid: Grid, span_s: tuple[float, float]) -> dict[str, object]:
-    """Returns the deformation for the script: control points as 16 bits of each field's largest value, axes x, y, z."""
+    """Returns the deformation for the script, axes x, y, z. Control points are 16-bit fractions of their largest value."""
     control_mm = deformation.control_mm
     largest_mm = np.abs(control_mm).max(axis=(1, 2, 3, 4))
     units_mm = np.where(largest_mm > 0, largest_mm, 1.0) / _LARGEST

@@ -1,4 +1,4 @@
-"""Writes a reconstruction as one HTML page that loads nothing."""
+"""Writes a report about a reconstruction as one HTML page that needs no other file and no network."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -19,25 +19,24 @@ from phyradgs_cl.report.markup import Markup, element, joined, label, number, ra
 from phyradgs_cl.report.run import Change, Run, computed_views, load_run, step_changes
 from phyradgs_cl.runtime import Runtime
 
-DEFAULT_VIEWS = 3  # default number of frames that a page compares with the volume
-# The order of the script's files matters: slices.js sends the window when it loads, so its listeners (space.js, motion.js)
-# come first.
+DEFAULT_VIEWS = 3  # frames that a page compares with frames computed from the volume
+# slices.js sends the grey values when it loads, so space.js and motion.js, which listen for them, must come first.
 _SCRIPT = ("common", "shaders", "render", "space", "motion", "slices", "rows")
-_SCRIPTED = ("volume",)  # the script reveals these sections
+_SCRIPTED = ("volume",)  # sections that are hidden until the script shows them
 
 
-@np.errstate(all="ignore")  # a file may hold any values
+@np.errstate(all="ignore")  # a file's values may overflow; the page shows what it can
 def write_report(
     volume: Path, output: Path, make_runtime: Callable[[], Runtime], *, scan: Path | None = None,
     views: int = DEFAULT_VIEWS,
 ) -> Run:
-    """Writes the page ``output`` of a volume file, completely or not at all, and returns the run.
+    """Writes a report about a volume file to ``output``, completely or not at all, and returns the run.
 
-    scan: None takes the file that the volume's provenance names, if it is unchanged. views: the number of frames that are
-    computed from the volume, on the device of ``make_runtime``. Without frames no device is needed.
+    scan: None takes the file that the volume's provenance names, if it is unchanged. views: how many frames are computed
+    from the volume, on the device of ``make_runtime``; for 0 no device is needed.
 
-    Raises InputError for files that cannot be read or are of another kind, and for an output that is one of them or no page.
-    Raises OutputError where the page cannot be written, and DeviceError where no device can project."""
+    Raises InputError for files that cannot be read or are of another kind, and for an output that is an input or no HTML.
+    Raises OutputError if the page cannot be written, and DeviceError if no device can project."""
     check_writable(output)
     run = load_run(volume, scan)
     refuse_overwriting("-o", output, volume, run.scan_path)
@@ -52,7 +51,7 @@ def write_report(
 
 
 def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Change] = ()) -> str:
-    """Returns the page as text. views: as from ``computed_views``; changes: as from ``step_changes``."""
+    """Returns the page's HTML. views: from ``computed_views``. changes: from ``step_changes``."""
     of_scan = {} if run.scan is None else {
         "preparation": sections.preparation_section(run, changes),
         "projections": sections.projections_section(run.scan, views),
@@ -82,7 +81,7 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
 
 
 def _arranged(shown: dict[str, Markup]) -> list[Markup]:
-    """Returns the sections in order. Metrics and convergence stand side by side where the window is wide enough."""
+    """Returns the sections in order. Metrics and convergence are side by side if the window is wide enough."""
     narrow = [part for name, part in shown.items() if name in ("metrics", "convergence")]
     wide = [part for name, part in shown.items() if name not in ("metrics", "convergence")]
     pair = element("div", *narrow, class_="pair") if narrow else Markup()
@@ -90,9 +89,8 @@ def _arranged(shown: dict[str, Markup]) -> list[Markup]:
 
 
 def head(title: str, script: str, reload_s: int | None = None) -> Markup:
-    """Returns the page's head: the styles, and a policy that permits no network and no script except ``script``.
-
-    reload_s: the seconds after which a browser without scripts loads the page again."""
+    """Returns the page's head, with styles and a policy that forbids network access and all scripts except ``script``.
+    reload_s: time in s after which a browser without scripts loads the page again."""
     digest = base64_of(hashlib.sha256(script.encode()).digest())
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
     policy += "; base-uri 'none'; form-action 'none'"
@@ -132,7 +130,7 @@ def _tiles(run: Run) -> list[tuple[str, str]]:
 
 
 def web_script(*names: str) -> str:
-    """Returns files of the folder ``web`` as one script."""
+    """Returns files of the folder ``web``, joined to one script."""
     return "".join(_web(f"{name}.js") for name in names)
 
 

@@ -1,4 +1,4 @@
-"""Shows a volume without a report: as a picture of its middle slices, also during a run, or in napari."""
+"""Shows a volume without a report: its middle slices as a picture, also during a run, or the volume in napari."""
 
 import logging
 import math
@@ -26,16 +26,16 @@ from phyradgs_cl.io import (
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.report.images import bytes_of, grey_range, png_bytes, top_row_first
 
-_GAP = 4  # width in pixels of the gap between slices
-_SMALLEST, _LARGEST = 128, 512  # least and largest number of pixels along the volume's longest side
+_GAP = 4  # pixels between two slices
+_SMALLEST, _LARGEST = 128, 512  # limits of the pixels along the volume's longest side
 log = logging.getLogger(__name__)
 
 
 def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) -> None:
-    """Writes a grey PNG of the middle slices of a volume (nz, ny, nx), in true proportions, completely or not at all.
+    """Writes a grey PNG of a volume's (nz, ny, nx) middle slices in true proportions, completely or not at all.
 
     From left to right they are axial (y up), coronal and sagittal (z up). Raises InputError for a volume that does not fit
-    its grid, NaN and infinity, and OutputError where the file cannot be written."""
+    its grid, NaN and infinity, and OutputError if the file cannot be written."""
     checks.shape("volume", volume, grid.shape)
     checks.finite("volume", volume)
     picture = png_bytes(preview_image(volume, grid))
@@ -44,9 +44,10 @@ def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) ->
 
 
 class Preview:
-    """Writes a picture of the present volume to ``io.partial_path`` of ``path``, as a listener to a method's progress.
+    """Writes a picture of the volume during a run; call it with each progress report.
 
-    It writes at most every ``every_s`` seconds. Pictures that cannot be written give one warning, and no error."""
+    It writes to ``io.partial_path`` of ``path``, at most every ``every_s`` seconds. Pictures that cannot be written give
+    one warning, and no error."""
 
     def __init__(self, path: Path, every_s: float = 5.0) -> None:
         self.path, self.partial, self.every_s = path, partial_path(path), every_s
@@ -60,7 +61,7 @@ class Preview:
         self._last_s = time.monotonic()
 
     def finish(self, volume: NDArray[np.floating], grid: Grid) -> None:
-        """Writes the picture of the result, and removes the picture of the run."""
+        """Writes the picture of the result, and removes the one made during the run."""
         self._write(volume, grid, self.path)
         with suppress(OSError):
             self.partial.unlink()
@@ -75,7 +76,7 @@ class Preview:
 
 
 def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]:
-    """Returns the picture of middle slices, (rows, columns) uint8, row 0 at the top. Slices are aligned at the bottom."""
+    """Returns a picture (rows, columns) uint8 of the middle slices, aligned at the bottom. Row 0 is the top."""
     low, high = grey_range(volume)
     per_mm = np.clip(max(grid.shape), _SMALLEST, _LARGEST) / max(grid.size_mm)
     slices = []
@@ -96,7 +97,7 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
 
 
 def _shown_axes(grid: Grid) -> list[int]:
-    """Returns the axes (0 z, 1 y, 2 x) to look along: all or, for a grid of one layer, only the axis across the layer."""
+    """Returns the axes (0 z, 1 y, 2 x) along which slices are cut: all, but only one for a grid one voxel thick."""
     across = [min(n for a, n in enumerate(grid.shape) if a != axis) for axis in range(3)]
     return [axis for axis in range(3) if across[axis] > 1] or [0, 1, 2]
 
@@ -106,9 +107,9 @@ Layer = tuple[np.ndarray, dict[str, Any], str]
 
 
 def view_volume(path: Path) -> None:
-    """Opens a window with a volume file, and returns when it is closed.
+    """Opens a volume file in a window of napari, and returns when it is closed.
 
-    Raises InputError where napari is missing, and for anything but a volume file of phyradgs-cl."""
+    Raises InputError if napari is missing, and for anything but a volume file of phyradgs-cl."""
     napari = checks.package("napari", "the package for this, 0.5.4 or later", "napari[all]")
     if (kind := file_kind(path)) != "volume":
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl")
@@ -117,19 +118,19 @@ def view_volume(path: Path) -> None:
 
 
 def add_volume(viewer: Any, stored: Volume, name: str) -> None:
-    """Adds a volume to napari's ``viewer``, in mm at its position, with axes z, y, x. y points up; black is 0."""
+    """Adds a volume to napari's ``viewer``, in mm at its position. Axes are z, y, x, y points up, and black is 0."""
     viewer.add_image(stored.values, **_look_of_volume(stored, name))
     viewer.dims.axis_labels = _AXES
     if hasattr(viewer.camera, "orientation2d"):  # napari has this since 0.6; before, y points down
         viewer.camera.orientation2d = ("up", "right")
-    # napari 0.9 has moved its overlays.
+    # napari 0.9 moved overlays to its canvas
     overlays = viewer.canvas.overlays if hasattr(viewer, "canvas") else viewer
     overlays.scale_bar.visible = True
 
 
 def napari_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Layer]] | None:
-    """Returns the function that reads a file for napari, which calls this for every .h5 file; None for files that are
-    neither a volume nor a scan of phyradgs-cl."""
+    """Returns the function with which napari reads volumes and scans of phyradgs-cl; None for other files. napari calls
+    this for every .h5 file."""
     paths = [path] if isinstance(path, str) else path
     with suppress(PhyradgsError):
         if all(file_kind(one) in ("volume", "scan") for one in paths):
@@ -138,8 +139,7 @@ def napari_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Lay
 
 
 def napari_layer(path: Path) -> Layer:
-    """Returns (values, arguments of add_image, "image") of a volume (z, y, x) in mm, or of a scan (projection, v, u).
-
+    """Reads a volume (z, y, x) in mm, or a scan (projection, v, u), as napari's (values, arguments of add_image, "image").
     Rows and columns of a scan are in mm from the central ray. Row 0 is the lowest."""
     if file_kind(path) == "volume":
         stored = read_volume(path)
@@ -157,7 +157,6 @@ def napari_layer(path: Path) -> Layer:
 
 
 def _look_of_volume(stored: Volume, name: str) -> dict[str, Any]:
-    """Returns the arguments of napari's add_image for a volume."""
     grid = stored.required_grid
     return {
         "name": f"{name} (1/mm)", "scale": grid.voxel_size_mm, "translate": grid.first_centre_mm,

@@ -1,4 +1,4 @@
-"""Collects what a report shows: a stored volume, its scan, their comparison, and frames before and after each step."""
+"""Collects the content of a report: a volume, its scan, their comparison, and what each preprocessing step changed."""
 
 import logging
 from collections.abc import Mapping
@@ -35,18 +35,17 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import plain_text
 
 log = logging.getLogger(__name__)
-_BINS = 80  # number of bins of a histogram of line integrals
+_BINS = 80  # bars of the histograms of line integrals
 Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A reconstruction from its volume file and, where it is found, its scan.
+    """A reconstruction, read from its volume file and, if it is found, its scan.
 
     - scan, scan_path, scan_facts: the scan, on the volume's grid.
     - reference (nz, ny, nx) 1/mm: the truth on that grid. compared: how volume and truth were compared. metrics: by name.
-    - notes: remarks for the reader of the page.
-    - deformation: how the object moved, where the run knew or found it."""
+    - notes: remarks for the reader of the page. deformation: how the object moved, if the run knew or found it."""
 
     path: Path
     stored: Volume
@@ -61,7 +60,7 @@ class Run:
 
     @property
     def motion(self) -> Motion | None:
-        """The motion model of the run, with the number of segments in use; None where the provenance lacks it."""
+        """The run's motion model, with the number of segments that it used; None if the provenance lacks it."""
         options = self.stored.provenance.get("options")
         table = options.get("motion") if isinstance(options, Mapping) else None
         if not isinstance(table, Mapping):
@@ -71,12 +70,12 @@ class Run:
             table = {**table, "segments": segments}
         try:
             return motion_from_facts(table)
-        except (InputError, TypeError):  # the provenance may be of another version or program
+        except (InputError, TypeError):  # another version or program may have written the provenance
             return None
 
     @property
     def preprocessing(self) -> Preprocessing:
-        """The run's preprocessing of frames, without options that this version lacks; the default where it is unknown."""
+        """The run's preprocessing of frames, without options that this version lacks; the default if it is unknown."""
         table = self.stored.provenance.get("input")
         try:
             return preprocessing_of(_kept(table)) if isinstance(table, Mapping) else Preprocessing()
@@ -85,14 +84,13 @@ class Run:
 
     @property
     def record(self) -> list[dict[str, float]]:
-        """The convergence record, a line per entry, with its finite numbers only."""
+        """The convergence record as a list, reduced to finite numbers."""
         lines: Any = self.stored.provenance.get("record") or []
         return [{k: float(v) for k, v in line.items() if checks.is_number(v)} for line in lines]
 
 
 def _kept(table: Mapping[str, Any], of: str = "") -> dict[str, Any]:
-    """Returns the options of ``table`` by name, without those that this version no longer has. of: the name of a nested
-    table."""
+    """Returns ``table`` without the options that this version no longer has. of: the prefix of a nested table's names."""
     return {
         name: _kept(value, f"{name}.") if isinstance(value, Mapping) else value
         for name, value in table.items() if f"{of}{name}" not in REMOVED
@@ -100,7 +98,7 @@ def _kept(table: Mapping[str, Any], of: str = "") -> dict[str, Any]:
 
 
 def load_run(path: Path, scan_path: Path | None = None) -> Run:
-    """Reads a volume file and its scan: ``scan_path``, or the unchanged file that the provenance names.
+    """Reads a volume file and its scan: ``scan_path``, else the file that the provenance names, if it is unchanged.
 
     Raises InputError for anything but a volume file of phyradgs-cl, and for a ``scan_path`` that cannot be read."""
     kind = file_kind(path)
@@ -119,8 +117,8 @@ def load_run(path: Path, scan_path: Path | None = None) -> Run:
 
 
 def _with_scan(run: Run, path: Path, is_given: bool, notes: list[str]) -> Run:
-    """Returns the run with the scan of a file and the comparison with its reference. Appends remarks to ``notes``.
-    is_given: the user named the file; raises InputError where it is then no scan."""
+    """Returns the run with a scan file, compared with its true volume. Appends remarks to ``notes``. is_given: the user
+    named the file; then it raises InputError for a file that is no scan."""
     kind = file_kind(path) if is_given else "scan"
     if kind != "scan":
         raise InputError(f"--scan {path}", f"a {kind}", "a scan")
@@ -149,8 +147,7 @@ def _with_scan(run: Run, path: Path, is_given: bool, notes: list[str]) -> Run:
 
 
 def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Path | None:
-    """Returns the scan file that the provenance names, in the current or the volume's folder, if it has the stored hash;
-    else None."""
+    """Returns the scan file that the provenance names, if it is found with the stored hash; else None with a note."""
     name = provenance.get("scan")
     if not isinstance(name, str) or not name:
         notes.append("The volume file names no scan.")
@@ -163,16 +160,16 @@ def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> 
 
 
 def _same_file(path: Path, name: str, sha256: object) -> Path | None:
-    """Returns the file ``name``, in the current or the volume's folder, if it has the hash ``sha256``; None otherwise."""
+    """Looks for the file ``name`` with the hash ``sha256`` in the current folder and the volume's; None without one."""
     for place in (Path(name), path.parent / name, path.parent / Path(name).name):
-        with suppress(InputError):  # the name may be of any file, or none
+        with suppress(InputError):  # there may be no such file
             if sha256_of(place) == sha256:
                 return place
     return None
 
 
 def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
-    """Returns ``count`` frames of the scan after the run's preprocessing, each with the frame computed from its volume."""
+    """Returns ``count`` frames of the scan after the run's preprocessing, with the frames computed from the volume."""
     if run.scan is None or count < 1:
         return []
     if run.deformation is None and "object_motion" in run.stored.provenance:
@@ -183,8 +180,7 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
 
 
 def _named_deformation(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Deformation | None:
-    """Returns the deformation in the file that the provenance names, if it has the stored hash; None otherwise, with a
-    remark where a file is named."""
+    """Reads the deformation file that the provenance names, if it has the stored hash; else returns None with a note."""
     name = provenance.get("object_motion")
     if not isinstance(name, str) or not name:
         return None
@@ -200,9 +196,9 @@ def _named_deformation(path: Path, provenance: Mapping[str, object], notes: list
 class Change:
     """The effect of a preprocessing step.
 
-    - numbers: the facts that the step reports.
-    - pairs: images before and after, by name. These are the frame (rows, columns) and the sinogram (frames, columns) that
-      changed most, and the middle slice (y, x) by FDK.
+    - numbers: facts that the step reports.
+    - pairs: images before and after, by name: the frame (rows, columns) and the sinogram (frames, columns) that changed
+      most, and the middle slice (y, x) by FDK.
     - counts (2, n): histograms of all line integrals, before and after, between ``edges`` (n + 1,)."""
 
     step: str
@@ -213,7 +209,7 @@ class Change:
 
 
 def step_changes(run: Run, rt: Runtime) -> list[Change]:
-    """Returns the effect of each preprocessing step of the run, repeated on its scan."""
+    """Repeats the run's preprocessing on its scan, and returns the effect of each step."""
     if run.scan is None or not run.preprocessing.chosen:
         return []
     changes: list[Change] = []

@@ -1,4 +1,4 @@
-"""Draws charts of a scan: its geometry from above and from the side, and its shutter in space and time."""
+"""Draws charts of a scan: its geometry from above and from the side, and when each detector line is exposed."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -17,19 +17,19 @@ from phyradgs_cl.report.markup import Markup, number
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_MOST_FRAMES = 180  # number of marked source positions, about, where there are more
-_ARC_SAMPLES = 24  # number of poses along the first frame's arc
-_FIRST_FRAMES = 4  # most frames in the chart of successive frames
-_MOST_DOTS = 600  # most dots for the times at which a model projects lines
-_LINES_WITH_DOTS = 12  # most lines with dots
-_BESIDE = 0.75  # drawn distance of sources and panels of a parallel beam from the volume's middle, over its diagonal
+_MOST_FRAMES = 180  # of more source positions, about this many are marked
+_ARC_SAMPLES = 24  # poses along the first frame's arc
+_FIRST_FRAMES = 4  # frames in the chart of successive frames
+_MOST_DOTS = 600  # dots, in all, for the poses at which a motion model projects lines
+_LINES_WITH_DOTS = 12  # detector lines that have such dots; more would merge
+_BESIDE = 0.75  # a parallel beam's source and panel are drawn this many diagonals of the volume from its middle
 _ROOM = 0.06  # margin around the data, as a fraction of their range
 Points = NDArray[np.float64]
 
 
 def orbit_chart(scan: Scan) -> Markup:
-    """Returns a chart of the scanner from above: all source positions, the first frame's arc, rays, panel and volume. In a
-    parallel beam, places on the middle ray stand for the source."""
+    """Returns a chart of the scanner from above: all source positions, the first frame's arc, rays, panel and volume. For a
+    parallel beam, points on the middle ray stand for the source."""
     places = "directions of parallel rays" if scan.is_parallel else "source positions"
     words = f"{scan.frames} {places}; the first frame's rays, panel and volume"
     middles, arc = with_sources(scan, middle_poses(scan)), _first_arc(scan)
@@ -56,7 +56,7 @@ def orbit_chart(scan: Scan) -> Markup:
 
 
 def side_chart(scan: Scan) -> Markup:
-    """Returns a chart of the scanner from the side, in the plane of axis and central ray: source, rays, panel, volume."""
+    """Returns a chart of the scanner from the side: source, rays, panel and volume in the plane of axis and central ray."""
     pose = _first_arc(scan)[0]
     corners = panel_corners(pose, scan.geometry.detector_shape)
     across = (corners.mean(0) - pose[:3])[:2]
@@ -82,8 +82,7 @@ def side_chart(scan: Scan) -> Markup:
 
 
 def _draw_rays(axes: "Axes", panel: Points, source: Points, is_parallel: bool) -> None:
-    """Draws the rays to a panel's two ends (2, 2): from the source or, in a parallel beam, each as long as the middle
-    ray."""
+    """Draws the rays to a panel's two ends (2, 2). They start at the source or, in a parallel beam, side by side."""
     starts = panel + source - panel.mean(0) if is_parallel else (source, source)
     for start, end in zip(starts, panel, strict=True):
         axes.plot(*np.array([start, end]).T, color=ACCENT, alpha=0.55, lw=1)
@@ -96,7 +95,7 @@ def _draw_source(axes: "Axes", source: Points, shift: tuple[float, float], is_pa
 
 
 def _plan(draw: "Callable[[Axes], None]", points: Sequence[Points], title: str, words: str) -> Markup:
-    """Returns a drawing in mm to scale, with a scale bar, and with room for labels around ``points``, each (N, 2)."""
+    """Returns a drawing to scale, in mm, with a scale bar and room for labels around ``points``, each (N, 2)."""
     every = np.concatenate(points)
     low, high = every.min(axis=0), every.max(axis=0)
     room = 0.1 * float(np.max(high - low)) or 1.0
@@ -115,8 +114,8 @@ def _plan(draw: "Callable[[Axes], None]", points: Sequence[Points], title: str, 
 
 
 def with_sources(scan: Scan, poses: Points) -> Points:
-    """Returns poses (..., 12) that begin with the source in mm. In a parallel beam, a place on the middle ray in front of
-    the volume stands for the source. The panel, whose distance does not matter there, is put behind the volume."""
+    """Returns poses (..., 12) that can be drawn. A parallel beam has no source: a point on the middle ray in front of the
+    volume takes its place, and the panel is put behind the volume."""
     if not scan.is_parallel:
         return poses
     away = poses[..., :3]
@@ -135,27 +134,27 @@ def panel_corners(pose: Points, detector_shape: tuple[int, int]) -> Points:
 
 
 def _first_arc(scan: Scan) -> Points:
-    """Returns poses (T, 12) of the first frame, from first light to last."""
+    """Returns poses (T, 12) of the first frame, from when its first line is exposed to when its last line ends."""
     first_s, last_s = scan.shutter.lit_span_s if scan.is_fly else (scan.shutter.middle_s,) * 2
     times_s = scan.frame_start_s[0] + np.linspace(first_s, last_s, _ARC_SAMPLES)
     return with_sources(scan, scan.trajectory.pose(0, times_s))
 
 
 def box_corners(scan: Scan) -> Points:
-    """Returns the corners (8, 3), x y z in mm, of the grid: the lower four around the box, then the upper four."""
+    """Returns the grid's corners (8, 3), x y z in mm: four around its bottom, then four around its top."""
     half, centre = np.array(scan.grid.size_mm[::-1]) / 2, np.array(scan.grid.offset_mm[::-1])
     around = [(-1, -1), (1, -1), (1, 1), (-1, 1)]
     return np.array([centre + half * (x, y, z) for z in (-1, 1) for x, y in around])
 
 
 def shutter_chart(scan: Scan, motion: Motion | None) -> Markup:
-    """Returns a chart of one frame in time: the exposures of all lines (Fig. 3 of the paper), and the times of the poses."""
+    """Returns a chart of when each line of a frame is exposed (Fig. 3 of the paper), and of the poses' times."""
     return chart(lambda axes: draw_shutter(axes, scan, motion), "Shutter of one frame", shutter_words(scan))
 
 
 def draw_shutter(axes: "Axes", scan: Scan, motion: Motion | None) -> None:
-    """Draws the lines' windows, the times of the run's poses, the lengths of exposure and readout, and above them the
-    gantry's angle."""
+    """Draws when each line is exposed, the times of the run's poses, the durations of exposure and readout, and above them
+    the gantry's angle."""
     shutter, last = scan.shutter, max(scan.lines - 1, 1)
     draw_windows(axes, shutter, scan.lines)
     if motion is not None:
@@ -174,7 +173,7 @@ def draw_shutter(axes: "Axes", scan: Scan, motion: Motion | None) -> None:
 
 
 def frames_chart(scan: Scan) -> Markup:
-    """Returns a chart of the first frames on one time axis, which shows overlaps and pauses."""
+    """Returns a chart of the first frames on one time axis, on which overlaps and pauses show."""
     start_s = np.asarray(scan.frame_start_s[:_FIRST_FRAMES]) - float(scan.frame_start_s[0])
     middle_s = (scan.shutter.delay_s(scan.lines).max() + scan.shutter.exposure_s) / 2
 
@@ -188,7 +187,7 @@ def frames_chart(scan: Scan) -> Markup:
 
 
 def shutter_words(scan: Scan) -> str:
-    """Returns the shutter in words, without a full stop."""
+    """Describes the shutter in words, without a full stop."""
     shutter = scan.shutter
     kind = "global shutter" if shutter.readout_s == 0 else f"rolling shutter along {shutter.axis}"
     words = f"{kind}: exposure {number(shutter.exposure_s)} s, readout {number(shutter.readout_s)} s"
@@ -200,7 +199,7 @@ def shutter_words(scan: Scan) -> str:
 
 
 def _draw_samples(axes: "Axes", scan: Scan, motion: Motion) -> None:
-    """Draws the times of the run's poses: dots on lines, or vertical lines for poses that all lines share."""
+    """Draws the times of the run's poses: dots where detector lines have their own, else vertical lines for all."""
     times_s, lines = pose_times(scan, motion)
     if lines is not None:
         axes.plot(times_s, lines, ".", color=SAMPLE, ms=5)
@@ -210,8 +209,8 @@ def _draw_samples(axes: "Axes", scan: Scan, motion: Motion) -> None:
 
 
 def pose_times(scan: Scan, motion: Motion) -> tuple[Points, Points | None]:
-    """Returns the times (N,) of the first frame's poses in s after its start, and their lines (N,), of some lines if there
-    are many; None for the lines where all share the poses. Of cells with motion it returns their ends."""
+    """Returns the times (N,) of the first frame's poses, in s after its start, and their detector lines (N,). Of many lines
+    it takes some; None stands for all. For segments in which Gaussians move it returns the segments' ends."""
     cells = motion.cells(scan, 0)
     if cells.is_moving:
         return np.linspace(*scan.shutter.lit_span_s, cells.count + 1), None
@@ -231,7 +230,7 @@ def _draw_span(axes: "Axes", times_s: tuple[float, float], line: float, words: s
 
 
 def _gantry_words(scan: Scan) -> list[tuple[float, str]]:
-    """Returns (time, text) of the gantry's angle at the start, the middle and the end of a frame on a circular orbit."""
+    """Returns (time, text) of the gantry's angle at start, middle and end of a frame; [] unless on a circular orbit."""
     if not isinstance(scan.trajectory, CircularOrbit):
         return []
     if not scan.is_fly:

@@ -1,4 +1,4 @@
-"""Makes the sections of a page. Each function returns HTML about a run, or None where there is nothing to show."""
+"""Makes the sections of a report. Each function returns HTML about a run, or None if there is nothing to show."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -25,15 +25,16 @@ from phyradgs_cl.report.scan_charts import (
 from phyradgs_cl.report.viewer import stills, viewer
 from phyradgs_cl.text import flattened, to_digits_of
 
-_MOST_ROWS = 400  # most rows of a table
-_STATES = 5  # most states that are shown
-_MOST_CHARTS = 6  # most charts of a calibration
-_MOST_COMBINATIONS = 20  # most listed combinations of parameters that a calibration cannot tell apart
-_ABSURD = 1e9  # parameters of this size and more come from damaged files and are not rounded
+# Limits of what a page shows, since a file may hold more.
+_MOST_ROWS = 400  # rows of a table that are shown
+_STATES = 5  # times at which a changing object is shown
+_MOST_CHARTS = 6  # charts of a calibration that are shown
+_MOST_COMBINATIONS = 20  # combinations of parameters, not told apart by a calibration, that are shown
+_ABSURD = 1e9  # larger parameters come from damaged files and are not rounded
 
 
 def slices_section(run: Run) -> Markup:
-    """Shows the volume, together with the truth where the scan has one."""
+    """Shows slices of the volume, and of the truth if the scan has one."""
     stored, grid = run.stored, run.stored.required_grid
     windows = images.windows_of(stored.values, run.reference, stored.doubt)
     planes = images.planes_of(stored.values, run.reference, grid, windows, stored.doubt)
@@ -47,7 +48,7 @@ def slices_section(run: Run) -> Markup:
 
 
 def doubt_section(run: Run) -> Markup | None:
-    """Shows a profile through the middle of the volume with its error bars, and the truth where the scan has one."""
+    """Shows a profile through the volume's middle with its error bars, and the truth if the scan has one."""
     stored = run.stored
     if stored.doubt is None:
         return None
@@ -61,7 +62,7 @@ def doubt_section(run: Run) -> Markup | None:
 
 
 def states_section(run: Run) -> Markup | None:
-    """Shows the middle slices of an object that changes, at some of its times."""
+    """Shows the middle slices of a changing object at some times."""
     if (states := run.stored.states) is None:
         return None
     high = images.windows_of(run.stored.values, run.reference)["result"].high
@@ -74,7 +75,7 @@ def states_section(run: Run) -> Markup | None:
 
 
 def motion_section(run: Run) -> Markup | None:
-    """Shows the object at any time of the scan, where its motion is known."""
+    """Shows the object at any time of the scan, if its motion is known."""
     if run.deformation is None or not has_depth(run.stored.values):
         return None
     stored, grid, field = run.stored, run.stored.required_grid, run.deformation
@@ -89,7 +90,7 @@ def motion_section(run: Run) -> Markup | None:
 
 
 def volume_section(run: Run) -> Markup | None:
-    """Shows the volume in 3D. The script reveals this section where the browser can draw it."""
+    """Shows the volume in 3D. The section is hidden until the script finds that the browser can draw it."""
     stored = run.stored
     window = images.windows_of(stored.values, run.reference)["result"]
     picture = space(stored.values, stored.required_grid, window, stored.gaussians)
@@ -97,7 +98,7 @@ def volume_section(run: Run) -> Markup | None:
 
 
 def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
-    """Shows numbers against the truth and, where frames were computed, against the measurement."""
+    """Shows errors of the volume against the truth, and of computed frames, if any, against the measured ones."""
     facts: dict[str, object] = dict(run.metrics)
     if run.reference is not None:
         error = run.stored.values.astype(np.float64) - run.reference
@@ -132,7 +133,8 @@ def geometry_section(scan: Scan) -> Markup:
 
 
 def shutter_section(run: Run, scan: Scan) -> Markup | None:
-    """Shows the times of a frame, and of successive frames if the gantry moves. None for stops without a stated exposure."""
+    """Shows when a frame's lines are exposed and, for a fly-scan, successive frames. Returns None for a gantry that stops
+    without a stated exposure."""
     if not scan.is_fly and scan.shutter.exposure_s == 0:
         return None
     words = shutter_words(scan)
@@ -147,7 +149,7 @@ def shutter_section(run: Run, scan: Scan) -> Markup | None:
 
 
 def projections_section(scan: Scan, views: Sequence[FramePair]) -> Markup | None:
-    """Shows measured, computed and residual frames, with one range of grey values and one range of residuals."""
+    """Shows measured, computed and residual frames. All frames share their grey values, and all residuals."""
     if not views:
         return None
     (rows, columns), (dv_mm, du_mm) = scan.geometry.detector_shape, scan.geometry.pixel_size_mm
@@ -160,7 +162,7 @@ def projections_section(scan: Scan, views: Sequence[FramePair]) -> Markup | None
 
 
 def frame_pictures(views: Sequence[FramePair], style: str | None = None) -> tuple[str, list[Markup]]:
-    """Returns the legend of frames, and their pictures, one row each. ``style``: CSS, if pixels are not square."""
+    """Returns the legend of frames, and a row of pictures for each. style: CSS, for pixels that are not square."""
     low = min(0.0, *(float(v.measured.min()) for v in views))
     high = max(float(v.measured.max()) for v in views)
     limit = max(float(np.percentile(np.abs(v.residual), 99.5)) for v in views) or 1.0
@@ -179,8 +181,8 @@ def frame_pictures(views: Sequence[FramePair], style: str | None = None) -> tupl
 
 
 def preparation_section(run: Run, changes: Sequence[Change]) -> Markup | None:
-    """Shows the effect of each preprocessing step: pictures, a histogram and numbers. Of steps that ``phyradgs prepare`` has
-    applied it shows only the numbers."""
+    """Shows the effect of each preprocessing step by pictures, a histogram and numbers; steps of ``phyradgs prepare`` by
+    numbers only, because the frames before are not in the file."""
     prepared = [] if run.scan is None else run.scan.provenance.get(PREPARED_KEY)
     earlier = [element("div", element("h3", str(line.get("step"))), facts_table(line)) for line in _tables(prepared)]
     if not changes and not earlier:
@@ -206,7 +208,7 @@ def _change(change: Change) -> Markup:
 
 
 def calibration_section(scan: Scan) -> Markup | None:
-    """Shows the results of ``calibrate`` in the order of its runs: tables of parameters, charts of views."""
+    """Shows the results of ``calibrate``, in the order in which it was run: tables of parameters, charts over views."""
     calibrations = _tables(scan.provenance.get("calibrated_before")) + _tables([scan.provenance.get("calibration")])
     parts = [part for one in calibrations for part in _calibration(one, scan)]
     if not parts:
@@ -217,8 +219,7 @@ def calibration_section(scan: Scan) -> Markup | None:
 
 
 def _calibration(calibration: Mapping[str, object], scan: Scan) -> list[Markup]:
-    """Returns a table of parameters, the combinations that frames do not distinguish, and a chart per correction of
-    views."""
+    """Returns a table of parameters, the combinations that frames cannot tell apart, and charts of views' corrections."""
     parameters = _tables(calibration.get("parameters"))
     if not parameters:
         return []
@@ -249,7 +250,7 @@ def _cells(line: Mapping[str, object]) -> list[str]:
 
 
 def provenance_section(run: Run) -> Markup:
-    """Shows everything that the volume file stores about its making, except the convergence record."""
+    """Shows all that the volume file says about how it was made, except the convergence record."""
     facts = {k: v for k, v in run.stored.provenance.items() if k not in ("record", "options")}
     options = run.stored.provenance.get("options")
     parts: list[object] = [facts_table(facts)]
@@ -277,7 +278,7 @@ def _motion_words(scan: Scan, motion: Motion) -> str:
 
 
 def _tables(value: object) -> list[Mapping[str, object]]:
-    """Returns the tables in a list from a file; [] for any other value."""
+    """Returns the tables in ``value``, a list read from a file; [] if it is no list."""
     return [line for line in value if isinstance(line, Mapping)] if isinstance(value, list) else []
 
 
@@ -299,12 +300,12 @@ def _charts(charts: Iterable[Chart]) -> Markup:
 
 
 def note(words: str) -> Markup:
-    """Returns a paragraph of small letters."""
+    """Returns a paragraph in small print."""
     return element("p", words, class_="note")
 
 
 def section(identifier: str, heading: str, *content: object, hidden: bool = False) -> Markup:
-    """Returns a section with its heading. Content that is empty or None is left out."""
+    """Returns a section with its heading, without content that is empty or None."""
     title = element("h2", heading, id=f"{identifier}-heading")
     body = joined(*(part for part in content if part))
     return element("section", title, body, id=identifier, aria_labelledby=f"{identifier}-heading", hidden=hidden)

@@ -1,4 +1,4 @@
-"""Shows the slices of a volume on a page, by keyboard, mouse or finger. Also pictures without controls."""
+"""Makes a viewer of a volume's slices for a page, used by keyboard, mouse or finger, and pictures without controls."""
 
 import math
 from collections.abc import Mapping
@@ -10,8 +10,8 @@ from phyradgs_cl.report.images import Plane, Window, base64_of, data_uri, diverg
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 
 _LAYER_NAMES = {"result": "Result", "truth": "Truth", "difference": "Difference", "doubt": "Error bar"}
-_MOST_ZOOM = 8  # largest zoom of a slice
-_BAR = 0.3  # largest length of the scale bar, as a fraction of a picture's width
+_MOST_ZOOM = 8
+_BAR = 0.3  # the scale bar is at most this fraction of a picture's width
 _HELP = (
     "Arrow keys, Page Up and Down, Home and End move a slider. The wheel moves the slice under the pointer, with Ctrl the "
     "zoom. A click in a picture, or dragging, moves the other two slices to that point."
@@ -19,7 +19,7 @@ _HELP = (
 
 
 def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
-    """Returns three pictures with a slider each, the choice of layers, window and zoom, and the data of the script."""
+    """Returns three pictures with sliders, controls for layer, grey values and zoom, and the script's data."""
     sliders = [
         slider("black", "Black", 0, 255, 0, ""),
         slider("white", "White", 0, 255, 255, ""),
@@ -42,7 +42,7 @@ def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
 
 
 def slider(name: str, words: str, low: float, high: float, value: float, shown: str, step: float = 1) -> Markup:
-    """Returns a slider with its name and its value in words, which the script updates."""
+    """Returns a slider with its name and its value as text, which the script updates."""
     control = element(
         "input", type="range", id=name, min=low, max=high, step=step, value=value, aria_describedby=f"{name}-value"
     )
@@ -64,7 +64,7 @@ def _figure(plane: Plane) -> Markup:
 
 
 def stills(planes: list[Plane], of: str, high: float) -> Markup:
-    """Returns pictures without controls, and a bar of their values: black is 0, white is ``high`` in 1/mm or more."""
+    """Returns pictures without controls, and a bar of their grey values: black is 0, white is ``high`` (1/mm) and above."""
     figures = []
     for plane in planes:
         words = f"{plane.name.capitalize()} slice ({place(plane, plane.middle)})"
@@ -75,8 +75,8 @@ def stills(planes: list[Plane], of: str, high: float) -> Markup:
 
 
 def picture(plane: Plane, of: str, *, canvases: int = 0, has_lines: bool = False) -> Markup:
-    """Returns a slice with world axes at its edges and a scale bar. canvases: how many canvases lie on top for the
-    script. has_lines: crossing lines lie on top."""
+    """Returns a slice with world axes at its edges and a scale bar. canvases: how many the script draws on, on top of it.
+    has_lines: two lines on top show where the other slices are."""
     width_mm, height_mm = plane.size_mm
     image = element(
         "img", src=data_uri(plane.still),
@@ -93,7 +93,7 @@ def picture(plane: Plane, of: str, *, canvases: int = 0, has_lines: bool = False
 
 
 def place(plane: Plane, k: int) -> str:
-    """Returns the position of the slice ``plane.indices[k]`` in words, as "z = 1.5 mm, 17 of 32"."""
+    """Returns the position of the slice ``plane.indices[k]`` as text, such as "z = 1.5 mm, 17 of 32"."""
     where = number(plane.position_mm(k), plane.step_mm)
     return f"{plane.axis} = {where} mm, {plane.indices[k] + 1} of {plane.count}"
 
@@ -116,5 +116,5 @@ def _plane_data(plane: Plane) -> dict[str, object]:
 
 
 def decimals_of(step: float) -> int:
-    """Returns the number of decimals that distinguishes values ``step`` apart."""
+    """Returns how many decimals are needed to tell values apart that differ by ``step``."""
     return int(min(20, max(0, math.ceil(-math.log10(step))))) if step > 0 else 0

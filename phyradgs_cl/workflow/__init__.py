@@ -1,4 +1,4 @@
-"""What the commands do from file to file, without output to the user. Its parts are imported when they are used."""
+"""Does the work of the commands from file to file, and prints nothing. Modules are imported when they are used."""
 
 import lazy_loader
 

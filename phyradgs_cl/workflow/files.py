@@ -1,4 +1,4 @@
-"""Loads scans, references and volumes by the kind of their file, and summarises files."""
+"""Loads scans, volumes and true volumes, by what their file holds, and summarises files."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -31,20 +31,20 @@ _KINDS = {
     "plain-volume": "a bare volume (dataset /volume)",
     "deformation": "how an object moves (/entry/deformation)",
 }
-_OF_MOTION = ("fields", "control_points", "displacements_below_mm", "smallest_determinant")  # shown for a volume that moves
+_OF_MOTION = ("fields", "control_points", "displacements_below_mm", "smallest_determinant")  # facts shown of a motion
 
 
 def load_scan(path: str | Path, flats: str = "mean", rows: tuple[int, int] | None = None) -> Scan:
-    """Reads a scan file, or its rows [first, stop), as line integrals. See ``read_corrected``. Raises InputError for a file
-    that is no scan or is damaged."""
+    """Reads a scan file as line integrals, see ``read_corrected``. rows: detector rows [first, stop); None reads all. Raises
+    InputError for a file that is no scan or is damaged."""
     with expecting(path, "scan"):
         return read_corrected(path, flats, rows)
 
 
 @contextmanager
 def expecting(path: str | Path, *kinds: str) -> Iterator[None]:
-    """Makes an InputError of the body name what the file holds, if that is none of ``kinds``; for a scan of another
-    program, also the command that imports it."""
+    """Improves the message of an InputError about the file ``path``: it then says what the file holds, if none of
+    ``kinds``. For another program's scan it names the command that imports it."""
     try:
         yield
     except InputError as error:
@@ -62,8 +62,7 @@ def expecting(path: str | Path, *kinds: str) -> Iterator[None]:
 
 
 def _is_foreign_scan(path: Path) -> bool:
-    """Returns whether ``path`` is a scan in a format of ``import``. An NXtomo file whose frames state a quantity is a
-    scan of this package."""
+    """Returns whether ``import`` reads ``path``. An NXtomo file whose frames state a quantity is this package's own."""
     try:
         if importers.recognise(path) != "nxtomo":
             return True
@@ -75,8 +74,8 @@ def _is_foreign_scan(path: Path) -> bool:
 
 
 def check_output(output: Path, *inputs: Path | None, remedy: str = "write scan.h5") -> None:
-    """Raises InputError for an HDF5 output that is one of the inputs, or has the suffix of another format, which would
-    mislead other programs. Raises OutputError where it cannot be written."""
+    """Raises InputError for an HDF5 output that is also an input, or has another format's suffix, which would mislead
+    other programs. Raises OutputError if it cannot be written."""
     refuse_overwriting("-o", output, *inputs)
     if (ending := foreign_suffix(output)) is not None:
         raise InputError("-o", f"the suffix {ending} of another format", "an HDF5 file, as NAME.h5", remedy)
@@ -84,8 +83,7 @@ def check_output(output: Path, *inputs: Path | None, remedy: str = "write scan.h
 
 
 def check_picture(option: str, picture: Path, *others: Path | None, suffixes: Sequence[str] = (".png",)) -> None:
-    """Raises InputError for a picture or page that is one of the other files or has none of the suffixes. Raises OutputError
-    where it cannot be written."""
+    """Raises InputError for a picture that is one of ``others`` or has a wrong suffix, OutputError if it is not writable."""
     refuse_overwriting(option, picture, *others)
     if picture.suffix.lower() not in suffixes:
         raise InputError(option, str(picture), f"a file name that ends in {suffixes[0]}")
@@ -93,15 +91,15 @@ def check_picture(option: str, picture: Path, *others: Path | None, suffixes: Se
 
 
 def load_result(path: Path, mu_water_per_mm: float | None = None) -> Volume:
-    """Reads a volume in 1/mm. ``mu_water_per_mm``: water's attenuation, for a file in Hounsfield units without a scale.
+    """Reads a volume in 1/mm. mu_water_per_mm: water's attenuation, for a file in Hounsfield units that does not state it.
     Raises InputError as ``importers.load_volume`` does."""
     with expecting(path, "volume", "plain-volume"):
         return importers.load_volume(path, mu_water_per_mm)
 
 
 def load_reference(path: Path, mu_water_per_mm: float | None = None) -> tuple[Volume, MovingTruth | None]:
-    """Reads a scan's true volume, with the true states of an object that moves or None; or a volume, and None.
-    ``mu_water_per_mm``: as in ``load_result``. Raises InputError for a scan without a reference."""
+    """Reads a true volume to compare with, and its states at several times if a scan file has them, else None. The file is
+    a scan or a volume. mu_water_per_mm: as in ``load_result``. Raises InputError for a scan without a true volume."""
     if importers.foreign_volume(path) is None and file_kind(path) == "scan":
         scan = load_scan(path)
         if scan.reference is None:
@@ -134,7 +132,7 @@ def summary(path: Path) -> dict[str, object]:
 
 
 def _facts_of_states(states: list[tuple[float, dict[str, Any]]]) -> dict[str, object]:
-    """Returns the number of states, their times and extremes, and the other facts of the first of them."""
+    """Summarises volumes at several times: their number, times and extremes, and the other facts of the first."""
     times = {"states": len(states), "first_s": states[0][0], "last_s": states[-1][0]}
     lowest = min(facts["minimum"] for _, facts in states)
     highest = max(facts["maximum"] for _, facts in states)
@@ -149,7 +147,7 @@ def _voxel_facts(volume: Volume) -> dict[str, object]:
 
 
 def _options_in_words(options: object) -> dict[str, object]:
-    """Returns, in words, the motion model and the iterations among the options of a run; {} without options."""
+    """Returns a run's motion model, as text, and its iterations; {} without options."""
     if not isinstance(options, Mapping):
         return {}
     told: dict[str, object] = {}

@@ -40,25 +40,24 @@ from phyradgs_cl.workflow.slabs import Slabs, reconstruct_slabs, remove_slabs, s
 from phyradgs_cl.workflow.volumes import compared_states
 
 log = logging.getLogger(__name__)
-# A converged run is warned of where its last residual, as a fraction of the norm of the line integrals, is too large.
-_SETTLED = 5  # least number of recorded residuals for this warning: the first is 1
-_UNLIKELY = 0.15  # largest residual without a warning: correct scans had at most 0.13 beside noise
-_AT_REST = 1.05  # largest ratio of the residual after 3/4 of the iterations to the last one, for a run that has converged
-# largest ratio of the residual to the noise without a warning: correct scans of 100 photons, residual 0.7, had at most 1.1
-_BEYOND_NOISE = 1.5
+# A converged run with a large last residual (a fraction of the line integrals' norm) gives a warning.
+_SETTLED = 5  # fewer recorded residuals say nothing about convergence: the first is always 1
+_UNLIKELY = 0.15  # smaller residuals give no warning: correct scans had at most 0.13, besides noise
+_AT_REST = 1.05  # converged: the residual after 3/4 of the iterations is at most this many times the last one
+_BEYOND_NOISE = 1.5  # in units of the noise; correct scans, even of 100 photons with residual 0.7, had at most 1.1
 _ALL_ROWS = Slabs()
 
 
 class _Checkpoints:
-    """Writes a checkpoint at most every ``every_s`` seconds (0: none), as a listener to a method's progress. A killed run
-    leaves its last complete checkpoint. One that cannot be written gives one warning, and no error."""
+    """Writes checkpoints; call it with each progress report. It writes at most every ``every_s`` seconds, never for 0. A
+    killed run leaves its last complete checkpoint. One that cannot be written gives one warning, and no error."""
 
     def __init__(self, path: Path, every_s: float) -> None:
         self.path, self.every_s = path, every_s
         self.last_s = time.monotonic()
         self.has_failed = False
         self.iteration: int | None = None
-        """The iteration of the checkpoint that this run has written."""
+        """The iteration of this run's last checkpoint; None before the first."""
 
     def __call__(self, progress: methods.Progress) -> None:
         is_due = self.every_s > 0 and time.monotonic() - self.last_s >= self.every_s
@@ -77,7 +76,7 @@ class _Checkpoints:
 
     @contextmanager
     def mentioned_in_errors(self) -> Iterator[None]:
-        """Adds the way to resume to the errors of the body, if this run has written a checkpoint."""
+        """Makes errors say how to resume, if this run has written a checkpoint."""
         try:
             yield
         except PhyradgsError as error:
@@ -96,12 +95,12 @@ def run_reconstruction(
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
     """Reconstructs a scan file and writes a volume file; returns the result and its metrics.
 
-    A parallel scan whose frames exceed half of this machine's memory is reconstructed in ``slabs`` of rows.
+    A parallel-beam scan whose frames exceed half of this machine's memory is reconstructed in ``slabs`` of rows.
 
-    An interrupted run does not change ``output``: it writes ``io.partial_path`` and a checkpoint, from which ``resume``
-    continues. A complete run removes both; a killed run leaves its last checkpoint. inputs: other files that the output
-    must not overwrite. ranks: those of the runtime; rank 0 alone writes and has metrics. Raises OutputError where the output
-    cannot be written, BusyError while another run writes it, and InputError for a wrong scan, option or checkpoint."""
+    An interrupted run does not change ``output``. It writes ``io.partial_path`` and a checkpoint, from which ``resume``
+    continues; a complete run removes both. A killed run leaves its last checkpoint. inputs: other files that the output
+    must not overwrite. ranks: of the runtime; only rank 0 writes and has metrics. Raises OutputError if the output cannot
+    be written, BusyError while another run writes it, and InputError for a wrong scan, option or checkpoint."""
     checks.within("--checkpoint-every (seconds)", checkpoint_every_s, 0, 1e9)
     leads = ranks is None or ranks.rank == 0
     if leads:
@@ -118,8 +117,8 @@ def run_reconstruction(
 
 
 def _slabs_of(plan: methods.RunPlan, slabs: Slabs, scan: Path, ranks: Communicator | None) -> list[tuple[int, int]]:
-    """Returns the slabs of a run; none for the whole scan at once. Raises InputError for slabs of an object that moves, with
-    a method that finds motion, and on several ranks."""
+    """Returns the slabs of a run; [] reconstructs the whole scan at once. Raises InputError for slabs of an object that
+    moves, with a method that finds motion, for error bars, and on several ranks."""
     if slabs == _ALL_ROWS and surely_fits(scan):
         return []
     with expecting(scan, "scan"):
@@ -181,17 +180,16 @@ def _reconstructed(
                 _keep_checkpoint(output, result)
                 _warn_of_residual(path, scan, result)
     except signals.InterruptedAfterwards:
-        # Without a result, or after a complete run, pass the signal on. After an incomplete run the caller reports it.
+        # after an incomplete run the caller reports the interruption; in all other cases nobody would
         if result is None or result.state is None:
             raise
     return result, metrics
 
 
 def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
-    """Returns the metrics against the scan's reference, by the rule of ``metrics.aligned``, and those on held-out pixels,
-    which it removes from the result's facts. A comparison other than voxel by voxel is added to these facts. For a result
-    that moves or changes, the metrics are means over the true states, because the time of its own reference is
-    arbitrary."""
+    """Returns the metrics against the scan's true volume, on the grid of ``metrics.aligned``, and those on held-out pixels.
+    If the object moves or changes, they are means over the times at which the truth is known. Removes the held-out metrics
+    from the result's facts, and adds there how volumes were compared, unless voxel by voxel."""
     held_out = result.facts.pop(HELD_OUT, {})
     if scan.reference is None:
         return held_out
@@ -235,10 +233,10 @@ def _warn_of_doubts(plan: methods.RunPlan, path: Path, scan: Scan) -> None:
 
 
 def _warn_of_residual(path: Path, scan: Scan, result: methods.Reconstruction) -> None:
-    """Warns where the iterations have converged to a volume whose residual is far above the scan's noise.
+    """Warns if the iterations have converged to a volume whose residual is far above the scan's noise.
 
-    Measured on four objects of 32³, 25 views, by default. An axis off by 2 pixels left 0.25, by 10 pixels 0.6; flats of
-    another scale 0.48 to 1; reversed angles 0.12 to 0.24; wrong units and orders 0.16 to 0.28."""
+    Residuals of wrong scans (four objects of 32³, 25 views, default options): axis off by 2 pixels 0.25, by 10 pixels 0.6;
+    flats of another scale 0.48 to 1; reversed angles 0.12 to 0.24; wrong units and orders 0.16 to 0.28."""
     residuals = [float(one.get("residual", 0.0)) for one in result.record]
     if len(residuals) < _SETTLED or (residual := residuals[-1]) <= _UNLIKELY:
         return
@@ -253,7 +251,7 @@ def _warn_of_residual(path: Path, scan: Scan, result: methods.Reconstruction) ->
 
 
 def _averages(scan: Scan, options: Any) -> bool:
-    """Returns whether the motion model has several poses per line; with one pose, both detector models give the same."""
+    """Returns whether the motion model has several poses per line. With one pose, both detector models are the same."""
     if not hasattr(options, "motion"):
         return False
     cells = options.motion.cells(scan, 0)
@@ -273,7 +271,7 @@ def _provenance(
 
 
 def _set_aside(output: Path) -> None:
-    """Renames the checkpoint of an earlier run, which may hold hours of work, where a run starts without --resume."""
+    """Renames an earlier run's checkpoint instead of overwriting it: it may hold hours of work."""
     checkpoint = checkpoint_path(output)
     if checkpoint.is_file():
         kept = former_checkpoint_path(output)
@@ -286,7 +284,7 @@ def _keep_checkpoint(output: Path, result: methods.Reconstruction) -> None:
     path = checkpoint_path(output)
     if result.state is None:
         for outdated in (path, partial_path(output)):
-            with suppress(OSError):  # the volume is complete, so a failure here does no harm
+            with suppress(OSError):  # harmless, since the volume is complete
                 outdated.unlink()
     else:
         write_checkpoint(path, result.state)
@@ -296,8 +294,8 @@ def resume_or_restart(
     plan: methods.RunPlan, scan: Path, output: Path, make_runtime: Callable[[], Runtime],
     report: methods.ProgressReport = methods.ignore_progress, checkpoint_every_s: float = 600.0,
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
-    """Runs ``run_reconstruction`` from the output's checkpoint; from the beginning where there is no checkpoint, or one
-    that is damaged or of another run."""
+    """Continues ``run_reconstruction`` from the output's checkpoint. Starts again if there is none, or if it is damaged or
+    of another run."""
     run = partial(run_reconstruction, plan, scan, output, make_runtime, report, checkpoint_every_s=checkpoint_every_s)
     checkpoint = checkpoint_path(output)
     if checkpoint.is_file() and methods.method_of(plan.method).is_resumable:
@@ -311,5 +309,5 @@ def resume_or_restart(
 
 
 def is_complete(result: methods.Reconstruction) -> bool:
-    """Returns whether the run came to its end; False for an interrupted run, which has left a checkpoint."""
+    """Returns whether the run was not interrupted."""
     return result.facts.get("interrupted_at") is None

@@ -1,4 +1,4 @@
-"""Writes scan files: simulations of a phantom or a volume, and scans corrected for effects of panel and beam."""
+"""Writes scan files: simulated ones of a phantom or a volume, and scans corrected for effects of panel and beam."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -26,7 +26,7 @@ _TOML = ".toml"
 
 
 def phantom_of(name: str) -> str | EllipsoidPhantom:
-    """Returns the phantom of a TOML file, or the name of a built-in one unchanged. Raises InputError for other names."""
+    """Reads a phantom from a TOML file; returns a built-in phantom's name unchanged. Raises InputError for other names."""
     if name.endswith(_TOML):
         return load_beads(Path(name))
     if name not in PHANTOMS:
@@ -35,15 +35,15 @@ def phantom_of(name: str) -> str | EllipsoidPhantom:
     return name
 
 
-@np.errstate(all="ignore")  # overflow is found in the result, and reported in one line
+@np.errstate(all="ignore")  # overflow is found in the result and gives one error instead of many warnings
 def run_simulation(
     output: Path, scanner: Scanner, options: SimulationOptions, rt: Runtime, report: Callable[[int, int], None], *,
     phantom: str | None = None, volume: Path | None = None, size: int | None = None, pixel_samples: int = 0,
     inputs: Sequence[Path] = (),
 ) -> Scan:  # fmt: skip
-    """Simulates a scan, writes its file and returns it. phantom: a name or TOML file; or a ``volume`` file. size,
-    pixel_samples: as in ``simulated_scan``. inputs: other files that must not be overwritten. Raises InputError and
-    OutputError before any work."""
+    """Simulates a scan, writes its file and returns it. phantom: a name or a TOML file. volume: a file to project instead
+    of a phantom. size, pixel_samples: as in ``simulated_scan``. inputs: other files that must not be overwritten. Raises
+    InputError and OutputError before any work."""
     if volume is not None and phantom is not None:
         raise InputError("--volume", f"given together with --phantom {phantom}", "one of the two")
     check_output(output, volume, *inputs, Path(phantom) if phantom and phantom.endswith(_TOML) else None)
@@ -65,9 +65,9 @@ def run_simulation(
 def run_preparation(
     source: Path, output: Path, options: Preprocessing, make_runtime: Callable[[], Runtime], config: Path | None = None
 ) -> tuple[list[dict[str, Any]], list[str]]:
-    """Writes the scan ``source`` after the steps of ``options`` as line integrals, with bad pixels masked and interpolated.
-    Returns what each step did, in order, as the file's provenance states too, and the names of the steps that ``source``
-    had been through before. Raises InputError and OutputError."""
+    """Applies the steps of ``options`` to the scan ``source``, and writes line integrals with bad pixels masked and
+    interpolated. Returns what each step did, in order, which is in the file's provenance too, and the names of steps that
+    had been applied before. Raises InputError and OutputError."""
     if not options.chosen and options.flats == "mean":
         raise InputError("--steps", "none", f"some of {', '.join(STEPS)}", "leave it out for the usual ones")
     options.check_written()

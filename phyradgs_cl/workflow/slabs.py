@@ -1,6 +1,6 @@
-"""Reconstructs a parallel scan slab by slab: rows of one slab at a time are read, reconstructed and kept on disk.
+"""Reconstructs a parallel-beam scan in slabs: some detector rows at a time are read, reconstructed and kept on disk.
 
-A slab's frames are those of its own rows: ``static`` takes the middle of their times, not of the whole frame's."""
+Times are those of a slab's rows: the motion model ``static`` takes the middle of their time, not of the whole frame's."""
 
 import logging
 import shutil
@@ -30,22 +30,21 @@ from phyradgs_cl.text import each_warning_once
 from phyradgs_cl.workflow.files import load_scan
 
 log = logging.getLogger(__name__)
-# largest fraction of this machine's memory for the frames of a slab and the arrays that methods make of them
-_HOST_SHARE = 0.5
-_COPIES = 4  # number of arrays of the size of a slab's frames that a method holds on the host
+_HOST_SHARE = 0.5  # fraction of this machine's memory for a slab's frames and what methods compute from them
+_COPIES = 4  # arrays of the frames' size that a method holds at a time
 
 
 @dataclass(frozen=True)
 class Slabs:
-    """Which ``rows`` [first, stop) of the panel to reconstruct (None: all), and how many at a time. rows_at_a_time 0
-    takes stated rows at once; of all rows it takes as many as half of this machine's memory holds."""
+    """Which detector rows to reconstruct, and how many at a time. rows: [first, stop); None takes all. rows_at_a_time: 0
+    takes stated ``rows`` at once, and of all rows as many as half of this machine's memory can hold."""
 
     rows: tuple[int, int] | None = None
     rows_at_a_time: int = 0
 
     def of(self, scan: Scan) -> list[tuple[int, int]]:
-        """Returns the slabs [first, stop) of a scan, from its header; [] for the whole scan at once. Raises InputError
-        for rows that the scan does not have, and for slabs of anything but a parallel beam."""
+        """Returns a scan's slabs [first, stop); [] reconstructs the whole scan at once. The scan's header is enough. Raises
+        InputError for rows that the scan does not have, and for slabs of a cone beam."""
         rows = scan.geometry.detector_shape[0]
         first, stop = self.rows or (0, rows)
         at_a_time = self.rows_at_a_time
@@ -61,13 +60,13 @@ class Slabs:
 
 
 def surely_fits(path: Path) -> bool:
-    """Returns whether a file is so small that its frames surely fit into memory, also if they are counts of 2 bytes that
-    become float32. True for a missing file."""
+    """Returns whether a file is so small that its frames surely fit into memory, even counts of 2 bytes that become 4. A
+    missing file counts as small, since reading it gives the right error."""
     return not path.is_file() or 2 * _COPIES * path.stat().st_size < _HOST_SHARE * host_bytes()
 
 
 def rows_of(text: str) -> tuple[int, int]:
-    """Parses ``A:B``, detector rows [A, B). Raises InputError for other text."""
+    """Parses detector rows [A, B) from "A:B". Raises InputError for other text."""
     first, colon, stop = text.partition(":")
     if not (colon and first.strip().isdigit() and stop.strip().isdigit()):
         raise InputError("--rows", repr(text), "A:B, the first detector row and the one after the last", "write 0:256")
@@ -79,10 +78,10 @@ def reconstruct_slabs(
     plan: methods.RunPlan, path: Path, output: Path, slabs: list[tuple[int, int]], rt: Runtime,
     report: methods.ProgressReport, *, resume: bool,
 ) -> methods.Reconstruction:
-    """Returns the volume of all slabs, mapped from a file. Each finished slab is written beside ``output``; ``resume``
-    reads it from there.
+    """Returns the volume of all slabs, memory-mapped from a file. Finished slabs are kept in a folder next to ``output``;
+    with ``resume`` they are read from there.
 
-    Raises InputError where the slabs there are of another run, and KeyboardInterrupt where a slab is interrupted."""
+    Raises InputError if these slabs are of another run, and KeyboardInterrupt if a slab is interrupted."""
     header = read_scan_header(path)
     grid = header.with_grid(plan.preprocessing).grid
     whole = header.on_grid(grid)
@@ -111,11 +110,12 @@ def reconstruct_slabs(
 def _slab(
     plan: methods.RunPlan, path: Path, whole: Scan, rows: tuple[int, int], rt: Runtime, report: methods.ProgressReport
 ) -> methods.Reconstruction:
-    """Reconstructs the slices of detector rows [first, stop), from these rows and ``HALO_ROWS`` on each side."""
+    """Reconstructs the slices that detector rows [first, stop) see. Reads ``HALO_ROWS`` more rows on each side, so that
+    slices at the edge have all their data."""
     count, (first, stop) = whole.geometry.detector_shape[0], rows
     near = max(first - HALO_ROWS, 0), min(stop + HALO_ROWS, count)
     scan = load_scan(path, plan.preprocessing.flats, near).on_grid(part_of(whole.grid, slices_of(whole, *rows)))
-    if hasattr(plan.options, "iterations"):  # iterations explain all frames, so they need the slices of all rows read
+    if hasattr(plan.options, "iterations"):  # iterative methods must fit all rows that they read, so need their slices
         z_mm, *across_mm = np.broadcast_to(plan.preprocessing.margin_mm or 0.0, 3).tolist()
         margin_mm = (max(z_mm, HALO_ROWS * whole.geometry.pixel_size_mm[0]), *across_mm)
         plan = replace(plan, preprocessing=replace(plan.preprocessing, margin_mm=margin_mm))
@@ -129,7 +129,7 @@ def _slab(
 def _named(
     report: methods.ProgressReport, number: int, count: int, rows: tuple[int, int]
 ) -> Callable[[methods.Progress], None]:
-    """Returns a listener that passes progress on to ``report``, with the slab's name in front and without the state."""
+    """Returns a function that passes progress on under the slab's name. It drops the state: a slab has no checkpoint."""
     label = f"slab {number + 1} of {count}, rows {rows[0]}:{rows[1]}: "
 
     def passed_on(progress: methods.Progress) -> None:
@@ -139,8 +139,8 @@ def _named(
 
 
 class _Store:
-    """The finished slabs of a run, each a .npy file in a folder beside the output, with a note of the run's ``identity``.
-    Without ``resume`` it removes earlier slabs; with ``resume`` it raises InputError for slabs of another run."""
+    """The finished slabs of a run: .npy files in a folder next to the output. identity: a text about the run, stored with
+    them. Without ``resume`` earlier slabs are removed; with it, slabs of another run raise InputError."""
 
     def __init__(self, output: Path, identity: str, resume: bool) -> None:
         self.folder = beside(output, ".slabs")
@@ -154,18 +154,18 @@ class _Store:
         note.write_text(identity, encoding="utf-8")
 
     def slab(self, first: int, stop: int) -> np.ndarray | None:
-        """Returns a finished slab (nz, ny, nx), mapped from its file; None where it is not finished."""
+        """Returns a slab (nz, ny, nx), memory-mapped from its file; None if it is not finished."""
         path = self.folder / f"{first}-{stop}.npy"
         return np.load(path, mmap_mode="r") if path.exists() else None
 
     def keep(self, first: int, stop: int, volume: np.ndarray) -> np.ndarray:
-        """Writes a finished slab and returns it mapped from its file."""
+        """Writes a finished slab, and returns it memory-mapped, so that it takes no memory."""
         with written_beside(self.folder / f"{first}-{stop}.npy") as temporary, open(temporary, "wb") as file:
             np.save(file, volume)
         return np.load(self.folder / f"{first}-{stop}.npy", mmap_mode="r")
 
     def joined(self, parts: list[np.ndarray], shape: tuple[int, int, int]) -> np.ndarray:
-        """Returns all slabs as one volume (z, y, x), mapped from a file."""
+        """Joins all slabs to one volume (z, y, x), memory-mapped from a file."""
         volume = np.lib.format.open_memmap(self.folder / "volume.npy", "w+", np.float32, shape)
         at = 0
         for part in parts:
@@ -175,5 +175,5 @@ class _Store:
 
 
 def remove_slabs(output: Path) -> None:
-    """Removes the finished slabs of a run whose volume is written."""
+    """Removes a run's finished slabs; call it when the volume is written."""
     shutil.rmtree(beside(output, ".slabs"), ignore_errors=True)

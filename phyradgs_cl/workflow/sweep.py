@@ -1,5 +1,5 @@
-"""Runs sweeps over scans × settings × seeds. The sweep's file is checked before any run. Runs are made one after the other
-or by Dask's workers. Each writes a line into one results file; a table has the means over scans and seeds."""
+"""Reconstructs many scans with many settings and seeds, listed in a TOML file that is checked before any run. Runs are made
+one by one or by Dask's workers. Each adds a line to one results file; a table has the means over scans and seeds."""
 
 import functools
 import glob
@@ -45,20 +45,19 @@ from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
 
 log = logging.getLogger(__name__)
 RESULTS, TABLE = "results.jsonl", "results.md"
-_RETRIES = 3  # most times that Dask repeats a run after an error
-_CONNECT_S = 10.0  # longest time to connect to Dask's scheduler
-_BUSY_S = 20.0  # time to wait before a run whose output another process writes is tried again
-# Dask listens on this machine only: others must not send work to it
+_RETRIES = 3  # times that Dask repeats a run after an error
+_CONNECT_S = 10.0  # time to connect to Dask's scheduler
+_BUSY_S = 20.0  # wait before a new try, while another process still writes the run's output
+# Dask listens on this machine only, so that nobody else can send work to it
 _LOCAL = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
 Line = dict[str, Any]
 
-runtime_of_process = functools.cache(Runtime)  # one runtime per process and device: built kernels stay from run to run
+runtime_of_process = functools.cache(Runtime)  # kept for a process and device, so that kernels are built only once
 
 
 @dataclass(frozen=True)
 class SweepRun:
-    """One reconstruction of a sweep, as a worker gets it. facts: the first entries of its results line, of which "run" is
-    its name."""
+    """One reconstruction of a sweep, ready for a worker. facts: first entries of its line of results; "run" is its name."""
 
     scan: Path
     plan: RunPlan
@@ -68,9 +67,9 @@ class SweepRun:
 
 
 def plan_sweep(path: Path, folder: Path, checkpoint_every_s: float = 600.0) -> list[SweepRun]:
-    """Returns every run of the sweep's file ``path``, scan by scan. Volumes go to ``folder``/volumes. Patterns start at the
-    folder of ``path``. A run's name is unique to its scan (path, size, time of change), setting and seed. Raises InputError
-    for all that would stop a run: unknown keys, values out of range, patterns without a match, files that are no scans."""
+    """Returns every run of the sweep's file ``path``, scan by scan. Volumes will be written to ``folder``/volumes. Patterns
+    of scans are relative to the folder of ``path``. A run's name depends on its scan (path, size, time of change), setting
+    and seed. Raises InputError for what would stop a run: unknown keys, wrong values, patterns that match no scan."""
     document = read_toml(path, f"GRID {path}")
     refuse_unknown(f"{path}:", document, ("scans", "seeds", "options", "grid", "runs"))
     patterns = _list(document.get("scans"), str, f"{path}: scans", 'a list of files or patterns, as ["scans/*.h5"]')
@@ -107,8 +106,8 @@ def _files(pattern: str, path: Path) -> list[Path]:
 
 
 def _settings(document: Mapping[str, Any], path: Path) -> Iterator[dict[str, Any]]:
-    """Yields the options of every setting by dotted name: all combinations of the lists in each [[grid]], and each
-    [[runs]], with the [options] of all. Raises InputError for a file without either, or with an empty list."""
+    """Yields the options of every setting, by dotted name: each [[runs]], and all combinations of the lists in each
+    [[grid]]. [options] are added to all. Raises InputError for a file with neither table, and for an empty list."""
     keys = [key for key in ("grid", "runs") if key in document]
     if not keys:
         remedy = "write for example [[grid]] with method = ['fdk', 'sirt']"
@@ -125,8 +124,7 @@ def _settings(document: Mapping[str, Any], path: Path) -> Iterator[dict[str, Any
 
 
 def _plan(values: Mapping[str, Any], seed: int, where: str) -> RunPlan:
-    """Returns the plan of a run. Raises the errors of ``plan_run``, with ``where`` and the values in front of the
-    message."""
+    """Returns the plan of a run. Errors of ``plan_run`` get ``where`` and the values in front of their message."""
     options = nested(values)
     method, preset = options.pop("method", DEFAULT_METHOD), options.pop("preset", None)
     try:
@@ -140,11 +138,11 @@ def run_sweep(
     runs: Sequence[SweepRun], folder: Path, workers: str | None = None, device: str | None = None, *,
     tell: Callable[[int, Line], object] = lambda done, line: None, report: ProgressReport = ignore_progress,
 ) -> int:  # fmt: skip
-    """Makes the runs that the results file lacks, then the table, results.md. Returns the number of runs that failed in this
-    call; the next call makes them again. workers: a number of Dask's workers on this machine, or the address of a Dask
-    scheduler; None makes the runs here. ``tell`` gets the number of finished runs and the last line. Raises OutputError
-    where the folder cannot be written, BusyError while another sweep uses it, and InputError for a scheduler that does not
-    answer or a missing package."""
+    """Makes the runs that the results file lacks, then the table results.md. Returns how many runs failed; the next call
+    tries them again. workers: a number of Dask's workers on this machine, or the address of a Dask scheduler; None makes
+    the runs in this process. tell: called with the number of finished runs and the last line. Raises OutputError if the
+    folder cannot be written, BusyError while another sweep uses it, and InputError for a scheduler that does not answer or
+    a missing package."""
     make_folder(folder / "volumes", folder)
     with only_run(folder / RESULTS):
         newest = {line["run"]: line for line in read_lines(folder / RESULTS)}
@@ -166,8 +164,8 @@ def run_sweep(
 
 def _made_here(runs: Sequence[SweepRun], device: str | None, report: ProgressReport) -> Iterator[Line]:
     for run in runs:
-        runtime_of_process(device)  # a missing device stops the sweep: it is no run's error
-        with keep_finished_work():  # a finished run is kept, then the sweep stops
+        runtime_of_process(device)  # without a device no run can succeed, so its error stops the sweep
+        with keep_finished_work():  # Ctrl-C stops the sweep, but a finished run is kept
             try:
                 line = make_run(run, report, device)
             except Exception as error:
@@ -177,9 +175,9 @@ def _made_here(runs: Sequence[SweepRun], device: str | None, report: ProgressRep
 
 def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None, page: Path) -> Iterator[Line]:
     """Yields the runs' lines as they finish, and writes Dask's report to ``page``. Raises InputError without a scheduler."""
-    os.environ.setdefault("DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION", "1.0")  # a death counts against one run only
+    os.environ.setdefault("DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION", "1.0")  # else a dead worker fails queued runs
     dask = checks.package("distributed", "the package that --workers needs", "phyradgs-cl[cluster]")
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # InputError below says the same
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # the InputError below says it already
     count, where = int(workers) if workers.isdigit() else None, {"address": workers, "timeout": _CONNECT_S}
     if count is not None:
         checks.within("--workers", count, 1, 1024)
@@ -189,8 +187,8 @@ def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None,
         with dask.Client(**where) as client, dask.performance_report(str(page)):
             if count is not None:
                 client.register_worker_callbacks(functools.partial(_begin, device))
-                client.cluster.adapt(minimum=count, maximum=count)  # else a worker that dies early is not replaced
-                device = None  # each worker has its own device
+                client.cluster.adapt(minimum=count, maximum=count)  # else Dask does not replace a worker that dies early
+                device = None  # _begin has set each worker's device
             run_of = {client.submit(make_run, run, device=device, retries=_RETRIES, pure=False): run for run in runs}
             for future in dask.as_completed(list(run_of)):
                 run = run_of.pop(future)
@@ -202,22 +200,22 @@ def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None,
 
 
 def _begin(device: str | None, dask_worker: Any) -> None:
-    """Sets a worker's device by the worker's number, and makes it ignore Ctrl-C, which the sweep's own process handles."""
+    """Prepares a worker: chooses its device by its number, and ignores Ctrl-C, which the sweep's main process handles."""
     os.environ[DEVICE_VARIABLE] = str(choose_device(device, int(dask_worker.name))[0].index)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: str | None = None) -> Line:
-    """Returns the results line of a run, or a line with the error where the scan, the options or a lack of memory is at
-    fault. Raises all other errors, after which another try may succeed, and KeyboardInterrupt for an incomplete run."""
+    """Makes a run and returns its line of results. If scan, options or a lack of memory are at fault, the line has the
+    error. Raises all other errors, after which another try may succeed, and KeyboardInterrupt for an incomplete run."""
     try:
         rt = runtime_of_process(device)
         result, metrics = resume_or_restart(run.plan, run.scan, run.output, lambda: rt, report, run.checkpoint_every_s)
     except (InputError, NumericalError, OutOfMemoryError) as error:
         return _failed(run, error)
     except Exception as error:
-        runtime_of_process.cache_clear()  # the next run opens its device again
-        time.sleep(_BUSY_S if isinstance(error, BusyError) else 0)  # a worker that lost contact may still be writing it
+        runtime_of_process.cache_clear()  # the device may have failed: the next run opens it again
+        time.sleep(_BUSY_S if isinstance(error, BusyError) else 0)  # a worker that lost contact may be writing it
         raise
     if not is_complete(result):
         raise KeyboardInterrupt
@@ -227,8 +225,8 @@ def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: st
 
 
 def _failed(run: SweepRun, error: Exception) -> Line:
-    """Returns the results line of a run that failed, also by dead workers. Raises an OutputError that all runs would
-    meet, except BusyError."""
+    """Returns the line of results of a run that failed or whose workers died. Raises an OutputError other than BusyError,
+    since all runs would meet it."""
     if isinstance(error, OutputError) and not isinstance(error, BusyError):
         raise error
     text = str(error) if isinstance(error, PhyradgsError) else f"{type(error).__name__}: {error}"
@@ -236,8 +234,8 @@ def _failed(run: SweepRun, error: Exception) -> Line:
 
 
 def markdown(lines: Sequence[Line], planned: int) -> str:
-    """Returns a table in Markdown: means and standard deviations over the scans and seeds of every setting, and the failed
-    runs below. planned: the number of all runs."""
+    """Returns a table in Markdown with the means and standard deviations of every setting over scans and seeds. Below are
+    the failed runs. planned: the number of all runs."""
     done, failed = [line for line in lines if "error" not in line], [line for line in lines if "error" in line]
     measured = {name for line in done for name in line["metrics"]}
     metrics = {**METRICS, **{name: metric for name, metric in HELD_OUT.items() if name in measured}}
@@ -264,8 +262,7 @@ def _mean(values: Sequence[Any], form: str) -> str:
 
 
 def read_lines(path: Path) -> list[Line]:
-    """Reads the complete lines of a results file; [] where there is no file. Warns of damaged lines, which it leaves
-    out."""
+    """Reads the lines of a results file; [] if there is no file. Leaves damaged lines out, with a warning."""
     lines, damaged = [], []
     text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
     for number, row in enumerate(text.split("\n"), 1):
@@ -280,12 +277,12 @@ def read_lines(path: Path) -> list[Line]:
 
 
 def append_line(path: Path, line: Mapping[str, Any]) -> None:
-    """Appends one line in a single write, and waits until it is on the disk. Raises OutputError where that fails."""
+    """Appends one line in a single write, and waits until it is on the disk. Raises OutputError if that fails."""
     text = plain_text(json.dumps(line, ensure_ascii=False, allow_nan=False, default=str)) + "\n"
     try:
         with open(path, "ab+") as file:
             if file.tell() and file.seek(-1, os.SEEK_END) >= 0 and file.read(1) != b"\n":
-                text = "\n" + text  # after a line that was cut off
+                text = "\n" + text  # the last line was cut off: begin a new one
             file.write(text.encode())
             file.flush()
             os.fsync(file.fileno())

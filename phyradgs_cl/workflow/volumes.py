@@ -1,4 +1,4 @@
-"""Compares a volume with a reference: metrics, and a picture of slices."""
+"""Compares a volume with a reference: computes metrics, and draws slices of both."""
 
 import logging
 from collections.abc import Mapping
@@ -32,8 +32,8 @@ from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_picture, load_reference, load_result
 
 log = logging.getLogger(__name__)
-_LITTLE = 0.5 - 1e-6  # least fraction of either box that both share: less is often a wrong size or offset
-_ALIKE = 0.65  # least correlation where they share so little: at most 0.6 under wrong sizes and offsets, 0.55 to 0.9 else
+_LITTLE = 0.5 - 1e-6  # boxes that share less than this fraction of either often have a wrong size or offset
+_ALIKE = 0.65  # least correlation in the shared part that clears the doubt: wrong ones had at most 0.6, right 0.55 to 0.9
 
 
 @np.errstate(all="ignore")
@@ -41,13 +41,15 @@ def run_evaluation(
     volume_path: Path, reference_path: Path, picture: Path, reference_voxel_mm: object = None,
     object_motion: Path | None = None, reference_of_rtk: bool = False, mu_water_per_mm: float | None = None,
 ) -> dict[str, object]:
-    """Compares a volume with a scan's reference or another volume, by the rule of ``metrics.aligned``, and writes the
-    picture of slices. Error bars get their coverage and a curve. A volume without a scale is compared voxel by voxel.
-    ``reference_voxel_mm``: sides of the voxels of a reference without a scale, one length or (z, y, x).
-    ``object_motion``: the file of a deformation, by which the volume is moved to the time of each true state of a scan;
-    None takes the volume's own, if it has one. ``reference_of_rtk``: the reference has RTK's axes. ``mu_water_per_mm``:
-    water's attenuation, for files in Hounsfield units without a scale. Raises InputError for wrong sides, files that do
-    not fit each other, and water's attenuation for files in 1/mm."""
+    """Compares a volume with a scan's true volume or another volume, on the grid of ``metrics.aligned``. Writes a picture of
+    slices and, for error bars, computes their coverage and draws a curve. A volume without voxel sizes is compared voxel by
+    voxel.
+
+    reference_voxel_mm: voxel sides of a reference that does not state them, one length or (z, y, x).
+    object_motion: the file of a deformation, which moves the volume to each time at which a scan has the truth; None takes
+    the volume's own, if it has one. reference_of_rtk: the reference has RTK's axes. mu_water_per_mm: water's attenuation,
+    for files in Hounsfield units that do not state it. Raises InputError for impossible sides, files that do not fit each
+    other, and water's attenuation for files in 1/mm."""
     check_picture("--picture", picture, volume_path, reference_path, object_motion)
     field = None if object_motion is None else read_deformation(object_motion)
     result = attenuation_of(str(volume_path), load_result(volume_path, mu_water_per_mm))
@@ -74,7 +76,7 @@ def run_evaluation(
     if result.doubt is not None and grid is not None:
         facts, curve = provenance.get("doubt"), picture.with_name(f"{picture.stem}.doubt.png")
         stated = facts.get("multiple_95") if isinstance(facts, Mapping) else None
-        multiple_95 = stated if isinstance(stated, float) else 1.96  # that of a normal law
+        multiple_95 = stated if isinstance(stated, float) else 1.96  # 95 % of a normal distribution
         bar = volume if (of_bars := aligned(result.doubt, grid, *truth)) is None else of_bars.volume
         with finish_despite_interrupt(), written_beside(curve) as temporary:
             reliability_png(temporary, bar, volume, reference, multiple_95)
@@ -89,7 +91,7 @@ def run_evaluation(
     with finish_despite_interrupt(), written_beside(picture) as temporary:
         try:
             slices_png(temporary, volume, reference, title)
-        except OutputError as error:  # its text names the temporary file; its cause is the system's error
+        except OutputError as error:  # it names the temporary file; its cause is reported under the picture's name
             raise error.__cause__ or error from None
     known: dict[str, object] = {key: provenance[key] for key in ("method", "seconds", "gaussians") if key in provenance}
     files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
@@ -98,8 +100,8 @@ def run_evaluation(
 
 
 def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dict[str, object]:
-    """Returns PSNR and SSIM of a volume at the time of each true state, and their means. Where both deformations are known,
-    it adds the mean and the 95th percentile of the motion's error in mm. Raises InputError for boxes that do not overlap."""
+    """Returns PSNR and SSIM at each time at which the truth is known, and their means. If both deformations are known, adds
+    the mean and the 95th percentile of the motion's error in mm. Raises InputError for boxes that do not overlap."""
     grid, field = result.required_grid, result.deformation
     rows: list[dict[str, float]] = []
     for time_s, state in zip(truth.times_s, truth.volumes, strict=True):
@@ -114,15 +116,15 @@ def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dic
     points_mm = edge_points_mm(truth.volumes[0], truth_grid)
     try:
         mean_mm, high_mm = motion_error_mm(field, truth.deformation, points_mm, truth.times_s)
-    except InputError as error:  # a deformation that cannot be inverted: metrics do not need its inverse
+    except InputError as error:  # a deformation without an inverse, which the other metrics do not need
         log.warning("no error of the motion: %s", error)
         return {"states": rows, **means}
     return {"states": rows, **means, "mean_motion_error_mm": mean_mm, "p95_motion_error_mm": high_mm}
 
 
 def _with_our_axes(volume: Volume) -> Volume:
-    """Returns a volume of RTK, whose axes (x, y, z) are this package's (y, z, x)."""
-    z, y, x = 1, 2, 0  # indices of our axes in RTK's (z, y, x)
+    """Reorders a volume of RTK, whose axes x, y, z are this package's y, z, x."""
+    z, y, x = 1, 2, 0  # where our axes are in RTK's (z, y, x)
     grid = volume.grid
     if grid is not None:
         shape, size_mm, at_mm = grid.shape, grid.voxel_size_mm, grid.offset_mm
@@ -131,8 +133,7 @@ def _with_our_axes(volume: Volume) -> Volume:
 
 
 def _grid_of(path: Path, reference: np.ndarray, grid: Grid | None, voxel_mm: object, volume_path: Path) -> Grid:
-    """Returns the reference's grid: its own, or voxels of ``voxel_mm`` centred on the axis. Raises InputError for both, and
-    for neither."""
+    """Returns the reference's grid, or voxels of ``voxel_mm`` centred on the axis. Raises InputError for both or neither."""
     if voxel_mm is not None:
         if grid is not None:
             expected = f"a reference without a scale; {path} has {in_words(grid)}"
@@ -148,8 +149,8 @@ def _grid_of(path: Path, reference: np.ndarray, grid: Grid | None, voxel_mm: obj
 def _on_one_grid(
     volume_path: Path, reference_path: Path, result: tuple[np.ndarray, Grid], truth: tuple[np.ndarray, Grid]
 ) -> Aligned:
-    """Returns both volumes on one grid. Raises InputError where they have no object in common. Warns of little overlap,
-    unless the volume's voxels are the reference's, or both look alike there."""
+    """Returns both volumes on one grid. Raises InputError if they have no object in common. Warns of little overlap, unless
+    they have the same voxels or look similar there."""
     pair = aligned(*result, *truth)
     if pair is None:
         found = f"{in_words(result[1])}, which has no voxel of the reference, {in_words(truth[1])}"

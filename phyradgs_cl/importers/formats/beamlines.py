@@ -1,9 +1,8 @@
-"""HDF5 files of beamlines: NXtomo of other programs, and Data Exchange. Values that this package's scan files must have may
-come from options.
+"""HDF5 files of beamlines: NXtomo of other programs, and Data Exchange. Options give values that the files lack.
 
 NXtomo does not state which row is on top. Row 0 is taken as the lowest, with a warning, after the flips that the file
-declares in either way of the nxtomo package. The column of the rotation axis becomes a detector offset. Without a source
-distance the beam is parallel.
+declares. The nxtomo package declares them in two ways, and both are read. The column of the rotation axis becomes a
+detector offset. Without a source distance the beam is parallel.
 
 Data Exchange has /exchange with data, data_white, data_dark and theta, of parallel beams; distances from the options make a
 cone. Angles are the sample's, in degrees unless units differ; row 0 is the top of the image."""
@@ -27,7 +26,7 @@ from phyradgs_cl.io.hdf5.datasets import ANGLE, LENGTH, TIME
 from phyradgs_cl.io.scan.header import find_entry, read_duration
 
 _log = logging.getLogger(__name__)
-_NOWHERE = "/no entry"  # stands for the entry of bare arrays: all else comes from the options
+_NOWHERE = "/no entry"  # an address that no file has, for bare arrays: all metadata then come from options
 _EXCHANGE = "/exchange"
 _INSTRUMENT = "/measurement/instrument"
 _DETECTOR, _OPTICS = f"{_INSTRUMENT}/detector", f"{_INSTRUMENT}/detection_system/objective"
@@ -46,8 +45,7 @@ _MOVES = ("x_translation", "y_translation", "z_translation")
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is an HDF5 file without Data Exchange's group. Raises InputError for a volume of this
-    package."""
+    """Returns whether ``path`` is an HDF5 file but no Data Exchange. Raises InputError for this package's volumes."""
     if not path.is_file() or not h5py.is_hdf5(path):
         return False
     with open_hdf5(path) as source:
@@ -61,12 +59,12 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports the projections, flats and darks of the file's NXtomo entry, or of the addresses among the options."""
+    """Imports projections, flats and darks from the file's NXtomo entry, or from the addresses that the options give."""
     options.refuse_unused("nxtomo", OF_HDF5)
     with open_hdf5(path, options.linked_folder) as source:
         places = hdf5.places_of(options, source)
         entry = find_entry(source, options.entry) if "projections" not in places.stated or options.entry else _NOWHERE
-        if source.find(extra := f"{entry}/{schema.EXTRA}") is not None:  # an import would lose a part of it
+        if source.find(extra := f"{entry}/{schema.EXTRA}") is not None:  # an import would lose what NXtomo cannot hold
             raise source.error(extra, "a scan file of this package", "a file of another program", "use it as it is")
         detector = f"{entry}/{schema.DETECTOR}"
         keys = [f"{detector}/{name}" for name in ("image_key_control", "image_key")]
@@ -118,8 +116,8 @@ def _turned(source: Hdf5Source, detector: str) -> assemble.Turned:
 
 
 def _axis_columns(source: Hdf5Source, detector: str, turn: assemble.Turned, options: ImportOptions) -> float:
-    """Returns how many columns the panel's middle lies to the right of the axis. Files of nxtomo state the axis from the
-    middle."""
+    """Returns how many columns the panel's middle lies to the right of the axis. Files of the nxtomo package count the
+    axis' column from the panel's middle."""
     names = (f"{detector}/{name}" for name in ("x_rotation_axis_pixel_position", "estimated_cor_from_motor"))
     for address in [address for address in names if source.find(address) is not None][:1]:
         if column := h5.read_number(source, address):
@@ -131,8 +129,8 @@ def _axis_columns(source: Hdf5Source, detector: str, turn: assemble.Turned, opti
 def _motion(
     places: hdf5.Places, entry: str, used: np.ndarray, geometry: Geometry, options: ImportOptions
 ) -> tuple[assemble.Timing, CircularOrbit]:
-    """Reads timing and orbit. With ``rotation_angle_end`` every frame turns from its start to its end angle; without, the
-    start angles give the speed."""
+    """Reads timing and orbit. ``rotation_angle_end`` states the angle at which each frame ends. Without it, the angles of
+    neighbouring frames give the speed."""
     assert places.source is not None
     source, detector, angles = places.source, f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SAMPLE}/rotation_angle"
     sign = gantry_sign(options, h5.read_attribute(source, angles, "rotates") or "sample")
@@ -153,7 +151,7 @@ def _motion(
 
 
 def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
-    """Raises InputError for a sample that moves between projections, which this import cannot express."""
+    """Raises InputError for a sample that is shifted between projections, which the imported scan could not express."""
     for name in _MOVES:
         address = f"{entry}/{schema.SAMPLE}/{name}"
         if source.find(address) is None or source.dataset(address).size == 1:
@@ -172,7 +170,7 @@ def recognises_exchange(path: Path) -> bool:
 
 
 def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
-    """Imports the projections of /exchange, with its flats and darks before and after."""
+    """Imports the projections of /exchange, with the flats and darks taken before and after them."""
     options.refuse_unused("data-exchange", OF_HDF5)
     with open_hdf5(path, options.linked_folder) as source:
         places, theta = hdf5.places_of(options, source), f"{_EXCHANGE}/theta"

@@ -1,8 +1,8 @@
 """Scans of TESCAN's FleX-ray scanners: "scan settings.txt" with TIFFs of counts, flats (io*) and darks (di*).
 
-Offsets have the signs of flexdata: ver_ up, tra_ to the right seen from the source, in mm; a window ROI (LTRB) of the panel
-moves its middle. The sample turns clockwise seen from above, row 0 is on top, column 0 on the left. flexdata's corrections
-for the scanner of CWI are not applied, since they belong to that scanner and its dates."""
+Offsets in mm have the signs of the package flexdata: ver_ up, tra_ to the right seen from the source. A window of the panel,
+ROI (LTRB), shifts the image's middle. The sample turns clockwise seen from above, row 0 is on top, column 0 on the left.
+flexdata's corrections are not applied, since they hold for one scanner, at CWI, and for certain dates."""
 
 import logging
 from functools import partial
@@ -26,8 +26,8 @@ _NAMES = (
     *("SOD", "SDD", *_PLACES, "Start angle", "Last angle", "ROI (LTRB)", "Binned pixel size", "Voxel size"),
     *("Exposure time (ms)", "Number of averages"),
 )
-_WHOLE_MIDDLE = (971, 767)  # (column, row) of the middle of the panel without binning
-_WHOLE_PITCH_MM = 0.0748  # pitch of the pixels of the panel without binning
+_WHOLE_MIDDLE = (971, 767)  # (column, row) of the panel's middle without binning, as in flexdata
+_WHOLE_PITCH_MM = 0.0748  # pixel pitch of the panel without binning
 
 
 def recognises(path: Path) -> bool:
@@ -37,7 +37,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder with settings and frames, or the settings with the frames in their folder."""
+    """Imports a folder of settings and frames. ``path`` may also be the settings file in it."""
     options.refuse_unused("flexray", OF_BARE_FRAMES)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.file(_FILE, str(path / _FILE))
@@ -67,7 +67,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:
-    """Returns the stage of the settings, in coordinates whose origin is at the source's height."""
+    """Returns the stage that the settings describe. Heights count from the source's, which makes z = 0 its plane."""
     to_axis_mm = options.taken("source_to_axis_mm", partial(scan.length, "SOD"))
     to_detector_mm = options.taken("source_to_detector_mm", partial(scan.length, "SDD"))
 
@@ -90,7 +90,7 @@ def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names
 
 
 def _window_mm(scan: Settings) -> tuple[float, float]:
-    """Returns (right, up) in mm, from the panel's middle to the middle of the window that was read."""
+    """Returns how far right and up, in mm, the middle of the window that was read lies from the panel's middle."""
     if not scan.has("ROI (LTRB)"):
         return 0.0, 0.0
     left, top, right, bottom = scan.listed("ROI (LTRB)", 4).tolist()

@@ -1,8 +1,9 @@
 """Scans of LEAP: the text file that its ``save_parameters`` writes, with line integrals as .npy (F, v, u) or TIFFs.
 
-LEAP's cone equals ours a quarter turn back: at φ = 0° the source stands at −y. Columns run along the turn, row 0 is the
-lowest. The ray through the origin falls on centerRow and centerCol; ``tau`` moves source and panel against the columns. A
-modular beam is a table of sources, panel centres and directions of rows and columns. Lengths in mm, angles in degrees."""
+LEAP's angle φ is our φ − 90°: at φ = 0° its source stands at −y. Columns count in the direction of the turn, row 0 is
+the lowest. The ray through the origin falls on centerRow and centerCol. ``tau`` shifts source and panel against the columns'
+direction. A modular beam is a table of sources, panel centres, and directions of rows and columns. Lengths are in mm, angles
+in degrees."""
 
 from functools import partial
 from pathlib import Path
@@ -29,7 +30,7 @@ _NAMES = (
     *("sod", "sdd", "tau", "helicalPitch", "tiltAngle", *_VECTORS),
 )
 _BEAMS, _ENDS = ("cone", "parallel", "modular"), (".txt", ".cfg")
-_MOST = 1_000_000  # largest number of angles, rows, columns, or voxels along an axis
+_MOST = 1_000_000  # a file with more angles, rows, columns or voxels along an axis is damaged
 _OF_TABLES = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
 
 
@@ -44,7 +45,7 @@ def _descriptions(path: Path) -> list[Path]:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder with one file of parameters and its frames, or the parameters with the frames in their folder."""
+    """Imports a folder of frames with one file of LEAP's parameters. ``path`` may also be that file."""
     options.refuse_unused("leap", OF_BARE_FRAMES)
     folder, descriptions = SafeFolder(path if path.is_dir() else path.parent), _descriptions(path)
     if len(descriptions) != 1:
@@ -71,7 +72,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 def _turning(
     scan: Settings, shape: tuple[int, int, int], options: ImportOptions, timing: assemble.Timing
 ) -> tuple[CircularOrbit | PoseTable, Geometry]:
-    """Returns trajectory and geometry of a cone or parallel beam about z. Raises InputError for a helix, tilt or curve."""
+    """Returns trajectory and geometry of a beam that turns about z. Raises InputError for a helix, tilt or curved panel."""
     for name in ("helicalPitch", "tiltAngle"):
         if scan.number(name, 0.0):
             raise scan.error(name, f"{scan.number(name):g}", "0", "write it with convert_to_modularbeam()")

@@ -1,9 +1,9 @@
 """Scans of Nikon's XT H systems: a .xtekct file and 16-bit TIFFs of counts, corrected for darks and flats by the scanner.
 
-The signs are those that the readers of CIL and TIGRE agree on: row 0 on top, column 0 on the right seen from the source,
-a sample that turns clockwise seen from above. An axis off the middle stands to the left for ObjectOffsetX above 0, or for
-the mean of CentreOfRotationTop and CentreOfRotationBottom, which are places on the panel. The axis' top leans to the right
-for ObjectRoll above 0, and towards the panel for ObjectTilt above 0. Lengths are in mm, angles in degrees."""
+Signs are as in the readers of CIL and TIGRE: row 0 on top, column 0 on the right seen from the source, a sample that turns
+clockwise seen from above. ObjectOffsetX above 0 puts the axis to the left. Without it, the mean of CentreOfRotationTop and
+CentreOfRotationBottom, measured on the panel, takes its place. ObjectRoll above 0 leans the axis' top to the right,
+ObjectTilt above 0 towards the panel. Lengths are in mm, angles in degrees."""
 
 import logging
 import math
@@ -36,7 +36,7 @@ _NAMES = (
     *("DetectorPixelsX", "DetectorPixelsY", "DetectorPixelSizeX", "DetectorPixelSizeY", "DetectorOffsetX"),
     *("DetectorOffsetY", "InitialAngle", "AngularStep", "ObjectOffsetX", "ObjectRoll", "ObjectTilt", "Units", *_ENDS),
 )
-_MOST_FRAMES = 1_000_000  # largest number of frames, and of rows or columns
+_MOST_FRAMES = 1_000_000  # a file that states more frames, rows or columns is damaged
 
 
 def recognises(path: Path) -> bool:
@@ -45,7 +45,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder with one .xtekct and its TIFFs, or the .xtekct with the TIFFs in its folder."""
+    """Imports a folder with one .xtekct file and its TIFFs. ``path`` may also be the .xtekct file."""
     options.refuse_unused("nikon", OF_FOLDERS)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("description of the scan", ".xtekct")
@@ -55,7 +55,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     sizes = ("Projections", "DetectorPixelsY", "DetectorPixelsX")
     count, *panel = (scan.count(name, _MOST_FRAMES) for name in sizes)
     prefix = scan.word("Name", default="") + scan.word("InputSeparator", default="_")
-    place, inside = folder, scan.word("InputFolderName", default="")  # often a folder on the scanner's disk: not here
+    place, inside = folder, scan.word("InputFolderName", default="")  # often a path on the scanner's disk, absent here
     if inside and folder.exists(inside.split("\\")[0].split("/")[0]):
         place = SafeFolder(folder.root / checked_name(inside, scan.name("InputFolderName")))
     frames, at, said = read_numbered(place, prefix, (count, *panel), [*map(scan.name, sizes)], options, first=1)
@@ -75,7 +75,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _angles(scan: Settings, measured: Path | None, count: int) -> np.ndarray:
-    """Returns the angles (count,) in rad: those of the file ``measured`` or, without it, equal steps."""
+    """Returns angles (count,) in rad: those in the file ``measured``, or equal steps if it is None."""
     if measured is not None and not scan.has("AngularStep"):
         return read_angles_rad(measured, count, column=1)
     steps_rad = np.deg2rad(scan.number("InitialAngle", 0.0) + scan.number("AngularStep") * np.arange(count))

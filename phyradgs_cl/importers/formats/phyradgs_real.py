@@ -1,8 +1,8 @@
 """Real scans of PhyRadGS: a JSON of calibrated views with the arcs of their rolling shutter, and 16-bit TIFF frames.
 
-A view's ``detector`` is a 4×4 matrix from the panel to the world (mm): column 0 along the rows of the image, column 1
-down them, column 3 the panel's centre. It holds where the panel stands on its circle, else turned about +z by its
-angle. The first stored row is read first."""
+A view's ``detector`` is a 4×4 matrix from the panel to the world (mm). Column 0 points to the image's next column, column 1
+to its next row, and column 3 is the panel's centre. The matrix describes the panel at that centre; at another angle of the
+gantry the panel is rotated about +z. The first stored row is read first."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -30,14 +30,14 @@ OPTIONS = (
 )
 PROJECTIONS = "projections"
 _ANGLES = ("first_row_start_angle", "first_row_end_angle", "last_row_end_angle")
-_TIMES_A_FRAME = 33  # number of poses in the pose table for the window of each frame
-_GAP = 1e-3  # least time between the windows of two frames, as a fraction of a frame's span
+_TIMES_A_FRAME = 33  # poses per frame in the pose table, from its first line's opening to its last line's closing
+_GAP = 1e-3  # least pause between two frames, as a fraction of a frame's duration: times in a pose table must rise
 
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """The circle of the source or the panel: centre (x, y) and radius in mm. Each view has a height z (F,) in mm and
-    angles (F, 3) in rad, at its first line's start and end and at its last line's end."""
+    """The circle on which the source or the panel moves: centre (x, y) and radius in mm. For each view: height z (F,) in
+    mm, and angles (F, 3) in rad when its first line opens and closes and when its last line closes."""
 
     centre: np.ndarray
     radius: float
@@ -56,8 +56,8 @@ class Circle:
         return cls(centre[:2], circle.length("radius"), z, angles)
 
     def at(self, view: int, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns angles (T,) in rad and points (T, 3) in mm of a view at times ``share`` (T,), in exposures after its
-        start."""
+        """Returns a view's angles (T,) in rad and points (T, 3) in mm at times ``share`` (T,), which count exposures from
+        its start: 1 is one exposure later."""
         start, closed, _ = self.angle_rad[view]
         angle = start + (closed - start) * share
         x, y = (self.centre[:, None] + self.radius * np.stack([np.cos(angle), np.sin(angle)])).tolist()
@@ -65,8 +65,7 @@ class Circle:
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a .json that does not describe another format, or a folder with such a file and TIFF
-    frames."""
+    """Returns whether ``path`` is a .json file of no other format, or a folder with such a file and TIFF frames."""
     others = (synthetic.META, synthetic.META_WITH_TIMES)
     if not path.is_dir():
         return path.suffix.lower() == ".json" and path.name not in others
@@ -77,8 +76,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder with a geometry JSON and TIFF frames (in it, or in its folder ``projections``), or the JSON
-    itself."""
+    """Imports a folder with one JSON and TIFF frames, in it or in its folder ``projections``. ``path`` may be the JSON."""
     options.refuse_unused("phyradgs-real", OPTIONS)
     checks.one_of(options.called("readout_axis"), options.readout_axis or "rows", ("rows",))
     description = path if path.is_file() else SafeFolder(path).only("description of the views", ".json")
@@ -92,7 +90,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         expected, remedy = "a length in mm along v and along u", f"say {options.named('pixel_size_mm')}"
         raise InputError(f"{description} pixel size", "nothing", expected, remedy)
     share = np.linspace(0, shutter.span_s / shutter.exposure_s, _TIMES_A_FRAME)
-    poses = np.stack([  # (F, T, 12) of the stored images at T times of every frame's window
+    poses = np.stack([  # (F, T, 12), of the images as stored, at T times of every frame
         _view_poses(view, source.at(i, share)[1], detector.at(i, share), detector.centre, panel, pitch)
         for i, view in enumerate(views)
     ])  # fmt: skip
@@ -113,7 +111,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 def _frames_and_views(
     description: Path, views: list[Fields], options: ImportOptions
 ) -> tuple[np.ndarray, list[Fields]]:
-    """Reads frames (F, v, u) as stored, and returns their F views: all of the file, or those from ``first_view`` on."""
+    """Reads frames (F, v, u) as stored. Returns them and their F views: all, or those from ``first_view`` on."""
     below = description.parent / PROJECTIONS
     folder = SafeFolder(below if below.exists() else description.parent)
     paths = folder.matching(*tiff.SUFFIXES)
@@ -131,7 +129,7 @@ def _frames_and_views(
 
 
 def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> ImportOptions:
-    """Returns options whose flat value, unless given, is the brightest pixel, as in the published code; warns of it."""
+    """Returns options with a flat value. Unless given, it is the brightest pixel, as in the published code; warns of it."""
     if options.flat_value is not None or options.quantity not in (None, "counts"):
         return options
     brightest = float(frames.max())
@@ -143,8 +141,7 @@ def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> Impo
 
 
 def _timing(subject: str, detector: Circle, options: ImportOptions) -> tuple[Shutter, np.ndarray]:
-    """Returns shutter and opening times (F,) in s. Frames whose windows would overlap are moved apart in time, because
-    one pose table holds the poses of all frames."""
+    """Returns shutter and opening times (F,) in s. Moves overlapping frames apart: a pose table has one pose at a time."""
     exposure_s = synthetic.exposure_of_blurred_s(options)
     first, closed, done = np.unwrap(detector.angle_rad, axis=1).T
     ratio = synthetic.readout_ratio(subject, closed - first, done - closed)
@@ -158,7 +155,7 @@ def _view_poses(
     view: Fields, source_mm: np.ndarray, detector: tuple[np.ndarray, np.ndarray], centre: np.ndarray,
     panel: tuple[int, int], pitch: tuple[float, float],
 ) -> np.ndarray:
-    """Returns poses (T, 12) of one view, with the panel rotated about +z from the angle at which its matrix holds."""
+    """Returns poses (T, 12) of one view. The panel is rotated about +z from the angle at which its matrix holds."""
     rotation, stands_at = _matrix(view)
     angle_rad, centre_mm = detector
     turned_rad = angle_rad - np.arctan2(stands_at[1] - centre[1], stands_at[0] - centre[0])

@@ -2,9 +2,9 @@
 TIGRE: the tuple (projections, geometry, angles) that its loaders return, with a ``tigre.geometry``. TIGRE's frames (F, v, u)
 are line integrals with row 0 the lowest, as ``tigre.Ax`` gives them; angles are the gantry's in radians.
 
-Pickles hold plain containers, numbers and NumPy arrays. Every other name in a pickle is refused, so nothing is executed; a
-geometry of TIGRE becomes a plain bag of its attributes. NumPy's own constructors are no substitute for the functions below:
-with types of Python objects, or with fields, they read memory at addresses that the file states."""
+Only plain containers, numbers, NumPy arrays and TIGRE's geometry are read. Every other name in a pickle is refused, so no
+code of the file runs. Arrays are built by the functions below, because NumPy's own constructors are not safe here: for some
+types they read memory at addresses that the file states."""
 
 import io
 import math
@@ -32,23 +32,23 @@ from phyradgs_cl.io.files import read_regular, regular_file
 from phyradgs_cl.io.tables import Fields, described
 
 OPTIONS = (*TIMING, "detector_model", "part")
-_PER_MM = 1e-3  # factor from 1/m to 1/mm
+_PER_MM = 1e-3  # NAF's volumes are in 1/m
 _PARTS = {"train": ("train",), "test": ("val",), "all": ("train", "val")}
 TIGRE_MODULE, _END_BYTES = "tigre.utilities.geometry", 1 << 18
 OPTIONS_OF_TIGRE = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
 _NAMES = ("DSO", "DSD", "nDetector", "dDetector", "nVoxel", "dVoxel", "offOrigin", "offDetector", "rotDetector", "COR")
-_SAME = 1e-9  # largest difference from one circle of poses that count as on it, over their largest entry
+_SAME = 1e-9  # poses lie on one circle if they differ from it by at most this fraction of their largest entry
 _CLASSES = ("Geometry", "ConeGeometryDefault", "ParallelGeometryDefault")
-_COPIES = 3  # bytes of memory for every byte of the file: arrays and line integrals
+_COPIES = 3  # bytes of memory for every byte of the file: the file, its arrays, and line integrals
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a file with a pickle's suffix that does not name TIGRE's geometry."""
+    """Returns whether ``path`` is a pickle (by its suffix) without TIGRE's geometry."""
     return path.is_file() and path.suffix.lower() in (".pickle", ".pkl") and not names_tigre(path)
 
 
 def names_tigre(path: Path) -> bool:
-    """Returns whether a file names TIGRE's geometry in its first or last 256 KiB, where a pickle has its small objects."""
+    """Returns whether a file names TIGRE's geometry in its first or last 256 KiB; the frames between are not searched."""
     with open(path, "rb") as file:
         head = file.read(_END_BYTES)
         file.seek(max(0, os.fstat(file.fileno()).st_size - _END_BYTES))
@@ -56,7 +56,7 @@ def names_tigre(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports the train projections, or val, or both, of a pickle of NAF or SAX-NeRF."""
+    """Imports projections of a pickle of NAF or SAX-NeRF: its train part, val part or both, as the option ``part`` says."""
     options.refuse_unused("naf", OPTIONS)
     data = Fields(f"{path}:", read_pickle(path))
     geometry, grid = r2_gaussian.read_geometry(data, 1.0), r2_gaussian.read_grid(data, 1.0)
@@ -98,7 +98,7 @@ def _array(table: Fields, key: str, ndim: int) -> np.ndarray:
 
 def read_pickle(path: Path, unpickler: "type[PlainUnpickler] | None" = None) -> object:
     """Reads dicts, lists, tuples, text, numbers and NumPy arrays of plain numbers. Raises InputError for a damaged file,
-    and for anything that the unpickler refuses, by default ``PlainUnpickler``."""
+    and for what ``unpickler`` refuses; None stands for ``PlainUnpickler``."""
     subject = str(path)
     size = regular_file(path, subject).st_size
     check_room(subject, _COPIES * size)
@@ -106,25 +106,25 @@ def read_pickle(path: Path, unpickler: "type[PlainUnpickler] | None" = None) -> 
     kind = unpickler or PlainUnpickler
     with naming_damage(path, "a damaged pickle", "a pickle of plain containers and NumPy arrays"):
         try:
-            return kind(io.BytesIO(data), encoding="latin1").load()  # Python 2 wrote the bytes of arrays as text
+            return kind(io.BytesIO(data), encoding="latin1").load()  # Python 2 wrote arrays' bytes as text
         except InputError as error:
             raise InputError(subject, error.found, error.expected, error.remedy) from error
 
 
 class PlainUnpickler(pickle.Unpickler):
-    """Python's unpickler, limited to a list of allowed names."""
+    """Python's unpickler, which here calls only a few functions of our own."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Returns the function for a name of the list. Raises InputError for any other name."""
-        functions: dict[str, Any] = {  # new for every name, since a pickle can set attributes of a function
-            "numpy.ndarray": object,  # an argument of _reconstruct
+        """Returns our function for an allowed name. Raises InputError for any other name."""
+        functions: dict[str, Any] = {  # made again at each call, since a pickle can set attributes of a function
+            "numpy.ndarray": object,  # only passed to _reconstruct, which ignores it
             "numpy.dtype": lambda code, *_: _Type(code),
             "numpy.core.multiarray._reconstruct": lambda *_: _Array((0,)),
             "numpy.core.multiarray.scalar": lambda dtype, raw: _plain_array(raw, dtype, ()).item(),
             "numpy.core.numeric._frombuffer": lambda *arguments: _plain_array(*arguments),
             "_codecs.encode": lambda text, encoding: text.encode("latin1"),
         }
-        full_name = f"{module.replace('numpy._core.', 'numpy.core.')}.{name}"  # NumPy 2 has renamed its core
+        full_name = f"{module.replace('numpy._core.', 'numpy.core.')}.{name}"  # NumPy 2 renamed numpy.core
         if full_name not in functions:
             found = f"a call of {full_name[:120]}"
             raise InputError("pickle", found, "plain containers and NumPy arrays", "nothing was executed")
@@ -132,7 +132,7 @@ class PlainUnpickler(pickle.Unpickler):
 
 
 class _Type:
-    """A NumPy type of plain numbers. Its state sets the byte order."""
+    """A NumPy type of plain numbers. Unpickling calls ``__setstate__`` with its byte order."""
 
     __slots__ = ("dtype",)
 
@@ -146,7 +146,7 @@ class _Type:
 
 
 class _Array(np.ndarray):
-    """An array whose state is checked: exactly as many bytes as its shape needs."""
+    """An array that takes its data only if the file holds exactly as many bytes as the shape needs."""
 
     def __setstate__(self, state: Any) -> None:
         _, shape, stated, is_fortran, raw = state
@@ -171,22 +171,22 @@ class _Geometry(SimpleNamespace):
 
 
 class TigreUnpickler(PlainUnpickler):
-    """The unpickler of plain arrays that also takes TIGRE's geometries."""
+    """A ``PlainUnpickler`` that also reads TIGRE's geometries, as plain attributes without TIGRE's code."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Returns ``_Geometry`` for a class of TIGRE's geometries, and for other names what ``PlainUnpickler`` allows."""
+        """Returns ``_Geometry`` for TIGRE's geometry classes, else what ``PlainUnpickler`` allows."""
         if module.startswith(TIGRE_MODULE) and name in _CLASSES:
             return _Geometry
         return super().find_class(module, name)
 
 
 def recognises_tigre(path: Path) -> bool:
-    """Returns whether ``path`` is a file with a pickle's suffix that names TIGRE's geometry."""
+    """Returns whether ``path`` is a pickle (by its suffix) with TIGRE's geometry."""
     return path.is_file() and path.suffix.lower() in (".pickle", ".pkl") and names_tigre(path)
 
 
 def import_scan_tigre(path: Path, options: ImportOptions) -> Scan:
-    """Imports the projections of a pickle of TIGRE."""
+    """Imports a pickle of TIGRE: (projections, geometry, angles), or a dictionary of them."""
     options.refuse_unused("tigre", OPTIONS_OF_TIGRE)
     content = read_pickle(path, TigreUnpickler)
     if isinstance(content, dict):
@@ -216,15 +216,14 @@ def import_scan_tigre(path: Path, options: ImportOptions) -> Scan:
 
 
 def _named(content: dict[object, Any], *words: str) -> Any:
-    """Returns the first value of a dictionary whose key begins with one of ``words``, in upper or lower case; None
-    without one."""
+    """Returns the first value whose key begins with one of ``words``, upper case or lower; None without one."""
     return next((value for name, value in content.items() if str(name).lower().startswith(words)), None)
 
 
 def _trajectory(
     geo: Any, poses: np.ndarray, angle_rad: np.ndarray, timing: Timing, subject: str
 ) -> tuple[CircularOrbit | PoseTable, Geometry]:
-    """Returns a circular orbit where single values of the lengths describe all poses (F, 12), else a table of the poses."""
+    """Returns trajectory and geometry: a circular orbit if one geometry describes all poses (F, 12), else a pose table."""
     rows, columns = np.ravel(geo.nDetector).tolist()
     pitch_v, pitch_u = np.ravel(geo.dDetector).tolist()
     off_v, off_u = np.resize(0.0 if geo.offDetector is None else geo.offDetector, 2).tolist()

@@ -1,8 +1,8 @@
-"""Folders of R2-Gaussian: meta_data.json with .npy projections and the true volume; taken at rest. Its frame is TIGRE's,
-which PhyRadGS and NAF share: projections [v, u] with row 0 at +z, volumes [x, y, z].
+"""Folders of R2-Gaussian: meta_data.json with .npy projections and the true volume, taken at rest. Axes are as in NAF and
+PhyRadGS: projections [v, u] with row 0 at +z, volumes [x, y, z].
 
-Synthetic folders of PhyRadGS also have the gantry angles of every frame's first and last line. The exposure takes
-``exposure_s`` (1 s unless given). The gantry's speed is the arc of an exposure over that time."""
+Synthetic folders of PhyRadGS also have the gantry's angles at every frame's first and last line, but no times. The exposure
+is the option ``exposure_s``, or 1 s; the gantry's speed is the angle of an exposure over this time."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,13 +27,12 @@ ROW_0 = "top"
 OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 OPTIONS_WITH_TIMES = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
 _KEYS = ("first_line_start", "first_line_end", "last_line_end")
-# largest range of the frames' ratios of readout to exposure that counts as none, over the largest of them or over 1
-_SAME = 1e-3
+_SAME = 1e-3  # readout over exposure may differ by this between frames, or by this fraction of a ratio above 1
 
 
 @dataclass(frozen=True, eq=False)
 class R2Folder:
-    """An opened folder with its description and geometry."""
+    """A folder of R2-Gaussian whose description and geometry have been read."""
 
     folder: SafeFolder
     meta: Fields
@@ -42,8 +41,7 @@ class R2Folder:
 
     @classmethod
     def opened(cls, given: Path, usual: str, unit_mm: float) -> "R2Folder":
-        """Opens a folder with the description ``usual``, or the folder of ``given`` if that is a description. unit_mm:
-        the scene's unit of length."""
+        """Reads the description: the file ``given``, or ``usual`` in the folder ``given``. unit_mm: the scene's unit."""
         folder = SafeFolder(given if given.is_dir() else given.parent)
         name = usual if given.is_dir() else given.name
         path = folder.file(name, str(folder.root / name))
@@ -53,7 +51,7 @@ class R2Folder:
     def frame(self, entry: Fields) -> np.ndarray:
         """Reads one projection (v, u) as stored."""
         name = entry.word("file_path")
-        first_copy = name.replace("_sim1", "")  # names repeated simulations, of which the first copy was kept
+        first_copy = name.replace("_sim1", "")  # _sim1 marks a repeated simulation; some folders have only the first one
         path = self.folder.file(first_copy if self.folder.exists(first_copy) else name, entry.name("file_path"))
         image = read_npy(path, 2)
         checks.shape(str(path), image, self.geometry.detector_shape)
@@ -62,8 +60,7 @@ class R2Folder:
     def scan(
         self, path: Path, entries: list[Fields], orbit: CircularOrbit, timing: Timing, options: ImportOptions
     ) -> Scan:
-        """Returns the scan of the frames in ``entries`` along ``orbit``, with the true volume in 1/mm where the folder
-        has it."""
+        """Returns a scan of the frames in ``entries`` on ``orbit``, with the true volume in 1/mm if the folder has it."""
         grid, reference = read_grid(self.meta.table("scanner"), self.unit_mm), None
         if self.meta.has("vol"):
             truth = self.folder.file(self.meta.word("vol"), self.meta.name("vol"))
@@ -79,8 +76,8 @@ class R2Folder:
 
 
 def entries_of(meta: Fields, prefix: str, part: str) -> list[Fields]:
-    """Returns the entries of frames of ``part``, train or test; "all" means train, then test. prefix: that of their
-    keys."""
+    """Returns the entries of the frames in ``part``: "train", "test", or "all" for both in this order. prefix: precedes
+    train and test in the file's keys."""
     parts = ("train", "test") if part == "all" else (part,)
     return [entry for name in parts for entry in meta.tables(f"{prefix}{name}")]
 
@@ -93,7 +90,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports the frames of a folder's ``proj_train``, or of the part that the options state."""
+    """Imports the frames of the part that the options state: by default train, under the key ``proj_train``."""
     options.refuse_unused("r2", OPTIONS)
     opened = R2Folder.opened(path, META, options.unit_mm)
     entries = entries_of(opened.meta, "proj_", options.part)
@@ -103,8 +100,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def read_geometry(scanner: Fields, unit_mm: float) -> Geometry:
-    """Reads the beam of a scanner's table, whose lengths are in units of ``unit_mm``. "Detector" values run [v, u],
-    ``offDetector`` [u, v]. The distances of mode "parallel" are not read, as in TIGRE."""
+    """Reads the beam from a scanner's table with lengths in ``unit_mm``. nDetector and dDetector are [v, u], offDetector is
+    [u, v]. The distances of mode "parallel" are not read, as in TIGRE."""
     rows, columns = scanner.counts("nDetector", 2)
     pitch_v, pitch_u = (float(p * unit_mm) for p in _pitches(scanner, "Detector", (rows, columns)))
     offset_u, offset_v = (float(o * unit_mm) for o in _offset(scanner, "offDetector", 2))
@@ -118,7 +115,7 @@ def read_geometry(scanner: Fields, unit_mm: float) -> Geometry:
 
 
 def read_grid(scanner: Fields, unit_mm: float) -> Grid:
-    """Reads the voxel grid of a scanner's table, whose triples run [x, y, z] and whose lengths are in ``unit_mm``."""
+    """Reads the voxel grid from a scanner's table, with triples [x, y, z] and lengths in ``unit_mm``."""
     counts = scanner.counts("nVoxel", 3)
     size = _pitches(scanner, "Voxel", counts) * unit_mm
     origin = _offset(scanner, "offOrigin", 3) * unit_mm
@@ -126,15 +123,15 @@ def read_grid(scanner: Fields, unit_mm: float) -> Grid:
 
 
 def _pitches(scanner: Fields, what: str, counts: tuple[int, ...]) -> np.ndarray:
-    """Returns the size of a pixel or voxel along each axis: dDetector or dVoxel, else sDetector or sVoxel over the count."""
+    """Returns a pixel's or voxel's size along each axis: d<what>, else the total size s<what> over the count."""
     if scanner.has(f"d{what}"):
         return scanner.lengths(f"d{what}", len(counts))
     return scanner.lengths(f"s{what}", len(counts)) / np.array(counts)
 
 
 def _offset(scanner: Fields, key: str, count: int) -> np.ndarray:
-    """Returns the first ``count`` numbers (count,) of ``key``, whose third may be unused; zeros where the table lacks the
-    key. Raises InputError for fewer numbers."""
+    """Returns the first ``count`` numbers of ``key``, zeros without the key. offDetector may have an unused third number.
+    Raises InputError for fewer numbers."""
     if not scanner.has(key):
         return np.zeros(count)
     values = scanner.numbers(key)
@@ -144,8 +141,8 @@ def _offset(scanner: Fields, key: str, count: int) -> np.ndarray:
 
 
 def turned_volume(subject: str, volume: np.ndarray, grid: Grid, per_mm: float) -> np.ndarray:
-    """Returns a stored volume [x, y, z], times ``per_mm``, as (nz, ny, nx) float32 in 1/mm. Raises InputError for a shape
-    other than the grid's, and for values that are not finite in float32."""
+    """Converts a stored volume [x, y, z] to (nz, ny, nx) float32 in 1/mm; ``per_mm``: the factor of its values. Raises
+    InputError for a shape other than the grid's, and for values that are not finite in float32."""
     checks.shape(subject, volume, grid.shape[::-1])
     checks.finite(subject, volume)
     turned = np.transpose(volume, (2, 1, 0)).astype(np.float64) * per_mm
@@ -160,8 +157,8 @@ def recognises_with_times(path: Path) -> bool:
 
 
 def import_scan_with_times(path: Path, options: ImportOptions) -> Scan:
-    """Imports the frames of a folder's ``simulate_train``, or of the part that the options state. They are read out along
-    columns unless the options differ."""
+    """Imports the frames of the part that the options state: by default train, under the key ``simulate_train``. Columns
+    are read out one after the other unless the options say rows."""
     options.refuse_unused("phyradgs", OPTIONS_WITH_TIMES)
     opened = R2Folder.opened(path, META_WITH_TIMES, options.unit_mm)
     entries = entries_of(opened.meta, "simulate_", options.part)
@@ -172,8 +169,8 @@ def import_scan_with_times(path: Path, options: ImportOptions) -> Scan:
 
 
 def timing_of_marks(subject: Fields, marks_rad: np.ndarray, options: ImportOptions) -> Timing:
-    """Returns the timing from gantry angles (F, 3) in rad at the first line's start and end, and the last line's end. The
-    first stored line is read first: column 0, or the top row in a readout along rows."""
+    """Returns the timing from gantry angles (F, 3) in rad: when the first line opens, when it closes, and when the last
+    line closes. The first stored line is read first: column 0, or the top row if rows are read."""
     exposure_s = exposure_of_blurred_s(options)
     ratio = readout_ratio(subject.subject, marks_rad[:, 1] - marks_rad[:, 0], marks_rad[:, 2] - marks_rad[:, 1])
     axis = options.readout_axis or "columns"
@@ -185,7 +182,7 @@ def timing_of_marks(subject: Fields, marks_rad: np.ndarray, options: ImportOptio
 
 
 def exposure_of_blurred_s(options: ImportOptions) -> float:
-    """Returns the options' exposure in s, or else 1 s, because the files state none. Raises InputError for 0 s or less."""
+    """Returns the options' exposure in s, else 1 s, because the files state none. Raises InputError for 0 s or less."""
     exposure_s = 1.0 if options.exposure_s is None else options.exposure_s
     if exposure_s <= 0:
         raise InputError(options.named("exposure_s"), f"{exposure_s:g}", "a time above 0 s", "the frames are blurred")
@@ -193,8 +190,8 @@ def exposure_of_blurred_s(options: ImportOptions) -> float:
 
 
 def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarray) -> float:
-    """Returns T_ro/T_exp from the arcs (F,) in rad of all frames. Raises InputError where it differs between frames, and for
-    exposures without an arc."""
+    """Returns readout time over exposure from the angles (F,) in rad through which the gantry turns in each. Raises
+    InputError where the ratio differs between frames, and for exposures without a turn."""
     if np.any(exposure_arc == 0) or np.any(np.sign(exposure_arc) != np.sign(exposure_arc[0])):
         found = f"arcs from {exposure_arc.min():.6g} to {exposure_arc.max():.6g} rad"
         raise InputError(f"{subject} exposure", found, "arcs that turn one way, none of them 0")
@@ -206,7 +203,7 @@ def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarra
 
 
 def start_times_s(first_rad: np.ndarray, closed_rad: np.ndarray, exposure_s: float) -> np.ndarray:
-    """Returns opening times (F,) in s for a gantry that turns at the mean speed of its exposures, from angles (F,) in
-    rad."""
+    """Returns opening times (F,) in s. The gantry is taken to turn at its mean speed within exposures; the angles (F,) in
+    rad are those at which the first line opens and closes."""
     speed_rad_per_s = float(np.mean(closed_rad - first_rad)) / exposure_s
     return (first_rad - first_rad[0]) / speed_rad_per_s

@@ -1,6 +1,8 @@
-"""Scans of RTK: a geometry file (RTKThreeDCircularGeometry, version 3) and a stack of projections as MetaImage. The geometry
-has nine numbers per projection. A SourceToDetectorDistance of 0 is a parallel beam, in which RTK ignores source distance and
-source offsets; its writer leaves out numbers that are 0 everywhere. The parser opens no file that the XML names."""
+"""Scans of RTK: a geometry file (RTKThreeDCircularGeometry, version 3) and a stack of projections as MetaImage.
+
+The geometry has nine numbers per projection. RTK's writer leaves out numbers that are 0 everywhere. A
+SourceToDetectorDistance of 0 is a parallel beam, in which RTK ignores source distance and source offsets. The parser opens
+no file that the XML names."""
 
 import logging
 from dataclasses import dataclass
@@ -33,16 +35,16 @@ NAMES = (
 _TO_AXIS, _TO_DETECTOR, _ANGLE = NAMES[:3]
 _ANGLES = ("GantryAngle", "InPlaneAngle", "OutOfPlaneAngle")
 _RADIUS = "RadiusCylindricalDetector"
-_RAW, _ORA = (".his", ".hnd", ".hnc", ".xim"), ".ora.xml"  # what rtk_projections reads
+_RAW, _ORA = (".his", ".hnd", ".hnc", ".xim"), ".ora.xml"  # files for rtk_projections.py, not for this module
 XIM_BELOW = "Acquisitions/*/*.xim"
-"""Where Varian's TrueBeam puts projections, below its Scan.xml."""
-# RTK's axes (X, Y, Z) are (y, z, x) here: the same right-handed frame under other names.
+"""Pattern of the projections of Varian's TrueBeam, from the folder of its Scan.xml."""
+# RTK's X, Y, Z are our y, z, x: the same right-handed frame with other names of its axes.
 _TO_WORLD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Projections (F, v, u), and their image plane: its origin, and the steps along u and v, each (2,) as (x, y) in mm."""
+    """Projections (F, v, u) and their pixels on the panel: pixel (0, 0), and the steps along u and v, each (x, y) in mm."""
 
     frames: np.ndarray
     origin_mm: np.ndarray
@@ -51,8 +53,8 @@ class Stack:
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is an .xml file without raw projections beside it, a folder with such a file and a
-    MetaImage, or a MetaImage in such a folder."""
+    """Returns whether ``path`` is a folder with an .xml file and a MetaImage, or one of the two files. An .xml file in a
+    folder of raw projections is left to rtk_projections.py."""
     folder = SafeFolder(path if path.is_dir() else path.parent)
     is_stack = path.suffix.lower() in STACKS
     descriptions = folder.matching(".xml") if path.is_dir() or is_stack else [path] if path.suffix.lower() == ".xml" else []
@@ -64,7 +66,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder with one .xml and one .mha (or .mhd), or one of both files with the other in its folder."""
+    """Imports a folder with one .xml and one .mha (or .mhd). ``path`` may also be one of the two files in it."""
     options.refuse_unused("rtk", OPTIONS)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     is_stack = path.suffix.lower() in STACKS and path.is_file()
@@ -80,8 +82,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 def scan_of(
     rtk: "RtkGeometry", stack: Stack, options: ImportOptions, subjects: tuple[str, str], title: str, source: str
 ) -> Scan:
-    """Returns the scan of a geometry and its projections. subjects: names of both in messages. Raises InputError where
-    their numbers of frames differ."""
+    """Returns the scan of a geometry and its projections. subjects: names of the two in messages. Raises InputError where
+    they have different numbers of frames."""
     described, stored = subjects
     if len(stack.frames) != rtk.frames:
         found = f"{len(stack.frames)} frames, {rtk.frames} projections in {Path(described).name}"
@@ -96,9 +98,9 @@ def scan_of(
 def stack_of(
     frames: np.ndarray, origin_mm: tuple[float, ...], spacing_mm: tuple[float, ...], direction: np.ndarray, subject: str
 ) -> Stack:
-    """Returns the projections (F, v, u) of an image of ITK with its origin and spacing (3,) in mm and its direction (3,
-    3). Raises InputError unless the third axis, the frames, is perpendicular to the others."""
-    steps_mm = direction * spacing_mm  # columns: along u, v and the frames
+    """Returns projections (F, v, u) with ITK's origin and spacing (3,) in mm and its direction (3, 3). Raises InputError
+    unless the third axis, which counts frames, is perpendicular to the others."""
+    steps_mm = direction * spacing_mm  # its columns are the steps along u, along v and to the next frame
     if np.abs([*steps_mm[:2, 2], *steps_mm[2, :2]]).max() > 1e-9 * np.abs(steps_mm).max():
         raise InputError(subject, str(steps_mm.tolist())[:80], "axes of a stack: columns, rows, frames")
     return Stack(frames, np.array(origin_mm[:2]), steps_mm[:2, 0], steps_mm[:2, 1])
@@ -107,8 +109,8 @@ def stack_of(
 def _trajectory(
     rtk: "RtkGeometry", stack: Stack, timing: assemble.Timing, subject: str
 ) -> tuple[CircularOrbit | PoseTable, Geometry, assemble.Turned]:
-    """Returns a circular orbit where the file's poses lie on one, else a pose table; the nearest circular geometry; and
-    the images' flips."""
+    """Returns the trajectory, the nearest circular geometry, and the images' flips. The trajectory is a circular orbit
+    where the file's poses lie on one, else a pose table."""
     panel = (stack.frames.shape[1], stack.frames.shape[2])
 
     def stored(position: np.ndarray) -> np.ndarray:
@@ -129,7 +131,7 @@ def _trajectory(
 
 @dataclass(frozen=True, eq=False)
 class RtkGeometry:
-    """The numbers of all projections by RTK's names: each (F,), lengths in mm, angles in rad."""
+    """The numbers (F,) of all projections under RTK's names, with lengths in mm and angles in rad."""
 
     values: dict[str, np.ndarray]
 
@@ -139,12 +141,11 @@ class RtkGeometry:
 
     @property
     def is_parallel(self) -> bool:
-        """Whether the beam is parallel."""
         return not self.values[_TO_DETECTOR].any()
 
     @property
     def is_circular(self) -> bool:
-        """Whether all projections are on one untilted circle with one panel."""
+        """Whether source and panel move on one circle about the axis, without tilt or change."""
         of_source = (_TO_AXIS, "SourceOffsetX", "SourceOffsetY") if self.is_parallel else ()
         steady = [v for name, v in self.values.items() if name not in (_ANGLE, *of_source)]
         still = all(np.ptp(v) <= 1e-9 * (1 + np.abs(v).max()) for v in steady)
@@ -154,8 +155,8 @@ class RtkGeometry:
     def poses(
         self, position: np.ndarray, origin_mm: np.ndarray, step_u: np.ndarray, step_v: np.ndarray
     ) -> np.ndarray:
-        """Returns poses (T, 12) at frame positions (T,), linear between and beyond frames. origin_mm (2,): place (u, v)
-        of pixel (0, 0) in the image's plane; step_u, step_v (2,): in mm, from column to column and row to row."""
+        """Returns poses (T, 12) at frame positions (T,), linear between and beyond frames. origin_mm (2,): where pixel
+        (0, 0) lies on the panel. step_u, step_v (2,): steps in mm to the next column and row."""
         at = {name: along(np.unwrap(v) if name in _ANGLES else v, position) for name, v in self.values.items()}
         # from the gantry's to RTK's fixed frame: the inverse of Rz(−in plane) Rx(−out of plane) Ry(−gantry)
         angles_rad = np.stack([at[name] for name in ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle")], -1)
@@ -163,7 +164,7 @@ class RtkGeometry:
         zero = np.zeros(position.shape)
         offsets = [at["SourceOffsetX"], at["SourceOffsetY"], at[_TO_AXIS]]
         to_detector = at[_TO_AXIS] - at[_TO_DETECTOR]
-        if self.is_parallel:  # the direction of the rays, and a panel through the axis
+        if self.is_parallel:  # the first three numbers of a pose are then the rays' direction; the panel is on the axis
             offsets, to_detector = [zero, zero, zero - 1], zero
         shift = np.stack([at["ProjectionOffsetX"], at["ProjectionOffsetY"], to_detector], -1)
         first = shift + np.array([*origin_mm, 0.0])
@@ -173,8 +174,8 @@ class RtkGeometry:
 
 
 def read_rtk_xml(path: Path) -> RtkGeometry:
-    """Reads a geometry file. Warns that a file without SourceToDetectorDistance counts as a parallel beam. Raises
-    InputError for numbers that are missing or that no scanner has."""
+    """Reads a geometry file. Without SourceToDetectorDistance it is a parallel beam, with a warning. Raises InputError
+    for numbers that are missing or impossible."""
     root = _root(path)
     common, projections = _numbers(path, root), [_numbers(path, e) for e in root.iterfind("Projection")]
     if not projections:
@@ -201,7 +202,7 @@ def read_rtk_xml(path: Path) -> RtkGeometry:
 def _root(path: Path) -> ElementTree.Element:
     try:
         root = ElementTree.fromstring(read_bytes(path))
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the latter for an unknown encoding
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # LookupError: an unknown encoding
         raise InputError(str(path), f"XML that is not well formed ({error})", f"a {ROOT}") from error
     if root.tag != ROOT or root.get("version", "3") != "3":
         found = f"a root element {root.tag[:60]!r}, version {root.get('version', '3')[:20]}"
@@ -210,7 +211,7 @@ def _root(path: Path) -> ElementTree.Element:
 
 
 def _numbers(path: Path, parent: ElementTree.Element) -> dict[str, float]:
-    """Returns the numbers directly inside an element, by their names. Raises InputError for a curved panel."""
+    """Returns the numbers directly below an element, by name. Raises InputError for a curved panel."""
     texts = Settings(f"{path}:", {e.tag: e.text or "" for e in parent})
     if radius := texts.position(_RADIUS):
         raise texts.error(_RADIUS, f"{radius:g}", "a flat panel")

@@ -1,8 +1,8 @@
 """Raw projections that the package itk-rtk reads: Elekta XVI 5, Varian OBI and ProBeam (TrueBeam), and ORA of medPhoton.
 
-RTK reads the geometry and the line integrals, and cuts off the rim of Elekta's images. The counts of air are its constants
-unless the options state them; ORA's files hold the transmission. RTK checks less than the other readers here: import files
-of people whom you trust."""
+RTK reads the geometry and the line integrals, and crops the edges of Elekta's images. Unless the options state the counts
+of air, RTK's constants are used; ORA's files hold the transmission and need none. RTK checks files less than the other
+readers here: import only files from people whom you trust."""
 
 import tempfile
 from dataclasses import dataclass, replace
@@ -18,13 +18,13 @@ from phyradgs_cl.importers.files import SafeFolder, check_room, in_natural_order
 from phyradgs_cl.importers.formats.rtk import XIM_BELOW, read_rtk_xml, scan_of, stack_of
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 
-_COPIES = 12  # bytes of memory for every byte of the files: RTK's images, packed by some makers, and line integrals
+_COPIES = 12  # bytes of memory for every byte of the files: some makers pack images, and RTK keeps several copies
 
 
 @dataclass(frozen=True)
 class _Maker:
-    """A maker's files: the ends of the names of description and projections, the name of RTK's reader of the geometry,
-    and the options that apply. below: a pattern of the projections, where they are not in the description's folder."""
+    """A maker's files: how names of the description and of projections end, RTK's class that reads the geometry, and the
+    options that apply. below: pattern of projections that are in folders below the description's."""
 
     description: str
     suffixes: tuple[str, ...]
@@ -42,7 +42,7 @@ _MAKERS = (
 
 
 def _read_geometry(rtk: Any, reader_name: str, description: str, names: list[str]) -> Any:
-    """Returns RTK's geometry of a description and of projections, whose headers hold angles and places."""
+    """Reads RTK's geometry from the description and, for makers that store angles there, from the projections' headers."""
     reader = getattr(rtk, reader_name).New()
     if hasattr(reader, "SetFilename"):  # Elekta's description holds the geometry of all projections
         reader.SetFilename(description)
@@ -56,7 +56,7 @@ def _read_geometry(rtk: Any, reader_name: str, description: str, names: list[str
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a folder, or a description, of one of the makers, with its projections."""
+    """Returns whether ``path`` is a folder of one of the makers, or the description in it, with projections."""
     return _located(path) is not None
 
 
@@ -76,7 +76,7 @@ def _located(path: Path) -> tuple[_Maker, Path, list[Path]] | None:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a maker's folder, or its description with the projections in its folder."""
+    """Imports a maker's folder. ``path`` may also be the description in it."""
     if (located := _located(path)) is None:
         expected = ", ".join(f"*{maker.description} with *{maker.suffixes[0]}" for maker in _MAKERS)
         raise InputError(str(path), "no description with projections", expected)
@@ -100,8 +100,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         reader.Update()
         image = reader.GetOutput()
         direction = np.asarray(itk.array_from_matrix(image.GetDirection()))
-        index = image.GetLargestPossibleRegion().GetIndex()  # above 0 where RTK has cut off a rim
+        index = image.GetLargestPossibleRegion().GetIndex()  # above 0 where RTK has cropped the image
         places_mm = tuple(image.TransformIndexToPhysicalPoint(index)), tuple(image.GetSpacing())
         stack = stack_of(np.array(itk.array_from_image(image)), *places_mm, direction, str(path))
-    options = replace(options, flat_value=None)  # RTK has divided by it
+    options = replace(options, flat_value=None)  # RTK has already divided by it
     return scan_of(geometry, stack, options, (str(description), str(path)), description.stem, str(path))

@@ -1,9 +1,9 @@
 """Scans of Bruker's SkyScan systems: a .log file and 16-bit TIFFs, flat-field corrected by the scanner.
 
-The log has no description by its maker. Distances and pixels are as in TIGRE's reader. A pixel of the camera is Image
-Pixel Size times the magnification; X/Y Ratio is its width over its height. The central ray falls on the line Optical
-Axis, counted from the bottom. Row 0 is on top, so column 0 is on the right, seen from the source, for a sample that turns
-counterclockwise seen from above, which the log calls CC. The log does not state the column of the axis."""
+The maker publishes no description of the log. Distances and pixels are read as in TIGRE. A pixel of the camera is Image
+Pixel Size times the magnification; X/Y Ratio is its width over its height. The central ray falls on the row Optical Axis,
+counted from the bottom. Row 0 is on top, column 0 on the right seen from the source. The log writes CC for a sample that
+turns counterclockwise seen from above. It does not state the column of the axis."""
 
 import logging
 import re
@@ -36,7 +36,7 @@ _FIELDS = {
     "source_to_axis_mm": "Object to Source (mm)", "source_to_detector_mm": "Camera to Source (mm)",
     "exposure_s": "Exposure (ms)", "angles": "Rotation Step (deg)", "pixel_size_mm": "Image Pixel Size (um)",
 }  # fmt: skip
-_OFF = re.compile(r"OFF( *\(.*\))?", re.I)  # in OFF (n), n is the number that would be used if it were on
+_OFF = re.compile(r"OFF( *\(.*\))?", re.I)  # the log writes OFF (n) too, where n would count if it were ON
 _SENSES = {"CC": 1, "CCW": 1, "CW": -1, "C": -1}
 _ASSUMED = {
     "Rotation Direction": "CC", "Optical Axis (line)": "the middle", "Scanning Start Angle": "0",
@@ -51,7 +51,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder with one .log and its TIFFs, or the .log with the TIFFs in its folder."""
+    """Imports a folder with one .log file and its TIFFs. ``path`` may also be the .log file in it."""
     options.refuse_unused("skyscan", OF_FOLDERS)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("log of the scan", ".log")
@@ -90,7 +90,7 @@ def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOp
         return width_mm / next((scan.length(name) for name in _RATIOS if scan.has(name)), 1.0), width_mm
 
     pitch_mm = options.taken("pixel_size_mm", stored_mm)
-    # a window of the camera may leave the central ray outside, by at most its own height
+    # a cropped image may not contain the central ray, but more than its own height away must be an error
     up_mm = (panel[0] / 2 - scan.number("Optical Axis (line)", panel[0] / 2, -panel[0], 2 * panel[0])) * pitch_mm[0]
     if options.detector_offset_mm is None:
         settings.say_missing(scan, {"place of the axis": "the middle of the panel; check --fix-offset or calibrate find it"})
@@ -98,9 +98,9 @@ def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOp
 
 
 def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredTiming:
-    """Returns the exposure in s of all averaged frames together; no exposure where the file has none, and where the
-    scanner stopped for each frame and the options state no frame time. Raises InputError for a Frame Averaging that is
-    neither ON with a count nor OFF."""
+    """Returns the exposure in s, summed over averaged frames. Leaves it out where the log has none, and where the scanner
+    stopped for each frame and the options give no frame time. Raises InputError for a Frame Averaging that is neither OFF
+    nor ON with a count."""
     motion = next((scan.word(name) for name in ("Type of Detector Motion", "Type of Motion") if scan.has(name)), "")
     averaging = scan.word("Frame Averaging", default="OFF")
     averaged = re.fullmatch(r"ON *\(([1-9]\d{0,5})\)", averaging, re.I)
@@ -113,8 +113,8 @@ def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredT
 
 
 def _white(scan: settings.Settings, frames: np.ndarray, options: ImportOptions) -> float:
-    """Returns the counts of air: the option's, else Reference Intensity, else the largest number of Depth (bits). Raises
-    InputError for frames (F, v, u) without flat-field correction or option, and for frames much brighter than that."""
+    """Returns the counts of air: the option's, else Reference Intensity, else the largest that Depth (bits) allows. Raises
+    InputError for frames (F, v, u) much brighter than that, and for uncorrected frames without the option."""
     remedy = f"say {options.named('flat_value')}"
     if not options.flat_value and scan.word("Flat Field Correction", default="ON").upper() == "OFF":
         raise scan.error("Flat Field Correction", "OFF", "frames that the scanner has corrected", remedy)

@@ -1,5 +1,5 @@
-"""A folder of TIFF or HDF5 frames and one TOML with their contents, geometry, angles and timing. The TOML has the tables of
-a scanner file, and [frames], [angles] and [timing]. Row 0 is the top, column 0 the left, seen from the source."""
+"""A folder of TIFF or HDF5 frames with a TOML file that describes them. The TOML has the tables of a scanner file, and
+[frames], [angles] and [timing]. Row 0 is the top, column 0 the left, seen from the source."""
 
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -29,7 +29,7 @@ OWN_TABLES = {
     "timing": ("exposure_s", "readout_s", "frame_time_s", "start_s", "detector_model"),
 }
 _PER_FRAME, _ANGLES = ("values_deg", "file"), ("step_deg", "last_deg", "values_deg", "file")
-_KEYS = {  # by option: the file's key of the same value
+_KEYS = {  # option: the TOML's key for the same value
     **{name: f"[timing] {name}" for name in ("exposure_s", "readout_s", "frame_time_s")},
     **{name: f"[readout] {name}" for name in ("first", "fps", "readout_ms")},
     **{name: f"[frames] {name}" for name in ("quantity", "flat_value", "row_0", "column_0")},
@@ -47,7 +47,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder with one TOML and its frames, or the TOML with the frames in its folder."""
+    """Imports a folder with one TOML file and its frames. ``path`` may also be the TOML file in it."""
     options.refuse_unused("tiff", (*OF_BARE_FRAMES, "linked_folder"))
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("description of the scan", ".toml")
@@ -82,8 +82,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _tables(path: Path) -> dict[str, Fields]:
-    """Returns the file's own tables by name, and under "" all tables of a scanner file. Raises InputError for unknown
-    names."""
+    """Returns the tables [frames], [angles], [timing] and [readout] by name, and under "" all tables that a scanner file
+    has too. Raises InputError for unknown names."""
     content = read_toml(path)
     for place in (content, content.get("frames")):  # angles = "FILE" is short for [angles] file
         if isinstance(place, dict) and isinstance(place.get("angles"), str):
@@ -96,7 +96,7 @@ def _tables(path: Path) -> dict[str, Fields]:
 
 
 def in_words_of_file(options: ImportOptions) -> ImportOptions:
-    """Returns the options so that messages name the TOML's key of a value, unless the user gave the value as an option."""
+    """Returns options whose messages name the TOML's key of a value, unless the user gave the value as an option."""
     given = options.given(FIELDS)
     return replace(
         options, named=lambda field: (None if field in given else _KEYS.get(field)) or options.named(field)
@@ -104,7 +104,7 @@ def in_words_of_file(options: ImportOptions) -> ImportOptions:
 
 
 def _with_file(options: ImportOptions, tables: dict[str, Fields]) -> ImportOptions:
-    """Returns the options, completed by the values that the file has under the same names."""
+    """Returns the options, completed by values of the TOML with the same names."""
     frames = tables["frames"]
     table_of = {**dict.fromkeys(("quantity", "row_0", "column_0"), frames), "rotates": tables["angles"]}
     table_of["detector_model"] = tables["timing"]
@@ -115,7 +115,7 @@ def _with_file(options: ImportOptions, tables: dict[str, Fields]) -> ImportOptio
 
 
 def _in_hdf5(folder: SafeFolder, frames: Fields, options: ImportOptions) -> hdf5.Stacks | None:
-    """Reads the frames where the projections have an address in HDF5; returns None where they have not."""
+    """Reads the frames if the TOML gives the projections as an address in HDF5, else returns None."""
     stated = {name: frames.values[name] for name in (*hdf5.STACKS, "image_key", "axes") if frames.has(name)}
     lists = {name: value if isinstance(value, list) else [value] for name, value in stated.items()}
     if not all(map(hdf5.is_address, lists.get("projections", [None]))):
@@ -124,7 +124,7 @@ def _in_hdf5(folder: SafeFolder, frames: Fields, options: ImportOptions) -> hdf5
 
 
 def _projections(folder: SafeFolder, tables: dict[str, Fields], options: ImportOptions, others: set[Path]) -> Series:
-    """Returns the files of the projections in order, without ``others``, the files of flats, darks and mask."""
+    """Returns the projections' files in order. others: files of flats, darks and mask, which are left out."""
     frames, angles = tables["frames"], tables["angles"]
     paths = [path for path in _files(folder, frames, "projections", "*.tif*") if path not in others]
     if not paths:
@@ -157,8 +157,7 @@ def _line_integrals(
 
 
 def _files(folder: SafeFolder, frames: Fields, name: str, default: str = "") -> list[Path]:
-    """Returns the files of the pattern, or list of patterns, that ``frames`` has under ``name``, in its order; else those
-    of ``default``."""
+    """Returns the files that match the patterns which ``frames`` has under ``name``, or ``default`` without that key."""
     value = frames.values.get(name) or default
     paths: list[Path] = []
     for one in value if isinstance(value, list) else [value] if value else []:
@@ -174,8 +173,8 @@ def _files(folder: SafeFolder, frames: Fields, name: str, default: str = "") -> 
 
 
 def _scanner(path: Path, scanner: Fields, panel: tuple[int, int], options: ImportOptions) -> Scanner:
-    """Returns the described scanner with the options' lengths in place of its own. Raises InputError where its panel's
-    numbers of pixels are not those of the images."""
+    """Returns the described scanner, with lengths of the options where given. Raises InputError where its panel has other
+    numbers of pixels than the images."""
     content = {name: dict(value) if isinstance(value, dict) else value for name, value in scanner.values.items()}
     source, detector = content.setdefault("source", {}), content.setdefault("detector", {})
     given: dict[str, dict[str, float | None]] = {
@@ -183,7 +182,7 @@ def _scanner(path: Path, scanner: Fields, panel: tuple[int, int], options: Impor
         "detector": dict(zip(("pixel_size_v_mm", "pixel_size_u_mm"), options.pixel_size_mm or (), strict=False)),
     }
     for table, values in ((source, given["source"]), (detector, given["detector"])):
-        if isinstance(table, dict) and table.get("beam") != "parallel":  # a parallel beam refuses distances
+        if isinstance(table, dict) and table.get("beam") != "parallel":  # with a parallel beam distances are an error
             table.update({key: value for key, value in values.items() if value is not None})
     if isinstance(detector, dict):
         content["detector"] = {"rows": panel[0], "columns": panel[1], **detector}
@@ -221,8 +220,8 @@ def _stored_timing(tables: dict[str, Fields], scanner: Scanner) -> StoredTiming:
 
 
 def _angles_rad(folder: SafeFolder, angles: Fields, used: np.ndarray, options: ImportOptions) -> np.ndarray:
-    """Returns the angles in rad of the frames that ``used``, bool (F,), marks: from a list, a file, a dataset, or the
-    first angle with the last or a step. Raises InputError unless exactly one of these is given."""
+    """Returns the angles in rad of the frames marked in ``used``, bool (F,). They come from a list, a file, an HDF5
+    dataset, or from the first angle and the last or a step. Raises InputError unless exactly one of these is given."""
     frames = int(used.sum())
     given = [key for key in _ANGLES if angles.has(key)]
     if len(given) != 1:

@@ -1,9 +1,9 @@
-"""Scans of Zeiss Xradia microscopes: a .txrm file, whose streams an OLE2 container holds.
+"""Scans of Zeiss Xradia microscopes: a .txrm file, an OLE2 container with named streams of data.
 
-As in the readers of DXchange, CIL and MBIRJAX: distances in mm without their signs, angles in degrees of a sample that turns
-counterclockwise seen from above, row 0 the lowest, column 0 on the left. PixelSize in µm is a pixel's at the sample. Each
-image is divided by the reference image. Alignment shifts, in columns and rows, move the images, and here the panel instead.
-CenterShift is not used: calibrate finds the axis."""
+As in the readers of DXchange, CIL and MBIRJAX, distances are in mm without their signs. Angles are in degrees; the sample
+turns counterclockwise seen from above. Row 0 is the lowest, column 0 on the left. PixelSize in µm is a pixel's size at the
+sample. Each image is divided by the reference image. Alignment shifts, in columns and rows, are meant for the images; here
+they shift the panel instead. CenterShift is not used: calibrate finds the axis."""
 
 import logging
 import re
@@ -38,28 +38,27 @@ _STREAMS = {
     "Alignment/X-Shifts": "<f4", "Alignment/Y-Shifts": "<f4", "ReconSettings/CenterShift": "<f4",
     f"{_ONE}/DataType": "<i4", f"{_SEVERAL}/DataType": "<i4",
 }  # fmt: skip
-_TYPES = {5: "<u2", 10: "<f4"}  # NumPy types by the numbers in DataType
-_PER_FOLDER = 100  # number of images in each of the folders ImageData1, ImageData2, …
+_TYPES = {5: "<u2", 10: "<f4"}  # DataType's codes, as NumPy types
+_PER_FOLDER = 100  # images in each of the container's folders ImageData1, ImageData2, …
 _RESULT_BYTES = 5  # bytes of memory per pixel of the result: a line integral in float32, and its mask
-_STEADY = 1e-3  # largest relative difference of a length between images that counts as none
+_STEADY = 1e-3  # relative difference up to which a length counts as the same in all images
 
 
 class Streams(Fields):
-    """Streams of numbers of a .txrm file, by name. A stream may have room for more images than were taken."""
+    """The streams of numbers in a .txrm file, by name. A stream may have room for more images than were taken."""
 
     def first_of(self, name: str, lowest: float = -LARGEST, highest: float = LARGEST) -> float:
-        """Returns the first number of a stream. Raises InputError for a number outside of [lowest, highest]."""
+        """Returns a stream's first number. Raises InputError for one outside [lowest, highest]."""
         return Fields(self.subject, {name: float(self.leading(name, 1)[0])}).number(name, lowest=lowest, highest=highest)
 
     def leading(self, name: str, count: int) -> np.ndarray:
-        """Returns the first ``count`` numbers (count,) of a stream. Raises InputError where it has fewer."""
+        """Returns a stream's first numbers (count,). Raises InputError where it has fewer."""
         if len(values := self.numbers(name)) < count:
             raise self.error(name, f"{len(values)} numbers", f"{count}, one for each image")
         return values[:count]
 
     def steady(self, name: str) -> float:
-        """Returns a length in mm without its sign, which all images must share. Raises InputError where it differs or is
-        0."""
+        """Returns a length in mm without its sign, the same in all images. Raises InputError if it differs or is 0."""
         lengths = np.abs(self.numbers(name))
         lengths = lengths[lengths > 0]
         if not len(lengths) or np.ptp(lengths) > _STEADY * lengths[0]:
@@ -73,7 +72,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports the images of a .txrm file."""
+    """Imports a .txrm file. Images that were never taken are left out."""
     options.refuse_unused("zeiss", OF_FOLDERS)
     with open_ole(path) as ole:
         present = {name: dtype for name, dtype in _STREAMS.items() if ole.exists(name)}
@@ -105,7 +104,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _taken(scan: Streams, count: int) -> int:
-    """Returns how many of the ``count`` planned images were taken. Warns where the scan stopped early."""
+    """Returns how many of ``count`` planned images were taken. Warns where the scan stopped early."""
     taken = int(scan.first_of(f"{_INFO}/ImagesTaken", 0)) if scan.has(f"{_INFO}/ImagesTaken") else count
     if 0 < taken < count:
         _log.warning("%s: the scan stopped early: %d of %d images were taken", scan.subject, taken, count)
@@ -113,8 +112,8 @@ def _taken(scan: Streams, count: int) -> int:
 
 
 def _type(scan: Streams, name: str, default: float | None = None) -> str:
-    """Returns the NumPy type of an image's pixels from the stream ``name``; ``default``, if given, stands for a missing
-    stream. Raises InputError for other types than 16 bits and float32."""
+    """Returns the NumPy type of an image's pixels from the code in stream ``name``. default: the code if the stream is
+    missing. Raises InputError for types other than 16 bits and float32."""
     number = scan.first_of(name) if default is None or scan.has(name) else default
     if number not in _TYPES:
         raise scan.error(name, f"{number:g}", "5 (16 bits) or 10 (float32)")
@@ -122,8 +121,7 @@ def _type(scan: Streams, name: str, default: float | None = None) -> str:
 
 
 def _stage(scan: Streams, at: np.ndarray, panel: tuple[int, int], options: ImportOptions) -> RotaryStage:
-    """Returns a stage whose panel is shifted in every image as the alignment says. at (F,): the images' numbers from 0
-    on."""
+    """Returns a stage whose panel is shifted in every image as the alignment says. at (F,): the images' numbers."""
     is_cone = not scan.has(f"{_INFO}/XrayGeometry") or scan.first_of(f"{_INFO}/XrayGeometry") == 1
 
     def pixel_mm(magnification: float = 1.0) -> tuple[float, float]:
@@ -151,7 +149,7 @@ def _stage(scan: Streams, at: np.ndarray, panel: tuple[int, int], options: Impor
 
 @contextmanager
 def open_ole(path: Path) -> Iterator[Any]:
-    """Yields the open OLE2 container. Any error of the library in the body becomes InputError."""
+    """Yields the open OLE2 container. Errors of the library olefile, while it is open, become InputError."""
     regular_file(path, str(path))
     olefile = checks.package("olefile", "the package that reads .txrm", "phyradgs-cl[formats]")
     with naming_damage(path, "a container that cannot be read", "an OLE2 file"), olefile.OleFileIO(str(path)) as ole:
@@ -159,7 +157,7 @@ def open_ole(path: Path) -> Iterator[Any]:
 
 
 def read_stream(ole: Any, path: Path, name: str, dtype: str) -> np.ndarray:
-    """Returns a stream as numbers (n,). Raises InputError for a missing one, and for one larger than its file."""
+    """Reads a stream as numbers (n,). Raises InputError for a missing stream, and for one that is larger than the file."""
     found, most = f"{ole.get_size(name)} bytes" if ole.exists(name) else "nothing", path.stat().st_size
     if found == "nothing" or ole.get_size(name) > most:
         raise InputError(f"{path}: {name}", found, f"numbers in at most {most} bytes")
@@ -168,7 +166,7 @@ def read_stream(ole: Any, path: Path, name: str, dtype: str) -> np.ndarray:
 
 
 def read_images(ole: Any, path: Path, names: list[str], dtype: str, panel: tuple[int, int]) -> np.ndarray:
-    """Returns images (F, v, u), one per stream, row 0 as stored. Raises InputError for other numbers of pixels."""
+    """Reads images (F, v, u), one per stream, row 0 as stored. Raises InputError for other numbers of pixels."""
     check_room(str(path), len(names) * panel[0] * panel[1] * (np.dtype(dtype).itemsize + _RESULT_BYTES))
     stack = np.empty((len(names), *panel), dtype)
     for image, name in zip(stack, names, strict=True):

@@ -1,5 +1,5 @@
-"""Opens HDF5 files of any origin, and finds the object at an address. HDF5 follows links and virtual datasets to other
-files, which must lie in the folder of the first file or in one that the user named."""
+"""Opens HDF5 files of any program, and finds the object at an address. HDF5 follows links to other files. These must lie in
+the folder of the first file or in one that the user named, so that a file cannot read others unasked."""
 
 import difflib
 import errno
@@ -16,15 +16,15 @@ import h5py
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.files import regular_file
 
-_ALIKE = (  # names of different things: none is a misspelling of another
+_ALIKE = (  # names that look similar but mean different things, so none is a misspelling of another
     *("x_pixel_size", "y_pixel_size", "rotation_angle", "rotation_angle_end", "image_key", "image_key_control"),
     *("poses", "pose", "time_s", "times"),
 )
-_CLOSE = 0.8  # least similarity, from 0 to 1 (difflib), at which a name counts as a misspelling of another
+_CLOSE = 0.8  # a name this similar to another (0 to 1, by difflib) is a misspelling
 LINKED = "--linked-folder"
 _UNLOCK = "set HDF5_USE_FILE_LOCKING=FALSE"
 BEING_WRITTEN = "a file that another program has open for writing"
-_REASONS = {  # by words in HDF5's message: what was found, and the remedy
+_REASONS = {  # words in HDF5's message: (what was found, remedy)
     "truncated": ("a truncated HDF5 file", "copy or write it again"),
     "signature not found": ("a file that is not HDF5", "check the path or convert it"),
     **{f"unable to lock file, errno = {number}": (BEING_WRITTEN,
@@ -37,8 +37,8 @@ _DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError)  # what h5py 
 
 @contextmanager
 def open_hdf5(path: str | Path, linked_folder: Path | None = None) -> "Iterator[Hdf5Source]":
-    """Opens a file for reading. ``linked_folder``: a folder whose files it may link to, besides its own. Raises InputError
-    for a file that is not readable HDF5, and for errors of HDF5 in the body."""
+    """Opens a file for reading. linked_folder: a folder, besides its own, with files to which it may link. Raises
+    InputError for a file that is not readable HDF5, and for HDF5's errors while it is open."""
     path, subject = Path(path), str(path)
     if regular_file(path, subject, "an HDF5 file").st_size == 0:
         raise InputError(subject, "an empty file", "an HDF5 file", "copy or write it again")
@@ -48,7 +48,7 @@ def open_hdf5(path: str | Path, linked_folder: Path | None = None) -> "Iterator[
         unknown = f"a file that HDF5 cannot open ({error})", ""
         found, remedy = next((known for words, known in _REASONS.items() if words in str(error)), unknown)
         raise InputError(subject, found, "a readable HDF5 file", remedy) from error
-    folders = filter(None, (path.parent, path.resolve().parent, linked_folder))  # a link has two folders
+    folders = filter(None, (path.parent, path.resolve().parent, linked_folder))  # of a symbolic link, both folders
     places = tuple(Path(place) for one in folders for place in (os.path.abspath(one), one.resolve()))
     with file:
         try:
@@ -59,22 +59,22 @@ def open_hdf5(path: str | Path, linked_folder: Path | None = None) -> "Iterator[
 
 @dataclass(frozen=True, eq=False)
 class Hdf5Source:
-    """An open HDF5 file. path: its name in messages. folders: those in which linked files may lie."""
+    """An open HDF5 file. path: its name in messages. folders: where files that it links to may lie."""
 
     file: h5py.File
     path: Path
     folders: tuple[Path, ...]
 
     def name(self, address: str) -> str:
-        """Returns the name of an object in messages: FILE:/address."""
+        """Returns what messages call an object: FILE:/address."""
         return f"{self.path}:{address}"
 
     def error(self, address: str, found: str, expected: str, remedy: str = "") -> InputError:
         return InputError(self.name(address), found, expected, remedy)
 
     def find(self, address: str) -> h5py.Group | h5py.Dataset | None:
-        """Returns the object at an absolute address; None where there is nothing. Raises InputError for damage, and for a
-        link to a file that is missing or lies in another folder."""
+        """Returns the object at an absolute address; None if there is nothing. Raises InputError for damage, and for a link
+        to a file that is missing or in a folder that is not allowed."""
         try:
             thing = self.file[address]
         except _DAMAGE as error:
@@ -86,7 +86,7 @@ class Hdf5Source:
         return thing
 
     def groups(self, depth: int = 1, below: str = "/") -> Iterator[str]:
-        """Yields the addresses of the groups at most ``depth`` levels below a group, without broken links."""
+        """Yields addresses of groups, at most ``depth`` levels below a group; leaves out broken links."""
         for name in self.file[below] if depth else ():
             with suppress(InputError):
                 if isinstance(self.find(inside := posixpath.join(below, name)), h5py.Group):
@@ -94,7 +94,7 @@ class Hdf5Source:
                     yield from self.groups(depth - 1, inside)
 
     def group(self, address: str) -> h5py.Group:
-        """Returns the group at an address. Raises InputError about the first group on the way that is missing."""
+        """Returns the group at an address. Raises InputError that names the first missing group of the address."""
         thing = self.find(address)
         if isinstance(thing, h5py.Group):
             return thing
@@ -105,13 +105,12 @@ class Hdf5Source:
         raise self.error(address, found, f"a group {name!r}", self.misspelling(parent, name))
 
     def optional_group(self, address: str) -> h5py.Group | None:
-        """Returns the group at an address; None where there is nothing. Raises InputError where a name close to it is there,
-        a misspelling."""
+        """Returns the group at an address, or None. Raises InputError if there is a similar name: it is a misspelling."""
         return self._optional(address, h5py.Group, "a dataset", "a group")
 
     def optional(self, address: str) -> h5py.Dataset | None:
-        """Returns the dataset at an address; None where there is nothing. Raises InputError for a misspelling, as
-        ``optional_group``, and for data that are missing, outside HDF5, or packed by an unknown filter."""
+        """Returns the dataset at an address; None if there is nothing. Raises InputError for a misspelling, as
+        ``optional_group`` does, and for data that are missing, outside HDF5, or compressed by an unknown filter."""
         if (dataset := self._optional(address, h5py.Dataset, "a group", "a dataset")) is not None:
             try:
                 self._check_stored(address, dataset)
@@ -129,7 +128,7 @@ class Hdf5Source:
         return thing
 
     def dataset(self, address: str) -> h5py.Dataset:
-        """Returns the dataset at an address. Raises InputError where there is none, with a similar name that is there."""
+        """Returns the dataset at an address. Raises InputError if there is none, and names a similar one."""
         if (dataset := self.optional(address)) is not None:
             return dataset
         parent, name = posixpath.split(address)
@@ -139,15 +138,14 @@ class Hdf5Source:
         raise self.error(address, "nothing there", f"a dataset {name!r}", remedy)
 
     def misspelling(self, parent: str, name: str) -> str:
-        """Returns the remedy "rename A to B", for a name A in the group ``parent`` that is close to ``name``, B; ""
-        without such a name."""
+        """Returns the remedy "rename A to B" if the group ``parent`` has a name A similar to ``name``, B; else ""."""
         group = self.find(parent)
         others = {n.lower(): n for n in group if n not in _ALIKE} if isinstance(group, h5py.Group) else {}
         close = [others[n] for n in difflib.get_close_matches(name.lower(), others, n=1, cutoff=_CLOSE) if others[n] != name]
         return f"rename {close[0]!r} to {name!r}" if close else ""
 
     def _refuse_broken(self, address: str, error: Exception) -> None:
-        """Raises InputError where an address has an object or link that HDF5 cannot open, except a soft link to nothing."""
+        """Raises InputError for an object or link that HDF5 cannot open. A soft link to nothing is no error."""
         parent, name = posixpath.split(address)
         group = self.find(parent) if name else None
         link = group.get(name, getlink=True) if isinstance(group, h5py.Group) else None
@@ -167,13 +165,13 @@ class Hdf5Source:
             raise self.error(address, f"a link to the file {place}", expected, f"say {LINKED} {place.parent} to trust it")
 
     def _check_linked(self, address: str, file: h5py.File, name: str, inside: str) -> None:
-        """Raises InputError where another file has no data at ``inside``: HDF5 itself returns nothing, or zeros."""
+        """Raises InputError if a linked file has no data at ``inside``; HDF5 itself would return nothing, or zeros."""
         own = Path(file.filename)
         place = own if name == "." else own.parent / name
-        if os.path.isabs(name) and not place.exists():  # HDF5 then looks in the first file's folder
+        if os.path.isabs(name) and not place.exists():  # HDF5 then looks for its name in the first file's folder
             place = own.parent / place.name
         self._check_place(address, place)
-        if "%" in name:  # a pattern of numbered files: HDF5 takes those that exist
+        if "%" in name:  # a pattern of numbered files, of which HDF5 reads all that exist
             return
         try:
             with open_hdf5(place) as other:
@@ -182,15 +180,15 @@ class Hdf5Source:
             raise self.error(address, f"a link to {inside} of {name} ({error})", "data there", error.remedy) from error
 
     def _check_stored(self, address: str, dataset: h5py.Dataset) -> None:
-        """Raises InputError for data that HDF5 would return as zeros, or not at all: parts of a virtual dataset that are
-        missing or do not fill it, other files' data, and data packed by an unknown filter."""
+        """Raises InputError for data that HDF5 would return as zeros, or not at all: a virtual dataset with missing parts,
+        data outside HDF5, and data compressed by an unknown filter."""
         if dataset.shape is None:
             raise self.error(address, "an empty dataset", "a value")
         if dataset.external:
             raise self.error(address, "data kept in files that are not HDF5", "HDF5", "copy them with 'h5repack'")
         _check_filters(self.name(address), dataset)
         parts = dataset.virtual_sources() if dataset.is_virtual else ()
-        with suppress(RuntimeError):  # a part of unlimited size has no number of values
+        with suppress(RuntimeError):  # HDF5 cannot count the values of a part of unlimited size
             filled = sum(part.vspace.get_select_npoints() for part in parts)
             if parts and filled < dataset.size:
                 found = f"a virtual dataset of which {100 * (1 - filled / dataset.size):.3g} % are kept nowhere"
@@ -200,7 +198,7 @@ class Hdf5Source:
 
 
 def _check_filters(subject: str, dataset: h5py.Dataset) -> None:
-    """Loads hdf5plugin where a dataset's compression needs it. Raises InputError where no filter can read it."""
+    """Loads hdf5plugin if a dataset's compression needs it. Raises InputError if no filter can read the dataset."""
     plist = dataset.id.get_create_plist()
     for code, _, _, name in (plist.get_filter(index) for index in range(plist.get_nfilters())):
         if not h5py.h5z.filter_avail(code):

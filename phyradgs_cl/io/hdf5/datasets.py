@@ -1,4 +1,4 @@
-"""Reads and writes typed values in HDF5: numbers with units, words, whole numbers and voxel grids. Reading checks them."""
+"""Reads, checks and writes values in HDF5: numbers with units, words, whole numbers and voxel grids."""
 
 import logging
 import math
@@ -25,8 +25,8 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Quantity:
-    """A physical quantity. factors: from a unit's name to the factor to the package's unit. assumed: the unit of a
-    dataset without units. largest: limit in the package's unit; larger numbers are damage, and would overflow later."""
+    """A physical quantity. factors: by unit, the factor that converts to the package's unit. assumed: the unit of datasets
+    that state none. largest: limit in the package's unit; larger numbers are damage and would overflow later."""
 
     name: str
     assumed: str
@@ -34,7 +34,7 @@ class Quantity:
     factors: MappingProxyType[str, float]
 
     def factor(self, unit: str) -> float | None:
-        """Returns the factor from ``unit``, in upper or lower case, to the package's unit; None for an unknown unit."""
+        """Returns the factor that converts ``unit``, in upper or lower case, to the package's; None if it is unknown."""
         return self.factors.get(unit.strip().rstrip(".").casefold())
 
     @property
@@ -74,8 +74,9 @@ ATTENUATION = _quantity("attenuation", "1/mm", 1e9, {
 def read_values(
     source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: str = "iuf", rows: slice | None = None
 ) -> np.ndarray:
-    """Reads a dataset in its own type; rows: reads only these rows of a stack (..., v, u). Raises InputError for damage,
-    and unless the type's ``dtype.kind`` is in ``kinds``; OutOfMemoryError for more than this machine can hold."""
+    """Reads a dataset in its own type. kinds: the allowed letters of NumPy's ``dtype.kind``. rows: the only rows that are
+    read of a stack (..., v, u). Raises InputError for damage and other types, OutOfMemoryError for more data than this
+    machine's memory holds."""
     if dataset.dtype.kind not in kinds:
         expected = "numbers" if "f" in kinds else "whole numbers"
         raise source.error(address, f"type {dataset.dtype}", expected, "store them as plain HDF5 numbers")
@@ -96,8 +97,8 @@ def read_array(
     source: Hdf5Source, address: str, shape: Sequence[int | None], quantity: Quantity | None = None,
     default: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Reads a numeric dataset as finite float64, in the package's unit of ``quantity``. Raises InputError for another shape,
-    values that are not finite, unknown units, and a missing dataset without a ``default``."""
+    """Reads a numeric dataset as finite float64, in the package's unit of ``quantity``. Raises InputError for another
+    shape, values that are not finite, unknown units, and a missing dataset that has no ``default``."""
     if default is not None and source.optional(address) is None:
         return default
     dataset = source.dataset(address)
@@ -106,8 +107,8 @@ def read_array(
 
 
 def read_per_frame(source: Hdf5Source, address: str, used: np.ndarray, quantity: Quantity) -> np.ndarray:
-    """Reads one finite number in the package's unit for each frame that ``used``, bool (F,), marks. The dataset has a
-    number for every frame, or for the used frames alone."""
+    """Reads one finite number, in the package's unit, for each frame marked in ``used``, bool (F,). The dataset may have
+    numbers for all frames or for the marked ones alone."""
     dataset = source.dataset(address)
     if is_of_all := dataset.shape != (int(used.sum()),):
         checks.shape(source.name(address), dataset, used.shape)
@@ -124,8 +125,8 @@ def _finite(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quan
 def read_number(
     source: Hdf5Source, address: str, quantity: Quantity | None = None, default: float | None = None
 ) -> float:
-    """Reads a finite number from a dataset of one element, in the package's unit of ``quantity``. Raises InputError where
-    the dataset is missing without a ``default``."""
+    """Reads a finite number from a dataset of one element, in the package's unit of ``quantity``. Raises InputError for a
+    missing dataset that has no ``default``."""
     if default is not None and source.optional(address) is None:
         return default
     dataset = source.dataset(address)
@@ -152,8 +153,8 @@ def read_integers(source: Hdf5Source, address: str, shape: Sequence[int | None])
 def read_word(
     source: Hdf5Source, address: str, allowed: Collection[str] | None = None, default: str | None = None
 ) -> str:
-    """Reads a string, one of ``allowed`` if given. Raises InputError for others, and where the dataset is missing without
-    a ``default``."""
+    """Reads a string, one of ``allowed`` if given. Raises InputError for others, and for a missing dataset that has no
+    ``default``."""
     if default is not None and source.optional(address) is None:
         return default
     dataset, word = source.dataset(address), None
@@ -169,12 +170,12 @@ def read_word(
 
 
 def read_title(source: Hdf5Source, address: str, default: str) -> str:
-    """Reads a string; ``default`` where it is missing or empty."""
+    """Reads a string; returns ``default`` if it is missing or empty."""
     return (read_word(source, address) if source.find(address) is not None else "") or default
 
 
 def read_attribute(source: Hdf5Source, address: str, name: str) -> str | None:
-    """Reads a text attribute; None where the object or the attribute is missing."""
+    """Reads a text attribute; returns None if the object or the attribute is missing."""
     if (thing := source.find(address)) is None:
         return None
     subject = f"{source.name(address)} @{name}"
@@ -197,13 +198,13 @@ def _text(value: object) -> str | None:
 
 
 def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quantity) -> np.ndarray:
-    """Converts finite values, of any shape, from the unit in the dataset's attribute "units" to the package's unit. Without
-    the attribute it assumes ``quantity.assumed``, with a warning unless the name ends in that unit. Raises InputError for an
-    unknown unit, and for values beyond ``quantity.largest``."""
+    """Converts finite values of any shape from the unit in the dataset's attribute "units" to the package's unit. Without
+    the attribute it assumes ``quantity.assumed``, and warns unless the dataset's name ends in that unit. Raises InputError
+    for an unknown unit, and for values beyond ``quantity.largest``."""
     unit = (read_attribute(source, address, "units") or read_attribute(source, address, "unit") or "").strip()
     if not unit:
         unit = quantity.assumed
-        # a name that ends in the unit, such as time_s or angle_deg, states it
+        # a name such as time_s or angle_deg states the unit
         if not posixpath.basename(address).endswith(f"_{unit}"):
             _log.warning("%s: no units attribute; %s assumed", source.name(address), unit)
     if (factor := quantity.factor(unit)) is None:
@@ -229,7 +230,7 @@ def read_grid(source: Hdf5Source, address: str) -> Grid:
 
 @contextmanager
 def new_hdf5(path: str | Path, size_bytes: int) -> Iterator[h5py.File]:
-    """Yields a new HDF5 file for arrays of ``size_bytes``, written whole or not at all; see ``written_beside``."""
+    """Yields a new HDF5 file for arrays of ``size_bytes``. It replaces ``path`` only on success; see ``written_beside``."""
     with written_beside(path, size_bytes) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["NX_class"], file.attrs["default"] = "NXroot", "entry"
         yield file

@@ -1,4 +1,4 @@
-"""Reads and writes scan files. This module holds the addresses in one, a NeXus NXtomo entry (docs/formats.md)."""
+"""Reads and writes scan files, which are NeXus NXtomo entries in HDF5 (docs/formats.md). This module lists the addresses."""
 
 DETECTOR = "instrument/detector"
 DATA, MASK = f"{DETECTOR}/data", f"{DETECTOR}/pixel_mask"
@@ -22,7 +22,7 @@ QUANTITIES = ("attenuation", "transmission", "counts")
 ROTATES = ("gantry", "sample")
 BEAMS = ("cone", "parallel")
 
-# Standard fields that change the geometry and that this package does not read.
+# Fields of NXtomo that would change the geometry. They are not read; a file that has them gives a warning.
 IGNORED = (
     *(f"{DETECTOR}/{name}" for name in ("transformations", "x_rotation_axis_pixel_position")),
     *(f"{DETECTOR}/{name}" for name in ("y_rotation_axis_pixel_position", "estimated_cor_from_motor")),

@@ -1,4 +1,4 @@
-"""Reads the header of a scan file: everything but its large arrays, checked before those are read. Functions raise
+"""Reads the header of a scan file: everything but its large arrays, which are read only after all checks. Functions raise
 InputError, about "FILE:/hdf5/path", for missing and for impossible values."""
 
 import logging
@@ -26,16 +26,16 @@ from phyradgs_cl.io.scan.motion import has_motion, read_gating, read_trajectory
 from phyradgs_cl.io.tables import read_facts
 
 _log = logging.getLogger(__name__)
-_JITTER = 0.01  # largest deviation of a measured time from the median of all frames' times, as a fraction of the median
-_DEEPEST_ENTRY = 3  # levels of groups searched below the root for NXtomo's definition, which a subentry may hold
+_JITTER = 0.01  # measured times of frames may differ from their median by this fraction of it
+_DEEPEST_ENTRY = 3  # levels of groups that are searched for NXtomo entries, which may be subentries
 
 
 @dataclass(frozen=True, eq=False)
 class ScanHeader:
     """A checked scan without its arrays: ``scan.projections`` are zeros that take no memory.
 
-    entry: address of the NXtomo group. image_key (F,): of all stored frames. mask_shape: None without a mask. states: the
-    number of true states. has_grid: the file states the grid."""
+    entry: address of the NXtomo group. image_key (F,): types of all stored frames. mask_shape: None without a mask. states:
+    number of true volumes at several times. has_grid: the file states the grid."""
 
     scan: Scan
     entry: str
@@ -49,7 +49,7 @@ class ScanHeader:
 
 
 def read_header(source: Hdf5Source) -> ScanHeader:
-    """Reads and checks everything but pixels, mask and reference. Raises InputError, with the HDF5 path, for damage."""
+    """Reads and checks everything but pixels, mask and true volume. Raises InputError, with the HDF5 path, for damage."""
     entry = find_entry(source)
     data, quantity = read_data_kind(source, entry)
     image_key = read_image_key(source, entry, len(data))
@@ -89,9 +89,9 @@ def read_header(source: Hdf5Source) -> ScanHeader:
 
 
 def find_entry(source: Hdf5Source, asked: str | None = None) -> str:
-    """Returns the address of the NXtomo entry: ``asked``, else the only group with that definition, at most 3 levels
-    deep. Of several groups it takes the root's @default, with a warning. Without such a group it takes the root's
-    @default, /entry, or the only NXentry. Raises InputError where no entry is left, and for several without a default."""
+    """Returns the address of the NXtomo entry: ``asked``, else the only group that is defined as NXtomo, at most 3 levels
+    deep. If there are several, it takes the one that the root's @default names, with a warning. If there is none, it takes
+    the root's @default, /entry, or the only NXentry. Raises InputError if nothing fits, or several do."""
     if asked is not None:
         address = f"/{asked.strip('/')}"
         source.group(address)
@@ -142,7 +142,7 @@ def _read_saturation(source: Hdf5Source, entry: str) -> Saturation | None:
 
 
 def read_data_kind(source: Hdf5Source, entry: str) -> tuple[h5py.Dataset, str]:
-    """Returns the dataset of frames (F, v, u), unread, and their quantity: "attenuation", "transmission" or "counts"."""
+    """Returns the dataset of frames (F, v, u), not read yet, and their quantity: "attenuation", "transmission", "counts"."""
     address = f"{entry}/{schema.DETECTOR}/data"
     data, subject = source.dataset(address), source.name(address)
     if data.ndim != 3 or min(data.shape) < 1:
@@ -181,7 +181,7 @@ def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int
     offset_mm = tuple(h5.read_array(source, offset, (2,), LENGTH, default=np.zeros(2)).tolist())
     if _is_parallel(source, entry):
         return ParallelGeometry(detector_shape, (pitch_v_mm, pitch_u_mm), offset_mm)
-    to_axis_mm = abs(h5.read_number(source, address, LENGTH))  # in NeXus the source's distance is negative
+    to_axis_mm = abs(h5.read_number(source, address, LENGTH))  # NeXus counts the source's distance negative
     if to_axis_mm == 0:
         remedy = f"correct the value, or store 'parallel' as {entry}/{schema.BEAM} and no distance"
         raise source.error(address, "0", "a length other than 0", remedy)
@@ -190,8 +190,8 @@ def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int
 
 
 def _is_parallel(source: Hdf5Source, entry: str) -> bool:
-    """Returns whether the beam is parallel: as stated or, with a warning, in another program's file without a source
-    distance."""
+    """Returns whether the file says that the beam is parallel. A file of another program is also taken as parallel, with a
+    warning, if it has no source distance."""
     beam, distance = f"{entry}/{schema.BEAM}", f"{entry}/{schema.SOURCE}/distance"
     has_distance = source.optional(distance) is not None
     if source.optional(beam) is not None:
@@ -207,13 +207,13 @@ def _is_parallel(source: Hdf5Source, entry: str) -> bool:
 
 
 def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool) -> Shutter:
-    """Reads exposure and readout, which must be there only where the gantry moves; their order only for a rolling readout.
-    used, bool (F,): the stored frames that are projections."""
+    """Reads the shutter. Exposure and readout are required only if the gantry moves, and the order of lines only if they
+    are read one after the other. used, bool (F,): which stored frames are projections."""
     exposure_s = read_duration(source, f"{entry}/{schema.DETECTOR}/count_time", used, moving)
     needed = moving and exposure_s > 0
     readout_s = read_duration(source, f"{entry}/{schema.DETECTOR}/detector_readout_time", used, needed)
     axis, direction = f"{entry}/{schema.EXTRA}/readout_axis", f"{entry}/{schema.EXTRA}/readout_direction"
-    rolling = needed and readout_s > 0  # only then the order of lines matters
+    rolling = needed and readout_s > 0  # else the order of lines has no effect
     word = h5.read_word(source, axis, AXES, default=None if rolling else "rows")
     number = h5.read_number(source, direction, default=None if rolling else 1.0)
     checks.one_of(source.name(direction), number, (1, -1))
@@ -235,8 +235,8 @@ def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, f
 
 
 def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bool) -> float:
-    """Reads one time in s for all projections, stored once or for every frame. Measured times may differ by a percent; their
-    median is returned. Returns 0 where it is missing and not ``needed``."""
+    """Reads one time in s for all projections, stored once or for every frame. Measured times may differ by a percent; the
+    result is their median. Returns 0 if it is missing and not ``needed``."""
     dataset = source.dataset(address) if needed else source.optional(address)
     if dataset is None:
         return 0.0
@@ -258,8 +258,8 @@ def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bo
 def read_starts(
     source: Hdf5Source, entry: str, used: np.ndarray, shutter: Shutter, moving: bool
 ) -> np.ndarray:
-    """Reads the opening times (P,) in s of the projections; returns evenly spaced times where nothing moves and none are
-    stored."""
+    """Reads the times (P,) in s at which projections' first lines open. If none are stored and nothing moves, returns
+    evenly spaced times, which only give the order."""
     address = f"{entry}/{schema.DETECTOR}/frame_start_time"
     if not moving and source.optional(address) is None:
         return np.arange(int(used.sum())) * max(shutter.span_s, 1.0)
@@ -267,7 +267,7 @@ def read_starts(
 
 
 def check_mask(source: Hdf5Source, entry: str, data_shape: tuple[int, ...]) -> tuple[int, ...] | None:
-    """Returns the shape, (v, u) or (F, v, u), of the pixel mask without reading it; None without a mask."""
+    """Returns the pixel mask's shape, (v, u) or (F, v, u), or None; does not read its pixels."""
     address = f"{entry}/{schema.DETECTOR}/pixel_mask"
     mask = source.optional(address)
     if mask is None:

@@ -1,5 +1,4 @@
-"""Reads and writes the motion in a scan file: the scanner's, as a pose table, an encoder table or two angles for each frame,
-and the gating signal of an object that moves."""
+"""Reads and writes motion in a scan file: the scanner's as poses, encoder table or angles, the object's as gating signal."""
 
 import logging
 import math
@@ -18,15 +17,14 @@ from phyradgs_cl.io.hdf5 import Hdf5Source
 from phyradgs_cl.io.hdf5 import datasets as h5
 
 _log = logging.getLogger(__name__)
-_KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # trajectories that files can hold
-_RAMP_ERROR_RAD = 1e-9  # largest error in rad of the table of angles that stands for a speed ramp
-_MOST_RAMP_SAMPLES = 500_000  # most angles of the table that stands for a speed ramp
-_SUSPECT_RAD = math.radians(5.0)  # largest difference between table and rotation_angle without a warning
+_KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # motions of a circular orbit that files can hold
+_RAMP_ERROR_RAD = 1e-9  # a speed ramp is stored as a table of angles, whose interpolation errs by at most this
+_MOST_RAMP_SAMPLES = 500_000  # longest such table, about 8 MB; a long, fast ramp is then stored less exactly
+_SUSPECT_RAD = math.radians(5.0)  # table and rotation_angle differ by more only if one has a wrong sign or zero
 
 
 def has_motion(source: Hdf5Source, entry: str) -> bool:
-    """Returns whether the file states how the gantry moved in an exposure, by end angles, an encoder table or a pose
-    table."""
+    """Returns whether the file says how the gantry moves within exposures: by end angles, an encoder or a pose table."""
     end = source.optional(f"{entry}/{schema.SAMPLE}/rotation_angle_end")
     groups = (schema.KINEMATICS, schema.POSES)
     found = [source.optional_group(f"{entry}/{group}") for group in groups]
@@ -37,8 +35,8 @@ def read_trajectory(
     source: Hdf5Source, entry: str, geometry: Geometry, used: np.ndarray, start_s: np.ndarray,
     exposure_s: float,
 ) -> CircularOrbit | PoseTable:
-    """Reads the trajectory of the P projections, which ``used``, bool (F,), marks among the stored frames and which open at
-    ``start_s`` (P,). Raises InputError for damage, and for tables whose times do not increase."""
+    """Reads the trajectory. used, bool (F,): which stored frames are projections. start_s (P,): when the P projections
+    begin. Raises InputError for damage, and for tables whose times do not increase."""
     first_rad = read_angles(source, entry, "rotation_angle", used)
     poses, kinematics = f"{entry}/{schema.POSES}", f"{entry}/{schema.KINEMATICS}"
     if source.optional_group(poses) is not None:
@@ -59,18 +57,17 @@ def read_trajectory(
 
 
 def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> np.ndarray:
-    """Reads gantry angles (P,) in rad of the frames that ``used``, bool (F,), marks, from ``name``: rotation_angle or
-    rotation_angle_end."""
+    """Reads gantry angles (P,) in rad of frames in ``used``, bool (F,). name: rotation_angle or rotation_angle_end."""
     address = f"{entry}/{schema.SAMPLE}/{name}"
     angle_rad = h5.read_array(source, address, used.shape, h5.ANGLE)[used]
-    # unless it states its own, the end angle has the start angle's sense: gantry or sample
+    # an end angle that does not say whether gantry or sample turns means the same as the start angle
     start = f"{entry}/{schema.SAMPLE}/rotation_angle"
     return angle_rad * _sense(source, address, absent=_sense(source, start, absent=-1.0))
 
 
 def storable(scan: Scan) -> Scan:
-    """Returns the scan with a trajectory that files can hold. A user-defined trajectory becomes a pose table that is
-    exact to a ten-thousandth of a pixel. Raises InputError where no table is that exact."""
+    """Returns the scan with a trajectory that files can hold. A user's own class of trajectory becomes a pose table that is
+    exact to a ten-thousandth of a pixel. Raises InputError if no table is that exact."""
     path = scan.trajectory
     if isinstance(path, PoseTable) or (isinstance(path, CircularOrbit) and isinstance(path.kinematics, _KINEMATICS)):
         return scan
@@ -79,7 +76,7 @@ def storable(scan: Scan) -> Scan:
 
 
 def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
-    """Writes rotation angles and tables. Stored frame i gets the angles of projection ``frame_of[i]``; frame_of (F,)."""
+    """Writes rotation angles and tables. frame_of (F,): the projection whose angles each stored frame gets."""
     first_rad, last_rad = _exposure_angles(scan)
     sample = entry[schema.SAMPLE]
     h5.write_number(sample, "rotation_angle", np.rad2deg(first_rad)[frame_of], "degree", rotates="gantry")
@@ -95,10 +92,9 @@ def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
 
 
 def write_poses(entry: h5py.Group, scan: Scan) -> None:
-    """Writes the table of a scan whose trajectory is a pose table."""
     path = scan.trajectory
     assert isinstance(path, PoseTable)
-    # a stop-and-shoot scan is stored without exposure, so its poses move to the frames' starts
+    # a stop-and-shoot scan is stored without exposure; its poses then belong to the starts of frames, not their middles
     time_s = path.time_s - (0.0 if scan.is_fly else scan.shutter.middle_s)
     h5.write_number(_table_group(entry, "poses", time_s), "pose", path.table, "mm")
 
@@ -110,7 +106,7 @@ def _table_group(entry: h5py.Group, name: str, time_s: np.ndarray) -> h5py.Group
 
 
 def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-    """Returns gantry angles (F,) in rad at the start and end of each exposure; both at mid-window for a gantry at rest."""
+    """Returns gantry angles (F,) in rad at start and end of each first line's exposure. At rest both are the frame's."""
     shutter = scan.shutter
     offsets_s = np.array([0.0, shutter.exposure_s] if scan.is_fly else [shutter.middle_s] * 2)
     pairs = np.array([_angles(scan, f, start_s + offsets_s) for f, start_s in enumerate(scan.frame_start_s)])
@@ -120,13 +116,13 @@ def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 def _angles(scan: Scan, frame: int, time_s: np.ndarray) -> np.ndarray:
     if isinstance(scan.trajectory, CircularOrbit):
         return scan.trajectory.angle_rad(frame, time_s)
-    source = towards_source(scan.trajectory.pose(frame, time_s), scan.is_parallel)  # its azimuth, for other programs
+    source = towards_source(scan.trajectory.pose(frame, time_s), scan.is_parallel)  # its azimuth is for other programs
     return np.unwrap(np.arctan2(source[:, 1], source[:, 0]))
 
 
 def _angle_table(scan: Scan, kinematics: EncoderTable | SpeedRamp) -> tuple[np.ndarray, np.ndarray]:
-    """Returns times (T,) in s and angles (T,) in rad: the encoder's, or samples of a speed ramp, between which linear
-    interpolation is exact to a nanoradian, up to 500,000 samples."""
+    """Returns times (T,) in s and angles (T,) in rad: the encoder's, or samples of a speed ramp. The samples are dense
+    enough for linear interpolation to ``_RAMP_ERROR_RAD``, up to ``_MOST_RAMP_SAMPLES``."""
     if isinstance(kinematics, EncoderTable):
         return kinematics.time_s, kinematics.angle_rad_table
     first_s, last_s = float(np.min(scan.frame_start_s)), float(np.max(scan.frame_start_s)) + scan.shutter.span_s
@@ -147,7 +143,7 @@ def _read_table_times(source: Hdf5Source, address: str) -> np.ndarray:
 
 
 def _sense(source: Hdf5Source, address: str, absent: float) -> float:
-    """Returns +1 where the attribute "rotates" of an angle says gantry, −1 for sample; ``absent`` without the attribute."""
+    """Returns the sign that makes an angle the gantry's: +1 if @rotates is gantry, −1 if sample, ``absent`` if missing."""
     rotates = h5.read_attribute(source, address, "rotates")
     if rotates is None:
         return absent
@@ -157,8 +153,7 @@ def _sense(source: Hdf5Source, address: str, absent: float) -> float:
 
 
 def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, first_rad: np.ndarray) -> None:
-    """Warns of table angles more than 5° from rotation_angle, as after a wrong sense of rotation. The table's angles are
-    used all the same."""
+    """Warns if table and rotation_angle differ by more than 5°, as with a wrong sign. The table is still used."""
     apart_rad = np.abs((table_rad - first_rad + np.pi) % (2 * np.pi) - np.pi)
     if apart_rad.max() > _SUSPECT_RAD:
         text = "%s: up to %.3g° from rotation_angle; the table is used"
@@ -166,8 +161,8 @@ def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, firs
 
 
 def read_gating(source: Hdf5Source, entry: str, used: np.ndarray, middle_s: np.ndarray) -> Gating | None:
-    """Returns the gating signal or phase of the projections, whose windows are centred at ``middle_s`` (P,); None where
-    the file has neither. used, bool (F,): the stored frames that are projections. Raises InputError for signal and phase
+    """Reads the gating signal or phase of the projections; None if the file has neither. used, bool (F,): which stored
+    frames are projections. middle_s (P,): the middle of each projection's time. Raises InputError for a signal and a phase
     together, and for equal times."""
     if source.optional_group(f"{entry}/{schema.GATING}") is None:
         return None
@@ -186,6 +181,6 @@ def read_gating(source: Hdf5Source, entry: str, used: np.ndarray, middle_s: np.n
 
 
 def write_gating(extra: h5py.Group, gating: Gating, middle_s: np.ndarray) -> None:
-    """Writes the signal, or the phase in cycles, at the middles ``middle_s`` (F,) of all stored frames."""
+    """Writes the signal, or the phase in cycles, for all stored frames. middle_s (F,): the middle of each frame's time."""
     group, values = h5.new_group(extra, "gating", "NXcollection"), gating.at(middle_s)
     h5.write_number(group, "phase" if gating.is_phase else "signal", values, "cycle" if gating.is_phase else None)

@@ -1,4 +1,4 @@
-"""Reads scan files, a NeXus NXtomo entry in HDF5, into a Scan of line integrals."""
+"""Reads scan files, which are NeXus NXtomo entries in HDF5, into a Scan of line integrals."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,29 +20,28 @@ from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5.datasets import ATTENUATION, read_array, read_grid, read_values
 from phyradgs_cl.io.scan.header import ScanHeader, read_header
 
-LARGEST_LINE_INTEGRAL = 1e6  # largest size of a line integral in a file; a larger one raises an error
+LARGEST_LINE_INTEGRAL = 1e6  # a larger one cannot be measured, so it raises an error
 # (data (F, v, u), image_key (F,), quantity) -> line integrals (P, v, u) of the projections, mask of bad pixels or None.
 ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.ndarray | None]]
 
 
 def read_scan_header(path: str | Path) -> Scan:
-    """Reads and checks a scan file except for its large arrays: the projections are zeros that take no memory. Raises
-    InputError as ``read_scan`` does."""
+    """Reads and checks a scan file as ``read_scan``, but not its large arrays: projections are zeros that take no memory."""
     with open_hdf5(path) as source:
         return read_header(source).scan
 
 
 def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, int] | None = None) -> Scan:
-    """Reads a scan file; ``to_attenuation`` converts the frames to line integrals. Of a parallel scan it can read detector
-    rows [first, stop) alone: the scan is then a ``slab`` on the whole grid.
+    """Reads a scan file. rows: detector rows [first, stop) that alone are read of a parallel-beam scan, which then keeps
+    the whole grid; None reads all.
 
-    ``to_attenuation`` takes (data (F, v, u), image_key (F,), quantity) and returns line integrals (P, v, u) of the P
-    projections. It also returns a mask (v, u) or (P, v, u) of unusable values, or None. Flat, dark and invalid frames are
-    left out. The scan has projections (P, v, u) float32 and a bool ``pixel_mask`` or None, from the file and the
+    to_attenuation: takes (data (F, v, u), image_key (F,), quantity) and returns line integrals (P, v, u) of the P
+    projections. It also returns a mask (v, u) or (P, v, u) of unusable values, or None. It leaves flat, dark and invalid
+    frames out. The scan has projections (P, v, u) float32 and a bool ``pixel_mask`` or None, from the file and the
     conversion; values that are not finite must be masked.
 
-    Everything but the pixels is checked before they are read. Raises InputError for a missing, damaged or incomplete file;
-    its subject is "FILE:/hdf5/path"."""
+    Everything else is checked before the pixels are read. Raises InputError for a missing, damaged or incomplete file; its
+    subject is "FILE:/hdf5/path"."""
     with open_hdf5(path) as source:
         header = read_header(source)
         lines = None if rows is None else slice(*rows)
@@ -50,7 +49,7 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, 
             header = replace(header, scan=slab(header.scan, *rows))
         mask = _read_mask(source, header, lines)
         reference = read_reference(source, header.entry) if header.has_reference else None
-        has_states = header.states > 0 and rows is None  # slabs are compared with the reference alone
+        has_states = header.states > 0 and rows is None  # a reconstruction of some rows is compared with one volume only
         moving = read_moving_truth(source, header.entry) if has_states else None
         metal = _read_metal(source, f"{header.entry}/{schema.METAL}")
         data = _read_frames(source, header, mask, lines)
@@ -74,13 +73,13 @@ def _read_metal(source: Hdf5Source, address: str) -> Metal | None:
 
 
 def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, object]:
-    """Returns facts about a scan file by name, and checks all but its pixels. sha256: the file's, if it is known already."""
+    """Returns what 'phyradgs info' prints about a scan file. Checks all but its pixels. sha256: the file's, if known."""
     with open_hdf5(path) as source:
         header = read_header(source)
     scan, key = header.scan, header.image_key
     kinds = ("projections", "flats", "darks", "invalid")
     counts = {name: int(np.count_nonzero(key == number)) for number, name in enumerate(kinds)}
-    if header.quantity == "attenuation":  # flats and darks that went into the line integrals are no longer in the file
+    if header.quantity == "attenuation":  # flats and darks have been applied; only their numbers are in the file
         applied = {name: scan.provenance.get(name) for name in APPLIED}
         counts |= {name: count for name, count in applied.items() if isinstance(count, int)}
     return {
@@ -97,8 +96,8 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
 
 
 def _timing_facts(scan: Scan) -> dict[str, object]:
-    """Returns exposure, readout, blur, and, for a circular orbit, angles and the first frame's arcs in degrees. A
-    stop-and-shoot scan has no times unless its exposure is stated, since its frames' starts only give their order."""
+    """Returns exposure, readout and blur and, for a circular orbit, angles and the first frame's arcs in degrees. A
+    stop-and-shoot scan without an exposure has no times: the starts of its frames only give their order."""
     shutter = scan.shutter
     facts: dict[str, object] = {}
     if scan.is_fly or shutter.exposure_s > 0:
@@ -150,8 +149,7 @@ def _read_mask(source: Hdf5Source, header: ScanHeader, rows: slice | None) -> np
 def _read_frames(
     source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None, rows: slice | None
 ) -> np.ndarray:
-    """Reads all stored frames (F, v, u), or their ``rows``. Raises InputError for a value that is neither finite nor masked,
-    except in invalid frames."""
+    """Reads all stored frames (F, v, u), or their ``rows``. Raises InputError for NaN and infinity that are not masked."""
     address = f"{header.entry}/{schema.DATA}"
     data = read_values(source, address, source.dataset(address), rows=rows)
     if data.dtype.kind == "f":
@@ -189,7 +187,7 @@ def _convert(
 
 
 def united(mask: np.ndarray | None, bad: np.ndarray | None) -> np.ndarray | None:
-    """Returns the union of two masks, each (v, u) or (P, v, u) or None; a mask without a masked pixel adds nothing."""
+    """Returns the union of two masks, each (v, u), (P, v, u) or None; ``mask`` itself if ``bad`` masks no pixel."""
     if bad is None or not np.any(bad):
         return mask
     return np.asarray(bad, bool) if mask is None else mask | np.asarray(bad, bool)

@@ -1,4 +1,4 @@
-"""Writes scan files, an NXtomo entry that other programs read too, and copies of them with another geometry or timing."""
+"""Writes scan files, which other programs can read as NXtomo, and copies of them with another geometry or timing."""
 
 import json
 import logging
@@ -29,13 +29,13 @@ def write_scan(
     path: str | Path, scan: Scan, *, data: np.ndarray | None = None, image_key: np.ndarray | None = None,
     quantity: str = "attenuation",
 ) -> None:
-    """Writes a scan file, whole or not at all, in place of an existing one. Without ``data`` the line integrals of ``scan``
-    are written. ``data``: (F, v, u) float32 or uint16 raw frames with flats and darks, whose ``quantity`` is "attenuation",
-    "transmission" or "counts"; image_key (F,): 0 projection, 1 flat, 2 dark, 3 invalid, with as many 0 as ``scan`` has
-    frames. A user-defined trajectory becomes a table of poses. Raises InputError for arguments that contradict each other,
-    or a scan that the format cannot express; OutputError where the file cannot be written."""
+    """Writes a scan file, completely or not at all; it replaces an existing one. data: raw frames (F, v, u), float32 or
+    uint16, with flats and darks; None writes the line integrals of ``scan``. quantity: of ``data``, "attenuation",
+    "transmission" or "counts". image_key (F,): 0 projection, 1 flat, 2 dark, 3 invalid, with as many 0 as ``scan`` has
+    frames. A user's own class of trajectory becomes a table of poses. Raises InputError for arguments that contradict each
+    other, and for a scan that the format cannot express; OutputError if the file cannot be written."""
     frames, key = _checked_frames(scan, data, image_key, quantity)
-    if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:  # would be read as at rest
+    if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:  # a reader would take it as at rest
         remedy = "give the exposure its real length"
         raise InputError("exposure_s", "0 in a fly-scan with a readout", "a time above 0 s", remedy)
     scan = storable(scan)
@@ -44,7 +44,7 @@ def write_scan(
         entry.attrs["default"], entry.attrs["definition"] = "data", "NXtomo"
         entry["definition"], entry["title"] = "NXtomo", plain_text(scan.title)
         h5.new_group(entry, schema.SAMPLE, "NXsample")["name"] = plain_text(scan.title)
-        # Frames between projections (flats, darks) get the values of the projection before them.
+        # Flats and darks get the angle and time of the projection before them.
         frame_of = np.clip(np.cumsum(key == schema.PROJECTION) - 1, 0, None)
         _write_instrument(entry, scan, frames, key, quantity, frame_of)
         _write_extra(entry, scan, frame_of)
@@ -147,8 +147,8 @@ def _write_links(entry: h5py.Group) -> None:
 
 
 def copy_with_offset(source: str | Path, target: str | Path, shift_u_mm: float) -> None:
-    """Copies a scan file with its panel ``shift_u_mm`` further along u: changes detector_offset, and poses where it has
-    them. Raises InputError for a file that is no scan, OutputError where the copy cannot be written."""
+    """Copies a scan file and shifts the panel by ``shift_u_mm`` along u, in detector_offset and, if there are any, in the
+    poses. Raises InputError for a file that is no scan, OutputError if the copy cannot be written."""
     with open_hdf5(source) as opened:
         header = read_header(opened)
         poses = f"{header.entry}/{schema.POSES}/pose"
@@ -163,8 +163,8 @@ def copy_with_offset(source: str | Path, target: str | Path, shift_u_mm: float) 
 
 
 def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None:
-    """Copies a scan file with the geometry, shutter, trajectory and provenance of ``scan``, which has the same frames. Equal
-    values are not touched. Raises InputError for a file that is no scan, OutputError where the copy cannot be written."""
+    """Copies a scan file with the geometry, shutter, trajectory and provenance of ``scan``, which has the same frames.
+    Changes only what differs. Raises InputError for a file that is no scan, OutputError if the copy cannot be written."""
     with open_hdf5(source) as opened:
         header = read_header(opened)
     stated, scan = header.scan, storable(scan)
@@ -184,7 +184,7 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
             write_motion(entry, scan, frame_of)
         elif isinstance(scan.trajectory, PoseTable):
             _remove(entry, schema.POSES)
-            if not scan.is_fly:  # with poses and an exposure it would be read as moving; poses need the times of frames
+            if not scan.is_fly:  # see _stored_durations; poses belong to times, so frames need their times too
                 detector = entry[schema.DETECTOR]
                 _replace(detector, "count_time", 0.0, "s")
                 _replace(detector, "detector_readout_time", 0.0, "s")
@@ -196,7 +196,7 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
 
 @contextmanager
 def _copied(source: str | Path, target: str | Path, entry: str) -> Iterator[h5py.Group]:
-    """Yields the entry of a copy of ``source``, with the group ``EXTRA``. The copy replaces ``target`` after the body."""
+    """Yields the entry of a copy of ``source``, which has the group ``EXTRA``. On success the copy replaces ``target``."""
     with written_beside(target) as temporary:
         shutil.copyfile(source, temporary)
         with h5py.File(temporary, "r+") as file:

@@ -1,5 +1,5 @@
 "use strict";
-// What the parts of the page share: numbers, data blocks, and a camera that mouse, fingers and keys turn.
+// What all scripts share: numbers as text, data blocks, and a camera that mouse, fingers and keys turn.
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 const inWords = (value, decimals) => value.toFixed(decimals).replace(/^-(?=[0.]*$)/, "").replace("-", "−");
 const bytesOf = (base64) => Uint8Array.from(atob(base64), (c) => c.charCodeAt(0));
@@ -32,7 +32,7 @@ async function decodedVoxels({ counts: [nx, ny, nz], atlas, columns }) {
   return bytes;
 }
 
-// Lets a button play a slider to its end in so many milliseconds; ``show`` draws its present place.
+// Lets a button move a slider to its end within some milliseconds; ``show`` draws its present position.
 function makePlayer(button, slider, lasts_ms, show) {
   let playing = 0, started = 0;
   const share = () => slider.valueAsNumber / Number(slider.max);
@@ -68,7 +68,7 @@ function roundLength(most) {
   return power * ([5, 2].find((factor) => factor * power <= most * (1 + 1e-9)) || 1);
 }
 
-// Sets the length and the words of a scale bar in a picture that is so wide.
+// Sets the length and the text of a scale bar, from the picture's width.
 function setBar(bar, width_mm) {
   const length = roundLength(0.3 * width_mm);
   bar.style.width = (100 * length) / width_mm + "%";
@@ -103,7 +103,7 @@ class Camera {
 }
 
 // Lets a canvas turn a camera. One finger turns about the axis, so that the page can be scrolled over the picture; two
-// fingers tilt and zoom too. ``changed`` is called with true while a movement goes on.
+// fingers tilt and zoom too. ``changed`` is called with true during a movement.
 function makeTurnable(canvas, camera, changed) {
   const pointers = new Map();
   const spread = () => {

@@ -1,4 +1,4 @@
-// The page of a run under way: loads itself again, and says when there has been no news for too long.
+// The page of a running reconstruction: loads itself again, and warns if the run has written nothing for too long.
 (() => {
   const data = dataOf("live-data");
   if (!data || data.is_over) return;
@@ -6,7 +6,7 @@
   const written = new Date(1000 * data.written), clock = written.toLocaleTimeString([], { hour12: false });
   let isHeld = false; // by a finger or a button of the mouse
 
-  // What survives loading: whether it is paused, and where the keyboard is.
+  // Kept when the page loads again: whether it is paused, and which element has the keyboard.
   let kept = {};
   try {
     kept = JSON.parse(sessionStorage.getItem("live") || "{}");

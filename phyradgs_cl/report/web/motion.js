@@ -6,7 +6,7 @@
   const time = find("time"), arrows = find("arrows"), reading = find("reading");
   const { counts } = volume, [nx, ny, nz] = counts, AXES = ["x", "y", "z"];
   const LASTS_MS = 8000, ARROW_EVERY_PX = 24, LEAST_PX = 2, BLACK = 20;
-  const air = (-255 * volume.least) / (volume.most - volume.least || 1); // the step of 0 1/mm, which is outside of the box
+  const air = (-255 * volume.least) / (volume.most - volume.least || 1); // grey level of 0 1/mm, used outside the box
   const control = new Int16Array(bytesOf(data.control).buffer), perField = control.length / data.units_mm.length;
   let bytes = null, ends = volume.ends, asked = 0;
 
@@ -68,7 +68,7 @@
     return (1 - c) * ((1 - b) * row(j, k) + b * row(j + 1, k)) + c * ((1 - b) * row(j, k + 1) + b * row(j + 1, k + 1));
   }
 
-  // Draws a slice at a state; returns the longest displacement in it in mm.
+  // Draws a slice of the object at a time; returns its longest displacement in mm.
   function draw({ axis, right, up, slider, canvas, overlay, output }, state) {
     const index = slider.valueAsNumber, field = displacements(state, axis, index), [first, last] = ends;
     const wide = counts[right], high = counts[up], at = [index, index, index];
@@ -93,7 +93,7 @@
     return longest_mm;
   }
 
-  // Arrows end at voxels of the slice, and begin where these voxels' matter is in the reference. Black voxels have none.
+  // Arrows end at voxels of the slice, and begin where their matter is in the reference volume. Black voxels have none.
   function drawArrows(overlay, field, right, up, isShown) {
     const density = Math.min(devicePixelRatio, 2), wide = overlay.clientWidth, high = overlay.clientHeight;
     const context = overlay.getContext("2d"), perVoxel = [wide / counts[right], high / counts[up]];

@@ -59,7 +59,7 @@ class VolumeRenderer {
     return ratio > 1 ? [half * ratio, half] : [half, half / ratio];
   }
 
-  // camera; ends: the steps 0 to 255 of black and white; threshold: a step, or null for the maximum; points: whether they
+  // camera; ends: grey levels 0 to 255 of black and white; threshold: a level, or null for the maximum; points: whether they
   // are shown; share: of the screen's pixels along each side. Returns the milliseconds that it took.
   draw({ camera, ends, threshold, points, share }) {
     const { gl, canvas } = this, started = performance.now();

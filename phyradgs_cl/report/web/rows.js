@@ -10,7 +10,7 @@
   const isStill = matchMedia("(prefers-reduced-motion: reduce)");
   let wasSeen = false, asked = 0;
 
-  // A value at a time, between those of a list that covers the frame.
+  // Interpolates a value at a time from a list of values that covers the frame evenly.
   function between(list, time_s) {
     const at = clamp((time_s - first_s) / (last_s - first_s || 1), 0, 1) * (list.length - 1);
     const before = Math.min(Math.floor(at), list.length - 2), share = at - before;

@@ -1,4 +1,4 @@
-// The programs of the 3D view. Lengths are in mm from the middle of the box; values are the steps 0 to 1 of the slices.
+// The shaders of the 3D view. Lengths are in mm from the middle of the box; values are grey levels from 0 to 1.
 const SCREEN_VERTEX = `#version 300 es
 out vec2 place;
 void main() {
@@ -11,7 +11,7 @@ precision highp float;
 precision highp sampler3D;
 uniform sampler3D volume;
 uniform vec3 size, voxel, right, up, towards;
-uniform vec2 extent, window; // half of the picture in mm; the steps of black and white
+uniform vec2 extent, window; // half the picture's width and height in mm; the grey levels of black and white
 uniform float reach, stride, threshold; // a negative threshold: the maximum along each ray
 in vec2 place;
 out vec4 colour;
@@ -20,7 +20,7 @@ float value_at(vec3 at) {
   return texture(volume, at / size + 0.5).r;
 }
 
-// Where the ray enters and leaves the box; beyond each other where it misses.
+// Where the ray enters and leaves the box. If it misses the box, the first is larger than the second.
 vec2 ends_in_box(vec3 start, vec3 way) {
   vec3 low = (-0.5 * size - start) / way, high = (0.5 * size - start) / way;
   vec3 first = min(low, high), last = max(low, high);

@@ -1,4 +1,4 @@
-// Slices, window, zoom and values of the three planes. Without this script the page shows the middle slices.
+// Slices, grey values, zoom and readings of the three planes. Without this script the page shows the middle slices.
 (() => {
   const data = dataOf("slice-data");
   if (!data) return;
@@ -6,8 +6,8 @@
   const palette = colours && bytesOf(colours);
   const black = document.getElementById("black"), white = document.getElementById("white");
   const zoom = document.getElementById("zoom"), reading = document.getElementById("reading");
-  const ends = {}; // first and last of the 256 steps that are shown, by window
-  const parts = {}; // by the axis that a plane cuts
+  const ends = {}; // by layer: the grey levels, of 256, of black and white
+  const parts = {}; // by the axis across the plane: its elements and state
   const origin = {}; // by axis: the fraction at which the picture stays fixed under zoom
   let layer = "result", pointed = null, armed = null;
 
@@ -26,7 +26,7 @@
     return [low, high].map((value) => (255 * (value - least)) / (most - least || 1));
   }
 
-  // The share of the axis at which the middle of a plane's present slice lies.
+  // Where the middle of a plane's present slice lies, as a fraction of the axis.
   function share(axis) {
     const { plane, slider } = parts[axis];
     return (plane.indices[Number(slider.value)] + 0.5) / plane.count;
@@ -43,14 +43,14 @@
       part.steps = null;
       image.decode().then(
         () => part.source === source && (take(part), paint(part), read()),
-        () => {}, // another slice came in between
+        () => {}, // another slice was chosen meanwhile
       );
     }
     magnify();
     read();
   }
 
-  // The steps of a decoded slice.
+  // The grey levels of a decoded slice.
   function take(part) {
     const { image, canvas } = part;
     canvas.width = image.naturalWidth;
@@ -76,7 +76,7 @@
 
   function showWindow() {
     const [first, last] = ends[kind()];
-    black.disabled = !isGrey(); // a difference has its ends about 0
+    black.disabled = !isGrey(); // differences have symmetric ends
     for (const [slider, step, name] of [[black, first, isGrey() ? "Black" : "Blue"], [white, last, isGrey() ? "White" : "Red"]]) {
       slider.previousElementSibling.textContent = name;
       slider.value = step;
@@ -99,7 +99,7 @@
     document.getElementById("zoom-value").textContent = times + "×";
     zoom.setAttribute("aria-valuetext", times + "×");
     for (const axis of Object.keys(parts)) {
-      const at = origin[axis], here = share(axis); // out of sight: it becomes the middle of what is seen
+      const at = origin[axis], here = share(axis); // a point out of sight becomes the middle of the zoomed picture
       if (times === 1 || here < at - at / times || here > at + (1 - at) / times) origin[axis] = here;
     }
     const seen = (axis) => 100 * (origin[axis] + times * (share(axis) - origin[axis]));
@@ -112,7 +112,7 @@
     }
   }
 
-  // Value and place, under the pointer where there is one, else where the lines cross.
+  // Shows value and position under the pointer or, without a pointer, where the lines cross.
   function read() {
     const part = pointed ? pointed.part : parts.z, { plane, canvas, steps } = part;
     const [right, up] = pointed ? [pointed.right, pointed.up] : [share(plane.right), share(plane.up)];

@@ -1,17 +1,17 @@
-// The volume in 3D, with the window of the slices. Without WebGL2 its section stays hidden.
+// The volume in 3D, with the grey values of the slices. Without WebGL2 its section stays hidden.
 (() => {
   const data = dataOf("volume-data");
   if (!data) return;
   const find = (id) => document.getElementById(id);
   const section = find("volume"), canvas = find("space"), reading = find("space-reading"), bar = find("space-bar");
   const threshold = find("threshold"), turn = find("turn"), tilt = find("tilt"), zoom = find("space-zoom");
-  const centres = find("centres"); // null of a volume without Gaussians
+  const centres = find("centres"); // null for a volume without Gaussians
   const links = document.querySelectorAll('a[href="#volume"]');
   const letters = ["x", "y", "z"].map((axis) => find("space-" + axis));
   const camera = new Camera(turn.valueAsNumber, tilt.valueAsNumber, Number(zoom.max));
   const TURNING_MS = 40, REST_AFTER_MS = 160, LEAST_SHARE = 0.15;
   let renderer = null, ends = data.ends, asked = 0, resting = 0, isVisible = false;
-  let share = 0.35; // of the screen's pixels along each side while something moves
+  let share = 0.35; // fraction of the screen's pixels along each side, while something moves
 
   const showsSurface = () => find("space-surface").checked;
   const show = (isShown) => [section, ...links].forEach((part) => (part.hidden = !isShown));
@@ -48,7 +48,7 @@
     resting = setTimeout(refine, REST_AFTER_MS, Math.min(1, 2 * share));
   }
 
-  // Draws the picture at rest finer and finer, as long as the next one does not take more milliseconds than the patience.
+  // Draws the picture at rest finer and finer, as long as the next one takes fewer milliseconds than ``data-patience``.
   function refine(ofPixels) {
     const took_ms = draw(ofPixels);
     if (took_ms !== null && ofPixels < 1 && 4 * took_ms < Number(canvas.dataset.patience)) resting = setTimeout(refine, 0, Math.min(1, 2 * ofPixels));
@@ -65,7 +65,7 @@
     });
   }
 
-  // While something moves the picture has fewer pixels, so that it follows the hand.
+  // While something moves, the picture has fewer pixels, so that it keeps up with the hand.
   function redraw() {
     asked = asked || requestAnimationFrame(drawMoving);
     clearTimeout(resting);
