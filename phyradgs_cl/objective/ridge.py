@@ -2,10 +2,9 @@
 anatomy.
 
 Goujon, Neumayer and Unser, "Learning weakly convex regularizers for convergent image-reconstruction algorithms", SIAM J.
-Imaging Sci. 17 (2024) 91, in 3D. The sum is over filters i and voxels p. The 16 filters W_i of 5³ voxels are chains: 4
+Imaging Sci. 17 (2024) 91, in 3D. The sums run over filters i and voxels p. A filter W_i of 5³ voxels is a chain: 4
 correlations with 3³ voxels, then 16 with their results. Only windows inside the volume count. ψ_i' is a difference of two
-clamps, with knots in units of the noise σ, so it may fall beyond a first rise. ½‖x − v‖² + step R(x) is convex for step ≤
-1."""
+clamps, with knots in units of the noise σ; it may fall again. ½‖x − v‖² + step R(x) is convex for step ≤ 1."""
 
 import json
 from dataclasses import dataclass
