@@ -22,21 +22,21 @@ from phyradgs_cl.calibrate.problem import CoarseFrames, Stage, measured_blocks, 
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
-DENSITY = 6  # index in a placement, which is a turn (rotation vector, rad), a shift (mm) and the density
-_MARGIN = 1.2  # factor on the half-width of a bead's shadow, which an oblique panel widens
-# Limits of the times per exposure. Between them, the phantom's edge moves by a pixel from one time to the next.
+DENSITY = 6  # a placement is a turn (rotation vector, rad), a shift (mm) and, at this index, the density
+_MARGIN = 1.2  # an oblique panel widens a bead's shadow, at most by this factor
+# An exposure is sampled so often that the phantom's edge moves by a pixel between two times, within these limits.
 _FEWEST_TIMES, _MOST_TIMES = 6, 24
-_FEWEST_RAYS = 2  # fewest rays along each side of a pixel (or block of pixels), and per bead's radius
-_MOST_RAYS = 6  # most rays along each side of a pixel
+_FEWEST_RAYS = 2  # rays along each side of a pixel (or block of pixels), and along a bead's radius, at least
+_MOST_RAYS = 6  # rays along each side of a pixel, at most: the time grows with their square
 # Blur of compared frames, in pixels: without it, differences of sharp edges would show single rays, half a pixel apart.
 _BLUR_PX = 0.8
 _LEAST_ZEROS = 0.2  # if at least this fraction of the pixels is 0, the noise of air was clipped at 0
-_ZEROS_PX = 5  # side in pixels of the blocks whose means give the noise of clipped air
+_ZEROS_PX = 5  # the noise of clipped air follows from means of blocks with this many pixels a side
 _BACKGROUND = 4  # cosines along each side of a frame: they describe holder, scatter and drift of the tube
-_STEP_PX = 0.25  # half of a central difference moves a frame by this much at its edge, in pixels
-_MOST_PX = 1.5  # one step of the placement moves a frame by at most this much, in pixels
-_SETTLED_PX = 0.01  # the search ends with a step that moves the frame by less, in pixels
-_LINEAR_PX = 0.3  # after a larger step, in pixels, the signals are computed again
+_STEP_PX = 0.25  # signals are central differences, for which the frame's edge moves by this much to each side
+_MOST_PX = 1.5  # one step of the placement moves a frame by at most this much: signals are not linear beyond
+_SETTLED_PX = 0.01  # the search ends when a step moves the frame by less than this
+_LINEAR_PX = 0.3  # after a step that moves the frame by more, signals are computed again
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +61,7 @@ class BeadOperator:
         turn = Rotation.from_rotvec(placement[:3]).as_matrix()
         places, steps = pose[:, :2] - placement[3:DENSITY], pose[:, 2:]
         if self.tables[0].is_parallel:
-            places[:, 0] = pose[:, 0]  # a turn does not move the direction of parallel rays
+            places[:, 0] = pose[:, 0]  # a shift of the phantom does not change the direction of parallel rays
         is_rows = self.tables[0].axis == "rows"
         panel_lines = _PanelLines(
             source=places[:, 0] @ turn, first=places[:, 1] @ turn, line_step=steps[:, int(is_rows)] @ turn,

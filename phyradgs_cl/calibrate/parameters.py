@@ -13,10 +13,10 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.removed import removal
 from phyradgs_cl.text import suggest_name
 
-_STEP_PX = 0.25  # half of a central difference moves the image by this much at its edge, in pixels
-_TIMING_STEP = 0.1  # for a time, half of a central difference is at most this fraction of the stated time
-_LARGEST_CUT = 0.7  # the search shortens a time by at most this fraction of the stated time
-_MOST_TILT_RAD = math.radians(2.0)  # for an angle, half of a central difference is at most this
+_STEP_PX = 0.25  # signals are central differences, for which the image's edge moves by this much to each side
+_TIMING_STEP = 0.1  # but a time is changed by at most this fraction of itself
+_LARGEST_CUT = 0.7  # the search shortens a time by at most this fraction, so that it stays above 0
+_MOST_TILT_RAD = math.radians(2.0)  # and an angle by at most this
 _SMALL_MISMATCH = 1.3  # the signal changes sign after half a turn, which errors of voxels do not: they disturb it less
 # An angle with a larger standard deviation counts as undetermined, because sines are not linear so far.
 _LEAST_KNOWN_RAD = math.radians(10.0)

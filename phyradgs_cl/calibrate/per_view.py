@@ -22,16 +22,16 @@ from phyradgs_cl.reconstructors.fits.residuals import AugmentedOperator, ViewPar
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.runtime import Runtime
 
-SPLINES = 7  # default number of splines, each about a seventh of the scan wide
+SPLINES = 7  # default number of splines; each is about a seventh of the scan wide
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
-_STEP_PX = 0.25  # half of a central difference moves a frame by this much, in pixels
-_LEAST_NORM = 0.1  # parameters are scaled by their signals' norms, or by this fraction of the largest of their kind
+_STEP_PX = 0.25  # signals are central differences, for which a frame moves by this much to each side
+_LEAST_NORM = 0.1  # parameters with weak signals are scaled as if they had this fraction of their kind's largest norm
 _DEG = float(np.rad2deg(1.0))
-# An estimate's discretisation error is this fraction of its change since a grid half as fine: it falls linearly with voxels.
+# An estimate's discretisation error is this fraction of its change since a grid half as fine, if it falls with the voxel.
 DISCRETISATION = 0.5
-_STEPS = 3  # Gauss–Newton steps on each grid
+_STEPS = 3  # Gauss–Newton steps on each grid; the next grid continues from there
 _ITERATIONS = 20  # iterations of CGLS for each step, and for each standard deviation
-_DEVIATIONS = 3.0  # a kind is corrected if its RMS over the views exceeds this many standard deviations
+_DEVIATIONS = 3.0  # a kind is corrected only if its RMS over the views exceeds this many standard deviations
 
 
 @dataclass(frozen=True)

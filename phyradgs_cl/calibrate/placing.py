@@ -10,15 +10,15 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
-FEWEST_BEADS = 4  # a phantom needs so many beads
+FEWEST_BEADS = 4  # three beads have a placement, a fourth confirms it
 WRONG_PHANTOM = "is it the right phantom, all of it in view, in mm? Does the gantry turn as stated ('phyradgs check')?"
-_LEAST_SHARE = 0.75  # at least this fraction of the beads must lie in bright spots
+_LEAST_SHARE = 0.75  # at least this fraction of the beads must lie in bright spots of the volume
 _SMOOTH = 0.5  # smoothing (std) in radii of a bead: a bead of many voxels then has one maximum
-_PEAKS_PER_BEAD = 2.0  # bright spots, per bead, that are compared with the beads
-_TOLERANCE_VOXELS = 1.5  # a bead may lie this far from its bright spot, in voxels
-_TRIANGLES = 40  # most triangles of known beads that are tried
-_APART = 0.05  # placements differ if their turns do, by at least this angle in rad
-_MOST = 6  # most placements that are tried: a nearly symmetric phantom fits equally well in several
+_PEAKS_PER_BEAD = 2.0  # this many bright spots per bead are compared with the beads, because some are no beads
+_TOLERANCE_VOXELS = 1.5  # a bead lies at most this far from its bright spot, in voxels
+_TRIANGLES = 40  # this many random triangles of known beads are sought among the spots
+_APART = 0.05  # placements whose turns differ by less, in rad, are the same
+_MOST = 6  # a nearly symmetric phantom fits equally well in several placements: this many are tried
 
 
 def bead_centres_mm(phantom: EllipsoidPhantom) -> np.ndarray:

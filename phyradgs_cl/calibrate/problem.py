@@ -24,12 +24,12 @@ from phyradgs_cl.reconstructors.voxels.priors import axis_weights
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-_MOST_TIMES = 8  # most times per exposure
-_VOXELS_PER_TIME = 2.0  # an exposure has one time for so much travel of the volume's rim, in voxels
+_MOST_TIMES = 8  # most times per exposure: each costs a projection
+_VOXELS_PER_TIME = 2.0  # an exposure is sampled so often that the volume's rim moves by this many voxels between two times
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
-_LEAST_SHARE = 0.1  # a phase still costs at least this fraction of what its most passes to come would
+_LEAST_SHARE = 0.1  # a phase is expected to cost at least this fraction of the passes that it may still make
 Passes = tuple[int, float]
 """How many passes may still come at most, and their expected total cost."""
 

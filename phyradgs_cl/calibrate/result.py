@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CORRECTED, AGREES, CANNOT_TELL = "corrected", "agrees", "cannot tell"
-_FRAMES = 4  # most frames shown in the figure
+_FRAMES = 4  # frames shown in the figure, at most
 _ROW_INCH, _CURVES_INCH, _WIDTH_INCH = 1.8, 2.4, 7.0
 
 
@@ -102,7 +102,7 @@ class Calibration:
             six = self.views.at(np.asarray(self.scan.frame_start_s) + self.scan.shutter.middle_s).T
             curves = {f"turn_{axis}_deg": np.rad2deg(values) for axis, values in zip("xyz", six[:3], strict=True)}
             curves |= {f"shift_{axis}_mm": values for axis, values in zip("xyz", six[3:], strict=True)}
-        return {name: values for name, values in curves.items() if values.any()}  # a kind without a correction has zeros
+        return {name: values for name, values in curves.items() if values.any()}  # kinds that were not corrected are all 0
 
     def plot(self) -> "Figure":
         """Returns a figure of the residuals of four frames, before on the left and after on the right, on one scale.

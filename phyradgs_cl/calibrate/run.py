@@ -58,14 +58,14 @@ STAGES = (
     Stage(96, first=50, again=15, steps=3, project=30),
 )
 BEAD_STAGES = (Stage(48, first=8, again=4, steps=6, project=0), Stage(128, first=6, again=4, steps=6, project=0))
-_FEWEST_FRAMES = 8  # a scan needs so many frames
-_FEWEST_COLUMNS = 12  # a scan needs so many columns
+_FEWEST_FRAMES = 8  # fewer frames do not determine geometry
+_FEWEST_COLUMNS = 12  # fewer columns do not determine geometry
 _FEWEST_SPLINES = 4  # a cubic spline of a wobble needs four
-# A phantom in its best place explains at least this fraction of the frames' squares, before any correction.
+# In its best place, the right phantom explains at least this fraction of the frames' squares before any correction.
 _LEAST_EXPLAINED = 0.3
 _ORDER_ERRORS = 4.0  # a direction of readout must be better by this many standard errors, as in ``check``
 _ORDER_RATIO = 1.04  # the squared residuals of both directions must differ by this factor, as in ``check``
-_BEYOND = 1e6  # an encoder table is continued by so many frame times: first steps of the search may be very wrong
+_BEYOND = 1e6  # an encoder table is continued by this many frame times: first steps of the search may be very wrong
 # A stage is expected to cost this fraction of its most: few parameters are determined, and steps become small early.
 _EXPECTED_SHARE = 0.25
 
@@ -109,7 +109,7 @@ class _Calibrator:
 
     def __post_init__(self) -> None:
         self.placement = np.zeros(0)
-        self.stated = self.ready  # ``ready`` may get the other readout direction
+        self.stated = self.ready  # ``ready`` may later get the other readout direction
         stages = {one.block(self.scan): one for one in reversed(STAGES if self.phantom is None else BEAD_STAGES)}
         self.stages = list(stages.values())[::-1]  # on a small panel several stages have the same blocks
         self.per_view: PerViewParameters | None = None
@@ -145,7 +145,7 @@ class _Calibrator:
         before = self._residual(as_stated, self.stages[-1], GeometryCorrection())
         after = self._residual(problem, self.stages[-1], correction, views)
         held = {name: value for name, value in corrections.items() if name in self.search.held}
-        before_rest = before  # the residual of the rest is compared at the values of the held parameters
+        before_rest = before  # residual with only the held parameters corrected: what the others add is compared with it
         if held:
             known = correction_of(held)
             before_rest = after if held == corrections else self._residual(as_stated, self.stages[-1], known)

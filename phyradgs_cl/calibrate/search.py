@@ -25,16 +25,16 @@ from phyradgs_cl.calibrate.per_view import DISCRETISATION
 from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, ParameterEstimate
 
-# A parameter is determined only if object and other parameters leave at least this fraction of its signal unexplained.
+# Frames determine a parameter if object and other parameters leave this fraction of its signal unexplained, or more.
 LEAST_SHARE = 0.2
-# The same for a known object (beads), which has no voxels that explain signals by accident.
+# For a known object (beads) less is enough: it has no voxels that explain signals by accident.
 LEAST_SHARE_OF_BEADS = 0.02
-_TINY = 1e-9  # added to the diagonal of a matrix before it is inverted
-_GAUGE_FACTOR = 2.0  # a parameter's unexplained fraction is at least this many times the one of its gauge (``GAUGES``)
-_MOST_GAUGE = 0.2  # a gauge's unexplained fraction counts up to this limit only: it is large in a wrong geometry
+_TINY = 1e-9  # added to the diagonal of a matrix before it is inverted: signals may be linearly dependent
+_GAUGE_FACTOR = 2.0  # voxels leave some signal of a gauge (``GAUGES``) by error: a parameter must leave twice as much
+_MOST_GAUGE = 0.2  # in a wrong geometry much more of a gauge's signal is left: then this counts
 DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
-_MOST_PX = 2.0  # a step moves the image by at most so many coarse pixels at its edge: signals are not linear beyond
-_SETTLED = 0.1  # steps on a grid end when all are smaller than this many standard deviations
+_MOST_PX = 2.0  # a step moves the image by at most this many coarse pixels at its edge: signals are not linear beyond
+_SETTLED = 0.1  # the steps on a grid end when all are smaller than this many standard deviations
 
 
 @dataclass(frozen=True, eq=False)

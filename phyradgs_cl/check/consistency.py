@@ -25,34 +25,32 @@ from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares, t_s
 from phyradgs_cl.runtime import Runtime
 
 CONSISTENCY = "consistency"
-# Largest residual in the stated order over that in a random order: correct scans have 0.02 to 0.23.
+# Consistent frames leave less than this fraction of their residual in a random order: correct scans have 0.02 to 0.23.
 _LARGEST = 0.35
-_DOUBTFUL = 0.1  # above this ratio, hypotheses of exchanged, missing and repeated frames are tried
-_RANDOM_ORDERS = 2  # random orders whose squared residuals are averaged
-_FEWEST_FRAMES = 5  # scans of fewer frames cannot be judged
-_FEWEST_PIXELS = 32  # scans with fewer valid coarse pixels per frame cannot be judged
+_DOUBTFUL = 0.1  # above this fraction, exchanged, missing and repeated frames are tried as explanations
+_RANDOM_ORDERS = 2  # the residual in a random order is averaged over this many orders
+_FEWEST_FRAMES = 5  # fewer frames cannot tell one order from another
+_FEWEST_PIXELS = 32  # fewer valid coarse pixels per frame cannot tell one order from another
 _CLEAR = 0.5  # a hypothesis must leave less than this fraction of the stated scan's squared residual
-_NEARLY = 1.5  # rough fits are refined if their mean squared residual is up to this many times the least
+_NEARLY = 1.5  # a rough fit is refined unless another one is better by this factor in squares
 _ERRORS = 4.0  # a hypothesis must be better than the stated scan by this many standard errors
-# If a random order leaves no more than one of these residuals, the frames look the same from every angle.
-_SAME = 0.03  # as a fraction of the standard deviation of the line integrals
-_NOISY = 1.6  # as a multiple of the noise: round objects had up to 1.3, others 2.3 or more
-_MOST_REFINED = 2  # for this many of the best hypotheses about the whole scan, the panel's shift is refined
-_SHIFT_PENALTY = 1.5  # a shift of the panel by a coarse pixel costs this factor: stated offsets are mostly right
-# A frame is odd if its mean line integral differs from its neighbours' by more than both of these.
-_DEVIATIONS = 12.0  # in robust standard deviations of such differences over all frames
-_LEAST_CHANGE = 0.75  # as a fraction of the frames' median mean line integral
+# The frames look the same from every angle if a random order leaves a residual below _SAME or _NOISY.
+_SAME = 0.03  # relative to the standard deviation of the line integrals
+_NOISY = 1.6  # relative to the noise: round objects had up to 1.3, others 2.3 or more
+_MOST_REFINED = 2  # only the best hypotheses get a refined shift of the panel, which takes time
+_SHIFT_PENALTY = 1.5  # a hypothesis pays this factor for each coarse pixel of shift: stated offsets are mostly right
+# A frame is odd if its mean line integral differs from its neighbours' by more than _DEVIATIONS and _LEAST_CHANGE.
+_DEVIATIONS = 12.0  # in robust standard deviations of these differences over all frames
+_LEAST_CHANGE = 0.75  # relative to the frames' median mean line integral
 _REPEATED = 0.15  # a repeated frame differs from its predecessor by less than this fraction of what neighbouring frames do
-_JUMP = 2.5  # views come in an order that jumps if recorded steps are this many times as large as steps in sorted order
-_UNLIKE = 2.0  # a repeated frame differs from the view nearest in angle by more than this many times the median
-_OUTLIER = 4.0  # an outlier's residual is at least this many times the frames' median
-# Frames at both ends of an arc fit badly without being wrong. Their residuals then differ by less than this factor: right
-# frames had at most 1.4, one odd frame at least 2.3.
+_JUMP = 2.5  # in an order that jumps, such as the golden angle, recorded steps are this many times as large as sorted ones
+_UNLIKE = 2.0  # a repeated frame differs this much, relative to the median, from the view nearest in angle
+_OUTLIER = 4.0  # the residual of an outlier is at least this many times the frames' median
+# Both ends of an arc fit badly without being wrong, and alike: within this factor (right frames 1.4, one odd frame 2.3).
 _ALIKE = 1.7
-# Besides, their residuals are below this fraction of the residual in a random order: right frames had 0.2, odd ones mostly
-# 0.3.
+# They must also fit better than this fraction of the residual in a random order (right frames 0.2, odd ones mostly 0.3).
 _AT_BOTH_ENDS = 0.25
-_MOST_OUTLIERS = 0.2  # if this fraction of the frames or more are outliers, they share a cause, and none counts as one
+_MOST_OUTLIERS = 0.2  # this many outliers, as a fraction of the frames, have a common cause: then none counts as one
 _EXCHANGED = 0.5  # two frames were exchanged if the opposite order leaves less than this fraction of the squares
 
 
@@ -132,7 +130,7 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
 
 def _unseen(scan: Scan, as_stated: Scan) -> float:
     """Returns the residual in a random order up to which the frames of a coarse ``scan`` tell nothing about their angles."""
-    # Both estimates are too large: fine pixels' because noise differs from ray to ray, coarse pixels' because of edges.
+    # The smaller one counts: edges raise the estimate from coarse pixels, noise that differs between rays the other one.
     levels = [noise_level(one.projections, np.broadcast_to(one.valid, one.projections.shape)) for one in (scan, as_stated)]
     noise = min(levels[0], levels[1] / float(np.prod(altered_trajectory(scan).blocks)) ** 0.5)
     return max(_SAME * float(np.asarray(scan.projections, np.float64).std()), _NOISY * noise)

@@ -9,18 +9,18 @@ from phyradgs_cl.acquisition.geometry import field_of_view_mm
 from phyradgs_cl.check.finding import FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
 from phyradgs_cl.detector import noise_level
 
-_LARGEST_SHARE = 0.1  # at the panel's sides, line integrals above this fraction of the largest one show the object
+_LARGEST_SHARE = 0.1  # air lies below this fraction of the largest line integral: more at the panel's sides is the object
 _DISPLACED = 0.1  # a panel that is off centre by this fraction of its width was displaced on purpose
 _NOISES = 4.0  # line integrals show the object only above this many standard deviations of the noise
-_OPAQUE = 30.0  # largest line integral that is possible: behind more material no light passes
-_INVERTED = 0.9  # values at the sides above this fraction of the largest value are no air: images are inverted
-_BRIGHT = 0.05  # at most this fraction of the pixels may be brighter than the flats
-_FRAMES = 0.1  # the object may touch a side of the panel in at most this fraction of the frames
+_OPAQUE = 30.0  # behind larger line integrals no light passes, so they are no line integrals
+_INVERTED = 0.9  # if the sides exceed this fraction of the largest value, bright and dark are exchanged
+_BRIGHT = 0.05  # at most this fraction of the pixels may be brighter than the flats, by noise
+_FRAMES = 0.1  # the object may touch a side of the panel in this fraction of the frames
 _COVERED = 0.1  # a column shows the object if more than this fraction of its rows does
-# A unit is wrong if the grid is wider than the panel's field of view by more, or the object wider than the grid.
+# A unit is wrong if the grid is this many times wider than the panel's field of view, or the object than the grid.
 _ANOTHER_SIZE = 5.0
-NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # units of findings without line integrals
-CUT_OFF = "line integral at the border"  # unit of a finding: the object reaches beyond the panel
+NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # in place of a finding's unit: the check ends here
+CUT_OFF = "line integral at the border"  # in place of a finding's unit: the object reaches beyond the panel
 _QUESTION = "coverage"
 
 

@@ -16,17 +16,17 @@ from phyradgs_cl.reconstructors.fits.residuals import fit
 from phyradgs_cl.runtime import Runtime
 
 GAIN = "gain drift"
-OVERFLOW = "overflow"  # unit of a finding without line integrals
+OVERFLOW = "overflow"  # in place of a finding's unit: the check ends here
 _SATURATION, _DEAD = "saturation", "dead pixels"
-_MOST_SATURATED = 1e-3  # at most this fraction of all pixels may be saturated without a finding
-_REPEATS = 3  # a clipped pixel has its least value in at least this many frames
-_ZERO = 1e-6  # line integrals of a smaller size count as 0
-_JUMP = 0.75  # neighbouring pixels jump if they differ by more than this fraction of the brightest transmission
-_MOST_JUMPS = 5e-4  # at most this fraction of all pixels may jump without a finding
-_MOST_DEAD = 2e-4  # at most this fraction of all pixels may be dead without a finding
-_LARGEST_DRIFT = 0.015  # the gain may change by this fraction over the scan without a finding
-_DRIFT_DEVIATIONS = 5.0  # a change of the gain is a finding only beyond this many of its standard deviations
-_FEWEST_FRAMES = 8  # a drift shows in at least this many frames
+_MOST_SATURATED = 1e-3  # a larger fraction of saturated pixels is suspicious
+_REPEATS = 3  # a pixel repeats its least value in at least this many frames if it was clipped there
+_ZERO = 1e-6  # smaller line integrals count as 0
+_JUMP = 0.75  # overflowed counts jump between neighbouring pixels by this fraction of the brightest transmission
+_MOST_JUMPS = 5e-4  # a larger fraction of jumping pixels is suspicious
+_MOST_DEAD = 2e-4  # a larger fraction of dead pixels is suspicious
+_LARGEST_DRIFT = 0.015  # a larger relative change of the gain over the scan is suspicious
+_DRIFT_DEVIATIONS = 5.0  # a change of the gain counts only beyond this many of its standard deviations
+_FEWEST_FRAMES = 8  # fewer frames cannot tell a drift from noise
 
 
 @dataclass

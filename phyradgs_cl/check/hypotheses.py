@@ -16,13 +16,13 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fits import axis
 
 SIZE_FACTORS = (10.0, 0.1, 1e3, 1e-3)
-LEAST_REDUNDANCY = 0.5  # if a smaller fraction of columns has rays that are measured twice, frames fit any size
+LEAST_REDUNDANCY = 0.5  # frames fit any pixel size if a smaller fraction of columns has rays that are measured twice
 _UNITS = {10.0: " (in cm, read as mm?)", 1e3: " (in m, read as mm?)", 1e-3: " (in µm, read as mm?)"}
 _FANS = (0.02, 3.0)  # real scanners have a panel's width over its distance from the source in this range
-_GRID_FACTOR = 3.0  # a grid that is wider or narrower than the panel's view by more than this factor is replaced
-_SAME_PLACE = 1.0  # shifts of the panel that differ by fewer coarse pixels look the same
-_ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)  # changes of the angle between views that are tried, in percent
-_GAPS = 15  # at so many frames, evenly spread, a missing or repeated frame is tried
+_GRID_FACTOR = 3.0  # a grid wider or narrower than the panel's view by this factor is as wrong as the sizes, and replaced
+_SAME_PLACE = 1.0  # shifts of the panel that differ by less, in coarse pixels, look the same
+_ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)  # changes of the angle between views, in percent, that are tried
+_GAPS = 15  # a missing or repeated frame is looked for at this many frames, evenly spread
 
 
 @dataclass(frozen=True, eq=False)

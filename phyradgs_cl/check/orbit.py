@@ -37,18 +37,18 @@ SIGN, CENTRE, DISTANCES = "sign of rotation", "centre of rotation", "distances"
 OTHER_CAUSE = "pixels, if pixel sizes are right"  # unit of an offset that wrong pixel sizes explain as well
 UNVERIFIED = "neither pixel sizes nor distances are verified by these frames"
 _ERRORS = 4.0  # two hypotheses must differ by this many standard errors; else the answer is "cannot tell"
-_SIGN_RATIO = 1.2  # the squared residuals of both senses must differ by this factor to decide on the sense of rotation
-_CLEAR_RATIO = 3.0  # from this factor on rough fits decide, without refined shifts
+_SIGN_RATIO = 1.2  # one sense of rotation must leave this many times the other's squared residual to be wrong
+_CLEAR_RATIO = 3.0  # if rough fits of both senses differ by this factor, they need no refined shifts
 _TOLERATED_PX = 1 / 3  # a shift of the panel by this many pixels is always tolerated
 _DEVIATIONS = 4.0  # a shift by this many of its standard deviations is always tolerated
-_BIAS_FULL_TURN = 0.003  # measured error of the axis in coarse pixels, for a full turn
-_BIAS_HALF_TURN = 0.04  # measured error of the axis in coarse pixels, where some rays are measured only once
+_BIAS_FULL_TURN = 0.003  # measured error of the axis in scans of a full turn, in coarse pixels
+_BIAS_HALF_TURN = 0.04  # measured error of the axis in coarse pixels, if some rays are measured only once
 _WHOLE_PIXELS = 2  # "ok" needs a tolerance of at most this many pixels, if the shift comes from pixels of full size
-_LEAST_REDUNDANCY = 0.1  # least fraction of columns seen twice, to divide by: at the panel's edge it is 0
+_LEAST_REDUNDANCY = 0.1  # a division by the fraction of columns seen twice, 0 at the panel's edge, takes at least this
 _NO_SIGN = "parallel rays show an object that turns one way and its mirror image that turns the other way alike"
 _SIGN_ADVICE = "look for a feature whose side is known: a mirror image would fit as well"
-_OTHER_SIZES = (0.8, 1.25)  # factors on the fan; distances are "ok" if the stated fan fits better than both
-_SIZE_RATIO = 1.05  # another fan fits worse if its squared residual is this many times the stated fan's
+_OTHER_SIZES = (0.8, 1.25)  # distances are "ok" if a fan narrower or wider by these factors fits worse
+_SIZE_RATIO = 1.05  # a fan fits worse if it leaves this many times the squared residual of the stated one
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.scan.reader import united
 from phyradgs_cl.runtime import Runtime
 
-_SPARE_COLUMNS = 2.0  # the grid has room for an error of the stated detector offset of this many coarse columns
+_SPARE_COLUMNS = 2.0  # the grid has room for an error of the stated detector offset by this many coarse columns
 Report = Callable[[int, int, str], None]
 """A callback for progress. It takes how many questions are answered, how many there are, and the next one."""
 

@@ -15,18 +15,18 @@ from phyradgs_cl.runtime import Runtime
 
 READOUT, EXPOSURE = "sign of readout", "exposure"
 _ERRORS = 4.0  # two hypotheses must differ by this many standard errors
-# This ratio of squared residuals decides between the two orders of readout: both models are equally free to fit.
+# The wrong order of readout leaves this many times the squared residual: both orders are equally free to fit.
 _ORDER_RATIO = 1.04
-_OTHER_RATIO = 1.5  # this one decides for another readout axis or readout time
-# This one decides for a gantry at rest: a model without blur fits better in any case, above all with few views.
+_OTHER_RATIO = 1.5  # another readout axis or time must fit better than the stated one by this factor in squares
+# A gantry at rest must fit better by this factor: a model without blur always fits better, above all with few views.
 _REST_RATIO = 2.0
 _AS_GOOD = 1.15  # further readouts are named if their squared residuals are at most this many times the best one's
-_READOUT_SHARE = 0.86  # where no readout time is stated, this fraction of the time between frames is tried
+_READOUT_SHARE = 0.86  # if no readout time is stated, this fraction of the time between frames is tried
 _OTHER_WAY, _AT_REST = "the other way", "all at once, the gantry at rest"
 _NEEDED_RATIO = {_OTHER_WAY: _ORDER_RATIO, _AT_REST: _REST_RATIO}
 # An exposure is suspicious if half of it leaves at most this fraction of the squared residual: correct scans have ≥ 0.8.
 _HALF_RATIO = 0.6
-_WORSE_RATIO = 1.05  # another exposure fits worse if its squared residual is this many times the stated one's
+_WORSE_RATIO = 1.05  # an exposure fits worse if it leaves this many times the squared residual of the stated one
 
 
 def check_readout(rt: Runtime, scan: Scan) -> Finding:

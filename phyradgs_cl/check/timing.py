@@ -26,10 +26,10 @@ _TIMING, _ANGLES = "timing", "angles"
 _ROUNDING = 1e-3  # relative tolerance: files round times and angles
 _SPEED_TOLERANCE = 0.02  # steps between frames may differ this much from the speed within frames: gantries vary less
 _LONGEST_TABLE = 100.0  # a table that lasts this many times as long as the scan belongs to more than one scan
-_FEW_RAD = math.radians(5)  # if frames see a smaller arc of such a table, its unit of time may differ from theirs
+_FEW_RAD = math.radians(5)  # if frames see a smaller arc of such a table, its times may be in another unit than theirs
 _MILLISECONDS = (900.0, 3000.0)  # if the table lasts this many times as long, it is in ms and the frames are in s
 _WIDE = 3.0  # a gap between views is wide above this multiple of the median gap
-_SAME_RAD = 1e-6  # angles at most this far apart count as one
+_SAME_RAD = 1e-6  # views nearer to each other than this have the same angle
 _TOLERATED_DEG = 1.0  # so much coverage may be missing: nearly parallel rays need half a turn only
 
 

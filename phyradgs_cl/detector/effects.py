@@ -22,10 +22,10 @@ from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 Array = NDArray[np.floating]
 # From this mean on, a rounded normal stands for Poisson (skewness off by < 4e-5): NumPy's own sampler fails near 9.2e18.
 NORMAL_FROM = 1e9
-COUNT_FLOOR = 0.5  # least counts before the logarithm: less than any detector records
+COUNT_FLOOR = 0.5  # counts of 0 and less have no logarithm: this is less than any detector records
 _LARGEST_EXPONENT = 700.0  # largest exponent: float64 overflows at very negative line integrals, which ringing may cause
-_SPARK_HEIGHT = (0.3, 2.0)  # range of the light that a spark adds, as fractions of the light without object
-_SCATTER_REACH = 6.0  # the panel's longer side is this many decay lengths of the scatter kernel
+_SPARK_HEIGHT = (0.3, 2.0)  # a spark adds this much light, at least and at most, relative to the light without object
+_SCATTER_REACH = 6.0  # the scatter kernel decays over the panel's longer side divided by this
 _SCATTER_POWERS = (0.8, 1.5)  # scattered light is the product of these powers of the primary light and the line integral
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
 

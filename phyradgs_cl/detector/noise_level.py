@@ -13,24 +13,23 @@ from phyradgs_cl.checks import ceil_div
 NORMAL_MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
 _MEDIAN_OF_NORMAL = 0.6745  # median of |x| over the standard deviation of a normal variable x with mean 0
 _FILTER_NORM = 1.5**0.5  # factor by which the filter (-1/2, 1, -1/2) multiplies white noise
-_LARGEST_SAMPLE = 1_000_000  # about as many pixels give the median: more take time and make it no better
-_TENTHS = 10  # classes of line integrals with equal numbers of pixels, in each of which the noise is estimated
-_BEHIND = 5.0  # pixels above this many noise levels lie behind the object
-_FRAMES = 16  # noise is estimated from about as many frames, evenly spread
+_LARGEST_SAMPLE = 1_000_000  # the median of about this many pixels is exact enough
+_TENTHS = 10  # noise grows with attenuation: it is estimated in this many equally large classes of line integrals
+_BEHIND = 5.0  # pixels lie behind the object if they exceed the noise this many times
+_FRAMES = 16  # noise is estimated from about this many frames, evenly spread, to save time
 
 LEAST_SHARE = 1e-3
 """Saturation is suspected if a larger fraction of the pixels has one extreme value."""
-_TOUCHING = 0.5  # pixels at an extreme are clipped, not noisy, if more than this fraction have four neighbours that are too
-_SAME = 1e-3  # a flat whose brightness differs less, relatively, from the projections' largest count is as bright
-_MOST_FRAMES = 8  # most frames that are searched for noise
-_LONGEST_EDGE = 1024  # longest side, in pixels, of the middle part of a frame that is searched for noise
-_ROUNDING = 0.5  # estimates of noise up to this, in counts, come from rounding
-_RELATIVE = 2e-5  # estimates of noise up to this fraction of the largest count are none
-# Noise is estimated along both axes and along rows. Above this ratio the two agree as for white noise; smooth structure has
-# a far lower one.
+_TOUCHING = 0.5  # saturation covers areas: pixels at an extreme are clipped if most of them have four neighbours at it
+_SAME = 1e-3  # flats and the largest count that differ by less than this fraction are equally bright: such pixels may be air
+_MOST_FRAMES = 8  # noise beside saturated pixels is sought in at most this many frames
+_LONGEST_EDGE = 1024  # it is sought in the middle of large frames, up to this many pixels along a side
+_ROUNDING = 0.5  # rounding of counts alone gives estimates of noise up to this
+_RELATIVE = 2e-5  # estimates of noise up to this fraction of the largest count are no noise
+# Noise estimated along both axes is white if it is at least this fraction of noise estimated along rows; else structure.
 _WHITE = 0.5
 _ROOT_OF_NORMAL = 0.8222  # mean of √|x| over the root of the standard deviation of a normal x with mean 0
-_NEAR = 9  # side in pixels of the square from which the noise of its middle pixel is estimated
+_NEAR = 9  # the noise of a pixel is estimated from a square of this side around it
 
 
 def robust_deviation(values: np.ndarray) -> float:
@@ -180,6 +179,6 @@ def _shows_noise(frames: NDArray[np.generic], level: float) -> bool:
     rows, both = np.concatenate(along_rows), np.concatenate(along_both)
     unclipped = np.isfinite(both)
     if not unclipped.any():
-        return True  # only clipped pixels and their neighbours: nothing speaks against noise
+        return True  # every pixel is clipped or next to one that is: no pixel can tell
     in_rows, in_both = (float(np.median(np.abs(d[unclipped]))) / norm for d, norm in ((rows, 6**0.5), (both, 6.0)))
     return in_both > max(_ROUNDING, _RELATIVE * level, _WHITE * in_rows)

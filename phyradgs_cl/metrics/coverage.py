@@ -15,7 +15,7 @@ COVERAGE = {
     "within_doubt_95": Metric("within the 95 % bar", "", ".3f"),
     "doubt_over_error": Metric("mean σ / RMS error", "", ".3f"),
 }
-_OBJECT, _AROUND = 0.01, 2  # the object lies above this fraction of the truth's maximum; voxels around it that count too
+_OBJECT, _AROUND = 0.01, 2  # the object is denser than 1 % of the truth's maximum; errors 2 voxels around it count too
 
 
 def object_voxels(truth: Array) -> NDArray[np.bool_]:

@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
-WINDOW = 11  # side of SSIM's window in voxels
-SIGMA = 1.5  # standard deviation of the Gaussian weights in SSIM's window, in voxels
+WINDOW = 11  # SSIM's window, in voxels a side (Wang et al. 2004)
+SIGMA = 1.5  # standard deviation in voxels of the Gaussian weights in SSIM's window (Wang et al. 2004)
 K1, K2 = 0.01, 0.03  # SSIM's constants for means and for variances, as fractions of the data range (Wang et al. 2004)
 _VOXELS_PER_BATCH = 1 << 20  # voxels compared at a time: SSIM holds about ten float64 arrays of them, 80 MB
-_EDGE = 0.25  # motion is compared where the slope is at least this fraction of the steepest: elsewhere it cannot be seen
-_MOST_POINTS = 2000  # most voxels at which motions are compared
-_INCH = 3.2  # side of a slice in the figure, in inches
-_DPI = 110  # dots per inch of the figure
+_EDGE = 0.25  # motion is compared at edges, whose slope is at least this fraction of the steepest: elsewhere it is invisible
+_MOST_POINTS = 2000  # most voxels at which motions are compared: enough for a mean and a percentile
+_INCH = 3.2  # side of a slice in the figure
+_DPI = 110
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,12 @@ from phyradgs_cl.errors import InputError
 JITTERS = ("ray", "sample", "none")
 LAST_ACTIVATIONS = ("sigmoid", "leaky-relu")
 TORCH_DEVICES = ("auto", "cpu", "cuda", "mps")
-# Used where the options state no number:
+# The next three hold where the options state no number.
 CELLS_PER_VOXEL = 1.0  # grid cells of the encoding's finest level per voxel, along the longest side
 SAMPLES_PER_VOXEL = 1.5  # samples along a ray per voxel of the longest side: NAF takes 192 for 128 voxels
-# The same for a pixel that has a ray at each of several times: only the mean over the rays must be exact.
+# Fewer samples are enough for a pixel with a ray at each of several times: only the mean over its rays must be exact.
 SAMPLES_PER_TIME = 1.2
-_FINEST = 2**24  # most grid cells along a side of a level: with more, float32 coordinates have no fractions
+_FINEST = 2**24  # with more grid cells along a side, float32 coordinates have no fraction within a cell
 
 
 @dataclass(frozen=True)

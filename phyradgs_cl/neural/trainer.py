@@ -17,10 +17,10 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural.field import NeuralField, repeatable, to_array, to_tensor, voxel_values
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
-_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's decay rates of both moments, and the addend to its denominator
-_POINTS_ON_CPU = 2**14  # most points at which a CPU evaluates the field at once: its cache holds them
-_POINTS_ELSEWHERE = 2**20  # most points for another device: the memory of a GPU holds them
-_BEYOND_VOLUME = 2.0  # distance from the volume's middle, in longest half-sides, that is beyond every corner
+_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's decay rates of both moments, and what it adds to its denominator
+_POINTS_ON_CPU = 2**14  # a CPU evaluates the field at this many points at once: its cache holds them
+_POINTS_ELSEWHERE = 2**20  # another device evaluates more points at once: the memory of a GPU holds them
+_BEYOND_VOLUME = 2.0  # parallel rays begin this far from the volume's middle, in longest half-sides: beyond every corner
 Field = Callable[[torch.Tensor], torch.Tensor]
 
 
@@ -266,7 +266,7 @@ class ExposureRays:
             place = np.full(to_corner.shape, np.nan)
         scale, column, row = np.moveaxis(place, -1, 0)
         is_behind = not self.is_parallel and np.any(scale <= 0)
-        if is_behind or not np.all(np.isfinite(scale)):  # the panel cannot see a corner
+        if is_behind or not np.all(np.isfinite(scale)):  # no ray of the panel meets this corner: take all pixels
             return slice(0, detector_shape[0]), slice(0, detector_shape[1])
         return _within(row, detector_shape[0]), _within(column, detector_shape[1])
 

@@ -17,8 +17,8 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, beside, brought_to, padded_zeros, pitch_of
 
 EDGE = 4  # voxels along each side of a block
-_SAMPLES = 8  # one voxel takes about as long as this many samples of a ray; from this a launch gets its size
-# By turn: the blocks' shift along y, in voxels, for each shift along z. A turn has each shift once; four turns, all pairs.
+_SAMPLES = 8  # one voxel takes as long as this many samples of a ray: it limits how long a launch lasts
+# In each turn, the blocks' shift along y for every shift along z: each shift occurs once, and in four turns each pair does.
 TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 
 

@@ -18,9 +18,9 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, beside, brought_to, move,
 
 EDGE = 5
 """Voxels along each side of a filter."""
-_SAMPLES = 200  # one voxel takes at most as long as this many samples of a ray; from this a launch gets its size
-_SLICES = 2  # slices of channels and responses that are computed at a time
-_RING = _SLICES + 2  # slices in memory: the correlation of two slices needs one more on either side
+_SAMPLES = 200  # one voxel takes at most as long as this many samples of a ray: it limits how long a launch lasts
+_SLICES = 2  # slices computed at a time: channels and responses of a whole volume would need 24 times its memory
+_RING = _SLICES + 2  # slices in memory: correlating two slices needs one more on either side
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class RidgeStep:
         move(self.rt, (observed, Strides.plain(self.shape)), padded, self.shape)
         is_thin = min(self.shape) < EDGE  # no filter fits in: the gradient stays 0
         end = np.float32(step), np.int32(nonnegative), result
-        # Responses need three slices of channels, so they follow two slices behind.
+        # A response needs three slices of channels, so responses follow two slices behind the channels.
         for first in range(0, nz + 2, _SLICES):
             if not is_thin:
                 self._launch(self._channels_of, first, 2, self._padded, ends=(self._channels,))

@@ -93,7 +93,7 @@ def tv_prox(
         changes = differences(x, axis_weights) / weight
         q = moved + np.concatenate([time_step * changes[:-3], step * changes[-3:]])
         new = q / np.maximum(1, np.linalg.norm(q[-3:], axis=0))
-        new[:-3] = np.clip(q[:-3], -1, 1)  # differences in time
+        new[:-3] = np.clip(q[:-3], -1, 1)  # differences in time are scalars, not vectors: clipped one by one
         t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
         moved = new + (t - 1) / t_next * (new - dual)
         dual, t = new, t_next
@@ -131,9 +131,9 @@ def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
     return (in_space / 2, 1 / (8 * time[0] ** 2)) if any(time) else (in_space, 0.0)
 
 
-# TV's gradient divides by the length of differences, which may be 0. The larger of these two is added to it.
-_SMALLEST = 1e-6  # as a fraction of the volume's RMS
-_NOTHING = 1e-30  # in 1/mm, for a volume of zeros
+# TV's gradient divides by the length of differences, which may be 0, plus the larger of _SMALLEST and _NOTHING.
+_SMALLEST = 1e-6  # relative to the volume's RMS, so that units do not matter
+_NOTHING = 1e-30  # in 1/mm, for a volume of zeros, whose RMS is 0
 
 
 class TvDescent:

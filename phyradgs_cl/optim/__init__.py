@@ -45,7 +45,7 @@ PUBLISHED_RATES = Rates(
 
 
 BETA1, BETA2 = 0.9, 0.999  # Adam's decay rates of the first and second moments
-EPSILON = 1e-15  # added to the root of the second moments, which Adam divides by
+EPSILON = 1e-15  # keeps Adam from dividing by a second moment of 0
 
 
 def folded_rates(rates: np.ndarray, step: int) -> np.ndarray:
@@ -180,7 +180,7 @@ def control_density(
     # Two children replace a Gaussian that is split. A cloned Gaussian stays beside its copy.
     remaining = np.setdiff1d(np.arange(population.count), split)
     raw = np.concatenate([changed[:, remaining], new_raw], axis=1)
-    # New Gaussians have no history of gradients.
+    # New Gaussians have no earlier gradients, so their moments are 0.
     fresh = np.zeros((2, g.ROWS, new_raw.shape[1]), population.moments.dtype)
     grown = Population(raw, np.concatenate([population.moments[:, :, remaining], fresh], axis=2))
     return prune(grown, activation, control, box)

@@ -17,21 +17,19 @@ from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames, with_mas
 
 _AROUND = np.ones((3, 3), bool)
 _NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
-# Sparks
-_SHARPNESS = 0.3  # a spark exceeds the pixels at both sides, in each direction, by this fraction of its height
-_NEAR, _FAR = 2, 3  # distances in pixels of these pixels: the far ones count where the near ones belong to another spark
-_MOVED = 5  # side in pixels of the square in which the next frame may show the same gap of the object, moved on
-_SHOWN_AGAIN = 0.5  # a gap is at least this fraction as high in the frames before and after; a spark is gone
+_SHARPNESS = 0.3  # a spark is brighter than the pixels on both sides, in every direction, by this fraction of its height
+_NEAR, _FAR = 2, 3  # distances of these pixels; the far ones count if a near one belongs to another spark
+_MOVED = 5  # the next frame may show an object's gap moved by 2 pixels: it is sought in a square of this side
+_SHOWN_AGAIN = 0.5  # a gap of the object is at least this fraction as high in the frames before and after; a spark is gone
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
-# Dead pixels
 LEAST_FRAMES = 5  # in fewer frames a sound pixel may look dead by chance
-_DEVIATIONS = 10.0  # default of DeadOptions.deviations
+_DEVIATIONS = 10.0
 _MOST_TIMES = 0.7  # a dead pixel is above, or below, all its neighbours in more than this fraction of the frames
-_MOST_FRAMES = 40  # most frames examined, evenly spread: more take time and show nothing new
-_STILL_SIDES = 0.5  # if more of the pixels in the two outermost columns never change, the air of this scan has no noise
-_NEAR_AXIS = 1.5  # columns on either side of the axis where a small part of the object stays on the same pixel in all views
-_SHARED = 0.1  # a dead pixel's neighbours show less than this fraction of its difference; next to an object's they show more
-_LINE = 0.9  # a row or column is dead as a whole if more than this fraction of its pixels is
+_MOST_FRAMES = 40  # dead pixels are sought in at most this many frames, evenly spread, to save time
+_STILL_SIDES = 0.5  # if more of the pixels in the two outermost columns never change, the scan has air without noise
+_NEAR_AXIS = 1.5  # a small part of the object this close to the axis, in columns, stays on one pixel in all views
+_SHARED = 0.1  # a dead pixel differs alone: its neighbours show less than this fraction of the difference
+_LINE = 0.9  # a row or column with more than this fraction of dead pixels is dead as a whole
 
 
 @dataclass(frozen=True)

@@ -27,18 +27,18 @@ log = logging.getLogger(__name__)
 Polynomial = tuple[float, float, float]
 BoneIn = Callable[[np.ndarray], np.ndarray]
 """Maps a volume (z, y, x) to the attenuation of the bone in each voxel."""
-_LARGEST = 1e3  # limit of the size of polynomial coefficients, and of bone_per_mm
-_PASSES = 2  # times that bone is taken from the volume, frames are corrected for it, and a volume is made of these
-_BONE_VOXELS = 128  # most voxels along the volume's longest side when bone is sought: its hardening is smooth
-# Candidates: soft tissue ends, and pure bone begins, at these fractions of the densest voxel (above 1: bone is too thin).
+_LARGEST = 1e3  # far beyond any real polynomial coefficient, and any attenuation of bone
+_PASSES = 2  # rounds of: bone from the volume, frames corrected for it, a volume from these
+_BONE_VOXELS = 128  # a coarse volume is enough to find bone, because its hardening is smooth: voxels along the longest side
+# Candidates: soft tissue ends, and pure bone begins, at these fractions of the densest voxel (above 1: no voxel is pure).
 _BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in (0.4, 0.7, 1.0) if soft < bone]
 _BETWEEN += [(0.7, 1.0), (0.7, 1.5), (0.8, 1.5)]
 _AS_WELL = 0.1  # candidates that explain at most this fraction less than the best are as good: the least bone then wins
 _NEARLY = 1.02  # bone may leave 2 % more unexplained than water, and is corrected: a stated voltage means a hardened scan
-_NEWTON = 3  # steps of Newton's method, which leave an error of 1e-12
-_UNIFORM = 0.08  # limit of the relative RMS that the path leaves unexplained: above it the object has several materials
+_NEWTON = 3  # steps of Newton's method: the error is then 1e-12
+_UNIFORM = 0.08  # if the path leaves a larger relative RMS unexplained, the object has several materials
 _SHADOW = 0.1  # pixels whose path is longer than this fraction of the longest lie behind the object
-_WATER_TO = 8.0  # largest line integral to which a voltage's polynomial is fitted
+_WATER_TO = 8.0  # the polynomial of a voltage is fitted up to this line integral: 40 cm of water at 0.2/cm
 _NONE: Polynomial = (0.0, 0.0, 0.0)
 
 
@@ -195,7 +195,7 @@ def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:
         found = f"{100 * rest:.2g} % of the line integrals that the path through one material does not explain"
         remedy = "state hardening.kvp or hardening.polynomial"
         raise InputError("--steps hardening", found, f"at most {100 * _UNIFORM:.2g} %", remedy)
-    # voxels alone cause a small quadratic term, in their reprojection too
+    # voxels cause a small quadratic term even without hardening: it is measured in their reprojection, and subtracted
     return _bend(path * np.float32(level), model)[2] - bend, 0.0, 0.0
 
 

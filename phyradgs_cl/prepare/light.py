@@ -22,12 +22,12 @@ from phyradgs_cl.io import ToAttenuation, read_scan
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 WAYS = ("mean", "time", "pca")
-_MOST_COMPONENTS, _CLEAR = 4, 4.0  # most principal components; least variance of one, over the median one's, which is noise
-_REWEIGHTINGS = 12  # iterations of reweighted least squares
-_LEAST_PIXELS = 20  # each frame needs as many pixels of air for a stable median
+_MOST_COMPONENTS, _CLEAR = 4, 4.0  # most principal components; one that varies 4 times as much as the median one is no noise
+_REWEIGHTINGS = 12
+_LEAST_PIXELS = 20  # with fewer pixels of air in a frame, their median is too noisy
 _AROUND = np.ones((3, 3), bool)
-_MARGIN = 2  # pixels next to the object that are not air, because its edge is blurred
-_PASSES = 3  # the threshold of air follows the air's median, which bright or dim light shifts
+_MARGIN = 2  # this near to the object, in pixels, its blurred edge is no air
+_PASSES = 3  # bright or dim light shifts the air, so the threshold follows its median, in this many rounds
 Counts = np.ndarray
 
 

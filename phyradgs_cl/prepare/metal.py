@@ -15,9 +15,9 @@ from phyradgs_cl.prepare.step import Facts, MakeModel
 
 _DENSER = 6.0  # metal attenuates 6 times as much as the main material: bone has up to 5 times water's, titanium 7 or more
 _FEWEST = 4  # fewer touching voxels than this are noise, not metal
-_BLIND = 2  # voxels around metal that are met by masked rays alone, so that the fill cannot see them
-_VOXELS = 128  # voxels along the longest side of the volume whose projection fills the shadow
-_MOST, _OBJECT = 0.5, 0.02  # largest shadow, as a fraction of the object's pixels; these exceed 0.02 of the largest value
+_BLIND = 2  # this near to metal, in voxels, only masked rays pass, so that the fill cannot see them
+_VOXELS = 128  # the volume that fills the shadow has at most this many voxels along its longest side, to save time
+_MOST, _OBJECT = 0.5, 0.02  # most of the object that the shadow may cover; the object exceeds 0.02 of the largest value
 
 
 @dataclass(frozen=True)

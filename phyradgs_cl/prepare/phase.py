@@ -21,7 +21,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 WAVELENGTH_MM_KEV = 1.239841984e-6  # wavelength in mm times energy in keV: Planck's constant times the speed of light
-_REACHES = 8  # frames are padded by this many decay lengths of the filter: exp(−8) of an edge is left at the opposite side
+_REACHES = 8  # frames are padded by this many decay lengths of the filter: only exp(−8) of an edge wraps around
 
 
 @dataclass(frozen=True)

@@ -24,22 +24,21 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.bad_pixels import axis_column
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
-_LEAST_FRAMES = 8  # fewer views do not average the object enough: such scans stay as they are
+_LEAST_FRAMES = 8  # fewer views do not average the object enough to show rings: such scans stay as they are
 _LEAST_PAIRS = 0.25  # columns are compared with their mirror images if at least this fraction of them has one on the panel
-_LEAST_SHARE = 0.25  # a pattern of less variance, relative to the noise of the mean, is not worth a correction
-_NEGLIGIBLE = 1e-4  # a pattern of smaller standard deviation is negligible, in line integrals: gains off by 0.01 %
+_LEAST_SHARE = 0.25  # a pattern that varies less, relative to the noise of the mean, is not worth a correction
+_NEGLIGIBLE = 1e-4  # nobody sees a pattern with a smaller standard deviation in line integrals: gains off by 0.01 %
 _SURE = 12.0  # a pattern is certain if its variance over the noise's exceeds this many standard errors, about 1/√pixels
-_THRESHOLD = 3.5  # coefficients above this many standard deviations of the pattern are the object's
+_THRESHOLD = 3.5  # coefficients above this many standard deviations of the pattern belong to the object
 _SHIFTS = 8  # positions of the blocks along each side, over which the result is averaged so that no block edges show
-# Single gains
-_DEVIATIONS = 8.0  # least deviation, in robust standard deviations, of a wrong gain in both sets of views
-_LEAST = 2e-3  # least deviation of a wrong gain in line integrals: 0.2 % off
-_NEIGHBOURS = 7  # a pixel's deviation is measured from the median over this many columns
-_NEAR = 21  # columns around a pixel that give the standard deviation of its surroundings
-_AXIS = 3  # columns at each side of the axis that are never changed: an object's edges stay on them in all views
-_UNEQUAL = 0.25  # a wrong gain differs between the sets by at most this fraction of their mean plus 2 standard deviations
-_OBJECT = 0.5  # if the mirrored pixel deviates by more than this fraction of the pixel's own deviation, either may be wrong
-_EQUALLY_FAR = 1.15  # a full turn has sources at about equal distances from their mean: largest over smallest is below this
+_DEVIATIONS = 8.0  # a wrong gain deviates by this many robust standard deviations, in both sets of views
+_LEAST = 2e-3  # a gain that is off by less, 0.2 %, is left alone
+_NEIGHBOURS = 7  # deviations are measured from the median of this many columns
+_NEAR = 21  # this many columns around a pixel tell how much its neighbours deviate
+_AXIS = 3  # an object's edges stay on the columns nearest to the axis in all views: this many at each side are left alone
+_UNEQUAL = 0.25  # the two sets of views may differ about a wrong gain by this fraction, plus 2 standard deviations
+_OBJECT = 0.5  # a pixel whose mirror image deviates by more than this fraction of its own deviation is left alone
+_EQUALLY_FAR = 1.15  # the sources of a full turn are nearly equally far from their mean: largest over smallest distance
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ def _strength(means: np.ndarray, axis_column: float) -> Strength:
     Columns minus their mirror images cancel the object, and second differences along rows what is left of it. The covariance
     of both sets is the pattern's variance."""
     one, other = (_rough(_antisymmetric(mean, axis_column)) for mean in means)
-    # the mean of half the views has twice the noise variance of the mean of all; two such means differ by four times it
+    # the mean of half the views has twice the noise variance of the mean of all; the difference of two halves, four times
     noise, rows = robust_deviation(one - other) ** 2 / 4, len(one) // 2
     least = noise * max(_LEAST_SHARE, _SURE / np.sqrt(one.size))
     pattern = _covariance(one, other)
@@ -142,7 +141,7 @@ def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarr
     """Denoises an image (v, u): thresholds the coefficients of overlapping cosine blocks, then guides a Wiener filter by the
     result. variances: of each pixel's own noise, and of the noise that a column shares."""
     sigma = np.full((window, window), variances[0])
-    # an error that a column shares is constant along it: it is in the first row of coefficients alone
+    # an error that a column shares is constant along it, so only the first row of coefficients has it
     sigma[0] += window * variances[1]
     sigma = np.sqrt(np.maximum(sigma, 1e-30))
     first = _blockwise(image, image, lambda c: (np.abs(c) > _THRESHOLD * sigma).astype(np.float64), window)

@@ -21,22 +21,22 @@ from phyradgs_cl.prepare.step import Facts, MakeModel, Model
 
 Kernel = Mapping[tuple[float, int], float]
 """Strength of each Gaussian, by its standard deviation over the panel's longer side and the power of the line integral."""
-_POWERS = (1, 2)  # powers of a ray's line integral in the fitted kernel
+_POWERS = (1, 2)  # powers of a ray's line integral to which scatter is fitted: the square tells thick rays from thin ones
 # Standard deviations of the fitted Gaussians over the panel's longer side. Narrower ones would fit columns of wrong gain.
 _REACHES = (0.12, 0.18, 0.27, 0.4)
-_PASSES = 6  # times that scatter is computed from primary light, and primary light from scatter
-_LEAST_PRIMARY = 0.05  # primary light is at least this fraction of the measured light: the logarithm of less is useless
+_PASSES = 6  # rounds of: scatter from the primary light, primary light from the scatter
+_LEAST_PRIMARY = 0.05  # an overestimate of scatter leaves at least this fraction of the light: the logarithm stays finite
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
-_FITTED_FRAMES = 24  # most frames, evenly spread, that the fit uses: scatter is smooth, and more frames change little
-_USUAL_REACH = 0.18  # standard deviation, as in _REACHES, where the user states only to_primary
-_HEIGHT_STEP = 1.25  # factor from one tried strength of the kernel to the next
-_MOST_STEPS = 8  # most strengths tried in this series: the last is 6 times the fitted one
+_FITTED_FRAMES = 24  # the fit uses at most this many frames, evenly spread, to save time
+_USUAL_REACH = 0.18  # where the user states to_primary alone: spread (std) of scatter over the panel's longer side
+_HEIGHT_STEP = 1.25  # the kernel is made stronger by this factor, time after time
+_MOST_STEPS = 8  # at most this often: it is then 6 times as strong as fitted
 _TRIALS = 6  # most strengths tried afterwards, between the neighbours of the best one
 # The stronger kernel must leave less than this fraction of what the fitted one leaves unexplained; else the fit stands.
 _BETTER = 0.65
-_AS_WELL = 1.05  # the series ends where the unexplained rest exceeds this many times the least so far
-_LARGEST_HEIGHT = 20.0  # largest strength in the bisection for a stated to_primary
-_BISECTIONS = 20  # halvings of its range: the strength is then exact to 2e-5
+_AS_WELL = 1.05  # kernels are made no stronger once they leave this many times the least unexplained rest
+_LARGEST_HEIGHT = 20.0  # no kernel for a stated to_primary is stronger than this
+_BISECTIONS = 20  # the strength for a stated to_primary is then exact to 2e-5
 
 
 @dataclass(frozen=True)

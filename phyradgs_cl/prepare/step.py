@@ -13,8 +13,8 @@ from phyradgs_cl.fields import GridChoice
 
 Facts = dict[str, Any]
 """What a step did, as numbers and words by name, for the scan's provenance."""
-_COARSE_VOXELS = 48  # most voxels along the longest side of a coarse model: hardening and scatter are smooth
-_INSIDE = 0.1  # a voxel belongs to the object above this fraction of the densest voxel's attenuation
+_COARSE_VOXELS = 48  # hardening and scatter are smooth, so few voxels along the longest side show them
+_INSIDE = 0.1  # the object is denser than this fraction of the densest voxel
 _SMOOTH = 1 / 24  # blur over the panel's longer side: it leaves hardening and scatter, and removes errors of the grid
 
 
@@ -33,7 +33,7 @@ class Model:
 
 
 MakeModel = Callable[[Scan], Model]
-Step = Callable[[Scan, Any, MakeModel], tuple[Scan, Facts]]  # (scan, the step's options, make_model) -> scan, facts
+Step = Callable[[Scan, Any, MakeModel], tuple[Scan, Facts]]  # (scan, the step's own options, make_model) to (scan, facts)
 
 
 def unmasked_frames(scan: Scan) -> np.ndarray:

@@ -21,13 +21,13 @@ from phyradgs_cl.prepare.bad_pixels import axis_column
 from phyradgs_cl.prepare.rings import mirror_columns
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
-_LEAST_VIEWS = 60  # in fewer views, neighbouring columns do not record the same values
-_LEAST = 2e-3  # least deviation of a stripe in line integrals: a gain that is 0.2 % off
-_NEAR = 5  # the median over this many columns stands for one side of a column
+_LEAST_VIEWS = 60  # the method assumes that neighbouring columns record the same values, which takes this many views
+_LEAST = 2e-3  # a stripe that deviates less, by a gain that is 0.2 % off, is left alone
+_NEAR = 5  # each side of a column is represented by the median of this many columns
 _FLUCTUATING = 3.0  # a column fluctuates if it changes this many times as much between views as the columns at both sides
 _UNRESPONSIVE = 10.0  # a column does not respond if it varies this many times less than the columns at both sides
-_MIRRORED = 2.0  # a stripe deviates this many times as much as its mirror image and the columns next to that
-_SMALLEST = 1e-6  # least spread in line integrals, to divide by: a stuck pixel has none
+_MIRRORED = 2.0  # an edge shows in the mirror image too: a stripe deviates this many times as much as that
+_SMALLEST = 1e-6  # least spread in line integrals, to divide by: that of a stuck pixel is 0
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ State = Mapping[str, np.ndarray]
 RUN, _CHECKSUM = "run", "checksum"
 """Names of the arrays that hold the identity of the run, as JSON, and the checksum of the other arrays."""
 _REMEDY = "start without --resume"
-_MOST_DIFFERENCES = 3  # most differences between two runs that an error names
-_LONGEST_NAME = 60  # a difference's name is cut after so many characters
+_MOST_DIFFERENCES = 3  # an error names at most this many differences between two runs
+_LONGEST_NAME = 60  # and cuts their names after this many characters
 
 
 def with_identity(state: State, identity: Mapping[str, Any]) -> State:
@@ -34,7 +34,7 @@ def without_identity(
     if not np.array_equal(state.get(_CHECKSUM, -1), _checksum(arrays)):
         raise InputError("checkpoint", "arrays that do not match their checksum", "a whole checkpoint", _REMEDY)
     both = completed(json.loads(str(arrays.pop(RUN)))), identity
-    then, now = (json.loads(json.dumps(one, default=repr)) for one in both)  # in JSON tuples are lists
+    then, now = (json.loads(json.dumps(one, default=repr)) for one in both)  # as JSON, because it turns tuples into lists
     differences = list(_differences(then, now))
     if differences:
         more = "; and more" if len(differences) > _MOST_DIFFERENCES else ""

@@ -16,7 +16,7 @@ from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport
 from phyradgs_cl.signals import stop_on_interrupt
 
-SILENT_S = 10.0  # a single process reports if it has been silent for so long
+SILENT_S = 10.0  # a run of slow iterations reports at least this often
 
 
 class Stepwise(Protocol):
@@ -113,7 +113,7 @@ class Loop:
     def _tell(self, before: int) -> bool:
         """Records and reports the step that began at iteration ``before``. Returns True if the report asks to stop."""
         is_recorded = self._reaches(self.record_every, before)
-        is_slow = time.perf_counter() - self._reported > SILENT_S and self.ranks.size == 1  # clocks of several ranks differ
+        is_slow = time.perf_counter() - self._reported > SILENT_S and self.ranks.size == 1  # clocks of ranks differ
         is_reported = self._reaches(self.report_every, before) or (is_slow and self.method.iteration > before)
         if not (is_recorded or is_reported):
             return False

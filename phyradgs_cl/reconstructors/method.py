@@ -114,7 +114,7 @@ def _plain(value: Any) -> Any:
 def _default_options(subject: str, function: Any, parameter: inspect.Parameter) -> Any:
     try:
         kind = typing.get_type_hints(function).get(parameter.name)
-    except (NameError, TypeError):  # annotations of names that do not exist at run time
+    except (NameError, TypeError):  # annotations may name what does not exist at run time
         kind = None
     if not (isinstance(kind, type) and is_dataclass(kind)):
         return OwnOptions()

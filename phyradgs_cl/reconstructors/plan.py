@@ -24,13 +24,13 @@ from phyradgs_cl.text import flag_of, suggest_name
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
 """Fields of motion models, such as the number of times per line, which are options of their names."""
 _ALL = motions_for(RAYS, SPLATS)  # for the user's own methods
-LARGEST_SEED = 2**63  # upper limit of the option ``seed``
+LARGEST_SEED = 2**63
 _DECIMALS = 6  # decimals of mm and s in a run's identity: a scan that was stored and read is still the same scan
 _SUBJECT = "--object-motion"
-_MOST_VOXELS = 24  # a deformation is checked on a grid of at most so many voxels a side
-_LEAST_DETERMINANT = 0.05  # least det(I + ∂w/∂y) of a deformation: near 0 matter folds
+_MOST_VOXELS = 24  # a deformation is checked on at most this many voxels a side: it is smooth
+_LEAST_DETERMINANT = 0.05  # a deformation with a smaller det(I + ∂w/∂y) is refused: at 0 matter folds
 _LEAST_COVERED = 0.5  # a deformation that covers less than this fraction of the scan's time is refused
-_MOSTLY_COVERED = 0.98  # one that covers less than this causes a warning
+_MOSTLY_COVERED = 0.98  # one that covers less than this fraction causes a warning
 log = logging.getLogger(__name__)
 
 

@@ -77,7 +77,7 @@ def reprojection(rt: Runtime | None, scan: Scan) -> Model:
     """Returns a model of FDK with every line at the middle of its own exposure, and of projection at the same times."""
     if rt is None:
         raise InputError("--steps", "a step that reconstructs, without a device", "a Runtime", "pass one")
-    from phyradgs_cl.operators import RayOperator  # methods are slow to import
+    from phyradgs_cl.operators import RayOperator  # imported here because methods are slow to import
     from phyradgs_cl.operators.rays.subrays import subrays_of
     from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk
     from phyradgs_cl.reconstructors.voxels import fista_tv

@@ -44,14 +44,14 @@ from phyradgs_cl.text import each_warning_once
 
 log = logging.getLogger(__name__)
 
-# Most volumes that voxel methods hold at one time (docs/large.md), with two of the intensity model. Besides, they hold
-# _STACKS arrays of all frames, and one buffer of _ONE_BUFFER volumes.
+# Memory of voxel methods, in volumes, with two of the intensity model (docs/large.md).
+# Besides, they hold _STACKS arrays of all frames, and need one buffer of _ONE_BUFFER volumes.
 _HELD = {"sirt": 8, "sart": 28, "os-sart": 28, "cgls": 11, "asd-pocs": 32, "fista-tv": 16}
 _HELD |= {"fista": 20, "moving": 28}
 _STACKS, _ONE_BUFFER = 12, 3
-_OF_OTHERS = 4  # volumes of other methods: the result, and copies in which it is made, checked and written
+_OF_OTHERS = 4  # memory of other methods in volumes: the result, and copies in which it is made, checked and written
 _DEVICE_SHARE = 0.9
-_ROUND = 8  # voxels to which a proposed --size is rounded down
+_ROUND = 8  # a proposed --size is rounded down to a multiple of this
 
 
 @each_warning_once()
@@ -164,7 +164,7 @@ def check_resumable(plan: RunPlan) -> None:
 
 def _with_defaults(identity: dict[str, Any]) -> dict[str, Any]:
     """Returns an earlier run's identity, with the defaults of preprocessing options that did not exist yet."""
-    with suppress(InputError):  # it may have options that this version lacks
+    with suppress(InputError):  # an earlier version may have had options that this one lacks
         return {**identity, "input": preprocessing_of(identity["input"]).facts()}
     return identity
 
@@ -249,7 +249,7 @@ def _size_that_fits(rt: Runtime, scan: Scan, method: str, options: Any) -> int:
     if held is not None:
         free = min(free, _DEVICE_SHARE * rt.ledger.limit_bytes)
         if hasattr(options, "prior"):
-            from phyradgs_cl.reconstructors.voxels.priors import volumes_of  # which loads SciPy
+            from phyradgs_cl.reconstructors.voxels.priors import volumes_of  # loads SciPy
 
             held += volumes_of(options.prior)
         voxels = (free - _STACKS * scan.projections.nbytes) / (4 * held)

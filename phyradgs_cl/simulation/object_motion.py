@@ -12,14 +12,14 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid, control_points
 from phyradgs_cl.io.tables import Fields, read_toml
 
-_NODES = 40  # weights stored per cycle: linear interpolation between them follows the curves to 0.3 %
-_SETTLING_NODES = 200  # times at which the weights of drying are stored
-_SPACINGS = 8.0  # spacings of control points along the longest side of the box
-_SLIDING_SPACINGS = 16.0  # the same for sliding, whose edge is about three control points wide
-_ASIDE = 1 / 3  # breathing moves the object this much along y, later, relative to the motion along z
-_PERIODS = (0.5, 1.5)  # limits of a breath's period, relative to the mean period
-_FADE = 3.0  # beyond the box the field falls to 0 over this many amplitudes, so its slope is a third: it cannot fold
-_MOST_CYCLES = 100_000  # most cycles of breathing or sliding in a scan
+_NODES = 40  # weights stored per cycle; linear interpolation between them is then off by 0.3 % at most
+_SETTLING_NODES = 200  # drying is a slow curve, for which weights at this many times are enough
+_SPACINGS = 8.0  # control points this many to the box's longest side follow breathing and drying, which are smooth
+_SLIDING_SPACINGS = 16.0  # sliding has an edge, about three control points wide, so they must be closer
+_ASIDE = 1 / 3  # breathing moves the object along y, too, by this fraction of its motion along z
+_PERIODS = (0.5, 1.5)  # a random breath lasts at least and at most this many mean periods
+_FADE = 3.0  # beyond the box, motion falls to 0 over this many amplitudes: with a slope of a third, the field cannot fold
+_MOST_CYCLES = 100_000  # most cycles of breathing or sliding in a scan: more would mean a wrong unit of time
 _COMMON = ("kind", "amplitude_mm", "amplitude", "states")
 _KEYS = {
     "breathing": (*_COMMON, "period_s", "jitter", "hysteresis", "seed"),

@@ -31,7 +31,7 @@ from phyradgs_cl.text import flag_of
 
 _LARGEST_GRID = 4096  # most voxels along a side of the volume
 _SMALLEST_PHANTOM = 2  # fewest voxels along a side: a procedural phantom is drawn on twice as many, and needs 4
-_STATES = 8  # stored true volumes, over a period, of a phantom whose parts move
+_STATES = 8  # a phantom whose parts move gets this many true volumes over a period
 log = logging.getLogger(__name__)
 _PEAK = "Largest line integral, by scaling the attenuation; 0: unscaled."
 _NOISE = "tigre: TIGRE's rescaled Poisson; beer: Beer-Lambert counts."
@@ -39,10 +39,10 @@ _ELECTRONIC = "Standard deviation of electronic noise, counts."
 _JITTER = "Wander of the gantry (std, degrees), in the encoder table."
 _MOTION = "TOML file of how the object moves: breathing, drying or sliding; the truth of some states is stored."
 # Limits of options, far beyond any scanner, yet far from an overflow of float32 or of a random sampler.
-_LARGEST_PEAK = 1e4  # of the largest line integral
-_LARGEST_NOISE = 1e9  # of the electronic noise, in counts
-_SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12  # of the dose, in photons per pixel
-_LARGEST_DETECTOR = 32_000  # of the pixels along a side of the panel
+_LARGEST_PEAK = 1e4  # largest line integral
+_LARGEST_NOISE = 1e9  # electronic noise in counts
+_SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12  # photons per pixel
+_LARGEST_DETECTOR = 32_000  # pixels along a side of the panel
 _TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse", "turns")
 _DATA_SHEET = ("first", "fps", "readout_ms")
 
@@ -134,7 +134,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
     timing = {key: values.pop(key) for key in _TIMING if key in values}
     sheet = {key: values.pop(key, None) for key in _DATA_SHEET}
     timed = make_protocol(protocol, **timing)
-    if given.get("jitter_deg") and not timed.is_fly:  # its gantry rests at the mid-window poses of a fly-scan
+    if given.get("jitter_deg") and not timed.is_fly:  # a gantry that stops rests at exact angles
         found, remedy = f"{given['jitter_deg']} with --protocol {protocol}", "leave it out, or choose a fly-scan"
         raise InputError("--jitter-deg", found, "0", remedy)
     unused = [name for name in ("dose", "electronic_noise") if name in given and given.get("noise", "none") == "none"]
@@ -247,7 +247,7 @@ def simulate(
     share = shutter.readout.spread(shutter.lit_share(lines))
     recorded = _recorded(frames, options, np.where(share > 0, share, 1.0), rng)
     return Scan(
-        projections=recorded if np.all(share > 0) else recorded * (share > 0),  # lines without light are masked
+        projections=recorded if np.all(share > 0) else recorded * (share > 0),  # a line without light has no measurement
         geometry=geometry,
         trajectory=trajectory,
         shutter=shutter,

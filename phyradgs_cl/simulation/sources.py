@@ -22,7 +22,7 @@ from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
 
 # One ray is enough for a pixel up to this width at the axis, in voxels. A scanner with as many voxels as pixels has 1.43.
 WIDEST_RAY = 1.5
-_MOST_SAMPLES = 32  # most rays along each side of a pixel
+_MOST_SAMPLES = 32  # most rays along each side of a pixel: the time grows with their square
 NEAREST = 0.1  # moving matter is projected at most this far from its exact position, in voxels to be reconstructed
 
 
@@ -193,7 +193,7 @@ class _Average:
 
     def __init__(self, cells: TimeCells, model: str) -> None:
         self._readout, self._is_log = cells.readout, model == "log"
-        self._sum: np.ndarray | None = None  # Σ w p, or ln Σ w exp(−p)
+        self._sum: np.ndarray | None = None  # Σ w p in the log model, ln Σ w exp(−p) in the intensity model
 
     def add(self, frame: np.ndarray, share: np.ndarray) -> None:
         """Adds line integrals (rows, columns). share (lines,): which fraction of each line's weight they have."""
@@ -201,7 +201,7 @@ class _Average:
         if self._is_log:
             self._sum = weight * frame + (0.0 if self._sum is None else self._sum)
             return
-        with np.errstate(divide="ignore"):  # a line without a share gives ln 0
+        with np.errstate(divide="ignore"):  # a line that these cells do not serve has the weight 0
             log_part = np.log(weight) - frame
         self._sum = log_part if self._sum is None else np.logaddexp(self._sum, log_part)
 

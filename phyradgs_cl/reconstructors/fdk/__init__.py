@@ -52,8 +52,8 @@ from phyradgs_cl.runtime import Runtime
 log = logging.getLogger(__name__)
 # Views share their ray weights if their poses, rotated back to one angle, differ by at most this fraction.
 _SAME_POSE = 1e-9
-_BLOCK_BYTES = 1 << 26  # most bytes of the rows that are filtered at one time
-_WORKERS = -1  # threads of SciPy's transforms: -1 takes all cores
+_BLOCK_BYTES = 1 << 26  # rows are filtered in blocks of at most this size, to limit memory
+_WORKERS = -1  # SciPy's transforms use all cores
 
 # Windows as functions of the frequency over the Nyquist frequency. All are 1 at frequency 0, so that none changes the mean.
 WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -108,7 +108,7 @@ def fdk(
         raise InputError("--object-motion", "extrapolate=reprojected, of an object at rest", expected, remedy)
     frames, numbers = _measured_frames(scan)
     poses = [options.motion.cells(scan, f).still().line_poses() for f in numbers]
-    # if some frames have a pose for every line, the others repeat theirs
+    # if some frames have a pose for each line, frames with one pose repeat it for all lines
     lines = max(map(len, poses))
     pose = np.concatenate(poses) if lines == 1 else np.stack([np.broadcast_to(p, (lines, 12)) for p in poses])
     check_beam(method, pose, scan.is_parallel)
@@ -170,7 +170,7 @@ def fdk_volume(
     pose = widened(pose, axis, missing)
 
     def of_views(images: np.ndarray, views: np.ndarray, power: int = 2) -> np.ndarray:
-        share, one = 0.5 * arc.gap_rad[views], pose[views]  # 0.5: every ray is measured twice
+        share, one = 0.5 * arc.gap_rad[views], pose[views]  # 0.5, because every ray is measured twice
         if moving is not None and power == 2:
             return moving.of_views(views)(images, one, share, grid, axis, is_parallel=is_parallel)
         if pose.ndim == 2:
@@ -186,7 +186,7 @@ def fdk_volume(
         volume = of_views(filtered, np.arange(len(filtered)))
     if circle:
         _, y_mm, x_mm = grid.axes_mm()
-        radius_mm = fan.half_rad + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # to the edge of the last pixel
+        radius_mm = fan.half_rad + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # up to the edge of the last pixel
         volume[:, np.hypot(y_mm[:, None], x_mm) > radius_mm] = 0
     return volume
 

@@ -30,12 +30,12 @@ from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions
 from phyradgs_cl.runtime import Runtime
 
 WAYS = ("none", "cosine", "cylinder", "reprojected")
-_SHARE = 0.5  # "cosine" and "cylinder" add this fraction of the panel's columns at each side
-_SLOPE_PIXELS = 5  # the slope of a row's end is measured over so many pixels
-_NOISE = 0.01  # the end of a row counts as air up to this fraction of the line integrals' 99.9th percentile
-_UNEVEN = 0.02  # views are evenly spaced if no step between them differs from the median step by more than this fraction
-_REACH = 8  # views continue beyond each end of an arc by so many arcs of an exposure
-_FULL_TURN = 1.5  # in a full turn no gap between views exceeds this many median steps
+_SHARE = 0.5  # "cosine" and "cylinder" extend rows at each side by this fraction of the panel's columns
+_SLOPE_PIXELS = 5  # the slope at a row's end is taken over this many pixels, against noise
+_NOISE = 0.01  # below this fraction of the line integrals' 99.9th percentile, the end of a row is air
+_UNEVEN = 0.02  # steps between views may differ by this fraction from the median step and still count as even
+_REACH = 8  # beyond an arc its first and last view are repeated over this many arcs of an exposure: the filter sees no edge
+_FULL_TURN = 1.5  # a gap of more median steps between views means less than a full turn
 
 
 def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
@@ -79,8 +79,8 @@ def _curvature(frames: np.ndarray) -> np.ndarray:
     return np.broadcast_to(np.maximum(np.median(down, axis=0), 0)[None, :, None], (*frames.shape[:2], 1))
 
 
-_ITERATIONS = 30  # iterations of FISTA-TV that reconstruct the object beyond the panel
-_MOST = 2.0  # "reprojected" adds at most so many times the panel's columns at each side
+_ITERATIONS = 30  # iterations of FISTA-TV for the object beyond the panel
+_MOST = 2.0  # "reprojected" extends rows at each side by at most this many panel widths
 
 
 def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport) -> np.ndarray:
@@ -129,7 +129,7 @@ def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: boo
     source, first, step_u, step_v = (pose[:, None, i : i + 3] for i in (0, 3, 6, 9))
     corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(1, 8, 3)
     normal = np.cross(step_u, step_v)
-    if is_parallel:  # the first three numbers are a direction, along which the corners go to the panel
+    if is_parallel:  # a pose then begins with the rays' direction, along which corners are projected
         ahead = ((first - corners) * normal).sum(-1) / (source * normal).sum(-1)
         hit = corners + ahead[..., None] * source - first
     else:

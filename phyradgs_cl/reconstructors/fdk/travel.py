@@ -16,16 +16,15 @@ from phyradgs_cl.reconstructors.fdk.views import pose_of_pixels, view_angles
 
 log = logging.getLogger(__name__)
 
-# An orbit travels along z if it moves by more than this fraction of the panel's height, and by more than a row. Less affects
-# only voxels that a circle would see in part too.
+# An orbit travels along z if it moves by more than this fraction of the panel's height: less matters at the ends only.
 _TRAVEL = 0.05
-_CLASS_RAD = np.deg2rad(15)  # default width in rad of a class of ray directions about z
-_VIEWS_A_CLASS = 2.0  # a class needs so many views of one turn: if there are fewer, classes are wider
-_EVEN = 0.5  # rows farther from the middle than this fraction of the panel's half height count less
-_LEAST_ROW = 0.02  # weight of the outermost row, relative to middle rows: some voxels are seen by no other row
-_LEAST_SHARE = 0.01  # a class counts fully for a voxel that is seen from at least this fraction of its directions
-_NAMED = 0.01  # a warning comes if more than this fraction of the voxels misses directions
-_FEW_VIEWS = 24  # a warning comes below so many views per turn: from here on, densities of balls are within 2 %
+_CLASS_RAD = np.deg2rad(15)  # width of a class of ray directions about z, unless views are few
+_VIEWS_A_CLASS = 2.0  # each class needs this many views of one turn: with fewer views, classes are wider
+_EVEN = 0.5  # rows count less from this fraction of the panel's half height on
+_LEAST_ROW = 0.02  # but the outermost row keeps this weight: some voxels are seen by no other row
+_LEAST_SHARE = 0.01  # a voxel that is seen from at least this fraction of a class's directions is seen from the class
+_NAMED = 0.01  # if a larger fraction of the voxels misses directions, a warning says so
+_FEW_VIEWS = 24  # a warning comes below this many views per turn: with 24, densities of balls are within 2 %
 Backproject = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """A function from frames (n, rows, columns) and the numbers (n,) of their views to a volume (z, y, x)."""
 
@@ -67,7 +66,7 @@ def seen_volume(
     twice."""
     by_pixel, shape = pose_of_pixels(pose, axis), frames.shape[1:]
     angle_rad, pace = _directions(by_pixel[:, [by_pixel.shape[1] // 2]], shape, is_parallel)
-    turn_rad = 2 * np.pi if is_displaced else np.pi  # a centred panel measures opposite rays alike: they count as one
+    turn_rad = 2 * np.pi if is_displaced else np.pi  # a centred panel measures every ray in half a turn
     views_a_turn = np.unique(np.round(np.mod(view_angles(by_pixel), 2 * np.pi), 6)).size
     width_rad = turn_rad / max(4, round(turn_rad / max(_CLASS_RAD, _VIEWS_A_CLASS * 2 * np.pi / views_a_turn)))
     classes, place = round(turn_rad / width_rad), np.mod(angle_rad, turn_rad) / width_rad

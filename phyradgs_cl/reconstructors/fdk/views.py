@@ -12,25 +12,23 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import weights
 
-# A gap between views stands out if it is this many times as wide as another gap. The widest of all is compared with the
-# second widest: compared with the median, uneven views (four times as dense over one half, say) would be no full turn. Any
-# gap wider than _WIDE_RAD is compared with both of its neighbours. With 2.5, one of many views may be lost.
+# A gap between views stands out if it is this many times as wide as another gap; one lost view makes a gap of 2 steps.
+# The widest gap is compared with the second widest. The median would make uneven views of a full turn a short scan.
+# Any gap wider than _WIDE_RAD is compared with both of its neighbours.
 SHORT_SCAN_GAP = 2.5
 _SAME_VIEW = 1e-3  # views nearer to each other than this fraction of the mean gap count as one, as those of a second turn
-# The warning counts filled gaps from this width on: narrower ones change the density of balls by less than 1 %, if these are
-# a quarter of the field wide.
+# A warning names filled gaps from this width on: narrower ones changed the density of large balls by less than 1 %.
 _NAMED_RAD = np.deg2rad(5)
-# Gaps up to this width are filled, unless it is the widest: dividing the arc there would cost more.
+# All gaps up to this width but the widest are filled: dividing the arc there would cost more accuracy.
 _WIDE_RAD = np.deg2rad(10)
-# A misaligned panel measures its rays again half a turn later, except for a strip. Gaps of a full turn up to this width are
-# filled, so that the strip counts fully; with a wider gap the scan counts as short.
+# A misaligned panel measures a strip of rays once only. Gaps up to this width are filled, so that the strip counts fully.
 _FILLED_RAD = np.deg2rad(15)
 # Views stand for a filled gap if they are nearer to it than this fraction of its width: more smears, less draws streaks.
 _FILL_REACH = 0.5
 log = logging.getLogger(__name__)
 
 # Limits in pairs: beyond the first a warning is logged; beyond the second, _NO_…, InputError is raised.
-_CIRCLE = 0.05  # distance of source or panel from a circle about z, relative to the distance between source and panel
+_CIRCLE = 0.05  # distance of source or panel from a circle about z, over their distance from each other
 _NO_CIRCLE = 0.5
 _PLANE_DEG = 10.0  # elevation of the source above the plane z = 0, seen from the origin
 _NO_PLANE_DEG = 45.0
@@ -38,7 +36,7 @@ _LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the p
 _NO_LEAN_DEG = 10.0
 _ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: densities are 0.1 % too low
 _NO_ROLL_DEG = 10.0  # densities are 1.5 % too low here, and 0 at 90°
-_LEAST_OVERLAP = 2.0  # a displaced panel reaches so many columns beyond the axis, or a warning comes
+_LEAST_OVERLAP = 2.0  # a displaced panel must reach this many columns beyond the axis, or a warning comes
 # A smaller missing angle causes no warning: nearly parallel rays have so narrow a fan that half a turn is enough.
 _TOLERATED_RAD = np.deg2rad(0.5)
 RayWeight = Callable[[int], np.ndarray]
@@ -97,7 +95,7 @@ def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
         whole = np.array([[0.0, 2 * np.pi]])
         return Arc((gap / count)[cell], (centre - centre[0])[cell], 2 * np.pi, True, whole, _filled_rad(ahead))
     first = (int(np.argmax(np.where(wide, ahead, 0))) + 1) % ahead.size
-    ahead, wide = np.roll(ahead, -first), np.roll(wide, -first)  # the widest gap that stands out is now the last
+    ahead, wide = np.roll(ahead, -first), np.roll(wide, -first)  # now the widest gap that stands out is the last
     forward, back = _steps(ahead, wide)
     progress = np.concatenate([[0.0], np.cumsum(ahead[:-1])]) + back[0] / 2
     parts = np.stack([(progress - back / 2)[np.roll(wide, 1)], (progress + forward / 2)[wide]], -1)
@@ -148,7 +146,7 @@ def _filled_cells(ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
     known = (forward + back) / 2
     cells = known.copy()
     for gap in np.flatnonzero(wide):
-        turned = np.cumsum(np.roll(ahead, -gap))  # from the view before the gap to all others, the next one first
+        turned = np.cumsum(np.roll(ahead, -gap))  # angle from the view before the gap to each other view
         away_rad = np.minimum(turned - ahead[gap], 2 * np.pi - turned)
         near = np.roll(np.maximum(1 - away_rad / (_FILL_REACH * ahead[gap]), 0), gap + 1) * known
         cells += (ahead[gap] - (forward[gap] + np.roll(back, -1)[gap]) / 2) * near / near.sum()

@@ -8,15 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Width of the transition between rays measured once and twice, over the overhang of the panel's longer side. It covers at
-# most all rays that are measured twice, as Wang's sine does. A ray and its opposite that count unevenly add noise and
-# aliasing, so a narrow transition is best: wider ones were up to 15 % noisier and had as many artefacts.
+# Width of the transition between rays measured once and twice, over the overhang of the panel's longer side.
+# Wang's covers all rays that are measured twice: such wide transitions were up to 15 % noisier, with no fewer artefacts.
 TRANSITION = 1.0
-_SYMMETRIC = 0.01  # a panel counts as symmetric about the axis up to an overhang of so many pixels
+_SYMMETRIC = 0.01  # a panel that is off centre by less, in pixels, is symmetric about the axis
 # A panel less asymmetric than this fraction of the fan was not displaced on purpose, and sees both sides of the object.
 _ASIDE = 0.1
 
-_PART_EDGE_RAD = np.deg2rad(15)  # beside a gap, views' weights rise from 0 to full over an arc of this width, in rad
+_PART_EDGE_RAD = np.deg2rad(15)  # next to a gap, weights of views rise from 0 to full over an arc of this width
 
 
 def turned_back(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:

@@ -15,23 +15,23 @@ from phyradgs_cl.acquisition.altered.variants import altered_trajectory, shifted
 from phyradgs_cl.reconstructors.fits.residuals import fit_squares, vertex
 from phyradgs_cl.runtime import Runtime
 
-_ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # first trial shifts, in coarse pixels
-_ROUGH_ITERATIONS = 8  # iterations of the fit for each of them
-_STEP = 0.25  # further trial shifts around the best are so far apart, in coarse pixels
-_MOST_STEPS = 8  # most times that the best of three trial shifts becomes the middle one
+_ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # shifts of the panel that are tried first, in coarse pixels
+_ROUGH_ITERATIONS = 8  # few iterations are enough to tell these shifts apart
+_STEP = 0.25  # then three shifts this far apart, in coarse pixels, bracket the best one
+_MOST_STEPS = 8  # the three shifts move at most this often, so that a search that leads away ends
 ANYWHERE = (-math.inf, math.inf)  # no limits of the shift, in pixels
-_MOST_VIEWS = 60  # most views that are compared with their opposites
-_MOST_ROWS = 64  # most blocks of rows that are compared
-_BEYOND = 1.5  # a view's opposite may lie beyond the scan's end by so many steps between views
-WIDEST_STEP_RAD = math.radians(10.0)  # views further apart than this are not interpolated
+_MOST_VIEWS = 60  # views that are compared with their opposites, at most, to save time
+_MOST_ROWS = 64  # blocks of rows that are compared, at most, to save time
+_BEYOND = 1.5  # at the scan's end, a view's opposite may lie this many steps beyond the last view
+WIDEST_STEP_RAD = math.radians(10.0)  # views further apart differ too much to be interpolated
 # Smoothing along rows (std, in pixels). Without it, interpolation would lower noise between pixels, which biases shifts.
 SMOOTHING_PX = 1.0
-_CORRELATED_PX = 2 * math.sqrt(math.pi) * SMOOTHING_PX  # columns of smoothed noise per independent one
-_LEAST_OVERLAP = 0.25  # a view and its mirrored opposite overlap in at least this fraction of the columns
-_LEAST_ENERGY = 0.2  # an overlap has at least this fraction of the largest sum of squares over all shifts
-_STEPS = 12  # most Gauss–Newton steps
+_CORRELATED_PX = 2 * math.sqrt(math.pi) * SMOOTHING_PX  # smoothing correlates the noise of this many columns
+_LEAST_OVERLAP = 0.25  # a view and its mirrored opposite must overlap in this fraction of the columns
+_LEAST_ENERGY = 0.2  # an overlap with less than this fraction of the largest sum of squares shows air alone
+_STEPS = 12
 _SETTLED_PX = 1e-3  # Gauss–Newton ends after a step shorter than this, in pixels
-_BIAS_PX = 0.02  # error (std) of a shift in pixels because views are interpolated between their neighbours
+_BIAS_PX = 0.02  # error (std) of a shift that comes from interpolating views
 
 
 @dataclass(frozen=True, eq=False)

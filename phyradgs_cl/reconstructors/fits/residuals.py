@@ -16,10 +16,10 @@ from phyradgs_cl.runtime import Runtime
 
 # Errors of flats affect frames this much, relative to the volume: as strong as the volume, they would explain motion.
 _FREEDOM = 0.3
-_ITERATIONS = 20  # default number of iterations of a fit
-_MOST_TIMES = 12  # most times per exposure
-_DRAWS = 200  # resamplings of the bootstrap; the deviation is NaN unless more than half of them have a minimum
-_TINY = 1e-30  # least denominator
+_ITERATIONS = 20  # of CGLS in a fit
+_MOST_TIMES = 12  # most times per exposure: each costs a projection
+_DRAWS = 200  # resamplings of the bootstrap
+_TINY = 1e-30  # keeps divisions finite
 
 
 @dataclass(frozen=True, eq=False)

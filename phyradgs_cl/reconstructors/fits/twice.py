@@ -15,16 +15,16 @@ from phyradgs_cl.prepare.step import fill_masked
 from phyradgs_cl.reconstructors.fdk.weights import fan_angle, pixel_rays
 from phyradgs_cl.reconstructors.fits.axis import NOT_FOUND, SMOOTHING_PX, WIDEST_STEP_RAD, AxisShift
 
-_COARSE_COLUMNS = 128  # most columns of the coarse frames
-_MOST_PX = 16.0  # trial shifts to either side go up to so many coarse pixels
-_STEP_PX = 0.5  # distance between trial shifts, in pixels of the compared frames
-_NEAR_PX = 2.0  # on full frames, shifts up to so many coarse pixels from the best coarse one are tried
-_FEWEST_VIEWS = 24  # a scan needs so many views
-_MOST_VIEWS = 360  # most views that are compared
-_MOST_ROWS = 32  # most rows that are compared
-_MOST_PAIRS = 48  # most pairs of opposite rays of a row that are compared
-_LEAST_PX = 1.0  # the axis must lie inside the middle of the panel's outer column by so many pixels
-_BLOCKS = 12  # the jackknife leaves out each of so many blocks of views once
+_COARSE_COLUMNS = 128  # shifts are first tried on frames of at most this many columns
+_MOST_PX = 16.0  # by up to this many coarse pixels to either side
+_STEP_PX = 0.5  # in steps of this many pixels of the compared frames
+_NEAR_PX = 2.0  # full frames are then tried this near to the best coarse shift, in coarse pixels
+_FEWEST_VIEWS = 24  # fewer views cannot be interpolated to the opposite of each ray
+_MOST_VIEWS = 360  # views that are compared, at most, to save time
+_MOST_ROWS = 32  # rows that are compared, at most, to save time
+_MOST_PAIRS = 48  # pairs of opposite rays that are compared in a row, at most, to save time
+_LEAST_PX = 1.0  # the axis must lie this far inside the middle of the panel's outer column, or no ray has an opposite
+_BLOCKS = 12  # the jackknife leaves out one of this many blocks of views at a time
 _BIAS_PX = 0.05  # error (std) of the shift in pixels without noise, measured with half-fans and features of two pixels
 
 
@@ -35,7 +35,7 @@ def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
     NaN if views are more than 10° apart, if columns are read one after the other, and if no shift within an eighth of the
     panel agrees best."""
     if scan.shutter.axis == "columns" and scan.shutter.readout_s > 0:
-        return NOT_FOUND  # a ray and its opposite lie on columns that are read at other times
+        return NOT_FOUND  # a ray and its opposite lie on different columns, read at different times
     poses = middle_poses(scan)
     turned, views = np.unique(np.round(np.mod(azimuth_rad(poses), 2 * np.pi), 9), return_index=True)
     if len(turned) < _FEWEST_VIEWS or np.diff(turned, append=turned[0] + 2 * np.pi).max() > WIDEST_STEP_RAD:

@@ -21,13 +21,13 @@ from phyradgs_cl.operators.warp.volume import StateStack, VolumeWarp
 from phyradgs_cl.reconstructors.moving.signal import Bending, TemporalSplines
 from phyradgs_cl.runtime import Runtime
 
-_CG_STEPS = 8  # iterations of conjugate gradients for a step of the control vectors
-_DAMPING = 1e-3  # Levenberg damping of a step, relative to the mean diagonal of JᵀJ
-_ROUGHNESS = 1e-2  # weight β of the weights' roughness in time, relative to the mean diagonal of JᵀJ
-_SHORTER = (1.0, 0.5, 0.25)  # fractions of a step that are tried in turn, until one lowers the misfit
-_LEAST_DETERMINANT = 0.1  # least det(I + ∂w/∂y) after a step: at 0 matter folds
-_LEAST_VOXELS = 1.0  # added to distances between states, in voxels per unit of weight, so that small fields have states too
-_SUPPORT = 4  # intervals between knots in which a spline in time is not 0
+_CG_STEPS = 8  # iterations of conjugate gradients for one step of the control vectors
+_DAMPING = 1e-3  # Levenberg damping, relative to the mean diagonal of JᵀJ: it keeps unseen control vectors still
+_ROUGHNESS = 1e-2  # β, the penalty on the weights' roughness in time, relative to the mean diagonal of JᵀJ
+_SHORTER = (1.0, 0.5, 0.25)  # fractions of a step, tried in turn until one lowers the misfit
+_LEAST_DETERMINANT = 0.1  # a step may lower det(I + ∂w/∂y) to this: at 0 matter folds
+_LEAST_VOXELS = 1.0  # added to distances between states, so that even a field of zeros has several states
+_SUPPORT = 4  # a cubic spline in time is not 0 over this many intervals
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,23 +39,23 @@ from phyradgs_cl.reconstructors.voxels.run import MethodRun
 from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages
 from phyradgs_cl.runtime import Runtime
 
-_MOST_COLUMNS = 64  # most blocks of pixels along the longer side of the panel in the coarse scan
-_MOST_VOXELS = 32  # most voxels along the longest side of the coarse scan's grid
-_MOST_FRAMES = 600  # most frames of the coarse scan; more if the signal has more knots
-_TIMES_PER_PERIOD = 12  # exposures see the object at so many times per period of its motion
-_MOST_TIMES = 6  # but an exposure gets at most so many times for that
-_FIRST_PASSES = 8  # passes of fista before the first round, with the object at rest
+_MOST_COLUMNS = 64  # blocks of pixels along the longer side of the panel in the coarse scan, at most
+_MOST_VOXELS = 32  # voxels along the longest side of the coarse scan's grid, at most
+_MOST_FRAMES = 600  # frames of the coarse scan, at most, unless the signal has more knots
+_TIMES_PER_PERIOD = 12  # exposures sample a periodic motion this often per period
+_MOST_TIMES = 6  # but at most at this many times per exposure, because each costs a projection
+_FIRST_PASSES = 8  # passes of fista before the first round, as for an object at rest
 _PASSES = 3  # passes of fista in each round
-_WEIGHT = 0.42  # prior weight of the passes of fista
-_TV_ITERATIONS = 5  # TV iterations of each pass of fista
-_COARSE_SPACINGS = 2  # spacings of control points along the box's longest side, in the first rounds
-_FINE_SPACINGS = 4  # spacings of control points along the box's longest side, in the last rounds
+_WEIGHT = 0.42  # prior weight of these passes
+_TV_ITERATIONS = 5  # TV iterations of each of these passes
+_COARSE_SPACINGS = 2  # the first rounds have this many spacings of control points along the box's longest side
+_FINE_SPACINGS = 4  # the last rounds have this many
 # Finer control points need a larger bending weight γ, by this factor, so that the field is as stiff in mm as before.
 _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4
-_COARSE_SHARE = 0.6  # fraction of the rounds with coarse control points
-_FREE_KNOTS = 6  # intervals of the splines in time, if there is no signal that they have to follow
+_COARSE_SHARE = 0.6  # fraction of the rounds that have coarse control points
+_FREE_KNOTS = 6  # if weights follow no signal, their splines have this many intervals in time
 _AT_REST = "no motion found"
-# One of so many iterations is a round of the search: by default 7 rounds, and then 35 passes as in fista.
+# One in six iterations is a round of the search: by default 7 rounds, and then 35 passes as in fista.
 _ITERATIONS_PER_ROUND = 6
 _STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")
 

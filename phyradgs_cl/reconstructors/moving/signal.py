@@ -16,18 +16,18 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gating
 
-_NODES = 4  # weights are stored at so many times per interval between knots; between them they are linear
-_STRETCH = 0.02  # weight of first differences in the bending energy: in air they keep a field from growing as a line
-_HARMONICS = 6  # harmonics of the gantry's angle that are removed: an object at rest explains them
-_FEWEST_CYCLES = 5  # a signal with fewer cycles in the scan counts as free in time
-_BAND = 0.25  # half width of the band about the dominant rate, over that rate: breaths differ in length
+_NODES = 4  # weights are stored at this many times per interval between knots, and are linear between them
+_STRETCH = 0.02  # weight of first differences in the bending energy: without it, a field could grow linearly in air
+_HARMONICS = 6  # an object at rest changes the signal with these harmonics of the gantry's angle: they are removed
+_FEWEST_CYCLES = 5  # a motion with fewer cycles in the scan is modelled freely in time
+_BAND = 0.25  # breaths differ in length: the dominant rate and rates that differ by this fraction count as one
 # A signal repeats if at least this fraction of its power lies in the band, not counting what white noise has there.
 _PERIODIC_SHARE = 0.5
-_FEWEST_FRAMES = 16  # no period is sought in a scan of fewer frames
-_FEWEST = 4  # a file needs so many values
-_KNOTS_PER_PERIOD = 6  # knots per period of the weights that follow a signal
+_FEWEST_FRAMES = 16  # fewer frames show no period
+_FEWEST = 4  # fewer values in a file are no signal
+_KNOTS_PER_PERIOD = 6  # weights that follow a signal have this many knots per period
 _SLOWER = 0.95  # a stated signal that does not repeat gets knots for the slow rates that hold this fraction of its power
-_MOST_EVEN = 100_000  # most evenly spaced intervals to which a signal is interpolated
+_MOST_EVEN = 100_000  # a signal is interpolated to at most this many even steps
 _FORMS = f"at least {_FEWEST} lines: time in s, value; or one value for each frame"
 
 

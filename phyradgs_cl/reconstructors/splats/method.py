@@ -32,8 +32,8 @@ from phyradgs_cl.reconstructors.splats.start import box_of, first_population, in
 from phyradgs_cl.reconstructors.splats.step import Batch, DeviceCloud, FrameStep, Scale, sharing_of
 from phyradgs_cl.runtime import Runtime
 
-REPORT_EVERY = 50  # iterations between reports, and most iterations between lines of the record
-LEAST_RECORDED = 20  # a run's record has at least so many lines, if it has as many iterations
+REPORT_EVERY = 50  # iterations between reports; lines of the record are as far apart or closer
+LEAST_RECORDED = 20  # a short run records more often, to have this many lines
 
 
 class SplatRun:
@@ -101,7 +101,7 @@ class SplatRun:
 
     def control_density(self) -> None:
         sums = self.cloud.read_statistics().astype(np.float64)
-        begun = time.perf_counter()  # the download has waited for the device
+        begun = time.perf_counter()  # after the download, which waits for the device, so that only density control is timed
         statistic = sums[0] / np.maximum(sums[1], 1)
         population, box = self.cloud.population(), box_of(self.grid)
         self._load(control_density(population, statistic, self.activation, self.options.control, box, self.rng))
@@ -156,12 +156,12 @@ def reconstruct_splats(
     started = time.perf_counter()
     if deformation is not None and deformation.is_still:
         deformation = None
-    # rank 0 alone makes the first volume
+    # rank 0 makes the first volume and sends it to the others
     of_reference = (rt, scan, options, seed, initial, deformation)
     scale, population, rng = rt.ranks.bcast(first_cloud(*of_reference) if rt.ranks.rank == 0 else None)
     first_count = population.count
     run = SplatRun(rt, scan, options, scale, population, rng, deformation)
-    record_every = max(1, min(REPORT_EVERY, options.iterations // LEAST_RECORDED))  # so that short runs have a curve too
+    record_every = max(1, min(REPORT_EVERY, options.iterations // LEAST_RECORDED))  # short runs need a curve too
     loop = Loop(run, rt.ranks, report, started, record_every, REPORT_EVERY)
     loop.run(resume)
     cloud = run.present_cloud()
@@ -176,7 +176,7 @@ def reconstruct_splats(
         "ranks": rt.ranks.size,
     }  # fmt: skip
     if isinstance(options.motion, Exact):
-        # segments: the most that a frame has
+        # the number of segments is the largest of all frames
         facts |= {"segments": run.frames.most_cells, "motion_phases": run.phases()}
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
     return Reconstruction(volume, scan.grid, cloud, loop.record, facts, loop.state_if_interrupted())

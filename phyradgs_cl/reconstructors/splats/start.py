@@ -12,7 +12,7 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.splats.step import Scale
 
 log = logging.getLogger(__name__)
-_REFERENCE_PERCENTILE = 99.9  # this percentile of the first volume's values is the unit of density
+_REFERENCE_PERCENTILE = 99.9  # the unit of density is this percentile of the first volume, because its maximum is noise
 
 
 def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:

@@ -23,9 +23,9 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import pad_rows
 
-_PEAK_PERCENTILE = 99.9  # this percentile of the line integrals counts as their peak; the maximum would be noise
-_ROWS = 11  # parameters of a Gaussian: rows of dL/d(parameters)
-_STATISTICS = 2  # rows of a Gaussian's statistics for density control
+_PEAK_PERCENTILE = 99.9  # this percentile of the line integrals is their peak, because their maximum is noise
+_ROWS = 11  # parameters of a Gaussian, which are rows of dL/d(parameters)
+_STATISTICS = 2  # numbers for density control: sum of gradient norms, and number of frames
 _DERIVED = 13  # rows of ``cloud.gradients``: dL/d(parameters), then dL/d(centre on the detector), (u, v)
 Corner = tuple[int, int, int]
 """First voxel (z, y, x) of the random sub-volume whose total variation enters the loss."""

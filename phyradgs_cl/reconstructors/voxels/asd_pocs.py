@@ -79,5 +79,5 @@ def _started(system: System, options: AsdPocsOptions, run: MethodRun) -> AsdPocs
 
 METHOD = voxel_method(
     "asd-pocs", AsdPocsOptions(), _started, frames=2,
-    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # 4 more to compare the lengths of steps
+    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # 4 more for comparing the lengths of steps
 )

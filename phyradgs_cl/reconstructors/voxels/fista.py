@@ -37,17 +37,17 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.algebra import HostSpace
 
 log = logging.getLogger(__name__)
-_VOLUMES = 16  # volumes in memory at one time, with the prior ``dct``
-_FRAMES = 3  # arrays of all frames in memory at one time
-_HELD = 9  # volumes that ``dct`` holds on the device
-_COPIES = 2  # further volumes on the device while a prior maps a volume that is on the host
-# Passes before those on smaller voxels are coarse. Measured in docs/results/settings.md:
+_VOLUMES = 16  # memory in volumes, with the prior ``dct``
+_FRAMES = 3  # memory in arrays of all frames
+_HELD = 9  # of these volumes, ``dct`` itself holds this many on the device
+_COPIES = 2  # if volumes are on the host, the device holds two copies while a prior maps one
+# The passes before those on smaller voxels are coarse. Their settings were measured (docs/results/settings.md).
 _COARSE_PASSES = 0.6  # fraction of all passes that are coarse
 _COARSE_SUBSETS = 1.6  # a coarse pass has this many times ``subsets`` subsets
 _COARSE_TIMES = 1 / 3  # a coarse pass has this fraction of the times per exposure, but two at least
-_FAINTEST = 1e-6  # row sums of AᵀA below this fraction of the largest count as that large in the bound
-# Voxels are divided if slices (y, x) of the grid have at most this many: it is worth its time at 64³, not at 128³. The
-# number of slices does not count, so that all slabs of a scan are reconstructed in the same manner.
+_FAINTEST = 1e-6  # row sums of AᵀA below this fraction of the largest count as this fraction, so that the bound stays useful
+# Voxels are divided if a slice (y, x) has at most this many: it is worth its time at 64³, not at 128³.
+# Slices are not counted, so that thick and thin slabs of one scan are reconstructed in the same manner.
 _MOST_DIVIDED = 90**2
 
 
@@ -105,7 +105,7 @@ class Accelerated(Algorithm):
         self.prior = prior
         self.previous = self.volume
         self.momentum = 1.0  # tₖ
-        self.curvature = (_tight_curvature if has_long_steps else _curvature)(system) or 1.0  # L
+        self.curvature = (_tight_curvature if has_long_steps else _curvature)(system) or 1.0  # L, which bounds ‖AᵀA‖
 
     def start_from(self, volume: Any) -> None:
         self.volume = self.previous = volume

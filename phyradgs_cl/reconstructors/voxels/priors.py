@@ -26,26 +26,26 @@ from phyradgs_cl.reconstructors.result import function_name
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime, Space
 
-# Length of a path over the standard deviation of five positions at even times from its start to its end.
+# The length of a path is this many standard deviations of five positions at even times from its start to its end.
 _SPREAD = 2.83
 _EDGES = 0.09  # error of a ray's path length at the object's edges, over a voxel's side
-_LEAST = 1e-4  # the prior's weight is at least this fraction of the largest value of Aᵀp: it holds for frames without noise
-# The next five are factors on the option ``prior_weight`` in a prior's maps (docs/results/settings.md):
+_LEAST = 1e-4  # the prior's weight is at least this fraction of the largest value of Aᵀp, for frames without noise
+# The next five multiply the option ``prior_weight`` in a prior's maps. They were measured (docs/results/settings.md).
 _TV_ALONE = 1.6  # weight of TV in the prior ``tv``
 _TV_BEFORE_DCT = 0.8  # weight of TV in ``dct``
 _DCT = 1.5  # threshold of the block cosine transforms in ``dct``
 _TV_AT_REST = 0.5  # weight of TV before ridge steps, for scans that stop for each projection
-_DCT_AT_REST = 1.35  # threshold of these before ridge steps, for scans that stop for each projection
-_RIDGE_NOISE = 17.0  # a ridge step assumes this noise, relative to the prior's weight, for fly-scans
-_RIDGE_NOISE_AT_REST = 20.0  # the same for scans that stop for each projection
-_RIDGE_LENGTH = 0.5  # factor on the regulariser's gradient in a ridge step
-_RIDGE_EVERY = 4  # maps of the other prior for each ridge step
-# _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals, and follow the sixth root of the scan's noise.
+_DCT_AT_REST = 1.35  # threshold of the block cosine transforms before ridge steps, for scans that stop
+_RIDGE_NOISE = 17.0  # noise that a ridge step assumes, relative to the prior's weight, for fly-scans
+_RIDGE_NOISE_AT_REST = 20.0  # noise that a ridge step assumes, relative to the prior's weight, for scans that stop
+_RIDGE_LENGTH = 0.5  # length of a ridge step: factor on the regulariser's gradient
+_RIDGE_EVERY = 4  # a ridge step follows each of this many maps of the other prior
+# The two factors for scans that stop hold for this noise of line integrals, and follow the sixth root of the scan's noise.
 _USUAL_NOISE = 0.01
-_LEAST_NOISE = 0.001  # the scan's noise counts as at least this large in that root
-_LEAST_NOISE_SHARE = 0.1  # a ridge step takes at least this as noise_share (``Prior``), for scans without noise
-_SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result; the volume of the passes before has the rest
-_SUBVOXELS_WITH_RIDGE = 0.85  # the same with the prior ``ridge``
+_LEAST_NOISE = 0.001  # but a scan's noise counts as at least this, because some scans have none
+_LEAST_NOISE_SHARE = 0.1  # least noise_share (``Prior``) of a ridge step, because some scans have no noise
+_SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result; the larger voxels of the passes before have the rest
+_SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels with the prior ``ridge``, which leaves less noise
 
 
 @dataclass(frozen=True)
@@ -225,7 +225,7 @@ class ThenRidge(Prior):
         """Joins both maps. noise_factor: the noise that the ridge step assumes, over the part of the weight that is due to
         noise."""
         self.before, self.ridge, self.noise_factor = before, ridge, noise_factor
-        self.maps = 0  # maps since the last step
+        self.maps = 0  # maps since the last ridge step
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         volume = self.before(space, volume, weight, nonnegative=nonnegative)
@@ -262,7 +262,7 @@ class Piccs(Prior):
             self._image_in_space = space.array(np.ascontiguousarray(self.image, np.float32))
         volume = self.plain(space, volume, (1 - self.share) * weight, nonnegative=nonnegative)
         change = space.add(volume, self._image_in_space, -1.0)
-        # a change may be negative; the sum below may not
+        # only the sum below must be nonnegative, not the change
         change = self.change(space, change, self.share * weight, nonnegative=False)
         return space.add(change, self._image_in_space, 1.0, nonnegative=nonnegative)
 

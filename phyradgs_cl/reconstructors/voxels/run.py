@@ -21,7 +21,7 @@ from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ig
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-MOST_ITERATIONS = 1_000_000  # upper limit of the option ``iterations``
+MOST_ITERATIONS = 1_000_000
 # Arrays of all frames that a system holds: measurement, mask, transmission, and what computing a residual takes.
 _SYSTEM_FRAMES = 6
 
@@ -85,7 +85,7 @@ class Algorithm:
             setattr(self, name, self.system.space.array(state[name]))
         for name in self.NUMBERS:
             setattr(self, name, state[name].item())
-        if self.system.intensity is not None:  # A is the same at every volume
+        if self.system.intensity is not None:  # J depends on the volume, A does not
             self.system.expected(self.volume)
 
 

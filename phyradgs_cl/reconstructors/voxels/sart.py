@@ -17,7 +17,7 @@ from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, voxel_method
 from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights, spread_order
 
-_WEIGHT_CACHE_BYTES = 1 << 29  # most bytes of subsets' column weights that are kept: others are computed in every pass
+_WEIGHT_CACHE_BYTES = 1 << 29  # column weights of subsets are kept up to this size; others are computed in every pass
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,9 @@ from phyradgs_cl.runtime import DeviceSpace, HostSpace, MemoryShortage, Runtime,
 
 log = logging.getLogger(__name__)
 
-_SHORTEST_PATH = 0.1  # a ray's path through the volume counts as at least this fraction of the longest path
-_FAINTEST = 1e-6  # path lengths of a voxel's rays add up to at least this fraction of the largest sum, to divide by
-_GROWTH = 1.2  # steps of subsets diverge if a pass leaves more than this many times the least residual so far
+_SHORTEST_PATH = 0.1  # shorter paths of rays count as this fraction of the longest, to divide by
+_FAINTEST = 1e-6  # smaller sums of path lengths over a voxel's rays count as this fraction of the largest, to divide by
+_GROWTH = 1.2  # steps of subsets diverge if a pass leaves this many times the least residual so far
 S = TypeVar("S", bound="SharedOperator")
 
 
@@ -90,7 +90,7 @@ class System:
         if len(operators) < 1 + (self.intensity is not None):
             return self
         for operator in operators:
-            # operators of moving objects, and of intensities, hold volumes and frames of their own
+            # operators of moving objects, and of intensities, need further volumes and frames
             if not isinstance(operator, RayOperator):
                 more_volumes, more_frames = operator.holds
                 volumes, frames = volumes + more_volumes, frames + more_frames
