@@ -117,7 +117,7 @@ class _PanelLines:
     is_parallel: bool
 
     def integrals(self, phantom: EllipsoidPhantom, samples: int) -> Iterator[np.ndarray]:
-        """Yields the line integrals (N, pixels), float32, at one after another of samples² points of each pixel's area."""
+        """Yields the line integrals (N, pixels), float32, at each of samples² points of the pixels' area in turn."""
         shadows = [(body, *self._shadow(np.array(body.ends_mm), body.reach_mm)) for body in phantom.ellipsoids]
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
         for across, along in itertools.product(offsets, offsets):
@@ -156,7 +156,7 @@ class _PanelLines:
         return tuple((v, *both, np.linalg.norm(v, axis=-1)) for v, both in zip(vectors, products, strict=True))
 
     def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:
-        """Returns which lines (n,) may see a body, the first pixel (n,) of it in each, and the number of pixels."""
+        """Returns the lines (n,) that may see a body, the first of its pixels (n,) in each, and their number."""
         (depth, depth_of_source, *_), *axes = self._panel_axes
         lowest, highest = [], []
         for end_mm in ends_mm:
@@ -259,7 +259,7 @@ class BeadProblem(CoarseFrames):
         return blurred.ravel()
 
     def _units(self) -> np.ndarray:
-        """Returns how much (7,) of each number of a placement moves a frame by a pixel at its edge, or doubles the
+        """Returns for each number of a placement (7,) the step that moves a frame by a pixel at its edge, or doubles the
         density."""
         scan = self.scans[0]
         pixel_mm = self.block * min(scan.geometry.pixel_size_mm) / scan.geometry.magnification

@@ -45,7 +45,7 @@ class Parameter:
     is_axial: bool = False
 
     def step(self, scan: Scan) -> float:
-        """Returns half of a central difference, in the field's unit."""
+        """Returns how far a central difference goes to each side, in the field's unit."""
         step = _STEP_PX / self.pixels(scan)
         if self.unit == "deg":
             return min(step, _MOST_TILT_RAD)

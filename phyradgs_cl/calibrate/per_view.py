@@ -143,8 +143,8 @@ class MotionParameters(PerViewParameters):
         return replace(self.still, coefficients=values)
 
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """Returns values (n, K) without what an object at rest explains. In another place, it explains the mean of each
-        kind. Larger or smaller, it explains shifts along x and y that follow the source."""
+        """Returns values (n, K) without what an object at rest explains. An object in another place explains the mean of
+        each kind. A larger or smaller one explains shifts along x and y that follow the source."""
         rest = values - (self.basis @ values).mean(0)
         towards_source = self.circle - (self.basis @ self.circle).mean(0)
         shifts, pattern = self.basis @ rest[:, 3:5], self.basis @ towards_source

@@ -29,7 +29,7 @@ _VOXELS_PER_TIME = 2.0  # an exposure is sampled so often that the volume's rim 
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
-_LEAST_SHARE = 0.1  # a phase is expected to cost at least this fraction of the passes that it may still make
+_LEAST_SHARE = 0.1  # in progress, a phase with passes left counts at least this fraction of their cost
 Passes = tuple[int, float]
 """How many passes may still come at most, and their expected total cost."""
 
@@ -223,8 +223,8 @@ class CoarseProblem(CoarseFrames):
 
 def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:
     """Returns the smoothing across (rows, columns), in pixels, before binning. Rows read one after the other are not
-    smoothed: they see the object at other angles, and would look like a shorter readout. Columns read so shear the image,
-    which smoothing does not change."""
+    smoothed: they see the object at other angles, so smoothing would look like a shorter readout. Columns read so shear the
+    image, which smoothing does not change."""
     if block == 1:
         return 0.0
     is_rolling = scan.shutter.readout_s > 0 and scan.shutter.axis == "rows"

@@ -29,7 +29,7 @@ from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, Paramet
 LEAST_SHARE = 0.2
 # For a known object (beads) less is enough: it has no voxels that explain signals by accident.
 LEAST_SHARE_OF_BEADS = 0.02
-_TINY = 1e-9  # added to the diagonal of a matrix before it is inverted: signals may be linearly dependent
+_TINY = 1e-9  # added to the diagonal of a matrix before its inverse, because signals may be linearly dependent
 _GAUGE_FACTOR = 2.0  # voxels leave some signal of a gauge (``GAUGES``) by error: a parameter must leave twice as much
 _MOST_GAUGE = 0.2  # in a wrong geometry much more of a gauge's signal is left: then this counts
 DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
@@ -85,8 +85,8 @@ class Reduced:
     def shares(self) -> np.ndarray:
         """The fraction (K,) of each parameter's signal that no object explains, 0 to 1.
 
-        This is the smaller of two ratios: of the signal's remaining norm to its whole norm, and of the parameter's
-        certainty, with all others unknown too, to its certainty if the object were known."""
+        This is the smaller of two ratios. One is the signal's norm without what an object explains, over its whole norm. The
+        other is how certain the parameter is among all unknowns, over how certain it would be with a known object."""
         tiny = _TINY * np.eye(len(self.names))
         variance, variance_with_object = (np.diag(np.linalg.inv(gram + tiny)) for gram in (self.gram, self.whole_gram))
         certainty = variance_with_object / variance

@@ -46,9 +46,9 @@ _REPEATED = 0.15  # a repeated frame differs from its predecessor by less than t
 _JUMP = 2.5  # in an order that jumps, such as the golden angle, recorded steps are this many times as large as sorted ones
 _UNLIKE = 2.0  # a repeated frame differs this much, relative to the median, from the view nearest in angle
 _OUTLIER = 4.0  # the residual of an outlier is at least this many times the frames' median
-# Both ends of an arc fit badly without being wrong, and alike: within this factor (right frames 1.4, one odd frame 2.3).
+# Right frames at both ends of an arc may fit badly, but equally: within this factor (they had 1.4, a single odd frame 2.3).
 _ALIKE = 1.7
-# They must also fit better than this fraction of the residual in a random order (right frames 0.2, odd ones mostly 0.3).
+# Such frames must leave less than this fraction of their residual in a random order (right ones 0.2, odd ones mostly 0.3).
 _AT_BOTH_ENDS = 0.25
 _MOST_OUTLIERS = 0.2  # this many outliers, as a fraction of the frames, have a common cause: then none counts as one
 _EXCHANGED = 0.5  # two frames were exchanged if the opposite order leaves less than this fraction of the squares
@@ -129,7 +129,8 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
 
 
 def _unseen(scan: Scan, as_stated: Scan) -> float:
-    """Returns the residual in a random order up to which the frames of a coarse ``scan`` tell nothing about their angles."""
+    """Returns how small a residual in a random order shows that the frames of a coarse ``scan`` tell nothing about their
+    angles."""
     # The smaller one counts: edges raise the estimate from coarse pixels, noise that differs between rays the other one.
     levels = [noise_level(one.projections, np.broadcast_to(one.valid, one.projections.shape)) for one in (scan, as_stated)]
     noise = min(levels[0], levels[1] / float(np.prod(altered_trajectory(scan).blocks)) ** 0.5)
@@ -170,8 +171,8 @@ def _random_order(rt: Runtime, scan: Scan) -> float:
 def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -> Hypothesis | None:
     """Returns the best hypothesis that fits far better than the stated scan; None without one.
 
-    A panel that sees few rays twice fits any geometry. For it, the first hypothesis of other sizes with consistent frames is
-    returned."""
+    If the panel sees few rays twice, frames fit any geometry. Then the first hypothesis of other sizes under which frames
+    are consistent is returned."""
     is_one_sided = hypotheses.stated_redundancy(as_stated) < hypotheses.LEAST_REDUNDANCY
     about_scan = _refined_hypotheses(rt, scan, as_stated, np.inf if is_one_sided else coarse.rough_mean_square)
     if is_one_sided:
@@ -187,7 +188,7 @@ def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -
 def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:
     """Returns the best two hypotheses about the whole scan, with the panel shifted to fit best.
 
-    most: a rough fit may have a mean squared residual of 1.5 times this: an offset between two coarse pixels hides other
+    most: a rough fit may leave 1.5 times this mean squared residual, because an offset between two coarse pixels hides other
     differences. Large shifts count against a hypothesis. Of several hypotheses with one factor of sizes, the best counts."""
     tried: list[tuple[Hypothesis, Scan, axis.AxisShift]] = []
     for hypothesis in hypotheses.of_scan(scan, as_stated):

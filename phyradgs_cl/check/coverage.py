@@ -19,8 +19,8 @@ _FRAMES = 0.1  # the object may touch a side of the panel in this fraction of th
 _COVERED = 0.1  # a column shows the object if more than this fraction of its rows does
 # A unit is wrong if the grid is this many times wider than the panel's field of view, or the object than the grid.
 _ANOTHER_SIZE = 5.0
-NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # in place of a finding's unit: the check ends here
-CUT_OFF = "line integral at the border"  # in place of a finding's unit: the object reaches beyond the panel
+NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # findings with these units end the check
+CUT_OFF = "line integral at the border"  # a finding with this unit says that the object reaches beyond the panel
 _QUESTION = "coverage"
 
 

@@ -16,7 +16,7 @@ from phyradgs_cl.reconstructors.fits.residuals import fit
 from phyradgs_cl.runtime import Runtime
 
 GAIN = "gain drift"
-OVERFLOW = "overflow"  # in place of a finding's unit: the check ends here
+OVERFLOW = "overflow"  # a finding with this unit ends the check
 _SATURATION, _DEAD = "saturation", "dead pixels"
 _MOST_SATURATED = 1e-3  # a larger fraction of saturated pixels is suspicious
 _REPEATS = 3  # a pixel repeats its least value in at least this many frames if it was clipped there

@@ -51,8 +51,8 @@ def has_axis_near_edge(scan: Scan) -> bool:
 
 
 def shifts_for_sense_px(scan: Scan) -> tuple[float, float]:
-    """Returns the limits (lowest, highest) of the panel's shift, in pixels of the recorded scan, when senses of rotation
-    compete.
+    """Returns how far the panel may be shifted, (lowest, highest) in pixels of the recorded scan, to compare senses of
+    rotation.
 
     If the axis is near the panel's edge, the panel may only move towards it. Away from it fewer rays are measured twice, and
     any angles would fit."""
@@ -146,7 +146,7 @@ def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hy
 
 
 def _azimuths(scan: Scan) -> np.ndarray:
-    """Returns each frame's angle (F,) in rad, from the first frame's on. Whole turns are kept if the trajectory states
+    """Returns each frame's angle (F,) in rad relative to the first frame. Whole turns are kept if the trajectory states
     angles."""
     trajectory = variants.altered_trajectory(scan)
     angle_rad = getattr(trajectory.base, "angle_rad", None)

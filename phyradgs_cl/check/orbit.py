@@ -44,7 +44,7 @@ _DEVIATIONS = 4.0  # a shift by this many of its standard deviations is always t
 _BIAS_FULL_TURN = 0.003  # measured error of the axis in scans of a full turn, in coarse pixels
 _BIAS_HALF_TURN = 0.04  # measured error of the axis in coarse pixels, if some rays are measured only once
 _WHOLE_PIXELS = 2  # "ok" needs a tolerance of at most this many pixels, if the shift comes from pixels of full size
-_LEAST_REDUNDANCY = 0.1  # a division by the fraction of columns seen twice, 0 at the panel's edge, takes at least this
+_LEAST_REDUNDANCY = 0.1  # least fraction of columns seen twice, to divide by: it is 0 if the axis is at the panel's edge
 _NO_SIGN = "parallel rays show an object that turns one way and its mirror image that turns the other way alike"
 _SIGN_ADVICE = "look for a feature whose side is known: a mirror image would fit as well"
 _OTHER_SIZES = (0.8, 1.25)  # distances are "ok" if a fan narrower or wider by these factors fits worse
@@ -135,10 +135,10 @@ def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px
 def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisShift, Finding]:
     """Returns the panel's shift along u and the finding about it. shift: found with blocks of ``block`` pixels.
 
-    Coarse pixels cause an error that the bootstrap over frames does not include: it is added to the standard deviation. It
-    is larger where ``scan`` measures fewer rays twice. Opposite views give a shift too, from pixels of full size; the shift
-    with the smaller deviation counts. If less than half of the rays are measured twice, only opposite views may decide: any
-    shift that leaves fewer such rays would fit better."""
+    Coarse pixels cause an error that the bootstrap over frames does not include: it is added to the standard deviation. This
+    error is larger where ``scan`` measures fewer rays twice. Opposite views give a shift too, from pixels of full size; the
+    shift with the smaller deviation counts. If less than half of the rays are measured twice, only opposite views may
+    decide: any shift that leaves fewer such rays would fit better."""
     pitch_mm = scan.geometry.pixel_size_mm[1]
     if has_axis_near_edge(scan):
         shift = shift_by_rays_seen_twice(scan)

@@ -1,4 +1,5 @@
-"""Asks all questions, each after those on whose answers it relies. Errors found are corrected before the next question."""
+"""Asks all questions, in an order in which each may rely on earlier answers. Errors found are corrected for later
+questions."""
 
 import math
 from collections.abc import Callable

@@ -26,8 +26,8 @@ _TIMING, _ANGLES = "timing", "angles"
 _ROUNDING = 1e-3  # relative tolerance: files round times and angles
 _SPEED_TOLERANCE = 0.02  # steps between frames may differ this much from the speed within frames: gantries vary less
 _LONGEST_TABLE = 100.0  # a table that lasts this many times as long as the scan belongs to more than one scan
-_FEW_RAD = math.radians(5)  # if frames see a smaller arc of such a table, its times may be in another unit than theirs
-_MILLISECONDS = (900.0, 3000.0)  # if the table lasts this many times as long, it is in ms and the frames are in s
+_FEW_RAD = math.radians(5)  # if frames see a smaller arc of a long table of angles, its times may be in another unit than theirs
+_MILLISECONDS = (900.0, 3000.0)  # if a table lasts this many times as long as the scan, it is in ms and the frames are in s
 _WIDE = 3.0  # a gap between views is wide above this multiple of the median gap
 _SAME_RAD = 1e-6  # views nearer to each other than this have the same angle
 _TOLERATED_DEG = 1.0  # so much coverage may be missing: nearly parallel rays need half a turn only
@@ -164,7 +164,7 @@ def _steps_deg(scan: Scan, turn_deg: float = 360.0) -> np.ndarray:
 
 
 def _half_fan_deg(scan: Scan, geometry: ConeGeometry) -> float:
-    """Returns half the fan angle in degrees that the grid's box fills, at most half that of the panel."""
+    """Returns half of the fan angle in degrees under which the source sees the grid's box, at most half of the panel's."""
     half_width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2
     panel_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
     radius_mm = max(scan.grid.size_mm[1:]) / 2

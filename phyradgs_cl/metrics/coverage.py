@@ -33,8 +33,8 @@ def coverage(sigma: Array, volume: Array, truth: Array, multiple_95: float) -> d
 
 
 def reliability_png(path: str | Path, sigma: Array, volume: Array, truth: Array, multiple_95: float) -> None:
-    """Draws how large errors are where σ says so: the object's voxels in tenths by σ, and percentiles of the error in each
-    tenth against its mean σ. Right bars lie on the dashed line."""
+    """Draws the size of errors over σ: the object's voxels are divided into tenths by σ, and percentiles of each tenth's
+    errors drawn over its mean σ. Right bars lie on the dashed line."""
     inside = object_voxels(truth)
     size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)
     tenths = [part for part in np.array_split(np.argsort(bar, kind="stable"), 10) if part.size]

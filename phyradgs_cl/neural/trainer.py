@@ -175,7 +175,7 @@ class Trainer:
     def _squares(
         self, source: np.ndarray, direction: np.ndarray, shifts: np.ndarray, measured: np.ndarray, times: int
     ) -> torch.Tensor:
-        """Returns the squared errors (R,) of pixels whose rays (R, s, 3) are those at s of their ``times``."""
+        """Returns the squared errors (R,) of pixels, from rays (R, s, 3) at s of each pixel's ``times``."""
         from_, along, shift = (
             to_tensor(a.reshape(-1, a.shape[-1]).astype(np.float32), self.device)
             for a in (source, direction, shifts)
@@ -322,7 +322,7 @@ def box_span(
 
 
 def sample_shifts(rays: int, samples: int, jitter: str, rng: np.random.Generator) -> np.ndarray:
-    """Returns where each sample lies in its interval, 0 to 1: (R, 1) if all of a ray shift alike, else (R, samples)."""
+    """Returns where samples lie in their intervals, 0 to 1: (R, 1) if all samples of a ray lie alike, else (R, samples)."""
     if jitter == "none":
         return np.full((rays, 1), 0.5, np.float32)
     return rng.random((rays, samples if jitter == "sample" else 1), np.float32)

@@ -49,7 +49,7 @@ class DctProx:
         voxels, by_voxel = (nx, ny, nz), rt.group(on_cpu=16)
         layout = self._shape4, self._pitch
         rt.launch(self._start, voxels, observed, *layout, self._padded, self._excess, group=by_voxel)
-        # Blocks of one launch do not overlap, so results repeat. A GPU has a work-item a block; a CPU's vectors run along x.
+        # Blocks of one launch do not overlap, so results repeat. On a GPU each is a work-item; on a CPU vectors run along x.
         along_x = EDGE if rt.pixel_items else 1
         blocks = ceil_div(nx, EDGE) if rt.pixel_items else 1, ceil_div(ny, EDGE), ceil_div(nz, EDGE)
         for (z, y), x in itertools.product(enumerate(TURNS[turn]), range(along_x)):

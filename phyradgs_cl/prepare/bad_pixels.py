@@ -96,8 +96,8 @@ def _height(frame: np.ndarray) -> np.ndarray:
 
 
 def _opposite(frame: np.ndarray) -> Iterable[np.ndarray]:
-    """Yields, for each of four directions, the lower value (v, u) of the two pixels on opposite sides, 2 pixels away. Those
-    3 away count where they are higher: a near one may be a spark too. The frame is mirrored at the panel's edge."""
+    """Yields, for each of four directions, the lower value (v, u) of the two opposite pixels 2 pixels away. The two 3 pixels
+    away count where they are higher: a near one may be a spark too. The frame is mirrored at the panel's edge."""
     wide = np.pad(frame, _FAR, mode="symmetric")
     rows, columns = frame.shape
 

@@ -220,8 +220,8 @@ def _no_object() -> InputError:
 
 
 def _between(soft_to: float, bone_from: float, volume: np.ndarray) -> np.ndarray:
-    """Returns the attenuation (z, y, x) that bone contributes to voxels that mix it with soft tissue. The fractions of the
-    ``densest`` voxel's attenuation: up to ``soft_to`` nothing is bone, from ``bone_from`` on all is."""
+    """Returns the attenuation (z, y, x) that bone contributes to voxels that mix it with soft tissue. Both limits are
+    fractions of the ``densest`` voxel's attenuation: up to ``soft_to`` nothing is bone, from ``bone_from`` on all is."""
     if soft_to >= bone_from:
         return np.zeros_like(volume)
     soft, bone = soft_to * step.densest(volume), bone_from * step.densest(volume)

@@ -32,10 +32,10 @@ Counts = np.ndarray
 
 
 def flat_correction(way: str) -> ToAttenuation:
-    """Returns the function that converts counts to line integrals for ``read_scan``. way: one of ``WAYS`` to use the flats.
+    """Returns the function that converts counts to line integrals for ``read_scan``. way: how it uses the flats (``WAYS``).
 
-    It takes data (F, v, u), image_key (F,) and the quantity, and returns line integrals (P, v, u) and bad pixels. It raises
-    InputError for too few flats and, with "time" or "pca", for other quantities than counts."""
+    The function takes data (F, v, u), image_key (F,) and the quantity, and returns line integrals (P, v, u) and bad pixels.
+    It raises InputError for too few flats and, with "time" or "pca", for other quantities than counts."""
     checks.one_of("flats", way, WAYS)
     return counts_to_attenuation if way == "mean" else partial(_with_changing_flats, way)
 

@@ -68,8 +68,8 @@ class Strength:
 def _strength(means: np.ndarray, axis_column: float) -> Strength:
     """Measures the pattern that all views share and no object can cause, from the means (2, v, u) of two sets of views.
 
-    Columns minus their mirror images cancel the object, and second differences along rows what is left of it. The covariance
-    of both sets is the pattern's variance."""
+    Subtracting its mirror image from each column cancels the object, and second differences along rows remove what is left
+    of it. The covariance of both sets is the pattern's variance."""
     one, other = (_rough(_antisymmetric(mean, axis_column)) for mean in means)
     # the mean of half the views has twice the noise variance of the mean of all; the difference of two halves, four times
     noise, rows = robust_deviation(one - other) ** 2 / 4, len(one) // 2
@@ -80,8 +80,7 @@ def _strength(means: np.ndarray, axis_column: float) -> Strength:
 
 
 def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
-    """Returns the scan without rings and single wrong gains, unchanged where nothing is certain; and numbers for the
-    record."""
+    """Returns the scan without rings and single wrong gains, unchanged where nothing is certain; and the step's numbers."""
     frames = unmasked_frames(scan)
     if options.window > frames.shape[2]:
         expected = f"no more than the panel's {frames.shape[2]} columns"
@@ -207,7 +206,7 @@ def _rough(image: np.ndarray) -> np.ndarray:
 
 
 def _covariance(one: np.ndarray, other: np.ndarray) -> float:
-    """Returns a robust covariance, to which the few pixels at edges do not add (Gnanadesikan and Kettenring, Biometrics
+    """Returns a robust covariance, which the few pixels at edges hardly change (Gnanadesikan and Kettenring, Biometrics
     1972)."""
     return (robust_deviation(one + other) ** 2 - robust_deviation(one - other) ** 2) / 4
 

@@ -72,8 +72,8 @@ def remove_scatter(frames: np.ndarray, kernel: Kernel) -> np.ndarray:
 
 def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kernel:
     """Fits the kernel, by non-negative least squares, to the transmission above 1 in ``air``, bool (F, v, u), of line
-    integrals (F, v, u). A ``reach`` other than 0 fixes its width. The light may vary between frames; its mean is that of the
-    flats."""
+    integrals (F, v, u). A ``reach`` other than 0 fixes its width. The light may vary between frames; on average it is that
+    of the flats."""
     numbers = _some(len(frames))
     recorded, where = np.exp(-frames[numbers].astype(np.float64)), air[numbers]
     terms = list(itertools.product((reach,) if reach > 0 else _REACHES, _POWERS))
@@ -91,8 +91,8 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
 
 
 def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
-    """Returns the kernel made as strong as leaves the least ``unexplained``; the kernel itself where that gains little.
-    frames: line integrals (F, v, u), blurred by ``blur`` pixels for a coarse model. Each frame's ``air`` is shifted to 0."""
+    """Returns the kernel with the strength that leaves the least ``unexplained``, or unchanged if that gains little. frames:
+    line integrals (F, v, u), blurred by ``blur`` pixels for a coarse model. Each frame's ``air`` is shifted to 0."""
     if not kernel:
         return kernel
     coarse = step.smooth(frames, blur)

@@ -23,8 +23,8 @@ class Model:
     """Reconstructs a scan and projects the volume again, on its grid: for steps that need to know the object.
 
     volume: frames (F, v, u) to a volume (z, y, x) in 1/mm. frames: a volume to frames. regularised: as volume, but slower
-    and with a weak total-variation prior. shadow: returns the pixels, bool (F, v, u), whose rays meet the true ones of the
-    voxels (z, y, x) at any time of the exposure."""
+    and with a weak total-variation prior. shadow: from voxels, bool (z, y, x), the pixels, bool (F, v, u), whose rays meet
+    them at any time of the exposure."""
 
     volume: Callable[[np.ndarray], np.ndarray]
     frames: Callable[[np.ndarray], np.ndarray]
@@ -101,11 +101,12 @@ def densest(volume: np.ndarray) -> float:
 
 
 def unexplained(frames: np.ndarray, volume: np.ndarray, inside: np.ndarray, model: Model) -> float:
-    """Returns the relative RMS by which line integrals (F, v, u) differ from their own reprojection, after blurring.
+    """Returns the relative RMS by which line integrals (F, v, u) differ from the projection of their ``volume``, after
+    blurring.
 
-    Only voxels ``inside`` the object, bool (z, y, x), are reprojected from ``volume``. The grid and the number of views
-    cause a difference too: it is seen when the reprojection is itself reconstructed and reprojected, and subtracted. What
-    remains comes from hardening, scatter and the like."""
+    Only voxels ``inside`` the object, bool (z, y, x), are projected. The grid and the number of views cause a difference
+    too: it is measured by reconstructing and projecting the projection itself, and subtracted. What remains is hardening,
+    scatter and the like."""
 
     def reprojected(values: np.ndarray) -> np.ndarray:
         return model.frames(np.where(inside, np.maximum(values, 0), 0).astype(np.float32))

@@ -16,7 +16,7 @@ RUN, _CHECKSUM = "run", "checksum"
 """Names of the arrays that hold the identity of the run, as JSON, and the checksum of the other arrays."""
 _REMEDY = "start without --resume"
 _MOST_DIFFERENCES = 3  # an error names at most this many differences between two runs
-_LONGEST_NAME = 60  # and cuts their names after this many characters
+_LONGEST_NAME = 60  # in an error, names of differences are cut after this many characters
 
 
 def with_identity(state: State, identity: Mapping[str, Any]) -> State:

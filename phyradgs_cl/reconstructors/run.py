@@ -44,7 +44,7 @@ from phyradgs_cl.text import each_warning_once
 
 log = logging.getLogger(__name__)
 
-# Memory of voxel methods, in volumes, with two of the intensity model (docs/large.md).
+# Most volumes that each voxel method holds in memory, two of them for the intensity model (docs/large.md).
 # Besides, they hold _STACKS arrays of all frames, and need one buffer of _ONE_BUFFER volumes.
 _HELD = {"sirt": 8, "sart": 28, "os-sart": 28, "cgls": 11, "asd-pocs": 32, "fista-tv": 16}
 _HELD |= {"fista": 20, "moving": 28}

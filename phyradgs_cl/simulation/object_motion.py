@@ -31,7 +31,7 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class ObjectMotion(checks.Checked):
-    """A motion of the object that is known, by a preset.
+    """A known motion of the object, by a preset.
 
     kind: "breathing" lowers the object, most at its top and not at its base, and moves it along y a little later. "drying"
     lowers its top and shrinks it sideways, and never returns. "sliding" moves a cylinder about the z axis up and down in

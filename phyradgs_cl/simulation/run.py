@@ -51,8 +51,8 @@ _DATA_SHEET = ("first", "fps", "readout_ms")
 class SimulationOptions:
     """Options of a simulation. ``peak`` > 0 scales attenuation so that the largest line integral is ``peak``.
 
-    - time_samples: at how many times a line's exposure is sampled, at the middles of equal parts. With 0 they are so many
-      that the volume's edge and a moving object move at most half a voxel of ``grid`` between two (docs/mathematics.md).
+    - time_samples: at how many times a line's exposure is sampled, in the middles of equal parts. 0: between two times, the
+      volume's edge and a moving object move at most half a voxel of ``grid`` (docs/mathematics.md).
     - dose: photons of a pixel without object, on a line that sees the whole pulse.
     - lag (λ), rings, sparks, drift, scatter: as in detector/effects.py; 0 is without.
     - kvp: as in detector/attenuation.py; 0 is a beam of one energy.
@@ -272,7 +272,7 @@ def _gating(scan: Scan, scene: Scene) -> Gating:
 
 
 def default_time_samples(protocol: Protocol, grid: Grid, fastest_mm_per_s: float = 0.0) -> int:
-    """Returns the number of time samples per line, 8 to 128: between two, the volume's edge, and the fastest part of a
+    """Returns the number of time samples per line, 8 to 128, between which the volume's edge, and the fastest part of a
     moving object, go at most half a voxel."""
     path_mm = np.deg2rad(protocol.exposure_deg) * max(grid.size_mm[1:]) / 2
     path_mm = max(path_mm, fastest_mm_per_s * protocol.exposure_s)

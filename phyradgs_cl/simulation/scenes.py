@@ -28,7 +28,7 @@ Moves = Callable[[Grid], Deformation]
 class Scene:
     """An object to scan: a source of frames, the grid to reconstruct, and the truth (nz, ny, nx) on it.
 
-    - source_shape: voxels (z, y, x) of the volume of a user that is projected. bone: makes the source of its dense part.
+    - source_shape: voxels (z, y, x) of a user's volume that is projected. bone: makes the source of its dense part.
     - deformation: how the object moves. state: returns the truth of a moving object at a time in s.
     - period_s: the period of a phantom whose parts move by themselves.
     - fastest_mm_per_s: a bound on the speed of every part."""

@@ -142,9 +142,9 @@ def on_panel(geometry: Geometry, grid: Grid, pixel_samples: int, make: Callable[
 class DeformedSource(FrameSource):
     """Projects a deforming volume (nz, ny, nx) in 1/mm on ``grid``.
 
-    The volume is deformed once for each distinct set of the fields' weights φ_r, over all frames, and weights are rounded so
-    that time cells share sets. Rounding displaces no point by more than ``NEAREST`` of ``voxel_mm``. A frame at a single
-    time is not rounded. make: returns the source of a volume at rest."""
+    A state of the object is a set of the fields' weights φ_r, for which the volume is deformed once. Weights are rounded so
+    that many time cells, also of other frames, share a state. Rounding displaces no point by more than ``NEAREST`` of
+    ``voxel_mm``. A frame at a single time is not rounded. make: returns the source of a volume at rest."""
 
     def __init__(
         self, rt: Runtime, volume: np.ndarray, grid: Grid, deformation: Deformation, voxel_mm: float,

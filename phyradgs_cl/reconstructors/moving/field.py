@@ -27,7 +27,7 @@ _ROUGHNESS = 1e-2  # β, the penalty on the weights' roughness in time, relative
 _SHORTER = (1.0, 0.5, 0.25)  # fractions of a step, tried in turn until one lowers the misfit
 _LEAST_DETERMINANT = 0.1  # a step may lower det(I + ∂w/∂y) to this: at 0 matter folds
 _LEAST_VOXELS = 1.0  # added to distances between states, so that even a field of zeros has several states
-_SUPPORT = 4  # a cubic spline in time is not 0 over this many intervals
+_SUPPORT = 4  # a cubic spline in time extends over this many intervals between knots
 
 
 @dataclass(frozen=True, eq=False)

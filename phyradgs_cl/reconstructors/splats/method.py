@@ -123,7 +123,7 @@ class SplatRun:
         }  # fmt: skip
 
     def restore(self, state: State) -> None:
-        """Continues from ``state``, on any number of ranks up to the frames of a batch."""
+        """Continues from ``state``, with any number of ranks that a batch has frames for."""
         self.iteration, self.batch = int(state["iteration"]), int(state["batch"])
         self.sharing = sharing_of(self.rt.ranks, self.batch)
         self.rng.bit_generator.state = json.loads(str(state["rng"]))
