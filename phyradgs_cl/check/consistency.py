@@ -129,7 +129,7 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
 
 
 def _unseen(scan: Scan, as_stated: Scan) -> float:
-    """Returns how small a residual in a random order shows that the frames of a coarse ``scan`` tell nothing about their
+    """Returns how small a residual in a random order shows that frames of a coarse ``scan`` tell nothing about their
     angles."""
     # The smaller one counts: edges raise the estimate from coarse pixels, noise that differs between rays the other one.
     levels = [noise_level(one.projections, np.broadcast_to(one.valid, one.projections.shape)) for one in (scan, as_stated)]

@@ -1,5 +1,4 @@
-"""Asks all questions, in an order in which each may rely on earlier answers. Errors found are corrected for later
-questions."""
+"""Asks all questions, in an order in which each may rely on earlier answers. Errors found are corrected for later ones."""
 
 import math
 from collections.abc import Callable

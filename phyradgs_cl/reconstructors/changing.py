@@ -48,8 +48,8 @@ class ChangingOptions(IterativeOptions):
 
 
 def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the states of the object, and as the volume their mean, in 1/mm. ``arguments``: further ones of ``MethodRun``;
-    no seed is used."""
+    """Returns the states of the object in 1/mm, and their mean as the volume. ``arguments``: as in ``MethodRun``; no seed is
+    used."""
     times_s = state_times_s(scan, options.states)
     shape = (len(times_s), *scan.grid.shape)
     run = MethodRun(scan, options, rt, state_times_s=times_s, **arguments)

@@ -209,7 +209,7 @@ ProgressReport = Callable[[Progress], None]
 
 
 class Report:
-    """Passes a method's progress on to listeners, through the hooks of the stages that are under way."""
+    """Passes a method's progress on to listeners. Stages that are under way may change it, by hooks."""
 
     def __init__(self, *listeners: ProgressReport) -> None:
         self.listeners = listeners

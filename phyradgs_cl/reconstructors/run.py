@@ -128,7 +128,7 @@ class _Prepared:
         self.box = None if preprocessing.margin_mm is None else preprocessing.of(scan.grid)
 
     def shown(self, progress: Progress) -> Progress:
-        """Adds the run's identity to the states that a report gives, adds frames, and cuts the margin off its volumes."""
+        """Returns a report with the run's identity in its states, with frames, and with volumes without the margin."""
         progress = progress.mapped(state=lambda state: with_identity(state, self.identity()))
         if progress.volume is not None and self.rt.ranks.size == 1:  # several ranks can only project together
             whole = cache(progress.volume)

@@ -194,8 +194,8 @@ def fdk_volume(
 def _seen(
     pose: np.ndarray, frames: np.ndarray, axis: str, is_parallel: bool
 ) -> tuple[np.ndarray, np.ndarray, weights.Fan, Arc]:
-    """Returns the poses, broadcast to all pixels; the same rotated back to one angle; their fan; and the arc of all views.
-    Raises InputError for a source on the rotation axis."""
+    """Returns the poses in a form that broadcasts to pixels, these rotated back to one angle, their fan, and the arc of all
+    views. Raises InputError for a source on the rotation axis."""
     by_pixel = pose_of_pixels(pose, axis)
     if np.any(np.hypot(by_pixel[..., 0], by_pixel[..., 1]) <= 0):
         raise InputError("poses", "a source on the rotation axis", "a source beside it")

@@ -61,9 +61,9 @@ def seen_volume(
     """Returns the volume (nz, ny, nx) of filtered frames (F, rows, columns) in which every voxel counts the views that see
     it.
 
-    pose (F, 12) or (F, lines, 12) mm. counted: gives a view's weights (rows, columns), which divide a ray with its opposite.
-    Both backprojections weight views by the angle between them; ``backproject_seen`` divides by the distance once, not
-    twice."""
+    pose (F, 12) or (F, lines, 12) mm. counted: gives a view's weights (rows, columns), which each ray shares with its
+    opposite. Both backprojections weight views by the angle between them; ``backproject_seen`` divides by the distance once,
+    not twice."""
     by_pixel, shape = pose_of_pixels(pose, axis), frames.shape[1:]
     angle_rad, pace = _directions(by_pixel[:, [by_pixel.shape[1] // 2]], shape, is_parallel)
     turn_rad = 2 * np.pi if is_displaced else np.pi  # a centred panel measures every ray in half a turn
@@ -92,8 +92,8 @@ def seen_volume(
 
 
 def _directions(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles about z (F, 1, columns) of the rays of poses (F, 1, c, 12). Also returns how far each ray turns,
-    about a voxel on the panel, per radian of the source."""
+    """Returns the angles about z (F, 1, columns) of the rays of poses (F, 1, c, 12). Also returns, for voxels on the panel,
+    how far their rays turn per radian of the source."""
     rays = weights.pixel_rays(pose, np.array([shape[0] // 2]), np.arange(shape[1]))
     if is_parallel:
         angle_rad = np.broadcast_to(np.arctan2(pose[..., 1], pose[..., 0]), rays.shape[:-1])

@@ -59,8 +59,8 @@ class Arc:
     filled_rad: float = 0.0
 
     def unseen_rad(self, fan_rad: float = 0.0) -> float:
-        """Returns from how large an angle, of half a turn, rays are measured from neither side. The largest counts, for rays
-        at fan angles −fan_rad, 0 and fan_rad."""
+        """Returns the angle, of half a turn, over which rays are measured from neither side: the largest for rays at fan
+        angles −fan_rad, 0 and fan_rad."""
         at_rad = np.linspace(0, 2 * np.pi, 1440, endpoint=False)
         fans = (-fan_rad, 0.0, fan_rad)
         shares = [(self.covers(at_rad) | self.covers(at_rad + np.pi + 2 * fan)).mean() for fan in fans]
@@ -211,7 +211,7 @@ def ray_weight(
 def opposite_weight(
     canonical: np.ndarray, shape: tuple[int, int], arc: Arc, is_parallel: bool
 ) -> Callable[[int], np.ndarray | float]:
-    """Returns a function from a view's index to the weights (rows, columns) that divide each ray with its opposite."""
+    """Returns a function from a view's index to weights (rows, columns): each ray shares its weight with its opposite."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
 
     def weight(view: int) -> np.ndarray | float:
@@ -236,8 +236,8 @@ def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc, is_parallel:
     """Returns the fan angle (rows, columns) on which a ray's opposite depends. In a parallel beam's short scan it is 0, and
     in its full turn a distance from the axis.
 
-    If columns are read out one after the other, each column has its own arc in a short scan, and a ray's opposite lies on
-    another column. So the two columns' angles behind the frame's, which is 0 here, add up."""
+    If columns are read out one after the other, a short scan begins at another angle for each column, and a ray's opposite
+    lies on another column. So the angles of both columns, relative to the frame's, which is 0 here, add up."""
     angle_rad = weights.fan_angle(pose, rays, is_parallel)
     if is_parallel and not arc.is_full:
         angle_rad = np.zeros_like(angle_rad)

@@ -268,7 +268,7 @@ class _Field:
 
 
 def moving(scan: Scan, options: MovingOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the reference volume in 1/mm, with the object's ``deformation``. ``arguments``: others of ``MethodRun``."""
+    """Returns the reference volume in 1/mm, with the object's ``deformation``. ``arguments``: as in ``MethodRun``."""
     run, one = MethodRun(scan, options, rt, **arguments), _Field()
     if run.resume is not None:
         run = replace(run, resume=one.restore(run.resume))

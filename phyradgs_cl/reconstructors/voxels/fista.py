@@ -112,7 +112,7 @@ class Accelerated(Algorithm):
 
     @property
     def next_momentum(self) -> float:
-        """The momentum's number tₖ₊₁ of Eq. 4.2."""
+        """The number tₖ₊₁ of Eq. 4.2, from which the momentum follows."""
         return float((1 + np.sqrt(1 + 4 * self.momentum**2)) / 2)
 
     @property
@@ -194,7 +194,7 @@ class Fista(Accelerated):
 
 
 def fista(scan: Scan, options: FistaOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the regularised volume of a scan in 1/mm. ``arguments``: others of ``MethodRun``; no seed is used."""
+    """Returns the regularised volume of a scan in 1/mm. ``arguments``: as in ``MethodRun``; no seed is used."""
     run = MethodRun(scan, options, rt, **arguments)
     return run.result("fista", Stages(fista_stages(run, lambda: run), run))
 
