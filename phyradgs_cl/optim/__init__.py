@@ -177,7 +177,7 @@ def control_density(
     changed = population.raw.copy()
     changed[:, cloned] = activation.invert(rows[:, cloned])
     new_raw = activation.invert(np.concatenate([copies, first, second], axis=1))
-    # Two children replace a Gaussian that is split. A cloned Gaussian stays beside its copy.
+    # Two children replace a Gaussian that is split. A cloned Gaussian stays, and gets a copy.
     remaining = np.setdiff1d(np.arange(population.count), split)
     raw = np.concatenate([changed[:, remaining], new_raw], axis=1)
     # New Gaussians have no earlier gradients, so their moments are 0.

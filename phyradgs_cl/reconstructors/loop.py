@@ -1,6 +1,6 @@
 """The loop of every iterative method: progress, convergence record, Ctrl-C, stopping, resuming.
 
-A method is a class with the attributes of ``Stepwise``. ``Loop`` runs it, in one process or in several that work alike."""
+A method is a class with the attributes of ``Stepwise``. ``Loop`` runs it, in one process or in ranks that do the same."""
 
 import json
 import time

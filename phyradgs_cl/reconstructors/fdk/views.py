@@ -332,7 +332,7 @@ def _check_orbit(pose: np.ndarray) -> None:
 def warn_if_incomplete(
     arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: Grid, is_parallel: bool = False
 ) -> None:
-    """Logs what the views do not cover, in one line each."""
+    """Logs what the views do not cover, in a line each."""
     name = "FBP" if is_parallel else "FDK"
     if np.unique(arc.progress_rad).size == 1:
         log.warning("%s: all views are from one angle: the volume is a single backprojection", name)
