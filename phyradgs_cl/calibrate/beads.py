@@ -26,7 +26,7 @@ DENSITY = 6  # a placement is a turn (rotation vector, rad), a shift (mm) and, a
 _MARGIN = 1.2  # an oblique panel widens a bead's shadow, at most by this factor
 # An exposure is sampled so often that the phantom's edge moves by a pixel between two times, within these limits.
 _FEWEST_TIMES, _MOST_TIMES = 6, 24
-_FEWEST_RAYS = 2  # rays along each side of a pixel (or block of pixels), and along a bead's radius, at least
+_FEWEST_RAYS = 2  # fewest rays along each side of a pixel, and along a bead's radius: sharp edges need several
 _MOST_RAYS = 6  # rays along each side of a pixel, at most: the time grows with their square
 # Blur of compared frames, in pixels: without it, differences of sharp edges would show single rays, half a pixel apart.
 _BLUR_PX = 0.8

@@ -14,10 +14,10 @@ from phyradgs_cl.removed import removal
 from phyradgs_cl.text import suggest_name
 
 _STEP_PX = 0.25  # signals are central differences, for which the image's edge moves by this much to each side
-_TIMING_STEP = 0.1  # but a time is changed by at most this fraction of itself
+_TIMING_STEP = 0.1  # a time is changed by at most this fraction of itself in a central difference
 _LARGEST_CUT = 0.7  # the search shortens a time by at most this fraction, so that it stays above 0
-_MOST_TILT_RAD = math.radians(2.0)  # and an angle by at most this
-_SMALL_MISMATCH = 1.3  # the signal changes sign after half a turn, which errors of voxels do not: they disturb it less
+_MOST_TILT_RAD = math.radians(2.0)  # an angle is changed by at most this in a central difference
+_SMALL_MISMATCH = 1.3  # errors of voxels do not change sign after half a turn, so they hardly disturb signals that do
 # An angle with a larger standard deviation counts as undetermined, because sines are not linear so far.
 _LEAST_KNOWN_RAD = math.radians(10.0)
 _DEGREES = math.degrees(1.0)

@@ -66,7 +66,7 @@ _LEAST_EXPLAINED = 0.3
 _ORDER_ERRORS = 4.0  # a direction of readout must be better by this many standard errors, as in ``check``
 _ORDER_RATIO = 1.04  # the squared residuals of both directions must differ by this factor, as in ``check``
 _BEYOND = 1e6  # an encoder table is continued by this many frame times: first steps of the search may be very wrong
-# A stage is expected to cost this fraction of its most: few parameters are determined, and steps become small early.
+# Progress expects a stage to cost this fraction of its most: few parameters are determined, and steps soon become small.
 _EXPECTED_SHARE = 0.25
 
 

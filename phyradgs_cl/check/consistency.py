@@ -35,13 +35,13 @@ _CLEAR = 0.5  # a hypothesis must leave less than this fraction of the stated sc
 _NEARLY = 1.5  # a rough fit is refined unless another one is better by this factor in squares
 _ERRORS = 4.0  # a hypothesis must be better than the stated scan by this many standard errors
 # The frames look the same from every angle if a random order leaves a residual below _SAME or _NOISY.
-_SAME = 0.03  # relative to the standard deviation of the line integrals
-_NOISY = 1.6  # relative to the noise: round objects had up to 1.3, others 2.3 or more
+_SAME = 0.03  # residual over the standard deviation of the line integrals
+_NOISY = 1.6  # residual over the noise: round objects had up to 1.3, others 2.3 or more
 _MOST_REFINED = 2  # only the best hypotheses get a refined shift of the panel, which takes time
 _SHIFT_PENALTY = 1.5  # a hypothesis pays this factor for each coarse pixel of shift: stated offsets are mostly right
 # A frame is odd if its mean line integral differs from its neighbours' by more than _DEVIATIONS and _LEAST_CHANGE.
-_DEVIATIONS = 12.0  # in robust standard deviations of these differences over all frames
-_LEAST_CHANGE = 0.75  # relative to the frames' median mean line integral
+_DEVIATIONS = 12.0  # difference in robust standard deviations of all frames' differences
+_LEAST_CHANGE = 0.75  # difference over the frames' median mean line integral
 _REPEATED = 0.15  # a repeated frame differs from its predecessor by less than this fraction of what neighbouring frames do
 _JUMP = 2.5  # in an order that jumps, such as the golden angle, recorded steps are this many times as large as sorted ones
 _UNLIKE = 2.0  # a repeated frame differs this much, relative to the median, from the view nearest in angle

@@ -20,7 +20,7 @@ _ORDER_RATIO = 1.04
 _OTHER_RATIO = 1.5  # another readout axis or time must fit better than the stated one by this factor in squares
 # A gantry at rest must fit better by this factor: a model without blur always fits better, above all with few views.
 _REST_RATIO = 2.0
-_AS_GOOD = 1.15  # further readouts are named if their squared residuals are at most this many times the best one's
+_AS_GOOD = 1.15  # readouts that leave up to this many times the best one's squared residual are named too
 _READOUT_SHARE = 0.86  # if no readout time is stated, this fraction of the time between frames is tried
 _OTHER_WAY, _AT_REST = "the other way", "all at once, the gantry at rest"
 _NEEDED_RATIO = {_OTHER_WAY: _ORDER_RATIO, _AT_REST: _REST_RATIO}

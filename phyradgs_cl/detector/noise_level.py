@@ -23,7 +23,7 @@ LEAST_SHARE = 1e-3
 _TOUCHING = 0.5  # saturation covers areas: pixels at an extreme are clipped if most of them have four neighbours at it
 _SAME = 1e-3  # flats and the largest count that differ by less than this fraction are equally bright: such pixels may be air
 _MOST_FRAMES = 8  # noise beside saturated pixels is sought in at most this many frames
-_LONGEST_EDGE = 1024  # it is sought in the middle of large frames, up to this many pixels along a side
+_LONGEST_EDGE = 1024  # of larger frames only the middle, this many pixels a side, is searched for noise
 _ROUNDING = 0.5  # rounding of counts alone gives estimates of noise up to this
 _RELATIVE = 2e-5  # estimates of noise up to this fraction of the largest count are no noise
 # Noise estimated along both axes is white if it is at least this fraction of noise estimated along rows; else structure.

@@ -22,7 +22,7 @@ from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 _ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # each axis of a volume (z, y, x) comes last once: segments run along the last
 _WIDER = 4  # feed-forward layers of a transformer are this many times as wide as its other layers
 _FACTORS = (1, 2_654_435_761, 805_459_861)  # factors of x, y, z in the hash (Müller et al., Eq. 4)
-_FIRST_FEATURES = 1e-4  # initial features are random and uniform up to this size (Müller et al., NAF)
+_FIRST_FEATURES = 1e-4  # initial features are random, between ± this (Müller et al., NAF)
 
 
 def torch_device(name: str) -> torch.device:

@@ -39,7 +39,7 @@ class Trainer:
         self.scan, self.options, self.device, self.iterations = scan, options, device, options.iterations
         self.field = field.to(device)
         self.density_per_mm = density_per_mm
-        self.unit = density_per_mm * scan.grid.half_longest_mm  # unit of line integrals
+        self.unit = density_per_mm * scan.grid.half_longest_mm  # line integrals are divided by this
         self.rng = np.random.default_rng(seed)
         motion = options.motion
         if type(motion) is PerRow:  # rays are evaluated one by one: times that lines share would save nothing
@@ -100,7 +100,6 @@ class Trainer:
         return values * np.float32(self.density_per_mm), grid
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the arrays on which the next step depends, and the losses of the pass so far."""
         moments = [self._flat([self._moments(p)[k] for p in self.field.parameters()]) for k in range(2)]
         return {
             "parameters": self._flat([p.detach() for p in self.field.parameters()]),

@@ -19,8 +19,8 @@ from phyradgs_cl.runtime.layout import GUARD
 
 WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
 WINDOW /= WINDOW.sum()
-C1 = 0.01**2  # SSIM adds it to products and squares of means, for images with values from 0 to 1
-C2 = 0.03**2  # SSIM adds it to covariances and variances, for images with values from 0 to 1
+C1 = 0.01**2  # keeps SSIM finite where means are 0; for images with values from 0 to 1
+C2 = 0.03**2  # keeps SSIM finite where variances are 0; for images with values from 0 to 1
 
 
 class ImageLoss:

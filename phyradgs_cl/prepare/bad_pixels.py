@@ -18,8 +18,8 @@ from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames, with_mas
 _AROUND = np.ones((3, 3), bool)
 _NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 _SHARPNESS = 0.3  # a spark is brighter than the pixels on both sides, in every direction, by this fraction of its height
-_NEAR, _FAR = 2, 3  # distances of these pixels; the far ones count if a near one belongs to another spark
-_MOVED = 5  # the next frame may show an object's gap moved by 2 pixels: it is sought in a square of this side
+_NEAR, _FAR = 2, 3  # a spark's surroundings are 2 pixels away, or 3 where another spark is near
+_MOVED = 5  # the next frame may show a gap of the object moved by 2 pixels, so a square of this side is searched
 _SHOWN_AGAIN = 0.5  # a gap of the object is at least this fraction as high in the frames before and after; a spark is gone
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 LEAST_FRAMES = 5  # in fewer frames a sound pixel may look dead by chance

@@ -30,13 +30,13 @@ _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie beh
 _FITTED_FRAMES = 24  # the fit uses at most this many frames, evenly spread, to save time
 _USUAL_REACH = 0.18  # where the user states to_primary alone: spread (std) of scatter over the panel's longer side
 _HEIGHT_STEP = 1.25  # the kernel is made stronger by this factor, time after time
-_MOST_STEPS = 8  # at most this often: it is then 6 times as strong as fitted
+_MOST_STEPS = 8  # at most this many steps make the kernel stronger, up to 6 times the fitted one
 _TRIALS = 6  # most strengths tried afterwards, between the neighbours of the best one
 # The stronger kernel must leave less than this fraction of what the fitted one leaves unexplained; else the fit stands.
 _BETTER = 0.65
-_AS_WELL = 1.05  # kernels are made no stronger once they leave this many times the least unexplained rest
+_AS_WELL = 1.05  # no stronger kernel is tried once a kernel leaves this many times the least unexplained rest
 _LARGEST_HEIGHT = 20.0  # no kernel for a stated to_primary is stronger than this
-_BISECTIONS = 20  # the strength for a stated to_primary is then exact to 2e-5
+_BISECTIONS = 20  # halvings that give the strength for a stated to_primary to 2e-5
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from phyradgs_cl.reconstructors.voxels.priors import PriorWeight, TvPrior, axis_
 from phyradgs_cl.reconstructors.voxels.run import Iterations, IterativeOptions, MethodRun
 from phyradgs_cl.runtime import Runtime
 
-_STACKS = 18  # memory that the method needs, in arrays of all states' volumes
-_FRAMES = 3  # and in arrays of all frames
+_STACKS = 18  # memory of the method in arrays of all states' volumes
+_FRAMES = 3  # memory of the method in arrays of all frames
 
 
 @dataclass(frozen=True)

@@ -27,10 +27,10 @@ _ALL = motions_for(RAYS, SPLATS)  # for the user's own methods
 LARGEST_SEED = 2**63
 _DECIMALS = 6  # decimals of mm and s in a run's identity: a scan that was stored and read is still the same scan
 _SUBJECT = "--object-motion"
-_MOST_VOXELS = 24  # a deformation is checked on at most this many voxels a side: it is smooth
+_MOST_VOXELS = 24  # deformations are smooth, so a grid of this many voxels a side is enough to check one
 _LEAST_DETERMINANT = 0.05  # a deformation with a smaller det(I + ∂w/∂y) is refused: at 0 matter folds
 _LEAST_COVERED = 0.5  # a deformation that covers less than this fraction of the scan's time is refused
-_MOSTLY_COVERED = 0.98  # one that covers less than this fraction causes a warning
+_MOSTLY_COVERED = 0.98  # a deformation that covers less than this fraction causes a warning
 log = logging.getLogger(__name__)
 
 
@@ -160,7 +160,7 @@ def _converted(current: Any, value: Any, subject: str) -> Any:
         if not isinstance(value, (list, tuple)) or len(value) != len(current):
             raise InputError(subject, checks.short_repr(value), f"a list of {len(current)} numbers")
         return tuple(_converted(c, v, subject) for c, v in zip(current, value, strict=True))
-    if type(current) not in _EXPECTED:  # a type that only a user's own options have
+    if type(current) not in _EXPECTED:  # only a user's own options have other types: they check themselves
         return value
     expected, fits = _EXPECTED[type(current)]
     if not fits(value):

@@ -19,7 +19,7 @@ from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.runtime import Runtime
 
 TIMES_PER_LINE = 16  # a line is projected at this many times of its exposure: the error is then far below the noise
-_HOLDOUT_SEED = 20  # one seed for all runs: they hold out the same pixels
+_HOLDOUT_SEED = 20  # all runs hold out the same pixels, by this seed
 FRAMES_AT_A_TIME = 8  # frames are projected in groups of at most this many, to limit memory
 Image = NDArray[np.float32]
 

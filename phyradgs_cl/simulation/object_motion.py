@@ -14,8 +14,8 @@ from phyradgs_cl.io.tables import Fields, read_toml
 
 _NODES = 40  # weights stored per cycle; linear interpolation between them is then off by 0.3 % at most
 _SETTLING_NODES = 200  # drying is a slow curve, for which weights at this many times are enough
-_SPACINGS = 8.0  # control points this many to the box's longest side follow breathing and drying, which are smooth
-_SLIDING_SPACINGS = 16.0  # sliding has an edge, about three control points wide, so they must be closer
+_SPACINGS = 8.0  # breathing and drying are smooth, so this many spacings of control points along the longest side are enough
+_SLIDING_SPACINGS = 16.0  # sliding has a sharp edge, which becomes about three control points wide
 _ASIDE = 1 / 3  # breathing moves the object along y, too, by this fraction of its motion along z
 _PERIODS = (0.5, 1.5)  # a random breath lasts at least and at most this many mean periods
 _FADE = 3.0  # beyond the box, motion falls to 0 over this many amplitudes: with a slope of a third, the field cannot fold

@@ -36,7 +36,6 @@ class FrameSource:
         return next(self.frames([cells], model, factor))
 
     def frames(self, tables: Sequence[TimeCells], model: str, factor: float) -> Iterator[np.ndarray]:
-        """Yields the frame of each table."""
         return (self.frame(cells, model, factor) for cells in tables)
 
 
@@ -68,7 +67,7 @@ class VolumeSource(FrameSource):
             return volume
         try:
             return self._rt.upload(volume)
-        except MemoryShortage:  # the operator then projects part after part of it
+        except MemoryShortage:  # from the host, the operator projects one part of it after the other
             return volume
 
 

@@ -34,7 +34,7 @@ _SHARE = 0.5  # "cosine" and "cylinder" extend rows at each side by this fractio
 _SLOPE_PIXELS = 5  # the slope at a row's end is taken over this many pixels, against noise
 _NOISE = 0.01  # below this fraction of the line integrals' 99.9th percentile, the end of a row is air
 _UNEVEN = 0.02  # steps between views may differ by this fraction from the median step and still count as even
-_REACH = 8  # beyond an arc its first and last view are repeated over this many arcs of an exposure: the filter sees no edge
+_REACH = 8  # the first and last view of an arc are repeated over this many arcs of an exposure, so that no edge is filtered
 _FULL_TURN = 1.5  # a gap of more median steps between views means less than a full turn
 
 

@@ -35,7 +35,7 @@ _NO_PLANE_DEG = 45.0
 _LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the plane of the rotation
 _NO_LEAN_DEG = 10.0
 _ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: densities are 0.1 % too low
-_NO_ROLL_DEG = 10.0  # densities are 1.5 % too low here, and 0 at 90°
+_NO_ROLL_DEG = 10.0  # angle at which densities are 1.5 % too low; at 90° they are 0
 _LEAST_OVERLAP = 2.0  # a displaced panel must reach this many columns beyond the axis, or a warning comes
 # A smaller missing angle causes no warning: nearly parallel rays have so narrow a fan that half a turn is enough.
 _TOLERATED_RAD = np.deg2rad(0.5)

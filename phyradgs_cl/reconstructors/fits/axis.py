@@ -16,9 +16,9 @@ from phyradgs_cl.reconstructors.fits.residuals import fit_squares, vertex
 from phyradgs_cl.runtime import Runtime
 
 _ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # shifts of the panel that are tried first, in coarse pixels
-_ROUGH_ITERATIONS = 8  # few iterations are enough to tell these shifts apart
-_STEP = 0.25  # then three shifts this far apart, in coarse pixels, bracket the best one
-_MOST_STEPS = 8  # the three shifts move at most this often, so that a search that leads away ends
+_ROUGH_ITERATIONS = 8  # few iterations are enough to tell coarse shifts of the panel apart
+_STEP = 0.25  # distance of three shifts that bracket the best one, in coarse pixels
+_MOST_STEPS = 8  # most moves of these three shifts, so that a search that leads away ends
 ANYWHERE = (-math.inf, math.inf)  # no limits of the shift, in pixels
 _MOST_VIEWS = 60  # views that are compared with their opposites, at most, to save time
 _MOST_ROWS = 64  # blocks of rows that are compared, at most, to save time
@@ -177,7 +177,7 @@ def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         if not same_side or abs(away[near]) > min(WIDEST_STEP_RAD, _BEYOND * step):
             return None
         two = np.array([near, same_side[0]])
-    # linear in the angle: so weighted, the two lie at angle 0 on average, even if both are on one side of it
+    # linear interpolation to angle 0, or extrapolation if both frames are on one side of it
     share = float(away[two[0]] / (away[two[0]] - away[two[1]]))
     return two, np.array([1 - share, share])
 

@@ -163,7 +163,7 @@ def t_statistic(stated: np.ndarray, other: np.ndarray) -> float:
 
 
 def residual_ratio(stated: np.ndarray, other: np.ndarray) -> float:
-    """Returns the other hypothesis's squared residuals (F,), summed over the frames, over those of the stated one."""
+    """Returns the squared residual of the other hypothesis over that of the stated one, from each frame's squares (F,)."""
     return float(other.sum() / max(float(stated.sum()), _TINY))
 
 

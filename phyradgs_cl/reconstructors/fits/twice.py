@@ -16,9 +16,9 @@ from phyradgs_cl.reconstructors.fdk.weights import fan_angle, pixel_rays
 from phyradgs_cl.reconstructors.fits.axis import NOT_FOUND, SMOOTHING_PX, WIDEST_STEP_RAD, AxisShift
 
 _COARSE_COLUMNS = 128  # shifts are first tried on frames of at most this many columns
-_MOST_PX = 16.0  # by up to this many coarse pixels to either side
-_STEP_PX = 0.5  # in steps of this many pixels of the compared frames
-_NEAR_PX = 2.0  # full frames are then tried this near to the best coarse shift, in coarse pixels
+_MOST_PX = 16.0  # largest shift of the panel that is tried, in coarse pixels: an eighth of the panel
+_STEP_PX = 0.5  # distance between shifts that are tried, in pixels of the compared frames
+_NEAR_PX = 2.0  # full frames are tried with shifts this near to the best coarse one, in coarse pixels
 _FEWEST_VIEWS = 24  # fewer views cannot be interpolated to the opposite of each ray
 _MOST_VIEWS = 360  # views that are compared, at most, to save time
 _MOST_ROWS = 32  # rows that are compared, at most, to save time

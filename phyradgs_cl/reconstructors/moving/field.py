@@ -22,7 +22,7 @@ from phyradgs_cl.reconstructors.moving.signal import Bending, TemporalSplines
 from phyradgs_cl.runtime import Runtime
 
 _CG_STEPS = 8  # iterations of conjugate gradients for one step of the control vectors
-_DAMPING = 1e-3  # Levenberg damping, relative to the mean diagonal of JᵀJ: it keeps unseen control vectors still
+_DAMPING = 1e-3  # Levenberg damping over the mean diagonal of JᵀJ: control vectors that no ray sees stay where they are
 _ROUGHNESS = 1e-2  # β, the penalty on the weights' roughness in time, relative to the mean diagonal of JᵀJ
 _SHORTER = (1.0, 0.5, 0.25)  # fractions of a step, tried in turn until one lowers the misfit
 _LEAST_DETERMINANT = 0.1  # a step may lower det(I + ∂w/∂y) to this: at 0 matter folds

@@ -42,12 +42,12 @@ from phyradgs_cl.runtime import Runtime
 _MOST_COLUMNS = 64  # blocks of pixels along the longer side of the panel in the coarse scan, at most
 _MOST_VOXELS = 32  # voxels along the longest side of the coarse scan's grid, at most
 _MOST_FRAMES = 600  # frames of the coarse scan, at most, unless the signal has more knots
-_TIMES_PER_PERIOD = 12  # exposures sample a periodic motion this often per period
-_MOST_TIMES = 6  # but at most at this many times per exposure, because each costs a projection
+_TIMES_PER_PERIOD = 12  # times per period of a motion at which exposures sample it
+_MOST_TIMES = 6  # most times per exposure for this: each costs a projection
 _FIRST_PASSES = 8  # passes of fista before the first round, as for an object at rest
 _PASSES = 3  # passes of fista in each round
-_WEIGHT = 0.42  # prior weight of these passes
-_TV_ITERATIONS = 5  # TV iterations of each of these passes
+_WEIGHT = 0.42  # prior weight of fista in the search
+_TV_ITERATIONS = 5  # TV iterations per pass of fista in the search
 _COARSE_SPACINGS = 2  # the first rounds have this many spacings of control points along the box's longest side
 _FINE_SPACINGS = 4  # the last rounds have this many
 # Finer control points need a larger bending weight γ, by this factor, so that the field is as stiff in mm as before.

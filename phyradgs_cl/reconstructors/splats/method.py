@@ -96,7 +96,6 @@ class SplatRun:
         return Batch(frames, corners, late=self.iteration >= self.options.parameter_terms_from)
 
     def measures(self) -> dict[str, float]:
-        """Returns the mean loss of the last batch, and the number of Gaussians."""
         return {"loss": self.sharing.loss(self.frame_step), "gaussians": self.cloud.count}
 
     def control_density(self) -> None:
@@ -113,7 +112,6 @@ class SplatRun:
         self.cloud = DeviceCloud(self.rt, population)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the arrays on which the next step depends."""
         population = self.cloud.population()
         return {
             "raw": population.raw, "moments": population.moments, "statistics": self.cloud.read_statistics(),

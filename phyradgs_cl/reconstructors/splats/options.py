@@ -14,8 +14,8 @@ from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 from phyradgs_cl.text import repr_of_changes
 
 # Iterations before ``exact_from`` model motion coarsely, which loses nothing (docs/results/motion_models.md).
-_STATIC_SHARE = 0.4  # this fraction of them, the first, have one pose per frame
-_COARSE_ERROR = 0.1  # the others have at least this ``time_error``
+_STATIC_SHARE = 0.4  # the first of the coarse iterations, this fraction, have one pose per frame
+_COARSE_ERROR = 0.1  # the other coarse iterations have at least this ``time_error``
 
 
 @dataclass(frozen=True, repr=False)

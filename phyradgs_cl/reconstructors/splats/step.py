@@ -107,7 +107,6 @@ class DeviceFrames:
 
     @property
     def most_cells(self) -> int:
-        """The largest number of time cells of a frame."""
         return max(cells.count for cells in self._cells)
 
     def get(self, frame: int) -> tuple[DeviceCells, DeviceArray, DeviceArray, float]:
@@ -180,7 +179,7 @@ class FrameStep:
         self.adam = DeviceAdam(rt, options.activation(grid))
 
     def follow(self, motion: Motion) -> None:
-        """Takes a motion model for the next steps."""
+        """Takes another motion model from the next step on."""
         if motion != self.motion:
             self.motion = motion
             self.frames.follow(motion)
@@ -240,7 +239,7 @@ class SharedFrames(Alone):
             self._losses[place] = step.loss.value()
             own.append(np.concatenate([rt.download(cloud.gradients)[:_ROWS], rt.download(statistics)]))
         total = exact_sum(self.ranks, own, (_ROWS + _STATISTICS, stride), count)
-        # the rows of dL/d(centre on the panel) stay 0: the statistics have them already
+        # rows of dL/d(centre on the panel) are 0 here, because the statistics include them already
         rt.write(cloud.gradients, np.pad(total[:_ROWS], ((0, _DERIVED - _ROWS), (0, 0))))
         rt.write(cloud.statistics, rt.download(cloud.statistics) + total[_ROWS:])
 

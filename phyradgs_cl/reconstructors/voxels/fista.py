@@ -39,7 +39,7 @@ from phyradgs_cl.runtime.algebra import HostSpace
 log = logging.getLogger(__name__)
 _VOLUMES = 16  # memory in volumes, with the prior ``dct``
 _FRAMES = 3  # memory in arrays of all frames
-_HELD = 9  # of these volumes, ``dct`` itself holds this many on the device
+_HELD = 9  # volumes that the prior ``dct`` holds on the device
 _COPIES = 2  # if volumes are on the host, the device holds two copies while a prior maps one
 # The passes before those on smaller voxels are coarse. Their settings were measured (docs/results/settings.md).
 _COARSE_PASSES = 0.6  # fraction of all passes that are coarse

@@ -42,7 +42,7 @@ _RIDGE_LENGTH = 0.5  # length of a ridge step: factor on the regulariser's gradi
 _RIDGE_EVERY = 4  # a ridge step follows each of this many maps of the other prior
 # The two factors for scans that stop hold for this noise of line integrals, and follow the sixth root of the scan's noise.
 _USUAL_NOISE = 0.01
-_LEAST_NOISE = 0.001  # but a scan's noise counts as at least this, because some scans have none
+_LEAST_NOISE = 0.001  # some scans have no noise: it counts as at least this
 _LEAST_NOISE_SHARE = 0.1  # least noise_share (``Prior``) of a ridge step, because some scans have no noise
 _SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result; the larger voxels of the passes before have the rest
 _SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels with the prior ``ridge``, which leaves less noise
@@ -173,7 +173,7 @@ class Prior:
         return {}
 
     def restore(self, state: State) -> None:
-        """Continues from ``state``."""
+        """Continues from what ``state`` returned."""
 
 
 class TvPrior(Prior):

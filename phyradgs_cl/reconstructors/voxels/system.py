@@ -233,7 +233,6 @@ class OrderedSubsets:
         return len(self._systems)
 
     def split(self, count: int) -> None:
-        """Divides the frames into ``count`` subsets."""
         frames = self.system.frames
         self._systems = [self.system.subset(range(first, frames, count)) for first in spread_order(count)]
 
