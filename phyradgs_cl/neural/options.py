@@ -26,19 +26,19 @@ class NeuralOptions(MotionOptions):
     """A field on a hash encoding and a small network, fitted to rays.
 
     - iterations: passes over all frames, with one step per frame. rays: pixels per step.
-    - samples: number along a ray inside the volume. 0 takes 1.5 per voxel of the longest side, 1.2 for a pixel of several
-      times.
+    - samples: along each ray inside the volume. 0: 1.5 per voxel of the longest side, 1.2 if a pixel has several times.
     - jitter: random shift of the samples, one per ``ray``, one per ``sample`` inside its own interval, or ``none``.
-    - times: how many times of a line a step uses, drawn for each pixel; 0 takes all.
+    - times: how many times of a line a step uses, drawn for each pixel; 0: all.
     - positive_only: use only pixels with a line integral above 0.
     - voxel_points: points along each side of a voxel, whose value is the field's mean over them.
 
-    - The encoding: levels (0: until the finest has one cell per voxel), features, base_resolution (cells along a side),
-      level_growth, table_log2 (most entries of a level).
-    - The network: layers, width, last_activation. A sigmoid has a density_bound, its largest value in units of FDK's 99.9th
-      percentile. The field starts everywhere at first_share of it.
-    - The rate of Adam is multiplied by rate_factor every rate_step passes; step 0 spreads one factor over the run.
-    - detector_model: the quantity that the detector averages over a line's times, or the model that the scan states (scan).
+    - levels (0: until the finest has one cell per voxel), features, base_resolution (cells along a side), level_growth,
+      table_log2 (each level has at most 2^table_log2 entries): of the hash encoding.
+    - layers, width, last_activation: of the network. A sigmoid reaches at most density_bound, in units of FDK's 99.9th
+      percentile. The field starts at first_share of that everywhere.
+    - rate: Adam's learning rate, multiplied by rate_factor every rate_step passes; step 0: once over the whole run,
+      gradually.
+    - detector_model: what the detector averages over a line's times, or the model that the scan states (scan).
     - torch_device: the device of PyTorch."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)

@@ -1,8 +1,8 @@
 """Terms of the objective (paper, Eq. 4): image loss, total variation of a small volume, mean density.
 
-A frame's image loss is L1 + λ (1 − SSIM). Eq. 4 prints "+ SSIM", but the paper minimises 1 − SSIM, as this module does. SSIM
-follows Wang et al. 2004 (IEEE Trans. Image Process. 13, 600), with an 11-tap Gaussian window of σ 1.5, zero padding, C1 =
-0.01² and C2 = 0.03².
+A frame's image loss is L1 + λ (1 − SSIM). Eq. 4 prints "+ SSIM", but the paper minimises 1 − SSIM, as this module does.
+SSIM follows Wang et al. 2004 (IEEE Trans. Image Process. 13, 600), with an 11-tap Gaussian window of σ 1.5, zero padding,
+C1 = 0.01² and C2 = 0.03².
 
 Total variation is anisotropic, as in R2-Gaussian: the mean absolute difference between neighbouring voxels along z, plus the
 same along y and x."""

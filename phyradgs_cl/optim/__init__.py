@@ -1,8 +1,8 @@
 """Optimises Gaussians by Adam (Kingma and Ba 2015), with decaying learning rates for each kind of parameter. Adaptive
 density control clones and splits Gaussians with a large gradient in the image, and removes faint and thin ones.
 
-Density control follows Kerbl et al. 2023 in R2-Gaussian's radiative form. It looks at the mean norm of dL/d(projected
-centre), in normalised detector units. The two halves of a clone or split each get half the density."""
+Density control follows Kerbl et al. 2023 in R2-Gaussian's radiative form. Its statistic is the mean norm of dL/d(projected
+centre), in normalised detector units. A clone or split gives two Gaussians of half the density."""
 
 from dataclasses import dataclass
 

@@ -1,11 +1,13 @@
 """Corrects beam hardening: returns the line integrals that a beam would give if every layer attenuated as a thin one does.
 
-Polynomial: the user has measured it with a wedge. One material: line integrals against the path through the segmented volume
-give the polynomial (Krumm, Kasperl and Franz, NDT & E Int. 41 (2008) 242). Tube voltage: bone in a reconstruction is
-reprojected, and the spectrum gives the soft tissue that remains (Joseph and Spital, J. Comput. Assist. Tomogr. 2 (1978)
-100); this is repeated with the better volume. The user states the attenuation of bone, or candidates are tried: the one
-whose corrected frames agree best with their own reprojection wins. No correction, and one for water alone, are among
-them."""
+- Polynomial: the user has measured it with a wedge.
+- One material: a polynomial is fitted to line integrals over the path through the segmented volume (Krumm, Kasperl and
+  Franz, NDT & E Int. 41 (2008) 242).
+- Tube voltage: bone in a reconstruction is projected, and the spectrum gives the soft tissue that remains (Joseph and
+  Spital, J. Comput. Assist. Tomogr. 2 (1978) 100). This is repeated with the better volume.
+
+For a voltage the user states from which attenuation a voxel is bone, or candidates are tried, also water alone and no
+correction. The one whose corrected frames agree best with their own projection wins."""
 
 import logging
 from collections.abc import Callable

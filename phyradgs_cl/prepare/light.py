@@ -1,9 +1,12 @@
 """Corrects light that changes during a scan: its pattern by flats, its amount by the air in each frame.
 
-WAYS to use flats: mean, of all. time, interpolated linearly between the means of flats taken one after another. pca, for
-each frame the combination of their principal components that leaves the least total variation, in logarithms (Van
-Nieuwenhove et al., Opt. Express 23 (2015) 27975). The step ``air`` corrects each frame's amount of light by the pixels that
-no object covers, as nabu and algotom's ROI normalisation do."""
+- mean: all flats are averaged.
+- time: flats taken one after another are averaged, and these means interpolated linearly in time.
+- pca: each frame gets the combination of the flats' principal components that leaves the least total variation, in
+  logarithms (Van Nieuwenhove et al., Opt. Express 23 (2015) 27975).
+
+The step ``air`` corrects each frame's amount of light by the pixels that no object covers, as nabu and algotom's ROI
+normalisation do."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace

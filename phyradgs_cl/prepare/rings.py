@@ -1,10 +1,9 @@
 """Removes rings: a pixel's wrong gain adds the same error to its line integrals in every view.
 
 Over a full turn, the mean of all views shows the object averaged around the axis, which is symmetric about it. So a column
-that differs from its mirror image shows an error of the panel. The views are split into two independent sets: the covariance
-of their errors says whether there are rings, and how strong. Without rings the frames stay unchanged. The pattern is the
-mean over views less the same mean after denoising in overlapping blocks of cosines, where strong coefficients are the
-object's.
+that differs from its mirror image shows an error of the panel. Two independent sets of views both show this error: their
+covariance says whether there are rings, and how strong. Without rings the frames stay unchanged. The pattern is the mean
+over views minus the same mean, denoised: in overlapping blocks of cosines, strong coefficients belong to the object.
 
 A single column or pixel of wrong gain deviates on one side of the axis only. Its neighbours and their mirror images do not,
 and both sets of views show it. (On an arc the mean is symmetric for a round object only.)"""

@@ -1,11 +1,13 @@
 """Changes frames before FDK's filter: continues detector rows beyond the panel, and removes motion blur along the angle.
 
-Rows continue so that the filter does not ring where they are cut off. cosine: a quarter of a cosine (similar to Ohnesorge et
-al., Med. Phys. 27 (2000) 39). cylinder: the chords of a cylinder from the row's last values and slope (Hsieh et al., Med.
-Phys. 31 (2004) 2385); a parabola through the squares of the row gives its attenuation. Both leave the object beyond the
-panel unknown. reprojected: projections of a volume that FISTA-TV reconstructs on a grid that holds the whole object.
+Rows continue so that the filter does not ring where they are cut off. The first two WAYS leave the object there unknown.
 
-Deblurring: in a parallel beam, an exposure over an arc Δθ averages the sinogram with a box along the angle: a pixel sees the
+- cosine: rows end in a quarter of a cosine (similar to Ohnesorge et al., Med. Phys. 27 (2000) 39).
+- cylinder: rows continue as chords of a cylinder, from their last values and slope (Hsieh et al., Med. Phys. 31 (2004)
+  2385). A parabola through the squares of the row gives its attenuation.
+- reprojected: FISTA-TV reconstructs a volume on a grid that holds the whole object, and its projections continue the rows.
+
+Deblurring: in a parallel beam, an exposure over an arc Δθ averages the sinogram with a box along the angle. A pixel sees the
 mean of p(θ, s) over [θ − Δθ/2, θ + Δθ/2], whatever the object. Along the views this is a convolution, which a Wiener filter
 inverts: with H(f) = sinc(f Δθ) it multiplies by (1 + λ) H / (H² + λ). λ is the power of noise over that of the signal;
 without it, noise would grow without bound at the zeros of H. Rows that open later see the same box at other angles. A full

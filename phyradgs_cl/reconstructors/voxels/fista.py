@@ -1,9 +1,9 @@
 """FISTA with a prior over ordered subsets of the frames: min ½‖p − A x‖² + R(x), x ≥ 0.
 
-Each subset S of M makes one step: xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁). The step and its
-momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The gradient of a subset, times
-the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34 (2015) 167). L
-bounds the norm of AᵀA.
+Each subset S of M makes one step: xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁).
+The step and its momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The gradient
+of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
+34 (2015) 167). L bounds the norm of AᵀA.
 
 The last 2/5 of the passes run on smaller voxels, whose means make up most of the result (``stages.py``). The passes before
 them only provide their first volume: they have more subsets, and few times in an exposure.
@@ -56,8 +56,8 @@ class FistaOptions(IterativeOptions):
     """Options of FISTA.
 
     - prior: one of ``PRIORS``, a user's function, or its ``package.module:function``. A function takes (volume (nz, ny, nx)
-      in 1/mm, weight in 1/mm) and returns a volume; docs/methods.md says how to scale a denoiser. The prior piccs is (1 −
-      prior_share) TV(x) + prior_share TV(x − first volume).
+      in 1/mm, weight in 1/mm) and returns a volume; docs/methods.md says how to scale a denoiser.
+    - prior_share: s in the prior piccs, (1 − s) TV(x) + s TV(x − first volume).
     - prior_weight: threshold relative to the error of the gradient. Two errors are added in squares: noise of the frames,
       and edges inside large voxels.
     - subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0: 2 for slices of up to 90² voxels where memory
