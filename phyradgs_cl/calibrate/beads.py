@@ -36,7 +36,7 @@ _BACKGROUND = 4  # cosines along each side of a frame: they describe holder, sca
 _STEP_PX = 0.25  # signals are central differences, for which the frame's edge moves by this much to each side
 _MOST_PX = 1.5  # one step of the placement moves a frame by at most this much: signals are not linear beyond
 _SETTLED_PX = 0.01  # the search ends when a step moves the frame by less than this
-_LINEAR_PX = 0.3  # after a step that moves the frame by more, signals are computed again
+_LINEAR_PX = 0.3  # signals are computed again after a step that moves the frame by more than this
 
 
 @dataclass(frozen=True, eq=False)

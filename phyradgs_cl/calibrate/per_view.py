@@ -27,10 +27,10 @@ TURN, SHIFT_V, SHIFT_U = 0, 1, 2
 _STEP_PX = 0.25  # signals are central differences, for which a frame moves by this much to each side
 _LEAST_NORM = 0.1  # parameters with weak signals are scaled as if they had this fraction of their kind's largest norm
 _DEG = float(np.rad2deg(1.0))
-# An estimate's discretisation error is this fraction of its change since a grid half as fine, if it falls with the voxel.
+# Discretisation errors fall in proportion to the voxel, so half of the change since a grid half as fine is still an error.
 DISCRETISATION = 0.5
 _STEPS = 3  # Gauss–Newton steps on each grid; the next grid continues from there
-_ITERATIONS = 20  # iterations of CGLS for each step, and for each standard deviation
+_ITERATIONS = 20  # iterations of CGLS for each step and each standard deviation
 _DEVIATIONS = 3.0  # a kind is corrected only if its RMS over the views exceeds this many standard deviations
 
 

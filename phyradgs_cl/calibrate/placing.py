@@ -16,7 +16,7 @@ _LEAST_SHARE = 0.75  # at least this fraction of the beads must lie in bright sp
 _SMOOTH = 0.5  # smoothing (std) in radii of a bead: a bead of many voxels then has one maximum
 _PEAKS_PER_BEAD = 2.0  # this many bright spots per bead are compared with the beads, because some are no beads
 _TOLERANCE_VOXELS = 1.5  # a bead lies at most this far from its bright spot, in voxels
-_TRIANGLES = 40  # this many random triangles of known beads are sought among the spots
+_TRIANGLES = 40  # this many random triangles of beads are looked for among the spots: one that fits gives a placement
 _APART = 0.05  # placements whose turns differ by less, in rad, are the same
 _MOST = 6  # a nearly symmetric phantom fits equally well in several placements: this many are tried
 

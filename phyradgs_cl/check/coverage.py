@@ -11,7 +11,7 @@ from phyradgs_cl.detector import noise_level
 
 _LARGEST_SHARE = 0.1  # air lies below this fraction of the largest line integral: more at the panel's sides is the object
 _DISPLACED = 0.1  # a panel that is off centre by this fraction of its width was displaced on purpose
-_NOISES = 4.0  # line integrals show the object only above this many standard deviations of the noise
+_NOISES = 4.0  # noise alone does not exceed this many of its standard deviations: more is the object
 _OPAQUE = 30.0  # behind larger line integrals no light passes, so they are no line integrals
 _INVERTED = 0.9  # if the sides exceed this fraction of the largest value, bright and dark are exchanged
 _BRIGHT = 0.05  # at most this fraction of the pixels may be brighter than the flats, by noise

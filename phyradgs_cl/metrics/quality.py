@@ -31,7 +31,7 @@ K1, K2 = 0.01, 0.03  # SSIM's constants for means and for variances, as fraction
 _VOXELS_PER_BATCH = 1 << 20  # voxels compared at a time: SSIM holds about ten float64 arrays of them, 80 MB
 _EDGE = 0.25  # motion can be seen at edges only, so it is compared where the slope is this fraction of the steepest
 _MOST_POINTS = 2000  # most voxels at which motions are compared: enough for a mean and a percentile
-_INCH = 3.2  # side of a slice in the figure
+_INCH = 3.2  # side of a slice in the figure, in inches
 _DPI = 110
 
 

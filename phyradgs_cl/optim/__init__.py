@@ -44,7 +44,7 @@ PUBLISHED_RATES = Rates(
 )
 
 
-BETA1, BETA2 = 0.9, 0.999  # Adam's decay rates of the first and second moments
+BETA1, BETA2 = 0.9, 0.999  # Adam's decay rates of the first and second moments, as in its paper
 EPSILON = 1e-15  # keeps Adam from dividing by a second moment of 0
 
 

@@ -67,7 +67,7 @@ def find_sparks(
 
     They lie below the median of 5 × 5 pixels by ``least``, and by ``threshold`` standard deviations, estimated from the
     median distance to it in 9 × 9 pixels. They are sharp in every direction and form groups of at most ``pixels``. A feature
-    that the previous and the next frame show nearby too, at least half as high, is a gap of the moving object."""
+    that the frames before and after show nearby, at least half as high, is a gap of the moving object and no spark."""
     sparks = np.stack([_sparks_of(frame, threshold, least, pixels) for frame in frames])
     for f in np.flatnonzero(sparks.any(axis=(1, 2))) if len(frames) > 2 else ():
         height = _height(frames[f])

@@ -29,9 +29,9 @@ _LEAST_PRIMARY = 0.05  # an overestimate of scatter leaves at least this fractio
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
 _FITTED_FRAMES = 24  # the fit uses at most this many frames, evenly spread, to save time
 _USUAL_REACH = 0.18  # where the user states to_primary alone: spread (std) of scatter over the panel's longer side
-_HEIGHT_STEP = 1.25  # the kernel is made stronger by this factor, time after time
+_HEIGHT_STEP = 1.25  # each kernel that is tried is stronger than the one before by this factor
 _MOST_STEPS = 8  # at most this many steps make the kernel stronger, up to 6 times the fitted one
-_TRIALS = 6  # most strengths tried afterwards, between the neighbours of the best one
+_TRIALS = 6  # most strengths tried in the final search, between the neighbours of the best one
 # The stronger kernel must leave less than this fraction of what the fitted one leaves unexplained; else the fit stands.
 _BETTER = 0.65
 _AS_WELL = 1.05  # no stronger kernel is tried once a kernel leaves this many times the least unexplained rest

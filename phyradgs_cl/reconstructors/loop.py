@@ -102,12 +102,10 @@ class Loop:
         return self.method.iteration if self.stopped_by == "interrupt" else None
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the state from which ``run`` can resume."""
         history = {"record": np.array(json.dumps(self.record)), "seconds": np.array(self.seconds)}
         return {**self.method.state(), **history}
 
     def state_if_interrupted(self) -> dict[str, np.ndarray] | None:
-        """Returns the state of an interrupted run; None without an interruption."""
         return self.state() if self.stopped_by == "interrupt" else None
 
     def _tell(self, before: int) -> bool:

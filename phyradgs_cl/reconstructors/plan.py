@@ -23,7 +23,7 @@ from phyradgs_cl.text import flag_of, suggest_name
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
 """Fields of motion models, such as the number of times per line, which are options of their names."""
-_ALL = motions_for(RAYS, SPLATS)  # for the user's own methods
+_ALL = motions_for(RAYS, SPLATS)  # a user's own method may take any motion model
 LARGEST_SEED = 2**63
 _DECIMALS = 6  # decimals of mm and s in a run's identity: a scan that was stored and read is still the same scan
 _SUBJECT = "--object-motion"

@@ -151,13 +151,13 @@ def _breath(phase: Array) -> Array:
 
 
 def _breathing_mm(places: list[Array], height: Array) -> list[Array]:
-    """Returns the control vectors along z, and those along y, for unit amplitude. They grow from the base to the top."""
+    """Returns two sets of control vectors of unit amplitude, along z and along y, which grow from the base to the top."""
     share = height**2 * (3 - 2 * height)
     return [_vectors(z=share), _vectors(y=-_ASIDE * share)]
 
 
 def _drying_mm(places: list[Array], height: Array) -> list[Array]:
-    """Returns the control vectors downwards, which grow with height, and those towards the z axis, for unit amplitude."""
+    """Returns two sets of control vectors of unit amplitude: downwards, growing with height, and towards the z axis."""
     _, y, x = places
     return [_vectors(z=height), _vectors(x=x / 2, y=y / 2)]
 

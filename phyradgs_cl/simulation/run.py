@@ -29,7 +29,7 @@ from phyradgs_cl.simulation.scenes import Scene, phantom_scene, volume_scene
 from phyradgs_cl.simulation.sources import FrameSource
 from phyradgs_cl.text import flag_of
 
-_LARGEST_GRID = 4096  # most voxels along a side of the volume
+_LARGEST_GRID = 4096  # limit of --size
 _SMALLEST_PHANTOM = 2  # fewest voxels along a side: a procedural phantom is drawn on twice as many, and needs 4
 _STATES = 8  # a phantom whose parts move gets this many true volumes over a period
 log = logging.getLogger(__name__)
@@ -39,10 +39,10 @@ _ELECTRONIC = "Standard deviation of electronic noise, counts."
 _JITTER = "Wander of the gantry (std, degrees), in the encoder table."
 _MOTION = "TOML file of how the object moves: breathing, drying or sliding; the truth of some states is stored."
 # Limits of options, far beyond any scanner, yet far from an overflow of float32 or of a random sampler.
-_LARGEST_PEAK = 1e4  # largest line integral
-_LARGEST_NOISE = 1e9  # electronic noise in counts
-_SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12  # photons per pixel
-_LARGEST_DETECTOR = 32_000  # pixels along a side of the panel
+_LARGEST_PEAK = 1e4  # limit of --peak, a line integral
+_LARGEST_NOISE = 1e9  # limit of --electronic-noise, in counts
+_SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12  # limits of --dose, in photons per pixel
+_LARGEST_DETECTOR = 32_000  # limit of --detector, in pixels along a side of the panel
 _TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse", "turns")
 _DATA_SHEET = ("first", "fps", "readout_ms")
 

@@ -140,8 +140,8 @@ def _filled_rad(ahead: np.ndarray) -> float:
 
 
 def _filled_cells(ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Returns for which angle (K,) in rad each view of a full turn stands. The views near a wide gap share it, the nearer
-    the more."""
+    """Returns the angle (K,) in rad for which each view of a full turn stands. A wide gap is divided among the views near
+    it, the nearer the more."""
     forward, back = _steps(ahead, wide)
     known = (forward + back) / 2
     cells = known.copy()
@@ -311,7 +311,6 @@ def _check_orbit(pose: np.ndarray) -> None:
     above_deg = float(np.rad2deg(np.arctan2(abs(usual[0, 2]), np.hypot(*usual[0, :2]))))
 
     def distances_beyond(most: float, most_deg: float, of_mm: np.ndarray) -> str:
-        """Returns in words which distances are too large."""
         off = float(np.linalg.norm(of_mm, axis=-1).max())
         parts = (
             f"{100 * off / length_mm:.0f} % of their distance off a circle about z",

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 # Width of the transition between rays measured once and twice, over the overhang of the panel's longer side.
-# Wang's covers all rays that are measured twice: such wide transitions were up to 15 % noisier, with no fewer artefacts.
+# Wang's transition covers all rays that are measured twice: it was up to 15 % noisier, with no fewer artefacts.
 TRANSITION = 1.0
 _SYMMETRIC = 0.01  # a panel that is off centre by less, in pixels, is symmetric about the axis
 # A panel less asymmetric than this fraction of the fan was not displaced on purpose, and sees both sides of the object.

@@ -16,9 +16,9 @@ from phyradgs_cl.runtime import Runtime
 
 # Errors of flats affect frames this much, relative to the volume: as strong as the volume, they would explain motion.
 _FREEDOM = 0.3
-_ITERATIONS = 20  # of CGLS in a fit
+_ITERATIONS = 20  # iterations of CGLS in a fit, unless stated
 _MOST_TIMES = 12  # most times per exposure: each costs a projection
-_DRAWS = 200  # resamplings of the bootstrap
+_DRAWS = 200  # resamplings of the bootstrap that gives a deviation
 _TINY = 1e-30  # keeps divisions finite
 
 

@@ -44,12 +44,12 @@ _MOST_VOXELS = 32  # voxels along the longest side of the coarse scan's grid, at
 _MOST_FRAMES = 600  # frames of the coarse scan, at most, unless the signal has more knots
 _TIMES_PER_PERIOD = 12  # times per period of a motion at which exposures sample it
 _MOST_TIMES = 6  # most times per exposure for this: each costs a projection
-_FIRST_PASSES = 8  # passes of fista before the first round, as for an object at rest
-_PASSES = 3  # passes of fista in each round
+_FIRST_PASSES = 8  # passes of fista before the first round, for an object at rest: the field needs a volume to start from
+_PASSES = 3  # passes of fista in each round, which let the volume follow the field
 _WEIGHT = 0.42  # prior weight of fista in the search
 _TV_ITERATIONS = 5  # TV iterations per pass of fista in the search
-_COARSE_SPACINGS = 2  # the first rounds have this many spacings of control points along the box's longest side
-_FINE_SPACINGS = 4  # the last rounds have this many
+_COARSE_SPACINGS = 2  # the first rounds find coarse motion, with this many spacings of control points along the longest side
+_FINE_SPACINGS = 4  # the last rounds refine it with closer control points, this many spacings
 # Finer control points need a larger bending weight γ, by this factor, so that the field is as stiff in mm as before.
 _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4
 _COARSE_SHARE = 0.6  # fraction of the rounds that have coarse control points
@@ -248,7 +248,6 @@ class _Field:
         return None if self.deformation is None or self.deformation.is_still else self.deformation
 
     def take(self, search: Any) -> None:
-        """Takes the field and its gain from a complete ``FieldSearch``."""
         self.deformation, self.gain = search.finding()
 
     def state(self) -> dict[str, np.ndarray]:

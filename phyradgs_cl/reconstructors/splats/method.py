@@ -33,7 +33,7 @@ from phyradgs_cl.reconstructors.splats.step import Batch, DeviceCloud, FrameStep
 from phyradgs_cl.runtime import Runtime
 
 REPORT_EVERY = 50  # iterations between reports; lines of the record are as far apart or closer
-LEAST_RECORDED = 20  # a short run records more often, to have this many lines
+LEAST_RECORDED = 20  # short runs record more often, to have a curve of this many lines
 
 
 class SplatRun:
@@ -159,7 +159,7 @@ def reconstruct_splats(
     scale, population, rng = rt.ranks.bcast(first_cloud(*of_reference) if rt.ranks.rank == 0 else None)
     first_count = population.count
     run = SplatRun(rt, scan, options, scale, population, rng, deformation)
-    record_every = max(1, min(REPORT_EVERY, options.iterations // LEAST_RECORDED))  # short runs need a curve too
+    record_every = max(1, min(REPORT_EVERY, options.iterations // LEAST_RECORDED))
     loop = Loop(run, rt.ranks, report, started, record_every, REPORT_EVERY)
     loop.run(resume)
     cloud = run.present_cloud()
@@ -174,7 +174,7 @@ def reconstruct_splats(
         "ranks": rt.ranks.size,
     }  # fmt: skip
     if isinstance(options.motion, Exact):
-        # the number of segments is the largest of all frames
+        # frames may differ in segments: the most counts
         facts |= {"segments": run.frames.most_cells, "motion_phases": run.phases()}
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
     return Reconstruction(volume, scan.grid, cloud, loop.record, facts, loop.state_if_interrupted())

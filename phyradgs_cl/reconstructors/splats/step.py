@@ -218,7 +218,6 @@ class Alone:
         step.gradient(cloud, batch.frames[0], batch.corners[0], batch.late, cloud.statistics)
 
     def loss(self, step: FrameStep) -> float:
-        """Returns the mean loss of the frames of the last batch."""
         return step.loss.value()
 
 

@@ -37,8 +37,8 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.algebra import HostSpace
 
 log = logging.getLogger(__name__)
-_VOLUMES = 16  # memory in volumes, with the prior ``dct``
-_FRAMES = 3  # memory in arrays of all frames
+_VOLUMES = 16  # memory of a run in volumes, with the prior ``dct``
+_FRAMES = 3  # memory of a run in arrays of all frames
 _HELD = 9  # volumes that the prior ``dct`` holds on the device
 _COPIES = 2  # if volumes are on the host, the device holds two copies while a prior maps one
 # The passes before those on smaller voxels are coarse. Their settings were measured (docs/results/settings.md).
