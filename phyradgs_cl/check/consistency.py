@@ -46,9 +46,9 @@ _REPEATED = 0.15  # a repeated frame differs from its predecessor by less than t
 _JUMP = 2.5  # in an order that jumps, such as the golden angle, recorded steps are this many times as large as sorted ones
 _UNLIKE = 2.0  # a repeated frame differs this much, relative to the median, from the view nearest in angle
 _OUTLIER = 4.0  # the residual of an outlier is at least this many times the frames' median
-# Right frames at both ends of an arc may fit badly, but equally: within this factor (they had 1.4, a single odd frame 2.3).
+# Both ends of an arc may fit badly if their residuals differ by less than this factor: right frames had 1.4, odd ones 2.3.
 _ALIKE = 1.7
-# Such frames must leave less than this fraction of their residual in a random order (right ones 0.2, odd ones mostly 0.3).
+# But they must leave less than this fraction of the residual in a random order: right frames had 0.2, odd ones mostly 0.3.
 _AT_BOTH_ENDS = 0.25
 _MOST_OUTLIERS = 0.2  # this many outliers, as a fraction of the frames, have a common cause: then none counts as one
 _EXCHANGED = 0.5  # two frames were exchanged if the opposite order leaves less than this fraction of the squares

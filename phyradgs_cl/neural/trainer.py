@@ -61,7 +61,7 @@ class Trainer:
 
     @property
     def iteration(self) -> int:
-        """How often all frames have been used so far."""
+        """How many times all frames have been used."""
         return self.steps // self.scan.frames
 
     @property

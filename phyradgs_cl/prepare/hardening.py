@@ -178,7 +178,7 @@ def _with_bone(bone: np.ndarray, frames: np.ndarray, spectrum: Spectrum, model: 
 
 
 def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> np.ndarray:
-    """Solves (Newton) for the soft tissue's line integrals that, behind ``dense`` ones of bone, give the measured
+    """Returns the soft tissue's line integrals that, behind bone of line integrals ``dense``, give the measured
     ``frames``."""
     soft, small = np.asarray(frames - dense, np.float64), 1e-3
     for _ in range(_NEWTON):

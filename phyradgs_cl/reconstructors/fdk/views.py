@@ -211,7 +211,8 @@ def ray_weight(
 def opposite_weight(
     canonical: np.ndarray, shape: tuple[int, int], arc: Arc, is_parallel: bool
 ) -> Callable[[int], np.ndarray | float]:
-    """Returns a function from a view's index to weights (rows, columns): each ray shares its weight with its opposite."""
+    """Returns a function from a view's index to redundancy weights (rows, columns): those of a ray and its opposite sum to
+    2."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
 
     def weight(view: int) -> np.ndarray | float:

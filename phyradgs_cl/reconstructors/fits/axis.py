@@ -18,7 +18,7 @@ from phyradgs_cl.runtime import Runtime
 _ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # shifts of the panel that are tried first, in coarse pixels
 _ROUGH_ITERATIONS = 8  # few iterations are enough to tell coarse shifts of the panel apart
 _STEP = 0.25  # distance of three shifts that bracket the best one, in coarse pixels
-_MOST_STEPS = 8  # most moves of these three shifts, so that a search that leads away ends
+_MOST_STEPS = 8  # most moves of the three shifts that bracket the best one, so that a search that leads away ends
 ANYWHERE = (-math.inf, math.inf)  # no limits of the shift, in pixels
 _MOST_VIEWS = 60  # views that are compared with their opposites, at most, to save time
 _MOST_ROWS = 64  # blocks of rows that are compared, at most, to save time

@@ -19,7 +19,7 @@ _FREEDOM = 0.3
 _ITERATIONS = 20  # iterations of CGLS in a fit, unless stated
 _MOST_TIMES = 12  # most times per exposure: each costs a projection
 _DRAWS = 200  # resamplings of the bootstrap that gives a deviation
-_TINY = 1e-30  # keeps divisions finite
+_TINY = 1e-30  # keeps divisions finite where residuals are 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,8 @@ from phyradgs_cl.runtime import DeviceSpace, HostSpace, MemoryShortage, Runtime,
 
 log = logging.getLogger(__name__)
 
-_SHORTEST_PATH = 0.1  # shorter paths of rays count as this fraction of the longest, to divide by
-_FAINTEST = 1e-6  # smaller sums of path lengths over a voxel's rays count as this fraction of the largest, to divide by
+_SHORTEST_PATH = 0.1  # shorter paths of rays count as this fraction of the longest: a division by less amplifies noise
+_FAINTEST = 1e-6  # voxels that rays hardly meet count as if they had this fraction of the largest sum of path lengths
 _GROWTH = 1.2  # steps of subsets diverge if a pass leaves this many times the least residual so far
 S = TypeVar("S", bound="SharedOperator")
 
