@@ -1,4 +1,4 @@
-"""Compares frames with a phantom of known shape: its placement, its density and a background replace the volume.
+"""Calibrates with a phantom of known shape: its placement, its density and a background replace the unknown volume.
 
 ``BeadOperator`` computes the expected frames in closed form, with each line at its own times."""
 
@@ -22,29 +22,29 @@ from phyradgs_cl.calibrate.problem import CoarseFrames, Stage, measured_blocks, 
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
-DENSITY = 6  # index of the density in a placement, which is turn (rotation vector, rad), shift (mm), density
-_MARGIN = 1.2  # factor on the half-width of a bead's shadow, for an oblique panel
-# limits of the times per exposure; between them the phantom's edge moves by a pixel from one time to the next
+DENSITY = 6  # a placement is a turn (rotation vector, rad), a shift (mm) and, at this index, the density
+_MARGIN = 1.2  # an oblique panel widens a bead's shadow, at most by this factor
+# An exposure is sampled so often that the phantom's edge moves by a pixel between two times, within these limits.
 _FEWEST_TIMES, _MOST_TIMES = 6, 24
-_FEWEST_RAYS = 2  # least number of rays along each side of a pixel (or block of pixels), and per bead's radius
-_MOST_RAYS = 6  # largest number of rays along each side of a pixel
-# standard deviation in pixels of a blur, without which differences of sharp edges would show single rays, half a pixel apart
+_FEWEST_RAYS = 2  # fewest rays along each side of a pixel, and along a bead's radius: sharp edges need several
+_MOST_RAYS = 6  # rays along each side of a pixel, at most: the time grows with their square
+# Blur of compared frames, in pixels: without it, differences of sharp edges would show single rays, half a pixel apart.
 _BLUR_PX = 0.8
-_LEAST_ZEROS = 0.2  # air was clipped at 0 where at least this fraction of the pixels is 0
-_ZEROS_PX = 5  # side in pixels of the blocks whose means give the noise of clipped air
-_BACKGROUND = 4  # number of cosines along each side of a frame: they describe holder, scatter and drift of the tube
-_STEP_PX = 0.25  # movement of a frame at its edge, in pixels, by half a central difference of a signal
-_MOST_PX = 1.5  # largest movement of a frame, in pixels, by one step of the placement
-_SETTLED_PX = 0.01  # the search ends at a step that moves the frame by less than this, in pixels
-_LINEAR_PX = 0.3  # after a larger step, in pixels, the signals are computed anew
+_LEAST_ZEROS = 0.2  # if at least this fraction of the pixels is 0, the noise of air was clipped at 0
+_ZEROS_PX = 5  # the noise of clipped air follows from means of blocks with this many pixels a side
+_BACKGROUND = 4  # cosines along each side of a frame: they describe holder, scatter and drift of the tube
+_STEP_PX = 0.25  # signals are central differences, for which the frame's edge moves by this much to each side
+_MOST_PX = 1.5  # one step of the placement moves a frame by at most this much: signals are not linear beyond
+_SETTLED_PX = 0.01  # the search ends when a step moves the frame by less than this
+_LINEAR_PX = 0.3  # signals are computed again after a step that moves the frame by more than this
 
 
 @dataclass(frozen=True, eq=False)
 class BeadOperator:
     """Computes the frames (F, rows, columns) of a phantom along the lines of ``tables``, for a detector of ``model``.
 
-    samples: rays along each side of a pixel. clipped_noise: standard deviation of noise that was clipped at 0; 0 without
-    clipping."""
+    samples: rays along each side of a pixel. clipped_noise: standard deviation of noise that was clipped at 0; 0:
+    unclipped."""
 
     phantom: EllipsoidPhantom
     tables: Sequence[TimeCells]
@@ -54,14 +54,14 @@ class BeadOperator:
     clipped_noise: float
 
     def forward(self, placement: np.ndarray) -> np.ndarray:
-        """Returns the frames of the phantom at a placement (7,): a turn (rotation vector, rad), a shift (mm), and a
-        density factor."""
+        """Returns the frames of the phantom at a placement (7,): a turn (rotation vector, rad), a shift (mm), and a density
+        factor."""
         pose, weight = _poses_by_line(self.tables)
         frames, lines, samples = weight.shape
         turn = Rotation.from_rotvec(placement[:3]).as_matrix()
         places, steps = pose[:, :2] - placement[3:DENSITY], pose[:, 2:]
         if self.tables[0].is_parallel:
-            places[:, 0] = pose[:, 0]  # a turn does not move the direction of parallel rays
+            places[:, 0] = pose[:, 0]  # a shift of the phantom does not change the direction of parallel rays
         is_rows = self.tables[0].axis == "rows"
         panel_lines = _PanelLines(
             source=places[:, 0] @ turn, first=places[:, 1] @ turn, line_step=steps[:, int(is_rows)] @ turn,
@@ -104,9 +104,8 @@ def _poses_by_line(tables: Sequence[TimeCells]) -> tuple[np.ndarray, np.ndarray]
 class _PanelLines:
     """N lines of a panel, each at one time, in the phantom's frame of reference.
 
-    - source, first (N, 3): the source and the middle of the panel's first pixel, mm.
-    - line_step, pixel_step (N, 3): the steps to the next line and to the next of its ``pixels``. line (N,): the line's
-      number.
+    - source, first (N, 3): the source, and the middle of the panel's first pixel, in mm.
+    - line_step, pixel_step (N, 3): the steps to the next line, and to the next of its ``pixels``. line (N,): its number.
     - is_parallel: ``source`` is the rays' direction."""
 
     source: np.ndarray
@@ -118,7 +117,7 @@ class _PanelLines:
     is_parallel: bool
 
     def integrals(self, phantom: EllipsoidPhantom, samples: int) -> Iterator[np.ndarray]:
-        """Yields line integrals (N, pixels), float32, for each of samples² points of a pixel's area."""
+        """Yields the line integrals (N, pixels), float32, at each of samples² points of the pixels' area in turn."""
         shadows = [(body, *self._shadow(np.array(body.ends_mm), body.reach_mm)) for body in phantom.ellipsoids]
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
         for across, along in itertools.product(offsets, offsets):
@@ -140,11 +139,11 @@ class _PanelLines:
 
     @cached_property
     def _panel_axes(self) -> tuple[tuple[np.ndarray, ...], ...]:
-        """Vectors (N, 3) whose inner products with a place in mm give its distance from the source (in panel distances),
-        its line and its pixel. Each comes with its products with the source and with the first pixel (N,), and with its
-        length (N,).
+        """Three vectors (N, 3). Their inner products with a point in mm give its distance from the source (in distances of
+        the panel), and the line and pixel of its image. Each comes with its products with the source and with the first
+        pixel (N,), and its length (N,).
 
-        In a parallel beam the distance is 1, and lines and pixels are those that a ray through the place meets."""
+        In a parallel beam the distance is 1, and lines and pixels are those that a ray through the point meets."""
         normal = np.cross(self.line_step, self.pixel_step)
         to_panel = self.source if self.is_parallel else self.first - self.source
         vectors = [normal / np.sum(normal * to_panel, -1, keepdims=True)]
@@ -157,7 +156,7 @@ class _PanelLines:
         return tuple((v, *both, np.linalg.norm(v, axis=-1)) for v, both in zip(vectors, products, strict=True))
 
     def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:
-        """Returns the lines (n,) that may see a body, the first pixel (n,) in each, and the number of pixels."""
+        """Returns the lines (n,) that may see a body, the first of its pixels (n,) in each, and their number."""
         (depth, depth_of_source, *_), *axes = self._panel_axes
         lowest, highest = [], []
         for end_mm in ends_mm:
@@ -180,8 +179,7 @@ class _PanelLines:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BeadProblem(CoarseFrames):
-    """The problem of ``CoarseProblem`` for a known phantom. Its placement (7,) takes the place of a volume; ``start`` is
-    a first guess."""
+    """A ``CoarseProblem`` for a known phantom, whose placement (7,) replaces the volume. ``start``: a first guess."""
 
     phantom: EllipsoidPhantom
     start: np.ndarray
@@ -215,15 +213,15 @@ class BeadProblem(CoarseFrames):
         return BeadOperator(self.phantom, tables, small.geometry.detector_shape, model, rays, self.clipped_noise)
 
     def residual(self, operator: BeadOperator, placement: np.ndarray) -> np.ndarray:
-        """Returns measured less expected frames (F, rows, columns), less a smooth background."""
+        """Returns measured minus expected frames (F, rows, columns), without a smooth background."""
         return self._without_background(self.measured - operator.forward(placement))
 
     def noise(self, residual: np.ndarray) -> float:
-        """Returns the standard deviation of the residual's valid pixels, which holds noise and model errors."""
+        """Returns the standard deviation of the residual's valid pixels: noise, and errors of the model."""
         return float(np.std(residual if self.valid is None else residual[self.valid]))
 
     def explained(self, operator: BeadOperator, placement: np.ndarray) -> float:
-        """Returns the fraction of the compared values' squares that the phantom explains. A negative density explains 0."""
+        """Returns which fraction of the squares of the compared values the phantom explains; 0 for a negative density."""
         residual = self.compared(self.residual(operator, placement))
         whole = self.compared(self.masked(self.measured))
         return float(1 - residual @ residual / max(float(whole @ whole), 1e-30)) if placement[DENSITY] > 0 else 0.0
@@ -255,20 +253,20 @@ class BeadProblem(CoarseFrames):
         return list(beyond.reshape(len(images), *self.measured.shape))
 
     def compared(self, frames: np.ndarray) -> np.ndarray:
-        """Returns the values (F · pixels,) float64 of frames that enter the misfit: blurred beyond single rays, without
+        """Returns the values (F · pixels,) float64 by which frames are compared: blurred beyond single rays, without
         background."""
         blurred = gaussian_filter(self._without_background(frames), (0, _BLUR_PX, _BLUR_PX), output=np.float64)
         return blurred.ravel()
 
     def _units(self) -> np.ndarray:
-        """Returns the step (7,) of each number of a placement that moves a frame by a pixel at its edge, or doubles the
+        """Returns for each number of a placement (7,) the step that moves a frame by a pixel at its edge, or doubles the
         density."""
         scan = self.scans[0]
         pixel_mm = self.block * min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
         return np.array([pixel_mm / (max(scan.grid.size_mm) / 2)] * 3 + [pixel_mm] * 3 + [1.0])
 
     def _signals(self, operator: BeadOperator, placement: np.ndarray) -> np.ndarray:
-        """Returns the change (7, F · pixels) of the compared values per unit (``_units``) of each number of the
+        """Returns the change (7, F · pixels) of the compared values, per unit (``_units``) of each number of the
         placement."""
         signals = []
         for number, unit in enumerate(self._units()):
@@ -278,7 +276,7 @@ class BeadProblem(CoarseFrames):
         return np.array(signals)
 
     def _without_background(self, frames: np.ndarray) -> np.ndarray:
-        """Returns frames (F, rows, columns) less their fit by a few slow cosines along each side."""
+        """Subtracts from frames (F, rows, columns) their fit by a few slow cosines along each side."""
         rows, columns = (_cosines(count) for count in frames.shape[1:])
         if self.valid is None:
             inner = np.einsum("vi,fvu,uj->fij", rows, frames, columns)
@@ -292,10 +290,8 @@ class BeadProblem(CoarseFrames):
 
 
 def _clipped_noise(scans: Sequence[Scan]) -> float:
-    """Returns the standard deviation of the noise in air where the scans' noise was clipped at 0, from means of small
-    blocks.
-
-    Returns 0 where few pixels are 0, or some are below."""
+    """Returns the standard deviation of noise in air that was clipped at 0, from means of small blocks. It is 0 if few
+    pixels are 0, or some are below: then nothing was clipped."""
     values = np.concatenate([np.asarray(scan.projections, np.float32) for scan in scans])
     valid = np.concatenate([scan.valid for scan in scans])
     if np.mean(values[valid] == 0) < _LEAST_ZEROS or values[valid].min() < 0:
@@ -305,9 +301,8 @@ def _clipped_noise(scans: Sequence[Scan]) -> float:
 
 
 def _with_spread_of(scan: Scan, times: int) -> Scan:
-    """Returns the scan with longer exposures about the same middle, so that ``times`` moments spread as widely as the
-    whole exposure (standard deviation). Otherwise few moments would look like a shorter exposure. Scans with a pulse stay
-    unchanged."""
+    """Returns the scan with longer exposures about the same middle, so that ``times`` moments spread as widely as the whole
+    exposure (standard deviation). Otherwise few moments would look like a shorter exposure. Pulsed scans stay unchanged."""
     if scan.shutter.pulse_s is not None:
         return scan
     exposure_s = scan.shutter.exposure_s / math.sqrt(1 - times**-2)
@@ -317,7 +312,7 @@ def _with_spread_of(scan: Scan, times: int) -> Scan:
 
 
 def _moved(placement: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Returns the placement (7,) after a further turn about the world's axes, a shift, and a change of density."""
+    """Returns the placement (7,) after a further turn about the axes of space, a shift, and a change of density."""
     turn = Rotation.from_rotvec(step[:3])
     turned = (turn * Rotation.from_rotvec(placement[:3])).as_rotvec()
     return np.concatenate([turned, turn.apply(placement[3:DENSITY]) + step[3:DENSITY], placement[DENSITY:] + step[DENSITY:]])

@@ -1,4 +1,4 @@
-"""The parameters that can be calibrated: name, unit, stated value, step, and the object that would look the same."""
+"""The parameters that can be calibrated: name, unit, stated value, step, and which other object would look the same."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -13,25 +13,24 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.removed import removal
 from phyradgs_cl.text import suggest_name
 
-_STEP_PX = 0.25  # movement of the image at its edge, in pixels, by half a central difference
-_TIMING_STEP = 0.1  # upper limit of half a central difference of a time, as a fraction of the stated time
-_LARGEST_CUT = 0.7  # largest decrease of a time that the search tries, as a fraction of the stated time
-_MOST_TILT_RAD = math.radians(2.0)  # upper limit, in rad, of half a central difference of an angle
-_SMALL_MISMATCH = 1.3  # ``mismatch`` of signals that change sign after half a turn, as the errors of voxels do not
-# an angle with a larger standard deviation counts as undetermined: sines are linear no further
+_STEP_PX = 0.25  # signals are central differences, for which the image's edge moves by this much to each side
+_TIMING_STEP = 0.1  # a time is changed by at most this fraction of itself in a central difference
+_LARGEST_CUT = 0.7  # the search shortens a time by at most this fraction, so that it stays above 0
+_MOST_TILT_RAD = math.radians(2.0)  # an angle is changed by at most this in a central difference
+_SMALL_MISMATCH = 1.3  # errors of voxels do not change sign after half a turn, so they hardly disturb signals that do
+# An angle with a larger standard deviation counts as undetermined, because sines are not linear so far.
 _LEAST_KNOWN_RAD = math.radians(10.0)
 _DEGREES = math.degrees(1.0)
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter that can be calibrated: the field of ``GeometryCorrection`` that it changes.
+    """A parameter that can be calibrated. field: which field of ``GeometryCorrection`` it changes.
 
     - scale: displayed units per unit of the field.
-    - object_instead: the object that explains the frames as well, where they do not determine the parameter.
-    - pixels: how far a unit of the field moves the image at its edge.
-    - mismatch: measured errors (docs/calibrate.md) over those of noise, because voxels do not represent the object
-      exactly.
+    - object_instead: another object that explains the frames as well, if they do not determine the parameter.
+    - pixels: how many pixels a unit of the field moves the image at its edge.
+    - mismatch: measured errors (docs/calibrate.md) over those that noise causes: voxels do not represent the object exactly.
     - is_axial: the parameter moves the image along the axis, like ``LIFT``. The others move it across, like ``TURN``."""
 
     name: str
@@ -46,19 +45,20 @@ class Parameter:
     is_axial: bool = False
 
     def step(self, scan: Scan) -> float:
-        """Returns half the distance of a central difference, in the field's unit."""
+        """Returns how far a central difference goes to each side, in the field's unit."""
         step = _STEP_PX / self.pixels(scan)
         if self.unit == "deg":
             return min(step, _MOST_TILT_RAD)
         return min(step, _TIMING_STEP * self.stated(scan) or step) if self.is_timing else step
 
     def is_known(self, deviation: float) -> bool:
-        """Returns whether a value with the standard deviation ``deviation``, in the field's unit, is of use: an angle may
-        not be too uncertain, others always are."""
+        """Returns whether a value with the standard deviation ``deviation``, in the field's unit, is of use. Only an angle
+        can be too uncertain."""
         return self.unit != "deg" or deviation < _LEAST_KNOWN_RAD
 
     def lowest(self, scan: Scan) -> float:
-        """Returns the lowest correction of the field to try: one that leaves times above 0; −∞ for other parameters."""
+        """Returns the lowest correction of the field that the search may try: times stay above 0; others have no limit
+        (−∞)."""
         stated = self.stated(scan) if self.is_timing else 0.0
         return -_LARGEST_CUT * stated if stated > 0 else -math.inf
 
@@ -77,19 +77,19 @@ def _edge_pixels(scan: Scan, factor: float = 1.0) -> float:
 
 
 def _tilt_pixels(axis: int) -> Callable[[Scan], float]:
-    """Returns a function of the scan: by how many pixels a radian of tilt moves the panel's edge. A tilt magnifies one
-    side, so that points move by the square of their distance from its axis."""
+    """Returns a function of the scan: by how many pixels a radian of tilt moves the panel's edge. A tilt magnifies one side,
+    so points move by the square of their distance from its axis."""
     return lambda scan: _half_mm(scan, axis) ** 2 / _cone(scan).source_to_detector_mm / _pitch_mm(scan)
 
 
 def _cone(scan: Scan) -> ConeGeometry:
-    """Returns the geometry of a cone beam. ``requested`` refuses tilts and distances of other beams."""
+    """Returns the geometry, which must be a cone beam's: ``requested`` refuses tilts and distances of other beams."""
     assert isinstance(scan.geometry, ConeGeometry)
     return scan.geometry
 
 
 def _timing_pixels(scan: Scan) -> float:
-    """Returns the pixels by which the object's edge turns in a second."""
+    """Returns by how many pixels the object's edge turns in a second."""
     speed_rad_per_s = exposure_arc_rad(scan) / scan.shutter.exposure_s
     edge_mm = max(scan.grid.size_mm[1:]) / 2 * scan.geometry.magnification
     return max(speed_rad_per_s * edge_mm / _pitch_mm(scan), 1e-12)
@@ -140,7 +140,7 @@ OFFSET_U = "offset-u"
 TURN = Parameter("all angles", "turn_rad", "deg", _TURN, lambda s: 0.0, _edge_pixels, _DEGREES)
 LIFT = Parameter("all heights", "lift_mm", "mm", "a lower object", lambda s: 0.0, lambda s: 1 / _pitch_mm(s), is_axial=True)
 GAUGES = (TURN, LIFT)
-"""Parameters that no frame determines. What remains of their signals is errors of the voxels."""
+"""Parameters that no frame determines. What a volume leaves of their signals comes from errors of the voxels."""
 PARAMETER_GROUPS = {
     "offset": (OFFSET_U, "offset-v"),
     "tilt": ("tilt-v", "tilt-u"),
@@ -154,8 +154,8 @@ NAMES = list(dict.fromkeys([*PARAMETER_GROUPS, *PARAMETERS, WOBBLE, MOTION, DIRE
 
 @dataclass(frozen=True)
 class Request:
-    """What to estimate. parameters: those of all views. per_view: "wobble", "motion" or "". asks_direction: whether to
-    test which line is read first."""
+    """What to estimate. parameters: common to all views. per_view: "wobble", "motion" or "". asks_direction: whether to test
+    which line is read first."""
 
     parameters: list[Parameter]
     per_view: str
@@ -169,11 +169,11 @@ class Request:
 def requested(what: str | None, scan: Scan, knows_shape: bool = False) -> Request:
     """Returns the request that ``what`` states, names separated by commas. knows_shape: the object's shape is known.
 
-    None takes offset, roll and tilt, in a fly-scan with a rolling readout also readout and exposure, for an object of
-    known shape also distances. A parallel beam has neither tilt nor distances.
+    None stands for offset, roll and tilt. It adds readout and exposure in a fly-scan with a rolling readout, and distances
+    for an object of known shape. A parallel beam has neither tilt nor distances.
 
-    Raises InputError for an unknown name, distances and tilts of a parallel beam, wobble together with motion, the timing
-    of a gantry that stands still, and a readout of 0 s."""
+    Raises InputError for an unknown name, distances and tilts of a parallel beam, wobble together with motion, the timing of
+    a gantry that stands still, and a readout of 0 s."""
     if what is None:
         is_rolling = _turns(scan) and scan.shutter.readout_s > 0
         what = "offset,roll" if scan.is_parallel else "offset,roll,tilt"
@@ -210,14 +210,14 @@ def _turns(scan: Scan) -> bool:
 
 
 def correction_of(values: Mapping[str, float]) -> GeometryCorrection:
-    """Returns the correction with these values by parameter name, in the fields' units."""
+    """Returns the correction with these values, by parameter name, in the fields' units."""
     fields = {**PARAMETERS, **{gauge.name: gauge for gauge in GAUGES}}
     return GeometryCorrection(**{fields[name].field: float(value) for name, value in values.items()})
 
 
 def in_words(weights: Mapping[str, float]) -> str:
-    """Returns a combination of parameters (weights by name) in words: the largest weight first, without weights below 0.3
-    of the largest."""
+    """Returns a combination of parameters (weights by name) in words: the largest weight first, and no weight below 0.3 of
+    it."""
     order = sorted(weights, key=lambda name: -abs(weights[name]))
     largest = abs(weights[order[0]])
     main, *others = [name for name in order if abs(weights[name]) > 0.3 * largest]

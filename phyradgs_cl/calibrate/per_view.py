@@ -1,7 +1,7 @@
-"""Estimates parameters of single views (a wobble), or of an object that moves slowly (a motion), as splines of time.
+"""Estimates errors of single views (a wobble), or an object that moves slowly (a motion), as splines of time.
 
-A view's parameters change its own frame only, so their signals are images of that frame. CGLS solves the normal equations
-of a Gauss–Newton step for the volume and all parameters together. Parameters then explain only what the volume cannot.
+A view's parameters change only its own frame, so their signals are images of that frame. CGLS solves the normal equations of
+a Gauss–Newton step for the volume and all parameters together. Parameters then explain only what the volume cannot.
 ``estimate_views`` takes such steps from coarse to fine grids."""
 
 from abc import ABC, abstractmethod
@@ -22,21 +22,21 @@ from phyradgs_cl.reconstructors.fits.residuals import AugmentedOperator, ViewPar
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.runtime import Runtime
 
-SPLINES = 7  # default number of splines of a wobble or motion, each about a seventh of the scan wide
+SPLINES = 7  # default number of splines; each is about a seventh of the scan wide
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
-_STEP_PX = 0.25  # movement of a frame, in pixels, by half a central difference of a signal
-_LEAST_NORM = 0.1  # lower limit of a signal's norm in the scaling of parameters, as a fraction of the largest of its kind
+_STEP_PX = 0.25  # signals are central differences, for which a frame moves by this much to each side
+_LEAST_NORM = 0.1  # parameters with weak signals are scaled as if they had this fraction of their kind's largest norm
 _DEG = float(np.rad2deg(1.0))
-# discretisation error over the change of an estimate since a grid half as fine: half, where the error is of first order
+# Discretisation errors fall in proportion to the voxel, so half of the change since a grid half as fine is still an error.
 DISCRETISATION = 0.5
-_STEPS = 3  # Gauss–Newton steps on each grid
-_ITERATIONS = 20  # iterations of CGLS for each step, and for each standard deviation
-_DEVIATIONS = 3.0  # a kind is corrected where its RMS over the views exceeds this many standard deviations
+_STEPS = 3  # Gauss–Newton steps on each grid; the next grid continues from there
+_ITERATIONS = 20  # iterations of CGLS for each step and each standard deviation
+_DEVIATIONS = 3.0  # a kind is corrected only if its RMS over the views exceeds this many standard deviations
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of parameter: its name and unit in the table; scale: how many of that unit are one internal unit (rad or
+    """A kind of parameter: its name and unit in the table. scale: how many of that unit make an internal unit (rad or
     mm)."""
 
     name: str
@@ -46,11 +46,12 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class PerViewParameters(ABC):
-    """Values of the parameters, ``values`` (n, K). View f has the values (``basis`` @ ``values``)[f], (K,); basis is (F, n).
+    """Parameters of views, with ``values`` (n, K) of K kinds. View f has (``basis`` @ ``values``)[f], (K,), with basis (F,
+    n).
 
-    - units (K,): the amount of each kind that moves a frame by a pixel at its edge.
+    - units (K,): how much of each kind moves a frame by a pixel at its edge.
     - circle (n, 2): values that vary as cosine and sine of the angle, as far as the basis can.
-    - MISMATCH: measured errors (docs/calibrate.md) over those of noise, because voxels do not represent the object exactly.
+    - MISMATCH: measured errors (docs/calibrate.md) over those that noise causes: voxels do not represent the object exactly.
     - RESTARTED: kinds that start from 0 on each grid."""
 
     values: np.ndarray
@@ -68,11 +69,10 @@ class PerViewParameters(ABC):
 
     @abstractmethod
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """Returns values (n, K) less the part that a moved object explains exactly."""
+        """Returns values (n, K) without the part that a moved object would explain exactly."""
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
-        """Returns the indices of the kinds to estimate in stage ``number`` of ``count``: all, unless a subclass leaves
-        some out."""
+        """Returns the indices of the kinds to estimate in stage ``number`` of ``count``. A subclass may leave some out."""
         return range(len(self.KINDS))
 
     def operator(
@@ -82,7 +82,7 @@ class PerViewParameters(ABC):
 
 
 class WobbleParameters(PerViewParameters):
-    """One turn (rad) and two shifts along v and u (mm) per view: separate for each view, or as splines of time."""
+    """One turn (rad) and two shifts, along v and u (mm), per view: separate for each view, or as splines of time."""
 
     KINDS = (Kind("turn per view", "deg", _DEG), Kind("shift-v per view", "mm", 1.0), Kind("shift-u per view", "mm", 1.0))
     MISMATCH = 4.0
@@ -90,7 +90,7 @@ class WobbleParameters(PerViewParameters):
 
     @classmethod
     def of(cls, scan: Scan, count: int = 0) -> "WobbleParameters":
-        """Returns parameters of 0: separate ones for every view with ``count`` 0, else ``count`` splines of time."""
+        """Returns parameters of 0, as ``count`` splines of time, or separate ones for each view if ``count`` is 0."""
         if count:
             basis = splines(scan_course(scan) + 0.5, count)
             circle = _fitted_circle(scan, basis)
@@ -103,7 +103,7 @@ class WobbleParameters(PerViewParameters):
         return Views(per_view[:, TURN], per_view[:, SHIFT_V:])
 
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """Returns values (n, K) less what a turned or shifted object explains: the means of turns and of shifts along v,
+        """Returns values (n, K) without what a turned or shifted object explains: the means of turns and of shifts along v,
         and shifts along u that vary as cosine and sine of the angle."""
         rest = values.copy()
         rest[:, :SHIFT_U] -= (self.basis @ rest[:, :SHIFT_U]).mean(0)
@@ -112,8 +112,8 @@ class WobbleParameters(PerViewParameters):
         return rest
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
-        """Returns the kinds of a stage. Turns need fine detail, so the last two grids alone estimate them, each from 0:
-        the difference between the two grids then shows their error."""
+        """Returns the kinds of a stage. Turns need fine detail, so only the last two grids estimate them, each from 0. The
+        difference between the two grids then shows their error."""
         return (TURN, SHIFT_V, SHIFT_U) if number >= count - 2 else (SHIFT_V, SHIFT_U)
 
 
@@ -143,8 +143,8 @@ class MotionParameters(PerViewParameters):
         return replace(self.still, coefficients=values)
 
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """Returns values (n, K) less what a still object explains. One elsewhere explains the mean of each kind; a larger
-        or smaller one explains shifts along x and y that follow the source."""
+        """Returns values (n, K) without what an object at rest explains. An object in another place explains the mean of
+        each kind. A larger or smaller one explains shifts along x and y that follow the source."""
         rest = values - (self.basis @ values).mean(0)
         towards_source = self.circle - (self.basis @ self.circle).mean(0)
         shifts, pattern = self.basis @ rest[:, 3:5], self.basis @ towards_source
@@ -153,13 +153,12 @@ class MotionParameters(PerViewParameters):
 
 
 def _turn_unit_rad(scan: Scan) -> float:
-    """Returns the turn in rad that moves the object's edge by a pixel."""
     edge_mm = max(scan.grid.size_mm[1:]) / 2 * scan.geometry.magnification
     return scan.geometry.pixel_size_mm[1] / edge_mm
 
 
 def units_of_views(scan: Scan) -> np.ndarray:
-    """Returns (3,) the turn in rad and the shifts along v and u in mm that each move a view's frame by a pixel at its
+    """Returns (3,) the turn in rad, and the shifts along v and u in mm, that each move a view's frame by a pixel at its
     edge."""
     return np.array([_turn_unit_rad(scan), *scan.geometry.pixel_size_mm])
 
@@ -178,16 +177,16 @@ def view_step(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters, volume: np.ndarray,
     kinds: Sequence[int], iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a Gauss–Newton step (n, K) from the parameters' values at the object ``volume``, 0 for kinds outside of
-    ``kinds``. Also returns the signals (F, kinds, rows, columns): the change of the frames when each kind moves them by
-    one pixel."""
+    """Returns a Gauss–Newton step (n, K) of the parameters, at the object ``volume``; it is 0 for kinds outside of
+    ``kinds``. Also returns the signals (F, kinds, rows, columns): the change of the frames when each kind moves them by one
+    pixel."""
     operator = parameters.operator(problem, correction)
     residual = problem.residual(operator, volume)
     signals = np.stack([_signal(problem, correction, parameters, volume, kind) for kind in kinds], 1)
     norms = _norms(parameters.basis, signals)
     scale = _strength(operator) / np.maximum(norms, _LEAST_NORM * norms.max(0))
     if not np.array_equal(parameters.basis, np.eye(len(signals))):
-        # one scale for all splines, each of which reaches over many views
+        # a spline reaches over many views, so all splines have one scale
         scale = np.broadcast_to(scale.mean(0), scale.shape)
     per_view = parameters.basis @ scale / parameters.basis.sum(1, keepdims=True)
     scaled = (signals * per_view[:, :, None, None]).astype(np.float32)
@@ -207,11 +206,11 @@ def view_deviations(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters,
     signals: np.ndarray, iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the standard deviation (K,) of a view's parameter of each kind, in the parameters' units, and the fraction
-    (K,) of each kind's signals that no object explains.
+    """Returns for each kind the standard deviation (K,) of a view's parameter, in the parameters' units, and the fraction
+    (K,) of its signals that no object explains.
 
-    signals: (F, K, rows, columns), changes of the frames per pixel of movement, of all kinds. Errors of the spline
-    coefficients that make up a view's value count as independent."""
+    signals: (F, K, rows, columns), changes of the frames per pixel of movement, of all kinds. A view's value is a sum over
+    spline coefficients, whose errors count as independent."""
     operator = parameters.operator(problem, correction)
     norms = _norms(parameters.basis, signals)
     noise = noise_level(problem.measured, problem.valid)
@@ -228,7 +227,7 @@ def _norms(basis: np.ndarray, signals: np.ndarray) -> np.ndarray:
 
 
 def _strength(operator: RayOperator) -> float:
-    """Returns a rough largest singular value of A in mm. Parameters scaled to it converge as fast as the object does."""
+    """Returns about the largest singular value of A, in mm. Parameters scaled to it converge as fast as the volume does."""
     lengths = operator.forward(np.ones(operator.volume_shape, np.float32))
     return float(np.linalg.norm(operator.adjoint(lengths)) / np.linalg.norm(lengths))
 
@@ -237,7 +236,7 @@ def _signal(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters, volume: np.ndarray,
     kind: int,
 ) -> np.ndarray:
-    """Returns the change of the frames (F, rows, columns) for ``kind``, per pixel of movement of each view."""
+    """Returns the change of the frames (F, rows, columns) with ``kind``, per pixel of movement of each view."""
     step_px = _STEP_PX * problem.block
     step = np.zeros(len(parameters.units))
     step[kind] = step_px * parameters.units[kind]
@@ -257,16 +256,15 @@ def _share(
 
 @dataclass(frozen=True, eq=False)
 class ViewsEstimate:
-    """The result of ``estimate_views``. views: the corrections, 0 for kinds that are not significant; None where no kind
-    is. table: an estimate per kind, whose value is the root mean square over the views."""
+    """The result of ``estimate_views``. views: the corrections, 0 for kinds that are not significant; None if no kind is.
+    table: an estimate per kind, whose value is the root mean square over the views."""
 
     views: Views | Sway | None
     table: list[ParameterEstimate]
 
 
 def passes_of_views(scan: Scan, stages: Sequence[Stage], kinds: int) -> Passes:
-    """Returns the number of passes through the frames that ``estimate_views`` makes, and their total cost
-    (``pass_cost``)."""
+    """Returns how many passes through the frames ``estimate_views`` makes, and their total cost (``pass_cost``)."""
     costs = [pass_cost([scan], stage.columns, scan.frames) for stage in stages]
     counts = [stage.first + (_STEPS - 1) * stage.again + _STEPS * _ITERATIONS for stage in stages]
     counts[-1] += kinds * _ITERATIONS
@@ -277,7 +275,7 @@ def estimate_views(
     rt: Runtime, scan: Scan, parameters: PerViewParameters, stages: Sequence[Stage],
     correction: GeometryCorrection, passes: PassCounter,
 ) -> ViewsEstimate:
-    """Estimates ``parameters`` of a scan after ``correction``, in a few Gauss–Newton steps per stage, on ever finer
+    """Estimates ``parameters`` of a scan that ``correction`` has changed, in a few Gauss–Newton steps on each of ever finer
     grids.
 
     A deviation combines noise and discretisation error, which is half the change since the coarser grid."""
@@ -310,5 +308,4 @@ def estimate_views(
 
 
 def _rms_over_views(parameters: PerViewParameters, values: np.ndarray) -> np.ndarray:
-    """Returns the root mean square (K,) over the views of values (n, K)."""
     return np.sqrt(np.mean(np.square(parameters.basis @ values), 0))

@@ -1,4 +1,4 @@
-"""Finds a first placement of a known phantom: the rigid motion that takes its beads to bright spots of a volume."""
+"""Finds first placements of a known phantom: rigid motions that take its beads to bright spots of a volume."""
 
 from collections.abc import Iterator
 
@@ -10,15 +10,15 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
-FEWEST_BEADS = 4  # least number of beads of a phantom
+FEWEST_BEADS = 4  # three beads have a placement, a fourth confirms it
 WRONG_PHANTOM = "is it the right phantom, all of it in view, in mm? Does the gantry turn as stated ('phyradgs check')?"
-_LEAST_SHARE = 0.75  # least fraction of the beads that have to lie in bright spots
-_SMOOTH = 0.5  # standard deviation of the smoothing over a bead's radius: a bead of many voxels then has one maximum
-_PEAKS_PER_BEAD = 2.0  # number of bright spots, per bead, that are compared with the beads
-_TOLERANCE_VOXELS = 1.5  # largest distance of a bead from its bright spot, in voxels
-_TRIANGLES = 40  # most triangles of known beads that are tried
-_APART = 0.05  # least angle in rad between placements that count as different
-_MOST = 6  # most placements that are tried, where a nearly symmetric phantom fits equally well in several
+_LEAST_SHARE = 0.75  # at least this fraction of the beads must lie in bright spots of the volume
+_SMOOTH = 0.5  # smoothing (std) in radii of a bead: a bead of many voxels then has one maximum
+_PEAKS_PER_BEAD = 2.0  # this many bright spots per bead are compared with the beads, because some are no beads
+_TOLERANCE_VOXELS = 1.5  # a bead lies at most this far from its bright spot, in voxels
+_TRIANGLES = 40  # this many random triangles of beads are looked for among the spots: one that fits gives a placement
+_APART = 0.05  # placements whose turns differ by less, in rad, are the same
+_MOST = 6  # a nearly symmetric phantom fits equally well in several placements: this many are tried
 
 
 def bead_centres_mm(phantom: EllipsoidPhantom) -> np.ndarray:
@@ -33,11 +33,11 @@ def bead_centres_mm(phantom: EllipsoidPhantom) -> np.ndarray:
 
 
 def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> list[np.ndarray]:
-    """Returns up to 6 placements (6,), the best first, that take most of the known beads to bright spots of ``volume``
-    (nz, ny, nx).
+    """Returns up to 6 placements (6,), the best first, that take most of the known beads to bright spots of ``volume`` (nz,
+    ny, nx).
 
-    A placement is a turn (rotation vector, rad) and a shift (mm). Raises InputError where no placement takes three
-    quarters of the beads to spots."""
+    A placement is a turn (rotation vector, rad) and a shift (mm). Raises InputError if none takes three quarters of the
+    beads to spots."""
     beads_mm = bead_centres_mm(phantom)
     radius_mm = np.median([body.reach_mm for body in phantom.ellipsoids if isinstance(body, Ellipsoid)])
     smooth = gaussian_filter(volume, _SMOOTH * radius_mm / np.array(grid.voxel_size_mm))
@@ -69,8 +69,8 @@ def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> lis
 
 
 def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
-    """Returns the bright spots (m, 3), m ≤ ``most``, x y z in mm, of a volume (nz, ny, nx): the centroids of the 3³
-    voxels about its largest positive local maxima, without maxima in the outermost voxels."""
+    """Returns up to ``most`` bright spots (m, 3), x y z in mm, of a volume (nz, ny, nx): centroids of the 3³ voxels about
+    its largest positive local maxima. Maxima at the volume's faces do not count."""
     inner = np.zeros(volume.shape, bool)
     inner[1:-1, 1:-1, 1:-1] = True
     peaks = np.argwhere((volume == maximum_filter(volume, 3)) & inner & (volume > 0))
@@ -88,8 +88,8 @@ def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
 def _matching_triangles(
     beads_mm: np.ndarray, spots_mm: np.ndarray, within_mm: float
 ) -> Iterator[tuple[tuple[int, int, int], list[int]]]:
-    """Yields triangles of beads (n, 3) with triangles of spots (m, 3) whose sides differ by less than ``within_mm``, as
-    three indices each."""
+    """Yields triangles of beads (n, 3) and triangles of spots (m, 3) whose sides differ by less than ``within_mm``, as three
+    indices each."""
     rng = np.random.default_rng(0)
     apart = np.linalg.norm(spots_mm[:, None] - spots_mm, axis=-1)
     for _ in range(_TRIANGLES):
@@ -103,7 +103,7 @@ def _matching_triangles(
 
 
 def _rigid(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Returns the turn (rad) and shift (mm), (6,), that take points (n, 3) nearest to targets (n, 3), both in mm."""
+    """Returns the turn (rad) and shift (mm), (6,), that bring points (n, 3) nearest to targets (n, 3), both in mm."""
     middle, there = points.mean(0), targets.mean(0)
     turn, _ = Rotation.align_vectors(targets - there, points - middle)
     return np.concatenate([turn.as_rotvec(), there - turn.apply(middle)])

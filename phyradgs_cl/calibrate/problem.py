@@ -1,5 +1,5 @@
-"""The grids of a calibration, from coarse to fine, and its progress in passes through the frames. The frames of one or
-two scans on one grid, their operator after a correction, and the volume that fits them."""
+"""What a calibration compares: the frames of one or two scans on a coarse grid, their operator after a correction, and the
+volume that fits them. Also its grids, from coarse to fine, and its progress in passes through the frames."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -24,22 +24,22 @@ from phyradgs_cl.reconstructors.voxels.priors import axis_weights
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-_MOST_TIMES = 8  # most times per exposure
-_VOXELS_PER_TIME = 2.0  # travel of the volume's rim, in voxels, for which one time of an exposure is taken
+_MOST_TIMES = 8  # most times per exposure: each costs a projection
+_VOXELS_PER_TIME = 2.0  # an exposure is sampled so often that the volume's rim moves by this many voxels between two times
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 Report = Callable[[int, int, str, float], None]
-"""Takes the passes done, the passes in all, the phase, and the share of the time that has passed."""
-_LEAST_SHARE = 0.1  # lower limit of the cost still expected of a phase, over that of the most passes still to come
+"""A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
+_LEAST_SHARE = 0.1  # in progress, a phase with passes left counts at least this fraction of their cost
 Passes = tuple[int, float]
-"""The most passes to come, and the cost that all passes are expected to have together."""
+"""How many passes may still come at most, and their expected total cost."""
 
 
 @dataclass(frozen=True)
 class Stage:
     """One grid of a calibration: at most ``columns`` blocks of pixels along the panel's longer side.
 
-    first, again: iterations of a first volume and of a later one. steps: the most Gauss–Newton steps. project: iterations
-    of CGLS in each step that remove what a volume explains."""
+    first, again: iterations for the first volume and for each later one. steps: most Gauss–Newton steps. project: iterations
+    of CGLS, in each step, that remove what a volume explains."""
 
     columns: int
     first: int
@@ -48,17 +48,16 @@ class Stage:
     project: int = 20
 
     def block(self, scan: Scan) -> int:
-        """Returns the pixels along a block's side."""
+        """Returns the number of pixels along a block's side."""
         return ceil_div(max(scan.geometry.detector_shape), self.columns)
 
     def passes(self, parameters: int, asks: bool) -> int:
-        """Returns the largest number of passes through the frames. asks: the stage also tests which parameters the frames
-        determine."""
+        """Returns the most passes through the frames. asks: the stage also tests which parameters the frames determine."""
         return self.first - self.again + self.steps * (self.again + self.project * (parameters + (3 if asks else 1)))
 
 
 def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:
-    """Returns the cost of a pass through the scans with at most ``columns`` blocks, proportional to rays × voxels along a
+    """Returns the cost of a pass through the scans with at most ``columns`` blocks: it grows as rays × voxels along a
     ray."""
     shape = scans[0].geometry.detector_shape
     rows, across = (ceil_div(n, ceil_div(max(shape), columns)) for n in shape)
@@ -66,8 +65,8 @@ def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:
 
 
 class PassCounter:
-    """Counts passes and reports them. plan: number and cost of the passes of each phase, in order. Passes that turn out
-    not to be needed are removed, so that the total falls."""
+    """Counts passes and reports them. plan: number and cost of the passes of each phase, in order. Passes that turn out to
+    be unnecessary are taken out, so the total falls."""
 
     def __init__(self, report: Report, plan: Mapping[str, Passes]) -> None:
         self.plan = dict(plan)
@@ -76,7 +75,7 @@ class PassCounter:
         self._current: Passes = (0, 0.0)  # passes that remain in this phase
 
     def begin(self, phase: str, text: str) -> None:
-        """Begins a phase, with the words of its report; earlier phases of the plan are over."""
+        """Begins a phase, which reports call ``text``. Earlier phases of the plan are over."""
         while phase in self.plan and next(iter(self.plan)) != phase:
             self.plan.pop(next(iter(self.plan)))
         self._text, self._current = text, self.plan.pop(phase, (0, 0.0))
@@ -103,9 +102,9 @@ class PassCounter:
 class CoarseFrames:
     """The scans as stated, without pixels and with fewer frames, and their binned measurement.
 
-    measured (F, rows, columns): all scans' frames, in line integrals averaged over blocks of ``block`` × ``block``
-    pixels. valid, of the same shape: valid pixels; None: all. ``count_pass`` is called once per iteration, in which all
-    frames are projected and backprojected."""
+    measured (F, rows, columns): all scans' frames, in line integrals averaged over blocks of ``block`` × ``block`` pixels.
+    valid, of the same shape: pixels to use; None: all. ``count_pass`` is called once per iteration, which projects and
+    backprojects all frames."""
 
     scans: Sequence[Scan]
     block: int
@@ -114,24 +113,23 @@ class CoarseFrames:
     count_pass: Callable[[], None] = lambda: None
 
     def masked(self, frames: np.ndarray) -> np.ndarray:
-        """Returns frames with 0 at invalid pixels."""
         return frames if self.valid is None else np.where(self.valid, frames, np.float32(0))
 
 
 def measured_blocks(small: Sequence[Scan]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Returns the frames (F, rows, columns) of all binned scans, and their valid pixels (None for all)."""
+    """Returns the frames (F, rows, columns) of all binned scans, and which pixels are valid (None: all)."""
     valid = np.concatenate([scan.valid for scan in small])
     return np.concatenate([np.asarray(scan.projections, np.float32) for scan in small]), None if valid.all() else valid
 
 
 def without_pixels(scan: Scan) -> Scan:
-    """Returns the scan with frames of zeros that take no memory."""
+    """Returns the scan with frames of zeros, which take no memory."""
     return replace(scan, projections=np.broadcast_to(np.float32(0), scan.projections.shape))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoarseProblem(CoarseFrames):
-    """Frames of an unknown object, whose volume has ``grid``."""
+    """Frames of an unknown object, and the grid of its volume."""
 
     rt: Runtime
     grid: Grid
@@ -156,11 +154,11 @@ class CoarseProblem(CoarseFrames):
         return replace(problem, measured=problem.masked(measured))
 
     def operator(self, correction: GeometryCorrection, views: Views | Sway | None = None) -> RayOperator:
-        """Returns the operator A of the coarse frames of all scans, with the geometry changed by ``correction`` and
-        ``views``.
+        """Returns the operator A of the coarse frames of all scans, in the geometry that ``correction`` and ``views``
+        change.
 
-        Each line integrates over 2 to 8 times of its exposure. views: changes of single views or of the object's pose;
-        None: none."""
+        Each line integrates over 2 to 8 times of its exposure. views: changes of single views or of the object's pose; None:
+        none."""
         tables = []
         for scan in self.scans:
             small = coarse.binned(perturb(scan, correction, views), self.block)
@@ -170,7 +168,7 @@ class CoarseProblem(CoarseFrames):
         return RayOperator(self.rt, self.grid, small.geometry.detector_shape, tables, fewest_lines=FEWEST_LINES)
 
     def line_integrals(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
-        """Returns the measurement as mean line integrals. A detector that averages intensity measures less at edges; the
+        """Returns the measurement as mean line integrals. A detector that averages intensity measures less at edges: the
         difference at ``volume`` is added."""
         if self.scans[0].detector_model != "intensity":
             return self.measured
@@ -183,8 +181,8 @@ class CoarseProblem(CoarseFrames):
         return IntensityOperator(self.rt, self.grid, operator.detector_shape, operator.tables).expected(volume)
 
     def reconstruct(self, operator: RayOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
-        """Returns a nonnegative volume (nz, ny, nx) with little total variation, after ``iterations`` from ``start``
-        (None: zeros)."""
+        """Returns a nonnegative volume (nz, ny, nx) of little total variation, after ``iterations`` from ``start`` (None:
+        zeros)."""
         volume = np.zeros(self.grid.shape, np.float32) if start is None else start
         system = System(operator, self.line_integrals(operator, volume), self.valid)
         method = FistaTv(system, _TV, TvProx(self.rt, self.grid.shape, axis_weights(self.grid)))
@@ -195,15 +193,15 @@ class CoarseProblem(CoarseFrames):
         return method.volume
 
     def compared(self, frames: np.ndarray) -> np.ndarray:
-        """Returns the values (F · pixels,) of frames that enter the misfit: 0 at invalid pixels."""
+        """Returns the values (F · pixels,) by which frames are compared: 0 at invalid pixels."""
         return self.masked(frames).ravel()
 
     def residual(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
-        """Returns measured less expected frames (F, rows, columns)."""
+        """Returns measured minus expected frames (F, rows, columns)."""
         return self.measured - self.masked(self._expected(operator, volume))
 
     def noise(self, residual: np.ndarray) -> float:
-        """Returns the standard deviation of a pixel's noise, from the measurement: a volume would fit some noise of
+        """Returns the standard deviation of a pixel's noise, from the measurement: a volume fits some of the noise in
         ``residual``."""
         return noise_level(self.measured, self.valid)
 
@@ -224,9 +222,9 @@ class CoarseProblem(CoarseFrames):
 
 
 def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:
-    """Returns the smoothing across (rows, columns), in pixels, before binning. Rows that are read one after the other see
-    the object at other angles: smoothing across them would look like a shorter readout. Columns read so are sheared,
-    which smoothing does not change."""
+    """Returns the smoothing across (rows, columns), in pixels, before binning. Rows read one after the other are not
+    smoothed: they see the object at other angles, so smoothing would look like a shorter readout. Columns read so shear the
+    image, which smoothing does not change."""
     if block == 1:
         return 0.0
     is_rolling = scan.shutter.readout_s > 0 and scan.shutter.axis == "rows"

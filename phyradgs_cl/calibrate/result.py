@@ -1,4 +1,5 @@
-"""The result of a calibration: an estimate per parameter, combinations that no frame distinguishes, the corrected scan."""
+"""The result of a calibration: an estimate per parameter, combinations that no frame distinguishes, and the corrected
+scan."""
 
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CORRECTED, AGREES, CANNOT_TELL = "corrected", "agrees", "cannot tell"
-_FRAMES = 4  # most frames shown in the figure
+_FRAMES = 4  # frames shown in the figure, at most
 _ROW_INCH, _CURVES_INCH, _WIDTH_INCH = 1.8, 2.4, 7.0
 
 
@@ -23,8 +24,8 @@ _ROW_INCH, _CURVES_INCH, _WIDTH_INCH = 1.8, 2.4, 7.0
 class ParameterEstimate:
     """One parameter in ``unit``: its stated value, and the value found with its standard deviation.
 
-    The latter two are None where the frames do not determine the parameter. share: the fraction of the frames' change
-    with the parameter that no object and no other parameter explains, 0 to 1."""
+    The latter two are None if the frames do not determine the parameter. share: the fraction of the frames' change with the
+    parameter that no object and no other parameter explains, 0 to 1."""
 
     name: str
     unit: str
@@ -42,7 +43,6 @@ class ParameterEstimate:
         return " ± ".join(to_digits_of(number, self.deviation) for number in (self.found, self.deviation))
 
     def facts(self) -> dict[str, object]:
-        """Returns the fields as plain values, for JSON."""
         return asdict(self)
 
 
@@ -50,12 +50,12 @@ class ParameterEstimate:
 class Calibration:
     """The corrected ``scan``, in which everything else is unchanged, and how it was found.
 
-    - parameters: an estimate each. alike: combinations of parameters, in words, that the frames do not distinguish from
-      another object.
-    - residual_rms: RMS residual before and after, in line integrals, on the finest grid. before, after: these residuals
-      (F, rows, columns).
-    - views: corrections per view, or the object's motion, where they were significant. The table has the root mean square of
-      each kind, with the deviation of one.
+    - parameters: an estimate each. alike: combinations of parameters, in words, that no frame distinguishes from another
+      object.
+    - residual_rms: RMS residual before and after, in line integrals, on the finest grid. before, after: these residuals (F,
+      rows, columns).
+    - views: corrections per view, or the object's motion, if significant. The table has the root mean square of each kind,
+      with the deviation of a single view.
 
     Lengths are in mm, angles in degrees, times in s. ``calibrate`` returns a Calibration, or raises InputError."""
 
@@ -90,9 +90,9 @@ class Calibration:
     def per_view(self) -> dict[str, np.ndarray]:
         """Returns the corrections of every view, (F,) by name and unit; {} without corrections of views.
 
-        A wobble is added to the stated poses: source and panel turn counterclockwise as seen from above, and the panel
-        moves along its own v and u. A motion is the object's position in the middle of each view: rotated about x, y and
-        z, then shifted along them."""
+        A wobble is added to the stated poses: source and panel turn counterclockwise as seen from above, and the panel moves
+        along its own v and u. A motion is the object's pose in the middle of each view: rotated about x, y and z, then
+        shifted along them."""
         if self.views is None:
             return {}
         if isinstance(self.views, Views):
@@ -102,13 +102,12 @@ class Calibration:
             six = self.views.at(np.asarray(self.scan.frame_start_s) + self.scan.shutter.middle_s).T
             curves = {f"turn_{axis}_deg": np.rad2deg(values) for axis, values in zip("xyz", six[:3], strict=True)}
             curves |= {f"shift_{axis}_mm": values for axis, values in zip("xyz", six[3:], strict=True)}
-        return {name: values for name, values in curves.items() if values.any()}  # a kind without a correction has zeros
+        return {name: values for name, values in curves.items() if values.any()}  # kinds that were not corrected are all 0
 
     def plot(self) -> "Figure":
         """Returns a figure of the residuals of four frames, before on the left and after on the right, on one scale.
 
-        Below are the corrections per view, where there are any. Red: the frame has more than the volume explains; blue:
-        less."""
+        Below are the corrections per view, if any. Red: the frame has more than the volume explains; blue: less."""
         frames = np.unique(np.linspace(0, len(self.before) - 1, _FRAMES).round().astype(int))
         curves = self.per_view()
         heights = [_ROW_INCH] * len(frames)
@@ -139,5 +138,4 @@ def _draw_curves(axes: "Axes", curves: dict[str, np.ndarray], unit: str) -> None
 
 
 def rms(values: np.ndarray) -> float:
-    """Returns the root mean square of values (any shape)."""
     return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))

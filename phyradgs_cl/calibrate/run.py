@@ -1,9 +1,9 @@
 """Calibrates a scan from its own frames.
 
-It starts from the axis that fits best and, for a known phantom, from the place where its beads are seen. On request it
-tests the readout's direction, and corrects single views or a motion first. The search (``search``) then estimates the
-parameters common to all views, from coarse to fine grids. After that, views or the motion are estimated again. Significant
-corrections enter the scan and its provenance. Without corrected views, they do so only if they lower the residual."""
+The start is the axis that fits best and, for a known phantom, the place where its beads are seen. On request the readout's
+direction is tested, and single views or a motion are corrected first. The search (``search``) then estimates what is common
+to all views, from coarse to fine grids. After that, views or the motion are estimated again. Significant corrections enter
+the scan and its provenance. Unless views were corrected, they do so only if they lower the residual."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -58,15 +58,15 @@ STAGES = (
     Stage(96, first=50, again=15, steps=3, project=30),
 )
 BEAD_STAGES = (Stage(48, first=8, again=4, steps=6, project=0), Stage(128, first=6, again=4, steps=6, project=0))
-_FEWEST_FRAMES = 8  # least number of frames of a scan
-_FEWEST_COLUMNS = 12  # least number of columns of a scan
-_FEWEST_SPLINES = 4  # least number of splines of a wobble: a cubic spline needs four
-# least fraction of the frames' squares that a phantom in its best place explains, before any correction
+_FEWEST_FRAMES = 8  # fewer frames do not determine geometry
+_FEWEST_COLUMNS = 12  # fewer columns do not determine geometry
+_FEWEST_SPLINES = 4  # a cubic spline of a wobble needs four
+# In its best place, the right phantom explains at least this fraction of the frames' squares before any correction.
 _LEAST_EXPLAINED = 0.3
-_ORDER_ERRORS = 4.0  # least advantage of the better direction of readout, in standard errors; as in ``check``
-_ORDER_RATIO = 1.04  # least ratio of the two directions' squared residuals; as in ``check``
-_BEYOND = 1e6  # spans of a frame by which an encoder table is continued: first steps of the search may be very wrong
-# expected cost of a stage over its largest: few parameters are determined, and steps become small early
+_ORDER_ERRORS = 4.0  # a direction of readout must be better by this many standard errors, as in ``check``
+_ORDER_RATIO = 1.04  # the squared residuals of both directions must differ by this factor, as in ``check``
+_BEYOND = 1e6  # an encoder table is continued by this many frame times: first steps of the search may be very wrong
+# Progress expects a stage to cost this fraction of its most: few parameters are determined, and steps soon become small.
 _EXPECTED_SHARE = 0.25
 
 
@@ -77,10 +77,10 @@ def calibrate(
 ) -> Calibration:
     """Estimates a scan's true geometry and timing, as far as its frames determine them.
 
-    - what: parameters separated by commas. None takes the usual ones.
+    - what: parameters separated by commas; None: the usual ones (``requested``).
     - others: more scans of the same object in the same place, with the same errors.
     - phantom: the object, in any place, if its shape is known.
-    - splines: a wobble's number of splines of time; 0 takes every view by itself.
+    - splines: a wobble's number of splines of time; 0: each view has parameters of its own.
     - note: takes a line with the estimates so far after each grid.
 
     Raises InputError for unknown parameters, a scan too small, others that do not fit the first, and a phantom not seen."""
@@ -109,7 +109,7 @@ class _Calibrator:
 
     def __post_init__(self) -> None:
         self.placement = np.zeros(0)
-        self.stated = self.ready  # ``ready`` may get the other readout direction
+        self.stated = self.ready  # ``ready`` may later get the other readout direction
         stages = {one.block(self.scan): one for one in reversed(STAGES if self.phantom is None else BEAD_STAGES)}
         self.stages = list(stages.values())[::-1]  # on a small panel several stages have the same blocks
         self.per_view: PerViewParameters | None = None
@@ -145,7 +145,7 @@ class _Calibrator:
         before = self._residual(as_stated, self.stages[-1], GeometryCorrection())
         after = self._residual(problem, self.stages[-1], correction, views)
         held = {name: value for name, value in corrections.items() if name in self.search.held}
-        before_rest = before  # the residual of the rest is compared at the values of the held parameters
+        before_rest = before  # residual with only the held parameters corrected: what the others add is compared with it
         if held:
             known = correction_of(held)
             before_rest = after if held == corrections else self._residual(as_stated, self.stages[-1], known)
@@ -163,8 +163,8 @@ class _Calibrator:
         """Starts from the offset that ``check`` finds, because steps reach it from a distance of a few pixels only.
 
         In half a turn of nearly parallel rays, a volume explains most of what an offset changes. The search cannot determine
-        the offset there, so ``check``'s answer stands. It stands as well where the panel sees few rays twice: a shift that
-        leaves fewer of them fits better whatever is true."""
+        the offset there, so ``check``'s answer stands. It stands too if the panel sees few rays twice: a shift that leaves
+        fewer of them fits better, whatever the truth."""
         if self.phantom is None and has_axis_near_edge(self.ready[0]):
             self.search.held = (OFFSET_U,)
         quick, pitch_mm = coarse(self.ready[0], QUICK_COLUMNS), self.scan.geometry.pixel_size_mm[1]
@@ -177,8 +177,8 @@ class _Calibrator:
             self.search.fallback = {OFFSET_U: Fallback(shift.pixels * pitch_mm, shift.deviation * pitch_mm, is_significant)}
 
     def _search_common(self) -> None:
-        """Searches the parameters that all views share, in a scan whose single views are corrected first, because their
-        errors would look like a roll."""
+        """Searches the parameters that all views share. Single views are corrected first, because their errors would look
+        like a roll."""
         steady = self.ready
         if self.per_view is not None:
             self.passes.begin("views before", "views, before the rest")
@@ -194,8 +194,8 @@ class _Calibrator:
             self.passes.plan |= self._plan_of_stages(len(self.search.determined), number + 1)
 
     def _with_steady_views(self, scan: Scan) -> Scan:
-        """Returns the scan with its single views corrected. The mean of their shifts along u counts as the panel's
-        offset, if the offset is to be estimated."""
+        """Returns the scan with its single views corrected. If the panel's offset is to be estimated, the mean of their
+        shifts along u counts as offset."""
         views = self._estimate_views(correction_of(self.search.at)).views
         if isinstance(views, Views) and OFFSET_U in self.search.at:
             common_mm = float(views.shift_mm[:, 1].mean())
@@ -221,7 +221,7 @@ class _Calibrator:
         return replace(problem, count_pass=self.passes.counter(pass_cost(scans, stage.columns, most_frames)))
 
     def _place(self, phantom: EllipsoidPhantom) -> np.ndarray:
-        """Returns a first placement (7,) of the phantom: among those where its beads are seen, the one that explains the
+        """Returns a first placement (7,) of the phantom: of those at which its beads are seen, the one that explains the
         frames best."""
         bead_centres_mm(phantom)
         correction = correction_of(self.search.at)
@@ -240,11 +240,11 @@ class _Calibrator:
         return placement
 
     def _test_direction(self) -> list[ParameterEstimate]:
-        """Compares the residuals with lines read from either end, and corrects the scans' direction. Returns its line of
-        the table.
+        """Compares the residuals with lines read from either end, and corrects the scans' direction. Returns its line of the
+        table.
 
-        A correction takes four standard errors and 4 % of the squared residual. The deviation is that of a direction, 1
-        or −1."""
+        A correction needs four standard errors and 4 % of the squared residual. The direction is 1 or −1; its deviation is
+        on that scale."""
         self.passes.begin("order", "which line is read first")
         stage = self.stages[min(1, len(self.stages) - 1)]
         reverse = [reversed_readout(scan) for scan in self.ready]
@@ -268,7 +268,7 @@ class _Calibrator:
         return problem.residual(operator, problem.reconstruct(operator, None, stage.first))
 
     def _plan(self) -> dict[str, Passes]:
-        """Returns the largest number of passes through the frames, and their cost, of each phase by name, in order."""
+        """Returns the most passes through the frames, and their cost, of each phase by name, in order."""
         second, last = self.stages[min(1, len(self.stages) - 1)], self.stages[-1]
         parameters, views, most_frames = len(self.request.parameters), (0, 0.0), MOST_FRAMES
         if self.per_view is not None:

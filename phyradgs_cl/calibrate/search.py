@@ -1,15 +1,15 @@
 """Searches for the parameters that all views share, with Gauss–Newton steps from coarse to fine grids.
 
-On each grid a volume is reconstructed, and every parameter's signal is computed: the change of the frames per unit of the
-parameter. The part of a signal that a change of the volume explains is removed (``reduced``). The parameters step until
-the steps are small, or the stage's steps are done. On the first grid each step also decides which parameters the frames
-determine. A known object of beads takes the place of the volume in a ``BeadProblem``.
+On each grid a volume is reconstructed, and each parameter's signal is computed: the change of the frames per unit of the
+parameter. The part of a signal that a change of the volume explains is removed (``reduced``). The parameters step until the
+steps are small, or the stage has no more. On the first grid each step also decides which parameters the frames determine. In
+a ``BeadProblem`` a known object of beads replaces the volume.
 
 The steps are variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413) in Kaufman's form. With A the
 operator at the parameters θ, x the volume and P the projector onto A's range, the Jacobian is J = (I − P) ∂A/∂θ x. The
-signal ∂A/∂θ x is a central difference, from which CGLS removes the part P ∂A/∂θ x. The remaining signals and residual
-give the step and its standard deviations. A parameter's share is the fraction of its signal that remains; the frames do
-not determine a parameter with too small a share."""
+signal ∂A/∂θ x is a central difference, from which CGLS removes the part P ∂A/∂θ x. The remaining signals and residual give
+the step and its standard deviations. A parameter's share is the fraction of its signal that remains; if it is too small, the
+frames do not determine the parameter."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,16 +25,16 @@ from phyradgs_cl.calibrate.per_view import DISCRETISATION
 from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, ParameterEstimate
 
-# A parameter is determined only if object and other parameters leave at least this fraction of its signal unexplained.
+# Frames determine a parameter if object and other parameters leave this fraction of its signal unexplained, or more.
 LEAST_SHARE = 0.2
-# the least unexplained fraction for a known object (beads), which has no voxels that explain signals by accident
+# For a known object (beads) less is enough: it has no voxels that explain signals by accident.
 LEAST_SHARE_OF_BEADS = 0.02
-_TINY = 1e-9  # number that is added to the diagonal of a matrix before its inverse
-_GAUGE_FACTOR = 2.0  # a parameter's unexplained fraction has to be at least this many times that of its gauge (``GAUGES``)
-_MOST_GAUGE = 0.2  # upper limit at which a gauge's unexplained fraction counts: it is large in a wrong geometry
+_TINY = 1e-9  # added to the diagonal of a matrix before its inverse, because signals may be linearly dependent
+_GAUGE_FACTOR = 2.0  # voxels leave some signal of a gauge (``GAUGES``) by error: a parameter must leave twice as much
+_MOST_GAUGE = 0.2  # in a wrong geometry more of a gauge's signal is left, which must not refuse every parameter
 DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
-_MOST_PX = 2.0  # largest step of a parameter, in coarse pixels at the image's edge: signals are not linear beyond
-_SETTLED = 0.1  # steps on a grid end when all are smaller than this many standard deviations
+_MOST_PX = 2.0  # a step moves the image by at most this many coarse pixels at its edge: signals are not linear beyond
+_SETTLED = 0.1  # the steps on a grid end when all are smaller than this many standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +43,8 @@ class Reduced:
 
     - jacobian (K, N): the part of each signal that no volume explains, per unit of the parameter's field.
     - residual (N,): the part of the residual that no volume explains.
-    - sizes (K,): norms of the whole signals. whole_gram (K, K): inner products of the whole signals over their norms.
-    - noise: standard deviation of a pixel. mismatch (K,): factors of the deviations, for errors other than noise."""
+    - sizes (K,): norms of the whole signals. whole_gram (K, K): inner products of the whole signals, each over its norm.
+    - noise: standard deviation of a pixel. mismatch (K,): factors on the deviations, for errors other than noise."""
 
     names: tuple[str, ...]
     mismatch: np.ndarray
@@ -56,7 +56,7 @@ class Reduced:
     noise: float
 
     def only(self, names: Sequence[str]) -> "Reduced":
-        """Returns the problem of the parameters ``names``. The others are fixed."""
+        """Returns the problem of the parameters ``names``, with the others fixed."""
         at = [self.names.index(name) for name in names]
         whole_gram = self.whole_gram[np.ix_(at, at)]
         mismatch, jacobian, sizes = self.mismatch[at], self.jacobian[at], self.sizes[at]
@@ -65,7 +65,7 @@ class Reduced:
         )
 
     def relative_to_stated(self, at: Mapping[str, float]) -> "Reduced":
-        """Returns the problem with its step counted from the stated values; it was linearised at the values ``at``, by
+        """Returns the problem with steps that count from the stated values. It was linearised at the values ``at``, by
         name."""
         back = np.array([at.get(name, 0.0) for name in self.names]) @ self.jacobian
         return replace(self, residual=self.residual + back)
@@ -77,7 +77,7 @@ class Reduced:
 
     @property
     def gram(self) -> np.ndarray:
-        """Inner products (K, K) of the rows of ``unit``. The diagonal is 1 where a volume explains nothing of a signal."""
+        """Inner products (K, K) of the rows of ``unit``. The diagonal is 1 if a volume explains nothing of a signal."""
         unit = self.unit
         return unit @ unit.T
 
@@ -85,8 +85,8 @@ class Reduced:
     def shares(self) -> np.ndarray:
         """The fraction (K,) of each parameter's signal that no object explains, 0 to 1.
 
-        This is the smaller of two ratios. One is the remaining norm over the whole norm. The other is the parameter's
-        certainty beside all others, over its certainty with a known object."""
+        This is the smaller of two ratios. One is the signal's norm without what an object explains, over its whole norm. The
+        other is how certain the parameter is among all unknowns, over how certain it would be with a known object."""
         tiny = _TINY * np.eye(len(self.names))
         variance, variance_with_object = (np.diag(np.linalg.inv(gram + tiny)) for gram in (self.gram, self.whole_gram))
         certainty = variance_with_object / variance
@@ -97,10 +97,10 @@ class Reduced:
         return np.linalg.solve(self.gram, self.unit @ self.residual) / self.sizes
 
     def deviations(self) -> np.ndarray:
-        """Returns the standard deviations (K,) of the step, by a sandwich estimator whose sample is the frames.
+        """Returns the standard deviations (K,) of the step, by a sandwich estimator whose samples are the frames.
 
-        Noise may therefore be correlated within a frame. Deviations are at least those of white noise. The noise that the
-        fit has removed from the residual is added back."""
+        So noise may be correlated within a frame. Deviations are at least those of white noise. The fit removes some noise
+        from the residual, which is added back."""
         unit = self.unit
         residual = self.residual - self.step() @ self.jacobian
         by_frame = (unit * residual).reshape(len(self.names), self.frames, -1).sum(-1)
@@ -116,10 +116,10 @@ def reduced(
     problem: CoarseProblem | BeadProblem, operator: Any, parameters: Sequence[Parameter], at: Mapping[str, float],
     volume: np.ndarray, iterations: int,
 ) -> Reduced:
-    """Returns the frames linearised at the parameters' values ``at`` (by name) and the object ``volume``: a volume, or a
+    """Returns the frames linearised at the parameters' values ``at`` (by name) and at the object ``volume``: a volume, or a
     placement of beads.
 
-    operator: that of the problem at these values. iterations: those of CGLS that remove what a volume explains."""
+    operator: of the problem at these values. iterations: of CGLS, which removes what a volume explains."""
     signals = [_signal(problem, one, at, volume) for one in parameters]
     images = [*signals, problem.residual(operator, volume)]
     *jacobian, residual = problem.beyond_object(operator, volume, images, iterations)
@@ -144,16 +144,16 @@ def _signal(
     for sign in (1, -1):
         correction = correction_of({**at, one.name: at.get(one.name, 0.0) + sign * step})
         operator: Any = problem.operator(correction)
-        ends.append(operator.forward(volume) - problem.measured)  # residuals are small: less rounding
+        ends.append(operator.forward(volume) - problem.measured)  # residuals are small, so less is lost by rounding
     return problem.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 
 def least_shares(problem: Reduced) -> dict[str, float]:
-    """Returns by name the least share with which a parameter counts as determined, from a problem with ``GAUGES``.
+    """Returns, by name, from which share on a parameter counts as determined. problem: with ``GAUGES``.
 
-    No frame distinguishes a turn of all views from a turned object. Voxels do not follow such an object exactly: they
-    leave a share of its signal, and as much of any other. The least share exceeds that of the turn; for parameters that
-    move the image along the axis, that of a lift."""
+    No frame distinguishes a turn of all views from a turned object. Voxels do not follow such an object exactly, though:
+    they leave some of its signal unexplained, and as much of any other. So a parameter's share must exceed the share of the
+    turn; of a lift, if the parameter moves the image along the axis."""
     remaining = {gauge.is_axial: float(problem.only([gauge.name]).shares[0]) for gauge in GAUGES}
     names = [name for name in problem.names if name in PARAMETERS]
     gauge_shares = {name: min(remaining[PARAMETERS[name].is_axial], _MOST_GAUGE) for name in names}
@@ -161,8 +161,8 @@ def least_shares(problem: Reduced) -> dict[str, float]:
 
 
 def indistinguishable(problem: Reduced, least: Mapping[str, float]) -> list[dict[str, float]]:
-    """Returns combinations of parameters, as weights by name, that an object explains but for less than the share in
-    ``least`` of the parameter with the largest weight."""
+    """Returns combinations of parameters, as weights by name, that an object explains almost wholly: what it leaves is less
+    than ``least`` of the parameter with the largest weight."""
     values, vectors = scipy.linalg.eigh(problem.gram, problem.whole_gram + _TINY * np.eye(len(problem.names)))
     limits = np.array([least[problem.names[k]] for k in np.abs(vectors).argmax(0)])
     return [dict(zip(problem.names, map(float, weights), strict=True)) for weights in vectors[:, values < limits**2].T]
@@ -173,8 +173,7 @@ Problem = CoarseProblem | BeadProblem
 
 @dataclass(frozen=True)
 class Fallback:
-    """An estimate from outside of the search, in the field's unit: value less the stated value, and its standard
-    deviation."""
+    """An estimate from outside of the search: value minus stated value, in the field's unit, and its standard deviation."""
 
     value: float
     deviation: float
@@ -189,10 +188,10 @@ class Fallback:
 class Search:
     """The state of a search.
 
-    - at: the current values by name. former: those at the end of the previous grid, which show the error of the voxels.
+    - at: the current values by name. former: the values at the end of the previous grid, which show the error of the voxels.
     - determined: the parameters that the frames determine; None before the first step.
     - fallback: estimates from elsewhere, for parameters that are not determined. fixed: the fallbacks in use.
-    - held: parameters that are not to be fitted, because wrong values would fit better.
+    - held: parameters that are not fitted, because wrong values would fit better.
     - shares: each parameter's share, by name. alike: combinations, in words, that no frame distinguishes.
     - reduced: the last linear problem."""
 
@@ -208,7 +207,7 @@ class Search:
     reduced: Reduced | None = None
 
     def descend(self, problem: Problem, stage: Stage) -> None:
-        """Steps on one grid until the steps are small, or the stage's steps are done."""
+        """Steps on one grid until the steps are small, or the stage has no more."""
         volume: np.ndarray | None = None
         asks = self.determined is None
         self.former = {} if asks or isinstance(problem, BeadProblem) else dict(self.at)
@@ -226,7 +225,7 @@ class Search:
                 return
 
     def _decide_determined(self, linear: Reduced) -> None:
-        """Sets which parameters the frames determine: those with a large enough share and a useful deviation."""
+        """Decides which parameters the frames determine: those with a large enough share and a useful deviation."""
         has_gauges = GAUGES[0].name in linear.names
         least = least_shares(linear) if has_gauges else dict.fromkeys(linear.names, LEAST_SHARE_OF_BEADS)
         linear = linear.only([one.name for one in self.parameters])
@@ -255,15 +254,15 @@ class Search:
         return bool(np.all(np.abs(change) < _SETTLED * self.reduced.deviations()))
 
     def keep_held(self) -> None:
-        """Keeps estimates of the held parameters alone."""
+        """Drops all estimates but those of held parameters."""
         self.determined = ()
         self.fixed = {name: estimate for name, estimate in self.fixed.items() if name in self.held}
 
     def estimates(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the values (K,) of the determined parameters and their standard deviations (K,), in the fields' units.
 
-        A deviation combines noise and discretisation error, which is half the change since the coarser grid. Both grow
-        where a parameter resembles undetermined ones, which stay as stated, right or wrong."""
+        A deviation combines noise and discretisation error, which is half the change since the coarser grid. Both grow where
+        a parameter resembles undetermined ones, which stay as stated, right or wrong."""
         if self.reduced is None or not self.determined:
             return np.zeros(0), np.zeros(0)
         values, noise = self.reduced.step(), self.reduced.deviations()
@@ -274,8 +273,8 @@ class Search:
     def corrections(self) -> dict[str, float]:
         """Returns the values, by name, of the parameters that differ from their stated values by three deviations.
 
-        All other parameters go back to their stated values. That changes the remaining values, so the test repeats until
-        all differ."""
+        All other parameters go back to their stated values. That changes the remaining values, so the test repeats until all
+        differ."""
         values, deviations = self.estimates()
         deviation = dict(zip(self.determined or (), deviations, strict=True))
         names = self.determined or ()

@@ -1,4 +1,4 @@
-"""Finds what is wrong or suspicious in a scan before a reconstruction. ``run.py`` asks the other modules' questions."""
+"""Finds what is wrong or suspicious in a scan before a reconstruction. ``run.py`` asks the questions of all modules here."""
 
 from phyradgs_cl.check.detector import CountReader
 from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding

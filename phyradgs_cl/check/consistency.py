@@ -25,41 +25,39 @@ from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares, t_s
 from phyradgs_cl.runtime import Runtime
 
 CONSISTENCY = "consistency"
-# upper limit of the ratio of the residual in the stated order to that in a random order: correct scans have 0.02 to 0.23
+# Consistent frames leave less than this fraction of their residual in a random order: correct scans have 0.02 to 0.23.
 _LARGEST = 0.35
-_DOUBTFUL = 0.1  # above this ratio of residuals, other orders of the frames and missing frames are tried
-_RANDOM_ORDERS = 2  # random orders whose squared residuals are averaged
-_FEWEST_FRAMES = 5  # scans of fewer frames cannot be judged
-_FEWEST_PIXELS = 32  # scans with fewer valid coarse pixels per frame cannot be judged
+_DOUBTFUL = 0.1  # above this fraction, exchanged, missing and repeated frames are tried as explanations
+_RANDOM_ORDERS = 2  # the residual in a random order is averaged over this many orders
+_FEWEST_FRAMES = 5  # fewer frames cannot tell one order from another
+_FEWEST_PIXELS = 32  # fewer valid coarse pixels per frame cannot tell one order from another
 _CLEAR = 0.5  # a hypothesis must leave less than this fraction of the stated scan's squared residual
-_NEARLY = 1.5  # rough fits with up to this many times the least mean squared residual are refined
-_ERRORS = 4.0  # least advantage of a hypothesis over the stated scan, in standard errors
-# Frames look the same from every angle where a random order leaves a residual within one of these limits.
-_SAME = 0.03  # largest ratio of the residual in a random order to the standard deviation of the line integrals
-_NOISY = 1.6  # largest ratio of the residual in a random order to the noise: round objects had up to 1.3, others 2.3 or more
-_MOST_REFINED = 2  # most hypotheses about the whole scan for which the panel's shift is refined
-_SHIFT_PENALTY = 1.5  # factor on the squared residual per coarse pixel of the panel's shift: stated offsets are mostly right
-# A frame is odd where its mean line integral differs from its neighbours' by more than both of these.
+_NEARLY = 1.5  # a rough fit is refined unless another one is better by this factor in squares
+_ERRORS = 4.0  # a hypothesis must be better than the stated scan by this many standard errors
+# The frames look the same from every angle if a random order leaves a residual below _SAME or _NOISY.
+_SAME = 0.03  # residual over the standard deviation of the line integrals
+_NOISY = 1.6  # residual over the noise: round objects had up to 1.3, others 2.3 or more
+_MOST_REFINED = 2  # only the best hypotheses get a refined shift of the panel, which takes time
+_SHIFT_PENALTY = 1.5  # a hypothesis pays this factor for each coarse pixel of shift: stated offsets are mostly right
+# A frame is odd if its mean line integral differs from its neighbours' by more than _DEVIATIONS and _LEAST_CHANGE.
 _DEVIATIONS = 12.0  # difference in robust standard deviations of all frames' differences
-_LEAST_CHANGE = 0.75  # difference as a fraction of the frames' median mean line integral
-_REPEATED = 0.15  # a repeated frame differs from its predecessor by less than this fraction of the neighbouring differences
-_JUMP = 2.5  # the order of angles jumps above this ratio of the median steps in recorded and in sorted order
-_UNLIKE = 2.0  # a repeated frame differs from the next view in angle by more than this many times the median difference
-_OUTLIER = 4.0  # an outlier's residual is at least this many times the frames' median
-# An arc's first and last frame fit about equally badly where their residuals differ by less than this factor: right frames
-# had at most 1.4, one odd frame at least 2.3.
+_LEAST_CHANGE = 0.75  # difference over the frames' median mean line integral
+_REPEATED = 0.15  # a repeated frame differs from its predecessor by less than this fraction of what neighbouring frames do
+_JUMP = 2.5  # in an order that jumps, such as the golden angle, recorded steps are this many times as large as sorted ones
+_UNLIKE = 2.0  # a repeated frame differs this much, relative to the median, from the view nearest in angle
+_OUTLIER = 4.0  # the residual of an outlier is at least this many times the frames' median
+# Both ends of an arc may fit badly if their residuals differ by less than this factor: right frames had 1.4, odd ones 2.3.
 _ALIKE = 1.7
-# Such a first or last frame is kept only with a residual below this fraction of that in a random order: right frames had
-# 0.2, odd ones mostly 0.3.
+# But they must leave less than this fraction of the residual in a random order: right frames had 0.2, odd ones mostly 0.3.
 _AT_BOTH_ENDS = 0.25
-_MOST_OUTLIERS = 0.2  # from this fraction of the frames on, the cause is common to all, and no frame counts as an outlier
-_EXCHANGED = 0.5  # two frames were exchanged where the opposite order leaves less than this fraction of the squared residual
+_MOST_OUTLIERS = 0.2  # this many outliers, as a fraction of the frames, have a common cause: then none counts as one
+_EXCHANGED = 0.5  # two frames were exchanged if the opposite order leaves less than this fraction of the squares
 
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """The answer about consistency. frames (n,): indices of the frames that fit together. is_sound: further questions
-    make sense. sees_angles: the object looks different from different angles."""
+    """The answer about consistency. frames (n,): indices of the frames that fit together. is_sound: further questions make
+    sense. sees_angles: the object looks different from different angles."""
 
     finding: Finding
     frames: np.ndarray
@@ -69,9 +67,9 @@ class Consistency:
 
 @dataclass(frozen=True, eq=False)
 class _CoarseFit:
-    """The coarse scan with its best sense of rotation (``turned``), and with its best panel shift as well (``best``).
-    fitted: the fit of ``best``. random_total: sum of the squared residuals of its frames in a random order.
-    rough_mean_square: mean squared residual of the best rough fit."""
+    """The coarse scan with its best sense of rotation (``turned``), and with the best panel shift too (``best``). fitted:
+    the fit of ``best``. random_total: sum of the squared residuals of its frames in a random order. rough_mean_square: mean
+    squared residual of the best rough fit."""
 
     turned: Scan
     best: Scan
@@ -87,8 +85,8 @@ class _CoarseFit:
 def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
     """Finds frames and hypotheses that explain why the frames of a coarse ``scan`` do not fit together.
 
-    The finding's value is √(squared residual in the stated order / that in a random order). as_stated: the scan before it
-    was made coarse."""
+    The finding's value is √(squared residual in the stated order / in a random order). as_stated: the scan before it was
+    made coarse."""
     pixels = float(scan.valid.sum()) / scan.frames
     if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
@@ -131,8 +129,9 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
 
 
 def _unseen(scan: Scan, as_stated: Scan) -> float:
-    """Returns the residual of a coarse ``scan`` in a random order up to which its frames tell nothing of their angles."""
-    # noise differs from ray to ray, which raises that of fine pixels, and edges raise that of coarse ones
+    """Returns how small a residual in a random order shows that frames of a coarse ``scan`` tell nothing about their
+    angles."""
+    # The smaller one counts: edges raise the estimate from coarse pixels, noise that differs between rays the other one.
     levels = [noise_level(one.projections, np.broadcast_to(one.valid, one.projections.shape)) for one in (scan, as_stated)]
     noise = min(levels[0], levels[1] / float(np.prod(altered_trajectory(scan).blocks)) ** 0.5)
     return max(_SAME * float(np.asarray(scan.projections, np.float64).std()), _NOISY * noise)
@@ -140,10 +139,9 @@ def _unseen(scan: Scan, as_stated: Scan) -> float:
 
 def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     """Chooses the sense of rotation and the panel's shift, where they fit far better than as stated. A scan with opposite
-    views keeps its sense, because both senses fit such views equally well.
+    views keeps its sense: both senses fit it equally well.
 
-    Returns the scan with the sense, the scan with sense and shift, and the mean squared residual of the best rough
-    fit."""
+    Returns the scan with the sense, the scan with sense and shift, and the mean squared residual of the best rough fit."""
     senses, limits_px = [scan], [axis.ANYWHERE]
     if not has_opposite_views(scan):
         senses, limits_px = [scan, reversed_rotation(scan)], [axis.ANYWHERE, hypotheses.shifts_for_sense_px(scan)]
@@ -164,17 +162,17 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
 
 
 def _random_order(rt: Runtime, scan: Scan) -> float:
-    """Returns the sum of squared residuals of the scan's frames in a random order, the mean of a few draws."""
+    """Returns the sum of squared residuals of the scan's frames in a random order, averaged over a few orders."""
     rng = np.random.default_rng(0)
     orders = [rng.permutation(scan.frames) for _ in range(_RANDOM_ORDERS)]
     return float(np.mean([fit_squares(rt, replace(scan, projections=scan.projections[order])).sum() for order in orders]))
 
 
 def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -> Hypothesis | None:
-    """Returns the best hypothesis that fits far better than the stated scan does; None without one.
+    """Returns the best hypothesis that fits far better than the stated scan; None without one.
 
-    Frames of a panel that sees few rays twice fit any geometry. For them it returns the first hypothesis of other sizes
-    under which the frames are consistent."""
+    If the panel sees few rays twice, frames fit any geometry. Then the first hypothesis of other sizes under which frames
+    are consistent is returned."""
     is_one_sided = hypotheses.stated_redundancy(as_stated) < hypotheses.LEAST_REDUNDANCY
     about_scan = _refined_hypotheses(rt, scan, as_stated, np.inf if is_one_sided else coarse.rough_mean_square)
     if is_one_sided:
@@ -190,9 +188,8 @@ def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -
 def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:
     """Returns the best two hypotheses about the whole scan, with the panel shifted to fit best.
 
-    most: the mean squared residual of a rough fit may be up to 1.5 ``most``, because an offset between two coarse pixels
-    hides other differences. Large shifts count against a hypothesis. Of hypotheses with the same factor of sizes, the
-    best counts."""
+    most: a rough fit may leave 1.5 times this mean squared residual, because an offset between two coarse pixels hides other
+    differences. Large shifts count against a hypothesis. Of several hypotheses with one factor of sizes, the best counts."""
     tried: list[tuple[Hypothesis, Scan, axis.AxisShift]] = []
     for hypothesis in hypotheses.of_scan(scan, as_stated):
         other = hypothesis.scan()
@@ -219,8 +216,8 @@ def _is_consistent(rt: Runtime, scan: Scan) -> bool:
 
 
 def _best_below(rt: Runtime, candidates: Iterable[Hypothesis], stated: Fit, most: float) -> Hypothesis | None:
-    """Returns the hypothesis with the least squared residual, if that is below ``most`` and four standard errors better
-    than ``stated``; else None."""
+    """Returns the hypothesis with the least squared residual; None if that is not below ``most``, or not four standard
+    errors better than ``stated``."""
     best, least = None, most
     for hypothesis in candidates:
         squares = fit_squares(rt, hypothesis.scan())
@@ -230,8 +227,8 @@ def _best_below(rt: Runtime, candidates: Iterable[Hypothesis], stated: Fit, most
 
 
 def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:
-    """Finds odd and repeated frames before any reconstruction. Returns the indices (n,) of the other frames, and a note
-    for each one left out."""
+    """Finds odd and repeated frames before any reconstruction. Returns the indices (n,) of the other frames, and a note for
+    each frame that is left out."""
     odd, repeated = odd_frames(scan.projections, scan.pixel_mask), repeated_frames(scan)
     notes = [f"frame {frame_number(scan, f)} is unlike all others (black, bright, or no image)" for f in odd]
     notes += [f"frame {frame_number(scan, f)} is frame {frame_number(scan, f - 1)} recorded twice" for f in repeated]
@@ -239,7 +236,7 @@ def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:
 
 
 def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
-    """Returns the indices of frames of p (F, v, u) whose mean line integral is far from their neighbours'."""
+    """Returns the indices of the frames of p (F, v, u) whose mean line integral is far from that of their neighbours."""
     if len(p) < _FEWEST_FRAMES:
         return []
     valid = 1.0 if mask is None else (np.asarray(mask) == 0).astype(np.float32)
@@ -251,9 +248,9 @@ def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
 
 
 def repeated_frames(scan: Scan) -> list[int]:
-    """Returns the indices of frames that repeat their predecessor although the gantry has turned: the two differ far less
-    than neighbours do. In an order that jumps, such as the golden angle, they must also be unlike the next view in angle,
-    because distant views of a round object may look the same."""
+    """Returns the indices of frames that repeat their predecessor although the gantry has turned: they differ far less than
+    neighbours do. In an order that jumps, such as the golden angle, distant views of a round object may look the same. So
+    there a repeated frame must also differ from the next view in angle."""
     p = scan.projections
     if len(p) < _FEWEST_FRAMES:
         return []
@@ -278,7 +275,7 @@ def _rms(image: np.ndarray) -> float:
 
 
 def _neighbours(values: np.ndarray) -> np.ndarray:
-    """Returns, as (4, F), the two values before and the two after each of ``values`` (F,), mirrored at the ends."""
+    """Returns (4, F): the two values before and the two after each of ``values`` (F,), mirrored at the ends."""
     wide = np.r_[values[2:0:-1], values, values[-2:-4:-1]]
     return np.stack([wide[:-4], wide[1:-3], wide[3:-1], wide[4:]])
 
@@ -288,9 +285,9 @@ def without_outliers(
 ) -> tuple[np.ndarray, Fit, list[str]]:
     """Removes frames whose residual is far above the others', the worst first, with a new fit after each.
 
-    stated: the fit of all frames. random_square: the mean squared residual of frames in a random order. Returns the
-    indices (n,) of the other frames, their fit, and notes. Where a fifth of the frames would go, all frames have the same
-    cause, and none is removed. Two outliers may be frames whose order is exchanged."""
+    stated: the fit of all frames. random_square: the mean squared residual of frames in a random order. Returns the indices
+    (n,) of the other frames, their fit, and notes. If a fifth of the frames would go, the cause is common to all, and none
+    is removed. Two outliers may be two exchanged frames, which a note says."""
     remaining, current = np.arange(scan.frames), stated
     outliers: list[int] = []
     while len(outliers) < _MOST_OUTLIERS * scan.frames:
@@ -318,9 +315,8 @@ def without_outliers(
 def _ends_alike(residual: np.ndarray, random: float) -> np.ndarray:
     """Returns which first and last frames, bool (F,), fit about equally badly, as correct frames of an open arc do.
 
-    Frames at an end have neighbours on one side only, so a fit of few iterations leaves larger residuals, and a slow
-    drift shows in them. If they were removed, the frames next to them would follow. random: the residual in a random
-    order."""
+    Frames at an end have neighbours on one side only, so a few iterations fit them less well, and a slow drift shows in
+    them. Were they removed, the frames next to them would follow. random: the residual in a random order."""
     is_apart = residual >= _OUTLIER * np.median(residual)
     at_an_end = np.logical_and.accumulate(is_apart) | np.logical_and.accumulate(is_apart[::-1])[::-1]
     return at_an_end & (residual < _ALIKE * residual[::-1]) & (residual < _AT_BOTH_ENDS * random)

@@ -9,31 +9,30 @@ from phyradgs_cl.acquisition.geometry import field_of_view_mm
 from phyradgs_cl.check.finding import FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
 from phyradgs_cl.detector import noise_level
 
-_LARGEST_SHARE = 0.1  # upper limit of the line integral at the panel's sides, as a fraction of the largest one
+_LARGEST_SHARE = 0.1  # air lies below this fraction of the largest line integral: more at the panel's sides is the object
 _DISPLACED = 0.1  # a panel that is off centre by this fraction of its width was displaced on purpose
-_NOISES = 4.0  # line integrals count as object only above this many standard deviations of the noise
-_OPAQUE = 30.0  # upper limit of the largest line integral: behind more material no light passes
-_INVERTED = 0.9  # upper limit of the median at the panel's sides over the largest value: higher sides are no air
-_BRIGHT = 0.05  # largest fraction of the pixels that may be brighter than the flats
-_FRAMES = 0.1  # largest fraction of the frames in which the object may touch a side of the panel
-_COVERED = 0.1  # a column shows the object where more than this fraction of its rows does
-# upper limit of the ratio of the grid's width to the panel's field of view, and of the object's width to the grid's
+_NOISES = 4.0  # noise alone does not exceed this many of its standard deviations: more is the object
+_OPAQUE = 30.0  # behind larger line integrals no light passes, so they are no line integrals
+_INVERTED = 0.9  # if the sides exceed this fraction of the largest value, bright and dark are exchanged
+_BRIGHT = 0.05  # at most this fraction of the pixels may be brighter than the flats, by noise
+_FRAMES = 0.1  # the object may touch a side of the panel in this fraction of the frames
+_COVERED = 0.1  # a column shows the object if more than this fraction of its rows does
+# A unit is wrong if the grid is this many times wider than the panel's field of view, or the object than the grid.
 _ANOTHER_SIZE = 5.0
-NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # units of findings without line integrals
-CUT_OFF = "line integral at the border"  # unit of a finding: the object reaches beyond the panel
+NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # findings with these units end the check
+CUT_OFF = "line integral at the border"  # a finding with this unit says that the object reaches beyond the panel
 _QUESTION = "coverage"
 
 
 def check_coverage(scan: Scan) -> Finding:
     """Checks that the panel sees the whole object, and that the scan's values can be line integrals.
 
-    The object touches a side where the two outermost columns are above noise and a tenth of the largest line integral.
-    Their mean over some eighth of the rows counts, in at least a tenth of the frames. A displaced panel may cut the
-    object on its short side; the top and bottom are not checked.
+    The object touches a side if the two outermost columns are above noise and above a tenth of the largest line integral.
+    They are averaged over an eighth of the rows, and a tenth of the frames must show it. A displaced panel may cut the
+    object on its short side. The top and bottom are not checked.
 
-    Other findings: no object above the noise, inverted values, line integrals beyond 30, and pixels brighter than the
-    flats. A grid is of a wrong size where it is more than 5 times as wide as the panel's view, or the object more than 5
-    times as wide as the grid."""
+    Other findings: no object above the noise, inverted values, line integrals beyond 30, and pixels brighter than the flats.
+    A size is wrong if the grid is over 5 times as wide as the panel's view, or the object as the grid."""
     p = np.asarray(scan.projections)
     if p.shape[2] < FEWEST_COLUMNS:
         return too_narrow(_QUESTION, "line integral")
@@ -44,8 +43,8 @@ def check_coverage(scan: Scan) -> Finding:
 
 
 def _check_values(p: np.ndarray, valid: np.ndarray, largest: float, threshold: float) -> Finding | None:
-    """Returns a finding where the values cannot be line integrals of an object; None where they can. largest: that of the
-    line integrals; threshold: the level above which a pixel sees the object."""
+    """Returns a finding where the values cannot be line integrals of an object; None where they can. largest: the largest
+    line integral. threshold: from here on a pixel sees the object."""
     noise = _NOISES * noise_level(p, valid)
     if largest <= noise:
         text = f"no object: line integrals reach {largest:.3g}, noise {noise:.3g}"
@@ -69,7 +68,7 @@ def _check_values(p: np.ndarray, valid: np.ndarray, largest: float, threshold: f
 
 
 def _check_sides(scan: Scan, p: np.ndarray, valid: np.ndarray, largest: float, threshold: float) -> Finding:
-    """Returns the finding about the object at the panel's sides, and about its width in mm compared with the grid's."""
+    """Returns the finding about the object at the panel's sides, and about its width compared with the grid's."""
     sides = {"left": _border(p, valid, slice(0, 2)), "right": _border(p, valid, slice(-2, None))}
     sides.pop(_short_side(scan), None)
     name, level = max(sides.items(), key=lambda item: item[1])
@@ -94,7 +93,7 @@ def _check_sides(scan: Scan, p: np.ndarray, valid: np.ndarray, largest: float, t
 
 
 def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) -> float:
-    """Returns the object's median width in mm at the axis: columns in which a tenth of the rows is above ``threshold``."""
+    """Returns the object's median width in mm at the axis. A column counts if a tenth of its rows is above ``threshold``."""
     geometry = scan.geometry
     columns = float(np.median((((p > threshold) & valid).mean(1) > _COVERED).sum(1)))
     if isinstance(geometry, ParallelGeometry):
@@ -104,8 +103,8 @@ def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) ->
 
 
 def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
-    """Returns the level of the two columns ``columns``: the largest mean over an eighth of the rows, at the 90th
-    percentile of the frames."""
+    """Returns the level of the two columns ``columns``: the largest mean over an eighth of the rows, at the 90th percentile
+    of the frames."""
     edge = p[:, :, columns]
     weight = valid[:, :, columns].astype(float)
     rows = max(1, edge.shape[1] // 8)

@@ -1,4 +1,4 @@
-"""Is the detector sound: are there saturated areas or dead pixels, and does the gain drift over the scan?"""
+"""Is the detector sound? Are there saturated areas or dead pixels, and does the gain drift over the scan?"""
 
 import math
 from dataclasses import dataclass
@@ -16,22 +16,22 @@ from phyradgs_cl.reconstructors.fits.residuals import fit
 from phyradgs_cl.runtime import Runtime
 
 GAIN = "gain drift"
-OVERFLOW = "overflow"  # unit of a finding without line integrals
+OVERFLOW = "overflow"  # a finding with this unit ends the check
 _SATURATION, _DEAD = "saturation", "dead pixels"
-_MOST_SATURATED = 1e-3  # largest fraction of all pixels that may be saturated without a finding
-_REPEATS = 3  # least number of frames in which a clipped pixel has its least value
-_ZERO = 1e-6  # line integrals of a smaller size count as 0
-_JUMP = 0.75  # difference of neighbouring pixels' transmissions, over the brightest transmission, above which it is a jump
-_MOST_JUMPS = 5e-4  # largest fraction of all pixels that may jump without a finding
-_MOST_DEAD = 2e-4  # largest fraction of all pixels that may be dead without a finding
-_LARGEST_DRIFT = 0.015  # largest relative change of the gain over the scan without a finding
-_DRIFT_DEVIATIONS = 5.0  # a change of the gain is a finding only beyond this many of its standard deviations
-_FEWEST_FRAMES = 8  # least number of frames in which a drift can be seen
+_MOST_SATURATED = 1e-3  # a larger fraction of saturated pixels is suspicious
+_REPEATS = 3  # a pixel repeats its least value in at least this many frames if it was clipped there
+_ZERO = 1e-6  # smaller line integrals count as 0
+_JUMP = 0.75  # overflowed counts jump between neighbouring pixels by this fraction of the brightest transmission
+_MOST_JUMPS = 5e-4  # a larger fraction of jumping pixels is suspicious
+_MOST_DEAD = 2e-4  # a larger fraction of dead pixels is suspicious
+_LARGEST_DRIFT = 0.015  # a larger relative change of the gain over the scan is suspicious
+_DRIFT_DEVIATIONS = 5.0  # a change of the gain counts only beyond this many of its standard deviations
+_FEWEST_FRAMES = 8  # fewer frames cannot tell a drift from noise
 
 
 @dataclass
 class CountReader:
-    """Converts counts as ``counts_to_attenuation`` does, for ``read_scan``, and remembers saturated counts.
+    """Converts counts for ``read_scan`` as ``counts_to_attenuation`` does, and remembers saturated counts.
 
     ceiling: the largest count of projections and flats; None for files without counts. at_ceiling: the fraction of the
     projections' pixels that lie in areas at that count."""
@@ -50,11 +50,10 @@ class CountReader:
 
 
 def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
-    """Finds areas of pixels at one extreme value, suspicious above 0.1 % of the pixels. counts: the reader of the scan's
-    file.
+    """Finds areas of pixels at one extreme value, suspicious above 0.1 % of the pixels. counts: what read the scan's file.
 
-    Only pixels whose neighbours have the same value count. Noise clipped at 0 gives single pixels, saturation whole
-    areas. Areas of exactly 0 may be air, so they get the answer "cannot tell"."""
+    Only pixels whose neighbours have the same value count: saturation covers areas, noise clipped at 0 hits single pixels.
+    Areas of exactly 0 may be air, so they get the answer "cannot tell"."""
     if counts is not None and counts.ceiling is not None and counts.at_ceiling > _MOST_SATURATED:
         return _clipped(Saturation(counts.ceiling, counts.at_ceiling), "lower the exposure, or mask these pixels")
     if scan.saturation is not None and scan.saturation.share > _MOST_SATURATED:
@@ -67,7 +66,7 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
         advice = "did counts overflow (65,536 becomes 0)? Read the frames as unsigned, or lower the exposure"
         return Finding(_SATURATION, SUSPICIOUS, jumps, _MOST_JUMPS, OVERFLOW, text, advice)
     lowest, highest = float(p[~masked].min()), float(p[~masked].max())
-    is_inverted = float(np.median(p[:, :, [0, -1]])) == highest  # ``check_coverage`` reports bright air
+    is_inverted = float(np.median(p[:, :, [0, -1]])) == highest  # inverted images: ``check_coverage`` reports them
     at_least = clustered_share((p == lowest) & ~masked & (abs(lowest) > _ZERO))
     at_largest = 0.0
     if not is_inverted:
@@ -102,12 +101,12 @@ def _jumps(p: np.ndarray, masked: np.ndarray) -> float:
     transmission = np.where(masked, 1.0, np.exp(-np.clip(p, -20, 20))).astype(np.float32)
     brightest = float(np.percentile(transmission[:: max(1, len(p) // 20)], 99))
     jumps = np.abs(np.diff(median_filter(transmission, size=(1, 1, 5)), axis=2)) > _JUMP * brightest
-    return float(np.median(jumps.mean((1, 2))))  # ignores a few odd frames, which another question finds
+    return float(np.median(jumps.mean((1, 2))))  # the median ignores a few odd frames, which another question finds
 
 
 def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
-    """Returns the fraction of pixels (F, v, u) that repeat their own least value, as those do whose counts were clipped
-    before the division by the flats.
+    """Returns the fraction of pixels (F, v, u) that repeat their own least value: their counts were clipped before the
+    division by the flats.
 
     Pixels that never change are dead, and line integrals of 0 are air in scans without noise. Neither counts."""
     least = p.min(0)
@@ -116,10 +115,10 @@ def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
 
 
 def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
-    """Finds dead pixels that the mask does not have. Returns the finding, and a map of them, bool (v, u).
+    """Finds dead pixels that are not masked yet. Returns the finding, and a map of them, bool (v, u).
 
-    A dead pixel always has the same value, or differs from its neighbours in every frame. More than 0.02 % of the pixels
-    is suspicious."""
+    A dead pixel always has the same value, or differs from its neighbours in nearly every frame. More than 0.02 % of the
+    pixels are suspicious."""
     masked = ~scan.valid.any(0)
     if scan.frames < LEAST_FRAMES:
         text = f"fewer than {LEAST_FRAMES} frames"
@@ -140,8 +139,8 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
 def check_gain(rt: Runtime, scan: Scan) -> Finding:
     """Finds drifts and jumps of the detector's gain, from the levels of the frames of a coarse ``scan``.
 
-    It fits a ramp, and a step at each frame. A change of more than 1.5 % and five standard deviations is suspicious.
-    Levels may vary with the sine of the angle."""
+    It fits a ramp, and a step at each frame. A change is suspicious above 1.5 % and five standard deviations. Levels may
+    also vary with the sine of the angle, which is no drift."""
     if scan.frames < _FEWEST_FRAMES:
         return Finding(GAIN, CANNOT_TELL, 0.0, _LARGEST_DRIFT, "share", f"fewer than {_FEWEST_FRAMES} frames")
     level = fit(rt, scan).level
@@ -151,7 +150,7 @@ def check_gain(rt: Runtime, scan: Scan) -> Finding:
     shapes |= {f"at frame {at} (from 0)": (frames >= at).astype(float) for at in range(3, scan.frames - 2)}
     fits = {where: _fit_change(turning, shape, level) for where, shape in shapes.items()}
     where, (change, deviation, _) = min(fits.items(), key=lambda item: item[1][2])
-    change = math.expm1(-change)  # a larger gain lowers line integrals
+    change = math.expm1(-change)  # a larger gain gives smaller line integrals
     text = f"the gain changes by {100 * change:+.2f} ± {100 * deviation:.2f} % {where}"
     if abs(change) <= max(_LARGEST_DRIFT, _DRIFT_DEVIATIONS * deviation):
         verdict = OK if deviation * _DRIFT_DEVIATIONS < 3 * _LARGEST_DRIFT else CANNOT_TELL
@@ -161,9 +160,9 @@ def check_gain(rt: Runtime, scan: Scan) -> Finding:
 
 
 def _fit_change(turning: np.ndarray, shape: np.ndarray, level: np.ndarray) -> tuple[float, float, float]:
-    """Fits ``level`` (F,) by least squares with the columns of ``turning`` (F, n) and with ``shape`` (F,).
+    """Fits ``level`` (F,) by least squares with a column ``shape`` (F,) and the columns ``turning`` (F, n).
 
-    Returns the shape's coefficient, its standard deviation, and the squared residual."""
+    Returns the coefficient of ``shape``, its standard deviation, and the squared residual."""
     design = np.column_stack([turning, shape])
     coefficients, *_ = np.linalg.lstsq(design, level, rcond=None)
     residual = level - design @ coefficients

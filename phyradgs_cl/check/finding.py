@@ -1,19 +1,19 @@
-"""The answers of a check: a verdict per question, with the number on which it rests."""
+"""The answers of a check: a verdict on each question, with the number on which it rests."""
 
 from dataclasses import asdict, dataclass
 
 OK, SUSPICIOUS, CANNOT_TELL = "ok", "suspicious", "cannot tell"
 PIXEL_SIZES = "x_pixel_size and y_pixel_size (--pixel-size-mm of import)"
 MIRROR_U, MIRROR_V = "--column-0 (left or right)", "--row-0 (top or bottom)"  # options of import that mirror frames
-FEWEST_COLUMNS = 8  # least number of columns that can be judged: four gave false alarms, five did not
+FEWEST_COLUMNS = 8  # panels with fewer columns cannot be judged: four gave false alarms, five did not
 
 
 @dataclass(frozen=True)
 class Finding:
     """The answer to one ``question``, with the ``verdict`` "ok", "suspicious" or "cannot tell".
 
-    value: the measured number, in ``unit``. uncertainty: the value's standard deviation, where it is an estimate.
-    threshold: the value from which it is suspicious. text: what was found. advice: what to do about it."""
+    value: the measured number, in ``unit``. uncertainty: its standard deviation, where it is an estimate. threshold: the
+    value from which it is suspicious. text: what was found. advice: what to do about it."""
 
     question: str
     verdict: str
@@ -25,15 +25,14 @@ class Finding:
     uncertainty: float | None = None
 
     def facts(self) -> dict[str, object]:
-        """Returns the fields as plain values, for JSON."""
         return asdict(self)
 
 
 def too_narrow(question: str, unit: str) -> Finding:
-    """Returns the answer "cannot tell" to a question about columns, for a panel with too few."""
+    """Returns the answer "cannot tell" to ``question``, for a panel with too few columns."""
     return Finding(question, CANNOT_TELL, 0.0, 0.0, unit, f"fewer than {FEWEST_COLUMNS} columns")
 
 
 def same_from_everywhere(question: str) -> Finding:
-    """Returns the answer "cannot tell" to a question about angles, for an object that looks the same from every angle."""
+    """Returns the answer "cannot tell" to ``question``, for an object that looks the same from every angle."""
     return Finding(question, CANNOT_TELL, 0.0, 0.0, "", "the object looks too much the same from every angle")

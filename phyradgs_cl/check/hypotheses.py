@@ -1,4 +1,4 @@
-"""Hypotheses about what is wrong in a scan: units of sizes, steps of the angles, lost frames, mirrored frames."""
+"""Hypotheses about what is wrong in a scan: units of sizes, steps of the angles, missing frames, mirrored frames."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -16,21 +16,21 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fits import axis
 
 SIZE_FACTORS = (10.0, 0.1, 1e3, 1e-3)
-LEAST_REDUNDANCY = 0.5  # least fraction of columns whose rays are measured twice: with fewer, frames fit any size
+LEAST_REDUNDANCY = 0.5  # frames fit any pixel size if a smaller fraction of columns has rays that are measured twice
 _UNITS = {10.0: " (in cm, read as mm?)", 1e3: " (in m, read as mm?)", 1e-3: " (in µm, read as mm?)"}
-_FANS = (0.02, 3.0)  # range of the panel's width over its distance from the source in real scanners; others are not tried
-_GRID_FACTOR = 3.0  # a stated grid wider or narrower than the panel's view by more than this factor is replaced
-_SAME_PLACE = 1.0  # shifts of the panel by fewer coarse pixels cannot be told apart
-_ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)  # tried changes of the angle between views, in percent
-_GAPS = 15  # number of places at which a missing or repeated frame is tried
+_FANS = (0.02, 3.0)  # real scanners have a panel's width over its distance from the source in this range
+_GRID_FACTOR = 3.0  # a grid wider or narrower than the panel's view by this factor is as wrong as the sizes, and replaced
+_SAME_PLACE = 1.0  # shifts of the panel that differ by less, in coarse pixels, look the same
+_ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)  # changes of the angle between views, in percent, that are tried
+_GAPS = 15  # a missing or repeated frame is looked for at this many frames, evenly spread
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
     """What may be wrong in a scan: a description, advice, and a function that returns the scan corrected for it.
 
-    factor: by which pixels are larger than stated. Hypotheses with one factor, if not 1, differ by the panel's shift
-    only."""
+    factor: by which pixels are larger than stated. Hypotheses that share a factor other than 1 differ only by the panel's
+    shift."""
 
     text: str
     advice: str
@@ -39,22 +39,23 @@ class Hypothesis:
 
 
 def stated_redundancy(scan: Scan) -> float:
-    """Returns the fraction of columns whose rays a full turn measures twice, by the stated offset. Negative where the
+    """Returns the fraction of columns whose rays a full turn measures twice, by the stated offset. It is negative if the
     axis misses the panel."""
     geometry = scan.geometry
     return 1 - 2 * abs(geometry.detector_offset_mm[1]) / (geometry.pixel_size_mm[1] * geometry.detector_shape[1])
 
 
 def has_axis_near_edge(scan: Scan) -> bool:
-    """Returns whether the panel sees the axis, but so near its edge that it sees few rays twice."""
+    """Returns whether the panel sees the axis, but so near its edge that few rays are measured twice."""
     return 0 <= stated_redundancy(scan) < LEAST_REDUNDANCY
 
 
 def shifts_for_sense_px(scan: Scan) -> tuple[float, float]:
-    """Returns the limits (lowest, highest) of the panel's shift, in pixels of the recorded scan, for comparing senses of
+    """Returns how far the panel may be shifted, (lowest, highest) in pixels of the recorded scan, to compare senses of
     rotation.
 
-    A panel beside the axis goes no further off, because rays that are measured once fit under any angles."""
+    If the axis is near the panel's edge, the panel may only move towards it. Away from it fewer rays are measured twice, and
+    any angles would fit."""
     offset_mm, pitch_mm = scan.geometry.detector_offset_mm[1], scan.geometry.pixel_size_mm[1]
     if not has_axis_near_edge(scan):
         return axis.ANYWHERE
@@ -68,18 +69,18 @@ def frame_number(scan: Scan, frame: int) -> int:
 
 
 def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. stated: the scan before
-    it was made coarse."""
+    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. stated: the scan before it
+    was made coarse."""
     yield from _other_units(scan, stated)
     yield from _other_images(scan, stated)
 
 
 def _other_units(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses of sizes or distances in other units. Only their ratio enters the fan angle; the panel's offset
-    may decide which of the two is wrong. A parallel beam has none."""
+    """Yields hypotheses of sizes or distances in other units. The fan angle depends on their ratio alone. The panel's offset
+    may decide which of the two is wrong."""
     geometry = stated.geometry
     if isinstance(geometry, ParallelGeometry):
-        return  # in a parallel beam sizes scale with the object
+        return  # in a parallel beam, other sizes only scale the object
     fan = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / geometry.source_to_detector_mm
     offset_px = np.abs(np.array(geometry.detector_offset_mm) / geometry.pixel_size_mm)
     for factor in SIZE_FACTORS:
@@ -105,7 +106,7 @@ def _times(name: str, factor: float) -> str:
 
 
 def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Scan:
-    """Returns the coarse scan with pixels ``factor`` times as large, and with a grid for such pixels. keeps_axis: as in
+    """Returns the coarse scan with pixels ``factor`` times as large, and a grid that fits them. keeps_axis: as in
     ``resized``."""
     v_mm, u_mm = stated.geometry.pixel_size_mm
     off_v_mm, off_u_mm = (offset * (factor if keeps_axis else 1) for offset in stated.geometry.detector_offset_mm)
@@ -118,7 +119,7 @@ def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Sc
 
 
 def _matching_grid(stated: Scan, panel_grid: Grid) -> Grid:
-    """Returns the stated grid, or ``panel_grid`` where the stated one has another size or was derived from the panel."""
+    """Returns the stated grid, or ``panel_grid`` if the stated one was derived from the panel or has quite another size."""
     ratio = max(stated.grid.size_mm) / max(panel_grid.size_mm)
     is_derived = stated.grid == default_grid(stated.geometry)
     return panel_grid if is_derived or not 1 / _GRID_FACTOR < ratio < _GRID_FACTOR else stated.grid
@@ -136,8 +137,8 @@ def _other_images(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
 
 
 def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hypothesis]:
-    """Yields hypotheses about single frames of a coarse scan: other angle steps, exchanged pixel sizes (for
-    ``shifted_scan``) and, with ``tries_orders``, missing or repeated frames."""
+    """Yields hypotheses about single frames of a coarse scan: other angle steps, exchanged pixel sizes (of ``shifted_scan``)
+    and, with ``tries_orders``, missing or repeated frames."""
     yield from _other_steps(scan)
     yield from _exchanged_sizes(shifted_scan)
     if tries_orders:
@@ -145,8 +146,8 @@ def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hy
 
 
 def _azimuths(scan: Scan) -> np.ndarray:
-    """Returns each frame's angle (F,) in rad, counted from the first frame's. Angles that a trajectory states keep whole
-    turns."""
+    """Returns each frame's angle (F,) in rad relative to the first frame. Whole turns are kept if the trajectory states
+    angles."""
     trajectory = variants.altered_trajectory(scan)
     angle_rad = getattr(trajectory.base, "angle_rad", None)
     if angle_rad is None:
@@ -180,7 +181,7 @@ def _other_steps(scan: Scan) -> Iterator[Hypothesis]:
 
 def _exchanged_sizes(scan: Scan) -> Iterator[Hypothesis]:
     if scan.is_parallel:
-        return  # an object of another size explains the frames as well
+        return  # an object of another size would explain the frames as well
     v, u = scan.geometry.pixel_size_mm
     if abs(v / u - 1) > 0.02:
         text, advice = "pixel sizes fit if v and u are exchanged", f"exchange {PIXEL_SIZES}"
@@ -188,14 +189,14 @@ def _exchanged_sizes(scan: Scan) -> Iterator[Hypothesis]:
 
 
 def nearly_sized(scan: Scan, factor: float) -> Scan:
-    """Returns the scan with pixels ``factor`` times as large, the axis at its column, and the grid of ``stretched``."""
+    """Returns the scan with pixels ``factor`` times as large, the axis in the same column, and the grid of ``stretched``."""
     grid = variants.stretched(scan, factor, factor).grid
     return replace(variants.resized(scan, factor, keeps_axis=True), grid=grid)
 
 
 def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses of a missing or a repeated frame at up to 15 places, after which all frames are a step further,
-    or a step back."""
+    """Yields hypotheses of a missing or a repeated frame, at up to 15 frames: all later frames are a step further on, or
+    back."""
     sense = -1.0 if variants.altered_trajectory(scan).is_reversed else 1.0
     step = float(np.median(wrapped(np.diff(_azimuths(scan))))) * sense
     for at in np.unique(np.linspace(1, scan.frames - 1, _GAPS).round().astype(int)):

@@ -36,25 +36,25 @@ from phyradgs_cl.runtime import Runtime
 SIGN, CENTRE, DISTANCES = "sign of rotation", "centre of rotation", "distances"
 OTHER_CAUSE = "pixels, if pixel sizes are right"  # unit of an offset that wrong pixel sizes explain as well
 UNVERIFIED = "neither pixel sizes nor distances are verified by these frames"
-_ERRORS = 4.0  # least difference of two hypotheses in standard errors; below it the answer is "cannot tell"
-_SIGN_RATIO = 1.2  # least ratio of both senses' squared residuals that decides on the sense of rotation
-_CLEAR_RATIO = 3.0  # ratio of both senses' squared residuals in rough fits from which no refined shifts are needed
-_TOLERATED_PX = 1 / 3  # shift of the panel in pixels that is always tolerated
-_DEVIATIONS = 4.0  # shift of the panel that is always tolerated, in standard deviations of the found shift
-_BIAS_FULL_TURN = 0.003  # measured error of the axis in coarse pixels, for coarse scans of a full turn
-_BIAS_HALF_TURN = 0.04  # measured error of the axis in coarse pixels, where some rays are measured only once
-_WHOLE_PIXELS = 2  # "ok" needs a tolerance of at most this many pixels, where the shift is found without coarse pixels
-_LEAST_REDUNDANCY = 0.1  # lower limit of the assumed fraction of columns seen twice, for a panel with the axis at its edge
+_ERRORS = 4.0  # two hypotheses must differ by this many standard errors; else the answer is "cannot tell"
+_SIGN_RATIO = 1.2  # the wrong sense of rotation leaves this many times the squared residual of the right one
+_CLEAR_RATIO = 3.0  # if rough fits of both senses differ by this factor, they need no refined shifts
+_TOLERATED_PX = 1 / 3  # a shift of the panel by this many pixels is always tolerated
+_DEVIATIONS = 4.0  # a shift by this many of its standard deviations is always tolerated
+_BIAS_FULL_TURN = 0.003  # measured error of the axis in scans of a full turn, in coarse pixels
+_BIAS_HALF_TURN = 0.04  # measured error of the axis in coarse pixels, if some rays are measured only once
+_WHOLE_PIXELS = 2  # "ok" needs a tolerance of at most this many pixels where the shift comes from pixels of full size
+_LEAST_REDUNDANCY = 0.1  # least fraction of columns seen twice, to divide by: it is 0 if the axis is at the panel's edge
 _NO_SIGN = "parallel rays show an object that turns one way and its mirror image that turns the other way alike"
 _SIGN_ADVICE = "look for a feature whose side is known: a mirror image would fit as well"
-_OTHER_SIZES = (0.8, 1.25)  # factors on the fan; distances are "ok" where both fit worse than the stated fan
-_SIZE_RATIO = 1.05  # another fan fits worse from this ratio of its squared residual to the stated fan's
+_OTHER_SIZES = (0.8, 1.25)  # distances are "ok" if a fan narrower or wider by these factors fits worse
+_SIZE_RATIO = 1.05  # a fan fits worse if it leaves this many times the squared residual of the stated one
 
 
 @dataclass(frozen=True, eq=False)
 class Orbit:
-    """The findings about sense of rotation (``sign``) and axis (``centre``). shift: the panel's, along u. is_reversed:
-    the gantry turns the other way."""
+    """The findings about sense of rotation (``sign``) and axis (``centre``). shift: of the panel, along u. is_reversed: the
+    gantry turns the other way."""
 
     sign: Finding
     centre: Finding
@@ -69,8 +69,8 @@ class Orbit:
 
 
 def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> Orbit:
-    """Finds from the coarse scan ``quick`` which way the gantry turns and where the axis is. Both stay open with few
-    columns, and where the object looks the same from all angles (``sees_angles`` False)."""
+    """Finds from the coarse scan ``quick`` which way the gantry turns and where the axis is. Neither is found on a panel of
+    few columns, nor if the object looks the same from all angles (``sees_angles`` False)."""
     if quick.geometry.detector_shape[1] < FEWEST_COLUMNS:
         return Orbit(too_narrow(SIGN, "standard errors"), too_narrow(CENTRE, "pixels"))
     if not sees_angles:
@@ -103,8 +103,8 @@ def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> 
 def check_rotation(stated: axis.AxisShift, other: axis.AxisShift) -> Finding:
     """Compares the residuals with the angles as stated and reversed, each with its own best shift of the panel.
 
-    A reversal takes four standard errors and 20 % of the squared residual, because a mirror image in a narrow fan fits as
-    well. Frames mirrored in u fit reversed angles and the opposite offset; ``with_cause`` decides between the two."""
+    A reversal needs four standard errors and 20 % of the squared residual, because a mirror image fits as well in a narrow
+    fan. Frames mirrored in u fit reversed angles and the opposite offset; ``with_cause`` decides between the two."""
     errors, ratio = t_statistic(stated.squares, other.squares), residual_ratio(stated.squares, other.squares)
     text = f"turned the other way, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"
     values = (errors, -_ERRORS, "standard errors", text)
@@ -116,10 +116,10 @@ def check_rotation(stated: axis.AxisShift, other: axis.AxisShift) -> Finding:
 
 
 def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px: float) -> Finding:
-    """Returns a suspicious finding about the sense of rotation with its cause: reversed angles, or frames mirrored in u.
+    """Adds the cause to a suspicious finding about the sense of rotation: reversed angles, or frames mirrored in u.
 
-    Frames are mirrored where the best panel offset under reversed angles (stated_px + shift_px) is nearer to the opposite
-    of the stated offset than to it. A stated offset below ``tolerance_px`` does not decide."""
+    Under reversed angles the best panel offset is stated_px + shift_px. If it is nearer to the opposite of the stated
+    offset, frames are mirrored. A stated offset below ``tolerance_px`` does not decide."""
     if abs(stated_px) < tolerance_px:
         text = f"{finding.text}; frames mirrored in u would look the same"
         advice = f"change the sign of the angles ('gantry' for 'sample'), or import with the other {MIRROR_U}"
@@ -135,10 +135,10 @@ def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px
 def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisShift, Finding]:
     """Returns the panel's shift along u and the finding about it. shift: found with blocks of ``block`` pixels.
 
-    The error of coarse pixels is added to its standard deviation, because the bootstrap over frames does not include it.
-    That error is larger where ``scan`` measures fewer rays twice. Opposite views give a shift too, from pixels that are
-    not coarse; the shift with the smaller deviation counts. Where less than half of the rays are measured twice, opposite
-    views alone decide, or nothing does: any shift that leaves fewer such rays fits better."""
+    Coarse pixels cause an error that the bootstrap over frames does not include: it is added to the standard deviation. This
+    error is larger where ``scan`` measures fewer rays twice. Opposite views give a shift too, from pixels of full size; the
+    shift with the smaller deviation counts. If less than half of the rays are measured twice, only opposite views may
+    decide: any shift that leaves fewer such rays would fit better."""
     pitch_mm = scan.geometry.pixel_size_mm[1]
     if has_axis_near_edge(scan):
         shift = shift_by_rays_seen_twice(scan)
@@ -154,9 +154,9 @@ def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisS
 
 
 def check_centre(shift: axis.AxisShift, block: int, pitch_mm: float, stated_px: float) -> Finding:
-    """Compares the panel's shift with a third of a pixel and four standard deviations.
+    """Finds whether the panel is shifted by more than a third of a pixel and four standard deviations.
 
-    A stated offset that is wrong by the factor of a unit may be right in mm, with pixel sizes wrong by that factor."""
+    If the stated offset is wrong by the factor of a unit, it may be right in mm, and pixel sizes wrong by that factor."""
     threshold = max(_TOLERATED_PX, _DEVIATIONS * shift.deviation)
     if not (shift.is_found and math.isfinite(shift.deviation)):
         return Finding(CENTRE, CANNOT_TELL, 0.0, _TOLERATED_PX, "pixels", "no shift fits best")
@@ -183,7 +183,7 @@ def check_centre(shift: axis.AxisShift, block: int, pitch_mm: float, stated_px: 
 def check_distances(rt: Runtime, scan: Scan) -> Finding:
     """Fits a coarse scan with its fan 0.8 and 1.25 times as wide, each with its own best shift of the panel.
 
-    Only the fan distinguishes these sizes. The answer is "ok" where both fit worse, otherwise "cannot tell". Sizes that
+    Sizes and distances show in the fan alone. The answer is "ok" where both fit worse, otherwise "cannot tell". Sizes that
     fit far better make the frames inconsistent, which another question finds."""
     stated = fit_squares(rt, scan)
     others = {factor: fit_squares(rt, axis.with_best_shift(rt, nearly_sized(scan, factor))) for factor in _OTHER_SIZES}

@@ -1,4 +1,4 @@
-"""Asks all questions in an order in which each relies on earlier answers. Errors found are corrected for the next ones."""
+"""Asks all questions, in an order in which each may rely on earlier answers. Errors found are corrected for later ones."""
 
 import math
 from collections.abc import Callable
@@ -23,18 +23,17 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.scan.reader import united
 from phyradgs_cl.runtime import Runtime
 
-_SPARE_COLUMNS = 2.0  # error of a stated detector offset, in coarse columns, for which the grid has room
+_SPARE_COLUMNS = 2.0  # the grid has room for an error of the stated detector offset by this many coarse columns
 Report = Callable[[int, int, str], None]
-"""The type of a callback for progress: it takes the number of answered questions, of all, and the next question."""
+"""A callback for progress. It takes how many questions are answered, how many there are, and the next one."""
 
 
 @dataclass(frozen=True, eq=False)
 class CheckResult:
     """The findings of a check, in order.
 
-    offset_mm: the shift of the panel along u that explains the frames best, and its standard deviation
-    ``offset_spread_mm``. Both are NaN where no shift does, or where something else has to be corrected first; in the
-    latter case ``is_consistent`` is False."""
+    offset_mm: the shift of the panel along u that explains the frames best; ``offset_spread_mm``: its standard deviation.
+    Both are NaN where no shift does, or where something else has to be corrected first: then ``is_consistent`` is False."""
 
     findings: list[Finding]
     offset_mm: float = math.nan
@@ -47,7 +46,7 @@ class CheckResult:
 
 
 class _Answers:
-    """Collects the findings, and reports each when it is there."""
+    """Collects the findings, and reports each at once."""
 
     def __init__(self, questions: list[str], report: Report) -> None:
         self.findings: list[Finding] = []
@@ -62,7 +61,7 @@ class _Answers:
         return finding
 
     def stop(self) -> CheckResult:
-        """Answers the remaining questions with "cannot tell", because of the last finding, and returns the result."""
+        """Answers all remaining questions with "cannot tell", because of the last finding, and returns the result."""
         cause = self.findings[-1]
         for question in self._questions[len(self.findings) : -1]:
             self.add(Finding(question, CANNOT_TELL, 0.0, 0.0, "", f"rests on {cause.question}: {cause.verdict}"))
@@ -77,8 +76,8 @@ def check(
     scan: Scan, rt: Runtime, counts: detector.CountReader | None = None,
     report: Report = lambda done, total, question: None,
 ) -> CheckResult:
-    """Returns what is wrong or suspicious in a scan. counts: the reader of the scan's file, if it remembers counts.
-    report: is called with the questions answered, their number, and the next question.
+    """Returns what is wrong or suspicious in a scan. counts: what read the scan's file, if it remembers counts. report: is
+    called with the questions answered, their number, and the next question.
 
     Raises InputError where every pixel is masked, and for NaN or infinity at other pixels."""
     scan = without_lag(_finite(scan))
@@ -136,15 +135,15 @@ def check(
 def quick_scan(scan: Scan) -> Scan:
     """Returns the coarse scan for the questions about angles and the axis.
 
-    For a panel far beside the axis, the grid is cut to the object. In all voxels of such a panel's view, the few frames
-    of a coarse scan would fit under wrong angles too."""
+    If the axis is near the panel's edge, the grid is cut to the object: with many voxels around it, the few frames of a
+    coarse scan would fit under wrong angles too."""
     quick = coarse(scan, QUICK_COLUMNS)
     return around_object(quick, _SPARE_COLUMNS) if has_axis_near_edge(scan) else quick
 
 
 def _finite(scan: Scan) -> Scan:
-    """Returns the scan with zeros in place of masked values that are not finite. Raises InputError for unmasked values
-    that are not finite, and where every pixel is masked."""
+    """Returns the scan with zeros for masked values that are not finite. Raises InputError for unmasked values that are not
+    finite, and where every pixel is masked."""
     p = np.asarray(scan.projections)
     if not scan.valid.any():
         raise InputError("pixel_mask", "every pixel masked", "at least one usable pixel", "correct the mask")

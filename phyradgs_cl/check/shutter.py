@@ -14,31 +14,30 @@ from phyradgs_cl.reconstructors.fits.residuals import fit_squares, residual_rati
 from phyradgs_cl.runtime import Runtime
 
 READOUT, EXPOSURE = "sign of readout", "exposure"
-_ERRORS = 4.0  # least difference of two hypotheses in standard errors
-# least ratio of squared residuals that decides between the two orders of readout; both models are equally free
+_ERRORS = 4.0  # two hypotheses must differ by this many standard errors
+# The wrong order of readout leaves this many times the squared residual: both orders are equally free to fit.
 _ORDER_RATIO = 1.04
-_OTHER_RATIO = 1.5  # least ratio of squared residuals that decides for another readout axis or readout time
-# least ratio of squared residuals that decides for a gantry at rest: a model without blur fits better in any case, above
-# all with few views
+_OTHER_RATIO = 1.5  # another readout axis or time must fit better than the stated one by this factor in squares
+# A gantry at rest must fit better by this factor: a model without blur always fits better, above all with few views.
 _REST_RATIO = 2.0
-_AS_GOOD = 1.15  # readouts with up to this many times the best one's squared residual are named beside it
-_READOUT_SHARE = 0.86  # readout time tried where none is stated, as a fraction of the time between frames
+_AS_GOOD = 1.15  # readouts that leave up to this many times the best one's squared residual are named too
+_READOUT_SHARE = 0.86  # if no readout time is stated, this fraction of the time between frames is tried
 _OTHER_WAY, _AT_REST = "the other way", "all at once, the gantry at rest"
 _NEEDED_RATIO = {_OTHER_WAY: _ORDER_RATIO, _AT_REST: _REST_RATIO}
-# An exposure is suspicious where half of it leaves at most this fraction of the squared residual: correct scans have ≥ 0.8.
+# An exposure is suspicious if half of it leaves at most this fraction of the squared residual: correct scans have ≥ 0.8.
 _HALF_RATIO = 0.6
-_WORSE_RATIO = 1.05  # another exposure fits worse from this ratio of its squared residual to the stated one's
+_WORSE_RATIO = 1.05  # an exposure fits worse if it leaves this many times the squared residual of the stated one
 
 
 def check_readout(rt: Runtime, scan: Scan) -> Finding:
     """Fits a coarse fly-scan with its lines read as stated, and with other orders, axes and times of the readout.
 
-    Squared residuals have to differ by four standard errors and by a ratio. A wrong order of rows only twists the object
-    about the axis, which is visible in a cone beam alone. A wrong order of columns bends it."""
+    Squared residuals must differ by four standard errors and by a ratio. A wrong order of rows only twists the object about
+    the axis, which shows in a cone beam alone. A wrong order of columns bends the object."""
     stated = fit_squares(rt, scan)
     others: dict[str, np.ndarray] = {}
     for name, variant in _other_readouts(scan).items():
-        with suppress(InputError):  # a table of poses or angles may end before the variant's last line
+        with suppress(InputError):  # a table of poses or angles may end before the last line is read
             others[name] = fit_squares(rt, variant)
     if not others:
         text = "the tables of poses or angles end with the stated times: no other readout can be tried"
@@ -61,7 +60,7 @@ def check_readout(rt: Runtime, scan: Scan) -> Finding:
 
 
 def _compared(hypothesis: str, stated: np.ndarray, other: np.ndarray) -> tuple[str, float, float]:
-    """Returns a sentence about a readout; the standard errors by which the stated one fits better; and the other's
+    """Returns a sentence about another readout, the standard errors by which the stated one fits better, and the other's
     squared residual over the stated one's."""
     ratio, errors = residual_ratio(stated, other), t_statistic(stated, other)
     return f"{hypothesis}, the squared residual is {ratio:.4g} times as large ({errors:+.1f} standard errors)", errors, ratio
@@ -101,9 +100,9 @@ def _readout_advice(scan: Scan, name: str) -> str:
 def check_exposure(rt: Runtime, scan: Scan) -> Finding:
     """Fits a coarse scan with half and with twice the stated exposure.
 
-    Only detail as fine as the arc of an exposure distinguishes blur by motion from a blurred object. A sharper model
-    always fits a little better, so half the exposure is suspicious only where its squared residual is 40 % smaller. For
-    "ok" both half and twice have to fit worse."""
+    Only detail as fine as the arc of an exposure tells blur by motion from a blurred object. A sharper model always fits a
+    little better. So half the exposure is suspicious only if its squared residual is 40 % smaller. For "ok" both half and
+    twice must fit worse."""
     if not scan.is_fly:
         text = "the gantry is stated to stand still: had it turned, a blurred object would fit as well"
         return Finding(EXPOSURE, CANNOT_TELL, 1.0, _HALF_RATIO, "share", text)

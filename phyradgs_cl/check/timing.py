@@ -1,4 +1,4 @@
-"""Do exposure, readout, frame times and angles fit each other, and do the views cover the turn?"""
+"""Do exposure, readout, frame times and angles agree with each other, and do the views cover the turn?"""
 
 import math
 
@@ -24,22 +24,21 @@ from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
 
 _TIMING, _ANGLES = "timing", "angles"
 _ROUNDING = 1e-3  # relative tolerance: files round times and angles
-_SPEED_TOLERANCE = 0.02  # largest relative difference of the steps between frames from the speed within: gantries vary less
-_LONGEST_TABLE = 100.0  # upper limit of the ratio of a table's duration to the scan's: longer ones belong to no single scan
-_FEW_RAD = math.radians(5)  # where frames see a smaller arc of a long table, its unit of time may be another
-_MILLISECONDS = (900.0, 3000.0)  # a ratio of durations, table to scan, in this range means a table in ms and frames in s
-_WIDE = 3.0  # a gap between views is wide above this multiple of the median step
-_SAME_RAD = 1e-6  # angles at most this far apart count as one
-_TOLERATED_DEG = 1.0  # missing coverage in degrees without a finding: nearly parallel rays need half a turn only
+_SPEED_TOLERANCE = 0.02  # steps between frames may differ this much from the speed within frames: gantries vary less
+_LONGEST_TABLE = 100.0  # a table that lasts this many times as long as the scan belongs to more than one scan
+_FEW_RAD = math.radians(5)  # if frames see a smaller arc of a long table of angles, its times may be in another unit
+_MILLISECONDS = (900.0, 3000.0)  # if a table lasts this many times as long as the scan, it is in ms and the frames are in s
+_WIDE = 3.0  # a gap between views is wide above this multiple of the median gap
+_SAME_RAD = 1e-6  # views nearer to each other than this have the same angle
+_TOLERATED_DEG = 1.0  # so much coverage may be missing: nearly parallel rays need half a turn only
 
 
 def check_timing(scan: Scan) -> Finding:
     """Compares exposure, readout and table times with the frame times, and the angles with the speed.
 
-    A line cannot open while it is open, a frame cannot be read during the readout of the frame before, and a gantry has
-    one angle at a time. The value is the worst of three numbers: exposure and readout over the shortest frame period (at
-    most 1); 1 + the relative difference between the angle steps and the speed within the frames; a table's duration over
-    the scan's."""
+    A line cannot open while it is open, a frame cannot be read while the one before is, and a gantry has one angle at a
+    time. The value is the worst of three numbers: exposure and readout over the shortest frame period (at most 1); 1 + the
+    relative difference between the angle steps and the speed within the frames; a table's duration over the scan's."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     if scan.frames < 2:
         return Finding(_TIMING, OK, 0.0, 1.0, "share", "one frame: nothing to compare")
@@ -55,7 +54,7 @@ def check_timing(scan: Scan) -> Finding:
         _share("readout", "a frame would be read while the last one is", scan.shutter.readout_s / period_s),
     ]
     if isinstance(scan.trajectory, CircularOrbit) and isinstance(scan.trajectory.kinematics, FrameSweeps):
-        findings.append(_speed(scan, starts_s))  # other trajectories hold one course for all times
+        findings.append(_speed(scan, starts_s))  # other trajectories are one function of time
     findings += _table(scan)
     suspicious = [finding for finding in findings if finding.verdict == SUSPICIOUS]
     return suspicious[0] if suspicious else max(findings, key=lambda finding: finding.value / finding.threshold)
@@ -70,8 +69,8 @@ def _share(name: str, consequence: str, share: float) -> Finding:
 
 
 def _table(scan: Scan) -> list[Finding]:
-    """Returns a finding for a table of angles or poses that lasts far longer than the scan, so that its unit of time most
-    likely differs from the frames'; [] otherwise."""
+    """Returns a finding if a table of angles or poses lasts far longer than the scan: its unit of time is then likely to
+    differ from the frames'. Else []."""
     table = scan.trajectory.kinematics if isinstance(scan.trajectory, CircularOrbit) else scan.trajectory
     if not isinstance(table, EncoderTable | PoseTable):
         return []
@@ -113,9 +112,9 @@ def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:
 def check_angles(scan: Scan) -> Finding:
     """Compares the largest gap between neighbouring views with three times the median gap.
 
-    Views that cover half a turn and the fan, or more, may leave one gap. Less coverage is suspicious with any steps.
-    Parallel rays at right angles to the axis see the same after half a turn, so their angles are taken modulo 180°.
-    Parallel rays that are tilted to the axis need a full turn."""
+    Views that cover at least half a turn and the fan may leave one gap. Less coverage is suspicious whatever the gaps.
+    Parallel rays at right angles to the axis see the same after half a turn, so their angles are taken modulo 180°. Parallel
+    rays that are tilted to the axis need a full turn."""
     turn_deg, needed_deg, of_needed = _needed_turn(scan)
     steps_deg = _steps_deg(scan, turn_deg)
     if steps_deg.size < 3:
@@ -126,7 +125,7 @@ def check_angles(scan: Scan) -> Finding:
     usual_deg = float(np.median(_steps_deg(scan)))
     widest = np.sort(steps_deg)[::-1]
     is_short = widest[0] > _WIDE * usual_deg
-    covered_deg = turn_deg - float(widest[0]) + (usual_deg if is_short else 0.0)  # half a step beyond each end counts
+    covered_deg = turn_deg - float(widest[0]) + (usual_deg if is_short else 0.0)  # a view covers half a step to each side
     if is_short and covered_deg < needed_deg - _TOLERATED_DEG:
         text = f"views cover {covered_deg:.4g}°; {of_needed}"
         advice = "expect streaks along the missing directions; check rotation_angle, its unit and its sign"
@@ -146,7 +145,7 @@ def is_full_turn(scan: Scan) -> bool:
 
 
 def _needed_turn(scan: Scan) -> tuple[float, float, str]:
-    """Returns the degrees after which views repeat, the degrees that a volume needs, and the latter in words."""
+    """Returns after how many degrees views repeat, how many a volume needs, and the latter in words."""
     geometry = scan.geometry
     if isinstance(geometry, ParallelGeometry):
         if has_opposite_views(scan):
@@ -157,7 +156,7 @@ def _needed_turn(scan: Scan) -> tuple[float, float, str]:
 
 
 def _steps_deg(scan: Scan, turn_deg: float = 360.0) -> np.ndarray:
-    """Returns the angles (n,) in degrees from each distinct view angle to the next, around a turn of ``turn_deg``."""
+    """Returns the gaps (n,) in degrees between neighbouring view angles, around a turn of ``turn_deg``."""
     angles_deg = np.rad2deg(azimuth_rad(middle_poses(scan))) % turn_deg
     angles_deg = np.sort(angles_deg % turn_deg)  # the second % is needed because -1e-16 % 360 is 360
     steps_deg = np.diff(angles_deg, append=angles_deg[0] + turn_deg)
@@ -165,7 +164,7 @@ def _steps_deg(scan: Scan, turn_deg: float = 360.0) -> np.ndarray:
 
 
 def _half_fan_deg(scan: Scan, geometry: ConeGeometry) -> float:
-    """Returns half the fan angle of the grid's box, at most half that of the panel."""
+    """Returns half of the fan angle in degrees under which the source sees the grid's box, at most half of the panel's."""
     half_width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2
     panel_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
     radius_mm = max(scan.grid.size_mm[1:]) / 2

@@ -1,4 +1,4 @@
-"""The detector: counts and line integrals, averages over an exposure, noise and other effects, and their estimates."""
+"""The detector: counts and line integrals, averages over an exposure, noise, lag and other effects, and noise estimates."""
 
 from phyradgs_cl.detector.attenuation import (
     Spectrum,

@@ -1,8 +1,8 @@
 """Converts counts to line integrals, averages line integrals over an exposure, and models the spectrum of a tube.
 
-The spectrum follows Kramers' law (Phil. Mag. 46 (1923) 836), or SpekPy's tungsten anode (Poludniowski et al., Med. Phys. 48
-(2021) 3630), behind aluminium. Attenuation is interpolated in the logarithms of NIST's tables (Hubbell and Seltzer, NISTIR
-5632). The thinnest layer of each material attenuates as stated; thicker layers attenuate less per length."""
+The spectrum behind an aluminium filter follows Kramers' law (Phil. Mag. 46 (1923) 836), or SpekPy's tungsten anode
+(Poludniowski et al., Med. Phys. 48 (2021) 3630). Attenuation is interpolated in the logarithms of NIST's tables (Hubbell and
+Seltzer, NISTIR 5632). Very thin layers attenuate as stated, thick ones less per length, because the beam hardens."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -15,11 +15,10 @@ from phyradgs_cl.errors import InputError
 
 PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3  # the codes of NXtomo's image_key
 QUANTITIES = ("attenuation", "transmission", "counts")
-# Lower limit of the transmission before the logarithm, a line integral of 13.8; pixels at or below it are masked. It is
-# below what 16-bit panels resolve.
+# Least transmission before the logarithm: 16-bit panels resolve no less. Pixels with less are masked.
 TRANSMISSION_FLOOR = 1e-6
-_LARGEST = float(np.finfo(np.float32).max)  # default of the largest size of a value that counts as usable
-_BLOCK_PIXELS = 1 << 18  # most pixels converted at a time: float64 copies of a whole scan, or of one huge frame, are large
+_LARGEST = float(np.finfo(np.float32).max)  # any float32 is usable as attenuation, by default
+_BLOCK_PIXELS = 1 << 18  # most pixels converted at a time: a float64 copy of a whole scan needs much memory
 Array = NDArray[np.floating]
 _ENERGY_KEV = np.array([15.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0, 100.0, 150.0])
 # Mass attenuation coefficients at these energies, in cm²/g, of water, cortical bone (ICRU-44) and aluminium.
@@ -28,8 +27,8 @@ _BONE = np.array([9.032, 4.001, 1.331, 0.6655, 0.4242, 0.3148, 0.2229, 0.1855, 0
 _ALUMINIUM = np.array([7.955, 3.441, 1.128, 0.5685, 0.3681, 0.2778, 0.2018, 0.1704, 0.1378])
 _ALUMINIUM_G_PER_CM3 = 2.699
 _STEP_KEV = 2.0  # step of SpekPy's energies: finer steps change a half-value layer by less than a thousandth
-LOWEST_KVP, HIGHEST_KVP = 30.0, 150.0  # limits of a tube voltage in kV
-FILTER_MM = 5.0  # default thickness of the aluminium filter
+LOWEST_KVP, HIGHEST_KVP = 30.0, 150.0  # tube voltages in kV that these tables cover
+FILTER_MM = 5.0
 
 
 def counts_to_attenuation(
@@ -37,9 +36,9 @@ def counts_to_attenuation(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Converts the projections of a scan, data (F, v, u), to line integrals (P, v, u) float32, always finite.
 
-    With ``quantity`` "counts", the transmission is (I − dark) / (flat − dark) with the mean flat and the mean dark (0
-    without darks). With "transmission" the data are the transmission; with "attenuation" they are returned unchanged.
-    image_key (F,): 0 projection, 1 flat, 2 dark, 3 invalid.
+    quantity: "counts": the transmission is (I − dark) / (flat − dark), with the mean flat and the mean dark (0 without
+    darks). "transmission": data are the transmission. "attenuation": data are returned unchanged. image_key (F,): 0
+    projection, 1 flat, 2 dark, 3 invalid.
 
     The second result (P, v, u) is True where a value must not be used: it is not finite, the flat is not brighter than the
     dark, or the transmission is at most ``TRANSMISSION_FLOOR``. Raises InputError for counts without a flat."""
@@ -52,12 +51,11 @@ def frames_to_attenuation(
     frames: NDArray[np.generic], quantity: str, flats: NDArray[np.generic] | None, darks: NDArray[np.generic] | None,
     largest: float = _LARGEST, place: NDArray[np.floating] | None = None, numbers: NDArray[np.intp] | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Converts projections (P, v, u) to line integrals, as ``counts_to_attenuation``, with flats and darks (n, v, u) in
-    arrays of their own.
+    """Converts projections (P, v, u) to line integrals as ``counts_to_attenuation`` does. flats, darks: (n, v, u), or None.
 
-    Attenuation above ``largest`` is marked as unusable too. place (P,): each projection's place between the flats, which
-    are interpolated; 0.5 is halfway from the first to the second. None takes the flats' mean. numbers (P,): the
-    projections' numbers among ``frames``; None takes all."""
+    Attenuation above ``largest`` is marked as unusable too. place (P,): where each projection lies between the flats, which
+    are then interpolated: 0.5 is halfway from the first to the second; None: the flats' mean is used. numbers (P,): indices
+    of the projections in ``frames``; None: all."""
     panel, projections = frames.shape[1:], range(len(frames)) if numbers is None else numbers
     result = np.empty((len(projections), *panel), dtype=np.float32)
     unusable = np.empty(result.shape, dtype=bool)
@@ -86,7 +84,7 @@ def frames_to_attenuation(
 
 
 def mean_dark(darks: NDArray[np.generic] | None, panel: tuple[int, ...]) -> NDArray[np.float64]:
-    """Returns the mean (v, u) of dark frames (n, v, u), or 0 without any. NaN in a frame affects its own pixel only."""
+    """Returns the mean (v, u) of dark frames (n, v, u), or 0 without any. A NaN spoils its own pixel only."""
     if darks is None or len(darks) == 0:
         return np.zeros(panel)
     return np.asarray(darks.mean(axis=0, dtype=np.float64))
@@ -95,7 +93,8 @@ def mean_dark(darks: NDArray[np.generic] | None, panel: tuple[int, ...]) -> NDAr
 def minus_log(signal: NDArray[np.float64], gain: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Returns −ln(signal / gain) for arrays of one shape, and where the result must not be used.
 
-    A pixel without gain holds no information and becomes 0. A dark pixel becomes −ln ``TRANSMISSION_FLOOR``."""
+    Where the gain is 0 or less the pixel tells nothing, and the result is 0. A dark one becomes −ln
+    ``TRANSMISSION_FLOOR``."""
     live = np.isfinite(signal) & np.isfinite(gain) & (gain > 0)
     transmission = np.divide(signal, gain, out=np.zeros_like(signal), where=live)
     p = -np.log(np.maximum(transmission, TRANSMISSION_FLOOR))
@@ -106,17 +105,17 @@ def minus_log(signal: NDArray[np.float64], gain: NDArray[np.float64]) -> tuple[N
 def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
     """Averages line integrals p (S, ...) over S moments of an exposure. Returns (...) float64.
 
-    Model "log" takes their weighted mean (PhyRadGS, Eq. 1). Model "intensity" adds photons as a detector does:
-    −ln Σ w exp(−p), without overflow at any p. weight (S,): fractions of the exposure, not negative, with sum 1."""
+    Model "log" takes their weighted mean (PhyRadGS, Eq. 1). Model "intensity" adds photons as a detector does: −ln Σ w
+    exp(−p), without overflow at any p. weight (S,): fractions of the exposure, not negative, with sum 1."""
     values, weights = np.asarray(p, dtype=np.float64), np.asarray(weight, dtype=np.float64)
     return np.tensordot(weights, values, axes=1) if model == "log" else intensity_average(values, weights)[0]
 
 
 def intensity_average(p: Iterable[np.ndarray], weights: Iterable[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Returns −ln Σ w exp(−p) over S moments, and each moment's softmax weight w exp(−p) / Σ w exp(−p), without overflow.
+    """Returns −ln Σ w exp(−p) over S moments, and each moment's weight in its derivative, w exp(−p) / Σ w exp(−p).
 
-    p: S arrays of line integrals, whose precision the result has. weights: S numbers or arrays that broadcast, with sum
-    1. Where all weights are 0, both results are 0."""
+    p: S arrays of line integrals; the result has their precision and cannot overflow. weights: S numbers or arrays that
+    broadcast, with sum 1. Where all weights are 0, both results are 0."""
     pairs = list(zip(p, weights, strict=True))
     least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # p of the brightest moment
     least = np.where(np.isfinite(least), least, 0)
@@ -130,7 +129,7 @@ def intensity_average(p: Iterable[np.ndarray], weights: Iterable[np.ndarray]) ->
 class Spectrum:
     """A beam's spectrum. energy_kev (E,). weight (E,): fraction of the signal recorded at each energy, with sum 1.
 
-    soft, bone (E,): attenuation of soft tissue and of bone at each energy, over its mean attenuation."""
+    soft, bone (E,): attenuation of soft tissue and of bone at each energy, divided by its mean over the spectrum."""
 
     energy_kev: Array
     weight: Array
@@ -138,7 +137,8 @@ class Spectrum:
     bone: Array
 
     def hardened(self, soft: Array, bone: Array | float = 0.0) -> Array:
-        """Returns measured line integrals (any shape) for line integrals of the two materials in the thin limit."""
+        """Returns the line integrals that this beam measures, from those of soft tissue and bone without hardening (any
+        shape)."""
         soft, energies = np.asarray(soft, np.float64), zip(self.weight, self.soft, self.bone, strict=True)
         # One energy at a time: ``intensity_average`` would hold all of them in memory.
         return -np.log(sum(w * np.exp(-(s * soft + b * np.asarray(bone))) for w, s, b in energies))
@@ -157,13 +157,11 @@ def tube_spectrum(kvp: float, filter_mm: float = FILTER_MM, anode_deg: float = 0
 
 
 def _kramers(kvp: float) -> tuple[Array, Array]:
-    """Returns energies (E,) in keV and the number of photons of each, without a filter."""
     energy_kev = np.linspace(_ENERGY_KEV[0], kvp, 40, endpoint=False)
     return energy_kev, (kvp - energy_kev) / energy_kev
 
 
 def _tungsten(kvp: float, anode_deg: float) -> tuple[Array, Array]:
-    """Returns energies (E,) in keV and the number of photons of each, by SpekPy, with characteristic lines."""
     spekpy = checks.package("spekpy", "the package that hardening.anode_deg asks", "phyradgs-cl[spectrum]")
     energy_kev, photons = spekpy.Spek(kvp=kvp, th=anode_deg, dk=_STEP_KEV).get_spectrum(diff=False)
     tabulated = energy_kev >= _ENERGY_KEV[0]

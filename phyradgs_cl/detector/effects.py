@@ -1,14 +1,14 @@
 """Effects of tube and panel on frames: photon and electronic noise, lag, gains, sparks, drift and scatter.
 
-The simulator adds them; random ones come from a seeded generator. ``without_lag`` removes lag. Expected counts and a sample
-of them are separate functions: counts = Poisson(expected) + N(0, electronic_noise). There are two rules for ``expected``:
+The simulator adds them; random ones come from a seeded generator. ``without_lag`` removes lag. Expected counts and their
+random sample are separate functions: counts = Poisson(expected) + N(0, electronic_noise). Two rules give ``expected``:
 
-- tigre: line integrals are divided by the scan's largest one, which squeezes the transmission into [1/e, 1]. This is the
-  noise of the published synthetic scans (TIGRE's CTnoise; Biguri et al., Biomed. Phys. Eng. Express 2 055010, 2016).
-- Beer-Lambert: expected = dose · exp(−p), which is the physics.
+- tigre: line integrals are first divided by the scan's largest one, so that the transmission lies in [1/e, 1]. The published
+  synthetic scans have this noise (TIGRE's CTnoise; Biguri et al., Biomed. Phys. Eng. Express 2 055010, 2016).
+- Beer-Lambert: expected = dose · exp(−p), as in a real panel.
 
-Lag is one exponential from frame to frame: y_f = (1 − λ) x_f + λ y_(f−1), with y = 0 before the first frame. For its
-effect on reconstructions see Tilley et al., arXiv:1805.11631."""
+Lag is one exponential from frame to frame: y_f = (1 − λ) x_f + λ y_(f−1), with y = 0 before the first frame. Its effect on
+reconstructions is in Tilley et al., arXiv:1805.11631."""
 
 from dataclasses import replace
 
@@ -20,18 +20,18 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 
 Array = NDArray[np.floating]
-# Above this mean, Poisson is drawn as a rounded normal, whose skewness is off by < 4e-5. NumPy's sampler fails near 9.2e18.
+# From this mean on, a rounded normal stands for Poisson (skewness off by < 4e-5): NumPy's own sampler fails near 9.2e18.
 NORMAL_FROM = 1e9
-COUNT_FLOOR = 0.5  # lower limit of counts before the logarithm: below what a detector can tell
-_LARGEST_EXPONENT = 700.0  # upper limit of exponents: very negative line integrals, as of ringing, would overflow float64
-_SPARK_HEIGHT = (0.3, 2.0)  # range of a spark's light, as fractions of the light without object
-_SCATTER_REACH = 6.0  # the panel's longer side over the decay length of the scatter kernel
-_SCATTER_POWERS = (0.8, 1.5)  # powers of the primary light and of the line integral, whose product is the scattered light
+COUNT_FLOOR = 0.5  # counts of 0 and less have no logarithm: this is less than any detector records
+_LARGEST_EXPONENT = 700.0  # largest exponent: float64 overflows at very negative line integrals, which ringing may cause
+_SPARK_HEIGHT = (0.3, 2.0)  # light that a spark adds, relative to the light without object
+_SCATTER_REACH = 6.0  # the scatter kernel decays over the panel's longer side divided by this
+_SCATTER_POWERS = (0.8, 1.5)  # scattered light is the product of these powers of the primary light and the line integral
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
 
 
 def tigre_counts(line_integrals: ArrayLike, dose: float) -> tuple[Array, float]:
-    """Returns expected counts dose · exp(−p/m) for p (F, v, u), and the scale m: the largest p, or 1 for an empty scan."""
+    """Returns expected counts dose · exp(−p/m) for p (F, v, u), and m: the largest p, or 1 for an empty scan."""
     p = np.asarray(line_integrals, dtype=np.float64)
     largest = float(p.max(initial=0.0))
     scale = largest if largest > 0 else 1.0
@@ -44,7 +44,7 @@ def beer_lambert_counts(line_integrals: ArrayLike, dose: float) -> Array:
 
 
 def sample_counts(expected: Array, electronic_noise: float, rng: np.random.Generator) -> Array:
-    """Draws counts Poisson(expected (...)) + N(0, electronic_noise) once, float64. They are not clamped."""
+    """Draws counts Poisson(expected (...)) + N(0, electronic_noise) once, (...) float64. They may be negative."""
     many = expected > NORMAL_FROM
     counts = rng.poisson(np.where(many, 0.0, expected)).astype(np.float64)
     if many.any():
@@ -74,9 +74,9 @@ def beer_lambert_noise(
     line_integrals: ArrayLike, dose: float, electronic_noise: float, rng: np.random.Generator,
     light: ArrayLike = 1.0, lag: float = 0.0
 ) -> NDArray[np.float32]:
-    """Returns −ln(counts/dose) with counts clamped at ``COUNT_FLOOR``. Negatives stay: otherwise air would attenuate.
-
-    Arguments and result as in ``tigre_noise``. Lag λ mixes photons of successive frames, before electronic noise."""
+    """Returns −ln(counts/dose), (F, v, u) float32; ``COUNT_FLOOR`` is the least count. Negative values stay: with 0 in their
+    place the mean of air would rise. Arguments as in ``tigre_noise``. Lag λ mixes photons of successive frames, before
+    electronic noise."""
     expected = beer_lambert_counts(line_integrals, dose)
     share = np.asarray(light, dtype=np.float64)
     counts = add_lag(sample_counts(expected * share, 0.0, rng), lag)
@@ -90,20 +90,20 @@ def _log_ratio(counts: Array, dose: float | Array) -> Array:
 
 
 def add_lag(signal: ArrayLike, lag: float) -> NDArray[np.float64]:
-    """Returns signals (F, ...), in the order of the frames, as a panel with lag λ records them, float64."""
+    """Returns signals (F, ...), one per frame in order of time, as a panel with lag λ records them, float64."""
     return np.asarray(scipy.signal.lfilter([1 - lag], [1, -lag], np.asarray(signal, np.float64), axis=0))
 
 
 def lagged(line_integrals: ArrayLike, lag: float) -> NDArray[np.float64]:
-    """Returns line integrals (F, ...) as a panel with lag shows them, without noise, float64."""
+    """Returns line integrals (F, ...) as a panel with lag records them, without noise, float64."""
     return -np.log(add_lag(np.exp(-np.asarray(line_integrals, np.float64)), lag))
 
 
 def without_lag(scan: Scan) -> Scan:
     """Returns the scan as a panel without lag would have recorded it. A scan whose lag is 0 is returned itself.
 
-    Values at or below ``TRANSMISSION_FLOOR`` are masked, and values that need a masked pixel of this or the previous frame.
-    Photon noise returns to its level without lag. Noise that was added after the panel grows by √(1 + λ²)/(1 − λ)."""
+    Values at or below ``TRANSMISSION_FLOOR`` are masked, and values computed from a masked pixel of this frame or the one
+    before. Photon noise returns to its level without lag. Noise added after the panel grows by √(1 + λ²)/(1 − λ)."""
     if scan.lag == 0:
         return scan
     projections = np.empty(scan.projections.shape, np.float32)
@@ -124,13 +124,13 @@ def without_lag(scan: Scan) -> Scan:
 
 
 def pixel_gains(shape: tuple[int, int], spread: float, rng: np.random.Generator) -> Array:
-    """Draws gains (v, u) about 1 with standard deviation ``spread``. A quarter of the variance is that of whole columns."""
+    """Draws gains (v, u) about 1 with the standard deviation ``spread``. Whole columns share a quarter of the variance."""
     own, column = rng.standard_normal(shape), rng.standard_normal((1, shape[1]))
     return np.maximum(1 + spread * (np.sqrt(0.75) * own + 0.5 * column), 0.05)
 
 
 def add_sparks(line_integrals: Array, share: float, rng: np.random.Generator) -> tuple[Array, NDArray[np.bool_]]:
-    """Returns line integrals (F, v, u) with light added to a fraction ``share`` of the pixels, and which pixels were hit,
+    """Adds light to a fraction ``share`` of the pixels of line integrals (F, v, u). Returns them, and which were hit,
     bool."""
     hit = rng.random(line_integrals.shape) < share
     height = rng.uniform(*_SPARK_HEIGHT, int(hit.sum()))
@@ -140,7 +140,7 @@ def add_sparks(line_integrals: Array, share: float, rng: np.random.Generator) ->
 
 
 def drifting_light(frames: int, largest: float, rng: np.random.Generator) -> Array:
-    """Draws the tube's light in each frame (F,), relative to the flats: a random walk at most ``largest`` away from 1."""
+    """Draws the tube's light in each frame (F,), relative to the flats: a random walk, at most ``largest`` away from 1."""
     walk = np.cumsum(rng.standard_normal(frames))
     walk -= walk.mean()
     return 1 + largest * walk / max(float(np.abs(walk).max()), 1e-12)
@@ -149,9 +149,9 @@ def drifting_light(frames: int, largest: float, rng: np.random.Generator) -> Arr
 def add_scatter(line_integrals: Array, to_primary: float) -> Array:
     """Returns line integrals (F, v, u) with scatter, float64.
 
-    A ray scatters P^0.8 p^1.5 with the primary light P, as Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) found for
-    water. A kernel exp(−r/ℓ) spreads it, with ℓ a sixth of the panel. Behind the object, scatter is ``to_primary`` times the
-    primary light on average."""
+    A ray with the primary light P scatters P^0.8 p^1.5, as Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) found for
+    water. A kernel exp(−r/ℓ) spreads it, where ℓ is a sixth of the panel's longer side. Behind the object, scatter is
+    ``to_primary`` times the primary light on average."""
     p = np.asarray(line_integrals, np.float64)
     primary = np.exp(-p)
     lost = primary**_SCATTER_POWERS[0] * np.maximum(p, 0) ** _SCATTER_POWERS[1]

@@ -1,4 +1,4 @@
-"""Estimates from the frames themselves: their noise, the weights that follow from it, and saturation of raw counts."""
+"""Estimates from the frames: their noise, statistical weights, and saturation of raw counts."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -12,38 +12,37 @@ from phyradgs_cl.checks import ceil_div
 
 NORMAL_MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
 _MEDIAN_OF_NORMAL = 0.6745  # median of |x| over the standard deviation of a normal variable x with mean 0
-_FILTER_NORM = 1.5**0.5  # Euclidean norm of the filter (-1/2, 1, -1/2), by which it multiplies white noise
-_LARGEST_SAMPLE = 1_000_000  # number of pixels, about, whose median is taken where there are more
-_TENTHS = 10  # number of classes of line integrals with equal numbers of pixels
-_BEHIND = 5.0  # pixels above this many noise levels lie behind the object
-_FRAMES = 16  # number of frames, about, from which noise is estimated where there are more
+_FILTER_NORM = 1.5**0.5  # factor by which the filter (-1/2, 1, -1/2) multiplies white noise
+_LARGEST_SAMPLE = 1_000_000  # the median of about this many pixels is exact enough
+_TENTHS = 10  # noise grows with attenuation: it is estimated in this many equally large classes of line integrals
+_BEHIND = 5.0  # pixels lie behind the object if they exceed the noise this many times
+_FRAMES = 16  # noise is estimated from about this many frames, evenly spread, to save time
 
 LEAST_SHARE = 1e-3
-"""Saturation is suspected from this fraction of the pixels at one extreme."""
-_TOUCHING = 0.5  # pixels at an extreme are clipped if the four neighbours of more than this fraction of them are too
-_SAME = 1e-3  # largest relative difference between a flat and the projections' ceiling that counts as none
-_MOST_FRAMES = 8  # most frames that are searched for noise
-_LONGEST_EDGE = 1024  # longest side in pixels of the middle part of a frame that is searched for noise
-_ROUNDING = 0.5  # largest estimate of noise in counts that counts as none
-_RELATIVE = 2e-5  # largest estimate of noise, as a fraction of the ceiling, that counts as none
-# least ratio of two estimates of noise, along both axes and along rows: they agree for white noise and differ by far for
-# smooth structure
+"""Saturation is suspected if a larger fraction of the pixels has one extreme value."""
+_TOUCHING = 0.5  # saturation covers areas: pixels at an extreme are clipped if most of them have four neighbours at it
+_SAME = 1e-3  # flats and the largest count that differ by less than this fraction are equally bright: such pixels may be air
+_MOST_FRAMES = 8  # noise beside saturated pixels is sought in at most this many frames
+_LONGEST_EDGE = 1024  # of larger frames only the middle, this many pixels a side, is searched for noise
+_ROUNDING = 0.5  # rounding of counts alone gives estimates of noise up to this
+_RELATIVE = 2e-5  # estimates of noise up to this fraction of the largest count are no noise
+# Noise estimated along both axes is white if it is at least this fraction of noise estimated along rows; else structure.
 _WHITE = 0.5
-_ROOT_OF_NORMAL = 0.8222  # mean of √|x| over the root of the standard deviation of a normal x
-_NEAR = 9  # side in pixels of the square from which the noise of its middle pixel is estimated
+_ROOT_OF_NORMAL = 0.8222  # mean of √|x| over the root of the standard deviation of a normal x with mean 0
+_NEAR = 9  # the noise of a pixel is estimated from a square of this side around it
 
 
 def robust_deviation(values: np.ndarray) -> float:
-    """Returns the standard deviation of values (any shape) from their median absolute deviation, which ignores outliers."""
+    """Returns the standard deviation of values (any shape) by their median absolute deviation: outliers hardly count."""
     return NORMAL_MAD * float(np.median(np.abs(values - np.median(values))))
 
 
 def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) -> float:
     """Returns the standard deviation of a pixel's noise behind the object, dimensionless. Without usable pixels it is 0.
 
-    It is estimated from the median of |second differences| along rows, where values are above 0. Structure is smooth
-    compared with white noise, and a median ignores edges (Donoho and Johnstone, Biometrika 81 (1994) 425). Structure as fine
-    as a pixel raises the estimate; noise correlated along rows lowers it. line_integrals (F, v, u); valid: None for all."""
+    It comes from the median of |second differences| along rows, where line integrals (F, v, u) are above 0. An object is
+    smooth compared with white noise, and a median ignores edges (Donoho and Johnstone, Biometrika 81 (1994) 425). Detail as
+    fine as a pixel raises the estimate; noise correlated along rows lowers it. valid (F, v, u): None for all."""
     if line_integrals.shape[-1] < 3:
         return 0.0
     left, middle, right = _along_rows(line_integrals)
@@ -59,14 +58,13 @@ def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | 
 
 
 def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], valid: NDArray[np.bool_]) -> float:
-    """Returns the root mean square of the noise of the pixels ``chosen``, bool (F, v, u), dimensionless. valid, bool (F,
-    v, u): pixels that may be used.
+    """Returns the root mean square of the noise of the pixels ``chosen``, dimensionless. chosen, valid: bool (F, v, u).
 
-    Noise grows with attenuation, so it is estimated for each tenth of the line integrals and averaged as the chosen
-    pixels lie. Each estimate is the median of |second differences along rows of those along columns|. These vanish at
-    straight edges along either (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300). Detail as fine as a pixel raises
-    the estimate, by up to 70 % on panels of 64² with noise of 0.5 %. For panels of fewer than three rows, rows alone are
-    used."""
+    Noise grows with attenuation. So it is estimated in each tenth of the ``valid`` line integrals (F, v, u), and averaged by
+    how many chosen pixels lie in each. An estimate is the median of |second differences along rows and then along columns|,
+    which vanish at edges along either (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300). Detail as fine as a pixel
+    raises it, by up to 70 % on panels of 64² with noise of 0.5 %. On panels of fewer than three rows, differences are along
+    rows alone."""
     usable, differences = valid, line_integrals
     means = line_integrals
     cuts = (_along_rows, _along_columns) if line_integrals.shape[-2] >= 3 else (_along_rows,)
@@ -86,11 +84,11 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
 
 
 def noise_map(residual: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Returns the standard deviation of every pixel's noise (v, u) in a residual (v, u), from 9 × 9 pixels about it.
+    """Returns the standard deviation of each pixel's noise (v, u), from the 9 × 9 pixels of a residual (v, u) around it.
 
-    It follows from the mean root of |second differences along rows of those along columns|. They leave out what is smooth,
-    which the volume does not explain and is no noise; roots give edges little weight. An axis shorter than three pixels is
-    left out. Where no pixel about is ``valid`` (v, u) the noise is 0."""
+    It comes from the mean root of |second differences along rows and then along columns|. They vanish for smooth structure,
+    which the volume does not explain but is no noise, and roots give edges little weight. An axis shorter than three pixels
+    is left out. Without ``valid`` (v, u) pixels nearby the noise is 0."""
     differences, usable, axes = residual.astype(np.float64), valid, [axis for axis in (0, 1) if residual.shape[axis] >= 3]
     for axis in axes:
         differences = scipy.ndimage.correlate1d(differences, (-0.5, 1, -0.5), axis, mode="mirror")
@@ -103,7 +101,7 @@ def noise_map(residual: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
 def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
     """Returns ``noise_rms`` behind the object, from some of the frames. line_integrals and valid: (F, v, u).
 
-    Air is left out because its noise is lower, and in some files clipped at 0."""
+    Air is left out: its noise is lower, and in some files clipped at 0."""
     some = slice(None, None, max(1, len(line_integrals) // _FRAMES))
     frames, usable = line_integrals[some], valid[some]
     behind = usable & (frames > _BEHIND * noise_level(frames, usable))
@@ -124,7 +122,7 @@ def transmission_weights(
     """Returns weights exp(−p) of line integrals p (F, v, u), with mean 1 over the ``valid`` pixels (None: all).
 
     They are the least-squares weights of photon noise (Sauer and Bouman, IEEE Trans. Signal Process. 41 (1993) 534).
-    Negative line integrals count as air, because a pixel that is bright by chance is not more precise."""
+    Negative line integrals count as 0: a pixel that is bright by chance is not more precise than air."""
     weights = np.exp(-np.maximum(line_integrals, 0)).astype(np.float32)
     if valid is None:
         mean = float(weights.mean(dtype=np.float64))
@@ -135,10 +133,10 @@ def transmission_weights(
 
 
 def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> Saturation:
-    """Returns the largest count of projections (P, v, u), and the fraction of their pixels clipped there.
+    """Returns the largest count of projections (P, v, u), and the fraction of their pixels that are clipped at it.
 
-    Only whole areas count as clipped. An area at the count of the mean ``flat`` (v, u) may be air without noise. It counts
-    only where the rest of the frames shows noise."""
+    Only whole areas count as clipped. An area as bright as the mean ``flat`` (v, u) may be air without noise. So it counts
+    only where the rest of the frames is noisy."""
     level = float(np.fmax.reduce([np.fmax.reduce(frame, axis=None) for frame in frames]))
     share = clustered_share(frame == level for frame in frames)
     if share <= LEAST_SHARE or not (_flat_differs(frames, flat, level) or _shows_noise(frames, level)):
@@ -147,10 +145,8 @@ def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> 
 
 
 def clustered_share(extreme: Iterable[NDArray[np.bool_]]) -> float:
-    """Returns the fraction of pixels at an extreme value, given frame by frame as bool (v, u), if most of them have four
-    neighbours at it; else 0.
-
-    Saturation puts whole areas at an extreme; clipped noise puts single pixels there."""
+    """Returns the fraction of pixels at an extreme value, given frame by frame as bool (v, u). It is 0 unless most of them
+    have four neighbours at that value too: saturation covers areas, clipped noise hits single pixels."""
     pixels = count = inner = touching = 0
     for at in extreme:
         pixels, count = pixels + at.size, count + int(np.count_nonzero(at))
@@ -164,7 +160,7 @@ def clustered_share(extreme: Iterable[NDArray[np.bool_]]) -> float:
 
 
 def _flat_differs(frames: NDArray[np.generic], flat: NDArray[np.floating], level: float) -> bool:
-    """Returns whether the clipped pixels, taken as air, would differ in brightness from the flats."""
+    """Returns whether the clipped pixels differ in brightness from the same pixels of the flats: then they are not air."""
     hit = np.zeros(frames.shape[1:], bool)
     for frame in frames:
         hit |= frame == level
@@ -172,7 +168,7 @@ def _flat_differs(frames: NDArray[np.generic], flat: NDArray[np.floating], level
 
 
 def _shows_noise(frames: NDArray[np.generic], level: float) -> bool:
-    """Returns whether pixels below the ceiling are noisy, from second differences along both axes and along rows."""
+    """Returns whether unclipped pixels are noisy, by second differences along both axes and along rows."""
     along_rows, along_both = [], []
     top, left = (max(0, n - _LONGEST_EDGE) // 2 for n in frames.shape[1:])
     middle = np.s_[top : top + _LONGEST_EDGE, left : left + _LONGEST_EDGE]
@@ -183,6 +179,6 @@ def _shows_noise(frames: NDArray[np.generic], level: float) -> bool:
     rows, both = np.concatenate(along_rows), np.concatenate(along_both)
     unclipped = np.isfinite(both)
     if not unclipped.any():
-        return True  # there are only clipped pixels and their rims
+        return True  # every pixel is clipped or next to one that is: no pixel can tell
     in_rows, in_both = (float(np.median(np.abs(d[unclipped]))) / norm for d, norm in ((rows, 6**0.5), (both, 6.0)))
     return in_both > max(_ROUNDING, _RELATIVE * level, _WHITE * in_rows)

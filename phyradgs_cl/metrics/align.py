@@ -1,4 +1,4 @@
-"""Brings a volume and its truth to one grid, by the rule that every PSNR follows."""
+"""Brings a volume and its truth to one grid, by one rule for every PSNR."""
 
 import math
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from phyradgs_cl.fields import Grid, triple
 
 Values = NDArray[np.floating]
 VOXEL_BY_VOXEL = "voxel by voxel"
-_ROUNDING = 1e-6  # largest distance, in voxels, of the faces of two boxes that count as equal
+_ROUNDING = 1e-6  # faces of two boxes that are at most this far apart, in voxels, count as equal
 
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """A volume and a reference (nz, ny, nx), both on ``grid``. how: in words, how they came onto one grid. share: the
-    compared fraction of the reference's box."""
+    """A volume and a reference (nz, ny, nx), both on ``grid``. how: how they came onto one grid, in words. share: fraction
+    of the reference's box that is compared."""
 
     volume: Values
     reference: Values
@@ -27,9 +27,9 @@ class Aligned:
 
 
 def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid) -> Aligned | None:
-    """Returns both volumes (nz, ny, nx) on one grid; None where the boxes have no voxel centre in common.
+    """Returns both volumes (nz, ny, nx) on one grid; None where their boxes share no voxel centre.
 
-    Where the volume's voxels are whole blocks of the reference's, the reference is averaged over the blocks. Any other
+    Where each voxel of the volume is a whole block of the reference's, the reference is averaged over blocks. Otherwise the
     volume is resampled trilinearly onto the reference's voxels that lie in its box."""
     if grid.is_close(reference_grid):
         return Aligned(volume, reference, grid)
@@ -50,14 +50,15 @@ def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid)
 
 
 def overlap(one: Grid, other: Grid) -> tuple[float, float]:
-    """Returns the volume that both boxes cover, as a fraction of each box."""
+    """Returns the volume that both boxes share, as a fraction of each."""
     low, high = np.maximum(one.box_mm[:, 0], other.box_mm[:, 0]), np.minimum(one.box_mm[:, 1], other.box_mm[:, 1])
     shared_mm3 = float(np.prod(np.maximum(high - low, 0)))
     return shared_mm3 / math.prod(one.size_mm), shared_mm3 / math.prod(other.size_mm)
 
 
 def reference_on(grid: Grid, reference: Values, reference_grid: Grid) -> Values | None:
-    """Returns the reference (nz, ny, nx) on ``grid`` by the rule of ``aligned``; None if that resamples the volume."""
+    """Returns the reference (nz, ny, nx) on ``grid`` by the rule of ``aligned``; None if that resamples the volume
+    instead."""
     if grid.is_close(reference_grid):
         return reference
     blocks = _blocks(grid, reference_grid)
@@ -65,7 +66,7 @@ def reference_on(grid: Grid, reference: Values, reference_grid: Grid) -> Values 
 
 
 def block_means(values: Values, factors: tuple[int, int, int]) -> Values:
-    """Returns means over blocks of ``factors`` (z, y, x) voxels of a volume that consists of whole blocks."""
+    """Returns means over blocks of ``factors`` (z, y, x) voxels of a volume that whole blocks fill."""
     if factors == (1, 1, 1):
         return values
     split = [part for n, factor in zip(values.shape, factors, strict=True) for part in (n // factor, factor)]
@@ -73,7 +74,7 @@ def block_means(values: Values, factors: tuple[int, int, int]) -> Values:
 
 
 def in_words(grid: Grid) -> str:
-    """Returns a grid in a few words, in the order x y z, as in all texts for users."""
+    """Returns a grid in a few words, in the order x y z as in all texts for users."""
     sizes, offsets = (v[::-1] for v in (grid.voxel_size_mm, grid.offset_mm))
     digits = 3 - math.floor(math.log10(min(sizes)))  # an offset below a thousandth of a voxel is not shown
     words = f"{_times(grid.shape)} voxels (x y z) of {'×'.join(f'{s:.4g}' for s in sizes)} mm"
@@ -81,7 +82,7 @@ def in_words(grid: Grid) -> str:
 
 
 def _blocks(grid: Grid, finer: Grid) -> tuple[tuple[int, int, int], tuple[slice, slice, slice]] | None:
-    """Returns how many voxels (z, y, x) of ``finer`` fill one of ``grid``, and which fill all; None for partial voxels."""
+    """Returns how many voxels (z, y, x) of ``finer`` fill one of ``grid``, and which fill all; None if some would be cut."""
     factors = triple(max(1, round(d / f)) for d, f in zip(grid.voxel_size_mm, finer.voxel_size_mm, strict=True))
     counts = triple(n * factor for n, factor in zip(grid.shape, factors, strict=True))
     if any(n > most for n, most in zip(counts, finer.shape, strict=True)):
@@ -92,7 +93,7 @@ def _blocks(grid: Grid, finer: Grid) -> tuple[tuple[int, int, int], tuple[slice,
 
 
 def shared_slices(onto: Grid, grid: Grid) -> tuple[slice, slice, slice] | None:
-    """Returns the block (z, y, x) of voxels of ``onto`` whose centres lie in the box of ``grid``; None if there are none."""
+    """Returns the block (z, y, x) of ``onto``'s voxels whose centres lie in the box of ``grid``; None if there are none."""
     block = []
     for centres_mm, (low_mm, high_mm), side_mm in zip(onto.axes_mm(), grid.box_mm, onto.voxel_size_mm, strict=True):
         rounding_mm = _ROUNDING * side_mm
@@ -106,8 +107,8 @@ def shared_slices(onto: Grid, grid: Grid) -> tuple[slice, slice, slice] | None:
 def resampled(volume: NDArray[np.floating], grid: Grid, onto: Grid) -> tuple[NDArray[np.float32], float]:
     """Samples a volume (nz, ny, nx) trilinearly at the voxel centres of another grid. Outside its box it is 0.
 
-    Between the outermost centres and the faces, the value is that of the centres. The second result is the fraction of the
-    voxels of ``onto`` that lie in the box."""
+    Between the outermost centres and the faces the value is constant. Also returns the fraction of the other grid's voxels
+    that lie in the box."""
     step = np.divide(onto.voxel_size_mm, grid.voxel_size_mm)
     first = np.subtract(onto.first_centre_mm, grid.first_centre_mm) / grid.voxel_size_mm
     values = scipy.ndimage.affine_transform(

@@ -1,4 +1,4 @@
-"""How far error bars of voxels can be believed: which share of the errors they cover, against a truth."""
+"""Tests error bars of voxels against a truth: which fraction of the errors do they cover?"""
 
 from pathlib import Path
 
@@ -15,16 +15,16 @@ COVERAGE = {
     "within_doubt_95": Metric("within the 95 % bar", "", ".3f"),
     "doubt_over_error": Metric("mean σ / RMS error", "", ".3f"),
 }
-_OBJECT, _AROUND = 0.01, 2  # of the truth's maximum: above it is the object; voxels around it that count too
+_OBJECT, _AROUND = 0.01, 2  # the object is denser than 1 % of the truth's maximum; errors 2 voxels around it count too
 
 
 def object_voxels(truth: Array) -> NDArray[np.bool_]:
-    """Returns the voxels (nz, ny, nx) of the object and two around it."""
+    """Returns which voxels (nz, ny, nx) count: the object, and two voxels around it."""
     return np.asarray(scipy.ndimage.binary_dilation(truth > _OBJECT * truth.max(), iterations=_AROUND))
 
 
 def coverage(sigma: Array, volume: Array, truth: Array, multiple_95: float) -> dict[str, float]:
-    """Returns the shares of the object's voxels within σ and within ``multiple_95`` σ of the truth, and the mean σ over the
+    """Returns the fractions of errors within σ and within ``multiple_95`` σ in the object's voxels, and the mean σ over the
     RMS error. sigma, volume, truth: (nz, ny, nx) in 1/mm."""
     inside = object_voxels(truth)
     size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)
@@ -33,8 +33,8 @@ def coverage(sigma: Array, volume: Array, truth: Array, multiple_95: float) -> d
 
 
 def reliability_png(path: str | Path, sigma: Array, volume: Array, truth: Array, multiple_95: float) -> None:
-    """Writes the curve of reliability: percentiles of the error in each tenth of the object's voxels by σ, over its mean σ.
-    Bars that are right lie on the dashed line."""
+    """Draws the size of errors over σ: the object's voxels are divided into tenths by σ, and percentiles of each tenth's
+    errors drawn over its mean σ. Right bars lie on the dashed line."""
     inside = object_voxels(truth)
     size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)
     tenths = [part for part in np.array_split(np.argsort(bar, kind="stable"), 10) if part.size]

@@ -1,8 +1,8 @@
-"""Compares a volume with the truth, by peak signal-to-noise ratio and structural similarity, and a motion with the true one.
+"""Compares a volume with the truth by peak signal-to-noise ratio and structural similarity, and a motion with the true one.
 
-SSIM (Z. Wang et al., IEEE Trans. Image Process. 13(4), 600-612, 2004) is taken in 2D with an 11×11 Gaussian window of sigma
-1.5 and zeros beyond the border. It is averaged over the slices of each axis whose truth is not empty, then over the axes, as
-in the published tables of radiative Gaussian splatting. A figure shows the three middle slices beside the truth."""
+SSIM (Z. Wang et al., IEEE Trans. Image Process. 13(4), 600-612, 2004) is taken in 2D, with an 11×11 Gaussian window of sigma
+1.5 and zeros beyond the border. As in the published tables of radiative Gaussian splatting, it is averaged over the slices
+across each axis whose truth is not empty, then over the axes."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -25,38 +25,37 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
-WINDOW = 11  # side of SSIM's window in voxels
-SIGMA = 1.5  # standard deviation of the Gaussian weights in SSIM's window, in voxels
+WINDOW = 11  # SSIM's window, in voxels a side (Wang et al. 2004)
+SIGMA = 1.5  # standard deviation in voxels of the Gaussian weights in SSIM's window (Wang et al. 2004)
 K1, K2 = 0.01, 0.03  # SSIM's constants for means and for variances, as fractions of the data range (Wang et al. 2004)
-_VOXELS_PER_BATCH = 1 << 20  # voxels compared at a time: about ten float64 arrays of this size exist at once, 80 MB
-_EDGE = 0.25  # motions are compared at voxels with at least this fraction of the steepest slope, where they can be seen
-_MOST_POINTS = 2000  # most voxels at which motions are compared
+_VOXELS_PER_BATCH = 1 << 20  # voxels compared at a time: SSIM holds about ten float64 arrays of them, 80 MB
+_EDGE = 0.25  # motion can be seen at edges only, so it is compared where the slope is this fraction of the steepest
+_MOST_POINTS = 2000  # most voxels at which motions are compared: enough for a mean and a percentile
 _INCH = 3.2  # side of a slice in the figure, in inches
-_DPI = 110  # dots per inch of the figure
+_DPI = 110
 
 
 @dataclass(frozen=True)
 class Metric:
-    """The title, the unit and the number format of a metric."""
+    """How a metric is printed: its title, its unit and the format of its numbers."""
 
     title: str
     unit: str
     form: str
 
     def text(self, value: float) -> str:
-        """Returns a value with its unit."""
         return f"{value:{self.form}} {self.unit}".rstrip()
 
     @property
     def heading(self) -> str:
-        """The title and the unit, as the head of a table's column."""
+        """The title and the unit, for the head of a table's column."""
         return f"{self.title} ({self.unit})" if self.unit else self.title
 
 
 METRICS = {"psnr_db": Metric("PSNR", "dB", ".2f"), "ssim": Metric("SSIM", "", ".4f")}
-"""The results of ``compare`` that are printed."""
+"""Which results of ``compare`` are printed, and how."""
 HELD_OUT = {"holdout_rms": Metric("held-out RMS", "", ".4g"), "holdout_noise_rms": Metric("noise RMS", "", ".4g")}
-"""The errors in line integrals on pixels that the method did not see, for runs that have held out some."""
+"""Errors, in line integrals, on pixels held out from the method; only some runs hold out pixels."""
 
 
 def printed(metrics: Mapping[str, object], names: Mapping[str, Metric] = METRICS) -> Iterator[tuple[str, str]]:
@@ -93,7 +92,7 @@ def psnr(result: ArrayLike, reference: ArrayLike, data_range: float | None = Non
 
 
 def checked_pair(result: ArrayLike, reference: ArrayLike, data_range: float | None) -> tuple[Floats, Floats, float]:
-    """Returns both arrays with at least one axis, and the data range. Raises InputError where they do not fit."""
+    """Returns both arrays with at least one axis, and the data range. Raises InputError as ``psnr`` does."""
     a, b = np.atleast_1d(np.asarray(result)), np.atleast_1d(np.asarray(reference))
     checks.shape("result", a, b.shape)
     if b.size == 0:
@@ -128,7 +127,7 @@ def ssim_map(result: ArrayLike, reference: ArrayLike, data_range: float) -> Arra
 
 
 def _along_axis(result: Floats, reference: Floats, peak: float, axis: int) -> float:
-    """Returns the mean SSIM of those slices across ``axis`` that are not empty in the reference."""
+    """Returns the mean SSIM of the slices across ``axis``, leaving out those that are empty in the reference."""
     a, b = np.moveaxis(result, axis, 0), np.moveaxis(reference, axis, 0)
     full = np.flatnonzero(b.any(axis=(1, 2)))
     if full.size == 0:
@@ -140,7 +139,7 @@ def _along_axis(result: Floats, reference: Floats, peak: float, axis: int) -> fl
 
 
 def _blur(images: Array) -> Array:
-    """Applies the Gaussian window over the last two axes, with zeros outside. The whole window sums to 1."""
+    """Applies SSIM's Gaussian window, whose weights sum to 1, over the last two axes, with zeros outside."""
     offsets = np.arange(WINDOW) - WINDOW // 2
     weights = np.exp(-0.5 * (offsets / SIGMA) ** 2)
     weights /= weights.sum()
@@ -159,9 +158,9 @@ def edge_points_mm(volume: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def displaced_mm(deformation: Deformation, points_mm: np.ndarray, times_s: np.ndarray) -> np.ndarray:
-    """Returns the displacement (K − 1, n, 3) in mm, from the first of K times to the others, of matter at points (n, 3).
+    """Returns the displacement (K − 1, n, 3) in mm of matter at points (n, 3), from the first of K times to each other time.
 
-    It does not depend on the state that the reference volume shows: two descriptions of one motion give the same result."""
+    It does not depend on the moment that the reference volume shows: two descriptions of one motion give the same result."""
     weights = deformation.weights_at(times_s)
     reference_mm = points_mm + deformation.displacement_mm(points_mm, weights[0])
     return np.stack([reference_mm + deformation.inverse_mm(reference_mm, other) - points_mm for other in weights[1:]])
@@ -170,9 +169,9 @@ def displaced_mm(deformation: Deformation, points_mm: np.ndarray, times_s: np.nd
 def motion_error_mm(
     estimate: Deformation, truth: Deformation, points_mm: np.ndarray, times_s: np.ndarray
 ) -> tuple[float, float]:
-    """Returns mean and 95th percentile of the distance in mm between two motions of matter, first at ``points_mm``.
+    """Returns the mean and 95th percentile of the distance in mm between two motions of the matter at ``points_mm`` (n, 3).
 
-    The distance is taken at the other times. Raises InputError for less than two times."""
+    Both start there at the first time; distances are taken at the others. Raises InputError for fewer than two times."""
     if len(times_s) < 2:
         raise InputError("states", str(len(times_s)), "at least two, between which the object moves")
     error_mm = displaced_mm(estimate, points_mm, times_s) - displaced_mm(truth, points_mm, times_s)
@@ -188,7 +187,7 @@ def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike, title:
     infinity, and OutputError for a file that cannot be written."""
     volume, truth = np.asarray(result), np.asarray(reference)
     figure = new_figure(3 * _INCH * 1.25, 3 * _INCH + 0.6)
-    figure.suptitle(plain_text(f"{title}\n{_scores(volume, truth)}"), parse_math=False)  # a dollar is no formula
+    figure.suptitle(plain_text(f"{title}\n{_scores(volume, truth)}"), parse_math=False)  # a dollar sign is text, not TeX
     draw_slices(figure, volume, truth, None)
     try:
         figure.savefig(path, dpi=_DPI, format="png")
@@ -203,7 +202,7 @@ def _scores(result: Floats, reference: Floats) -> str:
 
 
 def draw_slices(figure: "FigureBase", volume: Floats, truth: Floats | None, grid: Grid | None) -> None:
-    """Draws the three middle slices of a volume (z, y, x) in 1/mm, and those of a truth and of the difference."""
+    """Draws the three middle slices of a volume (z, y, x) in 1/mm; with a truth, also its slices and the difference."""
     if truth is not None:
         checks.shape("reference", truth, volume.shape)
         checks.finite("reference", truth)

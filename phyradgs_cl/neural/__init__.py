@@ -1,6 +1,6 @@
-"""Attenuation as a neural field: hash encoding, networks, rays over an exposure, training. Only this room uses PyTorch.
+"""Attenuation as a neural field: hash encoding, networks, rays over an exposure, training. No other package uses PyTorch.
 
-PyTorch is an optional package. This module and ``options`` load without it; the other modules need it."""
+PyTorch is optional. This module and ``options`` load without it; the other modules need it."""
 
 import importlib.util
 
@@ -12,11 +12,10 @@ INSTALL = 'pip install "phyradgs-cl[neural]"'
 
 
 def has_torch() -> bool:
-    """Returns whether the package torch can be imported."""
     return importlib.util.find_spec("torch") is not None
 
 
 def require_torch(subject: str) -> None:
-    """Raises InputError, which says what to install, where PyTorch is missing."""
+    """Raises InputError, which names the missing package, where PyTorch cannot be imported. subject: what needs it."""
     if not has_torch():
         raise InputError(subject, "no PyTorch", "the package torch", INSTALL)

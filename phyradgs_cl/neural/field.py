@@ -1,8 +1,8 @@
 """The field that is fitted: a hash encoding of positions, and a network from its features to attenuation. Also its first
 parameters, its values on a grid, and PyTorch's devices and tensors.
 
-The networks are NAF's, and SAX-NeRF's with attention along line segments (both in ``reconstructors/neural.py``). Encoding:
-Müller, Evans, Schied, Keller, ACM Trans. Graph. 41 (2022) 102."""
+The networks are NAF's, and SAX-NeRF's with attention along line segments (sources in ``reconstructors/neural.py``). The
+encoding is from Müller, Evans, Schied, Keller, ACM Trans. Graph. 41 (2022) 102."""
 
 import math
 import os
@@ -19,10 +19,10 @@ from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
-_ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # orders of a volume's axes z, y, x
-_WIDER = 4  # width of the feed-forward layers over that of the others
+_ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # each axis of a volume (z, y, x) comes last once: segments run along the last
+_WIDER = 4  # feed-forward layers of a transformer are this many times as wide as its other layers
 _FACTORS = (1, 2_654_435_761, 805_459_861)  # factors of x, y, z in the hash (Müller et al., Eq. 4)
-_FIRST_FEATURES = 1e-4  # largest size of the random initial features, which are uniform (Müller et al., NAF)
+_FIRST_FEATURES = 1e-4  # initial features are random, between ± this (Müller et al., NAF)
 
 
 def torch_device(name: str) -> torch.device:
@@ -41,9 +41,8 @@ def torch_device(name: str) -> torch.device:
 
 @contextmanager
 def repeatable(device: torch.device) -> Iterator[None]:
-    """Makes PyTorch use algorithms that give the same bits in every run.
-
-    On CPUs the sums of this room have a fixed order anyway. The switch would only slow them down."""
+    """Makes PyTorch use algorithms that give the same bits in every run. On CPUs this package sums in a fixed order anyway,
+    and the switch would only slow it down."""
     if device.type != "cuda":
         yield
         return
@@ -57,17 +56,17 @@ def repeatable(device: torch.device) -> Iterator[None]:
 
 
 def to_tensor(array: np.ndarray, device: torch.device) -> torch.Tensor:
-    """Returns a tensor of the array's own type and shape on ``device``. It never shares the array's memory."""
+    """Copies an array to a tensor of its type and shape on ``device``."""
     return torch.from_dlpack(np.array(array, order="C")).to(device)
 
 
 def to_array(tensor: torch.Tensor) -> np.ndarray:
-    """Returns an array of the tensor's values, with the same type and shape."""
+    """Copies a tensor to an array of its type and shape."""
     return np.from_dlpack(tensor.detach().to("cpu").contiguous()).copy()
 
 
 class LineAttention(nn.Module):
-    """Multi-head attention within segments of ``segment`` neighbours, for values (P, width). ``segment`` divides P."""
+    """Multi-head attention among each ``segment`` successive values of (P, width). ``segment`` divides P."""
 
     def __init__(self, width: int, segment: int, heads: int, head_width: int) -> None:
         super().__init__()
@@ -87,13 +86,13 @@ class LineAttention(nn.Module):
         return self.to_output(mixed.reshape(values.shape[0], -1))
 
     def _by_head(self, values: torch.Tensor) -> torch.Tensor:
-        """Returns values (P, inner) as (P / segment, segment, heads, head_width)."""
+        """Reshapes values (P, inner) to (P / segment, segment, heads, head_width)."""
         return values.reshape(-1, self.segment, self.heads, values.shape[1] // self.heads)
 
 
 class LineAttentionBlocks(nn.Module):
-    """Attention and feed-forward layers in turn, each after a layer norm and with a skip connection. Shapes stay (P,
-    width)."""
+    """Alternates attention and feed-forward layers on values (P, width). A layer norm precedes each, a skip connection
+    bypasses it."""
 
     def __init__(self, width: int, segment: int, heads: int, head_width: int, blocks: int) -> None:
         super().__init__()
@@ -118,10 +117,10 @@ class LineAttentionBlocks(nn.Module):
 
 
 class AttenuationNetwork(nn.Module):
-    """Maps features (P, inputs) to attenuation (P,) in the units of ``options.density_bound``.
+    """Maps features (P, inputs) to attenuation (P,) in the unit of ``options.density_bound``.
 
-    middle: the modules between the first and the last layer. skip: the index among all layers where the features enter
-    again. Leaky ReLU follows every layer but the last."""
+    middle: the modules between the first and the last layer. skip: the index of the layer that gets the features again.
+    Leaky ReLU follows every layer but the last."""
 
     def __init__(self, inputs: int, middle: list[nn.Module], skip: int, options: NeuralOptions) -> None:
         super().__init__()
@@ -147,9 +146,9 @@ class AttenuationNetwork(nn.Module):
 
 
 def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
-    """Returns NAF's linear layers. For ``LineOptions``, line-segment attention takes the place of the layers in the middle.
+    """Returns NAF's linear layers; for ``LineOptions``, line-segment attention replaces the layers in the middle.
 
-    In the middle of three or more layers the encoding enters again. The layer after this skip stays linear."""
+    With three or more layers, the middle one gets the encoding again; it stays linear."""
     skip, width = options.layers // 2 if options.layers > 2 else 0, options.width
     middle: list[nn.Module] = []
     for number in range(1, options.layers - 1):
@@ -161,11 +160,11 @@ def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
 
 
 class HashEncoding(nn.Module):
-    """Maps positions (P, 3) in [0, 1]³ to features (P, levels · features), interpolated linearly between a level's
-    corners.
+    """Maps positions (P, 3) in [0, 1]³ to features (P, levels · features), interpolated linearly from the corners of a grid
+    cell.
 
-    A level has an entry for each corner if its corners fit into 2^table_log2 entries. Otherwise corners share entries by
-    a hash."""
+    Each level is a finer grid. If it has at most 2^table_log2 corners, each has an entry of its own in the level's table.
+    Otherwise a hash assigns entries, and corners share them."""
 
     def __init__(
         self, levels: int, features: int, base_resolution: int, growth: float, table_log2: int
@@ -180,7 +179,6 @@ class HashEncoding(nn.Module):
 
     @property
     def width(self) -> int:
-        """The number of features of a position."""
         return len(self.sizes) * self.features
 
     def forward(self, positions: torch.Tensor) -> torch.Tensor:
@@ -195,8 +193,8 @@ class HashEncoding(nn.Module):
 
 
 def corners(positions: torch.Tensor, cells: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns entries (8, P) int64 and weights (8, P) of the corners around positions (P, 3), in a level of ``cells``
-    cells along a side and ``size`` entries."""
+    """Returns table entries (8, P) int64, and interpolation weights (8, P), of the corners around positions (P, 3). The
+    level has ``cells`` grid cells along a side and ``size`` entries."""
     scaled = positions.t() * cells
     low = scaled.floor().clamp_(0, cells - 1)
     high_share = scaled - low  # (3, P)
@@ -218,13 +216,15 @@ def _corner_shape(axis: int) -> tuple[int, int, int, int]:
 
 
 def weighted_rows(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Returns Σ weight · table[index] over the last axis of index (B, 8). Some devices lack ``embedding_bag``."""
+    """Returns Σ weight · table[index] over the last axis of index (B, 8), without ``embedding_bag``: some devices lack
+    it."""
     rows = table.index_select(0, index.reshape(-1)).reshape(*index.shape, table.shape[1])
     return torch.einsum("bkf,bk->bf", rows, weight)
 
 
 class _Interpolate(torch.autograd.Function):
-    """Returns Σ weight · table[index] over 8 corners, (B, 8). The gradient is summed into the table in one fixed order."""
+    """Returns Σ weight · table[index] over 8 corners, (B, 8). Its gradient is summed in a fixed order, so that runs
+    repeat."""
 
     @staticmethod
     def forward(ctx: Any, table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
@@ -249,7 +249,7 @@ class _Interpolate(torch.autograd.Function):
 class NeuralField(nn.Module):
     """Maps positions (P, 3), x y z in [−1, 1] along the longest side of the volume, to attenuation (P,).
 
-    segment: the number of neighbouring positions that belong together; 1 where every position stands for itself."""
+    segment: how many successive positions influence each other; 1: none do."""
 
     def __init__(self, encoding: HashEncoding, network: AttenuationNetwork, segment: int = 1) -> None:
         super().__init__()
@@ -264,8 +264,8 @@ def voxel_values(
 ) -> np.ndarray:
     """Returns the field in all voxels (nz, ny, nx) float32. ``grid``: centred, in units of half the longest side.
 
-    A voxel is the mean over ``points``³ points, the centres of its equal parts. With segments, a point's value depends on
-    its neighbours along the segment. It is then the mean over segments along x, y and z."""
+    A voxel is the mean over the centres of its ``points``³ equal parts. With segments, a point's value depends on its
+    neighbours along the segment. So it is averaged over segments along x, y and z."""
     orders = _ORDERS if field.segment > 1 else _ORDERS[:1]
     values = np.zeros(grid.shape, np.float32)
     for order in orders:
@@ -280,15 +280,14 @@ def _in_rows(
     field: NeuralField, grid: Grid, order: tuple[int, int, int], device: torch.device, points_at_once: int,
     points: int,
 ) -> np.ndarray:
-    """Returns the voxels of a grid whose axes are z, y, x in another ``order``, with segments along the last axis.
-
-    A row's last segment is filled up beyond the row's end."""
+    """Returns the voxels of a grid whose axes are z, y, x in another ``order``, with segments along the last axis. A row is
+    extended beyond its end to fill the last segment."""
     fine = grid.finer(points)
     slow, middle, fast = fine.axes_mm()
     filled = ceil_div(fast.size, field.segment) * field.segment
     fast = np.concatenate([fast, fast[-1] + fine.voxel_size_mm[2] * np.arange(1, filled - fast.size + 1)])
     slows, middles, fasts = grid.shape
-    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # rows of points, for one row of voxels after the other
+    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # rows of points, grouped by rows of voxels
     rows[..., 0], rows[..., 1] = slow.reshape(slows, 1, points, 1), middle.reshape(1, middles, 1, points)
     rows = rows.reshape(slows * middles, points**2, 2)
     values = np.empty((slows * middles, fasts), np.float32)
@@ -306,7 +305,7 @@ def _in_rows(
 
 
 def first_field(options: NeuralOptions, longest_voxels: int, seed: int) -> NeuralField:
-    """Returns SAX-NeRF's field for ``LineOptions``, otherwise NAF's, for the number of voxels along a volume's longest side.
+    """Returns SAX-NeRF's field for ``LineOptions``, otherwise NAF's. longest_voxels: voxels along the volume's longest side.
 
     The same seed gives the same parameters on every device."""
     with torch.random.fork_rng(devices=[]):

@@ -1,4 +1,4 @@
-"""Options of the neural methods with their ranges. This module loads without PyTorch."""
+"""Options of the neural methods, with their ranges. This module loads without PyTorch."""
 
 import math
 from dataclasses import dataclass
@@ -13,13 +13,12 @@ from phyradgs_cl.errors import InputError
 JITTERS = ("ray", "sample", "none")
 LAST_ACTIVATIONS = ("sigmoid", "leaky-relu")
 TORCH_DEVICES = ("auto", "cpu", "cuda", "mps")
-# The next three are defaults, used where the options do not state the numbers themselves.
-CELLS_PER_VOXEL = 1.0  # cells of the encoding's finest level per voxel, along the longest side
+# The next three hold where the options state no number.
+CELLS_PER_VOXEL = 1.0  # grid cells of the encoding's finest level per voxel of the longest side
 SAMPLES_PER_VOXEL = 1.5  # samples along a ray per voxel of the longest side: NAF takes 192 for 128 voxels
-# samples along a ray per voxel for pixels with a ray at each of several times, where only the mean over the rays counts
+# Fewer samples are enough for a pixel with a ray at each of several times: only the mean over its rays must be exact.
 SAMPLES_PER_TIME = 1.2
-
-_FINEST = 2**24  # most cells of a level along a side: with more, float32 coordinates have no fractions
+_FINEST = 2**24  # with more grid cells along a side, float32 coordinates have no fraction within a cell
 
 
 @dataclass(frozen=True)
@@ -27,19 +26,19 @@ class NeuralOptions(MotionOptions):
     """A field on a hash encoding and a small network, fitted to rays.
 
     - iterations: passes over all frames, with one step per frame. rays: pixels per step.
-    - samples: number along a ray inside the volume. 0 takes 1.5 per voxel of the longest side, 1.2 for a pixel of several
-      times.
+    - samples: along each ray inside the volume. 0: 1.5 per voxel of the longest side, 1.2 if a pixel has several times.
     - jitter: random shift of the samples, one per ``ray``, one per ``sample`` inside its own interval, or ``none``.
-    - times: how many times of a line a step uses, drawn for each pixel; 0 takes all.
+    - times: how many times of a line a step uses, drawn for each pixel; 0: all.
     - positive_only: use only pixels with a line integral above 0.
     - voxel_points: points along each side of a voxel, whose value is the field's mean over them.
 
-    - The encoding: levels (0: until the finest has one cell per voxel), features, base_resolution (cells along a side),
-      level_growth, table_log2 (most entries of a level).
-    - The network: layers, width, last_activation. A sigmoid has a density_bound, its largest value in units of FDK's 99.9th
-      percentile. The field starts everywhere at first_share of it.
-    - The rate of Adam is multiplied by rate_factor every rate_step passes; step 0 spreads one factor over the run.
-    - detector_model: the quantity that the detector averages over a line's times, or the model that the scan states (scan).
+    - levels (0: until the finest has one cell per voxel), features, base_resolution (cells along a side), level_growth,
+      table_log2 (each level has at most 2^table_log2 entries): of the hash encoding.
+    - layers, width, last_activation: of the network. A sigmoid reaches at most density_bound, in units of FDK's 99.9th
+      percentile. The field starts at first_share of that everywhere.
+    - rate: Adam's learning rate, multiplied by rate_factor every rate_step passes; step 0: once over the whole run,
+      gradually.
+    - detector_model: what the detector averages over a line's times, or the model that the scan states (scan).
     - torch_device: the device of PyTorch."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)
@@ -77,7 +76,7 @@ class NeuralOptions(MotionOptions):
             raise InputError("levels", found, f"at most {_FINEST}", remedy)
 
     def levels_for(self, longest_voxels: int) -> int:
-        """Returns the number of levels of the encoding, for the voxels along a volume's longest side."""
+        """Returns the number of levels of the encoding for a volume of ``longest_voxels`` along its longest side."""
         if self.levels or self.level_growth == 1:
             return max(self.levels, 1)
         steps = math.log(CELLS_PER_VOXEL * longest_voxels / self.base_resolution, self.level_growth)
@@ -85,15 +84,15 @@ class NeuralOptions(MotionOptions):
         return 1 + max(math.ceil(min(steps, finest) - 1e-9), 0)
 
     def samples_for(self, longest_voxels: int, times: int = 1) -> int:
-        """Returns the samples along each ray of a pixel with ``times``, for the voxels along the longest side."""
+        """Returns the number of samples along each ray of a pixel that has rays at ``times`` times."""
         density = SAMPLES_PER_VOXEL if times == 1 else SAMPLES_PER_TIME
         return self.samples or max(round(density * longest_voxels), 2)
 
     def times_for(self, count: int, model: str) -> int:
-        """Returns how many of the ``count`` times of a line a step uses.
+        """Returns how many of a line's ``count`` times a step uses.
 
-        Raises InputError for a number that would bias the loss. The square adds a variance, which one time cannot estimate.
-        The logarithm of a mean intensity is not the mean over subsets."""
+        Raises InputError for a subset that would bias the loss. The log model must estimate a variance, which takes two
+        times. In the intensity model, the logarithm of a mean is not the mean over subsets."""
         if self.times == 0:
             return count
         if self.times < count and model == "intensity":
@@ -108,8 +107,8 @@ class NeuralOptions(MotionOptions):
 class LineOptions(NeuralOptions):
     """Options of a field with a transformer over line segments, and windows of pixels in addition to the scattered ones.
 
-    segment: samples of a line segment. heads, head_width, blocks: those of its attention. windows: their number per step;
-    each has ``window`` by ``window`` pixels."""
+    segment: samples of a line segment. heads, head_width, blocks: of its attention. windows: how many a step uses; each has
+    ``window`` by ``window`` pixels."""
 
     segment: int = checks.ranged(2, 1, 256)
     heads: int = checks.ranged(8, 1, 256)
@@ -119,5 +118,4 @@ class LineOptions(NeuralOptions):
     windows: int = checks.ranged(16, 0, 100_000)
 
     def samples_for(self, longest_voxels: int, times: int = 1) -> int:
-        """Returns the samples of the base class, rounded up to whole segments."""
         return checks.ceil_div(super().samples_for(longest_voxels, times), self.segment) * self.segment

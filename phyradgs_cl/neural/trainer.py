@@ -1,6 +1,6 @@
 """Fits a field to a scan's rays, step by step. The state between two steps can be stored.
 
-Scattered pixels and windows are SAX-NeRF's masked local–global sampling (Cai et al., CVPR 2024)."""
+A step's pixels are scattered ones and whole windows: SAX-NeRF's masked local–global sampling (Cai et al., CVPR 2024)."""
 
 import json
 import math
@@ -17,16 +17,16 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural.field import NeuralField, repeatable, to_array, to_tensor, voxel_values
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
-_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's decay rates of both moments, and the addend to its denominator
-_POINTS_ON_CPU = 2**14  # most points at which a CPU evaluates the field at once: as many as its cache holds
-_POINTS_ELSEWHERE = 2**20  # most points at which another device evaluates the field at once: as many as a GPU holds
-_BEYOND_VOLUME = 2.0  # distance from the volume's middle, in its longest half-sides, that is beyond every corner
+_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's decay rates of both moments, and what it adds to its denominator
+_POINTS_ON_CPU = 2**14  # a CPU evaluates the field at this many points at once: its cache holds them
+_POINTS_ELSEWHERE = 2**20  # another device evaluates more points at once: the memory of a GPU holds them
+_BEYOND_VOLUME = 2.0  # parallel rays begin this far from the volume's middle, in longest half-sides: beyond every corner
 Field = Callable[[torch.Tensor], torch.Tensor]
 
 
 class Trainer:
-    """Fits a field to a scan's rays, as the ``Stepwise`` that a ``Loop`` runs: a step takes one frame, an iteration is a
-    pass over all frames. Holds the field, its optimiser and the random draws, which change from step to step.
+    """Fits a field to a scan's rays; a ``Loop`` runs it as a ``Stepwise``. A step takes one frame, an iteration all frames
+    once. Holds what changes from step to step: the field, its optimiser and the random draws.
 
     Lengths are in units of half the volume's longest side, attenuation in units of ``density_per_mm``."""
 
@@ -39,16 +39,16 @@ class Trainer:
         self.scan, self.options, self.device, self.iterations = scan, options, device, options.iterations
         self.field = field.to(device)
         self.density_per_mm = density_per_mm
-        self.unit = density_per_mm * scan.grid.half_longest_mm  # unit of line integrals
+        self.unit = density_per_mm * scan.grid.half_longest_mm  # line integrals are divided by this
         self.rng = np.random.default_rng(seed)
         motion = options.motion
-        if type(motion) is PerRow:  # the field evaluates single rays, so common times would save nothing
+        if type(motion) is PerRow:  # rays are evaluated one by one: times that lines share would save nothing
             motion = OwnTimes(motion.of(scan).sub_intervals)
         tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
         self.rays = [ExposureRays.of_cells(table, scan.grid) for table in tables]
         times = self.rays[0].times
         stated = scan.detector_model if options.detector_model == "scan" else options.detector_model
-        self.model = stated if times > 1 else "log"  # with a single value both models agree
+        self.model = stated if times > 1 else "log"  # for a single time both models agree
         self.times = options.times_for(times, self.model)
         self.samples = options.samples_for(max(scan.grid.shape), times)
         self.points_at_once = _POINTS_ON_CPU if device.type == "cpu" else _POINTS_ELSEWHERE
@@ -61,16 +61,15 @@ class Trainer:
 
     @property
     def iteration(self) -> int:
-        """The number of whole passes over the frames so far."""
+        """How many times all frames have been used."""
         return self.steps // self.scan.frames
 
     @property
     def parameters(self) -> int:
-        """The number of fitted parameters."""
         return sum(p.numel() for p in self.field.parameters())
 
     def step(self) -> None:
-        """Draws pixels of one frame, steps down the gradient of their squared error, and appends the loss to ``losses``."""
+        """Draws pixels of one frame, steps down the gradient of their squared error, and adds the loss to ``losses``."""
         if self.steps % self.scan.frames == 0:
             self.losses = []
         frame = self.queue.pop()
@@ -93,7 +92,7 @@ class Trainer:
         return {"loss": float(np.mean(self.losses))}
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
-        """Returns the field in the voxels (nz, ny, nx) of the scan's grid in mm, in 1/mm, and the grid."""
+        """Returns the field in the voxels (nz, ny, nx) of the scan's grid, in 1/mm, and the grid."""
         grid = self.scan.grid
         unit_grid = Grid(grid.shape, grid.scaled(1 / grid.half_longest_mm).voxel_size_mm)
         points = self.options.voxel_points
@@ -101,7 +100,6 @@ class Trainer:
         return values * np.float32(self.density_per_mm), grid
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the arrays that the next step depends on, and the losses of the pass so far."""
         moments = [self._flat([self._moments(p)[k] for p in self.field.parameters()]) for k in range(2)]
         return {
             "parameters": self._flat([p.detach() for p in self.field.parameters()]),
@@ -114,7 +112,7 @@ class Trainer:
         }
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Restores a state of ``state``: its draws, the field's values (n,) and Adam's moments (2, n)."""
+        """Restores what ``state`` returned: draws, the field's parameters (n,) and Adam's moments (2, n)."""
         self.rng.bit_generator.state = json.loads(str(state["rng"]))
         self.steps, self.updates = int(state["steps"]), int(state["updates"])
         self.queue, self.losses = state["queue"].tolist(), state["losses"].tolist()
@@ -139,7 +137,7 @@ class Trainer:
         return options.rate * options.rate_factor ** (self.steps / (options.iterations * self.scan.frames))
 
     def _pixels(self, frame: int) -> np.ndarray:
-        """Returns the pixels (R, 2) of a frame that may be used and whose rays can meet the volume."""
+        """Draws pixels (R, 2) of a frame, among those that are valid and whose rays can meet the volume."""
         scan, options = self.scan, self.options
         usable = np.zeros(scan.geometry.detector_shape, bool)
         usable[self._shadows[frame]] = True
@@ -155,13 +153,13 @@ class Trainer:
         return scattered_pixels(usable, options.rays, self.rng)
 
     def _loss_and_gradient(self, frame: int, pixels: np.ndarray) -> float:
-        """Returns the mean squared error in internal units. Its gradient is added up in the parameters."""
+        """Returns the mean squared error in internal units, and adds its gradient to the parameters'."""
         exposure = self.rays[frame]
         times = chosen_times(len(pixels), exposure.times, self.times, self.rng)
         shifts = sample_shifts(times.size, self.samples, self.options.jitter, self.rng)
         shifts = shifts.reshape(*times.shape, -1)
         measured = self.scan.projections[frame][tuple(pixels.T)].astype(np.float32) / np.float32(self.unit)
-        # Gradients of chunks add up to the whole gradient; a chunk needs less memory.
+        # Pixels are taken in chunks, which need less memory. Their gradients add up to the whole one.
         at_once = max(self.points_at_once // (self.samples * self.times), 1)
         total = 0.0
         for start in range(0, len(pixels), at_once):
@@ -176,7 +174,7 @@ class Trainer:
     def _squares(
         self, source: np.ndarray, direction: np.ndarray, shifts: np.ndarray, measured: np.ndarray, times: int
     ) -> torch.Tensor:
-        """Returns the squared errors (R,) of pixels with rays (R, s, 3) at some of their ``times``."""
+        """Returns the squared errors (R,) of pixels, from rays (R, s, 3) at s of each pixel's ``times``."""
         from_, along, shift = (
             to_tensor(a.reshape(-1, a.shape[-1]).astype(np.float32), self.device)
             for a in (source, direction, shifts)
@@ -203,9 +201,9 @@ class Trainer:
 class ExposureRays:
     """The rays of one frame's pixels.
 
-    - pose (C, 12): in units of half the volume's longest side about the volume's centre.
-    - cell (K, lines): the cell of each of a line's K times, which have equal weights.
-    - axis: whether lines are rows or columns. is_parallel: poses begin with the rays' direction."""
+    - pose (C, 12): of each time cell, in units of half the volume's longest side about the volume's centre.
+    - cell (K, lines): the time cell of each of a line's K times, which have equal weights.
+    - axis: whether lines are rows or columns. is_parallel: poses begin with the direction of the rays."""
 
     pose: np.ndarray
     cell: np.ndarray
@@ -214,7 +212,7 @@ class ExposureRays:
 
     @classmethod
     def of_cells(cls, table: TimeCells, grid: Grid) -> "ExposureRays":
-        """Returns the rays of cells of fixed pose in mm, for a volume on ``grid`` in mm.
+        """Returns the rays of time cells of fixed pose in mm, for a volume on ``grid`` in mm.
 
         Raises InputError for a table whose lines have different numbers of cells or different weights."""
         centre, unit = np.array(grid.offset_mm[::-1]), grid.half_longest_mm
@@ -235,11 +233,11 @@ class ExposureRays:
 
     @property
     def times(self) -> int:
-        """The number K of times of each line."""
         return len(self.cell)
 
     def __call__(self, pixels: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns sources and unit directions (R, s, 3) of pixels (R, 2), row and column, at some of their times (R, s).
+        """Returns sources and unit directions (R, s, 3) of pixels (R, 2), row and column, at s times of each, given by (R,
+        s).
 
         Parallel rays begin in front of the volume."""
         rows, columns = pixels.T
@@ -255,7 +253,7 @@ class ExposureRays:
         return pose[..., :3], direction
 
     def shadow(self, half_sides: np.ndarray, detector_shape: tuple[int, int]) -> tuple[slice, slice]:
-        """Returns rows and columns that hold every pixel whose rays meet a box of ``half_sides`` (x, y, z) about 0."""
+        """Returns the rows and columns outside which no ray meets a box of ``half_sides`` (x, y, z) about 0."""
         corners = np.array(np.meshgrid(*[(-h, h) for h in half_sides], indexing="ij")).reshape(3, -1).T
         source, first, steps = self.pose[:, None, :3], self.pose[:, None, 3:6], self.pose[:, None, 6:12]
         to_corner = corners - source  # (C, 8, 3)
@@ -267,7 +265,7 @@ class ExposureRays:
             place = np.full(to_corner.shape, np.nan)
         scale, column, row = np.moveaxis(place, -1, 0)
         is_behind = not self.is_parallel and np.any(scale <= 0)
-        if is_behind or not np.all(np.isfinite(scale)):  # the panel cannot see a corner
+        if is_behind or not np.all(np.isfinite(scale)):  # no ray of the panel meets this corner: take all pixels
             return slice(0, detector_shape[0]), slice(0, detector_shape[1])
         return _within(row, detector_shape[0]), _within(column, detector_shape[1])
 
@@ -278,7 +276,7 @@ def _within(place: np.ndarray, count: int) -> slice:
 
 
 def scattered_pixels(usable: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Returns ``count`` of the usable pixels (rows, columns) bool, as (R, 2) row, column. No pixel comes twice."""
+    """Draws ``count`` different pixels, (R, 2) row and column, from the ``usable`` ones, bool (rows, columns)."""
     where = np.flatnonzero(usable)
     chosen = rng.choice(where, min(count, where.size), replace=False, shuffle=False)
     return np.stack(np.unravel_index(chosen, usable.shape), -1)
@@ -289,7 +287,7 @@ def windows_and_scattered_pixels(
 ) -> np.ndarray:
     """Draws the pixels (R, 2) of ``windows`` windows of ``edge``² usable pixels, and ``count`` scattered ones outside them.
 
-    Windows are tiles of the frame. There are fewer windows if fewer tiles are usable throughout."""
+    Windows are tiles of the frame. Where fewer tiles are usable throughout, there are fewer windows."""
     down, across = (n // edge for n in usable.shape)
     tiles = usable[: down * edge, : across * edge].reshape(down, edge, across, edge).all(axis=(1, 3))
     whole = np.flatnonzero(tiles)
@@ -303,7 +301,7 @@ def windows_and_scattered_pixels(
 
 
 def chosen_times(pixels: int, times: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draws ``count`` of the ``times`` of every pixel, (pixels, count). No time comes twice, and all are equally likely."""
+    """Draws ``count`` different ones of each pixel's ``times``, (pixels, count), all equally likely."""
     if count >= times:
         return np.broadcast_to(np.arange(times), (pixels, times))
     return np.argsort(rng.random((pixels, times)), axis=1)[:, :count]
@@ -312,9 +310,8 @@ def chosen_times(pixels: int, times: int, count: int, rng: np.random.Generator) 
 def box_span(
     source: torch.Tensor, direction: torch.Tensor, half_sides: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns (first distance, length) (R,) of rays (R, 3) in a box of ``half_sides`` (3,) about 0. Length 0: no meeting.
-
-    Directions have unit length. A ray begins at its source."""
+    """Returns the distance (R,) at which rays (R, 3) enter a box of ``half_sides`` (3,) about 0, and the length (R,) inside,
+    0 if they miss it. Directions have unit length, and a ray begins at its source."""
     tiny = torch.finfo(direction.dtype).tiny
     slope = torch.where(direction.abs() < tiny, torch.full_like(direction, tiny), direction)
     one, other = (-half_sides - source) / slope, (half_sides - source) / slope
@@ -324,7 +321,7 @@ def box_span(
 
 
 def sample_shifts(rays: int, samples: int, jitter: str, rng: np.random.Generator) -> np.ndarray:
-    """Returns the place of each sample in its interval, 0 to 1: (R, 1) for one shift per ray or none, else (R, samples)."""
+    """Returns where samples lie in their intervals, 0 to 1: (R, 1) if all samples of a ray lie alike, else (R, samples)."""
     if jitter == "none":
         return np.full((rays, 1), 0.5, np.float32)
     return rng.random((rays, samples if jitter == "sample" else 1), np.float32)
@@ -334,9 +331,9 @@ def line_integrals(
     field: Field, source: torch.Tensor, direction: torch.Tensor, half_sides: torch.Tensor, samples: int,
     shifts: torch.Tensor,
 ) -> torch.Tensor:
-    """Returns the integrals (R,) of a field along rays (R, 3), a sample in each of ``samples`` intervals in the box.
+    """Returns the integrals (R,) of a field along rays (R, 3), with one sample in each of ``samples`` intervals in the box.
 
-    ``shifts``: from ``sample_shifts``. With uniformly drawn shifts the expectation is the integral itself, for any field."""
+    ``shifts``: from ``sample_shifts``. If they are drawn uniformly, the expectation is the exact integral of any field."""
     first, length = box_span(source, direction, half_sides)
     step = length / samples
     number = torch.arange(samples, dtype=source.dtype, device=source.device)
@@ -353,8 +350,8 @@ def intensity_average(integrals: torch.Tensor, unit: float) -> torch.Tensor:
 def log_squares(integrals: torch.Tensor, measured: torch.Tensor, times: int) -> torch.Tensor:
     """Returns squared errors (R,) of the mean over all K ``times`` of a pixel, estimated from s of them, integrals (R, s).
 
-    The square of a mean over a random subset is too large by the subset's variance. The spread of the s samples, times
-    (1/s − 1/K), estimates this variance. Without it, expectation and gradient are those of all K times."""
+    The squared error of a subset's mean is too large by the variance of that mean. This is estimated as the s samples'
+    variance times (1/s − 1/K), and subtracted. Expectation and gradient are then those of all K times."""
     count = integrals.shape[1]
     squares = (integrals.mean(1) - measured) ** 2
     return squares if count == times else squares - (1 / count - 1 / times) * integrals.var(1, unbiased=True)

@@ -1,11 +1,11 @@
-"""Shrinkage of all 4³ block cosine transforms: a prior for textures and edges, which total variation flattens.
+"""Shrinks the cosine transforms of all blocks of 4³ voxels: a prior that keeps textures, which total variation flattens.
 
-The map is B_sᵀ T(B_s v), averaged over the shifts s of the blocks: shrinkage of an overcomplete transform (Coifman and
-Donoho, "Translation-invariant de-noising", 1995; block DCT: Guleryuz, IEEE Trans. Image Process. 16 (2007) 3020). T is a
-soft threshold that leaves a block's mean as it is. Near faces the average is over the blocks inside the volume.
+For each shift s of the blocks, B_s takes the transforms; the result is the average of B_sᵀ T(B_s v) over the shifts (Coifman
+and Donoho, "Translation-invariant de-noising", 1995; block DCT: Guleryuz, IEEE Trans. Image Process. 16 (2007) 3020). T is a
+soft threshold that keeps each block's mean. Only blocks inside the volume count.
 
-A call takes a quarter of the shifts, the next call the next quarter. Over iterations the average is the same (cycle
-spinning; Kamilov, Bostan and Unser, IEEE Signal Process. Lett. 21 (2014) 1326)."""
+Each call takes a quarter of the shifts, in turn. Over iterations the average is the same (cycle spinning; Kamilov, Bostan
+and Unser, IEEE Signal Process. Lett. 21 (2014) 1326)."""
 
 import itertools
 
@@ -17,15 +17,14 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, beside, brought_to, padded_zeros, pitch_of
 
 EDGE = 4  # voxels along each side of a block
-_SAMPLES = 8  # estimated time of one voxel in one launch, in samples of a ray; it sets the size of launches
-# Shift of the blocks along y in voxels for every shift along z, by turn. A turn has each shift of both once; four turns have
-# all pairs.
+_SAMPLES = 8  # time of one voxel, in samples of a ray, from which the size of a launch follows: drivers kill long ones
+# In each turn, the blocks' shift along y for every shift along z: each shift occurs once, and in four turns each pair does.
 TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 
 
 class DctProx:
-    """Shrinks the block cosine transforms of volumes of a fixed ``shape`` (nz, ny, nx). A volume thinner than a block
-    stays as it is."""
+    """Shrinks the block cosine transforms of volumes of a fixed ``shape`` (nz, ny, nx). A volume thinner than a block stays
+    the same."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int]) -> None:
         self.rt, self.shape = rt, shape
@@ -41,8 +40,7 @@ class DctProx:
     def __call__(
         self, volume: SameArray, threshold: float, turn: int, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Returns the shrunk volume (nz, ny, nx) float32. threshold: that of the coefficients of the orthonormal
-        transform.
+        """Returns the shrunk volume (nz, ny, nx) float32. threshold: of the coefficients of the orthonormal transform.
 
         turn: 0 to 3, chooses a quarter of the shifts. nonnegative: clips the result at 0. A device array gives a device
         array (``out``, if given)."""
@@ -51,7 +49,7 @@ class DctProx:
         voxels, by_voxel = (nx, ny, nz), rt.group(on_cpu=16)
         layout = self._shape4, self._pitch
         rt.launch(self._start, voxels, observed, *layout, self._padded, self._excess, group=by_voxel)
-        # Blocks of one launch do not overlap. On a GPU they are work-items, also along x; on a CPU a vector runs along x
+        # Blocks of one launch do not overlap, so results repeat. On a GPU each is a work-item; on a CPU vectors run along x.
         along_x = EDGE if rt.pixel_items else 1
         blocks = ceil_div(nx, EDGE) if rt.pixel_items else 1, ceil_div(ny, EDGE), ceil_div(nz, EDGE)
         for (z, y), x in itertools.product(enumerate(TURNS[turn]), range(along_x)):

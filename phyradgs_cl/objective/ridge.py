@@ -1,9 +1,10 @@
-"""A gradient step of a learned, weakly convex ridge regulariser R(x) = Σ_i Σ_p ψ_i((W_i x)_p): a prior for texture, anatomy.
+"""Takes gradient steps of a learned, weakly convex regulariser R(x) = Σ_i Σ_p ψ_i((W_i x)_p): a prior for texture and
+anatomy.
 
 Goujon, Neumayer and Unser, "Learning weakly convex regularizers for convergent image-reconstruction algorithms", SIAM J.
-Imaging Sci. 17 (2024) 91, in 3D. The 16 filters W_i of 5³ voxels are a chain: 4 correlations with 3³ voxels, then 16 with
-their results. Only windows inside the volume count. ψ_i' is a difference of two clamps, with knots in units of the noise σ.
-It rises near 0 and may fall beyond, but R is ρ-weakly convex with ρ ≤ 1. So ½‖x − v‖² + step R(x) is convex for step ≤ 1."""
+Imaging Sci. 17 (2024) 91, in 3D. The sums run over filters i and voxels p. A filter W_i of 5³ voxels is a chain: 4
+correlations with 3³ voxels, then 16 with their results. Only windows inside the volume count. ψ_i' is a difference of two
+clamps, with knots in units of the noise σ; it may fall again. ½‖x − v‖² + step R(x) is convex for step ≤ 1."""
 
 import json
 from dataclasses import dataclass
@@ -16,18 +17,18 @@ from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, Strides, beside, brought_to, move, padded_zeros, pitch_of
 
 EDGE = 5
-"""The number of voxels along a side of a filter."""
-_SAMPLES = 200  # upper limit of the time of one voxel in one launch, in samples of a ray; it sets the size of launches
-_SLICES = 2  # slices of channels and responses that are computed at a time
-_RING = _SLICES + 2  # slices in memory: the correlation of two slices needs one more on either side
+"""Voxels along each side of a filter."""
+_SAMPLES = 200  # longest time of one voxel, in samples of a ray: it decides the size of launches, as drivers kill long ones
+_SLICES = 2  # slices computed at a time: channels and responses of a whole volume would need 24 times its memory
+_RING = _SLICES + 2  # slices in memory: correlating two slices needs one more on either side
 
 
 @dataclass(frozen=True, eq=False)
 class Ridge:
-    """The numbers of a regulariser, float32. first (4, 3, 3, 3), second (16, 4, 3, 3, 3): filters, with axes z, y, x.
+    """A regulariser's numbers, float32. first (4, 3, 3, 3), second (16, 4, 3, 3, 3): its filters, with axes z, y, x.
 
-    ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i] clip(t, ±σ knot_down[i]). Slopes and knots are (16,)
-    each, and not below 0."""
+    ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i] clip(t, ±σ knot_down[i]). Slopes and knots are (16,) each,
+    and not below 0."""
 
     first: np.ndarray
     second: np.ndarray
@@ -37,13 +38,13 @@ class Ridge:
     knot_down: np.ndarray
 
     def table(self) -> np.ndarray:
-        """Returns the table of numbers that the kernels read, float32."""
+        """Returns all numbers in one float32 array, in the order in which the kernels read them."""
         filters = np.moveaxis(self.first, 0, -1), np.moveaxis(self.second, 0, -1), np.moveaxis(self.second, (0, 1), (-2, -1))
         curves = self.slope_up, self.knot_up, self.slope_down, self.knot_down
         return np.concatenate([part.ravel() for part in (*filters, *curves)]).astype(np.float32)
 
     def bend(self, responses: np.ndarray, sigma: float) -> np.ndarray:
-        """Returns ψ_i' of the responses (16, z, y, x) of the filters; sigma: the noise σ in their unit."""
+        """Returns ψ_i' of the filters' responses (16, z, y, x). sigma: the noise σ in the volume's unit."""
         columns = (self.slope_up, self.knot_up, self.slope_down, self.knot_down)
         up, knot_up, down, knot_down = (values.astype(np.float64)[:, None, None, None] for values in columns)
         rising, falling = (np.clip(responses, -sigma * knot, sigma * knot) for knot in (knot_up, knot_down))
@@ -52,23 +53,23 @@ class Ridge:
 
 @cache
 def learned_ridge() -> Ridge:
-    """Returns the regulariser of ``data/ridge.json``, which stores its numbers in thousandths
+    """Returns the regulariser of ``data/ridge.json``, whose numbers are stored in thousandths
     (benchmarks/train_ridge.py)."""
     stored = json.loads((resource("data") / "ridge.json").read_text(encoding="utf-8"))
     first, second, *curves = (np.array(stored[name]) / 1000 for name in Ridge.__dataclass_fields__)
     first, second = first.reshape(-1, 3, 3, 3), second.reshape(len(curves[0]), -1, 3, 3, 3)
-    # Filters of the chain must sum to 0; rounding leaves small sums.
+    # The chained filters must sum to 0, so that flat volumes stay; rounding leaves small sums.
     sums = first.sum((1, 2, 3))
     second -= np.multiply.outer(second.sum((2, 3, 4)) @ sums, sums / (27 * sums @ sums))[..., None, None, None]
     return Ridge(*(values.astype(np.float32) for values in (first, second, *curves)))
 
 
 class RidgeStep:
-    """Steps down the ridge regulariser for volumes of a fixed ``shape`` (nz, ny, nx). A volume thinner than a filter
-    stays as it is."""
+    """Steps down the ridge regulariser for volumes of a fixed ``shape`` (nz, ny, nx). A volume thinner than a filter stays
+    the same."""
 
     VOLUMES = 4
-    """Most volumes of floats that a step holds in memory, for at least 50 slices with rows of at least 64 voxels."""
+    """Memory of a step, in volumes of floats, at most; for volumes of 50 slices and 64 voxels a row, or more."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], ridge: Ridge) -> None:
         self.rt, self.shape = rt, shape
@@ -93,9 +94,9 @@ class RidgeStep:
         observed, result = beside(self.rt, volume, out)
         padded = self._padded, Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))
         move(self.rt, (observed, Strides.plain(self.shape)), padded, self.shape)
-        is_thin = min(self.shape) < EDGE  # the channels of the gradient stay 0
+        is_thin = min(self.shape) < EDGE  # no filter fits in: the gradient stays 0
         end = np.float32(step), np.int32(nonnegative), result
-        # Responses follow two slices behind the channels, because they need three slices of channels.
+        # A response needs three slices of channels, so responses follow two slices behind the channels.
         for first in range(0, nz + 2, _SLICES):
             if not is_thin:
                 self._launch(self._channels_of, first, 2, self._padded, ends=(self._channels,))
@@ -132,7 +133,7 @@ def ridge_step(volume: np.ndarray, sigma: float, step: float, *, ridge: Ridge, n
 
 
 def correlated(channels: np.ndarray, filters: np.ndarray) -> np.ndarray:
-    """Correlates channels (c, z, y, x) with filters (i, c, 3, 3, 3), where windows are inside: (i, z − 2, y − 2, x − 2)."""
+    """Correlates channels (c, z, y, x) with filters (i, c, 3, 3, 3) where windows lie inside: (i, z − 2, y − 2, x − 2)."""
     windows = np.lib.stride_tricks.sliding_window_view(channels, (3, 3, 3), axis=(1, 2, 3))
     return np.asarray(np.einsum("czyxkji,fckji->fzyx", windows, filters.astype(np.float64), optimize=True))
 

@@ -1,11 +1,11 @@
 """Terms of the objective (paper, Eq. 4): image loss, total variation of a small volume, mean density.
 
-The image loss of one frame is L1 + λ (1 − SSIM). Eq. 4 prints "+ SSIM"; the paper minimises 1 − SSIM, as this module does.
-SSIM is that of Wang et al. 2004 (IEEE Trans. Image Process. 13, 600), with an 11-tap Gaussian window of σ 1.5, zero
-padding, C1 = 0.01² and C2 = 0.03².
+A frame's image loss is L1 + λ (1 − SSIM). Eq. 4 prints "+ SSIM", but the paper minimises 1 − SSIM, as this module does.
+SSIM follows Wang et al. 2004 (IEEE Trans. Image Process. 13, 600), with an 11-tap Gaussian window of σ 1.5, zero padding,
+C1 = 0.01² and C2 = 0.03².
 
-Total variation is anisotropic, as in R2-Gaussian: the mean absolute differences between neighbouring voxels along z, y and
-x, added up."""
+Total variation is anisotropic, as in R2-Gaussian: the mean absolute difference between neighbouring voxels along z, plus the
+same along y and x."""
 
 import math
 
@@ -19,12 +19,12 @@ from phyradgs_cl.runtime.layout import GUARD
 
 WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
 WINDOW /= WINDOW.sum()
-C1 = 0.01**2  # SSIM's addend to products and squares of means, for images with values from 0 to 1
-C2 = 0.03**2  # SSIM's addend to covariances and variances, for images with values from 0 to 1
+C1 = 0.01**2  # keeps SSIM finite where means are 0; for images with values from 0 to 1
+C2 = 0.03**2  # keeps SSIM finite where variances are 0; for images with values from 0 to 1
 
 
 class ImageLoss:
-    """Computes the loss of a frame of ``lines`` lines by ``width`` pixels, and its gradient, in the padded image layout."""
+    """Computes the loss of a frame of ``lines`` × ``width`` pixels, and its gradient, in images with padded rows."""
 
     def __init__(
         self, rt: Runtime, lines: int, width: int, pitch: int, ssim_weight: float, l1_weight: float = 1.0
@@ -44,8 +44,8 @@ class ImageLoss:
     def evaluate(
         self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float
     ) -> DeviceArray:
-        """Returns dL/d(rendered), valid until the next call. mask: 1 where a pixel counts, else 0. pixels: the mask's
-        sum."""
+        """Returns dL/d(rendered), valid until the next call. mask: 1 where a pixel counts, else 0. pixels: how many
+        count."""
         rt = self.rt
         vectors = ceil_div(self.width, rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
@@ -70,7 +70,7 @@ class ImageLoss:
         return self.gradient
 
     def value(self) -> float:
-        """Returns the loss of the last ``evaluate``. This waits for the device."""
+        """Returns the loss of the last ``evaluate``, and waits for the device."""
         ssim, l1, pixels = self.rt.download(self._sums).astype(np.float64).sum(axis=0)
         return float(self.l1_weight * l1 / max(pixels, 1.0) + self.ssim_weight * (1 - ssim / (self.lines * self.width)))
 
@@ -99,8 +99,8 @@ def _blur(image: np.ndarray) -> np.ndarray:
 
 
 class TotalVariation:
-    """Computes the anisotropic total variation of volumes of a fixed ``shape`` (nz, ny, nx), and its gradient, in the
-    padded layout."""
+    """Computes the anisotropic total variation of volumes of a fixed ``shape`` (nz, ny, nx) with padded rows, and its
+    gradient."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], pitch: int) -> None:
         self.rt, self.shape, self.pitch = rt, shape, pitch
@@ -122,7 +122,7 @@ class TotalVariation:
         return self.gradient
 
     def value(self) -> float:
-        """Returns the total variation of the last ``evaluate``. This waits for the device."""
+        """Returns the total variation of the last ``evaluate``, and waits for the device."""
         return float(self.rt.download(self._sums).astype(np.float64).sum())
 
 
@@ -141,13 +141,14 @@ def total_variation(volume: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _axis_weights(shape: tuple[int, ...]) -> list[float]:
-    """Returns one over the number of differences along each axis (z, y, x); 0 for an axis of one voxel."""
+    """Returns one over the number of differences along each axis (z, y, x), which turns sums into means; 0 if there are
+    none."""
     total = int(np.prod(shape))
     return [1.0 / (total // n * (n - 1)) if n > 1 else 0.0 for n in shape]
 
 
 def mean_density(rows: np.ndarray, weight: float) -> tuple[float, np.ndarray]:
-    """Returns ``weight`` times the mean density of parameter rows (11, G), and its gradient d/d(rows), (11, G): the
+    """Returns ``weight`` times the mean density of parameter rows (11, G), and its gradient by the rows, (11, G): the
     float64 twin of the term in ``chain_activations``."""
     gradient = np.zeros_like(rows)
     if (count := rows.shape[1]) == 0:

@@ -1,11 +1,11 @@
 """Two ways to lower the isotropic total variation (TV) of a volume: a proximal map, and steepest descent.
 
-``TvProx`` solves argmin_x ½‖x − b‖² + weight · TV(x), with x ≥ 0 if asked, by fast gradient projection on the dual (Beck
-and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weights scale the differences where voxels are not cubes. For
-the states of an object that changes, the sum of |differences| between a state and the next one is added.
+``TvProx`` solves argmin_x ½‖x − b‖² + weight · TV(x), with x ≥ 0 if asked, by fast gradient projection on the dual (Beck and
+Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weights scale the differences where voxels are not cubes. For an
+object that changes, the sum of |differences| between successive states is added.
 
-``TvDescent`` takes steps of a fixed length, as ASD-POCS does (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777). Backward
-differences are those of TIGRE. Their floor is relative to the volume's values, so that units do not matter."""
+``TvDescent`` takes steps of a fixed length, as ASD-POCS does (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777), with TIGRE's
+backward differences. A number that is small relative to the volume's values is added to their lengths: none is 0."""
 
 import math
 from collections.abc import Callable
@@ -18,9 +18,9 @@ from phyradgs_cl.runtime.layout import beside, brought_to
 
 
 class TvProx:
-    """The proximal map of TV for volumes of a fixed ``shape`` (nz, ny, nx), or (K, nz, ny, nx) of K states.
+    """The proximal map of TV for volumes of a fixed ``shape``: (nz, ny, nx), or (K, nz, ny, nx) for K states.
 
-    A call starts from the dual of the call before. axis_weights: factors of the differences along the axes of
+    Each call starts from the dual where the last one ended. axis_weights: factors of the differences along the axes of
     ``shape``."""
 
     def __init__(
@@ -40,8 +40,7 @@ class TvProx:
 
     @property
     def dual(self) -> np.ndarray:
-        """The dual field (3, nz, ny, nx) along x, y, z, with vectors of length at most 1; for K states (4, K, nz, ny,
-        nx)."""
+        """The dual field, with vectors of length at most 1: (3, nz, ny, nx) along x, y, z; for states (4, K, nz, ny, nx)."""
         return self.rt.download(self._dual)
 
     @dual.setter
@@ -94,7 +93,7 @@ def tv_prox(
         changes = differences(x, axis_weights) / weight
         q = moved + np.concatenate([time_step * changes[:-3], step * changes[-3:]])
         new = q / np.maximum(1, np.linalg.norm(q[-3:], axis=0))
-        new[:-3] = np.clip(q[:-3], -1, 1)  # differences in time
+        new[:-3] = np.clip(q[:-3], -1, 1)  # differences in time are scalars, not vectors: clipped one by one
         t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
         moved = new + (t - 1) / t_next * (new - dual)
         dual, t = new, t_next
@@ -102,8 +101,8 @@ def tv_prox(
 
 
 def differences(volume: np.ndarray, axis_weights: tuple[float, ...]) -> np.ndarray:
-    """Returns weighted forward differences (3, z, y, x) along z, y, x; 0 at the last voxel. For states (K, z, y, x) the
-    differences in time come first."""
+    """Returns weighted forward differences (3, z, y, x) along z, y, x; 0 at the last voxel. For states (K, z, y, x), those
+    between states come first."""
     result = np.zeros((volume.ndim, *volume.shape))
     for axis, weight in enumerate(axis_weights):
         inner = tuple(slice(0, -1) if a == axis else slice(None) for a in range(volume.ndim))
@@ -125,16 +124,16 @@ def _primal_of(
 def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
     """Returns the steps of the dual in space and in time: one over the Lipschitz constant of the differences.
 
-    For states, each step is half as long as it would be alone. A large weight in time then leaves the step in space
-    long."""
+    For states, each step is half as long as it would be alone. So a large weight in time does not shorten the step in
+    space."""
     *time, z, y, x = axis_weights
     in_space = 1 / (4 * (z * z + y * y + x * x))
     return (in_space / 2, 1 / (8 * time[0] ** 2)) if any(time) else (in_space, 0.0)
 
 
-# TV's gradient divides by the length of differences, which is 0 in flat regions, plus the larger of these two.
-_SMALLEST = 1e-6  # addend as a fraction of the volume's RMS
-_NOTHING = 1e-30  # addend in 1/mm, for a volume of zeros
+# TV's gradient divides by the length of differences, which may be 0, plus the larger of _SMALLEST and _NOTHING.
+_SMALLEST = 1e-6  # relative to the volume's RMS, so that units do not matter
+_NOTHING = 1e-30  # in 1/mm, for a volume of zeros, whose RMS is 0
 
 
 class TvDescent:
@@ -152,8 +151,8 @@ class TvDescent:
         return self._where_it_is(lambda x: self._gradient(x, self._least(x)), volume)
 
     def __call__(self, volume: SameArray, step: float, count: int) -> SameArray:
-        """Returns a volume (nz, ny, nx) after ``count`` steps downhill of Euclidean length ``step``, in the volume's
-        unit. A device array gives a device array."""
+        """Returns a volume (nz, ny, nx) after ``count`` steps downhill of Euclidean length ``step``, in the volume's unit. A
+        device array gives a device array."""
 
         def descended(x: DeviceArray) -> DeviceArray:
             least = self._least(x)
@@ -181,7 +180,7 @@ class TvDescent:
 
 def tv_gradient(volume: np.ndarray, least: float | None = None) -> np.ndarray:
     """Returns the gradient of Σ |backward difference|, (nz, ny, nx): the float64 twin of ``TvDescent.gradient``. least:
-    the floor of the differences; None takes the volume's."""
+    added to the length of differences; None: chosen from the volume."""
     volume = np.asarray(volume, np.float64)
     least = _least_of(volume) if least is None else least
     difference = np.stack([np.diff(volume, axis=a, prepend=volume.take([0], axis=a)) for a in range(3)])

@@ -1,8 +1,8 @@
-"""Optimisation of Gaussians: Adam (Kingma and Ba 2015) on all raw parameters at once, with decaying rates per parameter.
-Adaptive density control clones and splits Gaussians with a large image gradient, and prunes faint and thin ones.
+"""Optimises Gaussians by Adam (Kingma and Ba 2015), with decaying learning rates for each kind of parameter. Adaptive
+density control clones and splits Gaussians with a large gradient in the image, and removes faint and thin ones.
 
-Density control follows Kerbl et al. 2023 in R2-Gaussian's radiative form. The statistic is the mean norm of dL/d(projected
-centre), in normalised detector units. Both halves of a clone or split have half the density."""
+Density control follows Kerbl et al. 2023 in R2-Gaussian's radiative form. Its statistic is the mean norm of dL/d(projected
+centre), in normalised detector units. A clone or split gives two Gaussians of half the density."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,7 @@ _RANGE = (1e-12, 10)  # limits of a learning rate: 0 could not decay, and 1e-12 
 
 @dataclass(frozen=True)
 class Rates(checks.Checked):
-    """The (first, last) learning rate of each type of parameter, in internal units (half-sides of the volume).
+    """The (first, last) learning rate of each kind of parameter, in internal units (half-sides of the volume).
 
     The default rates are two to ten times the published ones, which are made for 20,000 iterations and more. In 3,000
     iterations, the published rates end 1 to 2 dB lower (docs/results/settings.md)."""
@@ -31,7 +31,7 @@ class Rates(checks.Checked):
     density: tuple[float, float] = checks.ranged((6e-2, 6e-3), *_RANGE)
 
     def at(self, progress: float) -> np.ndarray:
-        """Returns the rates (11,) per parameter row, at ``progress`` (0 to 1) of the run."""
+        """Returns the rates (11,) of the parameter rows at ``progress``, 0 to 1, of the run."""
         position, scale, rotation, density = (
             first * (last / first) ** progress
             for first, last in (self.position, self.scale, self.rotation, self.density)
@@ -44,14 +44,14 @@ PUBLISHED_RATES = Rates(
 )
 
 
-BETA1, BETA2 = 0.9, 0.999  # Adam's decay rates of the first and second moments
-EPSILON = 1e-15  # Adam's addend to the root of the second moments, before the division by it
+BETA1, BETA2 = 0.9, 0.999  # Adam's decay rates of the first and second moments, as in its paper
+EPSILON = 1e-15  # keeps Adam from dividing by a second moment of 0
 
 
 def folded_rates(rates: np.ndarray, step: int) -> np.ndarray:
-    """Returns the learning rates (11,) with both bias corrections of step ``step`` (from 1) folded in.
+    """Returns the learning rates (11,) times both of Adam's bias corrections for step ``step``, from 1.
 
-    m̂/√v̂ = m/√v · √(1−β2^t)/(1−β1^t). ε is scaled along, which has no effect at 1e-15."""
+    m̂/√v̂ = m/√v · √(1−β2^t)/(1−β1^t). This scales ε as well, which does not matter at 1e-15."""
     return np.asarray(rates * np.sqrt(1 - BETA2**step) / (1 - BETA1**step))
 
 
@@ -75,7 +75,7 @@ class DeviceAdam:
         self._step = rt.kernel("adam", "adam_step")
 
     def activate(self, raw: DeviceArray, parameters: DeviceArray, count: int, stride: int) -> None:
-        """Writes parameter rows (11, stride) from raw rows; ``count`` of the columns are Gaussians."""
+        """Computes parameter rows (11, stride) from raw rows. The first ``count`` columns are Gaussians."""
         self.rt.launch(
             self._activate, stride // self.rt.lanes, raw, count, stride,
             np.float32(self.activation.scale_min), np.float32(self.activation.scale_max), parameters,
@@ -86,8 +86,8 @@ class DeviceAdam:
         self, raw: DeviceArray, parameters: DeviceArray, gradients: DeviceArray, statistics: DeviceArray,
         count: int, stride: int, *, density_weight: float,
     ) -> None:
-        """Replaces dL/d(parameters) in ``gradients`` by dL/d(raw), adds the term of the mean density, and adds to the
-        ``statistics`` of density control."""
+        """Turns dL/d(parameters) in ``gradients`` into dL/d(raw), including the penalty on the mean density, and adds to
+        density control's ``statistics``."""
         share = 1.0 / max(count, 1)
         self.rt.launch(
             self._chain, stride // self.rt.lanes, raw, parameters, count, stride,
@@ -99,8 +99,8 @@ class DeviceAdam:
         self, raw: DeviceArray, gradients: DeviceArray, moments: DeviceArray, stride: int, rates: np.ndarray,
         step: int,
     ) -> None:
-        """Takes one step of Adam down ``gradients``, dL/d(raw). rates (11,): learning rates per parameter row. step:
-        counts from 1."""
+        """Takes one step of Adam down ``gradients``, dL/d(raw). rates (11,): learning rates of the rows. step: counts from
+        1."""
         rates16 = np.zeros(16, np.float32)
         rates16[:11] = folded_rates(rates, step)
         self.rt.launch(
@@ -111,8 +111,8 @@ class DeviceAdam:
 
 @dataclass(frozen=True)
 class DensityControl(checks.Checked):
-    """When and which Gaussians to clone, split and prune. Lengths are in half-sides of the volume, times in fractions of a
-    run.
+    """When Gaussians are cloned, split and removed, and which. Lengths are in half-sides of the volume, times in fractions
+    of a run.
 
     ``every``: iterations between two rounds; 0 keeps the first population. Gaussians whose longest scale is more than
     ``prune_aspect`` times their shortest are removed (0: never). Such thin sheets and needles lie between the rays, where no
@@ -161,7 +161,7 @@ def control_density(
     population: Population, statistic: np.ndarray, activation: Activation, control: DensityControl,
     box: np.ndarray, rng: np.random.Generator,
 ) -> Population:
-    """Returns the population after one round of density control: clones, splits and prunes.
+    """Returns the population after one round of density control: cloned, split and pruned.
 
     statistic (G,): mean gradient norm. box (2, 3): lowest and highest corner x y z; Gaussians with centres outside are
     removed."""
@@ -177,10 +177,10 @@ def control_density(
     changed = population.raw.copy()
     changed[:, cloned] = activation.invert(rows[:, cloned])
     new_raw = activation.invert(np.concatenate([copies, first, second], axis=1))
-    # Two children replace a Gaussian that is split. A cloned Gaussian stays, with its copy.
+    # Two children replace a Gaussian that is split. A cloned Gaussian stays, and gets a copy.
     remaining = np.setdiff1d(np.arange(population.count), split)
     raw = np.concatenate([changed[:, remaining], new_raw], axis=1)
-    # New Gaussians have no history of gradients.
+    # New Gaussians have no earlier gradients, so their moments are 0.
     fresh = np.zeros((2, g.ROWS, new_raw.shape[1]), population.moments.dtype)
     grown = Population(raw, np.concatenate([population.moments[:, :, remaining], fresh], axis=2))
     return prune(grown, activation, control, box)
@@ -189,8 +189,8 @@ def control_density(
 def prune(
     population: Population, activation: Activation, control: DensityControl, box: np.ndarray
 ) -> Population:
-    """Returns the population without Gaussians that are faint, outside the box or too thin, sorted by height: neighbours
-    then share lines of the detector."""
+    """Returns the population without Gaussians that are faint, too thin or outside the box. It is sorted by height, so that
+    neighbours in memory project onto the same detector lines."""
     rows = activation.apply(population.raw)
     inside = np.all((rows[g.MEAN] >= box[0][:, None]) & (rows[g.MEAN] <= box[1][:, None]), axis=0)
     kept = np.flatnonzero(inside & (rows[g.DENSITY] >= control.prune_density) & control.allows(rows[g.SCALE]))
@@ -198,7 +198,7 @@ def prune(
 
 
 def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray:
-    """Returns which statistics are at or above the threshold, bool (G,); of more than ``room``, only the largest."""
+    """Returns which statistics reach the threshold, bool (G,). If more than ``room`` do, only the largest are chosen."""
     chosen = statistic >= threshold
     if int(chosen.sum()) > room:
         order = np.argsort(-statistic, kind="stable")[:room]
@@ -208,7 +208,7 @@ def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray
 
 
 def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:
-    """Draws one child (11, S) from each Gaussian (11, S): smaller, half as dense, with its centre drawn from the parent's
+    """Draws one child (11, S) of each Gaussian (11, S): smaller, half as dense, its centre drawn from the parent's
     distribution."""
     child: np.ndarray = rows.copy()
     child[g.MEAN] += rotate(rows[g.QUATERNION], rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE])

@@ -1,8 +1,8 @@
 """Finds pixels to mask: sparks, which hit single pixels of single frames, and dead or hot pixels and lines.
 
-Sparks (zingers) come from X-rays, cosmic rays or noise. As with cosmic rays on astronomers' panels, a feature that is
-sharper than the optics allow in every direction is no object: van Dokkum, Publ. Astron. Soc. Pac. 113 (2001) 1420.
-Dead pixels never change, or differ from their neighbours in nearly every frame."""
+Sparks (zingers) come from X-rays, cosmic rays or noise. A feature that is sharper in every direction than the optics can
+make it is no part of the object (van Dokkum, Publ. Astron. Soc. Pac. 113 (2001) 1420, for cosmic rays on telescopes). Dead
+pixels never change, or differ from their neighbours in nearly every frame."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,27 +17,25 @@ from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames, with_mas
 
 _AROUND = np.ones((3, 3), bool)
 _NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
-# Sparks
-_SHARPNESS = 0.3  # least difference from the pixels at both sides, as a fraction of a spark's height
-_NEAR, _FAR = 2, 3  # distances in pixels of the pixels at both sides
-_MOVED = 5  # side in pixels of the square in which a neighbouring frame may show the same gap of the object
-_SHOWN_AGAIN = 0.5  # least height of that gap, as a fraction of a spark's height
+_SHARPNESS = 0.3  # a spark is brighter than the pixels on both sides, in every direction, by this fraction of its height
+_NEAR, _FAR = 2, 3  # a spark's surroundings are 2 pixels away, or 3 where another spark is near
+_MOVED = 5  # the next frame may show a gap of the object moved by 2 pixels, so a square of this side is searched
+_SHOWN_AGAIN = 0.5  # a gap of the object is at least this fraction as high in the frames before and after; a spark is gone
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
-# Dead pixels
-LEAST_FRAMES = 5  # fewer frames do not show dead pixels
-_DEVIATIONS = 10.0  # default of DeadOptions.deviations
-_MOST_TIMES = 0.7  # fraction of the frames above which a pixel that exceeds its neighbours is dead
-_MOST_FRAMES = 40  # frames that are examined, evenly spread
-_STILL_SIDES = 0.5  # fraction of the outermost columns' pixels: if more never change, air has no noise
-_NEAR_AXIS = 1.5  # distance in columns within which small parts of the object stand still
-_SHARED = 0.1  # fraction of a dead pixel's difference that its four neighbours do not reach, as an object's would
-_LINE = 0.9  # fraction of a line's pixels above which the whole line is dead
+LEAST_FRAMES = 5  # in fewer frames a sound pixel may look dead by chance
+_DEVIATIONS = 10.0
+_MOST_TIMES = 0.7  # a dead pixel is above, or below, all its neighbours in more than this fraction of the frames
+_MOST_FRAMES = 40  # dead pixels are sought in at most this many frames, evenly spread, to save time
+_STILL_SIDES = 0.5  # if more of the pixels in the two outermost columns never change, the scan has air without noise
+_NEAR_AXIS = 1.5  # a small part of the object this close to the axis, in columns, stays on one pixel in all views
+_SHARED = 0.1  # a dead pixel differs alone: its neighbours show less than this fraction of the difference
+_LINE = 0.9  # a row or column with more than this fraction of dead pixels is dead as a whole
 
 
 @dataclass(frozen=True)
 class SparkOptions(checks.Checked):
     """threshold: least height of a spark in local standard deviations (``find_sparks``). least: least height in line
-    integrals, dimensionless. pixels: largest number of touching pixels that count as one spark."""
+    integrals, dimensionless. pixels: most touching pixels that count as one spark."""
 
     PREFIX = "sparks."
 
@@ -65,11 +63,11 @@ def mask_sparks(scan: Scan, options: SparkOptions, make_model: MakeModel) -> tup
 def find_sparks(
     frames: np.ndarray, *, threshold: float = 5.0, least: float = 0.1, pixels: int = 6
 ) -> np.ndarray:
-    """Returns the pixels of line integrals (F, v, u) that are brighter than an object can make them, bool (F, v, u).
+    """Returns the pixels, bool (F, v, u), of line integrals (F, v, u) that are brighter than an object can make them.
 
-    They lie below the median of 5 × 5 pixels by ``least`` and by ``threshold`` standard deviations (from the median of 9 × 9
-    absolute differences), are sharp in every direction, and form groups of at most ``pixels``. A feature that both the
-    previous and the next frame show nearby, at least half as high, is a moving gap of the object, and is kept."""
+    They lie below the median of 5 × 5 pixels by ``least``, and by ``threshold`` standard deviations, estimated from the
+    median distance to it in 9 × 9 pixels. They are sharp in every direction and form groups of at most ``pixels``. A feature
+    that the frames before and after show nearby, at least half as high, is a gap of the moving object and no spark."""
     sparks = np.stack([_sparks_of(frame, threshold, least, pixels) for frame in frames])
     for f in np.flatnonzero(sparks.any(axis=(1, 2))) if len(frames) > 2 else ():
         height = _height(frames[f])
@@ -93,13 +91,13 @@ def _sparks_of(frame: np.ndarray, threshold: float, least: float, pixels: int) -
 
 
 def _height(frame: np.ndarray) -> np.ndarray:
-    """Returns how far each pixel of line integrals (v, u) lies below the median of 5 × 5 pixels: how much brighter it is."""
+    """Returns how far each pixel of line integrals (v, u) lies below the median of 5 × 5 pixels: the height of a spark."""
     return np.asarray(scipy.ndimage.median_filter(frame, size=5, mode="nearest") - frame)
 
 
 def _opposite(frame: np.ndarray) -> Iterable[np.ndarray]:
-    """Yields for each direction the lower value (v, u) of the pixels at both sides, two pixels away, or three where these
-    are higher, since another spark may be nearer. The frame is mirrored beyond the panel's edge."""
+    """Yields, for each of four directions, the lower value (v, u) of the two opposite pixels 2 pixels away. The two 3 pixels
+    away count where they are higher: a near one may be a spark too. The frame is mirrored at the panel's edge."""
     wide = np.pad(frame, _FAR, mode="symmetric")
     rows, columns = frame.shape
 
@@ -120,7 +118,7 @@ def mask_dead(scan: Scan, options: DeadOptions, make_model: MakeModel) -> tuple[
 
 
 def axis_column(scan: Scan) -> float:
-    """Returns the column, in pixels, onto which the first frame projects the axis of rotation."""
+    """Returns the column onto which the first frame projects the axis of rotation, as a fractional index."""
     time_s = scan.frame_start_s[:1] + scan.shutter.middle_s
     source, corner, u, v = scan.trajectory.pose(0, time_s)[0].reshape(4, 3)
     return float(np.linalg.lstsq(np.stack([u, v, source], axis=1), source - corner, rcond=None)[0][0])
@@ -129,12 +127,13 @@ def axis_column(scan: Scan) -> float:
 def find_dead(
     frames: np.ndarray, *, deviations: float = _DEVIATIONS, axis_column: float | None = None
 ) -> np.ndarray:
-    """Returns the dead pixels (v, u) bool of line integrals (F, v, u); none for fewer than five frames.
+    """Returns the dead pixels, bool (v, u), of line integrals (F, v, u); none for fewer than five frames.
 
-    A pixel is dead if it never changes while its neighbours do. It is also dead if, in 70 % of the frames, it is above, or
-    below, all its neighbours. It must then differ from the median of 3 × 3 pixels by more than ``deviations`` standard
-    deviations of the panel's pixels. Near ``axis_column`` small parts of the object stand still: there a dead pixel must be
-    sharper than these. A row or column that differs from both neighbours over 90 % of its length is dead as a whole."""
+    A pixel is dead if it never changes while its neighbours do. It is also dead if it is above all its neighbours, or below
+    all, in 70 % of the frames. It must then differ from the median of 3 × 3 pixels by more than ``deviations`` standard
+    deviations of the panel's pixels. Near ``axis_column`` small parts of the object stay on one pixel: there a dead pixel
+    must also be sharper than the optics. A row or column that differs from both neighbours over 90 % of its length is dead
+    as a whole."""
     if len(frames) < LEAST_FRAMES:
         return np.zeros(frames.shape[1:], bool)
     numbers = np.unique(np.linspace(0, len(frames) - 1, _MOST_FRAMES).round().astype(int))
@@ -147,8 +146,8 @@ def find_dead(
 
 
 def _lines(frames: np.ndarray, deviations: float) -> np.ndarray:
-    """Returns whole rows and columns, bool (v, u), that are above or below both neighbours nearly everywhere, in the median
-    over frames: also in air, and no object is so long and thin."""
+    """Returns whole rows and columns, bool (v, u), that lie above or below both neighbours nearly everywhere, in the median
+    over frames. Air counts too: an object may be long and thin, but not as long as the panel."""
     dead = np.zeros(frames.shape[1:], bool)
     floor = 1e-3 * max(float(np.percentile(frames, 99.9)), 1e-9)
     for axis in (0, 1):
@@ -165,7 +164,7 @@ def _lines(frames: np.ndarray, deviations: float) -> np.ndarray:
 
 
 def _constant(frames: np.ndarray) -> np.ndarray:
-    """Returns the pixels, bool (v, u), that never change while their neighbours do, except for air without noise."""
+    """Returns the pixels, bool (v, u), that never change while their neighbours do. Air without noise is left out."""
     swing = np.ptp(frames, axis=0)
     constant = swing == 0
     sides = np.zeros_like(constant)
@@ -178,8 +177,8 @@ def _constant(frames: np.ndarray) -> np.ndarray:
 
 
 def _exceeding(frames: np.ndarray, deviations: float) -> np.ndarray:
-    """Returns pixels, bool (v, u), far above or below all neighbours in most frames. Edges of objects move, or are
-    longer."""
+    """Returns the pixels, bool (v, u), far above or far below all neighbours in most frames. An object's edge moves, or
+    covers several pixels in a line."""
     above = np.mean([f > scipy.ndimage.maximum_filter(f, footprint=_NEIGHBOURS) for f in frames], axis=0)
     below = np.mean([f < scipy.ndimage.minimum_filter(f, footprint=_NEIGHBOURS) for f in frames], axis=0)
     difference = np.median([f - scipy.ndimage.median_filter(f, size=3) for f in frames], axis=0)
@@ -189,8 +188,8 @@ def _exceeding(frames: np.ndarray, deviations: float) -> np.ndarray:
 
 
 def _shared(frames: np.ndarray) -> np.ndarray:
-    """Returns pixels, bool (v, u), whose difference from the median of 5 × 5 is shared by their four neighbours, in their
-    median, since one of them may be dead too."""
+    """Returns the pixels, bool (v, u), whose four neighbours also differ from the median of 5 × 5, as in a blurred image of
+    an object. The neighbours' median counts, since one of them may be dead too."""
     difference = np.median([f - scipy.ndimage.median_filter(f, size=5) for f in frames], axis=0)
     wide = np.pad(difference, 1, mode="edge")
     sides = np.median([wide[:-2, 1:-1], wide[2:, 1:-1], wide[1:-1, :-2], wide[1:-1, 2:]], axis=0)

@@ -32,18 +32,19 @@ STEPS: Mapping[str, Step] = {
     "metal": mask_metal,
     "phase": retrieve,
 }
-"""The steps by name, in the order in which they run, in whatever order the user names them."""
+"""The steps by name. They run in this order, whatever the order in which the user names them."""
 DEFAULT_STEPS = "sparks,dead,rings"
 STEPS_HELP = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 PREPARED_KEY = "prepared"
-"""The provenance's key of the list of applied steps."""
-_ONCE = ("scatter", "hardening", "phase")  # a second time would take out again what is no longer there
+"""The key under which a scan's provenance lists the steps that were applied to it."""
+_ONCE = ("scatter", "hardening", "phase")  # a second correction would take away from what the first one left
 
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """flats: one of ``light.WAYS``, used when a file is read. steps: names of ``STEPS``, separated by commas. The other
-    fields hold the options of each step. Raises InputError for unknown steps, and for options of a step not named."""
+    """flats: one of ``light.WAYS``; it acts when a file is read. steps: names of ``STEPS``, separated by commas. The other
+    fields are the options of the step of that name. Raises InputError for unknown steps, and for options of a step not
+    named."""
 
     flats: str = checks.option("mean", words=WAYS)
     steps: str = checks.option("", STEPS_HELP, "none", metavar="NAME,...")
@@ -72,12 +73,12 @@ class PrepareOptions:
 
     @property
     def chosen(self) -> list[str]:
-        """The names of the steps to apply, in their order."""
+        """The names of the steps to apply, in the order of ``STEPS``."""
         names = {name.strip() for name in self.steps.split(",")}
         return [name for name in STEPS if name in names]
 
     def step_facts(self) -> dict[str, object]:
-        """Returns the steps and their options by name for the provenance; empty without any."""
+        """Returns what the provenance records: the chosen steps and their options by name. It is empty for the defaults."""
         flats = {} if self.flats == "mean" else {"flats": self.flats}
         if not self.chosen:
             return {**flats}
@@ -97,7 +98,7 @@ def prepare(scan: Scan, options: PrepareOptions, make_model: MakeModel) -> Scan:
 def one_by_one(
     scan: Scan, options: PrepareOptions, make_model: MakeModel
 ) -> Iterator[tuple[str, Scan, Facts]]:
-    """Applies the chosen steps as ``prepare`` does, and yields (name, scan after it, numbers) for each."""
+    """Applies the chosen steps as ``prepare`` does. Yields the name, the scan after the step, and the step's numbers."""
     if options.flats not in ("mean", scan.provenance.get("flats")):
         expected = "counts and their flats, read from a file: load_scan(path, flats=...)"
         raise InputError("option flats", "a scan of line integrals", expected, "leave it out")

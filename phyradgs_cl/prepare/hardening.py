@@ -1,11 +1,13 @@
-"""Corrects beam hardening: converts line integrals to those that a thin layer's attenuation would give. There are three
-ways.
+"""Corrects beam hardening: returns the line integrals that a beam would give if every layer attenuated as a thin one does.
 
-Polynomial: the user measured it with a wedge. Tube voltage: bone in the scan's own volume is reprojected, and the spectrum
-gives the soft tissue that remains (Joseph and Spital, J. Comput. Assist. Tomogr. 2 (1978) 100); this is repeated with the
-better volume. The user states the attenuation from which a voxel is bone, or candidates are tried: the frames that their own
-reprojection explains best win, uncorrected frames and a correction for water alone included. One material: line integrals
-against the path through the segmented volume give the polynomial (Krumm, Kasperl and Franz, NDT & E Int. 41 (2008) 242)."""
+- Polynomial: the user has measured it with a wedge.
+- One material: a polynomial is fitted to line integrals over the path through the segmented volume (Krumm, Kasperl and
+  Franz, NDT & E Int. 41 (2008) 242).
+- Tube voltage: bone in a reconstruction is projected, and the spectrum gives the soft tissue that remains (Joseph and
+  Spital, J. Comput. Assist. Tomogr. 2 (1978) 100). This is repeated with the better volume.
+
+For a voltage the user states from which attenuation a voxel is bone, or candidates are tried, also water alone and no
+correction. The one whose corrected frames agree best with their own projection wins."""
 
 import logging
 from collections.abc import Callable
@@ -27,25 +29,25 @@ log = logging.getLogger(__name__)
 Polynomial = tuple[float, float, float]
 BoneIn = Callable[[np.ndarray], np.ndarray]
 """Maps a volume (z, y, x) to the attenuation of the bone in each voxel."""
-_LARGEST = 1e3  # limit of the size of polynomial coefficients, and of bone_per_mm
-_PASSES = 2  # repetitions of: bone from the volume, frames corrected for it, a volume of these
-_BONE_VOXELS = 128  # limit along the longest side of the volume that is searched for bone: its hardening is smooth
-# Candidates (end of soft tissue, start of pure bone) as fractions of the densest; above 1 for bone thinner than a voxel.
+_LARGEST = 1e3  # coefficients and attenuations beyond this cannot be meant
+_PASSES = 2  # rounds in which bone is taken from a volume and frames are corrected for it: the second round has better bone
+_BONE_VOXELS = 128  # a coarse volume is enough to find bone, because its hardening is smooth: voxels along the longest side
+# Candidates: soft tissue ends, and pure bone begins, at these fractions of the densest voxel (above 1: no voxel is pure).
 _BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in (0.4, 0.7, 1.0) if soft < bone]
 _BETWEEN += [(0.7, 1.0), (0.7, 1.5), (0.8, 1.5)]
-_AS_WELL = 0.1  # within this fraction of what bone explains, the candidate with the least bone wins: it does less harm
-_NEARLY = 1.02  # limit of bone's unexplained rest over water's: a user who states a voltage has a hardened scan
-_NEWTON = 3  # steps of Newton's method, which leave an error of 1e-12
-_UNIFORM = 0.08  # limit of the relative RMS that the path through one material leaves unexplained
-_SHADOW = 0.1  # fraction of the longest path above which pixels lie behind the object
-_WATER_TO = 8.0  # largest line integral to which the polynomial of a voltage is fitted
+_AS_WELL = 0.1  # of candidates that explain at most this fraction less than the best one, the one with the least bone wins
+_NEARLY = 1.02  # bone may leave 2 % more unexplained than water, and is corrected: a stated voltage means a hardened scan
+_NEWTON = 3  # steps of Newton's method, enough for an error of 1e-12
+_UNIFORM = 0.08  # if the path leaves a larger relative RMS unexplained, the object has several materials
+_SHADOW = 0.1  # pixels whose path is longer than this fraction of the longest lie behind the object
+_WATER_TO = 8.0  # the polynomial of a voltage is fitted up to this line integral: 40 cm of water at 0.2/cm
 _NONE: Polynomial = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class HardeningOptions(checks.Checked):
-    """polynomial: coefficients of p², p³ and p⁴. kvp: tube voltage in kV, for its spectrum; 0: none. Without both, a
-    polynomial is fitted to one material. With kvp, bone_per_mm: attenuation in 1/mm from which a voxel is bone; 0:
+    """polynomial: coefficients of p², p³ and p⁴. kvp: tube voltage in kV, which gives the spectrum; 0: not stated. With
+    neither, a polynomial is fitted for one material. bone_per_mm: attenuation in 1/mm from which a voxel is bone; 0:
     candidates are tried. filter_mm: thickness of aluminium. anode_deg: angle of a tungsten anode, for SpekPy's spectrum; 0:
     Kramers' law. Raises InputError for values out of range or in contradiction."""
 
@@ -69,7 +71,7 @@ class HardeningOptions(checks.Checked):
 
 
 def straighten(frames: np.ndarray, polynomial: Polynomial) -> np.ndarray:
-    """Returns p + a p² + b p³ + c p⁴ for line integrals p (any shape), float32; values below 0 are air and stay."""
+    """Returns p + a p² + b p³ + c p⁴ for line integrals p (any shape), float32. Values below 0 are air and stay."""
     p = np.asarray(frames, np.float64)
     up = np.maximum(p, 0)
     square, cube, fourth = polynomial
@@ -77,7 +79,7 @@ def straighten(frames: np.ndarray, polynomial: Polynomial) -> np.ndarray:
 
 
 def water_polynomial(kvp: float, filter_mm: float = FILTER_MM, anode_deg: float = 0.0) -> Polynomial:
-    """Returns the polynomial that straightens line integrals of water, up to 8, for a spectrum of ``tube_spectrum``."""
+    """Returns the coefficients that correct line integrals of water, up to 8, under the spectrum of ``tube_spectrum``."""
     true = np.linspace(0.05, _WATER_TO, 80)
     seen = tube_spectrum(kvp, filter_mm, anode_deg).hardened(true)
     basis = np.stack([seen**2, seen**3, seen**4], axis=1) / true[:, None]
@@ -126,8 +128,9 @@ def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) ->
 def _straighten_two(
     frames: np.ndarray, spectrum: Spectrum, model: Model, blur: float, water: Polynomial, bone_in: BoneIn
 ) -> tuple[np.ndarray, float]:
-    """Returns corrected line integrals (F, v, u) of soft tissue and bone, and bone's fraction of the volume's attenuation.
-    Without bone in the volume they are corrected for water. blur: standard deviation, in pixels, that the model needs."""
+    """Returns line integrals (F, v, u) corrected for soft tissue and bone, and bone's fraction of the volume's attenuation.
+    Without bone they are corrected for water. blur: standard deviation in pixels by which frames are blurred for a coarse
+    model."""
     clean, share = straighten(frames, water), 0.0
     for _ in range(_PASSES):
         volume = model.regularised(step.smooth(clean, blur))
@@ -142,10 +145,11 @@ def _straighten_two(
 def find_bone(
     frames: np.ndarray, spectrum: Spectrum, water: Polynomial, model: Model
 ) -> tuple[tuple[float, float] | None, dict[str, float]]:
-    """Finds the candidate with which line integrals (F, v, u) explain themselves best.
+    """Finds the candidate (``_BETWEEN``) whose corrected line integrals (F, v, u) agree best with their own reprojection.
 
-    Returns the fractions of the densest up to which all is soft and from which all is bone (infinite: water alone; None: no
-    correction is best), and the unexplained rest of each alternative. Raises InputError where there is no object."""
+    Returns two fractions of the densest voxel: all is soft up to the first, all is bone from the second on (both infinite:
+    water alone is best; None: no correction). Also returns each alternative's unexplained rest. Raises InputError without an
+    object."""
 
     def rest_of(clean: np.ndarray) -> float:
         return step.unexplained(clean, model.volume(clean), inside, model)
@@ -160,7 +164,6 @@ def find_bone(
     bones = {pair: _between(*pair, volume) for pair in _BETWEEN}
     rest = {pair: rest_of(_with_bone(bone, frames, spectrum, model)) for pair, bone in bones.items()}
     least = min(rest.values())
-    # among candidates that explain the frames about as well, the one with the least bone
     good = [pair for pair in bones if rest[pair] <= least + _AS_WELL * max(water_alone - least, 0.0)]
     best = min(good, key=lambda pair: float(bones[pair].sum()))
     rests = {"as_they_are": uncorrected, "water": water_alone, "bone": rest[best]}
@@ -170,13 +173,13 @@ def find_bone(
 
 
 def _with_bone(bone: np.ndarray, frames: np.ndarray, spectrum: Spectrum, model: Model) -> np.ndarray:
-    """Returns corrected line integrals (F, v, u) for a given volume of ``bone`` (z, y, x) in 1/mm."""
     dense = np.maximum(model.frames(bone.astype(np.float32)), 0)
     return (_soft_beside(dense, frames, spectrum) + dense).astype(np.float32)
 
 
 def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> np.ndarray:
-    """Returns the soft tissue's line integrals that, with ``dense`` ones of bone, give the measured ``frames`` (Newton)."""
+    """Returns the soft tissue's line integrals that, behind bone of line integrals ``dense``, give the measured
+    ``frames``."""
     soft, small = np.asarray(frames - dense, np.float64), 1e-3
     for _ in range(_NEWTON):
         now = spectrum.hardened(soft, dense)
@@ -185,22 +188,22 @@ def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> n
 
 
 def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:
-    """Fits the polynomial for ``straighten``, p² alone, to line integrals (F, v, u) of one material and their paths.
+    """Fits the polynomial of ``straighten``, only p², to line integrals (F, v, u) of an object of one material.
 
-    The quadratic term that the same fit finds in reprojections of that volume, without hardening, is subtracted. Raises
+    The coefficient that the same fit finds in a reprojection of the volume, which has no hardening, is subtracted. Raises
     InputError for an object of several materials, and for none."""
     path, level, bend, rest = _bend(frames, model)
     if rest > _UNIFORM:
         found = f"{100 * rest:.2g} % of the line integrals that the path through one material does not explain"
         remedy = "state hardening.kvp or hardening.polynomial"
         raise InputError("--steps hardening", found, f"at most {100 * _UNIFORM:.2g} %", remedy)
-    # reprojected voxels alone have a small quadratic term, which is no hardening
+    # voxels cause a small quadratic term even without hardening: it is measured in their reprojection, and subtracted
     return _bend(path * np.float32(level), model)[2] - bend, 0.0, 0.0
 
 
 def _bend(frames: np.ndarray, model: Model) -> tuple[np.ndarray, float, float, float]:
-    """Fits p = t + b t² to line integrals (F, v, u), with t in proportion to the path through the object. Returns the path
-    (F, v, u) in mm, the object's attenuation in 1/mm, b, and the relative RMS of the residual."""
+    """Fits p = t + b t² to line integrals (F, v, u), where t is the path through the object times its attenuation. Returns
+    the path (F, v, u) in mm, the attenuation in 1/mm, b, and the relative RMS of the residual."""
     volume = model.volume(frames)
     level = float(np.median(volume[volume > 0.5 * np.percentile(volume, 99)])) if volume.max() > 0 else 0.0
     path = model.frames(np.clip(volume / max(level, 1e-20), 0, 1).astype(np.float32))
@@ -219,8 +222,8 @@ def _no_object() -> InputError:
 
 
 def _between(soft_to: float, bone_from: float, volume: np.ndarray) -> np.ndarray:
-    """Returns the bone's attenuation in voxels (z, y, x) that may mix bone and soft tissue: none up to ``soft_to``, all from
-    ``bone_from``. Both are fractions of the ``densest`` voxel's attenuation."""
+    """Returns the attenuation (z, y, x) that bone contributes to voxels that mix it with soft tissue. Both limits are
+    fractions of the ``densest`` voxel's attenuation: up to ``soft_to`` nothing is bone, from ``bone_from`` on all is."""
     if soft_to >= bone_from:
         return np.zeros_like(volume)
     soft, bone = soft_to * step.densest(volume), bone_from * step.densest(volume)

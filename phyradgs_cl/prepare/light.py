@@ -1,9 +1,12 @@
-"""Corrects light that changes during a scan: its pattern from flats, its amount from air.
+"""Corrects light that changes during a scan: its pattern by flats, its amount by the air in each frame.
 
-Flats are interpolated in time or combined. time: linearly between the means of flats that were taken together, in the order
-of the stored frames. pca: each frame takes the combination of their principal components that leaves the least total
-variation, in logarithms (Van Nieuwenhove et al., Opt. Express 23 (2015) 27975). The amount of light in each frame comes from
-the step ``air``: pixels beside the object, as in nabu and in algotom's ROI normalisation."""
+- mean: all flats are averaged.
+- time: flats taken one after another are averaged, and these means interpolated linearly in time.
+- pca: each frame gets the combination of the flats' principal components that leaves the least total variation, in
+  logarithms (Van Nieuwenhove et al., Opt. Express 23 (2015) 27975).
+
+The step ``air`` corrects each frame's amount of light by the pixels that no object covers, as nabu and algotom's ROI
+normalisation do."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -22,26 +25,26 @@ from phyradgs_cl.io import ToAttenuation, read_scan
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 WAYS = ("mean", "time", "pca")
-_MOST_COMPONENTS, _CLEAR = 4, 4.0  # limit of the principal components; their least variance over the median one's
-_REWEIGHTINGS = 12  # iterations of reweighted least squares
-_LEAST_PIXELS = 20  # least number of pixels of air in a frame
+_MOST_COMPONENTS, _CLEAR = 4, 4.0  # most principal components; one that varies 4 times as much as the median one is no noise
+_REWEIGHTINGS = 12
+_LEAST_PIXELS = 20  # with fewer pixels of air in a frame, their median is too noisy
 _AROUND = np.ones((3, 3), bool)
-_MARGIN = 2  # pixels between air and the object's edge
-_PASSES = 3  # repetitions in which the threshold of air follows the median of the air found
+_MARGIN = 2  # this near to the object, in pixels, its blurred edge is no air
+_PASSES = 3  # bright or dim light shifts the air, so the threshold follows its median, in this many rounds
 Counts = np.ndarray
 
 
 def flat_correction(way: str) -> ToAttenuation:
-    """Returns the function by which ``read_scan`` converts counts, with flats as ``way`` says.
+    """Returns the function that converts counts to line integrals for ``read_scan``. way: how it uses the flats (``WAYS``).
 
-    It takes data (F, v, u), image_key (F,) and the quantity, and returns line integrals (P, v, u) and bad pixels. It raises
-    InputError for other quantities and for too few flats."""
+    The function takes data (F, v, u), image_key (F,) and the quantity, and returns line integrals (P, v, u) and bad pixels.
+    It raises InputError for too few flats and, with "time" or "pca", for other quantities than counts."""
     checks.one_of("flats", way, WAYS)
     return counts_to_attenuation if way == "mean" else partial(_with_changing_flats, way)
 
 
 def read_corrected(path: str | Path, flats: str = "mean", rows: tuple[int, int] | None = None) -> Scan:
-    """Reads a scan file, or its rows [first, stop), as line integrals by ``flat_correction``. See ``io.read_scan``."""
+    """Reads a scan file, or its rows [first, stop), as line integrals (``flat_correction``). Raises as ``io.read_scan``."""
     scan = read_scan(path, flat_correction(flats), rows)
     return scan if flats == "mean" else replace(scan, provenance={**scan.provenance, "flats": flats})
 
@@ -49,7 +52,6 @@ def read_corrected(path: str | Path, flats: str = "mean", rows: tuple[int, int] 
 def _with_changing_flats(
     way: str, data: Counts, image_key: np.ndarray, quantity: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Converts counts by flats that change, as ``way``, "time" or "pca", says. See ``flat_correction``."""
     flats = np.flatnonzero(image_key == FLAT)
     needed = 2 if way == "time" else 3
     if quantity != "counts" or len(flats) < needed:
@@ -68,7 +70,8 @@ def _with_changing_flats(
 
 
 def _in_time(signal: np.ndarray, flats: np.ndarray, numbers: np.ndarray) -> Iterator[np.ndarray]:
-    """Yields the flat (v, u) of each projection: interpolated by frame number between the means of groups of flats."""
+    """Yields each projection's flat (v, u), interpolated by frame number between the means of flats taken one after
+    another."""
     groups = np.split(np.arange(len(flats)), np.flatnonzero(np.diff(flats) > 1) + 1)
     time = np.array([flats[group].mean() for group in groups])
     means = np.stack([signal[group].mean(axis=0) for group in groups])
@@ -78,13 +81,13 @@ def _in_time(signal: np.ndarray, flats: np.ndarray, numbers: np.ndarray) -> Iter
 
 
 def _of_components(signal: np.ndarray, counts: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """Yields the flat of each projection's counts (v, u), from the principal components of the flats' logarithms."""
+    """Yields the flat (v, u) for each projection's counts (v, u), from principal components of the flats' logarithms."""
     mean = signal.mean(axis=0)
     live = mean > 0
     ratio = np.divide(signal, mean, out=np.ones_like(signal), where=live)
     logs = np.log(np.maximum(ratio, TRANSMISSION_FLOOR)).reshape(len(signal), -1)
     _, size, components = np.linalg.svd(logs - logs.mean(axis=0), full_matrices=False)
-    size = size[: len(signal) - 1]  # the mean took one degree of freedom
+    size = size[: len(signal) - 1]  # subtracting the mean leaves one component fewer than there are flats
     clear = size**2 > _CLEAR * np.median(size**2) if len(size) > 2 else size > 0
     used = components[: len(size)][clear][:_MOST_COMPONENTS].reshape(-1, *mean.shape)
     if not len(used):
@@ -97,8 +100,8 @@ def _of_components(signal: np.ndarray, counts: Iterable[np.ndarray]) -> Iterator
 
 
 def _least_variation(frame: np.ndarray, components: np.ndarray) -> np.ndarray:
-    """Returns the weights (k,) of components (k, v, u) that minimise the total variation of frame (v, u) − components.
-    Solves it by iteratively reweighted least squares, each difference weighted by its inverse size."""
+    """Returns the weights (k,) of components (k, v, u) whose subtraction leaves frame (v, u) with the least total variation:
+    least squares, repeated with weights 1/|difference|, which turn squares into absolute values."""
 
     def differences(image: np.ndarray) -> np.ndarray:
         return np.concatenate([np.diff(image, axis=axis).ravel() for axis in (-2, -1)])
@@ -115,8 +118,8 @@ def _least_variation(frame: np.ndarray, components: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class AirOptions(checks.Checked):
-    """below: fraction of the scan's largest line integral below which a pixel may be air, if it is connected with a side of
-    the panel. least: least fraction of air in every frame."""
+    """below: pixels are air if they lie below this fraction of the scan's largest line integral and connect to the panel's
+    left or right side. least: least fraction of air in every frame."""
 
     PREFIX = "air."
 
@@ -125,7 +128,7 @@ class AirOptions(checks.Checked):
 
 
 def normalise_air(scan: Scan, options: AirOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
-    """Returns the scan with the median of each frame's air shifted to 0."""
+    """Returns the scan with each frame shifted so that the median of its air is 0."""
     frames = unmasked_frames(scan)
     air = enough_air(frames, options.below, options.least, "air", "raise air.below, or leave the step out")
     clean, value = with_air_at_0(frames, air)
@@ -154,8 +157,8 @@ def find_air(frames: np.ndarray, *, below: float = 0.05) -> np.ndarray:
 
 
 def enough_air(frames: np.ndarray, below: float, least: float, step: str, remedy: str) -> np.ndarray:
-    """Returns the air, bool (F, v, u), of ``find_air``. Raises InputError about --steps ``step`` where a frame has less than
-    20 pixels, or than the fraction ``least``."""
+    """Returns the air, bool (F, v, u), by ``find_air``. Raises InputError, which names --steps ``step``, where a frame has
+    fewer than 20 pixels of air, or a smaller fraction than ``least``."""
     air = find_air(frames, below=below)
     counts = air.sum(axis=(1, 2))
     needed = max(_LEAST_PIXELS, int(np.ceil(least * frames[0].size)))
@@ -166,6 +169,7 @@ def enough_air(frames: np.ndarray, below: float, least: float, step: str, remedy
 
 
 def with_air_at_0(frames: np.ndarray, air: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns line integrals (F, v, u) with each frame's median over ``air`` shifted to 0, and these medians (F,)."""
+    """Shifts each frame of line integrals (F, v, u) so that its median over ``air`` is 0. Returns them, and the medians
+    (F,)."""
     value = np.array([np.median(frame[where]) for frame, where in zip(frames, air, strict=True)])
     return frames - value[:, None, None].astype(np.float32), value

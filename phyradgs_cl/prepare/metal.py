@@ -1,5 +1,5 @@
-"""Metal: rays through it are masked for iterative methods and interpolated for FDK; its voxels are put back into the volume
-(Kalender, Hebel and Ebersberger, Radiology 164 (1987) 576)."""
+"""Metal: masks rays through it for iterative methods, fills its shadow for FDK, and returns its voxels for the finished
+volume (Kalender, Hebel and Ebersberger, Radiology 164 (1987) 576)."""
 
 from dataclasses import dataclass, replace
 
@@ -13,16 +13,17 @@ from phyradgs_cl.fields import Metal
 from phyradgs_cl.prepare import step
 from phyradgs_cl.prepare.step import Facts, MakeModel
 
-_DENSER = 6.0  # times the object's main material: bone and enamel have up to 5 times water's attenuation, titanium 7 or more
-_FEWEST = 4  # voxels that touch: fewer are noise
-_BLIND = 2  # voxels around metal that only masked rays meet
-_VOXELS = 128  # along the longest side of the volume that fills the shadow
-_MOST, _OBJECT = 0.5, 0.02  # of the object's pixels, which are those with so much of the largest line integral
+_DENSER = 6.0  # metal attenuates 6 times as much as the main material: bone has up to 5 times water's, titanium 7 or more
+_FEWEST = 4  # fewer touching voxels than this are noise, not metal
+_BLIND = 2  # only masked rays pass this near to metal, in voxels, so the fill knows nothing there
+_VOXELS = 128  # the volume that fills the shadow has at most this many voxels along its longest side, to save time
+_MOST, _OBJECT = 0.5, 0.02  # most of the object that the shadow may cover; the object exceeds 0.02 of the largest value
 
 
 @dataclass(frozen=True)
 class MetalOptions(checks.Checked):
-    """above_per_mm: attenuation of a first volume from which a voxel is metal; 0: found."""
+    """above_per_mm: attenuation in 1/mm, in a first volume, from which a voxel is metal. 0: six times the main
+    material's."""
 
     PREFIX = "metal."
 
@@ -30,8 +31,8 @@ class MetalOptions(checks.Checked):
 
 
 def mask_metal(scan: Scan, options: MetalOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
-    """Returns the scan with the shadow of its metal masked and interpolated, and the metal of the first volume; the scan
-    itself where there is none. InputError where the shadow covers most of the object."""
+    """Returns the scan with the shadow of metal masked and filled, and with the metal's voxels. A scan without metal is
+    returned itself. Raises InputError where the shadow covers most of the object."""
     model = make_model(scan)
     frames = step.unmasked_frames(scan)
     volume = model.volume(frames)
@@ -53,10 +54,10 @@ def mask_metal(scan: Scan, options: MetalOptions, make_model: MakeModel) -> tupl
 
 
 def _completed(masked: Scan, shadow: np.ndarray, is_metal: np.ndarray, make_model: MakeModel) -> np.ndarray:
-    """Returns the frames (F, v, u) with the shadow as a volume of the other pixels projects into it. What the projection
-    misses beside the shadow is interpolated across it, so that no edge is left.
+    """Returns the frames (F, v, u) with the shadow filled by the projection of a volume that the other pixels give. Its
+    difference from the frames at the shadow's rim is interpolated across the shadow, so that no edge is left.
 
-    No ray but masked ones meets voxels in and beside metal, so they stay near 0: they get the density around them."""
+    Only masked rays meet the voxels in and beside metal. These would stay near 0, so they get the density around them."""
     model, _ = step.coarse_model(masked, make_model, _VOXELS)
     volume = model.regularised(masked.projections)
     factors = np.divide(volume.shape, is_metal.shape)
@@ -70,8 +71,8 @@ def _completed(masked: Scan, shadow: np.ndarray, is_metal: np.ndarray, make_mode
 
 
 def _main_level(volume: np.ndarray) -> float:
-    """Returns the attenuation above which half of a volume's total attenuation (z, y, x) lies: that of the material that
-    there is most of, whatever surrounds it. Infinity for a volume of nothing."""
+    """Returns the attenuation of the main material in a volume (z, y, x): half of the total attenuation lies in denser
+    voxels. Infinity for an empty volume."""
     rising = np.sort(volume[volume > 0])
     if rising.size == 0:
         return float("inf")

@@ -1,12 +1,11 @@
-"""Retrieves phase from a single distance: returns line integrals of attenuation alone, without the bright and dark edges
-that free propagation from object to panel adds.
+"""Retrieves phase from one distance: removes the bright and dark edges that free propagation adds to line integrals.
 
-Paganin, Mayo, Gureyev, Miller and Wilkins, J. Microsc. 206 (2002) 33. For an object of one material (δ and β of its
-refractive index 1 − δ + iβ, thickness T) the transport-of-intensity equation gives the transmission exp(−p) at the panel as
-(1 − d δ/μ ∇²) exp(−μT), with μ = 4πβ/λ. Its inverse is a division by 1 + π λ d (δ/β) f² at the frequency f, in 1/mm.
+Paganin, Mayo, Gureyev, Miller and Wilkins, J. Microsc. 206 (2002) 33. The object has one material, of refractive index
+1 − δ + iβ, and thickness T. The transport-of-intensity equation gives the transmission exp(−p) at the panel as
+(1 − d δ/μ ∇²) exp(−μT), with μ = 4πβ/λ. The inverse divides by 1 + π λ d (δ/β) f² at the frequency f, in 1/mm.
 
-The filter is linear in the intensity, so it also holds for the average over an exposure that a panel records. Rows that a
-rolling shutter reads later see the object turned further; the filter ignores that within its reach of some pixels."""
+The filter is linear in intensity, so it holds for the average over an exposure. A rolling shutter reads later rows when the
+object has turned further. This is ignored: the filter mixes rows only a few pixels apart."""
 
 import math
 from dataclasses import dataclass, replace
@@ -21,13 +20,13 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 WAVELENGTH_MM_KEV = 1.239841984e-6  # wavelength in mm times energy in keV: Planck's constant times the speed of light
-_REACHES = 8  # margin around a frame in decay lengths of the filter: exp(−8) of an edge wraps around
+_REACHES = 8  # frames are padded by this many decay lengths of the filter: only exp(−8) of an edge wraps around
 
 
 @dataclass(frozen=True)
 class PhaseOptions(checks.Checked):
-    """energy_kev: the beam's energy. distance_mm: from object to panel; None: from the axis to the panel, by the geometry.
-    delta_beta: δ/β of the object's material; or delta and beta themselves. Raises InputError for values out of range or in
+    """energy_kev: the beam's energy. distance_mm: from object to panel; None: from the axis to the panel. delta_beta: δ/β of
+    the object's material. delta, beta: both, in place of their ratio. Raises InputError for values out of range or in
     contradiction."""
 
     PREFIX = "phase."
@@ -51,7 +50,7 @@ class PhaseOptions(checks.Checked):
             raise InputError("phase.beta", "0", "a number above 0", remedy)
 
     def stated(self) -> tuple[float, float]:
-        """Returns energy in keV and δ/β. Raises InputError where one of them is missing, because no scan states them."""
+        """Returns energy in keV and δ/β. Raises InputError where one is missing: no scan file states them."""
         if self.energy_kev is None:
             raise InputError("phase.energy_kev", "no energy", "the one of the beam", "say --set phase.energy_kev=25")
         if self.delta is not None and self.beta is not None:
@@ -65,11 +64,12 @@ class PhaseOptions(checks.Checked):
 def retrieve_phase(
     frames: np.ndarray, pixel_mm: tuple[float, float], distance_mm: float, energy_kev: float, delta_beta: float
 ) -> np.ndarray:
-    """Returns the line integrals of attenuation, float32, of line integrals (F, v, u) that free propagation changed.
+    """Returns line integrals of attenuation alone, float32, from line integrals (F, v, u) after free propagation.
 
-    pixel_mm (v, u) and distance_mm: those of a parallel beam. A cone beam that magnifies M times has pixels of pitch/M and a
-    distance of R₁R₂/(R₁ + R₂), from source to object R₁ and from object to panel R₂. delta_beta: δ/β of the material; with
-    0, or at a distance of 0, the frames themselves are returned. Frames continue with the values at their edges."""
+    pixel_mm (v, u), distance_mm: for a parallel beam. A cone beam with the magnification M has pixels of pitch/M and the
+    distance R₁R₂/(R₁ + R₂), from source to object R₁ and from object to panel R₂. delta_beta: δ/β of the material. If it or
+    the distance is 0, the frames themselves are returned. Beyond the panel, frames continue with the values at their
+    edges."""
     reach_mm = filter_reach_mm(distance_mm, energy_kev, delta_beta)
     if reach_mm == 0:
         return frames
@@ -89,7 +89,7 @@ def retrieve_phase(
 
 
 def filter_reach_mm(distance_mm: float, energy_kev: float, delta_beta: float) -> float:
-    """Returns the length in mm, in the object's plane, over which the filter's kernel decays by e: √(λ d (δ/β) / 4π)."""
+    """Returns the length in mm, in the object's plane, over which the filter's kernel falls to 1/e: √(λ d (δ/β) / 4π)."""
     return math.sqrt(WAVELENGTH_MM_KEV / energy_kev * distance_mm * delta_beta / (4 * math.pi))
 
 

@@ -1,14 +1,12 @@
 """Removes rings: a pixel's wrong gain adds the same error to its line integrals in every view.
 
-Over a full turn the mean of all views is the projection of the object averaged around the axis, and symmetric about it. A
-difference between a column and its mirror image is therefore an error of the panel. Its covariance between two independent
-sets of views tells whether there are rings and how strong they are; without rings the frames stay unchanged.
-The pattern comes from the mean over views, which is denoised in overlapping blocks of cosines with the measured strength:
-coefficients above the noise belong to the object.
+Over a full turn, the mean of all views shows the object averaged around the axis, which is symmetric about it. So a column
+that differs from its mirror image shows an error of the panel. Two independent sets of views both show this error: their
+covariance says whether there are rings, and how strong. Without rings the frames stay unchanged. The pattern is the mean
+over views minus the same mean, denoised: in overlapping blocks of cosines, strong coefficients belong to the object.
 
-Single columns and pixels with a wrong gain are outliers of the mean over views on one side of the axis only. The mean over
-a full turn is symmetric about the axis for every object, on an arc for a round one. A wrong gain therefore shows as a
-deviation that neither its neighbours nor their mirror images have, in two independent sets of views."""
+A single column or pixel of wrong gain deviates on one side of the axis only. Its neighbours and their mirror images do not,
+and both sets of views show it. (On an arc the mean is symmetric for a round object only.)"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -25,27 +23,26 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.bad_pixels import axis_column
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
-_LEAST_FRAMES = 8  # scans of fewer frames stay as they are
-_LEAST_PAIRS = 0.25  # fraction of all columns: with fewer pairs, columns are not compared with their mirror images
-_LEAST_SHARE = 0.25  # least variance of a pattern over that of the mean's noise: weaker ones are not worth a correction
-_NEGLIGIBLE = 1e-4  # standard deviation of a negligible pattern, in line integrals: gains that are 0.01 % off
-_SURE = 12.0  # least variance of a pattern over that of the noise, in standard errors of about 1/√pixels
-_THRESHOLD = 3.5  # standard deviations of the pattern above which coefficients belong to the object
-_SHIFTS = 8  # positions of the blocks along each side, over which the result is averaged
-# Single gains
-_DEVIATIONS = 8.0  # least deviation in robust standard deviations, in both sets of views
-_LEAST = 2e-3  # least deviation in line integrals: a gain that is 0.2 % off
-_NEIGHBOURS = 7  # width in columns of the median from which deviations are measured
-_NEAR = 21  # width in columns of the neighbourhood that gives the usual deviation
-_AXIS = 3  # columns at each side of the axis that are never changed, because an object's edges stand still there
-_UNEQUAL = 0.25  # largest difference between the two sets, relative to their mean, plus two standard deviations
-_OBJECT = 0.5  # largest deviation of the mirrored pixel, relative to the pixel's own: above it either may be wrong
-_EQUALLY_FAR = 1.15  # largest over smallest distance of the sources from their mean, on a full turn
+_LEAST_FRAMES = 8  # fewer views do not average the object enough to show rings: such scans stay as they are
+_LEAST_PAIRS = 0.25  # columns are compared with their mirror images if at least this fraction of them has one on the panel
+_LEAST_SHARE = 0.25  # a pattern that varies less, relative to the noise of the mean, is not worth a correction
+_NEGLIGIBLE = 1e-4  # nobody sees a pattern with a smaller standard deviation in line integrals: gains off by 0.01 %
+_SURE = 12.0  # a pattern is certain if its variance over the noise's exceeds this many standard errors, about 1/√pixels
+_THRESHOLD = 3.5  # coefficients above this many standard deviations of the pattern belong to the object
+_SHIFTS = 8  # positions of the blocks along each side, over which the result is averaged so that no block edges show
+_DEVIATIONS = 8.0  # a wrong gain deviates by this many robust standard deviations, in both sets of views
+_LEAST = 2e-3  # a gain that is off by less, 0.2 %, is left alone
+_NEIGHBOURS = 7  # deviations are measured from the median of this many columns
+_NEAR = 21  # this many columns around a pixel tell how much its neighbours deviate
+_AXIS = 3  # an object's edges stay on the columns nearest to the axis in all views: this many at each side are left alone
+_UNEQUAL = 0.25  # the two sets of views may differ about a wrong gain by this fraction, plus 2 standard deviations
+_OBJECT = 0.5  # a pixel whose mirror image deviates by more than this fraction of its own deviation is left alone
+_EQUALLY_FAR = 1.15  # the sources of a full turn are nearly equally far from their mean: largest over smallest distance
 
 
 @dataclass(frozen=True)
 class RingOptions(checks.Checked):
-    """window: side in pixels of the blocks of cosines; wider patterns are not removed."""
+    """window: side in pixels of the blocks of cosines. Patterns wider than a block are not removed."""
 
     PREFIX = "rings."
 
@@ -54,8 +51,8 @@ class RingOptions(checks.Checked):
 
 @dataclass(frozen=True)
 class Strength:
-    """Variances, in line integrals squared, of the pattern, of its part common to a column, and of the noise in the mean of
-    all views. least: the variance above which a pattern is certain."""
+    """Variances, in line integrals squared: of the pattern, of the part of it that whole columns share, and of the noise in
+    the mean of all views. least: the variance above which a pattern is certain."""
 
     pattern: float
     column: float
@@ -70,10 +67,10 @@ class Strength:
 def _strength(means: np.ndarray, axis_column: float) -> Strength:
     """Measures the pattern that all views share and no object can cause, from the means (2, v, u) of two sets of views.
 
-    Its variance is the robust covariance of the sets in second differences along rows, taken of the difference between
-    columns mirrored about the axis."""
+    Subtracting its mirror image from each column cancels the object, and second differences along rows remove what is left
+    of it. The covariance of both sets is the pattern's variance."""
     one, other = (_rough(_antisymmetric(mean, axis_column)) for mean in means)
-    # the mean of half of the views has twice the variance, and the difference of two such means four times
+    # the mean of half the views has twice the noise variance of the mean of all; the difference of two halves, four times
     noise, rows = robust_deviation(one - other) ** 2 / 4, len(one) // 2
     least = noise * max(_LEAST_SHARE, _SURE / np.sqrt(one.size))
     pattern = _covariance(one, other)
@@ -109,23 +106,23 @@ def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tup
 
 
 def surround_evenly(scan: Scan) -> bool:
-    """Returns whether the sources of all views lie evenly around a circle, that is equally far from their mean."""
+    """Returns whether the sources of all views lie on a full circle: about equally far from their mean."""
     sources = middle_poses(scan)[:, :3]
     distance = np.linalg.norm(sources - sources.mean(axis=0), axis=1)
     return bool(distance.max() < _EQUALLY_FAR * distance.min())
 
 
 def _means(frames: np.ndarray, full_turn: bool) -> np.ndarray:
-    """Returns the means (2, v, u) of two independent sets of views: the even and the odd ones; on an arc its halves, which
-    see the object differently."""
+    """Returns the means (2, v, u) of two independent sets of views: even and odd ones. On an arc, its two halves, which see
+    the object differently."""
     half = (len(frames) + 1) // 2
     sets = (frames[::2], frames[1::2]) if full_turn else (frames[:half], frames[half:])
     return np.stack([part.mean(axis=0, dtype=np.float64) for part in sets])
 
 
 def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: float | None) -> np.ndarray:
-    """Returns the pattern (v, u) float32 of a given strength. The symmetric and the antisymmetric part of the mean are
-    denoised separately; each has half of the pattern's variance."""
+    """Returns the pattern (v, u) float32, given its strength. The symmetric and the antisymmetric part of the mean over
+    views each hold half of the pattern's variance, and are denoised separately."""
     mean = frames.mean(axis=0, dtype=np.float64)
     if not strength.is_certain:
         return np.zeros(mean.shape, np.float32)
@@ -134,15 +131,15 @@ def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: f
     parts = [(mean + mean[:, mirrored]) / 2, (mean - mean[:, mirrored]) / 2] if whole else [mean]
     variances = np.array([strength.pattern - strength.column, strength.column]) / len(parts)
     rough = sum(part - _denoised(part, variances, window) for part in parts)
-    # this fraction of what the denoising removed is the pattern, and the rest the noise of the mean
+    # Denoising removes the pattern together with the noise of the mean: this fraction of both is the pattern.
     return np.asarray(rough * strength.pattern / (strength.pattern + strength.noise), np.float32)
 
 
 def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarray:
-    """Removes noise with two ``variances``, of each pixel and common to a column, from an image (v, u). Coefficients of
-    overlapping cosine blocks are thresholded first; that result guides a Wiener filter."""
+    """Denoises an image (v, u): thresholds the coefficients of overlapping cosine blocks, then guides a Wiener filter by the
+    result. variances: of each pixel's own noise, and of the noise that a column shares."""
     sigma = np.full((window, window), variances[0])
-    # an error common to a column is constant along it: only the first row of coefficients has it
+    # an error that a column shares is constant along it, so only the first row of coefficients has it
     sigma[0] += window * variances[1]
     sigma = np.sqrt(np.maximum(sigma, 1e-30))
     first = _blockwise(image, image, lambda c: (np.abs(c) > _THRESHOLD * sigma).astype(np.float64), window)
@@ -152,8 +149,8 @@ def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarr
 def _blockwise(
     image: np.ndarray, guide: np.ndarray, share_of: Callable[[np.ndarray], np.ndarray], window: int
 ) -> np.ndarray:
-    """Multiplies the cosine coefficients of overlapping blocks by ``share_of`` the guide's, and averages the blocks. The
-    mean value of a block stays. Blocks with fewer coefficients have more weight."""
+    """Multiplies the cosine coefficients of overlapping blocks by ``share_of`` the coefficients of ``guide``, and averages
+    blocks. Each keeps its mean value. A block of fewer remaining coefficients has less noise, and more weight."""
     width = [(window, window + (-n) % window) for n in image.shape]
     padded, guiding = (np.pad(part, width, mode="symmetric") for part in (image, guide))
     total, weight = np.zeros_like(padded), np.zeros_like(padded)
@@ -174,7 +171,7 @@ def _blockwise(
 
 
 def _cosines(image: np.ndarray, window: int) -> np.ndarray:
-    """Returns coefficients (block v, block u, window, window) of an image (v, u) that whole blocks fill."""
+    """Returns cosine coefficients (block v, block u, window, window) of an image (v, u) that whole blocks fill."""
     rows, columns = (n // window for n in image.shape)
     blocks = image.reshape(rows, window, columns, window).swapaxes(1, 2)
     return np.asarray(scipy.fft.dctn(blocks, axes=(2, 3), norm="ortho"))
@@ -186,7 +183,7 @@ def _joined(blocks: np.ndarray) -> np.ndarray:
 
 
 def mirror_columns(columns: int, axis_column: float | None) -> np.ndarray:
-    """Returns the columns' mirror images about the axis, where they are on the panel, in descending order."""
+    """Returns each column's mirror image about the axis, in descending order. Images that lie off the panel are left out."""
     twice = columns - 1 if axis_column is None else 2 * axis_column
     if not abs(twice) < 2 * columns:
         return np.zeros(0, int)
@@ -195,8 +192,8 @@ def mirror_columns(columns: int, axis_column: float | None) -> np.ndarray:
 
 
 def _antisymmetric(mean: np.ndarray, axis_column: float | None) -> np.ndarray:
-    """Returns the difference of a mean over views (v, u) from its mirror image, over √2: white noise keeps its variance.
-    Where few columns have a mirror image it returns the mean itself."""
+    """Returns a mean over views (v, u) minus its mirror image, over √2, so that white noise keeps its variance. Where few
+    columns have a mirror image it returns the mean itself."""
     mirrored = mirror_columns(mean.shape[1], axis_column)
     if len(mirrored) < _LEAST_PAIRS * mean.shape[1]:
         return mean
@@ -204,19 +201,19 @@ def _antisymmetric(mean: np.ndarray, axis_column: float | None) -> np.ndarray:
 
 
 def _rough(image: np.ndarray) -> np.ndarray:
-    """Returns the second difference along rows, scaled so that white noise keeps its variance."""
-    return (2 * image[:, 1:-1] - image[:, :-2] - image[:, 2:]) / np.sqrt(6)
+    return (2 * image[:, 1:-1] - image[:, :-2] - image[:, 2:]) / np.sqrt(6)  # white noise keeps its variance
 
 
 def _covariance(one: np.ndarray, other: np.ndarray) -> float:
-    """Returns a covariance that ignores the few pixels at edges (Gnanadesikan and Kettenring, Biometrics 28 (1972) 81)."""
+    """Returns a robust covariance, which the few pixels at edges hardly change (Gnanadesikan and Kettenring, Biometrics
+    1972)."""
     return (robust_deviation(one + other) ** 2 - robust_deviation(one - other) ** 2) / 4
 
 
 @dataclass(frozen=True)
 class SingleGains:
-    """offset: the error (v, u) float32 that wrong gains add to line integrals, 0 elsewhere. columns, pixels: the numbers of
-    columns and of single pixels with one."""
+    """offset: the error (v, u) float32 that wrong gains add to line integrals, 0 elsewhere. columns, pixels: how many
+    columns and single pixels have one."""
 
     offset: np.ndarray
     columns: int = 0
@@ -228,7 +225,7 @@ class SingleGains:
 
     @property
     def words(self) -> str:
-        """The numbers in words, as "1 column, gain off by 3.0 %"."""
+        """The numbers in words, as in "1 column, gain off by 3.0 %"."""
         counted = [(self.columns, "column"), (self.pixels, "pixel")]
         names = " and ".join(f"{n} {name}{'s' if n > 1 else ''}" for n, name in counted if n)
         return f"{names}, gain off by {100 * float(np.abs(np.expm1(-self.offset)).max()):.1f} %"
@@ -237,8 +234,8 @@ class SingleGains:
 def find_single_gains(
     means: np.ndarray, mirrored: np.ndarray, usable: np.ndarray, full_turn: bool
 ) -> SingleGains:
-    """Finds single wrong gains in the means (2, v, u) of two sets of views. mirrored: the columns' mirror images, as of
-    ``mirror_columns``; columns without one stay. usable: bool (v, u), False for masked pixels."""
+    """Finds single wrong gains in the means (2, v, u) of two sets of views. mirrored: from ``mirror_columns``; columns
+    without a mirror image are left alone. usable: bool (v, u), False for masked pixels."""
     offset = np.zeros(usable.shape, np.float32)
     if len(mirrored) < _NEAR:
         return SingleGains(offset)
@@ -249,7 +246,7 @@ def find_single_gains(
     lines = _outliers(medians[0], medians[1], usable.mean(axis=0, keepdims=True) > 0.5)
     means = means - lines
     pixels = np.zeros(usable.shape)
-    if full_turn:  # single pixels on an arc cannot be told from edges of the object
+    if full_turn:  # on an arc, a single wrong pixel looks like an edge of the object
         along, across = _deviation(means), _deviation(means.swapaxes(1, 2)).swapaxes(1, 2)
         deviation = np.where(np.abs(along) < np.abs(across), along, across)
         pixels = _outliers(deviation, _deviation(means - means[..., ::-1]), usable)
@@ -258,13 +255,13 @@ def find_single_gains(
 
 
 def _deviation(means: np.ndarray) -> np.ndarray:
-    """Returns means (set, v, u) minus the median of their neighbours along the row."""
+    """Returns means (set, v, u) minus their median over neighbours along the row."""
     return means - scipy.ndimage.median_filter(means, (1, 1, _NEIGHBOURS))
 
 
 def _outliers(deviation: np.ndarray, unlike: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Returns the errors (v, u) of outliers, 0 elsewhere. deviation: ``_deviation`` (set, v, u) of the means. unlike: that
-    of the means minus their mirror images."""
+    """Returns the errors (v, u) of outliers, 0 elsewhere. deviation: ``_deviation`` (set, v, u) of the means. unlike:
+    ``_deviation`` of the means minus their mirror images, which cancels the object."""
     around = (1, 3, 3)
     mirrored = deviation[..., ::-1]
     low, high = scipy.ndimage.minimum_filter(mirrored, around), scipy.ndimage.maximum_filter(mirrored, around)

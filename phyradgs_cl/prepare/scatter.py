@@ -1,10 +1,10 @@
 """Removes scatter by a kernel: a ray of transmission P scatters P · (−ln P) and P · (−ln P)², spread by wide Gaussians.
 
 Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563. The square lets thick rays scatter differently from thin
-ones, for which Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) take several kernels. The user states the ratio of
-scatter to primary light and the width, or they are fitted: a non-negative sum of Gaussians explains the light beside the
-object beyond that of the flats, while each frame's light may vary. Such a fit may underestimate scatter behind the object.
-The kernel is therefore raised as long as the corrected frames explain themselves equally well."""
+ones, for which Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) take several kernels. The user states the width and the
+ratio of scatter to primary light. Otherwise a non-negative sum of Gaussians is fitted to the light in air beyond that of the
+flats, while each frame's light may vary. This may underestimate scatter behind the object. So the kernel is made stronger as
+long as the corrected frames agree about as well with their own reprojection."""
 
 import itertools
 from collections.abc import Mapping
@@ -20,30 +20,29 @@ from phyradgs_cl.prepare.light import enough_air, with_air_at_0
 from phyradgs_cl.prepare.step import Facts, MakeModel, Model
 
 Kernel = Mapping[tuple[float, int], float]
-"""{(standard deviation as a fraction of the panel's longer side, power of the line integral): height}"""
-_POWERS = (1, 2)  # powers of a ray's line integral in the fitted kernel
-# standard deviations of the fitted Gaussians over the panel's longer side; narrower ones would fit columns' gains
+"""Strength of each Gaussian, by its standard deviation over the panel's longer side and the power of the line integral."""
+_POWERS = (1, 2)  # powers of a ray's line integral to which scatter is fitted: the square tells thick rays from thin ones
+# Standard deviations of the fitted Gaussians over the panel's longer side. Narrower ones would fit columns of wrong gain.
 _REACHES = (0.12, 0.18, 0.27, 0.4)
-_PASSES = 6  # alternating estimates of scatter and primary light
-_LEAST_PRIMARY = 0.05  # lower limit of the estimated primary light, as a fraction of the measured light
+_PASSES = 6  # rounds of: scatter from the primary light, primary light from the scatter
+_LEAST_PRIMARY = 0.05  # an overestimate of scatter leaves at least this fraction of the light: the logarithm stays finite
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
-_FITTED_FRAMES = 24  # most frames, evenly spread, to which heights are fitted
-_USUAL_REACH = 0.18  # default standard deviation, as in _REACHES, where the user states only to_primary
-_HEIGHT_STEP = 1.25  # factor from one tried height of the kernel to the next
-_MOST_STEPS = 8  # most heights of the kernel that are tried one after the other
-_TRIALS = 6  # most heights tried in the search between the best height's neighbours
-# the raised kernel is taken only if it leaves less than this fraction of the fitted kernel's unexplained rest
+_FITTED_FRAMES = 24  # the fit uses at most this many frames, evenly spread, to save time
+_USUAL_REACH = 0.18  # where the user states to_primary alone: spread (std) of scatter over the panel's longer side
+_HEIGHT_STEP = 1.25  # each kernel that is tried is stronger than the one before by this factor
+_MOST_STEPS = 8  # at most this many steps make the kernel stronger, up to 6 times the fitted one
+_TRIALS = 6  # most strengths tried in the final search, between the neighbours of the best one
+# The stronger kernel must leave less than this fraction of what the fitted one leaves unexplained; else the fit stands.
 _BETTER = 0.65
-_AS_WELL = 1.05  # heights are raised until the unexplained rest exceeds this many times the least so far
-_LARGEST_HEIGHT = 20.0  # upper end of the bisection for the kernel's height that gives a stated to_primary
-_BISECTIONS = 20  # number of steps of the bisection for the height
+_AS_WELL = 1.05  # no stronger kernel is tried once a kernel leaves this many times the least unexplained rest
+_LARGEST_HEIGHT = 20.0  # no kernel for a stated to_primary is stronger than this
+_BISECTIONS = 20  # halvings that give the strength for a stated to_primary to 2e-5
 
 
 @dataclass(frozen=True)
 class ScatterOptions(checks.Checked):
-    """Options of the scatter step. to_primary: ratio of scatter to primary light behind the object; 0: the kernel is
-    fitted to air. reach: standard deviation of the kernel over the panel's longer side; 0: fitted, or 0.18 where
-    to_primary is stated."""
+    """to_primary: ratio of scatter to primary light behind the object; 0: the kernel is fitted to air. reach: standard
+    deviation of the kernel over the panel's longer side; 0: fitted, or 0.18 where to_primary is stated."""
 
     PREFIX = "scatter."
 
@@ -67,15 +66,14 @@ def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel)
 
 
 def remove_scatter(frames: np.ndarray, kernel: Kernel) -> np.ndarray:
-    """Returns line integrals (F, v, u) float32 less the scatter that ``kernel`` predicts; frames (F, v, u): line
-    integrals."""
+    """Returns line integrals (F, v, u) float32 without the scatter that ``kernel`` predicts from ``frames`` (F, v, u)."""
     return -np.log(_primary(np.exp(-frames.astype(np.float64)), kernel)).astype(np.float32)
 
 
 def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kernel:
-    """Returns the kernel fitted, by non-negative least squares, to the transmission above 1 at pixels ``air``, bool (F,
-    v, u), of line integrals (F, v, u). A ``reach`` other than 0 fixes its width. Single frames may differ in light, but
-    not their mean."""
+    """Fits the kernel, by non-negative least squares, to the transmission above 1 in ``air``, bool (F, v, u), of line
+    integrals (F, v, u). A ``reach`` other than 0 fixes its width. The light may vary between frames; on average it is that
+    of the flats."""
     numbers = _some(len(frames))
     recorded, where = np.exp(-frames[numbers].astype(np.float64)), air[numbers]
     terms = list(itertools.product((reach,) if reach > 0 else _REACHES, _POWERS))
@@ -88,14 +86,13 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
         kernel = dict(zip(terms, map(float, heights), strict=True))
         over = recorded / (1 + shapes @ heights)
         gain = np.array([np.median(frame[beside]) for frame, beside in zip(over, where, strict=True)])
-        # the tube's output may vary from frame to frame; its mean is that of the flats
         light = recorded / (gain / gain.mean())[:, None, None]
     return {term: height for term, height in kernel.items() if height > 0}
 
 
 def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
-    """Returns the kernel scaled to the height with the least ``unexplained`` rest, unchanged where that gains little.
-    frames: line integrals (F, v, u), blurred by ``blur`` pixels for the model; each frame's ``air`` is shifted to 0."""
+    """Returns the kernel with the strength that leaves the least ``unexplained``, or unchanged if that gains little. frames:
+    line integrals (F, v, u), blurred by ``blur`` pixels for a coarse model. Each frame's ``air`` is shifted to 0."""
     if not kernel:
         return kernel
     coarse = step.smooth(frames, blur)
@@ -119,15 +116,15 @@ def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, bl
             break
     if least >= _BETTER * fitted:
         return kernel
-    # the minimum lies between the neighbours of the best height tried
+    # the minimum lies between the two neighbours of the best strength tried
     bounds = best / _HEIGHT_STEP, best * _HEIGHT_STEP
     found = scipy.optimize.minimize_scalar(rest, bounds=bounds, method="bounded", options={"maxiter": _TRIALS})
     return times(float(found.x))
 
 
 def _height_for(frames: np.ndarray, to_primary: float, reach: float) -> float:
-    """Returns the kernel's height that gives ``to_primary``, the ratio of scatter to primary light, by bisection: the
-    ratio grows with the height."""
+    """Returns the kernel's strength that gives the ratio ``to_primary``. The ratio grows with the strength: bisection finds
+    it."""
     some = frames[_some(len(frames))]
     low, high = 0.0, _LARGEST_HEIGHT
     for _ in range(_BISECTIONS):
@@ -159,5 +156,4 @@ def _scattered(primary: np.ndarray, reach: float, power: int) -> np.ndarray:
 
 
 def _some(frames: int) -> np.ndarray:
-    """Returns the indices of the frames to which heights are fitted."""
     return np.unique(np.linspace(0, frames - 1, _FITTED_FRAMES).round().astype(int))

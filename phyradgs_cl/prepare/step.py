@@ -1,4 +1,5 @@
-"""What several steps share: the type of a step, interpolation of masked pixels, and how well a scan explains itself."""
+"""What preparation steps share: their type, interpolation of masked pixels, and whether a scan agrees with its
+reprojection."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,19 +12,19 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.fields import GridChoice
 
 Facts = dict[str, Any]
-"""A step's results by name, for the provenance."""
-_COARSE_VOXELS = 48  # limit along the longest side of a coarse model
-_INSIDE = 0.1  # fraction of the densest voxel's attenuation above which a voxel belongs to the object
-_SMOOTH = 1 / 24  # standard deviation over the panel's longer side: hardening and scatter are smoother than grid errors
+"""What a step did, as numbers and words by name, for the scan's provenance."""
+_COARSE_VOXELS = 48  # hardening and scatter are smooth, so few voxels along the longest side show them
+_INSIDE = 0.1  # the object is denser than this fraction of the densest voxel
+_SMOOTH = 1 / 24  # blur over the panel's longer side: it leaves hardening and scatter, and removes errors of the grid
 
 
 @dataclass(frozen=True)
 class Model:
-    """A scan's reconstruction and forward projection on its grid, for steps that need the object.
+    """Reconstructs a scan and projects the volume again, on its grid: for steps that need to know the object.
 
-    volume: reconstructs frames (F, v, u) to a volume (z, y, x) in 1/mm. frames: projects a volume to frames. regularised:
-    reconstructs more slowly, with a weak total-variation prior. shadow: returns the pixels (F, v, u) whose rays meet the
-    true voxels (z, y, x) at any time of the exposure."""
+    volume: frames (F, v, u) to a volume (z, y, x) in 1/mm. frames: a volume to frames. regularised: as volume, but slower
+    and with a weak total-variation prior. shadow: from voxels, bool (z, y, x), the pixels, bool (F, v, u), whose rays meet
+    them at any time of the exposure."""
 
     volume: Callable[[np.ndarray], np.ndarray]
     frames: Callable[[np.ndarray], np.ndarray]
@@ -32,11 +33,11 @@ class Model:
 
 
 MakeModel = Callable[[Scan], Model]
-Step = Callable[[Scan, Any, MakeModel], tuple[Scan, Facts]]  # (scan, the step's options, make_model) -> scan, facts
+Step = Callable[[Scan, Any, MakeModel], tuple[Scan, Facts]]  # (scan, the step's own options, make_model) to (scan, facts)
 
 
 def unmasked_frames(scan: Scan) -> np.ndarray:
-    """Returns the scan's line integrals (F, v, u) with masked pixels interpolated, unless the step metal has filled them."""
+    """Returns line integrals (F, v, u) with masked pixels interpolated, unless the step metal has filled them already."""
     is_filled = scan.pixel_mask is None or scan.metal is not None
     return scan.projections if is_filled else fill_masked(scan.projections, ~scan.valid)
 
@@ -56,7 +57,6 @@ def fill_masked(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
 
 
 def _between_rows(frame: np.ndarray, good: np.ndarray, bad: np.ndarray) -> np.ndarray | float:
-    """Returns the rows ``bad`` of a frame (v, u), interpolated from its rows ``good``."""
     if good.size == 0:
         return 0.0
     after = np.clip(np.searchsorted(good, bad), 1, max(good.size - 1, 1))
@@ -66,7 +66,7 @@ def _between_rows(frame: np.ndarray, good: np.ndarray, bad: np.ndarray) -> np.nd
 
 
 def with_masked(scan: Scan, bad: np.ndarray) -> Scan:
-    """Returns the scan with the pixels ``bad`` (v, u) or (F, v, u) masked and interpolated, too."""
+    """Returns the scan with further pixels masked and interpolated: those of ``bad``, bool (v, u) or (F, v, u)."""
     if not bad.any():
         return scan
     mask = bad if scan.pixel_mask is None else (np.asarray(scan.pixel_mask) != 0) | bad
@@ -77,7 +77,7 @@ def with_masked(scan: Scan, bad: np.ndarray) -> Scan:
 
 def coarse_model(scan: Scan, make_model: MakeModel, most: int = _COARSE_VOXELS) -> tuple[Model, float]:
     """Returns the scan's model on at most ``most`` voxels along the longest side, and the standard deviation in pixels by
-    which frames must be blurred for it."""
+    which frames must be blurred to fit it."""
     factor = max(1.0, max(scan.grid.shape) / most)
     return make_model(scan.with_grid(GridChoice(size=round(max(scan.grid.shape) / factor)))), (factor - 1) / 2
 
@@ -88,23 +88,25 @@ def smooth(frames: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def object_in(volume: np.ndarray) -> np.ndarray:
-    """Returns the voxels (z, y, x) of the object and their neighbours, bool."""
+    """Returns the voxels of the object and their neighbours, bool (z, y, x)."""
     return np.asarray(scipy.ndimage.binary_dilation(volume >= _INSIDE * densest(volume)))
 
 
 def densest(volume: np.ndarray) -> float:
-    """Returns the 99.9th percentile of a volume (z, y, x) in its middle, where a cone beam's views are complete enough."""
+    """Returns the 99.9th percentile of a volume (z, y, x) in its middle: near the ends a cone beam does not see all of
+    it."""
     z, y, x = (np.abs(np.arange(n) - (n - 1) / 2) / max(n / 2, 1) for n in volume.shape)
     middle = (z[:, None, None] <= 0.6) & (y[None, :, None] ** 2 + x[None, None, :] ** 2 <= 0.9)
     return float(np.percentile(volume[middle], 99.9))
 
 
 def unexplained(frames: np.ndarray, volume: np.ndarray, inside: np.ndarray, model: Model) -> float:
-    """Returns the relative RMS of the smooth residual of line integrals (F, v, u) and their reprojected ``volume``.
+    """Returns the relative RMS by which line integrals (F, v, u) differ from the projection of their ``volume``, after
+    blurring.
 
-    Only voxels ``inside`` the object, bool (z, y, x), count. The residual of a reprojected reconstruction of the
-    reprojection is subtracted: it comes from the grid and the number of views. What remains comes from hardening, scatter
-    and the like."""
+    Only voxels ``inside`` the object, bool (z, y, x), are projected. The grid and the number of views cause a difference
+    too: it is measured by reconstructing and projecting the projection itself, and subtracted. What remains is hardening,
+    scatter and the like."""
 
     def reprojected(values: np.ndarray) -> np.ndarray:
         return model.frames(np.where(inside, np.maximum(values, 0), 0).astype(np.float32))

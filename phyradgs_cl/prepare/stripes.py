@@ -1,13 +1,13 @@
 """Removes stripes in sinograms of many views: columns that fluctuate, do not respond, or are wrong in all or some views.
 
 Vo, Atwood and Drakopoulos, Opt. Express 26 (2018) 28396. Neighbouring columns of a sinogram (view, column) record nearly the
-same values, in another order of views. So columns that are sorted by value hardly differ, and a median across them gives
-the values that a column should have recorded. Put back in the order of its views, they replace the column. Columns that
-fluctuate or do not respond have no such order. They are first interpolated from their neighbours.
+same values, in another order of views. Sorted by value they hardly differ, so a median across sorted columns gives what a
+column should have recorded. It replaces the column, back in the order of its views. Columns that fluctuate or do not respond
+have no such order: they are first interpolated from their neighbours.
 
-The paper sorts and replaces every column, which blurs a scan of a few hundred columns. Here a column is replaced if it
-deviates from the sorted medians much more than the columns at both its sides do, and than its mirror image about the axis.
-An edge of the object spreads over many columns, shows at one side only, or has a mirror image."""
+The paper replaces every column, which blurs a scan of a few hundred columns. Here a column is replaced only if it deviates
+from the sorted median much more than the columns at both sides, and than its mirror image about the axis. An edge of the
+object spreads over many columns, shows at one side only, or has a mirror image."""
 
 from dataclasses import dataclass, replace
 
@@ -21,19 +21,19 @@ from phyradgs_cl.prepare.bad_pixels import axis_column
 from phyradgs_cl.prepare.rings import mirror_columns
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
-_LEAST_VIEWS = 60  # with fewer views, neighbouring columns record other values
-_LEAST = 2e-3  # least deviation of a stripe in line integrals: a gain that is 0.2 % off
-_NEAR = 5  # width in columns of the median that stands for one side of a column
-_FLUCTUATING = 3.0  # least fluctuation over that of the columns at both sides
-_UNRESPONSIVE = 10.0  # least factor by which the spread over the views is below that of the columns at both sides
-_MIRRORED = 2.0  # least deviation over that of the mirror image and its neighbours
-_SMALLEST = 1e-6  # least spread in line integrals, for division: a stuck pixel has none
+_LEAST_VIEWS = 60  # the method assumes that neighbouring columns record the same values, which takes this many views
+_LEAST = 2e-3  # a stripe that deviates less, by a gain that is 0.2 % off, is left alone
+_NEAR = 5  # each side of a column is represented by the median of this many columns
+_FLUCTUATING = 3.0  # a column fluctuates if it changes this many times as much between views as the columns at both sides
+_UNRESPONSIVE = 10.0  # a column does not respond if it varies this many times less than the columns at both sides
+_MIRRORED = 2.0  # an edge shows in the mirror image too: a stripe deviates this many times as much as that
+_SMALLEST = 1e-6  # least spread in line integrals, to divide by: that of a stuck pixel is 0
 
 
 @dataclass(frozen=True)
 class StripeOptions(checks.Checked):
-    """width: width of the median in columns; stripes are narrower than half of it. ratio: least deviation of a stripe over
-    that of the columns at both sides; 0 replaces every column, as the paper does."""
+    """width: columns over which the median is taken; stripes are narrower than half of it. ratio: a stripe deviates this
+    many times as much as the columns at both sides; 0 replaces every column, as the paper does."""
 
     PREFIX = "stripes."
 
@@ -44,8 +44,8 @@ class StripeOptions(checks.Checked):
 def remove_stripes(
     frames: np.ndarray, *, width: int = 5, ratio: float = 3.0, axis_column: float | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns line integrals (F, v, u) float32 without stripes, and the pixels (v, u) bool that were interpolated, and
-    that were replaced after sorting.
+    """Returns line integrals (F, v, u) float32 without stripes, and two masks (v, u) bool: pixels that were interpolated,
+    and pixels that were replaced after sorting.
 
     width, ratio: as in ``StripeOptions``. axis_column: the column of the axis, about which columns are mirrored; None: the
     middle. Every detector row is filtered separately."""
@@ -67,20 +67,20 @@ def remove_stripes(
 
 
 def _fluctuation(sinogram: np.ndarray) -> np.ndarray:
-    """Returns the median change (u,) from view to view of a sinogram (F, u), in second differences: an object passes in a
-    few views, or changes slowly."""
+    """Returns the median change (u,) from view to view of a sinogram (F, u), by second differences. An object hardly adds to
+    it: it changes slowly, or passes in a few views."""
     return np.median(np.abs(np.diff(sinogram, 2, axis=0)), axis=0) / np.sqrt(6)
 
 
 def _spread(sinogram: np.ndarray) -> np.ndarray:
-    """Returns the distance (u,) between the quartiles of a sinogram's columns (F, u)."""
+    """Returns the distance between the quartiles over views, (u,), of a sinogram (F, u)."""
     low, high = np.percentile(sinogram, (25, 75), axis=0)
     return np.asarray(high - low)
 
 
 def _stand_out(values: np.ndarray, ratio: float, mirrored: np.ndarray) -> np.ndarray:
-    """Returns which columns, bool (u,), have values (u,) above ``ratio`` times those at both sides, and above twice those of
-    their mirror image, if they have one in ``mirrored``. For a ratio of 0 it returns all columns."""
+    """Returns the columns, bool (u,), whose ``values`` exceed ``ratio`` times those at both sides, and twice those of their
+    mirror image if ``mirrored`` has one. A ratio of 0 chooses all columns."""
     if ratio == 0:
         return np.ones(len(values), bool)
     columns, usual = np.arange(len(values)), scipy.ndimage.median_filter(values, _NEAR)
@@ -91,7 +91,7 @@ def _stand_out(values: np.ndarray, ratio: float, mirrored: np.ndarray) -> np.nda
 
 
 def _interpolate(sinogram: np.ndarray, bad: np.ndarray) -> None:
-    """Interpolates the columns ``bad``, bool (u,), of a sinogram (F, u) in place, between the nearest others."""
+    """Interpolates the columns ``bad``, bool (u,), of a sinogram (F, u) in place, from the nearest others."""
     if bad.any() and not bad.all():
         good = np.flatnonzero(~bad)
         at = np.interp(np.flatnonzero(bad), good, np.arange(len(good)))

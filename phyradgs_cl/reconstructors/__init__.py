@@ -1,6 +1,6 @@
 """Methods: a file or a folder each. ``run.py`` runs a plan (``reconstruct``), ``method.py`` lists the methods (``METHODS``).
 
-Modules are imported when they are used, so that commands without a reconstruction do not wait for them."""
+Modules are imported when they are used, so that commands that do not reconstruct need not wait for them."""
 
 import lazy_loader
 

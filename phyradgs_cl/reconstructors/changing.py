@@ -1,8 +1,8 @@
 """``changing``: an object that changes during the scan, as a stack of states: min ½‖p − A x‖² + R(x), x ≥ 0.
 
-A projects each state to the lines of its own time. R is the total variation of every state, and of every voxel in time. Most
-voxels keep their value from one state to the next, so that views of other times help a state where the object rests. The
-steps are those of ``fista``. Total variation in space and time: L. Ritschl et al., Iterative 4D cardiac micro-CT image
+A projects each state to the lines of its own time. R is the total variation of each state in space, and of each voxel in
+time. Most voxels keep their value from one state to the next. So where the object rests, views of other times help a state.
+The steps are those of ``fista``. Total variation in space and time: L. Ritschl et al., Iterative 4D cardiac micro-CT image
 reconstruction using an adaptive spatio-temporal sparsity prior, Phys. Med. Biol. 57 (2012) 1517."""
 
 from dataclasses import dataclass, replace
@@ -22,21 +22,21 @@ from phyradgs_cl.reconstructors.voxels.priors import PriorWeight, TvPrior, axis_
 from phyradgs_cl.reconstructors.voxels.run import Iterations, IterativeOptions, MethodRun
 from phyradgs_cl.runtime import Runtime
 
-_STACKS = 18  # number of stacks of all states' volumes in memory at one time
-_FRAMES = 3  # number of stacks of all frames in memory at one time
+_STACKS = 18  # memory of the method in arrays of all states' volumes
+_FRAMES = 3  # memory of the method in arrays of all frames
 
 
 @dataclass(frozen=True)
 class ChangingOptions(IterativeOptions):
     """Options of ``changing``.
 
-    - states: number of the object's states, each with as many frames; fewer where the scan has fewer frames.
+    - states: number of the object's states, each with as many frames; fewer if the scan has fewer frames.
     - prior_weight: weight of total variation in space, relative to the error of the gradient as in ``fista``.
     - time_weight: weight of a voxel's change from one state to the next, relative to an equal step between two voxels.
     - subsets: as in ``fista``, but at most two for each frame of a state. tv_iterations: as in ``fista``."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 8)
-    """Iterations of the short runs of ``estimate``: the first passes, which touch new memory, are slower."""
+    """Iterations of the two short runs that ``estimate`` times: the first passes, which touch new memory, are slower."""
 
     motion: Motion = PerRow()
     iterations: int = 40
@@ -48,8 +48,8 @@ class ChangingOptions(IterativeOptions):
 
 
 def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the states of the object, and as the volume their mean, in 1/mm. ``arguments``: the others of ``MethodRun``;
-    no seed is used."""
+    """Returns the states of the object in 1/mm, and their mean as the volume. ``arguments``: as in ``MethodRun``; no seed is
+    used."""
     times_s = state_times_s(scan, options.states)
     shape = (len(times_s), *scan.grid.shape)
     run = MethodRun(scan, options, rt, state_times_s=times_s, **arguments)
@@ -60,7 +60,7 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
         prox = TvProx(rt, shape, (options.time_weight, *axis_weights(scan.grid)))
         weight = PriorWeight(system, frame_error(scan, options.motion), options.prior_weight)
         prior, nonnegative = TvPrior(prox, options.tv_iterations), options.nonnegative
-        # a state has few frames: where one of them is a large part of a subset, steps would be too long and diverge
+        # a state has few frames: if one frame were a large part of a subset, steps would be too long and diverge
         subsets = min(options.subsets, 2 * scan.frames // len(times_s))
         method = Fista(system, prior, weight, subsets=subsets, nonnegative=nonnegative)
 
@@ -76,8 +76,7 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
 
 
 def state_times_s(scan: Scan, count: int) -> np.ndarray:
-    """Returns the mean times (K,) in s of up to ``count`` states, which take equal numbers of frames in the order of
-    time."""
+    """Returns the mean times (K,) in s of up to ``count`` states, each with the same number of successive frames."""
     middles_s = np.unique(np.asarray(scan.frame_start_s, np.float64)) + scan.shutter.span_s / 2
     shares = np.array_split(middles_s, min(count, len(middles_s)))
     return np.array([share.mean() for share in shares])

@@ -1,4 +1,4 @@
-"""States of interrupted runs, each with the identity of its run and a checksum, which are compared before a run resumes."""
+"""States of interrupted runs. Each has the identity of its run and a checksum, which are compared before a run resumes."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -11,16 +11,16 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 
 State = Mapping[str, np.ndarray]
-"""The state of an interrupted run as named arrays, from which it resumes. Each method has its own names."""
+"""The named arrays from which an interrupted run resumes. Each method has its own names."""
 RUN, _CHECKSUM = "run", "checksum"
-"""The arrays of a state that hold the identity of its run, as JSON, and the checksum of the others."""
+"""Names of the arrays that hold the identity of the run, as JSON, and the checksum of the other arrays."""
 _REMEDY = "start without --resume"
-_MOST_DIFFERENCES = 3  # most differences between two runs that an error names
-_LONGEST_NAME = 60  # most characters of a difference's name
+_MOST_DIFFERENCES = 3  # an error names at most this many differences between two runs
+_LONGEST_NAME = 60  # in an error, names of differences are cut after this many characters
 
 
 def with_identity(state: State, identity: Mapping[str, Any]) -> State:
-    """Returns a method's state with a checksum and the identity of its run, of ``RunPlan.identity``."""
+    """Returns a method's state with a checksum and the identity of its run, from ``RunPlan.identity``."""
     arrays = {**state, RUN: np.array(json.dumps(identity, default=repr))}
     return {**arrays, _CHECKSUM: np.array(_checksum(arrays))}
 
@@ -28,13 +28,13 @@ def with_identity(state: State, identity: Mapping[str, Any]) -> State:
 def without_identity(
     state: State, identity: Mapping[str, Any], completed: Callable[[dict[str, Any]], dict[str, Any]]
 ) -> State:
-    """Returns the method's own state. completed: adds the defaults of options that are younger than the state to its
-    identity. Raises InputError for a damaged state, and for the state of another run."""
+    """Returns the method's own state. completed: adds to a stored identity the defaults of options that did not exist yet.
+    Raises InputError for a damaged state, and for the state of another run."""
     arrays = {name: array for name, array in state.items() if name != _CHECKSUM}
     if not np.array_equal(state.get(_CHECKSUM, -1), _checksum(arrays)):
         raise InputError("checkpoint", "arrays that do not match their checksum", "a whole checkpoint", _REMEDY)
     both = completed(json.loads(str(arrays.pop(RUN)))), identity
-    then, now = (json.loads(json.dumps(one, default=repr)) for one in both)  # in JSON tuples are lists
+    then, now = (json.loads(json.dumps(one, default=repr)) for one in both)  # as JSON, because it turns tuples into lists
     differences = list(_differences(then, now))
     if differences:
         more = "; and more" if len(differences) > _MOST_DIFFERENCES else ""
@@ -44,7 +44,7 @@ def without_identity(
 
 
 def _checksum(arrays: State) -> int:
-    """Returns the CRC-32 of all arrays with their names, types and shapes, which decide on what a device reads."""
+    """Returns the CRC-32 of all arrays with their names, types and shapes, which say what a device would read."""
     total = 0
     for name in sorted(arrays):
         array = arrays[name]
@@ -54,7 +54,7 @@ def _checksum(arrays: State) -> int:
 
 
 def _differences(then: object, now: object, name: str = "") -> Iterator[str]:
-    """Yields "NAME (then, now)" for every value that differs between two trees of tables."""
+    """Yields "NAME (then, now)" for every value that differs between two nested tables."""
     if isinstance(then, dict) and isinstance(now, dict):
         for key in sorted({*then, *now}):
             yield from _differences(then.get(key), now.get(key), f"{name}.{key}" if name else key)

@@ -16,7 +16,7 @@ from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport
 from phyradgs_cl.signals import stop_on_interrupt
 
-SILENT_S = 10.0  # time without a report after which a process that runs alone reports
+SILENT_S = 10.0  # a run of slow iterations reports at least this often
 
 
 class Stepwise(Protocol):
@@ -30,7 +30,7 @@ class Stepwise(Protocol):
 
     @property
     def remedy(self) -> str:
-        """Advice for an error where ``quantity`` is not finite."""
+        """Advice for the error that is raised if ``quantity`` is not finite."""
 
     @property
     def iteration(self) -> int:
@@ -38,7 +38,7 @@ class Stepwise(Protocol):
 
     @property
     def finished(self) -> str | None:
-        """The reason for which the method has ended before its last iteration; None while it goes on."""
+        """Why the method has ended before its last iteration; None if it has not."""
 
     def step(self) -> None: ...
 
@@ -49,7 +49,7 @@ class Stepwise(Protocol):
         """Returns the arrays from which ``restore`` continues with the next step."""
 
     def restore(self, state: State) -> None:
-        """Restores a state of ``state``. Raises InputError for a state that this run cannot have written."""
+        """Restores what ``state`` returned. Raises InputError for a state that this run cannot have written."""
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
         """Returns the present volume (nz, ny, nx) in 1/mm, and its grid in mm."""
@@ -58,9 +58,9 @@ class Stepwise(Protocol):
 class Loop:
     """Runs a method to its end, an interruption, or its own reason to stop, and records its convergence.
 
-    stopped_by: ``iterations``, ``interrupt``, or the method's reason. record_every, report_every: iterations between
-    lines of the record, and between reports, which come sooner for slow iterations. started: the ``time.perf_counter``
-    from which seconds count."""
+    stopped_by: ``iterations``, ``interrupt``, or the method's reason. record_every, report_every: iterations between lines
+    of the record, and between reports, which come sooner for slow iterations. started: the ``time.perf_counter`` from which
+    seconds count."""
 
     def __init__(
         self, method: Stepwise, ranks: Communicator, report: ProgressReport, started: float,
@@ -74,8 +74,8 @@ class Loop:
         self._reported = time.perf_counter()
 
     def run(self, resume: State | None) -> None:
-        """Makes all steps, after those of the state ``resume`` if given. Ctrl-C, or a report that raises
-        KeyboardInterrupt, ends the run after the present step, unless that is the last."""
+        """Makes all steps, or those after the state ``resume``. Ctrl-C, or a report that raises KeyboardInterrupt, ends the
+        run after the present step, unless that is the last."""
         method = self.method
         if resume is not None:
             method.restore(resume)
@@ -93,7 +93,7 @@ class Loop:
 
     @property
     def seconds(self) -> float:
-        """Seconds since the start, with those before an interruption that this run resumes."""
+        """Seconds since the start, including those before an interruption from which this run resumed."""
         return time.perf_counter() - self._started
 
     @property
@@ -102,18 +102,16 @@ class Loop:
         return self.method.iteration if self.stopped_by == "interrupt" else None
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the state from which ``run`` can resume."""
         history = {"record": np.array(json.dumps(self.record)), "seconds": np.array(self.seconds)}
         return {**self.method.state(), **history}
 
     def state_if_interrupted(self) -> dict[str, np.ndarray] | None:
-        """Returns the state of an interrupted run; None without an interruption."""
         return self.state() if self.stopped_by == "interrupt" else None
 
     def _tell(self, before: int) -> bool:
         """Records and reports the step that began at iteration ``before``. Returns True if the report asks to stop."""
         is_recorded = self._reaches(self.record_every, before)
-        is_slow = time.perf_counter() - self._reported > SILENT_S and self.ranks.size == 1  # ranks do not agree on a time
+        is_slow = time.perf_counter() - self._reported > SILENT_S and self.ranks.size == 1  # clocks of ranks differ
         is_reported = self._reaches(self.report_every, before) or (is_slow and self.method.iteration > before)
         if not (is_recorded or is_reported):
             return False
@@ -138,7 +136,7 @@ class Loop:
         return False
 
     def _reaches(self, every: int, before: int) -> bool:
-        """Returns whether the step that began at iteration ``before`` has reached a multiple of ``every``, or the last
+        """Returns whether a step that began at iteration ``before`` reached a multiple of ``every``, or the last
         iteration."""
         now = self.method.iteration
         return now // every > before // every or now == self.method.iterations

@@ -48,7 +48,7 @@ class Method:
 
 @dataclass(frozen=True)
 class OwnOptions:
-    """Options of a user's function whose ``options`` argument has no annotation: the motion model alone."""
+    """Options of a user's function whose ``options`` argument has no annotation: only the motion model."""
 
     motion: Motion = PerRow()
 
@@ -85,8 +85,8 @@ def own_method(name: str, function: Any) -> Method:
 
 
 def imported(text: str, subject: str = "--method") -> Any:
-    """Returns the object ``package.module:name``, found also in the present folder, as ``python -m`` does. Raises
-    InputError, about ``subject``, where the import fails."""
+    """Returns the object ``package.module:name``, also from the present folder, as ``python -m`` does. Raises InputError,
+    which names ``subject``, if the import fails."""
     module, _, name = text.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
@@ -105,7 +105,7 @@ def imported(text: str, subject: str = "--method") -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Returns a value that JSON can hold: tables of plain values, and the repr of everything else."""
+    """Returns a value that JSON can hold: numbers and words as they are, tables of such, and the repr of everything else."""
     if isinstance(value, Mapping):
         return {key: _plain(one) for key, one in value.items()}
     return value if isinstance(value, int | float | str | None) else repr(value)
@@ -114,7 +114,7 @@ def _plain(value: Any) -> Any:
 def _default_options(subject: str, function: Any, parameter: inspect.Parameter) -> Any:
     try:
         kind = typing.get_type_hints(function).get(parameter.name)
-    except (NameError, TypeError):  # annotations of names that do not exist at run time
+    except (NameError, TypeError):  # annotations may name what does not exist at run time
         kind = None
     if not (isinstance(kind, type) and is_dataclass(kind)):
         return OwnOptions()
@@ -137,7 +137,7 @@ def _result(subject: str, made: object, scan: Scan) -> Reconstruction:
 
 
 class _Methods(UserDict[str, Any]):
-    """Methods by name, each imported when it is first used: imports take time."""
+    """Methods by name. Each is imported when it is first used, because imports take time."""
 
     def __getitem__(self, name: str) -> Method:
         entry = self.data[name]
@@ -184,7 +184,7 @@ def method_name(method: object) -> str:
 
 
 def check_able(option: str, method: object, ability: str, kind: str, remedy: str = "choose one of them") -> None:
-    """Raises InputError about an option for a method without the ability that it needs, a field of ``Method``."""
+    """Raises InputError about ``option`` if the method lacks the ability that it needs, a field of ``Method``."""
     if not getattr(method_of(method), ability):
         names = ", ".join(name for name, one in METHODS.items() if getattr(one, ability))
         raise InputError(option, f"--method {method_name(method)}", f"{kind}: {names}", remedy)

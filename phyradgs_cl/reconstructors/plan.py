@@ -1,5 +1,5 @@
-"""A run as one value: its method, options by name, preprocessing, seed and first volume, and how the object moves. The
-command line, configuration files, the API, sweeps all make it with ``plan_run``."""
+"""A run as one value: method, options by name, preprocessing, seed, first volume, and how the object moves. The command
+line, configuration files, the API and sweeps all make it with ``plan_run``."""
 
 import hashlib
 import logging
@@ -22,15 +22,15 @@ from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.text import flag_of, suggest_name
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
-"""The fields of motion models, by which options name them."""
-_ALL = motions_for(RAYS, SPLATS)  # for the user's own methods
-LARGEST_SEED = 2**63  # upper limit of the option ``seed``
-_DECIMALS = 6  # decimals of mm and s in a run's identity: a scan that went through a file is still the same scan
+"""Fields of motion models, such as the number of times per line, which are options of their names."""
+_ALL = motions_for(RAYS, SPLATS)  # a user's own method may take any motion model
+LARGEST_SEED = 2**63
+_DECIMALS = 6  # decimals of mm and s in a run's identity: a scan that was stored and read is still the same scan
 _SUBJECT = "--object-motion"
-_MOST_VOXELS = 24  # most voxels along each side of the grid on which a deformation is checked
-_LEAST_DETERMINANT = 0.05  # lower limit of a deformation's det(I + ∂w/∂y): near 0 matter folds
-_LEAST_COVERED = 0.5  # least fraction of the scan's time that a deformation has to cover: with less it is refused
-_MOSTLY_COVERED = 0.98  # least fraction of the scan's time that a deformation covers without a warning
+_MOST_VOXELS = 24  # deformations are smooth, so a grid of this many voxels a side is enough to check one
+_LEAST_DETERMINANT = 0.05  # a deformation with a smaller det(I + ∂w/∂y) is refused: at 0 matter folds
+_LEAST_COVERED = 0.5  # a deformation that covers less than this fraction of the scan's time is refused
+_MOSTLY_COVERED = 0.98  # a deformation that covers less than this fraction causes a warning
 log = logging.getLogger(__name__)
 
 
@@ -43,7 +43,7 @@ def method_options(method: object, preset: str | None = None, changes: Mapping[s
 
 
 def preset_of(method: object, preset: str | None = None) -> Any:
-    """Returns the options of a method's preset, of the first by default. Raises InputError for a preset that it lacks."""
+    """Returns the options of a method's preset, the first one by default. Raises InputError for a preset that it lacks."""
     name, presets = method_name(method), method_of(method).presets
     chosen = next(iter(presets)) if preset is None else preset
     if not isinstance(chosen, str) or chosen not in presets:
@@ -55,7 +55,7 @@ def preset_of(method: object, preset: str | None = None) -> Any:
 
 
 def changed_options(method: object, base: Any, given: Mapping[str, Any]) -> Any:
-    """Returns options ``base`` of a method with the changes ``given`` by field name, as ``method_options`` does."""
+    """Returns the options ``base`` of a method with the changes ``given`` by field name. See ``method_options``."""
     name, changes = method_name(method), dict(given)
     if hasattr(base, "motion"):
         motion = changes.pop("motion", None)
@@ -70,8 +70,8 @@ def preprocessing_of(changes: Mapping[str, Any]) -> Preprocessing:
 
 
 def _models(options: Any) -> dict[str, Any]:
-    """Returns the motion models of a method's options by name; the preset's own model keeps its counts of strips and
-    times."""
+    """Returns the motion models that a method's options allow, by name. The preset's own model keeps its numbers of strips
+    and times."""
     own = [options.motion] if hasattr(options.motion, "name") else []
     return {model.name: model for model in (*getattr(options, "MOTIONS", _ALL), *own)}
 
@@ -81,8 +81,8 @@ def _has(model: Any, count: str) -> bool:
 
 
 def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> Motion:
-    """Returns the motion model named ``motion`` with the given counts of strips and times, or the user's own model.
-    Raises InputError for an unknown name, and for counts that the model lacks."""
+    """Returns the motion model named ``motion``, with the given numbers of strips and times, or the user's own model. Raises
+    InputError for an unknown name, and for numbers that the model lacks."""
     if callable(getattr(motion, "cells", None)) and not counts:
         return motion
     models = _models(options)
@@ -104,9 +104,8 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
 
 
 def _implied_motion(usual: str, counts: Mapping[str, Any], models: Mapping[str, Any]) -> str:
-    """Returns the name of the usual model, or of the only other model that the given counts of strips and times mean.
-
-    A method whose usual model is static stays static unless ``motion`` is given."""
+    """Returns the name of the usual model if it takes the given numbers of strips and times, else the only other model that
+    does. A method that is usually static stays static unless ``motion`` is given."""
     if usual.startswith("static") or all(_has(models[usual], key) for key in counts):
         return usual
     having = [name for name, m in models.items() if m.is_implied and all(_has(m, key) for key in counts)]
@@ -140,14 +139,14 @@ def _changed(options: Any, changes: Mapping[str, Any], subject: str) -> Any:
 
 
 def _having(option: str) -> str:
-    """Returns the advice to use a method that has ``option``; "" where none has it."""
+    """Returns the advice to use a method that has ``option``; "" if none has it."""
     usual = {name: next(iter(one.presets.values())) for name, one in METHODS.items()}
     having = [name for name, options in usual.items() if hasattr(options, option)]
     return f"--method {' or '.join(having)} has it" if having else ""
 
 
 def _converted(current: Any, value: Any, subject: str) -> Any:
-    """Returns ``value`` as the type of ``current``: number, word, tuple or nested table; unchanged where ``current`` is
+    """Returns ``value`` in the type of ``current``: number, word, tuple or nested table; unchanged if ``current`` is
     None."""
     if current is None:  # the options check it themselves
         return value.item() if isinstance(value, np.generic) else value
@@ -161,7 +160,7 @@ def _converted(current: Any, value: Any, subject: str) -> Any:
         if not isinstance(value, (list, tuple)) or len(value) != len(current):
             raise InputError(subject, checks.short_repr(value), f"a list of {len(current)} numbers")
         return tuple(_converted(c, v, subject) for c, v in zip(current, value, strict=True))
-    if type(current) not in _EXPECTED:  # of the user's own options
+    if type(current) not in _EXPECTED:  # only a user's own options have other types: they check themselves
         return value
     expected, fits = _EXPECTED[type(current)]
     if not fits(value):
@@ -184,7 +183,7 @@ _EXPECTED: dict[type, tuple[str, Callable[[Any], bool]]] = {
 
 @dataclass(frozen=True, eq=False)
 class InitialVolume:
-    """A volume (nz, ny, nx) in 1/mm from which a method starts, and its grid. facts: which file holds it, for provenance."""
+    """A volume (nz, ny, nx) in 1/mm from which a method starts, and its grid. facts: the file it came from."""
 
     values: np.ndarray
     grid: Grid
@@ -193,7 +192,7 @@ class InitialVolume:
 
 @dataclass(frozen=True, eq=False)
 class ObjectMotion:
-    """How the object moves during the scan. facts: which file holds it, for provenance."""
+    """How the object moves during the scan. facts: the file it came from."""
 
     deformation: Deformation
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -201,9 +200,9 @@ class ObjectMotion:
 
 @dataclass(frozen=True, eq=False)
 class RunPlan:
-    """What to run on a scan. method: a name as from ``method_name``, or a function of the user's own. options: the
-    method's, checked. preprocessing: changes of the frames before the method. Raises InputError for a seed out of range,
-    an object that moves with a method that takes objects at rest only, and error bars of runs that cannot differ."""
+    """What to run on a scan. method: a name as ``method_name`` returns it, or the user's own function. options: of the
+    method, checked. preprocessing: changes of the frames before the method. Raises InputError for a seed out of range, an
+    object that moves with a method for objects at rest, and error bars of runs that cannot differ."""
 
     method: "str | Callable[..., Any]"
     options: Any
@@ -272,8 +271,8 @@ def plan_run(
 ) -> RunPlan:
     """Returns the plan of a run: ``values`` by name over the method's preset.
 
-    A name that both the method and the preprocessing have is the method's, except those in ``of_preprocessing``.
-    Raises InputError for a method, preset, option or value that does not exist."""
+    A name that both the method and the preprocessing have is the method's, except for names in ``of_preprocessing``. Raises
+    InputError for a method, preset, option or value that does not exist."""
     own, base = dict(values or {}), preset_of(method, preset)
     names = [f.name for f in fields(Preprocessing) if f.name in of_preprocessing or not hasattr(base, f.name)]
     preprocessing = preprocessing_of({name: own.pop(name) for name in names if name in own})
@@ -283,7 +282,7 @@ def plan_run(
 
 
 def check_object_motion(deformation: Deformation, scan: Scan) -> None:
-    """Raises InputError for a deformation whose place, times or unit do not fit the scan, and for one that folds matter
+    """Raises InputError for a deformation whose position, times or unit do not fit the scan, and for one that folds matter
     or compresses it to nothing."""
     _check_times(deformation, scan)
     grid = scan.grid.in_shape(triple(min(n, _MOST_VOXELS) for n in scan.grid.shape))

@@ -1,4 +1,4 @@
-"""A figure of a result: slices, convergence, and a measured frame with its residual."""
+"""Draws a result: slices, convergence, and a measured frame with its residual."""
 
 from typing import TYPE_CHECKING
 
@@ -29,8 +29,8 @@ def plot_result(
     """Returns a figure of a volume's middle slices, the convergence record and, with a scan, frame ``frame`` and its
     residual.
 
-    note: text added to the residual's title. moves: how the object moves or changes, for the residual. Raises InputError
-    for a scan that is no Scan, and for a frame out of range."""
+    note: text added to the residual's title. moves: how the object moves or changes, for the residual. Raises InputError for
+    a scan that is no Scan, and for a frame out of range."""
     if not (scan is None or isinstance(scan, Scan)):
         raise InputError("scan", checks.short_repr(scan), "the Scan of the result, or None")
     truth = None
@@ -62,7 +62,7 @@ def plot_result(
 
 
 def _draw_record(axes: "Axes", record: list[dict[str, float]]) -> None:
-    """Draws the residual, or else the loss, over the iterations; nothing with fewer than two lines of the record."""
+    """Draws the residual, or else the loss, over the iterations; nothing if the record has fewer than two lines."""
     name = next((key for key in ("residual", "loss") if record and key in record[-1]), None)
     if name is None or len(record) < 2:
         axes.set_axis_off()

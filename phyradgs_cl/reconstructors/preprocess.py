@@ -27,10 +27,8 @@ _DOUBT = "Run twice more, for an error bar of every voxel: dataset doubt of the 
 @dataclass(frozen=True)
 class Preprocessing(PrepareOptions, GridChoice):
     """size, voxel_mm, roi_mm, margin_mm: the grid, as in ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
-
-    holdout: percentage of the pixels that the method does not use, for a measure of quality. doubt: run the method on two
-    synthesised scans too, for error bars of voxels. steps and a table for each:
-    as in ``PrepareOptions``."""
+    holdout: percentage of the pixels that the method does not use, to measure its error on them. doubt: run the method on
+    two synthesised scans too, for error bars of voxels. steps, and a table for each: as in ``PrepareOptions``."""
 
     ignore_lag: bool = False
     holdout: float = checks.option(0.0, _HOLDOUT, "0", metavar="PERCENT", range=(0, MOST_HELD_OUT), of_method=True)
@@ -47,7 +45,7 @@ class Preprocessing(PrepareOptions, GridChoice):
         return {**stated, **self.step_facts()}
 
     def check_written(self) -> None:
-        """Raises InputError for options that mean nothing in a scan that is written to a file."""
+        """Raises InputError for options that mean nothing for a scan that is written to a file."""
         for one in (one for one in fields(self) if "of_method" in one.metadata and getattr(self, one.name)):
             found, remedy = "a scan that is prepared, without a method", "give it to the reconstruction instead"
             raise InputError(flag_of(one.name), found, "a reconstruction", remedy)
@@ -57,7 +55,7 @@ class Preprocessing(PrepareOptions, GridChoice):
 def prepared(scan: Scan, options: Preprocessing, rt: Runtime | None = None) -> Scan:
     """Returns the scan for a method, on a grid with its margin; the scan itself if there is nothing to do.
 
-    ``rt``: the device of steps that reconstruct and project."""
+    ``rt``: the device for steps that reconstruct and project."""
     return prepare(regrid_and_remove_lag(scan, options), options, partial(reprojection, rt))
 
 
@@ -69,17 +67,17 @@ def stages(scan: Scan, options: Preprocessing, rt: Runtime) -> Iterator[tuple[st
 
 
 def regrid_and_remove_lag(scan: Scan, options: Preprocessing) -> Scan:
-    """Returns the scan for the first step of ``prepare``."""
+    """Returns the scan on its grid with its margin, and without lag unless the options leave it in."""
     scan = scan.with_grid(options)
     scan = scan.on_grid(options.with_margin(scan.grid))
     return scan if options.ignore_lag else without_lag(scan)
 
 
 def reprojection(rt: Runtime | None, scan: Scan) -> Model:
-    """Returns FDK with every line at the middle of its own exposure, and projection at the same times."""
+    """Returns a model of FDK with every line at the middle of its own exposure, and of projection at the same times."""
     if rt is None:
         raise InputError("--steps", "a step that reconstructs, without a device", "a Runtime", "pass one")
-    from phyradgs_cl.operators import RayOperator  # methods are slow to import
+    from phyradgs_cl.operators import RayOperator  # imported here because methods are slow to import
     from phyradgs_cl.operators.rays.subrays import subrays_of
     from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk
     from phyradgs_cl.reconstructors.voxels import fista_tv
@@ -97,7 +95,7 @@ def reprojection(rt: Runtime | None, scan: Scan) -> Model:
         moving = with_times(PerRow(), scan)
         cells = [moving.cells(scan, frame) for frame in range(scan.frames)]
         whole = RayOperator(rt, scan.grid, scan.geometry.detector_shape, cells, subrays=subrays_of(scan.grid, cells))
-        near = scipy.ndimage.binary_dilation(inside)  # a voxel's edge, and the way between two times
+        near = scipy.ndimage.binary_dilation(inside)  # for rays that meet a voxel's edge, or meet it between two times
         return whole.forward(near.astype(np.float32)) > 0
 
     return Model(

@@ -1,7 +1,7 @@
-"""Frames computed from a volume: beside the measured ones, at held-out pixels, and for steps of ``prepare``.
+"""Frames computed from a volume, to compare with the measured ones, at held-out pixels, and for steps of ``prepare``.
 
-Held-out pixels measure quality without a true volume: cross-validation over pixels (as of one parameter in Golub, Heath and
-Wahba, Technometrics 21 (1979) 215). They are the same for every method, option and seed, so that errors can be compared."""
+Held-out pixels measure quality without a true volume, by cross-validation over pixels (Golub, Heath and Wahba, Technometrics
+21 (1979) 215, for one parameter). They are the same for all methods, options and seeds, so that errors can be compared."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,16 +18,16 @@ from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.runtime import Runtime
 
-TIMES_PER_LINE = 16  # number of times of a line's exposure at which it is projected: their error is far below the noise
-_HOLDOUT_SEED = 20  # seed of the random generator that draws held-out pixels
-FRAMES_AT_A_TIME = 8  # most frames that are projected at one time
+TIMES_PER_LINE = 16  # a line is projected at this many times of its exposure: the error is then far below the noise
+_HOLDOUT_SEED = 20  # all runs hold out the same pixels, by this seed
+FRAMES_AT_A_TIME = 8  # frames are projected in groups of at most this many, to limit memory
 Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """One measured frame and the same frame computed from a volume, in line integrals (rows, columns), 0 where ``valid``
-    is False."""
+    """A measured frame and the same frame computed from a volume, in line integrals (rows, columns), 0 where ``valid`` is
+    False."""
 
     frame: int
     measured: Image
@@ -55,7 +55,7 @@ def _rms(values: NDArray[np.floating]) -> float:
 
 
 def spread_frames(frames: int, count: int) -> list[int]:
-    """Returns up to ``count`` frame numbers spread evenly over a scan of ``frames`` frames, from frame 0."""
+    """Returns up to ``count`` frame numbers spread evenly over a scan of ``frames`` frames, from frame 0 on."""
     return sorted({(k * frames) // count for k in range(min(count, frames))})
 
 
@@ -64,9 +64,9 @@ def frame_pairs(
     moves: Deformation | States | None = None,
 ) -> list[FramePair]:
     """Returns the frames of a scan with those computed from a volume (nz, ny, nx) in 1/mm, under the motion of gantry and
-    object. Where ``moves`` is States, their volumes take the place of ``volume``.
+    object. If ``moves`` is States, their volumes are used in place of ``volume``.
 
-    Where the detector averages intensity, so do the computed frames."""
+    If the detector averages intensity, so do the computed frames."""
     motion = PerRow(sub_intervals=TIMES_PER_LINE)
     tables = [motion.cells(scan, frame) for frame in frames]
     if isinstance(moves, States):
@@ -87,8 +87,7 @@ def frame_pairs(
 
 
 def held_out(scan: Scan, percent: float) -> np.ndarray:
-    """Draws ``percent`` of the valid pixels, bool (F, v, u), the same in every run. Raises InputError where no pixel is
-    drawn."""
+    """Draws ``percent`` of the valid pixels, bool (F, v, u), the same in every run. Raises InputError if none is drawn."""
     drawn = np.random.default_rng(_HOLDOUT_SEED).random(scan.projections.shape, np.float32) < percent / 100
     held: np.ndarray = drawn & scan.valid
     if not held.any():
@@ -103,7 +102,7 @@ def holdout_errors(
     """Returns by name: the RMS residual of a volume (nz, ny, nx) in 1/mm at held-out pixels (F, v, u), the noise of these
     pixels, and their number.
 
-    No reconstruction can have a smaller true error than the noise. Both are dimensionless, as line integrals are."""
+    Both are dimensionless, as line integrals are. No reconstruction can have a smaller true error than the noise."""
     squares = 0.0
     for first in range(0, scan.frames, FRAMES_AT_A_TIME):
         frames = range(first, min(first + FRAMES_AT_A_TIME, scan.frames))

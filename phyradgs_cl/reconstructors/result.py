@@ -24,28 +24,28 @@ if TYPE_CHECKING:
     from phyradgs_cl.runtime import Runtime
 
 VolumeMap = Callable[[np.ndarray, Grid], tuple[np.ndarray, Grid]]
-"""A function from a volume and its grid to others."""
+"""A function from a volume and its grid to another volume and grid."""
 HELD_OUT = "held_out"
-"""The key, in a result's facts, of its error on held-out pixels."""
+"""This key, and the next ones, are in a result's facts. Here: the error on held-out pixels."""
 COMPARED = "compared"
-"""The key of the way in which the volume was compared with the scan's reference, if not voxel by voxel."""
+"""How the volume was compared with the scan's reference, if not voxel by voxel."""
 MOTION_FOUND = "motion_found"
-"""The key of what a method has found about the motion of the object."""
+"""What a method has found about the motion of the object."""
 MARGIN_MM = "margin_mm"
-"""The key of the width (z, y, x) of the discarded margin."""
+"""The width (z, y, x) of the discarded margin."""
 DOUBT = "doubt"
-"""The key of the facts about the error bars, and of the run in which they were interrupted."""
+"""Facts about the error bars, and in which of their runs they were interrupted."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Reconstruction:
     """A volume (nz, ny, nx) float32 in 1/mm on ``grid``, whose lengths are in mm.
 
-    gaussians: the cloud in mm, for methods that have one; record: the convergence record, one dict per report;
-    facts: what is needed to make it again (method, options, scales, seconds); state: how to go on, where a run
-    was interrupted; deformation: how the object moves, of ``moving``, whose volume is its reference; states: the object at
-    some times, of ``changing``, whose volume is their mean; doubt: σ (nz, ny, nx) in 1/mm of its errors
-    (docs/methods.md#error-bars). Raises InputError for arrays that are not the grid's."""
+    gaussians: the cloud in mm, for methods that have one. record: the convergence record, one dict per line. facts: what is
+    needed to make it again (method, options, scales, seconds). state: from where an interrupted run resumes. deformation:
+    how the object moves, for ``moving``, whose volume is its reference state. states: the object at some times, for
+    ``changing``, whose volume is their mean. doubt: σ (nz, ny, nx) in 1/mm of its errors (docs/methods.md#error-bars).
+    Raises InputError for arrays that do not fit the grid."""
 
     volume: np.ndarray
     grid: Grid
@@ -77,12 +77,12 @@ class Reconstruction:
 
     @property
     def interrupted_at(self) -> str:
-        """Where the run was interrupted, as "iteration 3 of 40", or nothing."""
+        """Where the run was interrupted, as in "iteration 3 of 40"; "" if it was not."""
         return place_of(interruption(self.facts))
 
     @property
     def early_stop(self) -> str:
-        """The reason for which the method ended before its last iteration, for the end of a line, or nothing."""
+        """Why the method ended before its last iteration, as the end of a line; "" if it did not."""
         done, reason = self.facts.get("iterations"), self.facts.get("stopped_by")
         options = self.facts.get("options")
         asked = options.get("iterations") if isinstance(options, Mapping) else None
@@ -91,13 +91,15 @@ class Reconstruction:
         return f", stopped after {done} of {asked} iterations ({reason})"
 
     def complete(self) -> "Reconstruction":
-        """Returns the result; KeyboardInterrupt for that of an interrupted run, which others would take for the whole."""
+        """Returns the result. Raises KeyboardInterrupt if the run was interrupted: nobody shall take a part for the
+        whole."""
         if self.facts.get("interrupted_at") is not None:
             raise KeyboardInterrupt
         return self
 
     def within(self, grid: Grid) -> "Reconstruction":
-        """Returns the part of the result on ``grid``, with all Gaussians, or the result itself outside its grid."""
+        """Returns the part of the result on ``grid``, with all Gaussians, or the result itself if ``grid`` reaches beyond
+        it."""
         if (part := grid.slices_in(self.grid)) is None:
             return self
         of_all = slice(None), *part
@@ -107,7 +109,7 @@ class Reconstruction:
 
     @property
     def scale(self) -> Hounsfield | None:
-        """The scale of Hounsfield units, where ``hounsfield`` has fitted or a file has kept one."""
+        """The scale of Hounsfield units, if ``hounsfield`` has fitted one or a file has kept one."""
         return of_facts(self.facts)
 
     @naming_arguments()
@@ -116,9 +118,9 @@ class Reconstruction:
     ) -> "Reconstruction":
         """Returns the result, still in 1/mm, with a scale of Hounsfield units fitted to two points.
 
-        air, water: boxes (z0, z1, y0, y1, x0, x1) in mm, whose mean counts; None takes the volume's own peak, the lowest
-        and the largest above it. insert_hu: the HU of the second point, where it is not water. ``result.scale.line`` says
-        what was fitted, ``result.scale.of(result.volume)`` is the volume (nz, ny, nx) in HU. ``save_volume`` keeps it.
+        air, water: boxes (z0, z1, y0, y1, x0, x1) in mm, whose mean counts; None: the volume's own peak, the lowest and the
+        largest above it. insert_hu: the HU of the second point, if it is not water. ``result.scale.line`` says what was
+        fitted, ``result.scale.of(result.volume)`` is the volume (nz, ny, nx) in HU. ``save_volume`` keeps the scale.
 
         Raises InputError for less than 100 voxels, air that is not below water, and peaks that are not theirs."""
         scale = fitted(self.volume, self.grid, air, water, insert_hu)
@@ -131,7 +133,7 @@ class Reconstruction:
         hu: in Hounsfield units of ``scale``, a copy, in place of 1/mm. states: the states (time, z, y, x) of a result that
         has them, with times in s.
 
-        Raises InputError for a scale or states that the result does not have, and where xarray is not installed."""
+        Raises InputError for a scale or states that the result does not have, and if xarray is not installed."""
         scale, of_times = self.scale, self.states
         if hu and scale is None:
             raise InputError("hu", "a result without a scale", "a scale", "result.hounsfield(air, water) fits one")
@@ -144,12 +146,12 @@ class Reconstruction:
 
     @naming_arguments()
     def plot(self, scan: "Scan | None" = None, *, frame: int = 0, device: "str | Runtime | None" = None) -> "Figure":
-        """A figure: the three middle slices in 1/mm with a bar in mm, and the convergence where there is a record.
+        """Returns a figure: the three middle slices in 1/mm with a bar in mm, and the convergence if there is a record.
 
-        scan: the result's; then also a frame, its residual and, where the scan has a reference (nz, ny, nx) in 1/mm, the
-        truth and the difference. device: what projects the volume for the residual.
+        scan: of the result; adds a frame, its residual and, if the scan has a reference (nz, ny, nx) in 1/mm, the truth and
+        the difference. device: what projects the volume for the residual.
 
-        Raises InputError for what is no scan, or a frame that it does not have."""
+        Raises InputError if ``scan`` is no Scan or has no such frame."""
         from phyradgs_cl.reconstructors.plot import plot_result
 
         note = ", without the margin" if MARGIN_MM in self.facts else ""
@@ -159,7 +161,7 @@ class Reconstruction:
 def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
     """Returns a KeyboardInterrupt whose attribute ``partial`` is the result so far, or None if there is no volume yet.
 
-    Not a subclass: only for KeyboardInterrupt itself does Python end by the signal, so that shells stop too."""
+    It is no subclass: only for KeyboardInterrupt itself does Python end by the signal, so that shells stop too."""
     kept = "before there was a volume"
     if partial is not None:
         when = f"after {partial.interrupted_at}" if partial.interrupted_at else "at its end"
@@ -173,11 +175,11 @@ def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
 class Progress:
     """One report of a running method: ``iteration`` of ``iterations`` is finished, after ``seconds`` in s.
 
-    loss: the dimensionless measure that ``quantity`` names. gaussians: their number, or 0. state: returns the state from
-    which the run can resume. volume: returns the present volume (nz, ny, nx) in 1/mm and its grid. frames: returns so
-    many measured frames, spread evenly, with those computed from the present volume. All three may be called during the
-    report only. deformation: how the object moves, where the method has found it. states: returns the object at some times,
-    of a method that has them. A report that raises KeyboardInterrupt ends the run as Ctrl-C does."""
+    loss: the dimensionless measure that ``quantity`` names. gaussians: their number, or 0. Three functions may be called
+    during the report only. state returns the state from which the run can resume. volume returns the present volume (nz, ny,
+    nx) in 1/mm and its grid. frames returns so many measured frames, spread evenly, with those computed from the present
+    volume. deformation: how the object moves, once the method has found it. states: returns the object at some times, if the
+    method has them. A report that raises KeyboardInterrupt ends the run as Ctrl-C does."""
 
     iteration: int
     iterations: int
@@ -194,7 +196,7 @@ class Progress:
     def mapped(
         self, state: "Callable[[State], State] | None" = None, volume: "VolumeMap | None" = None, **changes: Any
     ) -> "Progress":
-        """Returns the report with other fields; ``state`` and ``volume`` change what the run gives, where it gives any."""
+        """Returns the report with other fields. ``state`` and ``volume`` change what the run gives, if it gives any."""
         own_state, own_volume = self.state, self.volume
         if state is not None and own_state is not None:
             changes["state"] = lambda: state(own_state())
@@ -207,7 +209,7 @@ ProgressReport = Callable[[Progress], None]
 
 
 class Report:
-    """Passes a method's progress on to listeners, through the hooks of the stages that are under way."""
+    """Passes a method's progress on to listeners. Stages that are under way may change it, by hooks."""
 
     def __init__(self, *listeners: ProgressReport) -> None:
         self.listeners = listeners

@@ -44,14 +44,14 @@ from phyradgs_cl.text import each_warning_once
 
 log = logging.getLogger(__name__)
 
-# Volumes that voxel methods hold at one time at most (docs/large.md), with two of the intensity model; they hold stacks of
-# all frames too, and one buffer of three volumes.
+# Most volumes that each voxel method holds in memory, two of them for the intensity model (docs/large.md).
+# Besides, they hold _STACKS arrays of all frames, and need one buffer of _ONE_BUFFER volumes.
 _HELD = {"sirt": 8, "sart": 28, "os-sart": 28, "cgls": 11, "asd-pocs": 32, "fista-tv": 16}
 _HELD |= {"fista": 20, "moving": 28}
 _STACKS, _ONE_BUFFER = 12, 3
-_OF_OTHERS = 4  # volumes: the result, and copies in which it is made, checked and written
+_OF_OTHERS = 4  # memory of other methods in volumes: the result, and copies in which it is made, checked and written
 _DEVICE_SHARE = 0.9
-_ROUND = 8  # voxels
+_ROUND = 8  # a proposed --size is rounded down to a multiple of this
 
 
 @each_warning_once()
@@ -81,7 +81,7 @@ def reconstruct(
 
 
 def _warn_of_doubt(plan: RunPlan, kind: str, grid: Grid) -> None:
-    """Warns of methods and grids on which error bars were not measured."""
+    """Warns of methods and grids for which error bars were not measured."""
     if plan.method not in MEASURED:
         text = "error bars were measured for %s: those of %s may be far too narrow; --holdout 2 widens them in part"
         log.warning(text, ", ".join(MEASURED), plan.method)
@@ -91,8 +91,8 @@ def _warn_of_doubt(plan: RunPlan, kind: str, grid: Grid) -> None:
 
 
 class _Prepared:
-    """A run that is ready for its method: ``scan`` after preprocessing, with its margin; ``visible``, without held-out
-    pixels; ``options`` and further ``arguments``."""
+    """A run that is ready for its method: ``scan`` after preprocessing, with its margin; ``visible``, the scan without
+    held-out pixels; ``options`` and further ``arguments``."""
 
     def __init__(self, scan: Scan, plan: RunPlan, rt: Runtime, resume: State | None) -> None:
         preprocessing, self.plan, self.rt = plan.preprocessing, plan, rt
@@ -100,7 +100,7 @@ class _Prepared:
             _check_ranks(plan.method_name, rt)
         if preprocessing.margin_mm is not None:
             _check_margin(plan)
-        self.identity = cache(partial(plan.identity, scan))  # made where it is needed: it reads all frames
+        self.identity = cache(partial(plan.identity, scan))  # computed only if needed: it reads all frames
         self.arguments: dict[str, Any] = {}
         if resume is not None:
             check_resumable(plan)
@@ -119,7 +119,7 @@ class _Prepared:
         if self.scan.metal is not None and (self.deformation is not None or plan.method_name == "moving"):
             log.warning("metal: found and masked as in an object at rest, and this one moves: do not trust what is near it")
         self.options = plan.options
-        if hasattr(self.options, "motion") and plan.method_name != "moving":  # which finds the object's speed itself
+        if hasattr(self.options, "motion") and plan.method_name != "moving":  # moving finds the object's speed itself
             motion = with_times(self.options.motion, self.scan, self.deformation)
             self.options = replace(self.options, motion=motion)
         self.hidden = held_out(self.scan, preprocessing.holdout) if preprocessing.holdout else None
@@ -128,9 +128,9 @@ class _Prepared:
         self.box = None if preprocessing.margin_mm is None else preprocessing.of(scan.grid)
 
     def shown(self, progress: Progress) -> Progress:
-        """Adds the run's identity to its states, and frames; takes the margin from its volumes."""
+        """Returns a report with the run's identity in its states, with frames, and with volumes without the margin."""
         progress = progress.mapped(state=lambda state: with_identity(state, self.identity()))
-        if progress.volume is not None and self.rt.ranks.size == 1:  # ranks project together
+        if progress.volume is not None and self.rt.ranks.size == 1:  # several ranks can only project together
             whole = cache(progress.volume)
             progress = replace(progress, volume=whole, frames=partial(self._pairs, progress, whole))
         box = self.box
@@ -163,8 +163,8 @@ def check_resumable(plan: RunPlan) -> None:
 
 
 def _with_defaults(identity: dict[str, Any]) -> dict[str, Any]:
-    """Returns an earlier run's identity with the defaults of options of preprocessing that are younger than the run."""
-    with suppress(InputError):  # it may have options that this version lacks
+    """Returns an earlier run's identity, with the defaults of preprocessing options that did not exist yet."""
+    with suppress(InputError):  # an earlier version may have had options that this one lacks
         return {**identity, "input": preprocessing_of(identity["input"]).facts()}
     return identity
 
@@ -182,7 +182,7 @@ def _initial(plan: RunPlan, initial: InitialVolume, grid: Grid) -> np.ndarray:
 
 
 def _with_metal(result: Reconstruction, metal: Metal) -> Reconstruction:
-    """Returns the result with the metal of the scan's first volume in its volume and states; Gaussians have none."""
+    """Puts the metal that ``prepare`` found into the result's volume and states; Gaussians get none."""
     amount, _ = resampled((metal.values != 0).astype(np.float32), metal.grid, result.grid)
     values, _ = resampled(metal.values, metal.grid, result.grid)
     inside = amount >= 0.5
@@ -193,7 +193,7 @@ def _with_metal(result: Reconstruction, metal: Metal) -> Reconstruction:
 
 
 def _check_margin(plan: RunPlan) -> None:
-    """Raises InputError for a method that ignores voxels outside the box."""
+    """Raises InputError for a method in which voxels outside the box do not help those inside."""
     if (way := getattr(plan.options, "extrapolate", None)) not in (None, "reprojected"):
         found = f"--method {plan.method_name} with extrapolate={way}, whose voxels do not depend on each other"
         remedy = "add --set extrapolate=reprojected, or leave it out"
@@ -222,7 +222,7 @@ def _check_ranks(method: str, rt: Runtime) -> None:
 
 @contextmanager
 def _naming_size_that_fits(rt: Runtime, scan: Scan, plan: RunPlan) -> Iterator[None]:
-    """Adds the ``--size`` that fits, if one does, and the size of the grid with its margin to a shortage of memory.
+    """Adds to a shortage of memory the ``--size`` that fits, if one does, and the size of the grid with its margin.
 
     Raises OutOfMemoryError at once for a volume that this machine cannot hold."""
     size = _size_that_fits(rt, scan, plan.method_name, plan.options)
@@ -243,13 +243,13 @@ def _naming_size_that_fits(rt: Runtime, scan: Scan, plan: RunPlan) -> Iterator[N
 
 
 def _size_that_fits(rt: Runtime, scan: Scan, method: str, options: Any) -> int:
-    """Returns the voxels along the longest side of the scan's grid for which the memory suffices, or 0."""
+    """Returns for how many voxels along the grid's longest side the memory suffices; 0 if unknown."""
     free, held = HOST_SHARE * free_bytes(), _HELD.get(method)
     voxels = (free - scan.projections.nbytes) / (4 * _OF_OTHERS)
     if held is not None:
         free = min(free, _DEVICE_SHARE * rt.ledger.limit_bytes)
         if hasattr(options, "prior"):
-            from phyradgs_cl.reconstructors.voxels.priors import volumes_of  # which loads SciPy
+            from phyradgs_cl.reconstructors.voxels.priors import volumes_of  # loads SciPy
 
             held += volumes_of(options.prior)
         voxels = (free - _STACKS * scan.projections.nbytes) / (4 * held)

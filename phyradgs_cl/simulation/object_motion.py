@@ -1,4 +1,4 @@
-"""Makes deformations of the presets of a TOML file that say how a simulated object moves.
+"""Turns the presets of a TOML file, which say how a simulated object moves, into deformations.
 
 Breathing follows A. E. Lujan et al., Med. Phys. 26, 715-720 (1999): a(φ) = 1 − cos⁴(π φ) at the phase φ of a breath."""
 
@@ -12,14 +12,14 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid, control_points
 from phyradgs_cl.io.tables import Fields, read_toml
 
-_NODES = 40  # number of weights in a cycle: linear interpolation between them follows the curves to 0.3 %
-_SETTLING_NODES = 200  # number of times at which the weights of drying are stored
-_SPACINGS = 8.0  # number of spacings of control points along the longest side of the box
-_SLIDING_SPACINGS = 16.0  # number of spacings for sliding, whose edge is about three control points wide
-_ASIDE = 1 / 3  # amplitude of breathing along y, with its delay, over that along z
-_PERIODS = (0.5, 1.5)  # limits of a breath's period, over the mean period
-_FADE = 3.0  # distance in amplitudes over which the field falls to 0 beyond the box: its slope is then a third
-_MOST_CYCLES = 100_000  # most cycles of breathing or sliding in a scan
+_NODES = 40  # weights stored per cycle; linear interpolation between them is then off by 0.3 % at most
+_SETTLING_NODES = 200  # drying is a slow curve, for which weights at this many times are enough
+_SPACINGS = 8.0  # breathing and drying are smooth, so this many spacings of control points along the longest side are enough
+_SLIDING_SPACINGS = 16.0  # sliding has a sharp edge, which becomes about three control points wide
+_ASIDE = 1 / 3  # breathing moves the object along y, too, by this fraction of its motion along z
+_PERIODS = (0.5, 1.5)  # a random breath lasts at least and at most this many mean periods
+_FADE = 3.0  # beyond the box, motion falls to 0 over this many amplitudes: with a slope of a third, the field cannot fold
+_MOST_CYCLES = 100_000  # most cycles of breathing or sliding in a scan: more would mean a wrong unit of time
 _COMMON = ("kind", "amplitude_mm", "amplitude", "states")
 _KEYS = {
     "breathing": (*_COMMON, "period_s", "jitter", "hysteresis", "seed"),
@@ -38,11 +38,11 @@ class ObjectMotion(checks.Checked):
     surroundings at rest.
 
     - amplitude_mm: the largest displacement. None takes ``amplitude`` times half of the box's shortest side.
-    - period_s: the time of a breath or of the slide. jitter: standard deviation of a breath's period over ``period_s``.
+    - period_s: the time of a breath, or of sliding up and down. jitter: spread (std) of a breath's period over ``period_s``.
     - hysteresis: the delay of the motion along y, in periods.
-    - settling_s: the time after which 63 % of the way down is done. None takes a third of the scan.
-    - radius: that of the sliding cylinder, over half of the shortest side. seed: that of the jitter.
-    - states: the number of true volumes.
+    - settling_s: the time in which drying goes 63 % of its way. None takes a third of the scan.
+    - radius: of the sliding cylinder, over half of the shortest side. seed: of the jitter's random numbers.
+    - states: at how many times the true volume is stored.
 
     Raises InputError for an unknown kind and for numbers out of range."""
 
@@ -60,7 +60,7 @@ class ObjectMotion(checks.Checked):
     states: int = checks.ranged(10, 1, 1000)
 
     def deformation(self, box: Grid, first_s: float, last_s: float) -> Deformation:
-        """Returns the field for an object in ``box``, from a scan's first light to its last.
+        """Returns the deformation of an object in ``box``, from a scan's first light to its last.
 
         Raises InputError for an amplitude larger than half of the box's shortest side."""
         half_mm = min(box.size_mm) / 2
@@ -83,8 +83,8 @@ class ObjectMotion(checks.Checked):
         return Deformation(control_mm, origin_mm, spacing_mm, times_s, weights)
 
     def state_times_s(self, first_s: float, last_s: float) -> Array:
-        """Returns the times (K,) in s of the true volumes: the middles of equal parts of the cycle about the middle of
-        the scan; where nothing repeats, of the whole scan."""
+        """Returns the times (K,) in s of the true volumes: the middles of equal parts of the cycle in the middle of the
+        scan. For a motion that does not repeat, the parts divide the whole scan."""
         parts = (np.arange(self.states) + 0.5) / self.states
         if self.kind == "drying":
             return np.asarray(first_s + parts * (last_s - first_s))
@@ -94,13 +94,13 @@ class ObjectMotion(checks.Checked):
         return np.asarray(first + parts * (last - first))
 
     def _sliding_mm(self, places: list[Array], height: Array) -> list[Array]:
-        """Returns the control vectors in mm of a cylinder about the z axis that moves along z. Its edge is about three
-        control points wide."""
+        """Returns the control vectors of a cylinder about the z axis that moves along z, for unit amplitude. Its edge is
+        about three control points wide."""
         _, y, x = places
         return [_vectors(z=(np.hypot(x, y) < self.radius).astype(float))]
 
     def _cycles_s(self, first_s: float, last_s: float) -> Array:
-        """Returns the beginnings in s of all cycles that touch the scan. The first begins at first light or before."""
+        """Returns when each cycle that the scan meets begins, in s. The first begins at first light."""
         count = int(np.ceil((last_s - first_s) / self.period_s)) + 1
         if count > _MOST_CYCLES:
             expected = f"at most {_MOST_CYCLES} cycles in the scan's {last_s - first_s:.4g} s"
@@ -112,7 +112,7 @@ class ObjectMotion(checks.Checked):
         return np.asarray(begins_s[: int(np.searchsorted(begins_s, last_s)) + 1])
 
     def _weights(self, first_s: float, last_s: float) -> tuple[Array, Array]:
-        """Returns times (T,) in s and weights (T, R) of the preset's fields."""
+        """Returns times (T,) in s, and the weights (T, R) of the R fields at these times."""
         if self.kind == "drying":
             settling_s = (last_s - first_s) / 3 if self.settling_s is None else self.settling_s
             times_s = np.linspace(first_s, max(last_s, np.nextafter(first_s, np.inf)), _SETTLING_NODES)
@@ -151,13 +151,13 @@ def _breath(phase: Array) -> Array:
 
 
 def _breathing_mm(places: list[Array], height: Array) -> list[Array]:
-    """Returns the control vectors of unit amplitude, along z and along y, which grow from the base to the top."""
+    """Returns two sets of control vectors of unit amplitude, along z and along y, which grow from the base to the top."""
     share = height**2 * (3 - 2 * height)
     return [_vectors(z=share), _vectors(y=-_ASIDE * share)]
 
 
 def _drying_mm(places: list[Array], height: Array) -> list[Array]:
-    """Returns the control vectors of unit amplitude: downwards, growing with the height, and towards the z axis."""
+    """Returns two sets of control vectors of unit amplitude: downwards, growing with height, and towards the z axis."""
     _, y, x = places
     return [_vectors(z=height), _vectors(x=x / 2, y=y / 2)]
 

@@ -1,5 +1,5 @@
-"""Simulates a scan from a source of frames and an acquisition. Each line averages over its own time window. Options have the
-scanner's values as defaults."""
+"""Simulates a scan from an object and an acquisition: each detector line averages over its own time window. Options that are
+not stated have the scanner's values."""
 
 import logging
 from collections.abc import Callable
@@ -29,20 +29,20 @@ from phyradgs_cl.simulation.scenes import Scene, phantom_scene, volume_scene
 from phyradgs_cl.simulation.sources import FrameSource
 from phyradgs_cl.text import flag_of
 
-_LARGEST_GRID = 4096  # most voxels along a side of the volume
-_SMALLEST_PHANTOM = 2  # least number of voxels along a side: procedural phantoms need 4 and are drawn on twice as many
-_STATES = 8  # number of stored states of a phantom whose bodies move
+_LARGEST_GRID = 4096  # limit of --size
+_SMALLEST_PHANTOM = 2  # fewest voxels along a side: a procedural phantom is drawn on twice as many, and needs 4
+_STATES = 8  # a phantom whose parts move gets this many true volumes over a period
 log = logging.getLogger(__name__)
 _PEAK = "Largest line integral, by scaling the attenuation; 0: unscaled."
 _NOISE = "tigre: TIGRE's rescaled Poisson; beer: Beer-Lambert counts."
 _ELECTRONIC = "Standard deviation of electronic noise, counts."
 _JITTER = "Wander of the gantry (std, degrees), in the encoder table."
 _MOTION = "TOML file of how the object moves: breathing, drying or sliding; the truth of some states is stored."
-# Limits of options: far beyond any scanner, and far below an overflow of float32 or of a sampler.
-_LARGEST_PEAK = 1e4  # upper limit of the largest line integral
-_LARGEST_NOISE = 1e9  # upper limit of the electronic noise in counts
-_SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12  # limits of the dose in photons per pixel
-_LARGEST_DETECTOR = 32_000  # most pixels along a side of the panel
+# Limits of options, far beyond any scanner, yet far from an overflow of float32 or of a random sampler.
+_LARGEST_PEAK = 1e4  # limit of --peak, a line integral
+_LARGEST_NOISE = 1e9  # limit of --electronic-noise, in counts
+_SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12  # limits of --dose, in photons per pixel
+_LARGEST_DETECTOR = 32_000  # limit of --detector, in pixels along a side of the panel
 _TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse", "turns")
 _DATA_SHEET = ("first", "fps", "readout_ms")
 
@@ -51,8 +51,8 @@ _DATA_SHEET = ("first", "fps", "readout_ms")
 class SimulationOptions:
     """Options of a simulation. ``peak`` > 0 scales attenuation so that the largest line integral is ``peak``.
 
-    - time_samples: midpoint samples in the exposure of a line. With 0, the volume's edge and a moving object move at most
-      half a voxel of ``grid`` between two samples (docs/mathematics.md).
+    - time_samples: at how many times a line's exposure is sampled, in the middles of equal parts. 0: between two times, the
+      volume's edge and a moving object move at most half a voxel of ``grid`` (docs/mathematics.md).
     - dose: photons of a pixel without object, on a line that sees the whole pulse.
     - lag (λ), rings, sparks, drift, scatter: as in detector/effects.py; 0 is without.
     - kvp: as in detector/attenuation.py; 0 is a beam of one energy.
@@ -94,10 +94,10 @@ def scanner_for(
     name: str, detector: int | None = None, detector_offset_mm: tuple[float, float] | None = None,
     truncation: float = 0.0
 ) -> Scanner:
-    """Returns a scanner by name or TOML file.
+    """Returns a scanner by its name, or from a TOML file.
 
     detector: another number of columns, with rows in proportion. detector_offset_mm: the panel's offset (v, u). truncation:
-    the fraction of the columns to cut off, half at each side."""
+    the fraction of the columns that is cut off, half of it at each side."""
     scanner = load_scanner(name, resource("data"))
     geometry = scanner.geometry
     if detector is not None:
@@ -113,15 +113,15 @@ def scanner_for(
 
 
 def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> SimulationOptions:
-    """Returns options of a simulation with a named protocol. The scanner's value, or the default, stands for options that
-    are missing or None.
+    """Returns options of a simulation with the protocol of that name. Where an option is missing or None, the scanner's
+    value counts, or else the default.
 
     Raises InputError for unknown options, values out of range, and values that contradict each other."""
     given = {key: value for key, value in given.items() if value is not None}
     order = readout_order(given.get("first"), given.get("readout_axis"), given.get("readout_direction"), _flag)
     keys = ("readout_axis", "readout_direction", "lag", "readout_ratio", "pulse", "fps", "readout_ms")
     of_scanner = {key: getattr(scanner, key) for key in keys}
-    if "readout_ratio" in given or "readout_ms" in given:  # either of these replaces both of the scanner
+    if "readout_ratio" in given or "readout_ms" in given:  # both state the readout time: the scanner's is then void
         del of_scanner["readout_ratio"], of_scanner["readout_ms"]
     values = {**of_scanner, **given}
     values.update({key: value for key, value in zip(keys, order, strict=False) if value is not None})
@@ -134,7 +134,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
     timing = {key: values.pop(key) for key in _TIMING if key in values}
     sheet = {key: values.pop(key, None) for key in _DATA_SHEET}
     timed = make_protocol(protocol, **timing)
-    if given.get("jitter_deg") and not timed.is_fly:  # its gantry rests at the mid-window poses of a fly-scan
+    if given.get("jitter_deg") and not timed.is_fly:  # a gantry that stops rests at exact angles
         found, remedy = f"{given['jitter_deg']} with --protocol {protocol}", "leave it out, or choose a fly-scan"
         raise InputError("--jitter-deg", found, "0", remedy)
     unused = [name for name in ("dose", "electronic_noise") if name in given and given.get("noise", "none") == "none"]
@@ -159,8 +159,8 @@ def simulated_scan(
 ) -> Scan:
     """Returns a scanner's scan of a phantom (given by name or as an object) or of a volume. The truth is its reference.
 
-    name: that of the volume. size: voxels along the longest side of grid and reference; None takes the scanner's or the
-    volume's. pixel_samples: rays along each side of a pixel; 0 takes the truth's voxels. Warns of an inverse crime."""
+    name: of the volume, for titles. size: voxels along the longest side of grid and reference; None: the scanner's or the
+    volume's. pixel_samples: rays along each side of a pixel; 0: by the truth's voxels. Warns of an inverse crime."""
     if size is not None:
         checks.within("--size", size, 1 if isinstance(of, Volume) else _SMALLEST_PHANTOM, _LARGEST_GRID)
     where, axis = (scanner.geometry, scanner.grid), options.readout_axis
@@ -191,7 +191,7 @@ def simulated_scan(
         scan.provenance["motion_of_object"] = asdict(motion)
         times_s = motion.state_times_s(*window_s)
     else:
-        # Times are eighths of the cycle about the middle of the scan.
+        # The times are eighths of the cycle in the middle of the scan.
         period_s = scene.period_s or 1.0
         times_s = (np.floor(sum(window_s) / 2 / period_s) + np.arange(_STATES) / _STATES) * period_s
     volumes = np.stack([scene.state(time_s) for time_s in times_s])
@@ -206,8 +206,8 @@ def simulate(
 ) -> Scan:
     """Returns a scan of the object that ``source`` projects, with noise.
 
-    reference (nz, ny, nx): the truth in 1/mm, which ``peak`` scales too. bone: the source of the object's bone, for a
-    beam of many energies."""
+    reference (nz, ny, nx): the truth in 1/mm, which ``peak`` scales too. bone: projects the object's bone alone, for a beam
+    of many energies."""
     if options.kvp and bone is None:
         expected = "an object of voxels, whose dense ones are bone: foot, jaw or a volume"
         raise InputError("--kvp", "a phantom in closed form", expected, "leave it out")
@@ -247,7 +247,7 @@ def simulate(
     share = shutter.readout.spread(shutter.lit_share(lines))
     recorded = _recorded(frames, options, np.where(share > 0, share, 1.0), rng)
     return Scan(
-        projections=recorded if np.all(share > 0) else recorded * (share > 0),  # lines without light are masked
+        projections=recorded if np.all(share > 0) else recorded * (share > 0),  # a line without light has no measurement
         geometry=geometry,
         trajectory=trajectory,
         shutter=shutter,
@@ -263,7 +263,8 @@ def simulate(
 
 
 def _gating(scan: Scan, scene: Scene) -> Gating:
-    """Returns the weight of the first field in the middle of every frame. Without a field it is the phase of the motion."""
+    """Returns the state of the motion in the middle of every frame: the first field's weight, or the phase without
+    fields."""
     middle_s = np.asarray(scan.frame_start_s) + scan.shutter.span_s / 2
     if scene.deformation is not None:
         return Gating(middle_s, scene.deformation.weights_at(middle_s)[:, 0])
@@ -271,15 +272,15 @@ def _gating(scan: Scan, scene: Scene) -> Gating:
 
 
 def default_time_samples(protocol: Protocol, grid: Grid, fastest_mm_per_s: float = 0.0) -> int:
-    """Returns the number of time samples per line, at least 8. From one to the next, the volume's edge, or the fastest
-    part of a moving object, goes at most half a voxel."""
+    """Returns the number of time samples per line, 8 to 128, between which the volume's edge, and the fastest part of a
+    moving object, go at most half a voxel."""
     path_mm = np.deg2rad(protocol.exposure_deg) * max(grid.size_mm[1:]) / 2
     path_mm = max(path_mm, fastest_mm_per_s * protocol.exposure_s)
     return int(np.clip(np.ceil(2 * path_mm / min(grid.voxel_size_mm)), 8, 128))
 
 
 def _recorded(frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Adds scatter, drifting light, noise, gains and sparks to frames (F, v, u), as the options say."""
+    """Adds to frames (F, v, u), in physical order, the effects that the options ask for."""
     if options.scatter > 0:
         frames = effects.add_scatter(frames, options.scatter).astype(np.float32)
     if options.drift > 0:
@@ -293,7 +294,7 @@ def _recorded(frames: np.ndarray, options: SimulationOptions, light: np.ndarray,
 
 
 def _with_noise(frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Adds lag and noise to frames (F, v, u). TIGRE's counts are no real intensities: lag comes before noise."""
+    """Adds lag and noise to frames (F, v, u). For TIGRE's counts, which are no intensities, lag comes before noise."""
     if options.noise == "beer":
         return effects.beer_lambert_noise(frames, options.dose, options.electronic_noise, rng, light, options.lag)
     if options.lag > 0:

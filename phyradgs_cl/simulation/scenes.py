@@ -1,4 +1,4 @@
-"""Scenes: an object, which may move, as a source of frames, with its grid and the truth."""
+"""Scenes: an object that may move, ready to be projected, with its grid and the truth."""
 
 import logging
 from collections.abc import Callable
@@ -16,23 +16,22 @@ from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom, make_phantom
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.sources import AnalyticSource, DeformedSource, FrameSource, VolumeSource, on_panel
 
-_DENSE = 0.5  # voxels above this fraction of the largest attenuation may be bone in a beam of many energies
-# The threshold of bone lies at an attenuation with fewer voxels than this fraction of the commonest one's: it must not
-# divide a material.
+_DENSE = 0.5  # in a beam of many energies, voxels above this fraction of the largest attenuation may be bone
+# Bone begins at an attenuation that few voxels have, relative to the commonest one: a threshold must not cut a material.
 _RARE = 0.2
 log = logging.getLogger(__name__)
 Moves = Callable[[Grid], Deformation]
-"""Returns how an object in a box moves."""
+"""A function from the object's box to its deformation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
     """An object to scan: a source of frames, the grid to reconstruct, and the truth (nz, ny, nx) on it.
 
-    - source_shape: voxels (z, y, x) of a source that is a user's volume. bone: makes the source of its dense part.
+    - source_shape: voxels (z, y, x) of a user's volume that is projected. bone: makes the source of its dense part.
     - deformation: how the object moves. state: returns the truth of a moving object at a time in s.
-    - period_s: the period of an object that moves without a deformation.
-    - fastest_mm_per_s: a bound of the speed of its parts."""
+    - period_s: the period of a phantom whose parts move by themselves.
+    - fastest_mm_per_s: a bound on the speed of every part."""
 
     source: FrameSource
     grid: Grid
@@ -59,10 +58,10 @@ def phantom_scene(
     rt: Runtime, of: str | EllipsoidPhantom | MovingPhantom, geometry: Geometry, box: Grid, size: int, axis: str,
     seed: int, pixel_samples: int = 0, moves: Moves | None = None
 ) -> Scene:
-    """Returns the scene of a phantom, or of one by its name, in the scanner's box, with ``size`` voxels per side.
+    """Returns the scene of a phantom, given as an object or by name, in the scanner's box, with ``size`` voxels per side.
 
     Closed forms are integrated exactly unless they deform. Other phantoms are projected at twice ``size``, and the truth is
-    their block mean. Pixels average ``pixel_samples``² rays over their area; 0 takes the truth's voxels."""
+    their block mean. Pixels average ``pixel_samples``² rays over their area; 0: by the truth's voxels."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
     if isinstance(phantom, MovingPhantom):
@@ -89,7 +88,7 @@ def phantom_scene(
 
 
 def _moving_scene(phantom: MovingPhantom, grid: Grid, geometry: Geometry, pixel_samples: int) -> Scene:
-    """Returns the scene of a phantom whose bodies move. Its reference is the state at time 0."""
+    """Returns the scene of a phantom whose parts move. Its reference is the state at time 0."""
 
     def state(time_s: float) -> np.ndarray:
         return phantom.at(time_s).voxelise(grid, 4)
@@ -105,7 +104,7 @@ def volume_scene(
 ) -> Scene:
     """Returns the scene of a volume, called ``name``, at its own resolution, with ``pixel_samples``² rays per pixel.
 
-    A volume with a grid keeps it and its unit 1/mm. A bare array is fitted into the scanner's box; its values are
+    A volume with a grid keeps it, and its values are in 1/mm. A bare array is fitted into the scanner's box; its values are
     attenuation per half of the longest side."""
     volume, fine = loaded.values, loaded.grid
     if fine is None:
@@ -122,7 +121,7 @@ def _voxel_scene(
     rt: Runtime, volume: np.ndarray, fine: Grid, grid: Grid, title: str, deformation: Deformation | None,
     geometry: Geometry, axis: str, pixel_samples: int,
 ) -> Scene:
-    """Returns the scene of a volume (nz, ny, nx) on the grid ``fine``, with its block means on ``grid`` as the truth."""
+    """Returns the scene of a volume (nz, ny, nx) on the grid ``fine``. The truth is its block means on ``grid``."""
 
     def source_of(values: np.ndarray) -> FrameSource:
         return on_panel(geometry, grid, pixel_samples, lambda panel: on_one_panel(values, panel))
@@ -153,8 +152,8 @@ def _voxel_scene(
 
 
 def bone_from(volume: np.ndarray) -> float:
-    """Returns the attenuation in 1/mm from which voxels (nz, ny, nx) count as bone: half the largest value, or the upper
-    end of a material that this value would divide."""
+    """Returns the attenuation in 1/mm from which voxels (nz, ny, nx) count as bone: half the largest value, or, if that
+    would cut a material in two, the upper end of the material."""
     largest = float(volume.max())
     counts, edges = np.histogram(volume, 64, (0.1 * largest, max(largest, 1e-20)))
     is_rare = (edges[1:] > _DENSE * largest) & (counts < _RARE * counts.max())
@@ -162,10 +161,10 @@ def bone_from(volume: np.ndarray) -> float:
 
 
 def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
-    """Returns means float32 of a volume (z, y, x) over the voxels of a coarser or equal grid of the same box."""
+    """Returns means, float32, of a volume (z, y, x) over the voxels of a coarser grid of ``shape`` in the same box."""
     if volume.shape == tuple(shape):
         return volume.astype(np.float32)
-    from skimage.transform import resize_local_mean  # this import is slow
+    from skimage.transform import resize_local_mean  # imported here because it is slow
 
     mean = resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True)
     return mean.astype(np.float32)

@@ -1,6 +1,5 @@
-"""Sources of frames: voxel volumes at rest or deforming, and phantoms in closed form, projected from a frame's time cells.
-
-Every line sees a moving object at the times at which the line is open."""
+"""Projects objects for simulated frames: voxel volumes, at rest or deforming, and phantoms in closed form. Each line sees a
+moving object at the times at which the line is open. A table of time cells says which pose each line has, and when."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -21,16 +20,15 @@ from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom
 from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
 
-# largest width of a pixel at the axis, in voxels, for which one ray is enough; the usual scanner with as many voxels as
-# pixels has 1.43
+# One ray is enough for a pixel up to this width at the axis, in voxels. A scanner with as many voxels as pixels has 1.43.
 WIDEST_RAY = 1.5
-_MOST_SAMPLES = 32  # most rays along each side of a pixel
-NEAREST = 0.1  # largest distance of moving matter from its exact place, in voxels to be reconstructed
+_MOST_SAMPLES = 32  # most rays along each side of a pixel: the time grows with their square
+NEAREST = 0.1  # moving matter is projected at most this far from its exact position, in voxels to be reconstructed
 
 
 class FrameSource:
-    """An object that is projected to the frame of a table of time cells, with its attenuation multiplied by ``factor``. A
-    subclass writes ``frame`` or ``frames``."""
+    """Projects an object, its attenuation multiplied by ``factor``, to the frame of each table of time cells. A subclass
+    writes ``frame`` or ``frames``."""
 
     pixel_samples = 1  # rays along each side of a pixel
 
@@ -38,7 +36,6 @@ class FrameSource:
         return next(self.frames([cells], model, factor))
 
     def frames(self, tables: Sequence[TimeCells], model: str, factor: float) -> Iterator[np.ndarray]:
-        """Yields the frame of each table."""
         return (self.frame(cells, model, factor) for cells in tables)
 
 
@@ -65,20 +62,19 @@ class VolumeSource(FrameSource):
         return (self._rt.download(frames) if isinstance(frames, DeviceArray) else frames)[0]
 
     def _where_it_fits(self, volume: np.ndarray) -> np.ndarray | DeviceArray:
-        """Returns the volume on the device; on the host where the device lacks room for the volume and the operator's
-        padded copy."""
+        """Returns the volume on the device if there is room for it and for the operator's padded copy; else on the host."""
         if not self._rt.room().holds(volume.nbytes, 4 * self._memory.layout.volume_floats):
             return volume
         try:
             return self._rt.upload(volume)
-        except MemoryShortage:  # the operator then projects in bricks
+        except MemoryShortage:  # from the host, the operator projects one part of it after the other
             return volume
 
 
 class AnalyticSource(FrameSource):
-    """Projects a phantom with closed-form line integrals to float32 frames, computed in float64.
+    """Projects a phantom by closed-form line integrals, computed in float64, to float32 frames.
 
-    Moving bodies stand where they are at each time cell's time."""
+    Parts that move are where they are at each time cell's time."""
 
     def __init__(self, phantom: EllipsoidPhantom | MovingPhantom, geometry: Geometry) -> None:
         self._phantom, self._geometry = phantom, geometry
@@ -121,19 +117,18 @@ class PixelAreaSource(FrameSource):
 
 
 def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Yields (first line, line after the last, indices of cells) for every run of lines that the same cells serve."""
+    """Yields (first line, line after the last, indices of cells) for each run of lines that share the same time cells."""
     ranges = np.stack([cells.line_start, cells.line_stop], -1)
     for start, stop in np.unique(ranges, axis=0):
         yield int(start), int(stop), np.flatnonzero((ranges == (start, stop)).all(axis=1))
 
 
 def on_panel(geometry: Geometry, grid: Grid, pixel_samples: int, make: Callable[[Geometry], FrameSource]) -> FrameSource:
-    """Returns the source that ``make`` builds for the panel; with several samples per pixel, one that averages a finer
-    panel.
+    """Returns the source that ``make`` builds for the panel. With several samples per pixel it averages a finer panel.
 
-    pixel_samples: samples along each side of a pixel, at most 32. 0 takes one where a pixel, projected to the axis, has
-    at most ``WIDEST_RAY`` voxels of the grid, else one per voxel: rays through the middles of wide pixels would miss
-    parts of the object. Raises InputError for a number out of range."""
+    pixel_samples: along each side of a pixel, at most 32. 0 takes one where a pixel, projected to the axis, has at most
+    ``WIDEST_RAY`` voxels of the grid, else one per voxel: rays through the middles of wide pixels would miss parts of the
+    object. Raises InputError for a number out of range."""
     checks.within("--pixel-samples", pixel_samples, 0, _MOST_SAMPLES)
     if pixel_samples == 0:
         voxels = max(geometry.pixel_size_mm) / geometry.magnification / min(grid.voxel_size_mm)
@@ -146,10 +141,9 @@ def on_panel(geometry: Geometry, grid: Grid, pixel_samples: int, make: Callable[
 class DeformedSource(FrameSource):
     """Projects a deforming volume (nz, ny, nx) in 1/mm on ``grid``.
 
-    Cells at one time see the object exactly as it is then. For other frames the weights φ_r of each time cell are
-    rounded, so that cells with the same rounded weights share one deformed volume. The rounding displaces no point by
-    more than ``NEAREST`` of ``voxel_mm``. ``frames`` deforms the volume once for each distinct state of all its frames.
-    make: returns the source of a volume."""
+    A state of the object is a set of the fields' weights φ_r, for which the volume is deformed once. Weights are rounded so
+    that many time cells, also of other frames, share a state. Rounding displaces no point by more than ``NEAREST`` of
+    ``voxel_mm``. A frame at a single time is not rounded. make: returns the source of a volume at rest."""
 
     def __init__(
         self, rt: Runtime, volume: np.ndarray, grid: Grid, deformation: Deformation, voxel_mm: float,
@@ -176,8 +170,8 @@ class DeformedSource(FrameSource):
         return (each.frame() for each in sums)
 
     def _volumes(self, weights: np.ndarray) -> Callable[[int], np.ndarray]:
-        """Returns a function from a state's index to its volume (nz, ny, nx), for ``weights`` (K, R). It deforms on the
-        device where all buffers fit."""
+        """Returns a function from a state's index to its volume (nz, ny, nx), for ``weights`` (K, R). It uses the device if
+        all buffers fit there."""
         volume, rank = self._volume, self._deformation.rank
         if not self._rt.room().scaled(0.5).holds(3 * rank * volume.nbytes, *[2 * volume.nbytes] * 2):
             spline = SplineVolume(volume, self._grid)
@@ -188,39 +182,39 @@ class DeformedSource(FrameSource):
         return lambda k: volume if warp.is_still(k) else np.maximum(self._rt.download(warp.forward(k, source)), least)
 
     def _rounded_weights(self, cells: TimeCells) -> np.ndarray:
-        """Returns the weights (C, R) at the cells' times, rounded unless they are the same for all cells."""
+        """Returns the weights (C, R) at the cells' times. They are rounded, unless all cells have the same."""
         weights = self._deformation.weights_at(cells.time_s)
         return np.round(weights / self._step) * self._step if np.ptp(weights, axis=0).any() else weights
 
 
 class _Average:
-    """Averages a frame from frames that each hold some of its time cells."""
+    """Averages a frame from partial frames, each of which holds some of its time cells."""
 
     def __init__(self, cells: TimeCells, model: str) -> None:
         self._readout, self._is_log = cells.readout, model == "log"
-        self._sum: np.ndarray | None = None  # Σ w p, or ln Σ w exp(−p)
+        self._sum: np.ndarray | None = None  # Σ w p in the log model, ln Σ w exp(−p) in the intensity model
 
     def add(self, frame: np.ndarray, share: np.ndarray) -> None:
-        """Adds line integrals (rows, columns); share (lines,): their fraction of each line's weight."""
+        """Adds line integrals (rows, columns). share (lines,): which fraction of each line's weight they have."""
         weight = self._readout.spread(share)
         if self._is_log:
             self._sum = weight * frame + (0.0 if self._sum is None else self._sum)
             return
-        with np.errstate(divide="ignore"):  # a line without a share gives ln 0
+        with np.errstate(divide="ignore"):  # a line that these cells do not serve has the weight 0
             log_part = np.log(weight) - frame
         self._sum = log_part if self._sum is None else np.logaddexp(self._sum, log_part)
 
     def frame(self) -> np.ndarray:
-        """Returns the average (rows, columns). It is 0 on lines without light."""
+        """Returns the average (rows, columns), 0 on lines without light."""
         assert self._sum is not None
         mean = self._sum if self._is_log else np.where(np.isfinite(self._sum), -self._sum, 0)
         return mean.astype(np.float32)
 
 
 def part_of(cells: TimeCells, members: np.ndarray) -> tuple[TimeCells, np.ndarray]:
-    """Returns a table of the cells ``members``, bool (C,), and their fraction (lines,) of each line's weight.
+    """Returns a table of the cells ``members``, bool (C,), and which fraction (lines,) of each line's weight they have.
 
-    Weights are rescaled: those of a line sum to 1 in the new table, or are all 0. The cells must have fixed poses."""
+    Weights are rescaled: in the new table those of a line sum to 1, or are all 0. The cells must have fixed poses."""
     part = some_cells(cells, np.flatnonzero(members))
     share = part.line_weights()
     factors = np.divide(1.0, share, out=np.zeros_like(share), where=share > 0)

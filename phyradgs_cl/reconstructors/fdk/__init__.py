@@ -50,12 +50,12 @@ from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ig
 from phyradgs_cl.runtime import Runtime
 
 log = logging.getLogger(__name__)
-# upper limit of the difference of poses, rotated back to one angle, over their largest entry, at which views share weights
+# Views share their ray weights if their poses, rotated back to one angle, differ by at most this fraction.
 _SAME_POSE = 1e-9
-_BLOCK_BYTES = 1 << 26  # most bytes of the rows that are filtered at one time
-_WORKERS = -1  # threads of SciPy's transforms: -1 takes all cores
+_BLOCK_BYTES = 1 << 26  # rows are filtered in blocks of at most this size, to limit memory
+_WORKERS = -1  # SciPy's transforms use all cores
 
-# Windows as functions of the frequency over the Nyquist frequency; all are 1 at zero, so that none changes the mean.
+# Windows as functions of the frequency over the Nyquist frequency. All are 1 at frequency 0, so that none changes the mean.
 WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "ram-lak": np.ones_like,
     "shepp-logan": lambda share: np.sinc(share / 2),
@@ -67,8 +67,8 @@ WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 @dataclass(frozen=True)
 class FdkOptions(MotionOptions):
-    """Options of FDK. window: window of the ramp filter, one of ``WINDOWS``. extrapolate: how rows continue beyond the
-    panel, one of ``WAYS``.
+    """Options of FDK. window: of the ramp filter, one of ``WINDOWS``. extrapolate: how rows continue beyond the panel, one
+    of ``WAYS``.
 
     motion: static (one pose per frame, mid-window), static-start (the frame's first pose) or per-row (every line at the
     middle of its own exposure). Of a model with several poses per line FDK uses the middle pose."""
@@ -82,8 +82,8 @@ class FdkOptions(MotionOptions):
 
 @dataclass(frozen=True)
 class FbpOptions(FdkOptions):
-    """Options of FBP, with those of FDK. deblur: sharpens a fly-scan along the angle: the power of noise over that of the
-    signal, such as 0.01; 0 does not sharpen. circle: sets voxels to 0 outside of the circle that the panel's wider side
+    """Options of FBP, with those of FDK. deblur: sharpens a fly-scan along the angle; the value is the power of noise over
+    that of the signal, such as 0.01; 0: off. circle: sets voxels to 0 outside the circle that the panel's wider side
     reaches, unless rows are extrapolated."""
 
     deblur: float = checks.ranged(0.0, 0, 1)
@@ -95,7 +95,8 @@ def fdk(
     deformation: Deformation | None = None,
 ) -> Reconstruction:
     """Returns the FDK volume of a scan in 1/mm, or with ``FbpOptions`` the filtered backprojection of a parallel beam: half
-    turns, full turns, and full turns with the axis near the panel's edge. Of an object that moves it is the reference.
+    turns, full turns, and full turns with the axis near the panel's edge. For a moving object the volume is its reference
+    state.
 
     ``seed`` is part of the common signature and not used.
 
@@ -107,7 +108,7 @@ def fdk(
         raise InputError("--object-motion", "extrapolate=reprojected, of an object at rest", expected, remedy)
     frames, numbers = _measured_frames(scan)
     poses = [options.motion.cells(scan, f).still().line_poses() for f in numbers]
-    # beside frames with a pose for every line, a frame with one pose repeats it
+    # if some frames have a pose for each line, frames with one pose repeat it for all lines
     lines = max(map(len, poses))
     pose = np.concatenate(poses) if lines == 1 else np.stack([np.broadcast_to(p, (lines, 12)) for p in poses])
     check_beam(method, pose, scan.is_parallel)
@@ -144,13 +145,12 @@ def fdk_volume(
     axis: str = "rows", extrapolate: str = "none", whole: Callable[[], np.ndarray] | None = None,
     is_parallel: bool = False, circle: bool = False, moving: MovingBackprojector | None = None,
 ) -> np.ndarray:
-    """Returns FDK, or FBP of parallel beams, of line integrals (F, rows, columns) on ``grid``, (nz, ny, nx) float32 in
-    1/mm.
+    """Returns FDK, or FBP of parallel beams, of line integrals (F, rows, columns) on ``grid``, (nz, ny, nx) float32 in 1/mm.
 
-    pose: (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns) and
-    short scans are recognised and weighted. whole: reconstructs the complete object (nz, ny, nx) in 1/mm on ``grid``, for
-    extrapolate ``reprojected``. circle, for parallel beams: as in ``FbpOptions``. moving: backprojects an object that
-    moves. Logs a warning where data are missing. Raises InputError for a source on the rotation axis."""
+    pose: (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns) and short
+    scans are recognised and weighted. whole: reconstructs the complete object (nz, ny, nx) in 1/mm on ``grid``, for
+    extrapolate ``reprojected``. circle, for parallel beams: as in ``FbpOptions``. moving: backprojects an object that moves.
+    Logs a warning where data are missing. Raises InputError for a source on the rotation axis."""
     by_pixel, canonical, fan, arc = _seen(pose, frames, axis, is_parallel)
     if extrapolate != "none" and fan.is_put_aside:
         log.warning("%s: the rows of a displaced detector are not extrapolated", "FBP" if is_parallel else "FDK")
@@ -170,7 +170,7 @@ def fdk_volume(
     pose = widened(pose, axis, missing)
 
     def of_views(images: np.ndarray, views: np.ndarray, power: int = 2) -> np.ndarray:
-        share, one = 0.5 * arc.gap_rad[views], pose[views]  # 0.5: every ray is measured twice
+        share, one = 0.5 * arc.gap_rad[views], pose[views]  # 0.5, because every ray is measured twice
         if moving is not None and power == 2:
             return moving.of_views(views)(images, one, share, grid, axis, is_parallel=is_parallel)
         if pose.ndim == 2:
@@ -186,7 +186,7 @@ def fdk_volume(
         volume = of_views(filtered, np.arange(len(filtered)))
     if circle:
         _, y_mm, x_mm = grid.axes_mm()
-        radius_mm = fan.half_rad + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # to the edge of the last pixel
+        radius_mm = fan.half_rad + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # up to the edge of the last pixel
         volume[:, np.hypot(y_mm[:, None], x_mm) > radius_mm] = 0
     return volume
 
@@ -194,14 +194,14 @@ def fdk_volume(
 def _seen(
     pose: np.ndarray, frames: np.ndarray, axis: str, is_parallel: bool
 ) -> tuple[np.ndarray, np.ndarray, weights.Fan, Arc]:
-    """Returns the poses that broadcast to all pixels, these poses rotated back to one angle, their fan, and the arc of
-    all views. Raises InputError for a source on the rotation axis."""
+    """Returns the poses in a form that broadcasts to pixels, these rotated back to one angle, their fan, and the arc of all
+    views. Raises InputError for a source on the rotation axis."""
     by_pixel = pose_of_pixels(pose, axis)
     if np.any(np.hypot(by_pixel[..., 0], by_pixel[..., 1]) <= 0):
         raise InputError("poses", "a source on the rotation axis", "a source beside it")
     angle_rad = view_angles(by_pixel)
     canonical = travel.still_along_z(weights.turned_back(by_pixel, angle_rad), is_parallel)
-    # on a circle all views are the same but for a rotation: one set of weights serves all of them
+    # on a circle all views are equal after the rotation, so one set of weights serves all
     if np.ptp(canonical, axis=0).max() <= _SAME_POSE * np.abs(canonical).max():
         canonical = canonical[:1]
     fan = weights.measured_fan(canonical, (frames.shape[1], frames.shape[2]), is_parallel)
@@ -209,10 +209,9 @@ def _seen(
 
 
 def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], window: str) -> np.ndarray:
-    """Returns weighted and filtered frames (F, rows, columns + missing) float32. weight: returns a view's weights (rows,
-    columns); missing: columns to add at both ends.
-
-    The rows of a displaced detector are widened to be symmetric, because the filter's response continues beyond them."""
+    """Returns weighted and filtered frames (F, rows, columns + missing) float32. weight: gives a view's weights (rows,
+    columns). missing: columns added at both ends. The rows of a displaced detector are widened to be symmetric, because the
+    filter's response continues beyond them."""
     views, rows, columns = frames.shape
     width = columns + sum(missing)
     filtered = np.empty((views, rows, width), np.float32)
@@ -227,10 +226,10 @@ def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], w
 
 
 def ramp_spectrum(length: int, window: str = "ram-lak") -> np.ndarray:
-    """Returns the filter's real spectrum (length // 2 + 1,) for a pitch of 1 and a period of ``length`` samples.
+    """Returns the filter's real spectrum (length // 2 + 1,) for a pixel pitch of 1 and a period of ``length`` samples.
 
-    Sampling |frequency| instead would put a false constant under every row."""
-    # the distance from sample 0 on a circle: the second half stands for negative distances
+    It comes from the space-domain kernel: |frequency|, sampled, would add a wrong constant to every row."""
+    # distance from sample 0, counted around the period: its second half stands for negative distances
     n = np.minimum(np.arange(length), length - np.arange(length))
     kernel = np.where(n % 2 == 1, -1.0 / (np.pi * np.maximum(n, 1)) ** 2, 0.0)
     kernel[0] = 0.25
@@ -251,8 +250,8 @@ def ramp_filter(rows: np.ndarray, spacing_mm: float, window: str = "ram-lak") ->
 
 
 def static_fdk(rt: Runtime, scan: Scan, deformation: Deformation | None = None) -> np.ndarray:
-    """Returns FDK, or FBP of a parallel beam, (nz, ny, nx) in 1/mm at the mid-window poses: a start or a reference of
-    other methods. deformation: how the object moves; None: at rest."""
+    """Returns FDK, or FBP of a parallel beam, (nz, ny, nx) in 1/mm at the mid-window poses: a start or a reference of other
+    methods. deformation: how the object moves; None: it rests."""
     frames, numbers = _measured_frames(scan)
     pose = np.concatenate([Static().cells(scan, f).pose for f in numbers])
     moving = None if deformation is None else _moving(rt, scan, Static(), numbers, deformation)
@@ -262,7 +261,7 @@ def static_fdk(rt: Runtime, scan: Scan, deformation: Deformation | None = None) 
 def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
     """Returns frames (n, v, u) with masked pixels filled in, and the frames' numbers (n,).
 
-    Frames that are masked completely are left out, so that their neighbours cover their angles, unless all frames are."""
+    Completely masked frames are left out, so that their neighbours cover their angles, unless all frames are masked."""
     frames, numbers = unmasked_frames(scan), np.arange(scan.frames)
     if np.asarray(scan.pixel_mask).ndim == 3:
         measured = np.flatnonzero(scan.valid.any(axis=(1, 2)))

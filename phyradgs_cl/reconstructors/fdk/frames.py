@@ -1,17 +1,17 @@
-"""Changes of the frames before FDK's filter: detector rows that continue beyond the panel, and less motion blur along the
-angle.
+"""Changes frames before FDK's filter: continues detector rows beyond the panel, and removes motion blur along the angle.
 
-Beyond the panel, so that the filter does not ring at a cut: cosine: rows end in a quarter of a cosine (similar to Ohnesorge
-et al., Med. Phys. 27 (2000) 39). cylinder: they continue as the chords of a cylinder from the row's last values and slope
-(Hsieh et al., Med. Phys. 31 (2004) 2385); a parabola through the squares of the row gives its attenuation. Both leave the
-object beyond the panel unknown. reprojected: FISTA-TV reconstructs a volume on a grid that holds the object, and its
-projections continue the rows.
+Rows continue so that the filter does not ring where they are cut off. The first two WAYS leave the object there unknown.
 
-Deblurring: in a parallel beam an exposure over an arc Δθ averages the sinogram along the angle with a box: every pixel of a
-detector row sees p(θ, s) averaged over [θ − Δθ/2, θ + Δθ/2], whatever the object. Along the views this is a convolution,
-which a Wiener filter inverts: with H(f) = sinc(f Δθ) it multiplies by (1 + λ) H / (H² + λ). λ is the power of noise over
-that of the signal; without it noise would grow without bound at the zeros of H. Rows that open later see the same box at
-other angles. A full turn is periodic, and after half a turn the frames come back mirrored at the axis."""
+- cosine: rows end in a quarter of a cosine (similar to Ohnesorge et al., Med. Phys. 27 (2000) 39).
+- cylinder: rows continue as chords of a cylinder, from their last values and slope (Hsieh et al., Med. Phys. 31 (2004)
+  2385). A parabola through the squares of the row gives its attenuation.
+- reprojected: FISTA-TV reconstructs a volume on a grid that holds the whole object, and its projections continue the rows.
+
+Deblurring: in a parallel beam, an exposure over an arc Δθ averages the sinogram with a box along the angle. A pixel sees the
+mean of p(θ, s) over [θ − Δθ/2, θ + Δθ/2], whatever the object. Along the views this is a convolution, which a Wiener filter
+inverts: with H(f) = sinc(f Δθ) it multiplies by (1 + λ) H / (H² + λ). λ is the power of noise over that of the signal;
+without it, noise would grow without bound at the zeros of H. Rows that open later see the same box at other angles. A full
+turn is periodic; after half a turn the frames repeat, mirrored at the axis."""
 
 from dataclasses import replace
 
@@ -32,23 +32,23 @@ from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions
 from phyradgs_cl.runtime import Runtime
 
 WAYS = ("none", "cosine", "cylinder", "reprojected")
-_SHARE = 0.5  # number of columns added at each side by "cosine" and "cylinder", over the panel's number of columns
-_SLOPE_PIXELS = 5  # number of pixels at the end of a row over which its slope is measured
-_NOISE = 0.01  # an edge of a row up to this fraction of the line integrals' 99.9th percentile counts as air
-_UNEVEN = 0.02  # largest deviation of a step between views from the median step, as a fraction of it, that counts as even
-_REACH = 8  # length of the continuation of views beyond each end of an arc, in arcs of an exposure
-_FULL_TURN = 1.5  # upper limit of the gaps between views of a full turn, over the median step
+_SHARE = 0.5  # "cosine" and "cylinder" extend rows at each side by this fraction of the panel's columns
+_SLOPE_PIXELS = 5  # the slope at a row's end is taken over this many pixels, against noise
+_NOISE = 0.01  # below this fraction of the line integrals' 99.9th percentile, the end of a row is air
+_UNEVEN = 0.02  # steps between views may differ by this fraction from the median step and still count as even
+_REACH = 8  # the first and last view of an arc are repeated over this many arcs of an exposure, so that no edge is filtered
+_FULL_TURN = 1.5  # a gap of more median steps between views means less than a full turn
 
 
 def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
-    """Returns line integrals (F, v, u + 2 n) float32, ``frames`` (F, v, u) continued beyond both sides as ``way`` says,
-    and n."""
+    """Continues line integrals ``frames`` (F, v, u) beyond both sides as ``way`` says. Returns (F, v, u + 2 n) float32, and
+    n."""
     count = max(1, round(_SHARE * frames.shape[2]))
     beyond = np.arange(1, count + 1)
     least = _NOISE * float(np.percentile(frames, 99.9))
     curvature = _curvature(frames)
     sides = []
-    for rows in (frames[..., ::-1], frames):  # reversed or not, so that the row ends at the panel's edge
+    for rows in (frames[..., ::-1], frames):  # reversed for the first side: rows then end at the panel's edge
         pixels = min(_SLOPE_PIXELS, rows.shape[-1])
         end = rows[..., -pixels:].astype(np.float64)
         edge, slope = end.mean(-1, keepdims=True), (end[..., -1:] - end[..., :1]) / max(pixels - 1, 1)
@@ -63,8 +63,8 @@ def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
 def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: np.ndarray) -> np.ndarray:
     """Returns line integrals p (F, v, n) at d pixels beyond the panel: p² = edge² + 2 edge slope d − a d².
 
-    edge, slope: line integral and its change per pixel at a row's end. A rising slope counts as 0, and the curvature a is
-    raised until p reaches 0 within the n pixels."""
+    edge, slope: line integral and its change per pixel at a row's end. A rising slope counts as 0. The curvature a is raised
+    until p reaches 0 within the n pixels."""
     falling, reach = np.minimum(slope, 0), beyond[-1]
     widest = (edge**2 + 2 * reach * edge * falling) / reach**2
     squares = edge**2 + 2 * edge * falling * beyond - np.maximum(curvature, widest) * beyond**2
@@ -72,7 +72,8 @@ def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: 
 
 
 def _curvature(frames: np.ndarray) -> np.ndarray:
-    """Returns the downward curvature (F, v, 1) of the parabola through each row's squares: its median over the frames."""
+    """Returns the curvature (F, v, 1), positive downwards, of the parabola through a row's squares: its median over
+    frames."""
     u = np.linspace(-1, 1, frames.shape[2])
     basis = np.stack([np.ones_like(u), u, u**2], axis=1)
     squares = np.maximum(frames, 0).astype(np.float64) ** 2
@@ -80,8 +81,8 @@ def _curvature(frames: np.ndarray) -> np.ndarray:
     return np.broadcast_to(np.maximum(np.median(down, axis=0), 0)[None, :, None], (*frames.shape[:2], 1))
 
 
-_ITERATIONS = 30  # iterations of FISTA-TV that find the object beyond the panel
-_MOST = 2.0  # most columns added at each side by "reprojected", over the panel's number of columns
+_ITERATIONS = 30  # iterations of FISTA-TV for the object beyond the panel
+_MOST = 2.0  # "reprojected" extends rows at each side by at most this many panel widths
 
 
 def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport) -> np.ndarray:
@@ -102,7 +103,7 @@ def reprojected(
     rt: Runtime, frames: np.ndarray, pose: np.ndarray, axis: str, volume: np.ndarray, grid: Grid,
     is_parallel: bool = False,
 ) -> tuple[np.ndarray, int]:
-    """Returns line integrals (F, v, u + 2 n) float32, ``frames`` (F, v, u) continued by the projections of a volume, and n.
+    """Continues line integrals ``frames`` (F, v, u) by projections of a volume. Returns (F, v, u + 2 n) float32, and n.
 
     volume (nz, ny, nx) in 1/mm; pose (F, 12) or (F, lines, 12) in mm, with a pose for every line along ``axis``."""
     rows, columns = frames.shape[1:]
@@ -126,11 +127,11 @@ def _cells(pose: np.ndarray, lines: int, axis: str, is_parallel: bool) -> TimeCe
 
 
 def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: bool) -> int:
-    """Returns the columns to add at each side so that panels of poses (n, 12) see the grid's whole box."""
+    """Returns how many columns to add at each side so that panels of poses (n, 12) see the grid's whole box."""
     source, first, step_u, step_v = (pose[:, None, i : i + 3] for i in (0, 3, 6, 9))
     corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(1, 8, 3)
     normal = np.cross(step_u, step_v)
-    if is_parallel:  # the first three numbers are a direction, along which the corners go to the panel
+    if is_parallel:  # a pose then begins with the rays' direction, along which corners are projected
         ahead = ((first - corners) * normal).sum(-1) / (source * normal).sum(-1)
         hit = corners + ahead[..., None] * source - first
     else:
@@ -143,10 +144,10 @@ def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: boo
 
 
 def deblurred(scan: Scan, frames: np.ndarray, angle_rad: np.ndarray, noise: float) -> np.ndarray:
-    """Returns frames (F, rows, columns) float32 without the motion blur along the angle, as a gantry that stops would
-    record them. angle_rad (F,): gantry angles at the frames' middles.
+    """Returns frames (F, rows, columns) float32 without motion blur along the angle, as if the gantry stopped for each view.
+    angle_rad (F,): gantry angles at the frames' middles. noise: λ above.
 
-    noise: λ above. Raises InputError where views are not evenly spaced in angle; their order does not matter."""
+    Raises InputError where views are not evenly spaced in angle; their order does not matter."""
     arc_rad = exposure_arc_rad(scan)
     if arc_rad == 0:
         return frames
@@ -179,8 +180,8 @@ def deblurred(scan: Scan, frames: np.ndarray, angle_rad: np.ndarray, noise: floa
 
 
 def _mirrored(line: np.ndarray, scan: Scan) -> np.ndarray:
-    """Returns one row of all views, (F, columns), as seen from the other side: mirrored at the column of the axis.
-    Columns beyond the panel take its last value."""
+    """Returns one row of all views, (F, columns), as seen from the other side: mirrored at the column of the axis. Columns
+    beyond the panel take its last value."""
     columns = line.shape[1]
     axis = (columns - 1) / 2 - scan.geometry.detector_offset_mm[1] / scan.geometry.pixel_size_mm[1]
     at = np.clip(2 * axis - np.arange(columns), 0, columns - 1)

@@ -1,8 +1,8 @@
-"""FDK of helices and other orbits with travel, in which every voxel counts the views that see it.
+"""FDK of helices and other orbits that move along z: each voxel counts only the views that see it.
 
-A voxel is seen by other views than its neighbour along z, some of its rays twice, others once. The rays' directions about
-z fall into overlapping classes. Of each class a voxel takes the mean of the views that see it, weighted down towards the
-panel's first and last rows, and counts it by the class' width. After K. Stierstorfer et al., Phys. Med. Biol. 49 (2004)
+Neighbouring voxels along z are seen by different views, some of their rays twice, others once. The rays' directions about z
+are sorted into overlapping classes. In each class a voxel takes the mean of the views that see it, weighted by the width of
+the class. Views count less towards the panel's first and last rows. After K. Stierstorfer et al., Phys. Med. Biol. 49 (2004)
 2209, with classes of directions in place of rebinned rays."""
 
 import logging
@@ -16,23 +16,22 @@ from phyradgs_cl.reconstructors.fdk.views import pose_of_pixels, view_angles
 
 log = logging.getLogger(__name__)
 
-# the orbit travels along z where it moves by more than this fraction of the panel's height, and by more than a row: less
-# travel concerns only voxels that a circle sees in part too
+# An orbit travels along z if it moves by more than this fraction of the panel's height: less matters at the ends only.
 _TRAVEL = 0.05
-_CLASS_RAD = np.deg2rad(15)  # default width in rad of a class of ray directions about z
-_VIEWS_A_CLASS = 2.0  # least number of views of one turn in a class: with fewer, classes are wider
-_EVEN = 0.5  # rows farther from the middle than this fraction of the panel's half height count less
-_LEAST_ROW = 0.02  # weight of the outermost row, over that of middle rows, so that voxels seen by no other row are seen
-_LEAST_SHARE = 0.01  # a voxel seen from less than this fraction of a class's directions counts as not fully seen from it
-_NAMED = 0.01  # largest fraction of the voxels with missing directions without a warning
-_FEW_VIEWS = 24  # least number of views per turn without a warning: densities of balls are then within 2 %
+_CLASS_RAD = np.deg2rad(15)  # width of a class of ray directions about z, unless views are few
+_VIEWS_A_CLASS = 2.0  # each class needs this many views of one turn: with fewer views, classes are wider
+_EVEN = 0.5  # rows count fully up to this fraction of the panel's half height, then less
+_LEAST_ROW = 0.02  # least weight of a row: some voxels are seen by the outermost row alone
+_LEAST_SHARE = 0.01  # a class counts for a voxel if it is seen from at least this fraction of the class's directions
+_NAMED = 0.01  # if a larger fraction of the voxels misses directions, a warning says so
+_FEW_VIEWS = 24  # a warning comes below this many views per turn: with 24, densities of balls are within 2 %
 Backproject = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Returns a volume (z, y, x) of frames (n, rows, columns) and the numbers (n,) of their views."""
+"""A function from frames (n, rows, columns) and the numbers (n,) of their views to a volume (z, y, x)."""
 
 
 def travels(pose: np.ndarray, rows: int, is_parallel: bool) -> bool:
-    """Returns whether the origin moves along the panel's rows between poses (F, r, c, 12), so that voxels miss some
-    views."""
+    """Returns whether poses (F, r, c, 12) travel along the axis so far that voxels miss some views: the origin's image moves
+    along the panel's columns."""
     middle = pose[:, pose.shape[1] // 2, pose.shape[2] // 2]
     first, across = middle[:, 3:6], np.cross(middle[:, 6:9], middle[:, 9:12])
     source = middle[:, :3]
@@ -46,8 +45,8 @@ def travels(pose: np.ndarray, rows: int, is_parallel: bool) -> bool:
 
 
 def still_along_z(canonical: np.ndarray, is_parallel: bool) -> np.ndarray:
-    """Returns poses (F, r, c, 12) without the height of the source or, in a parallel beam, of the first pixel: the
-    weights of rays do not depend on that height."""
+    """Returns poses (F, r, c, 12) with the source (in a parallel beam, the first pixel) at height 0: ray weights do not
+    depend on the height."""
     level = canonical.copy()
     level[..., 5] -= canonical[..., 5 if is_parallel else 2]
     if not is_parallel:
@@ -59,15 +58,14 @@ def seen_volume(
     frames: np.ndarray, pose: np.ndarray, axis: str, grid: Grid, is_displaced: bool, is_parallel: bool,
     counted: Callable[[int], np.ndarray | float], backproject: Backproject, backproject_seen: Backproject,
 ) -> np.ndarray:  # fmt: skip
-    """Returns the volume (nz, ny, nx) of filtered frames (F, rows, columns) in which every voxel counts the views that
-    see it.
+    """Returns the volume (nz, ny, nx) of filtered frames (F, rows, columns) in which every voxel counts the views that see
+    it.
 
-    pose (F, 12) or (F, lines, 12) mm. counted: returns a view's weights (rows, columns) that divide a ray with its
-    opposite. Both backprojections weigh views by angular cells; ``backproject_seen`` divides by the distance once, not
-    twice."""
+    pose (F, 12) or (F, lines, 12) mm. counted: gives a view's redundancy weights (rows, columns). Both backprojections
+    weight each view by the angle for which it stands; ``backproject_seen`` divides by the distance once, not twice."""
     by_pixel, shape = pose_of_pixels(pose, axis), frames.shape[1:]
     angle_rad, pace = _directions(by_pixel[:, [by_pixel.shape[1] // 2]], shape, is_parallel)
-    turn_rad = 2 * np.pi if is_displaced else np.pi  # opposite rays are one where both sides are measured alike
+    turn_rad = 2 * np.pi if is_displaced else np.pi  # a centred panel measures every ray in half a turn
     views_a_turn = np.unique(np.round(np.mod(view_angles(by_pixel), 2 * np.pi), 6)).size
     width_rad = turn_rad / max(4, round(turn_rad / max(_CLASS_RAD, _VIEWS_A_CLASS * 2 * np.pi / views_a_turn)))
     classes, place = round(turn_rad / width_rad), np.mod(angle_rad, turn_rad) / width_rad
@@ -93,8 +91,8 @@ def seen_volume(
 
 
 def _directions(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles about z (F, 1, columns) of the rays of poses (F, 1, c, 12). Also returns, for a voxel on the
-    panel, how far its ray turns per radian of the source."""
+    """Returns the angles about z (F, 1, columns) of the rays of poses (F, 1, c, 12). Also returns, for voxels on the panel,
+    how far their rays turn per radian of the source."""
     rays = weights.pixel_rays(pose, np.array([shape[0] // 2]), np.arange(shape[1]))
     if is_parallel:
         angle_rad = np.broadcast_to(np.arctan2(pose[..., 1], pose[..., 0]), rays.shape[:-1])
@@ -111,22 +109,21 @@ def _row_weight(rows: int) -> np.ndarray:
 
 
 def _views_a_turn(angle_rad: np.ndarray) -> float:
-    """Returns how many consecutive views at angles (F,) make a turn; infinity where steps are too wide to tell."""
+    """Returns how many consecutive views at angles (F,) make a turn; infinity if steps are too wide to tell."""
     steps_rad = np.abs(np.angle(np.exp(1j * np.diff(angle_rad))))
     step_rad = float(np.median(steps_rad)) if steps_rad.size else 0.0
     return 2 * np.pi / step_rad if 0 < step_rad < np.pi / 2 else np.inf
 
 
 def _warn_if_few_views(views_a_turn: float, name: str) -> None:
-    """Logs a warning where a turn has too few views for right densities, because each voxel is seen for a turn or less."""
     if views_a_turn < _FEW_VIEWS - 0.5:
         text = "%s: %.0f views a turn are few for a helix: densities may be 5 %% wrong at 17 views, 20 %% at 7; take %d"
         log.warning(text, name, views_a_turn, _FEW_VIEWS)
 
 
 def _warn_if_unseen(covered: np.ndarray, name: str, turn: str) -> None:
-    """Logs how many voxels the views see from too few directions. covered: fraction (nz, ny, nx) of the needed directions
-    that a voxel has."""
+    """Logs how many voxels are seen from too few directions. covered: fraction (nz, ny, nx) of the directions that they
+    need."""
     share = float((covered < 1 - 1e-3).mean())
     if share > _NAMED:
         text = "%s: %.0f %% of the voxels are seen from less than %s turn, the least from %.0f°: their densities are wrong"

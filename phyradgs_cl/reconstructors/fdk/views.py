@@ -1,5 +1,5 @@
-"""The views of an FDK reconstruction: the arcs that they cover, their orbit, what they miss, and their pixels' weights
-before filtering."""
+"""The views of an FDK reconstruction: the arcs that they cover, what they miss, whether their orbit is a circle, and the
+weights of their pixels before filtering."""
 
 import logging
 from collections.abc import Callable
@@ -12,46 +12,44 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import weights
 
-# A gap between views stands out where it is wider than this many times another gap. The widest of all is compared with the
-# second widest, not with the median, so that uneven views (four times as dense over one half, say) stay a full turn. Any
-# gap wider than _WIDE_RAD is compared with both of its neighbours. 2.5 lets one view of many be lost.
+# A gap between views stands out if it is this many times as wide as another gap; one lost view makes a gap of 2 steps.
+# The widest gap is compared with the second widest. The median would make uneven views of a full turn a short scan.
+# Any gap wider than _WIDE_RAD is compared with both of its neighbours.
 SHORT_SCAN_GAP = 2.5
-_SAME_VIEW = 1e-3  # views closer than this fraction of the mean gap share one angular cell (a second turn over the first)
-# lower limit of a filled gap that the warning counts: narrower ones cost less than 1 % of the density of balls a quarter of
-# the field wide
+_SAME_VIEW = 1e-3  # views nearer to each other than this fraction of the mean gap count as one, as those of a second turn
+# A warning names filled gaps from this width on: narrower ones changed the density of large balls by less than 1 %.
 _NAMED_RAD = np.deg2rad(5)
-# gaps up to this width, except for the widest of all, do not part the arc: more parts would cost more than filled gaps
+# All gaps up to this width but the widest are filled: dividing the arc there would cost more accuracy.
 _WIDE_RAD = np.deg2rad(10)
-# The rays of a misaligned panel come again half a turn later, except for a strip that is measured once. Gaps of a full turn
-# up to this width are filled, so that the strip counts fully; with a wider one the scan is short.
+# A misaligned panel measures a strip of rays once only. Gaps up to this width are filled, so that the strip counts fully.
 _FILLED_RAD = np.deg2rad(15)
-# views at most this fraction of a filled gap's width away from it stand for it: more smears, less draws streaks at wide gaps
+# Views stand for a filled gap if they are nearer to it than this fraction of its width: more smears, less draws streaks.
 _FILL_REACH = 0.5
 log = logging.getLogger(__name__)
 
-# Upper limits in pairs: beyond the first a warning is logged; beyond the second, _NO_…, InputError is raised.
-_CIRCLE = 0.05  # distance of source or panel from a circle about z, over the distance between source and panel
-_NO_CIRCLE = 0.5  # distance from a circle, as for _CIRCLE, that is refused
+# Limits in pairs: beyond the first a warning is logged; beyond the second, _NO_…, InputError is raised.
+_CIRCLE = 0.05  # distance of source or panel from a circle about z, over their distance from each other
+_NO_CIRCLE = 0.5
 _PLANE_DEG = 10.0  # elevation of the source above the plane z = 0, seen from the origin
-_NO_PLANE_DEG = 45.0  # elevation of the source that is refused
+_NO_PLANE_DEG = 45.0
 _LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the plane of the rotation
-_NO_LEAN_DEG = 10.0  # angle of parallel rays or their rows that is refused
+_NO_LEAN_DEG = 10.0
 _ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: densities are 0.1 % too low
-_NO_ROLL_DEG = 10.0  # angle of a cone beam's rows that is refused: densities are 1.5 % too low, and 0 at 90°
-_LEAST_OVERLAP = 2.0  # least number of columns from the axis to a displaced panel's nearer edge without a warning
-# largest missing angle without a warning: the fan of rays that are nearly parallel, for which half a turn is enough
+_NO_ROLL_DEG = 10.0  # angle at which densities are 1.5 % too low; at 90° they are 0
+_LEAST_OVERLAP = 2.0  # a displaced panel must reach this many columns beyond the axis, or a warning comes
+# A smaller missing angle causes no warning: nearly parallel rays have so narrow a fan that half a turn is enough.
 _TOLERATED_RAD = np.deg2rad(0.5)
 RayWeight = Callable[[int], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
 class Arc:
-    """The angles that the views cover, and the angular cell of each view.
+    """The angles that the views cover, and how much of them each view stands for.
 
-    gap_rad (F,): each view's part of the arc. progress_rad (F,): its angle from the arc's start, which is half a step
-    before the first view; the end is half a step behind the last. In a full turn progress counts from the view of the
-    least angle. parts_rad (P, 2): progress where each part between gaps begins and ends. filled_rad: total width of the
-    gaps that the views beside them cover."""
+    gap_rad (F,): each view's part of the arc. progress_rad (F,): its angle from the arc's start, which is half a step before
+    the first view; the end is half a step behind the last. In a full turn progress counts from the view of the least angle.
+    parts_rad (P, 2): progress at which each part between gaps begins and ends. filled_rad: total width of the gaps for which
+    neighbouring views stand."""
 
     gap_rad: np.ndarray
     progress_rad: np.ndarray
@@ -61,7 +59,7 @@ class Arc:
     filled_rad: float = 0.0
 
     def unseen_rad(self, fan_rad: float = 0.0) -> float:
-        """Returns the angle, of half a turn, from which rays are measured from neither side: the largest for rays at fan
+        """Returns the angle, of half a turn, over which rays are measured from neither side: the largest for rays at fan
         angles −fan_rad, 0 and fan_rad."""
         at_rad = np.linspace(0, 2 * np.pi, 1440, endpoint=False)
         fans = (-fan_rad, 0.0, fan_rad)
@@ -75,7 +73,7 @@ class Arc:
 
 
 def filled_gap_rad(fan: weights.Fan) -> float:
-    """Returns the width in rad up to which gaps count to the views beside them, because these alone see some of the gap's
+    """Returns the width in rad up to which gaps are filled by the views beside them, because no others see some of their
     rays."""
     if fan.is_put_aside:
         return 2 * np.pi
@@ -85,8 +83,8 @@ def filled_gap_rad(fan: weights.Fan) -> float:
 def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
     """Returns the arc that views at gantry angles (F,) cover, in any order and over any number of turns.
 
-    Gaps that stand out divide the arc into parts. If all are at most ``filled_rad`` wide, the arc is a full turn, and the
-    views beside the gaps count for them."""
+    Gaps that stand out divide the arc into parts. If none is wider than ``filled_rad``, the arc is a full turn, and the
+    views beside the gaps stand for them."""
     cell, centre = _distinct(angle_rad)
     count = np.bincount(cell)
     ahead = np.diff(centre, append=centre[0] + 2 * np.pi)
@@ -97,7 +95,7 @@ def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
         whole = np.array([[0.0, 2 * np.pi]])
         return Arc((gap / count)[cell], (centre - centre[0])[cell], 2 * np.pi, True, whole, _filled_rad(ahead))
     first = (int(np.argmax(np.where(wide, ahead, 0))) + 1) % ahead.size
-    ahead, wide = np.roll(ahead, -first), np.roll(wide, -first)  # the widest gap that stands out is now the last
+    ahead, wide = np.roll(ahead, -first), np.roll(wide, -first)  # now the widest gap that stands out is the last
     forward, back = _steps(ahead, wide)
     progress = np.concatenate([[0.0], np.cumsum(ahead[:-1])]) + back[0] / 2
     parts = np.stack([(progress - back / 2)[np.roll(wide, 1)], (progress + forward / 2)[wide]], -1)
@@ -108,8 +106,8 @@ def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
 
 
 def _stand_out(ahead: np.ndarray) -> np.ndarray:
-    """Returns which gaps (K,) to the next view are more than a step, bool (K,): the largest where it stands out from all,
-    and others that stand out from their neighbours."""
+    """Returns which gaps (K,) to the next view are wider than a step, bool (K,): the widest if it stands out from all, and
+    others that stand out from their neighbours."""
     wide = np.zeros(ahead.size, bool)
     if ahead.size < 2:
         return wide
@@ -120,8 +118,8 @@ def _stand_out(ahead: np.ndarray) -> np.ndarray:
 
 
 def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Returns which narrow gaps (K,) have a gap on the opposite side too, bool (K,), so that the views beside them must
-    count for them. The widest gap is never among them."""
+    """Returns which narrow gaps (K,) have a gap on the opposite side too, bool (K,): no opposite ray stands for them, so the
+    views beside them must. The widest gap is never among them."""
     narrow = wide & (ahead <= _FILLED_RAD) & (np.arange(ahead.size) != np.argmax(ahead))
     opposite = centre + ahead / 2 + np.pi
     before = np.searchsorted(centre, np.mod(opposite - centre[0], 2 * np.pi) + centre[0], side="right") - 1
@@ -129,26 +127,26 @@ def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.nd
 
 
 def _steps(ahead: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles (K,) in rad from each view to the next, and from the view before to each. Where a gap follows or
-    precedes, the step on the view's other side takes its place."""
+    """Returns the angles (K,) in rad from each view to the next, and from the view before to each. Instead of a gap, the
+    step on the view's other side counts."""
     forward = np.where(wide, np.roll(ahead, 1), ahead)
     return forward, np.roll(np.where(wide, np.roll(ahead, -1), ahead), 1)
 
 
 def _filled_rad(ahead: np.ndarray) -> float:
-    """Returns the sum in rad of what gaps (K,) have beyond the usual step, over gaps much wider than that step."""
+    """Returns by how much in rad gaps (K,) are wider than the median step, summed over gaps much wider than that."""
     usual = np.median(ahead) if ahead.size else 0.0
     return float((ahead - usual)[ahead > max(SHORT_SCAN_GAP * usual, _NAMED_RAD)].sum())
 
 
 def _filled_cells(ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Returns the angular cells (K,) in rad of views of a full turn. The views near a wide gap divide it, the nearer the
-    more."""
+    """Returns the angle (K,) in rad for which each view of a full turn stands. A wide gap is divided among the views near
+    it, the nearer the more."""
     forward, back = _steps(ahead, wide)
     known = (forward + back) / 2
     cells = known.copy()
     for gap in np.flatnonzero(wide):
-        turned = np.cumsum(np.roll(ahead, -gap))  # from the view before the gap to all others, the next one first
+        turned = np.cumsum(np.roll(ahead, -gap))  # angle from the view before the gap to each other view
         away_rad = np.minimum(turned - ahead[gap], 2 * np.pi - turned)
         near = np.roll(np.maximum(1 - away_rad / (_FILL_REACH * ahead[gap]), 0), gap + 1) * known
         cells += (ahead[gap] - (forward[gap] + np.roll(back, -1)[gap]) / 2) * near / near.sum()
@@ -172,8 +170,7 @@ def _distinct(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pose_of_pixels(pose: np.ndarray, axis: str) -> np.ndarray:
-    """Returns poses (F, 12) or (F, lines, 12), lines along ``axis``, as a view that broadcasts to (F, rows, columns,
-    12)."""
+    """Returns poses (F, 12) or (F, lines, 12), lines along ``axis``, as a view that broadcasts to (F, rows, columns, 12)."""
     if pose.ndim == 2:
         return pose[:, None, None]
     return pose[:, :, None] if axis == "rows" else pose[:, None]
@@ -189,7 +186,7 @@ def view_angles(by_pixel: np.ndarray) -> np.ndarray:
 def ray_weight(
     canonical: np.ndarray, shape: tuple[int, int], arc: Arc, fan: weights.Fan, is_parallel: bool = False
 ) -> RayWeight:
-    """Returns a function from a view's index to its pixels' weights (rows, columns) before filtering, in 1/mm."""
+    """Returns a function from a view's index to the weights (rows, columns), in 1/mm, of its pixels before filtering."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
 
     def geometry(view: int) -> tuple[np.ndarray, np.ndarray]:
@@ -214,8 +211,8 @@ def ray_weight(
 def opposite_weight(
     canonical: np.ndarray, shape: tuple[int, int], arc: Arc, is_parallel: bool
 ) -> Callable[[int], np.ndarray | float]:
-    """Returns a function from a view's index to the weights (rows, columns) that divide each ray's weight with its
-    opposite."""
+    """Returns a function from a view's index to redundancy weights (rows, columns): those of a ray and its opposite sum to
+    2."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
 
     def weight(view: int) -> np.ndarray | float:
@@ -237,11 +234,11 @@ def _redundancy(view: int, angle_rad: np.ndarray, arc: Arc, fan: weights.Fan) ->
 
 
 def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc, is_parallel: bool) -> np.ndarray:
-    """Returns the fan angle (rows, columns) that determines a ray's opposite. In a parallel beam's short scan it is 0, and
+    """Returns the fan angle (rows, columns) on which a ray's opposite depends. In a parallel beam's short scan it is 0, and
     in its full turn a distance from the axis.
 
-    Where columns are read out one after the other, the arc of a short scan begins at another angle for every column,
-    and a ray's opposite lies on another column: their lags behind the frame, whose own angle is 0 here, add up."""
+    If columns are read out one after the other, a short scan begins at another angle for each column, and a ray's opposite
+    lies on another column. So the angles of both columns, relative to the frame's, which is 0 here, add up."""
     angle_rad = weights.fan_angle(pose, rays, is_parallel)
     if is_parallel and not arc.is_full:
         angle_rad = np.zeros_like(angle_rad)
@@ -251,7 +248,7 @@ def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc, is_parallel:
 
 
 def widened(pose: np.ndarray, axis: str, missing: tuple[int, int]) -> np.ndarray:
-    """Returns the poses of frames with ``missing`` columns added at their two ends."""
+    """Returns the poses of frames that got ``missing`` more columns at their two ends."""
     if missing == (0, 0):
         return pose
     if pose.ndim == 3 and axis == "columns":
@@ -264,7 +261,7 @@ def widened(pose: np.ndarray, axis: str, missing: tuple[int, int]) -> np.ndarray
 def check_beam(method: str, pose: np.ndarray, is_parallel: bool) -> None:
     """Raises InputError for ``fdk`` in a parallel beam and ``fbp`` in a cone, and for orbits that they cannot reconstruct.
 
-    Logs how far poses (F, 12) or (F, lines, 12) are from one circle about z, if the method then loses accuracy."""
+    Poses (F, 12) or (F, lines, 12) that are so far from a circle about z that accuracy suffers cause a warning."""
     if is_parallel != (method == "fbp"):
         found, expected, remedy = ("parallel", "cone", "fbp") if is_parallel else ("cone", "parallel", "fdk")
         raise InputError(f"--method {method}", f"a {found} beam", f"a {expected} beam", f"take --method {remedy}")
@@ -310,12 +307,11 @@ def _check_orbit(pose: np.ndarray) -> None:
     canonical = weights.turned_back(middle, azimuth_rad(middle)).reshape(-1, 4, 3)
     usual = np.median(canonical, axis=0)
     length_mm = float(np.linalg.norm(usual[1] - usual[0]))
-    off_mm = canonical[:, :2] - usual[:2]  # offsets of source and panel from their usual places
-    aside_mm = off_mm - np.eye(3)[2] * off_mm[:, :1, 2:]  # less the source's travel along z, by which voxels only miss views
+    off_mm = canonical[:, :2] - usual[:2]  # offsets of source and panel from their median positions
+    aside_mm = off_mm - np.eye(3)[2] * off_mm[:, :1, 2:]  # travel along z only makes voxels miss views
     above_deg = float(np.rad2deg(np.arctan2(abs(usual[0, 2]), np.hypot(*usual[0, :2]))))
 
     def distances_beyond(most: float, most_deg: float, of_mm: np.ndarray) -> str:
-        """Returns in words which distances are too large."""
         off = float(np.linalg.norm(of_mm, axis=-1).max())
         parts = (
             f"{100 * off / length_mm:.0f} % of their distance off a circle about z",
@@ -336,7 +332,7 @@ def _check_orbit(pose: np.ndarray) -> None:
 def warn_if_incomplete(
     arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: Grid, is_parallel: bool = False
 ) -> None:
-    """Logs what the views do not cover, in one line each."""
+    """Logs what the views do not cover, in a line each."""
     name = "FBP" if is_parallel else "FDK"
     if np.unique(arc.progress_rad).size == 1:
         log.warning("%s: all views are from one angle: the volume is a single backprojection", name)

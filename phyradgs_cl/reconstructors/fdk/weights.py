@@ -1,27 +1,25 @@
-"""FDK's weights of rays: the measure of a ray, displaced detectors, short scans.
+"""FDK's weights of rays: a measure of each ray, and the weights of displaced detectors and of short scans.
 
-The measure generalises FDK's cosine to any pose (docs/mathematics.md). Displaced detectors after G. Wang, Med. Phys. 29
-(2002) 1634, in the fan angle; short scans after D. L. Parker, Med. Phys. 9 (1982) 254, with M. D. Silver's margin for
-arcs beyond the least, Med. Phys. 27 (2000) 773. A ray and its opposite have redundancy weights that sum to 2."""
+The measure generalises FDK's cosine to any pose (docs/mathematics.md). Displaced detectors follow G. Wang, Med. Phys. 29
+(2002) 1634, in the fan angle. Short scans follow D. L. Parker, Med. Phys. 9 (1982) 254, with M. D. Silver's margin for arcs
+longer than the shortest, Med. Phys. 27 (2000) 773. The redundancy weights of a ray and its opposite sum to 2."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-# Width of the transition between rays measured once and twice, over the overhang of the panel's longer side; at most all
-# that is measured twice (Wang's sine throughout). Every ray that is not counted evenly with its opposite adds noise and
-# aliasing, so a quarter-pixel offset touches two columns; wider transitions were noisier (up to 15 %) and no freer of
-# artefacts.
+# Width of the transition between rays measured once and twice, over the overhang of the panel's longer side.
+# Wang's transition covers all rays that are measured twice: it was up to 15 % noisier, with no fewer artefacts.
 TRANSITION = 1.0
-_SYMMETRIC = 0.01  # largest overhang in pixels of a panel that counts as symmetric about the axis
-# largest asymmetry, as a fraction of the fan, of a panel that was not displaced on purpose: it sees both sides of the object
+_SYMMETRIC = 0.01  # a panel that is off centre by less, in pixels, is symmetric about the axis
+# A panel less asymmetric than this fraction of the fan was not displaced on purpose, and sees both sides of the object.
 _ASIDE = 0.1
 
-_PART_EDGE_RAD = np.deg2rad(15)  # width of the arc beside a gap, in rad, over which views' weights rise from 0 to full
+_PART_EDGE_RAD = np.deg2rad(15)  # next to a gap, weights of views rise from 0 to full over an arc of this width
 
 
 def turned_back(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-    """Returns poses (F, ..., 12) rotated by −angle_rad (F,) about +z, which makes all views of a circular orbit equal."""
+    """Returns poses (F, ..., 12) rotated by −angle_rad (F,) about +z. All views of a circular orbit become equal."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     turn = np.zeros((len(angle_rad), 3, 3))
     turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = c, s, -s, c, 1
@@ -37,12 +35,12 @@ def pixel_rays(pose: np.ndarray, rows: np.ndarray, columns: np.ndarray, is_paral
 
 
 def ray_measure(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -> np.ndarray:
-    """Returns |ȧ·n| / D (v, u), which generalises FDK's cosine: the measure of each ray per radian of gantry angle and mm
-    of detector, over the filter's own 1/mm².
+    """Returns |ȧ·n| / D (v, u), which generalises FDK's cosine: how much each ray measures per radian of gantry angle and mm
+    of detector, relative to the filter's own 1/mm².
 
-    ȧ is the source's motion per radian, n the ray's normal in the plane of ray and detector row, D the distance of the
-    row from the source. For a flat panel that faces the source the measure is DSO / |ray|, FDK's cosine. In a parallel
-    beam it is the sine of the angle between rays and row: 1 for a panel across the rays."""
+    ȧ is the source's motion per radian, n the ray's normal in the plane of ray and detector row, D the distance of the row
+    from the source. For a flat panel that faces the source the measure is DSO / |ray|, FDK's cosine. In a parallel beam it
+    is the sine of the angle between rays and row: 1 for a panel across the rays."""
     if is_parallel:
         across = np.cross(pose[..., 0:3], pose[..., 6:9]) / np.linalg.norm(pose[..., 6:9], axis=-1, keepdims=True)
         return np.linalg.norm(across, axis=-1)
@@ -69,8 +67,8 @@ def fan_angle(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -> 
 class Fan:
     """The fan angles that every view sees; in a parallel beam distances in mm from the axis (see ``fan_angle``).
 
-    missing_columns: columns to add at the panel's two ends to make it symmetric about the axis. pixel_rad: the width of
-    the pixel at the shorter end."""
+    missing_columns: columns that would make the panel symmetric about the axis, at its two ends. pixel_rad: the width of the
+    pixel at the shorter end."""
 
     low_rad: float
     high_rad: float
@@ -83,18 +81,18 @@ class Fan:
 
     @property
     def is_put_aside(self) -> bool:
-        """Whether one side is so short that the detector was displaced on purpose. Less may be a misaligned panel that
-        still sees the whole object."""
+        """Whether the detector was displaced on purpose: one side is much shorter. Less may be a misaligned panel that still
+        sees the whole object."""
         return abs(self.low_rad + self.high_rad) > _ASIDE * (self.high_rad - self.low_rad)
 
     @property
     def sees_axis(self) -> bool:
-        """Whether the panel sees the axis, with a pixel's centre or its outer half."""
+        """Whether the axis meets the panel, up to the outer edge of its last pixel."""
         return self.low_rad - self.pixel_rad / 2 < 0 < self.high_rad + self.pixel_rad / 2
 
     @property
     def overlap_columns(self) -> float:
-        """Columns from the axis to the panel's nearer edge, of a displaced detector."""
+        """Columns of a displaced detector from the axis to its nearer edge."""
         return min(self.high_rad, -self.low_rad) / self.pixel_rad + 0.5
 
     @property
@@ -104,10 +102,8 @@ class Fan:
 
 
 def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = False) -> Fan:
-    """Returns the fan that all views with poses as in ``pixel_rays``, (F, ..., 12), see on a detector of ``shape`` (rows,
-    columns).
-
-    Its ``missing_columns`` would make the detector reach equally far on both sides of the axis."""
+    """Returns the fan that all views see on a detector of ``shape`` (rows, columns), with poses (F, ..., 12) as in
+    ``pixel_rays``."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
     outer = pose[:, :, [0, -1]] if pose.shape[2] > 1 else pose
     ends = np.sort(fan_angle(outer, pixel_rays(outer, rows, columns[[0, -1]], is_parallel), is_parallel), axis=-1)
@@ -125,12 +121,11 @@ def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = F
 
 
 def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
-    """Returns the weights of rays at fan angles of any shape: 1 ± sin where both sides of the axis are seen, 0 and 2
-    beyond.
+    """Returns the weights of rays at fan angles of any shape: 1 ± sin where both sides of the axis are seen, 0 and 2 beyond.
 
-    Where the panel does not see the axis, every ray is measured once and counts 2. Where the axis falls into the panel's
-    outermost pixel there is no room for a transition: a pixel then counts by the part of its width on the axis' long
-    side."""
+    If the panel does not see the axis, every ray is measured once and counts 2. If the axis meets the panel's outermost
+    pixel, there is no room for a transition. A pixel then counts by how much of its width lies on the long side of the
+    axis."""
     if not fan.sees_axis:
         return np.full(angle_rad.shape, 2.0)
     short = min(fan.high_rad, -fan.low_rad)
@@ -146,7 +141,7 @@ def short_scan_weight(progress_rad: float, angle_rad: np.ndarray, coverage_rad: 
     """Returns Parker's weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc of
     ``coverage_rad``.
 
-    Rays without an opposite in the arc count 2, which are all rays of an arc under half a turn."""
+    Rays without an opposite in the arc count 2: under half a turn, these are all rays."""
     margin = (coverage_rad - np.pi) / 2
     if margin <= 0:
         return np.full(angle_rad.shape, 2.0)
@@ -157,15 +152,15 @@ def short_scan_weight(progress_rad: float, angle_rad: np.ndarray, coverage_rad: 
 def parted_weight(progress_rad: float, angle_rad: np.ndarray, parts_rad: np.ndarray) -> np.ndarray:
     """Returns the weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc of parts (P, 2).
 
-    The weights of a ray and its opposite add up to 2, by how deep in their parts the two views are. A ray without an
-    opposite counts 2. After F. Noo et al., Phys. Med. Biol. 47 (2002) 2525."""
+    The weights of a ray and its opposite add up to 2; the one whose view is deeper inside its part counts more. A ray
+    without an opposite counts 2. After F. Noo et al., Phys. Med. Biol. 47 (2002) 2525."""
     here = max(float(_depth(np.array(progress_rad), parts_rad)), 1e-6)
     there = _depth(np.mod(progress_rad + np.pi + 2 * angle_rad, 2 * np.pi), parts_rad)
     return 2 * here / (here + there)
 
 
 def _depth(at_rad: np.ndarray, parts_rad: np.ndarray) -> np.ndarray:
-    """Returns a smooth weight (sin²) at angles (...), from 0 at the ends of parts (P, 2) to 1 inside; 0 outside."""
+    """Returns a smooth weight (sin²) at angles (...): 0 at the ends of parts (P, 2) and outside, 1 deep inside."""
     begin, end = parts_rad.T
     from_end = np.minimum(at_rad[..., None] - begin, end - at_rad[..., None])
     return _eased(from_end, np.minimum(_PART_EDGE_RAD, (end - begin) / 2) / 2).max(-1)

@@ -1,5 +1,5 @@
-"""Where the axis of rotation is on the panel. In any scan: the shift of the panel under which a coarse scan fits best. In a
-parallel beam: from views half a turn apart, which see mirror images."""
+"""Finds where the panel sees the axis of rotation. In any scan: by the shift of the panel under which a coarse scan fits
+best. In a parallel beam: by views half a turn apart, which see mirror images."""
 
 import math
 from dataclasses import dataclass
@@ -15,30 +15,29 @@ from phyradgs_cl.acquisition.altered.variants import altered_trajectory, shifted
 from phyradgs_cl.reconstructors.fits.residuals import fit_squares, vertex
 from phyradgs_cl.runtime import Runtime
 
-_ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # first trial shifts, in coarse pixels
-_ROUGH_ITERATIONS = 8  # number of iterations of the fit for each trial shift
-_STEP = 0.25  # distance between neighbouring trial shifts around the best, in coarse pixels
-_MOST_STEPS = 8  # most moves to a better centre of three trial shifts
-ANYWHERE = (-math.inf, math.inf)  # limits of the shift in pixels: none
-_MOST_VIEWS = 60  # most views that are compared with their opposites
-_MOST_ROWS = 64  # most blocks of rows that are compared
-_BEYOND = 1.5  # largest distance of a view's opposite from the nearest view beyond the scan's end, in steps between views
-WIDEST_STEP_RAD = math.radians(10.0)  # largest angle between two views that are interpolated
-# standard deviation in pixels of a smoothing along rows: interpolation lowers noise between pixels, which biases shifts
+_ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # shifts of the panel that are tried first, in coarse pixels
+_ROUGH_ITERATIONS = 8  # few iterations are enough to tell coarse shifts of the panel apart
+_STEP = 0.25  # distance of three shifts that bracket the best one, in coarse pixels
+_MOST_STEPS = 8  # most moves of the three shifts that bracket the best one, so that a search that leads away ends
+ANYWHERE = (-math.inf, math.inf)  # no limits of the shift, in pixels
+_MOST_VIEWS = 60  # views that are compared with their opposites, at most, to save time
+_MOST_ROWS = 64  # blocks of rows that are compared, at most, to save time
+_BEYOND = 1.5  # at the scan's end, a view's opposite may lie this many steps beyond the last view
+WIDEST_STEP_RAD = math.radians(10.0)  # views further apart differ too much to be interpolated
+# Smoothing along rows (std, in pixels). Without it, interpolation would lower noise between pixels, which biases shifts.
 SMOOTHING_PX = 1.0
-_CORRELATED_PX = 2 * math.sqrt(math.pi) * SMOOTHING_PX  # columns of smoothed noise per independent one
-_LEAST_OVERLAP = 0.25  # least overlap of a view and its mirrored opposite, as a fraction of the columns
-_LEAST_ENERGY = 0.2  # least sum of squares in an overlap, as a fraction of the largest over all shifts
-_STEPS = 12  # most Gauss–Newton steps
+_CORRELATED_PX = 2 * math.sqrt(math.pi) * SMOOTHING_PX  # smoothing correlates the noise of this many columns
+_LEAST_OVERLAP = 0.25  # a view and its mirrored opposite must overlap in this fraction of the columns
+_LEAST_ENERGY = 0.2  # an overlap with less than this fraction of the largest sum of squares shows air alone
+_STEPS = 12
 _SETTLED_PX = 1e-3  # Gauss–Newton ends after a step shorter than this, in pixels
-_BIAS_PX = 0.02  # standard error of a shift in pixels because views are interpolated between their neighbours
+_BIAS_PX = 0.02  # error (std) of a shift that comes from interpolating views
 
 
 @dataclass(frozen=True, eq=False)
 class AxisShift:
     """A shift of the panel along u, and the fit that found it. pixels, deviation: the shift and its standard deviation in
-    pixels of the recorded scan, both NaN where no shift fits best. squares (F,): squared residuals of the nearest
-    trial."""
+    pixels of the recorded scan, both NaN if no shift fits best. squares (F,): squared residuals of the nearest trial."""
 
     pixels: float
     deviation: float
@@ -53,8 +52,8 @@ NOT_FOUND = AxisShift(math.nan, math.nan, np.empty(0))
 
 
 def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHERE) -> AxisShift:
-    """Returns the best of five shifts within ``limits_px``, one coarse pixel apart, after a few iterations. Its deviation
-    is NaN."""
+    """Returns the best of five shifts within ``limits_px``, one coarse pixel apart, after a few iterations. Its deviation is
+    NaN."""
     block = columns_per_block(scan)
     shifts_px = [block * shift for shift in _ROUGH_SHIFTS if limits_px[0] <= block * shift <= limits_px[1]]
     trials = [fit_squares(rt, shifted(scan, shift_px), _ROUGH_ITERATIONS) for shift_px in shifts_px]
@@ -65,8 +64,8 @@ def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHE
 def refined_shift(
     rt: Runtime, scan: Scan, rough: AxisShift, limits_px: tuple[float, float] = ANYWHERE
 ) -> AxisShift:
-    """Returns the shift near ``rough`` with the least residual, from a parabola through three neighbouring shifts. Where
-    that lies outside of ``limits_px``, returns ``rough`` fitted with all iterations, whose deviation is NaN."""
+    """Returns the shift near ``rough`` with the least residual, from a parabola through three neighbouring shifts. If it
+    lies outside of ``limits_px``, ``rough`` is fitted with all iterations and returned, with a deviation of NaN."""
     block = columns_per_block(scan)
     centre = rough.pixels / block
     trials: dict[float, np.ndarray] = {}
@@ -95,8 +94,8 @@ def axis_shift(rt: Runtime, scan: Scan) -> AxisShift:
 
 
 def with_best_shift(rt: Runtime, scan: Scan) -> Scan:
-    """Returns the coarse scan shifted to the least residual of three shifts, one coarse pixel apart, after a few
-    iterations; the scan as it is where no shift fits best."""
+    """Returns the coarse scan with the panel shifted to the least residual, from three shifts one coarse pixel apart and a
+    few iterations; the scan itself if no shift fits best."""
     block, start = columns_per_block(scan), altered_trajectory(scan).shift_px
     shifts = np.array([-1.0, 0.0, 1.0])
     trials = np.stack([fit_squares(rt, shifted(scan, start + block * shift), _ROUGH_ITERATIONS) for shift in shifts])
@@ -111,7 +110,7 @@ def columns_per_block(scan: Scan) -> int:
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """A view and the mirror image of its opposite, both (rows, columns). apart_px: columns by which the stated axis lies
+    """A view and the mirror image of its opposite, both (rows, columns). apart_px: by how many columns the stated axis lies
     further right in the view than in the mirror image."""
 
     view: np.ndarray
@@ -122,10 +121,9 @@ class _Pair:
 def opposite_shift(scan: Scan) -> AxisShift:
     """Returns the panel's shift along u under which views half a turn apart are mirror images, with its deviation.
 
-    A view's opposite is interpolated between its two neighbours in angle, or extrapolated by a step, because a half turn
-    has opposite views at its ends only. NaN for cone beams, for panels that are rolled or move along the axis, and where
-    no views are opposite. NaN also for columns read one after the other, whose mirror images are seen from other
-    angles."""
+    A view's opposite is interpolated between its two neighbours in angle. A half turn has opposites at its ends only: there
+    it may be extrapolated by a step. NaN for cone beams, panels that are rolled or move along the axis, and scans without
+    opposite views. NaN also if columns are read one after the other: mirror images are then seen from other angles."""
     if not has_opposite_views(scan) or (scan.shutter.axis == "columns" and scan.shutter.readout_s > 0):
         return NOT_FOUND
     pairs = _pairs(scan)
@@ -139,7 +137,7 @@ def opposite_shift(scan: Scan) -> AxisShift:
     shifts, weight = shifts[is_found], information[is_found] / information[is_found].sum()
     shift = float(weight @ shifts)
     noise, scatter = 1 / information[is_found].sum(), float(weight**2 @ (shifts - shift) ** 2)
-    return AxisShift(shift, math.sqrt(2 * max(noise, scatter) + _BIAS_PX**2), np.empty(0))  # 2: each pair is there twice
+    return AxisShift(shift, math.sqrt(2 * max(noise, scatter) + _BIAS_PX**2), np.empty(0))  # 2: each pair occurs twice
 
 
 def _pairs(scan: Scan) -> list[_Pair]:
@@ -148,7 +146,7 @@ def _pairs(scan: Scan) -> list[_Pair]:
     across = np.stack([-np.sin(angle), np.cos(angle), np.zeros(scan.frames)], -1)
     first, step_u, step_v = poses[:, 3:6], poses[:, 6:9], poses[:, 9:12]
     pitch = np.einsum("fi,fi->f", step_u, across)
-    # the same row must see the same slice from both sides: no roll, and no motion along the axis
+    # a row must see the same slice from both sides: no roll, and no motion along the axis
     moved_rows = np.ptp(first[:, 2]) / np.linalg.norm(step_v, axis=1).min()
     if moved_rows > 0.5 or (np.abs(pitch) < 0.9 * np.linalg.norm(step_u, axis=1)).any() or np.ptp(np.sign(pitch)) > 0:
         return []
@@ -166,8 +164,8 @@ def _pairs(scan: Scan) -> list[_Pair]:
 
 
 def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Returns two frames and their weights, which sum to 1, that make up the view at angle 0 of frames at angles ``away``
-    (F,) in rad; None where no frame is near."""
+    """Returns two frames and their weights, which sum to 1, that give the view at angle 0; None if no frame is near. away
+    (F,): angles of the frames in rad."""
     order = np.argsort(away)
     step = float(np.median(np.abs(np.diff(away[order])))) if len(away) > 1 else math.inf
     above = int(np.searchsorted(away[order], 0.0))
@@ -179,14 +177,14 @@ def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         if not same_side or abs(away[near]) > min(WIDEST_STEP_RAD, _BEYOND * step):
             return None
         two = np.array([near, same_side[0]])
-    # linear in the angle: the two shares put the mean of the pair at angle 0, also outside of the two
+    # linear interpolation to angle 0, or extrapolation if both frames are on one side of it
     share = float(away[two[0]] / (away[two[0]] - away[two[1]]))
     return two, np.array([1 - share, share])
 
 
 def _few_rows(scan: Scan, frame: int) -> np.ndarray:
-    """Returns a frame as means over blocks of rows, (few rows, columns) float64, smoothed along the rows; masked pixels
-    are interpolated."""
+    """Returns a frame as means over blocks of rows, (few rows, columns) float64, smoothed along rows. Masked pixels are
+    interpolated."""
     image = np.asarray(scan.projections[frame], np.float64)
     if scan.pixel_mask is not None:
         columns = np.arange(image.shape[1])
@@ -200,11 +198,11 @@ def _few_rows(scan: Scan, frame: int) -> np.ndarray:
 
 
 def _rough_shift(pairs: list[_Pair]) -> float:
-    """Returns the shift in pixels, a multiple of half a column, with the least squared difference of overlapping images
-    over their energy."""
+    """Returns the shift in pixels, a multiple of half a column, at which overlapping images differ least, relative to their
+    energy."""
     columns = pairs[0].view.shape[1]
     # a shift moves the view and the mirror image against each other, by twice its size
-    lags = np.arange(1 - columns, columns)  # column of the mirror image less that of the view
+    lags = np.arange(1 - columns, columns)  # column of the mirror image minus column of the view
     twice_px = lags.astype(np.float64)
     products, energies = np.zeros(lags.size), np.zeros(lags.size)
     for pair in pairs:
@@ -223,8 +221,8 @@ def _correlation(mirrored: np.ndarray, view: np.ndarray) -> np.ndarray:
 
 
 def _refined_shift(pair: _Pair, shift_px: float) -> tuple[float, float]:
-    """Returns the shift in pixels of least squares near ``shift_px`` by Gauss–Newton (NaN where the steps lead away), and
-    the inverse of its variance."""
+    """Returns the shift in pixels of least squares near ``shift_px``, by Gauss–Newton, and the inverse of its variance. The
+    shift is NaN if the steps lead away."""
     last = pair.view.shape[1] - 1
     columns = np.arange(last + 1)
     view, mirrored = (CubicSpline(columns, image, axis=1) for image in (pair.view, pair.mirrored))
@@ -235,7 +233,7 @@ def _refined_shift(pair: _Pair, shift_px: float) -> tuple[float, float]:
         if middle.size < _LEAST_OVERLAP * columns.size:
             return math.nan, 0.0
         difference = view(middle - half_lag) - mirrored(middle + half_lag)
-        # d(difference)/d(shift): a shift moves the two against each other
+        # d(difference)/d(shift), where a shift moves the two in opposite directions
         slope = -view(middle - half_lag, 1) - mirrored(middle + half_lag, 1)
         squares = float((slope**2).sum())
         step = -float((difference * slope).sum()) / max(squares, 1e-30)

@@ -1,5 +1,5 @@
-"""How well a coarse reconstruction explains the frames, and which of two hypotheses explains them better. The volume and
-further unknowns, such as errors of flats, are solved for together."""
+"""How well a coarse reconstruction explains the frames, and which of two hypotheses explains them better. Further unknowns,
+such as errors of flats, are found together with the volume."""
 
 import math
 from dataclasses import dataclass
@@ -14,19 +14,18 @@ from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-# norm of the map from patterns and levels to frames, over that from the volume: with equal norms they would explain motion
+# Errors of flats affect frames this much, relative to the volume: as strong as the volume, they would explain motion.
 _FREEDOM = 0.3
-_ITERATIONS = 20  # default number of iterations of a fit
-_MOST_TIMES = 12  # most times per exposure
-_DRAWS = 200  # resamplings of the bootstrap; the deviation is NaN unless more than half of them have a minimum
-_TINY = 1e-30  # lower limit of denominators
+_ITERATIONS = 20  # iterations of CGLS in a fit, unless stated
+_MOST_TIMES = 12  # most times per exposure: each costs a projection
+_DRAWS = 200  # resamplings of the bootstrap that gives a deviation
+_TINY = 1e-30  # keeps divisions finite where residuals are 0
 
 
 @dataclass(frozen=True, eq=False)
 class FlatErrors:
-    """Unknowns b of errors of flats: a pattern (rows, columns) that all frames share (noise of flats, air that is not 0)
-    and a level (F,) per frame (the source's brightness). pattern_unit, level_unit: line integral per unit of an
-    unknown."""
+    """Unknown errors b of flats: a pattern (rows, columns) that all frames share (noise of flats, air that is not 0) and a
+    level (F,) per frame (the source's brightness). pattern_unit, level_unit: line integral per unit of an unknown."""
 
     frames_shape: tuple[int, int, int]
     pattern_unit: float
@@ -34,8 +33,8 @@ class FlatErrors:
 
     @classmethod
     def beside(cls, operator: LinearOperator) -> "FlatErrors":
-        """Returns the unknowns for the frames of ``operator``, in units that make their effect on frames ``_FREEDOM``
-        times as strong as the volume's."""
+        """Returns the unknowns for the frames of ``operator``, in units that make their effect on frames ``_FREEDOM`` times
+        as strong as the volume's."""
         frames, rows, columns = shape = operator.frames_shape
         back = operator.adjoint(np.ones(shape, np.float32))
         strength = _FREEDOM * float(np.linalg.norm(back)) / math.sqrt(frames * rows * columns)
@@ -62,8 +61,8 @@ class FlatErrors:
 
 @dataclass(frozen=True, eq=False)
 class ViewParameters:
-    """Unknowns b: coefficients (n, K) of parameters of single views. View f has the values (basis @ b)[f], (K,), for
-    ``basis`` (F, n); its frame changes by their products with ``signals`` (F, K, rows, columns), summed over K."""
+    """Unknowns b: coefficients (n, K) of K kinds of parameters of views. View f has the values (basis @ b)[f], with
+    ``basis`` (F, n). Its frame changes by each value times its signal, from ``signals`` (F, K, rows, columns)."""
 
     signals: np.ndarray
     basis: np.ndarray
@@ -85,7 +84,7 @@ class ViewParameters:
 
 @dataclass(frozen=True, eq=False)
 class AugmentedOperator:
-    """Maps one vector (x, b), a volume and further unknowns, to frames A x + B b. B should have about the norm of A,
+    """Maps one vector (x, b), of a volume and further unknowns, to frames A x + B b. B should be about as strong as A,
     because CGLS moves all unknowns together."""
 
     operator: LinearOperator
@@ -100,7 +99,7 @@ class AugmentedOperator:
         return self.operator.frames_shape
 
     def system(self, measured: np.ndarray, valid: np.ndarray | None) -> System:
-        """Returns the equations for measured frames (F, rows, columns); valid: as in ``System``. They have no subsets."""
+        """Returns the equations for measured frames (F, rows, columns), without subsets. valid: as in ``System``."""
         return System(self, measured, valid)  # type: ignore[arg-type]
 
     def forward(self, vector: np.ndarray, out: None = None) -> np.ndarray:
@@ -119,8 +118,8 @@ class AugmentedOperator:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Result of ``fit``. squares (F,): mean squared residual of each frame's line integrals. level (F,): the constant
-    that the fit added to each frame's line integrals."""
+    """Result of ``fit``. squares (F,): mean squared residual of each frame. level (F,): the constant that the fit added to
+    each frame's line integrals."""
 
     squares: np.ndarray
     level: np.ndarray
@@ -154,8 +153,8 @@ def fit_squares(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> np.nd
 def t_statistic(stated: np.ndarray, other: np.ndarray) -> float:
     """Returns by how many standard errors the stated hypothesis explains the frames better than the other.
 
-    stated, other (F,): mean squared residuals of each frame. Their difference over their sum is the sample, a value per
-    frame. Returns 0 with fewer than three frames, or where all differences are equal."""
+    stated, other (F,): mean squared residuals of each frame. The sample is their difference over their sum, one value per
+    frame. Returns 0 with fewer than three frames, or if all differences are equal."""
     difference = (other - stated) / np.maximum(stated + other, _TINY)
     if difference.size < 3:
         return 0.0
@@ -164,7 +163,7 @@ def t_statistic(stated: np.ndarray, other: np.ndarray) -> float:
 
 
 def residual_ratio(stated: np.ndarray, other: np.ndarray) -> float:
-    """Returns the sum over the frames of the other hypothesis's squared residuals (F,), over that of the stated one."""
+    """Returns the squared residual of the other hypothesis over that of the stated one, from each frame's squares (F,)."""
     return float(other.sum() / max(float(stated.sum()), _TINY))
 
 
@@ -172,8 +171,8 @@ def vertex(at: np.ndarray, squares: np.ndarray) -> tuple[float, float]:
     """Returns the minimum of the parabola through three sums of squares, and its standard deviation by a bootstrap over
     frames.
 
-    at (3,): evenly spaced, ascending values of a parameter; squares (3, F): each frame's squared residual there. NaN
-    where the parabola has no minimum; the deviation is also NaN where that holds for half of the resamplings."""
+    at (3,): evenly spaced, ascending values of a parameter. squares (3, F): each frame's squared residual there. The minimum
+    is NaN if the parabola has none; the deviation is NaN if half of the resamplings have none."""
     frames = squares.shape[1]
     draws = np.random.default_rng(0).integers(0, frames, (_DRAWS, frames))
     drawn = np.array([_minimum(at, squares[:, draw].sum(1)) for draw in draws])

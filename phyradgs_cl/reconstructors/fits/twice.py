@@ -1,7 +1,7 @@
-"""Where the axis of rotation is on a panel that stands far beside it: from the rays that a full turn measures twice.
+"""Finds the axis of rotation near the edge of a displaced panel, from the rays that a full turn measures twice.
 
 The residual of a fit is no help there: a shift that leaves fewer rays measured twice always leaves less of it. Here each ray
-is compared with its opposite, half a turn and twice its fan angle away, and the mean square counts, not the sum."""
+is compared with its opposite, half a turn and twice its fan angle away, by the mean of squares, whatever their number."""
 
 import math
 
@@ -15,27 +15,27 @@ from phyradgs_cl.prepare.step import fill_masked
 from phyradgs_cl.reconstructors.fdk.weights import fan_angle, pixel_rays
 from phyradgs_cl.reconstructors.fits.axis import NOT_FOUND, SMOOTHING_PX, WIDEST_STEP_RAD, AxisShift
 
-_COARSE_COLUMNS = 128  # most columns of the coarse frames
-_MOST_PX = 16.0  # largest trial shift to either side, in coarse pixels
-_STEP_PX = 0.5  # distance between trial shifts, in pixels of the frames that are compared
-_NEAR_PX = 2.0  # largest distance, in coarse pixels, of the trial shifts on full frames from the best coarse one
-_FEWEST_VIEWS = 24  # least number of views of a scan
-_MOST_VIEWS = 360  # most views that are compared
-_MOST_ROWS = 32  # most rows that are compared
-_MOST_PAIRS = 48  # most pairs of opposite rays in a row that are compared
-_LEAST_PX = 1.0  # least distance, in pixels, from the axis to the middle of the panel's outer column
-_BLOCKS = 12  # blocks of views of the jackknife
-_BIAS_PX = 0.05  # standard error of the shift in pixels beside noise, measured with half-fans and features of two pixels
+_COARSE_COLUMNS = 128  # shifts are first tried on frames of at most this many columns
+_MOST_PX = 16.0  # largest shift of the panel that is tried, in coarse pixels: an eighth of the panel
+_STEP_PX = 0.5  # distance between shifts that are tried, in pixels of the compared frames
+_NEAR_PX = 2.0  # full frames are tried with shifts this near to the best coarse one, in coarse pixels
+_FEWEST_VIEWS = 24  # fewer views cannot be interpolated to the opposite of each ray
+_MOST_VIEWS = 360  # views that are compared, at most, to save time
+_MOST_ROWS = 32  # rows that are compared, at most, to save time
+_MOST_PAIRS = 48  # pairs of opposite rays that are compared in a row, at most, to save time
+_LEAST_PX = 1.0  # the axis must lie this far inside the middle of the panel's outer column, or no ray has an opposite
+_BLOCKS = 12  # the jackknife leaves out one of this many blocks of views at a time
+_BIAS_PX = 0.05  # error (std) of the shift in pixels without noise, measured with half-fans and features of two pixels
 
 
 def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
-    """Returns the panel's shift along u under which rays and their opposites agree best, its deviation by a jackknife
-    over the views, and the mean squares (F,) of their differences.
+    """Returns the panel's shift along u under which rays and their opposites agree best, its deviation by a jackknife over
+    the views, and the mean squares (F,) of their differences.
 
-    NaN where views are more than 10° apart, where columns are read one after the other, and where no shift within an
-    eighth of the panel agrees best."""
+    NaN if views are more than 10° apart, if columns are read one after the other, and if no shift within an eighth of the
+    panel agrees best."""
     if scan.shutter.axis == "columns" and scan.shutter.readout_s > 0:
-        return NOT_FOUND  # a ray and its opposite are read at other times
+        return NOT_FOUND  # a ray and its opposite lie on different columns, read at different times
     poses = middle_poses(scan)
     turned, views = np.unique(np.round(np.mod(azimuth_rad(poses), 2 * np.pi), 9), return_index=True)
     if len(turned) < _FEWEST_VIEWS or np.diff(turned, append=turned[0] + 2 * np.pi).max() > WIDEST_STEP_RAD:
@@ -52,7 +52,7 @@ def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
 
 
 def _level_rows(scan: Scan, views: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Returns frames (n, few rows, columns) of ``views``, with the rows next to the plane of the source: opposite rays
+    """Returns frames (n, few rows, columns) of ``views``, with the rows nearest to the plane of the source: opposite rays
     there meet the same matter."""
     rows = scan.projections.shape[1]
     level_mm = pose[5] + np.arange(rows) * pose[11] - (0.0 if scan.is_parallel else pose[2])
@@ -74,7 +74,7 @@ def _binned(frames: np.ndarray, pose: np.ndarray, block: int) -> tuple[np.ndarra
 
 
 def _best(scan: Scan, turned: np.ndarray, frames: np.ndarray, pose: np.ndarray, shifts_px: np.ndarray) -> AxisShift:
-    """Returns the best of the shifts in pixels of ``frames``, refined by a parabola; NaN where it is the first or last."""
+    """Returns the best of the shifts, in pixels of ``frames``, refined by a parabola; NaN if it is the first or last."""
     scores, shifts = [], []
     row, columns = np.array([(scan.projections.shape[1] - 1) / 2]), np.arange(frames.shape[2])
     for shift_px in shifts_px:
@@ -96,8 +96,8 @@ def _best(scan: Scan, turned: np.ndarray, frames: np.ndarray, pose: np.ndarray, 
 
 
 def _mean_squares(turned: np.ndarray, frames: np.ndarray, fan: np.ndarray, is_parallel: bool) -> np.ndarray | None:
-    """Returns the mean squares (F,) of rays less their opposites. turned (F,): views' angles in rad; fan (columns,): fan
-    angles of the columns. None where the columns do not see the axis."""
+    """Returns the mean squared differences (F,) of rays and their opposites; None if the columns do not see the axis. turned
+    (F,): views' angles in rad. fan (columns,): fan angles of the columns."""
     columns = np.arange(fan.size)
     if fan[-1] < fan[0]:
         fan, columns = fan[::-1], columns[::-1]

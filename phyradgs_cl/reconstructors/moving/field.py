@@ -1,9 +1,9 @@
-"""Steps of Gauss-Newton on the displacement field of a moving object, at a given volume.
+"""Improves the displacement field of a moving object by steps of Gauss-Newton, at a given volume.
 
     min over U, φ of ‖p − Σ_k P_k W_k v‖² + γ bending(U) + β roughness(φ)
 
-The control vectors of U and the temporal coefficients of φ are improved in turn. A step is taken only where it lowers the
-sum and matter does not fold."""
+The control vectors U and the weights' coefficients in time φ are improved in turn. A step is taken only if it lowers the sum
+and matter does not fold."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
@@ -21,19 +21,19 @@ from phyradgs_cl.operators.warp.volume import StateStack, VolumeWarp
 from phyradgs_cl.reconstructors.moving.signal import Bending, TemporalSplines
 from phyradgs_cl.runtime import Runtime
 
-_CG_STEPS = 8  # iterations of conjugate gradients for a step of the control vectors
-_DAMPING = 1e-3  # Levenberg damping of a step, as a fraction of the mean diagonal of JᵀJ
-_ROUGHNESS = 1e-2  # weight β of the weights' roughness in time, as a fraction of the mean diagonal of JᵀJ
-_SHORTER = (1.0, 0.5, 0.25)  # fractions of a step that are tried in turn, until one lowers the misfit
-_LEAST_DETERMINANT = 0.1  # lower limit of det(I + ∂w/∂y) after a step: at 0 matter folds
-_LEAST_VOXELS = 1.0  # displacement in voxels, per unit of weight, that is added to the distances between states
-_SUPPORT = 4  # number of intervals between knots in which a temporal spline differs from 0
+_CG_STEPS = 8  # iterations of conjugate gradients for one step of the control vectors
+_DAMPING = 1e-3  # Levenberg damping over the mean diagonal of JᵀJ: control vectors that no ray sees stay where they are
+_ROUGHNESS = 1e-2  # β, the penalty on the weights' roughness in time, relative to the mean diagonal of JᵀJ
+_SHORTER = (1.0, 0.5, 0.25)  # fractions of a step, tried in turn until one lowers the misfit
+_LEAST_DETERMINANT = 0.1  # a step may lower det(I + ∂w/∂y) to this: at 0 matter folds
+_LEAST_VOXELS = 1.0  # added to distances between states, so that even a field of zeros has several states
+_SUPPORT = 4  # a cubic spline in time extends over this many intervals between knots
 
 
 @dataclass(frozen=True, eq=False)
 class MotionField:
-    """A displacement field during its search. control_mm: (R, cz, cy, cx, 3) as in ``Deformation``. temporal: (count, R),
-    spline coefficients in time of the fields' weights."""
+    """A displacement field during its search. control_mm: (R, cz, cy, cx, 3) as in ``Deformation``. temporal (count, R):
+    spline coefficients, in time, of the weights of the R fields."""
 
     control_mm: np.ndarray
     origin_mm: tuple[float, float, float]
@@ -43,8 +43,8 @@ class MotionField:
 
     @classmethod
     def at_rest(cls, scan: Scan, spacing_mm: float, splines: TemporalSplines, temporal: np.ndarray) -> "MotionField":
-        """Returns a field of zeros over the scan's grid. Its weights, from ``temporal`` (count, R), have mean 0 and
-        largest size 1."""
+        """Returns a field of zeros over the scan's grid. Its weights, from ``temporal`` (count, R), have mean 0 and largest
+        size 1."""
         origin_mm, counts = control_points(scan.grid, spacing_mm)
         centred = temporal - splines.at(splines.node_times_s).mean(0) @ temporal  # splines sum to 1
         control_mm = np.zeros((temporal.shape[1], *counts, 3))
@@ -63,8 +63,7 @@ class MotionField:
         return replace(self, control_mm=control_mm, temporal=self.temporal / factor)
 
     def refined(self, scan: Scan, spacing_mm: float) -> "MotionField":
-        """Returns the field on control points ``spacing_mm`` apart, closer than before, fitted to the displacements at
-        the voxels."""
+        """Returns the field on closer control points, ``spacing_mm`` apart, fitted to the displacements of the voxels."""
         coarse = self.deformation()
         units_mm = np.stack([coarse.on_grid_mm(scan.grid, unit) for unit in np.eye(coarse.rank)])
         control_mm, origin_mm = fitted_control_mm(units_mm, scan.grid, spacing_mm)
@@ -73,8 +72,8 @@ class MotionField:
 
 @dataclass(eq=False)
 class FieldProblem:
-    """The misfit of a scan under a motion model, as a function of the field. bending: γ, relative to the response of the
-    frames to a control vector."""
+    """The misfit of a scan under a motion model, as a function of the field. bending: γ, relative to how strongly frames
+    respond to a control vector."""
 
     rt: Runtime
     scan: Scan
@@ -110,7 +109,7 @@ class FieldProblem:
         return self._masked(self.scan.projections - self.operator(one).forward(volume))
 
     def space_step(self, one: MotionField, volume: np.ndarray) -> MotionField:
-        """Returns the field after a step on its control vectors; the field unchanged where no step lowers the sum."""
+        """Returns the field after a step of its control vectors; the field itself if no step lowers the sum."""
         operator = self.operator(one)
         residual = self._masked(self.scan.projections - operator.forward(volume))
         derivative = FieldDerivative(operator, volume)
@@ -118,7 +117,7 @@ class FieldProblem:
         def normal(change: np.ndarray) -> np.ndarray:
             return derivative.adjoint(self._masked(derivative.forward(change)))
 
-        # Hutchinson: a vector of random signs estimates the mean of the diagonal of JᵀJ, to which the weights are relative
+        # the weights are relative to the mean diagonal of JᵀJ, which a vector of random signs estimates (Hutchinson)
         probe = np.random.default_rng(0).choice([-1.0, 1.0], one.control_mm.shape)
         response = float(np.vdot(probe, normal(probe))) / probe.size
         if not response > 0:
@@ -137,7 +136,7 @@ class FieldProblem:
         return self._first_better(one, residual, candidates, volume, penalty)
 
     def time_step(self, one: MotionField, volume: np.ndarray) -> MotionField:
-        """Returns the field after a step on the coefficients of its weights; the field unchanged where no step lowers the
+        """Returns the field after a step of its weights' coefficients in time; the field itself if no step lowers the
         sum."""
         operator = self.operator(one)
         residual = self._masked(self.scan.projections - operator.forward(volume))
@@ -163,13 +162,13 @@ class FieldProblem:
     def _temporal_equations(
         self, one: MotionField, operator: WarpedOperator, volume: np.ndarray, residual: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns JᵀJ (count, R, count, R) and Jᵀ r (count, R) for the temporal coefficients and the residual r (F, rows,
+        """Returns JᵀJ (count, R, count, R) and Jᵀ r (count, R) for the coefficients in time and the residual r (F, rows,
         columns).
 
         Splines that no frame sees together are projected together."""
         count, rank = one.temporal.shape
         spans_s = max(float(np.ptp(table.time_s)) for table in self.tables)
-        # splines of one colour are so far apart that a frame sees at most one of them: one projection serves all
+        # splines of one colour lie so far apart in time that a frame sees at most one: one projection serves all of them
         colours = min(count, _SUPPORT + int(np.ceil(spans_s / one.splines.step_s)) + 1)
         values = [one.splines.at(table.time_s) for table in self.tables]
         derivative = FieldDerivative(operator, volume)
@@ -201,11 +200,11 @@ class FieldProblem:
         self, one: MotionField, residual: np.ndarray, candidates: Iterable[MotionField], volume: np.ndarray,
         penalty: Callable[[MotionField], float],
     ) -> MotionField:  # fmt: skip
-        """Returns the first of ``candidates`` that does not fold and whose squared misfit plus ``penalty`` is below that
-        of ``one``, else ``one``."""
+        """Returns the first of ``candidates`` that does not fold and that has a smaller sum of squared misfit and
+        ``penalty`` than ``one``; else ``one``."""
         before = sum_squares(residual) + penalty(one)
         for candidate in candidates:
-            # a field that folds has no inverse, however well its frames fit
+            # a field that folds has no inverse, so it counts for nothing however well its frames fit
             if candidate.deformation().smallest_determinant() < _LEAST_DETERMINANT:
                 continue
             if sum_squares(self.residual(candidate, volume)) + penalty(candidate) < before:
@@ -217,13 +216,11 @@ class FieldProblem:
 
 
 def sum_squares(values: np.ndarray) -> float:
-    """Returns Σ x² in float64."""
     return float(np.square(values, dtype=np.float64).sum())
 
 
 def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], right: np.ndarray, steps: int) -> np.ndarray:
-    """Returns an approximate solution of A x = b after ``steps`` steps from 0, or fewer where the residual's norm falls
-    to 1 %."""
+    """Solves A x = b approximately, in ``steps`` steps from 0, or fewer if the residual's norm falls to 1 %."""
     solution, residual = np.zeros_like(right), right.copy()
     direction, squares = residual.copy(), sum_squares(residual)
     least = 1e-4 * squares

@@ -1,11 +1,10 @@
 """``moving``: the volume of an object that moves in an unknown way, and its displacement field.
 
-The search finds the field on a coarse copy of the scan. Each of its rounds makes a few passes of ``fista`` with the
-present field, then a Gauss-Newton step on the field, and one on its weights (``field.py``). Motion and image together: J.
-Wang and X. Gu, Simultaneous motion estimation and image reconstruction (SMEIR) for 4D cone-beam CT, Med. Phys. 40, 101912
-(2013).
+First the field is sought on a coarse copy of the scan. Each round makes a few passes of ``fista`` with the present field,
+then a Gauss-Newton step of the field and one of its weights (``field.py``). Motion and image together: J. Wang and X. Gu,
+Simultaneous motion estimation and image reconstruction (SMEIR) for 4D cone-beam CT, Med. Phys. 40, 101912 (2013).
 
-``fista`` then reconstructs the reference volume with that field, as it does with ``--object-motion``. An object that shows
+Then ``fista`` reconstructs the reference volume with that field, as it does with ``--object-motion``. An object that shows
 no motion gets the volume of ``fista`` at rest."""
 
 import math
@@ -40,23 +39,23 @@ from phyradgs_cl.reconstructors.voxels.run import MethodRun
 from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages
 from phyradgs_cl.runtime import Runtime
 
-_MOST_COLUMNS = 64  # most blocks of pixels along the longer side of the panel in the coarse scan
-_MOST_VOXELS = 32  # most voxels along the longest side of the coarse scan's grid
-_MOST_FRAMES = 600  # most frames of the coarse scan, or more: one for every knot of the signal
-_TIMES_PER_PERIOD = 12  # number of times per period of the motion at which exposures see the object
-_MOST_TIMES = 6  # most times of one exposure that this takes
-_FIRST_PASSES = 8  # passes of fista before the first round, with the object at rest
-_PASSES = 3  # passes of fista in each round
-_WEIGHT = 0.42  # prior weight of the passes of fista
-_TV_ITERATIONS = 5  # TV iterations of each pass of fista
-_COARSE_SPACINGS = 2  # number of spacings of control points along the box's longest side, in the first rounds
-_FINE_SPACINGS = 4  # number of spacings of control points along the box's longest side, in the last rounds
-# factor on the bending weight γ for finer control points: the field then is as stiff in mm as before
+_MOST_COLUMNS = 64  # blocks of pixels along the longer side of the panel in the coarse scan, at most
+_MOST_VOXELS = 32  # voxels along the longest side of the coarse scan's grid, at most
+_MOST_FRAMES = 600  # frames of the coarse scan, at most, unless the signal has more knots
+_TIMES_PER_PERIOD = 12  # times per period of a motion at which exposures sample it
+_MOST_TIMES = 6  # most times per exposure for this: each costs a projection
+_FIRST_PASSES = 8  # passes of fista before the first round, for an object at rest: the field needs a volume to start from
+_PASSES = 3  # passes of fista in each round, which let the volume follow the field
+_WEIGHT = 0.42  # prior weight of fista in the search
+_TV_ITERATIONS = 5  # TV iterations per pass of fista in the search
+_COARSE_SPACINGS = 2  # the first rounds find coarse motion, with this many spacings of control points along the longest side
+_FINE_SPACINGS = 4  # the last rounds refine it with closer control points, this many spacings
+# Finer control points need a larger bending weight γ, by this factor, so that the field is as stiff in mm as before.
 _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4
-_COARSE_SHARE = 0.6  # fraction of the rounds with coarse control points
-_FREE_KNOTS = 6  # number of intervals of the temporal splines where no signal has knots
+_COARSE_SHARE = 0.6  # fraction of the rounds that have coarse control points
+_FREE_KNOTS = 6  # if weights follow no signal, their splines have this many intervals in time
 _AT_REST = "no motion found"
-# iterations of the method per round of its search: 7 rounds come before the 35 passes that are the default of fista
+# One in six iterations is a round of the search: by default 7 rounds, and then 35 passes as in fista.
 _ITERATIONS_PER_ROUND = 6
 _STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")
 
@@ -70,7 +69,7 @@ def coarse_scan(scan: Scan, most_frames: int = _MOST_FRAMES) -> Scan:
 
 
 def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: float) -> MotionField:
-    """Returns a field at rest over the times from ``first_s`` to ``last_s``. Its weights follow ``signal`` where it has a
+    """Returns a field at rest over the times from ``first_s`` to ``last_s``. Its weights follow ``signal`` if that has a
     knot spacing, else a line and its square in time."""
     spacing_mm = max(scan.grid.size_mm) / _COARSE_SPACINGS
     if signal.knot_s is not None:
@@ -84,8 +83,8 @@ def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: floa
 
 
 class FieldSearch:
-    """Searches the field on a coarse copy of the scan, as a ``Stepwise``. rounds: iterations of the search. bending: as
-    in ``FieldProblem``."""
+    """Searches the field on a coarse copy of the scan, as a ``Stepwise``. rounds: iterations of the search. bending: as in
+    ``FieldProblem``."""
 
     quantity, remedy = "residual", "check the scan for extreme values"
 
@@ -105,8 +104,8 @@ class FieldSearch:
 
     @property
     def finished(self) -> str | None:
-        """The reason to end: the object is at rest, where the first two rounds found no step of the field that lowers the
-        residual. Else None."""
+        """Why the search ends early: the object is at rest, because in two rounds no step of the field lowered the residual.
+        Else None."""
         return _AT_REST if self.iteration >= 2 and not self.field.control_mm.any() else None
 
     def step(self) -> None:
@@ -153,9 +152,9 @@ class FieldSearch:
         return resampled(self.volume, self.scan.grid, self.grid)[0], self.grid
 
     def finding(self) -> tuple[Deformation, float]:
-        """Returns the field, and the fraction by which its squared residual is below that of an object at rest after as
-        many passes. The field is zeros unless that fraction exceeds ``LEAST_GAIN``, and what as many free numbers would
-        explain of noise."""
+        """Returns the field, and its gain: by which fraction its squared residual is below that of an object at rest after
+        as many passes. The field is zeros if the gain is within ``LEAST_GAIN``, or within what as many free numbers explain
+        of noise."""
         if not self.field.control_mm.any():
             return self.field.deformation(), 0.0
         moving = self._reconstructed(self.field, self.volume, _PASSES)
@@ -184,8 +183,8 @@ class FieldSearch:
 
 
 def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:
-    """Returns the model with as many times per exposure as the gantry and the signal's period need. The object's speed is
-    not known yet."""
+    """Returns the model with as many times per exposure as the gantry and the signal's period need. How fast the object
+    moves is not known yet."""
     timed = with_times(motion, scan)
     if motion != PerRow() or not isinstance(timed, PerRow) or period_s is None:
         return timed
@@ -194,7 +193,7 @@ def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:
 
 
 def _difference(one: MotionField, other: MotionField) -> float:
-    """Returns the root of the summed squared relative changes of control vectors and of weights between two rounds."""
+    """Returns how much control vectors and weights changed in a round: the root of their summed squared relative changes."""
     pairs = [(one.control_mm, other.control_mm), (one.temporal, other.temporal)]
     parts: list[Any] = [
         sum_squares(new - old) / sum_squares(new) for new, old in pairs if new.shape == old.shape and new.any()
@@ -208,12 +207,11 @@ class MovingOptions(FistaOptions):
 
     - iterations: a sixth are rounds of the search for the field, the rest passes of ``fista`` after it.
     - bending: stiffness of the field, relative to how strongly frames respond to it.
-    - gating: what the motion follows at first: ``auto`` (the signal of the frames, where it repeats), ``free`` (any
-      smooth curve in time), ``scan`` (the signal or phase that the scan states), or a file, NAME.csv
-      (``load_gating``)."""
+    - gating: what the motion follows at first: ``auto`` (the signal of the frames, if it repeats), ``free`` (any smooth
+      curve in time), ``scan`` (the signal or phase that the scan states), or a file, NAME.csv (``load_gating``)."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 7)
-    """Iterations of the short runs of ``estimate``: one round alone, two rounds with five passes."""
+    """Iterations of the two short runs that ``estimate`` times: one round alone, and two rounds with five passes."""
 
     iterations: int = 42
     bending: float = checks.ranged(0.01, 0, 1e6)
@@ -239,18 +237,17 @@ class MovingOptions(FistaOptions):
 
 @dataclass
 class _Field:
-    """Hands the field from the search to the passes, and keeps it in their states, which need it to resume."""
+    """Hands the field from the search to the passes. A state of the passes holds it too, because they need it to resume."""
 
     deformation: Deformation | None = None
     gain: float = 0.0
 
     @property
     def for_passes(self) -> Deformation | None:
-        """The field as a deformation; None where nothing moves."""
+        """The field as a deformation; None if nothing moves."""
         return None if self.deformation is None or self.deformation.is_still else self.deformation
 
     def take(self, search: Any) -> None:
-        """Takes the field and its gain from a complete ``FieldSearch``."""
         self.deformation, self.gain = search.finding()
 
     def state(self) -> dict[str, np.ndarray]:
@@ -270,7 +267,7 @@ class _Field:
 
 
 def moving(scan: Scan, options: MovingOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the reference volume in 1/mm with the object's ``deformation``. ``arguments``: the others of ``MethodRun``."""
+    """Returns the reference volume in 1/mm, with the object's ``deformation``. ``arguments``: as in ``MethodRun``."""
     run, one = MethodRun(scan, options, rt, **arguments), _Field()
     if run.resume is not None:
         run = replace(run, resume=one.restore(run.resume))
@@ -302,8 +299,8 @@ METHOD = Method(moving, {"default": MovingOptions()}, finds_motion=True)
 
 
 def _signal_of(scan: Scan, gating: str) -> MotionSignal:
-    """Returns the signal of the scan, of a file, or that of the frames; ``free`` has no period. Raises InputError for the
-    signal of a scan that states none."""
+    """Returns the signal of the scan, of a file, or of the frames; with ``free`` it has no period. Raises InputError if the
+    scan should state a signal and does not."""
     if gating == "scan":
         if scan.gating is None:
             remedy = "take --set gating=auto, or a file NAME.csv"
@@ -316,7 +313,7 @@ def _signal_of(scan: Scan, gating: str) -> MotionSignal:
 
 
 def _motion_facts(one: _Field, signal: MotionSignal, scan: Scan) -> dict[str, object]:
-    """Returns what the search found, for the result's facts. Displacements count from the mean place of matter in the
+    """Returns what the search found, for the result's facts. Displacements count from the mean position of matter in the
     scan."""
     moves = one.for_passes is not None
     follows = signal.knot_s is not None

@@ -1,9 +1,9 @@
-"""The motion signal of a scan: from its frames, or stated in the scan or in a file of comma-separated values. Cubic
-B-splines in time, for the weights of a field that follow it.
+"""The motion signal of a scan: from its frames, or stated in the scan or in a file of comma-separated values. Also cubic
+B-splines in time, for the weights of a field that follows it.
 
-From frames it is the first principal component of the Amsterdam shroud, which has the mean of every detector row of every
-frame. A displacement along the rotation axis shows in it from all sides, while the gantry's own turning changes it slowly.
-L. Zijp et al., Extraction of the respiratory signal from sequential thorax cone-beam X-ray images, Proc. ICCR (2004) 507."""
+From frames it is the first principal component of the Amsterdam shroud: the mean of each detector row in each frame. A
+displacement along the rotation axis shows in it from all sides, while the turning gantry changes it slowly. L. Zijp et al.,
+Extraction of the respiratory signal from sequential thorax cone-beam X-ray images, Proc. ICCR (2004) 507."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,18 +16,18 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gating
 
-_NODES = 4  # number of times per interval between knots at which weights are stored; between them they are linear
-_STRETCH = 0.02  # weight of squared first differences in the bending energy: a field that is linear in air stays small there
-_HARMONICS = 6  # number of harmonics of the gantry's angle that are removed: an object at rest explains them
-_FEWEST_CYCLES = 5  # least number of cycles in the scan: slower motion is taken as free in time
-_BAND = 0.25  # half width of the band about the dominant rate, over that rate: breaths differ in length
-# A signal repeats where at least this fraction of its power lies in the band, beyond what white noise has there.
+_NODES = 4  # weights are stored at this many times per interval between knots, and are linear between them
+_STRETCH = 0.02  # weight of first differences in the bending energy: without it, a field could grow linearly in air
+_HARMONICS = 6  # an object at rest changes the signal with these harmonics of the gantry's angle: they are removed
+_FEWEST_CYCLES = 5  # a motion with fewer cycles in the scan is modelled freely in time
+_BAND = 0.25  # breaths differ in length: the dominant rate and rates that differ by this fraction count as one
+# A signal repeats if at least this fraction of its power lies in the band, not counting what white noise has there.
 _PERIODIC_SHARE = 0.5
-_FEWEST_FRAMES = 16  # least number of frames of a scan in which a period is sought
-_FEWEST = 4  # least number of values in a file
-_KNOTS_PER_PERIOD = 6  # knots per period of the weights that follow a signal
-_SLOWER = 0.95  # knots follow rates up to this fraction of the power, for a stated signal that does not repeat
-_MOST_EVEN = 100_000  # largest number of evenly spaced intervals to which a signal is interpolated
+_FEWEST_FRAMES = 16  # fewer frames show no period
+_FEWEST = 4  # fewer values in a file are no signal
+_KNOTS_PER_PERIOD = 6  # weights that follow a signal have this many knots per period
+_SLOWER = 0.95  # a stated signal that does not repeat gets knots for the slow rates that hold this fraction of its power
+_MOST_EVEN = 100_000  # a signal is interpolated to at most this many even steps
 _FORMS = f"at least {_FEWEST} lines: time in s, value; or one value for each frame"
 
 
@@ -59,20 +59,19 @@ class TemporalSplines:
         return np.linspace(self.first_s, self.last_s, _NODES * self.intervals + 1)
 
     def at(self, times_s: np.ndarray) -> np.ndarray:
-        """Returns the values (n, count) of all splines at times (n,) in s; times outside of the covered span count as its
-        ends."""
+        """Returns the values (n, count) of all splines at times (n,) in s. Before the first and after the last time they
+        stay constant."""
         knots_s = self.first_s + self.step_s * np.arange(-3, self.intervals + 4)
         return BSpline(knots_s, np.eye(self.count), 3)(np.clip(times_s, self.first_s, self.last_s))
 
     def fit(self, times_s: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Returns coefficients (count, R) whose splines follow ``values`` (n, R) at times (n,) in s, taken as linear in
-        between."""
+        """Returns coefficients (count, R) whose splines follow ``values`` (n, R) at times (n,) in s, linear in between."""
         nodes_s = self.node_times_s
         wanted = np.stack([np.interp(nodes_s, times_s, column) for column in values.T], -1)
         return np.asarray(np.linalg.lstsq(self.at(nodes_s), wanted, rcond=None)[0])
 
     def roughness(self) -> np.ndarray:
-        """Returns the matrix K (count, count) for which cᵀ K c is the sum of squared second differences of coefficients
+        """Returns the matrix K (count, count) with which cᵀ K c is the sum of squared second differences of coefficients
         c."""
         return _difference_squares(self.count, 2)
 
@@ -87,7 +86,7 @@ class Bending:
         self._second = [_difference_squares(n, 2) for n in counts]
 
     def __call__(self, control: np.ndarray) -> np.ndarray:
-        """Returns K c for control vectors (R, cz, cy, cx, 3); the energy is cᵀ K c."""
+        """Returns K c for control vectors c (R, cz, cy, cx, 3); the energy is cᵀ K c."""
         total = np.zeros_like(control)
         for axis in range(3):
             along = _apply(self._first[axis], control, axis)
@@ -98,7 +97,7 @@ class Bending:
 
 
 def _difference_squares(count: int, order: int) -> np.ndarray:
-    """Returns DᵀD (count, count), with D the differences of ``order`` between neighbours."""
+    """Returns DᵀD (count, count), where D takes the differences of ``order`` between neighbours."""
     differences = np.diff(np.eye(count), order, axis=0)
     return np.asarray(differences.T @ differences)
 
@@ -112,9 +111,9 @@ class MotionSignal:
     """The course of the object's motion in time.
 
     - times_s (F,): the middles of the frames, rising. values (F,): mean 0, largest size 1, without a unit or a sign.
-    - period_s: mean length of a cycle; None where no cycle repeats.
+    - period_s: mean length of a cycle; None if no cycle repeats.
     - later (F,): the quadrature, a quarter of a cycle later; None derives it from ``values``.
-    - knot_s: time between two knots of weights that follow the signal; None where weights need not follow it."""
+    - knot_s: time between two knots of weights that follow the signal; None if weights need not follow it."""
 
     times_s: np.ndarray
     values: np.ndarray
@@ -132,8 +131,7 @@ class MotionSignal:
 
 
 def motion_signal(scan: Scan) -> MotionSignal:
-    """Returns the motion signal of a scan's frames. Its period is None where ``period_of`` finds none; ``knot_s`` is then
-    None too."""
+    """Returns the motion signal of a scan's frames. period_s and knot_s are None if ``period_of`` finds no period."""
     times_s = middle_times_s(scan)
     order = np.argsort(times_s, kind="stable")
     times_s, rows = times_s[order], _shroud(scan)[order]
@@ -145,13 +143,13 @@ def motion_signal(scan: Scan) -> MotionSignal:
 
 
 def middle_times_s(scan: Scan) -> np.ndarray:
-    """Returns the middle (F,) in s of each frame's span, in which any of its lines is open."""
+    """Returns the middle (F,) in s of the time in which any line of a frame is open."""
     return np.asarray(scan.frame_start_s, np.float64) + scan.shutter.span_s / 2
 
 
 def period_of(times_s: np.ndarray, values: np.ndarray) -> float | None:
-    """Returns the mean period in s of a signal (F,) at times (F,) in s. Returns None where its power is not concentrated
-    about one rate of at least five cycles in the scan, where it does not change, and for fewer than 16 values."""
+    """Returns the mean period in s of a signal (F,) at times (F,) in s. Returns None unless its power is concentrated about
+    one rate of at least five cycles in the scan, and for fewer than 16 values."""
     power, length_s = _spectrum(times_s, values)
     last = len(power) - 1
     if len(values) < _FEWEST_FRAMES or last < _FEWEST_CYCLES or not power.sum() > 0:
@@ -190,19 +188,19 @@ def _shroud(scan: Scan) -> np.ndarray:
 
 
 def _gantry(scan: Scan, times_s: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Returns the terms (F, n) that explain a row's mean of an object at rest: a constant, a line in time, harmonics of
-    the gantry's angle. n is at most a quarter of F."""
+    """Returns the terms (F, n) that explain a row's mean for an object at rest: a constant, a line in time, harmonics of the
+    gantry's angle. n is at most a quarter of F."""
     poses = np.stack([scan.trajectory.pose(int(f), np.array([t]))[0] for f, t in zip(order, times_s, strict=True)])
     towards = poses[:, :3] - (0.0 if scan.is_parallel else np.array(scan.grid.offset_mm[::-1]))
     angle_rad = np.arctan2(towards[:, 1], towards[:, 0])
     harmonics = [wave(k * angle_rad) for k in range(1, _HARMONICS + 1) for wave in (np.cos, np.sin)]
     drift = (times_s - times_s[0]) / max(times_s[-1] - times_s[0], 1e-300)
-    most = max(1, len(times_s) // 4)  # so many terms at most: more would explain all of few frames
+    most = max(1, len(times_s) // 4)  # more terms would explain everything in few frames
     return np.stack([np.ones(len(times_s)), drift, *harmonics][:most], -1)
 
 
 def scaled(values: np.ndarray) -> np.ndarray:
-    """Returns a signal of mean 0 and largest size 1; zeros stay zeros."""
+    """Returns a signal shifted and scaled to mean 0 and largest size 1; zeros stay zeros."""
     centred = values - values.mean()
     largest = np.abs(centred).max(initial=0.0)
     return np.asarray(centred / largest if largest > 0 else centred)
@@ -213,7 +211,7 @@ def load_gating(path: str, scan: Scan) -> Gating:
     heading. Values whose heading is ``phase`` are phases in cycles. Raises InputError for other files."""
     subject = f"gating {path}"
     try:
-        # utf-8-sig: spreadsheets begin a file with a mark
+        # utf-8-sig: spreadsheets begin a file with a byte order mark
         lines = [line.strip() for line in Path(path).read_text(encoding="utf-8-sig").splitlines() if line.strip()]
         names, lines = (lines[0].lower(), lines[1:]) if lines and not _is_number(lines[0].split(",")[0]) else ("", lines)
         rows = [[float(word) for word in line.split(",")] for line in lines]
@@ -242,9 +240,9 @@ def load_gating(path: str, scan: Scan) -> Gating:
 
 
 def signal_of(gating: Gating, scan: Scan, subject: str) -> MotionSignal:
-    """Returns the motion signal of a gating. Its period is that of the phases or, of values, that of ``period_of``.
+    """Returns the motion signal of a gating. Its period comes from the phases, or from the values by ``period_of``.
 
-    Raises InputError, about ``subject``, for times that miss the scan and for values that do not change."""
+    Raises InputError, which names ``subject``, for times that miss the scan and for values that do not change."""
     times_s, values = gating.times_s, gating.values
     advance = float(gating.steps.sum()) if gating.is_phase else 0.0
     if advance == 0 and (gating.is_phase or np.ptp(values) == 0):

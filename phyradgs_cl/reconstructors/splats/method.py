@@ -1,11 +1,11 @@
 """The splatting methods ``phyradgs`` and ``r2``: radiative Gaussians that are optimised against a scan's frames.
 
-phyradgs is the paper's method, exact splats that follow the gantry's motion; with a static motion it is the paper's
-"w/o ST". r2 is R2-Gaussian (Zha et al. 2024): affine splats with its published constants, static by default; micro-views
-make it the paper's "R2 w/ ST".
+phyradgs is the paper's method, exact splats that follow the gantry's motion; with a static motion it is the paper's "w/o
+ST". r2 is R2-Gaussian (Zha et al. 2024): affine splats with its published constants, static by default; micro-views make it
+the paper's "R2 w/ ST".
 
-Inside, lengths are divided by half the volume's longest side and densities by a reference (FDK's 99.9th percentile), so that
-rates, thresholds and SSIM's constants hold for every scan."""
+Internally, lengths are divided by half the volume's longest side and densities by a reference (FDK's 99.9th percentile), so
+that rates, thresholds and SSIM's constants hold for every scan."""
 
 import json
 import time
@@ -32,12 +32,12 @@ from phyradgs_cl.reconstructors.splats.start import box_of, first_population, in
 from phyradgs_cl.reconstructors.splats.step import Batch, DeviceCloud, FrameStep, Scale, sharing_of
 from phyradgs_cl.runtime import Runtime
 
-REPORT_EVERY = 50  # number of iterations between reports, and most between lines of the record
-LEAST_RECORDED = 20  # least number of lines of a run's record, if it has as many iterations
+REPORT_EVERY = 50  # iterations between reports; lines of the record are as far apart or closer
+LEAST_RECORDED = 20  # short runs record more often, to have a curve of this many lines
 
 
 class SplatRun:
-    """The state of an optimisation, the same on every rank, as the ``Stepwise`` that a ``Loop`` runs."""
+    """The state of an optimisation, the same on every rank; a ``Loop`` runs it as a ``Stepwise``."""
 
     quantity, remedy, finished = "loss", "check the scan for extreme values", None
 
@@ -58,7 +58,7 @@ class SplatRun:
         self.cloud = DeviceCloud(rt, population)
 
     def step(self) -> None:
-        """Does one batch of frames: gradient, move, and density control where it is due."""
+        """Does one batch of frames: computes the gradient, steps, and controls density if it is due."""
         options, before = self.options, self.iteration
         self.frame_step.follow(self.motion_at(before))
         batch = self.next_batch()
@@ -72,7 +72,7 @@ class SplatRun:
             self.control_density()
 
     def motion_at(self, iteration: int) -> Motion:
-        """Returns the motion model of an iteration: coarse in early iterations, except for an object that moves."""
+        """Returns the motion model of an iteration. It is coarse in early iterations, unless the object moves."""
         is_coarse = self.frames.scan.is_fly and self.frames.deformation is None
         return self.options.motion_at(iteration / max(self.iterations, 1)) if is_coarse else self.options.motion
 
@@ -96,12 +96,11 @@ class SplatRun:
         return Batch(frames, corners, late=self.iteration >= self.options.parameter_terms_from)
 
     def measures(self) -> dict[str, float]:
-        """Returns the mean loss of the last batch, and the number of Gaussians."""
         return {"loss": self.sharing.loss(self.frame_step), "gaussians": self.cloud.count}
 
     def control_density(self) -> None:
         sums = self.cloud.read_statistics().astype(np.float64)
-        begun = time.perf_counter()  # the download has waited for the device
+        begun = time.perf_counter()  # after the download, which waits for the device, so that only density control is timed
         statistic = sums[0] / np.maximum(sums[1], 1)
         population, box = self.cloud.population(), box_of(self.grid)
         self._load(control_density(population, statistic, self.activation, self.options.control, box, self.rng))
@@ -109,11 +108,10 @@ class SplatRun:
         self.control_rounds += 1
 
     def _load(self, population: Population) -> None:
-        del self.cloud  # free the old arrays before the new ones are allocated
+        del self.cloud  # a device may have no room for the old and the new arrays together
         self.cloud = DeviceCloud(self.rt, population)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the arrays that the next step depends on."""
         population = self.cloud.population()
         return {
             "raw": population.raw, "moments": population.moments, "statistics": self.cloud.read_statistics(),
@@ -123,7 +121,7 @@ class SplatRun:
         }  # fmt: skip
 
     def restore(self, state: State) -> None:
-        """Continues from ``state``, on any number of ranks up to the frames of a batch."""
+        """Continues from ``state``, with any number of ranks that a batch has frames for."""
         self.iteration, self.batch = int(state["iteration"]), int(state["batch"])
         self.sharing = sharing_of(self.rt.ranks, self.batch)
         self.rng.bit_generator.state = json.loads(str(state["rng"]))
@@ -151,17 +149,17 @@ def reconstruct_splats(
     """Runs a splatting method under its name ``phyradgs`` or ``r2``.
 
     resume: continues an interrupted run of the same scan and options from its state. initial: the volume (nz, ny, nx) in
-    1/mm from which the cloud is drawn; None: an FDK volume. deformation: how the object moves; the cloud and the volume
-    are then the object's reference."""
+    1/mm from which the cloud is drawn; None: an FDK volume. deformation: how the object moves; the cloud and the volume then
+    show its reference state."""
     started = time.perf_counter()
     if deformation is not None and deformation.is_still:
         deformation = None
-    # rank 0 alone makes the first volume
+    # rank 0 makes the first volume and sends it to the others
     of_reference = (rt, scan, options, seed, initial, deformation)
     scale, population, rng = rt.ranks.bcast(first_cloud(*of_reference) if rt.ranks.rank == 0 else None)
     first_count = population.count
     run = SplatRun(rt, scan, options, scale, population, rng, deformation)
-    record_every = max(1, min(REPORT_EVERY, options.iterations // LEAST_RECORDED))  # short runs show their course too
+    record_every = max(1, min(REPORT_EVERY, options.iterations // LEAST_RECORDED))
     loop = Loop(run, rt.ranks, report, started, record_every, REPORT_EVERY)
     loop.run(resume)
     cloud = run.present_cloud()
@@ -176,7 +174,7 @@ def reconstruct_splats(
         "ranks": rt.ranks.size,
     }  # fmt: skip
     if isinstance(options.motion, Exact):
-        # segments: the largest number K of a frame
+        # frames may differ in segments: the most counts
         facts |= {"segments": run.frames.most_cells, "motion_phases": run.phases()}
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
     return Reconstruction(volume, scan.grid, cloud, loop.record, facts, loop.state_if_interrupted())
@@ -186,8 +184,8 @@ def first_cloud(
     rt: Runtime, scan: Scan, options: SplatOptions, seed: int, initial: np.ndarray | None = None,
     deformation: Deformation | None = None,
 ) -> tuple[Scale, Population, np.random.Generator]:
-    """Returns the internal units, the first cloud, and the generator that drew it, from ``initial`` (nz, ny, nx) in 1/mm
-    or, without, from FDK's volume."""
+    """Returns the internal units, the first cloud, and the random generator that drew it. The cloud comes from ``initial``
+    (nz, ny, nx) in 1/mm or, without, from FDK's volume."""
     first = static_fdk(rt, scan, deformation) if initial is None else initial
     scale = internal_scale(first, scan.grid)
     rng = np.random.default_rng(seed)

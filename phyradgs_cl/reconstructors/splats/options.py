@@ -13,23 +13,23 @@ from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 from phyradgs_cl.text import repr_of_changes
 
-# Settings of the iterations before ``exact_from``, which are coarse (docs/results/motion_models.md).
-_STATIC_SHARE = 0.4  # fraction of the coarse iterations with one pose per frame
-_COARSE_ERROR = 0.1  # lower limit of ``time_error`` in the other coarse iterations
+# Iterations before ``exact_from`` model motion coarsely, which loses nothing (docs/results/motion_models.md).
+_STATIC_SHARE = 0.4  # the first of the coarse iterations, this fraction, have one pose per frame
+_COARSE_ERROR = 0.1  # the other coarse iterations have at least this ``time_error``
 
 
 @dataclass(frozen=True, repr=False)
 class SplatOptions(MotionOptions):
     """Options of a splatting run; lengths in half-sides of the volume, densities relative to FDK's 99.9th percentile.
 
-    - gaussians: size of the first cloud; 0 chooses it from the grid. The weights are Eq. 4's λ. tv_edge: edge in voxels
-      of the random sub-volume for total variation. scale_min_voxels: least scale as a fraction of a voxel.
+    - gaussians: size of the first cloud; 0 chooses it from the grid. The weights are Eq. 4's λ. tv_edge: edge in voxels of
+      the random sub-volume for total variation. scale_min_voxels: least scale as a fraction of a voxel.
     - detector_model: what the detector averages over a line's times: line integrals (log), intensity, or what the scan
       states (scan).
-    - exact_from: fraction of the iterations before which the motion ``exact`` is coarse: first one pose for each frame,
-      then one segment of few times. 0: it is exact throughout.
-    - iterations: frames, with a step of Adam every ``batch`` of them (0: as many as there are ranks) at rates × √batch.
-      The same batch gives the same bits on any number of ranks (docs/cluster.md)."""
+    - exact_from: in iterations before this fraction of the run, the motion ``exact`` is coarse: first one pose for each
+      frame, then one segment of few times. 0: it is exact throughout.
+    - iterations: frames used; a step of Adam takes ``batch`` of them (0: as many as there are ranks) at rates × √batch. The
+      same batch gives the same bits on any number of ranks (docs/cluster.md)."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(SPLATS)
 
@@ -64,35 +64,35 @@ class SplatOptions(MotionOptions):
             raise InputError("scale_max", f"{self.scale_max:g}", f"more than scale_min ({self.scale_min:g})")
 
     def activation(self, grid: Grid) -> Activation:
-        """Returns the map from raw to actual parameters, with its bounds of the scales on ``grid`` (in internal units)."""
+        """Returns the map from raw to actual parameters, with the limits of scales on ``grid`` (in internal units)."""
         smallest = max(self.scale_min, self.scale_min_voxels * min(grid.voxel_size_mm))
         return Activation(smallest, max(self.scale_max, 2 * smallest))
 
     def gaussians_for(self, grid: Grid) -> int:
-        """Returns the size of the first cloud: the option, or one sixteenth of the voxels within 1,000 to 50,000."""
+        """Returns the size of the first cloud: the option, or one sixteenth of the voxels, within 1,000 to 50,000."""
         if self.gaussians:
             return self.gaussians
         voxels = grid.shape[0] * grid.shape[1] * grid.shape[2]
         return int(min(max(voxels / 16, 1000), 50_000))
 
     def motion_at(self, share: float) -> Motion:
-        """Returns the motion model after the fraction ``share`` of the run: coarser in early iterations, which gain
-        nothing from exact motion."""
+        """Returns the motion model after the fraction ``share`` of the run: coarse in early iterations, which gain nothing
+        from exact motion."""
         if not isinstance(self.motion, Exact) or share >= self.exact_from:
             return self.motion
         is_first = share < _STATIC_SHARE * self.exact_from
         return Static() if is_first else Exact(1, max(_COARSE_ERROR, self.motion.time_error))
 
     def batch_for(self, frames: int, ranks: int) -> int:
-        """Returns the frames per step: the option or, where it is 0, one for every rank. Raises InputError for more than
-        the scan has."""
+        """Returns the frames per step: the option or, if it is 0, one for every rank. Raises InputError for more than the
+        scan has."""
         if self.batch > frames:
             raise InputError("batch", str(self.batch), f"no more than the scan's {frames} frames")
         return self.batch or min(ranks, frames)
 
     @property
     def asks_for_gaussians(self) -> bool:
-        """Whether the user chose the size of the first cloud, and not a preset or the grid."""
+        """Whether the user, not a preset or the grid, chose the size of the first cloud."""
         return self.gaussians not in {0, *(preset.gaussians for preset in (*PRESETS.values(), R2_PUBLISHED))}
 
 
@@ -101,14 +101,14 @@ _PAPER = SplatOptions(
     motion=MicroViews(8, 5), gaussians=50_000, iterations=20_000, rates=PUBLISHED_RATES,
     control=PUBLISHED_CONTROL,
 )
-# The preset "quick": a sixth of the default's iterations, its schedule in proportion, and two or three segments per frame.
+# "quick": a sixth of the default's iterations, with its schedule in proportion, and two or three segments per frame.
 _QUICK = SplatOptions(
     motion=Exact(time_error=0.02), iterations=500, parameter_terms_from=80,
     control=DensityControl(every=20, start_iteration=80),
 )
 
 PRESETS = {"default": SplatOptions(), "quick": _QUICK, "paper": _PAPER}
-# R2-Gaussian's constants, but with our default number of iterations in place of its 30,000. Rates decay over the run.
+# R2-Gaussian's constants, but with our default number of iterations, not its 30,000; its rates decay over these.
 R2_PUBLISHED = SplatOptions(
     motion=Exact(), affine=True, gaussians=50_000, ssim_weight=0.25, tv_weight=0.05, density_weight=0.0,
     rates=PUBLISHED_RATES, control=PUBLISHED_CONTROL,

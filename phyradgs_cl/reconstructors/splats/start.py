@@ -12,12 +12,12 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.splats.step import Scale
 
 log = logging.getLogger(__name__)
-_REFERENCE_PERCENTILE = 99.9  # percentile of the first volume's values that is the unit of density
+_REFERENCE_PERCENTILE = 99.9  # the unit of density is this percentile of the first volume, because its maximum is noise
 
 
 def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:
-    """Returns the internal units: half the longest side in mm, and the 99.9th percentile of an FDK volume in 1/mm (one
-    over that half side where it is not positive). Raises NumericalError where the percentile is not finite."""
+    """Returns the internal units: half the longest side in mm, and the 99.9th percentile of an FDK volume in 1/mm; if that
+    is not positive, one over the half side. Raises NumericalError if the percentile is not finite."""
     reference = float(np.percentile(fdk, _REFERENCE_PERCENTILE))
     if not np.isfinite(reference):
         raise NumericalError("projections", "values that overflow in FDK", "line integrals of order 1")
@@ -48,12 +48,11 @@ def initial_cloud(
     volume: np.ndarray, grid: Grid, count: int, *, threshold: float, density_share: float,
     scale_bounds: tuple[float, float], scale_factor: float, rng: np.random.Generator,
 ) -> Gaussians:
-    """Draws up to ``count`` isotropic Gaussians at voxels above ``threshold``, without replacement; all in internal
-    units.
+    """Draws up to ``count`` isotropic Gaussians at different voxels above ``threshold``, all in internal units.
 
-    volume (nz, ny, nx). A Gaussian's density is ``density_share`` of the voxel's value; its scale is ``scale_factor`` ×
-    the RMS distance to the three nearest others, within ``scale_bounds``. An empty volume still gives one faint Gaussian
-    in the middle, so that there is something to optimise."""
+    volume (nz, ny, nx). A Gaussian's density is ``density_share`` of the voxel's value. Its scale is ``scale_factor`` × the
+    RMS distance to the three nearest others, within ``scale_bounds``. An empty volume still gives one faint Gaussian in the
+    middle, so that there is something to optimise."""
     candidates = np.flatnonzero(volume.ravel() > threshold)
     if candidates.size == 0:
         log.warning(

@@ -1,8 +1,8 @@
 """One step of a splatting run on the device: its Gaussians and frames there, and the gradient, summed over ranks.
 
-``FrameStep.gradient`` is the only place that renders a frame, compares, goes back, adds total variation and applies the
-chain rule. Ranks have all Gaussians each, and some frames of the batch. Their gradients sum to bits that depend on the
-batch, not on the number of ranks."""
+Only ``FrameStep.gradient`` renders a frame, compares it, goes back, adds total variation and applies the chain rule. Each
+rank has all Gaussians, and some frames of the batch. Gradients are summed so that the bits depend on the batch, not on the
+number of ranks."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,12 +23,12 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import pad_rows
 
-_PEAK_PERCENTILE = 99.9  # percentile of the line integrals that counts as their peak; the maximum would be noise
-_ROWS = 11  # parameters of a Gaussian: rows of dL/d(parameters)
-_STATISTICS = 2  # rows of a Gaussian's statistics for density control
+_PEAK_PERCENTILE = 99.9  # this percentile of the line integrals is their peak, because their maximum is noise
+_ROWS = 11  # parameters of a Gaussian, which are rows of dL/d(parameters)
+_STATISTICS = 2  # numbers for density control: sum of gradient norms, and number of frames
 _DERIVED = 13  # rows of ``cloud.gradients``: dL/d(parameters), then dL/d(centre on the detector), (u, v)
 Corner = tuple[int, int, int]
-"""First voxel (z, y, x) of the sub-volume of the total variation."""
+"""First voxel (z, y, x) of the random sub-volume whose total variation enters the loss."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class DeviceCloud:
         adam.activate(self.raw, self.gaussians.rows, self.count, self.gaussians.stride)
 
     def move(self, adam: DeviceAdam, rates: np.ndarray, step: int) -> None:
-        """Does a step of Adam down the gradients. rates (11,): step sizes by parameter; step: counts from 1."""
+        """Takes a step of Adam down the gradients. rates (11,): learning rates of the parameters; step: counts from 1."""
         adam.step(self.raw, self.gradients, self.moments, self.gaussians.stride, rates, step)
 
     def population(self) -> Population:
@@ -70,19 +70,18 @@ class DeviceCloud:
         return Population(self.rt.download(self.raw)[:, :count], self.rt.download(self.moments)[:, :, :count])
 
     def read_statistics(self) -> np.ndarray:
-        """Returns (2, count) float32: the sum of the centre's gradient norms over frames, and the number of frames with a
-        gradient."""
+        """Returns (2, count) float32: the norms of the gradient by the projected centre, summed over frames, and the number
+        of frames that have one."""
         return self.rt.download(self.statistics)[:, : self.count]
 
     def write_statistics(self, statistics: np.ndarray) -> None:
-        """Replaces the statistics (2, count)."""
         padded = np.zeros((2, self.gaussians.stride), np.float32)
         padded[:, : self.count] = statistics
         self.rt.write(self.statistics, padded)
 
 
 class DeviceFrames:
-    """Time cells, measurement in internal units and mask of every frame on the device."""
+    """Each frame on the device: its time cells, its measurement in internal units, and its mask."""
 
     def __init__(
         self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, deformation: Deformation | None = None
@@ -108,7 +107,6 @@ class DeviceFrames:
 
     @property
     def most_cells(self) -> int:
-        """The largest number of time cells of a frame."""
         return max(cells.count for cells in self._cells)
 
     def get(self, frame: int) -> tuple[DeviceCells, DeviceArray, DeviceArray, float]:
@@ -122,7 +120,7 @@ def tables_of(
 ) -> tuple[list[TimeCells], bool]:
     """Returns the time cells of every frame in mm, and whether frames average intensities over a line's cells.
 
-    Where ``exact`` chooses the segments, an object that moves gets as many as its paths need."""
+    If ``exact`` chooses the segments, an object that moves gets as many as its paths need."""
     peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
     cells = partial(motion.cells, intensity_peak=peak) if isinstance(motion, Exact) else motion.cells
     tables = [cells(scan, frame) for frame in range(scan.frames)]
@@ -132,13 +130,13 @@ def tables_of(
             needed = segments_for_object(deformation, start_s + lit_s, voxel_mm)
             if needed > tables[frame].count:
                 tables[frame] = replace(motion, segments=needed).cells(scan, frame)
-    # with a single value the log and the intensity model agree
+    # for a single time the log and the intensity model agree
     return tables, model == "intensity" and any(table.averages for table in tables)
 
 
 def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[float]]:
-    """Uploads masks, 1 at valid pixels: one for all frames, or one per frame. Returns the masks and their numbers of
-    valid pixels."""
+    """Uploads masks, 1 at valid pixels: one for all frames, or one per frame. Returns them and their numbers of valid
+    pixels."""
     masks = np.zeros((1, *scan.geometry.detector_shape)) if scan.pixel_mask is None else scan.pixel_mask
     stack = [(m == 0).astype(np.float32) for m in (masks if masks.ndim == 3 else masks[None])]
     arrays = [rt.upload(pad_rows(scan.shutter.readout.frames(m))) for m in stack]
@@ -156,7 +154,7 @@ class Batch:
 
 
 class FrameStep:
-    """Computes gradients from single frames of a scan, in internal units; ``grid`` is the volume's. deformation: how the
+    """Computes gradients from single frames of a scan, in internal units, for a volume on ``grid``. deformation: how the
     object moves, in mm."""
 
     def __init__(
@@ -181,14 +179,14 @@ class FrameStep:
         self.adam = DeviceAdam(rt, options.activation(grid))
 
     def follow(self, motion: Motion) -> None:
-        """Takes a motion model for the next steps."""
+        """Takes another motion model from the next step on."""
         if motion != self.motion:
             self.motion = motion
             self.frames.follow(motion)
             self.projector.time_error = getattr(motion, "time_error", DEFAULT_TIME_ERROR)
 
     def draw_corner(self, rng: np.random.Generator) -> Corner | None:
-        """Draws the corner (z, y, x) of a sub-volume for total variation; None where that has no weight."""
+        """Draws the corner (z, y, x) of a sub-volume for total variation; None if that has no weight."""
         if self.options.tv_weight == 0:
             return None
         room = (n - edge + 1 for n, edge in zip(self.grid.shape, self.crop.shape, strict=True))
@@ -198,8 +196,8 @@ class FrameStep:
     def gradient(
         self, cloud: DeviceCloud, frame: int, corner: Corner | None, late: bool, statistics: DeviceArray
     ) -> None:
-        """Writes one frame's dL/d(raw parameters) into the gradients of an activated cloud, and adds to the
-        ``statistics`` (2, stride) of density control. corner, late: as in ``Batch``."""
+        """Writes one frame's dL/d(raw parameters) into the gradients of an activated cloud, and adds to the ``statistics``
+        (2, stride) of density control. corner, late: as in ``Batch``."""
         options, gaussians, by_cloud = self.options, cloud.gaussians, cloud.gradients
         cells, measured, mask, pixels = self.frames.get(frame)
         rendered = self.projector.forward(gaussians, cells)
@@ -220,7 +218,6 @@ class Alone:
         step.gradient(cloud, batch.frames[0], batch.corners[0], batch.late, cloud.statistics)
 
     def loss(self, step: FrameStep) -> float:
-        """Returns the mean loss of the frames of the last batch."""
         return step.loss.value()
 
 
@@ -241,7 +238,7 @@ class SharedFrames(Alone):
             self._losses[place] = step.loss.value()
             own.append(np.concatenate([rt.download(cloud.gradients)[:_ROWS], rt.download(statistics)]))
         total = exact_sum(self.ranks, own, (_ROWS + _STATISTICS, stride), count)
-        # dL/d(centre on the panel) is in the statistics already
+        # rows of dL/d(centre on the panel) are 0 here, because the statistics include them already
         rt.write(cloud.gradients, np.pad(total[:_ROWS], ((0, _DERIVED - _ROWS), (0, 0))))
         rt.write(cloud.statistics, rt.download(cloud.statistics) + total[_ROWS:])
 
@@ -252,7 +249,7 @@ class SharedFrames(Alone):
 
 
 def sharing_of(ranks: Communicator, batch: int) -> Alone:
-    """Returns how ``ranks`` share steps of ``batch`` frames. Raises InputError where some rank would have no frame."""
+    """Returns how ``ranks`` share steps of ``batch`` frames. Raises InputError if a rank would have no frame."""
     if ranks.size > batch:
         found = f"{batch} for {ranks.size} ranks"
         raise InputError("batch", found, "a frame for every rank", "raise it, or take fewer ranks")

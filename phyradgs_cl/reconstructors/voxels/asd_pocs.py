@@ -1,4 +1,4 @@
-"""ASD-POCS: a SART pass, then a few descent steps of the total variation, with the two lengths kept in balance.
+"""ASD-POCS: a SART pass, then a few steps down the total variation (TV), with the lengths of both kept in balance.
 
 Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777, with the step control of TIGRE (Biguri et al. 2016)."""
 
@@ -17,10 +17,10 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 @dataclass(frozen=True)
 class AsdPocsOptions(SartOptions):
-    """Options of ASD-POCS. tv_steps: TV steps per iteration. tv_share: α, length of a TV step over the change by the
-    first SART pass.
+    """Options of ASD-POCS. tv_steps: TV steps per iteration. tv_share: α, length of a TV step over the change by the first
+    SART pass.
 
-    tv_reduction: factor of that length when TV moves the volume by more than ``tv_ratio`` (r_max) of the SART pass's
+    tv_reduction: factor on that length when TV moves the volume by more than ``tv_ratio`` (r_max) times the SART pass's
     change and the residual is above ε. residual_share: ε over the residual of the FDK volume."""
 
     iterations: int = 10
@@ -33,7 +33,7 @@ class AsdPocsOptions(SartOptions):
 
 
 class AsdPocs(Algorithm):
-    """ASD-POCS. The residual of an iteration is that of the volume between the SART pass and the TV steps."""
+    """ASD-POCS. An iteration's residual belongs to the volume between the SART pass and the TV steps."""
 
     def __init__(self, system: System, options: AsdPocsOptions, descend: TvDescent, epsilon: float) -> None:
         super().__init__(system)
@@ -56,7 +56,7 @@ class AsdPocs(Algorithm):
         if tv_length > options.tv_ratio * data_length and residual > self.epsilon:
             self.tv_step *= options.tv_reduction
         cosine = space.inner(by_tv, by_data) / max(tv_length * data_length, 1e-30)
-        # the steps on data and on TV point against each other and undo each other: more of them would only alternate
+        # data and TV steps point in opposite directions and undo each other: more of them would only alternate
         if cosine < -0.99 and residual <= self.epsilon:
             self.finished = "data and TV in balance"
         return residual
@@ -79,5 +79,5 @@ def _started(system: System, options: AsdPocsOptions, run: MethodRun) -> AsdPocs
 
 METHOD = voxel_method(
     "asd-pocs", AsdPocsOptions(), _started, frames=2,
-    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # 4: for the balance of the steps
+    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # 4 more for comparing the lengths of steps
 )

@@ -24,7 +24,7 @@ class CglsOptions(IterativeOptions):
 
 
 class Cgls(Algorithm):
-    """Minimises ‖p − A x‖ over the Krylov spaces of AᵀA from x = 0. The residual of an iteration is that after its step.
+    """Minimises ‖p − A x‖ over the Krylov spaces of AᵀA from x = 0. An iteration's residual is the one after its step.
 
     In the intensity model the residual is p − I(x), and J replaces A. Directions then combine as in nonlinear conjugate
     gradients (Polak and Ribière 1969), which is the same iteration where I is linear."""
@@ -48,7 +48,7 @@ class Cgls(Algorithm):
         space = self.system.space
         projected = self.system.derivative(self.direction)
         energy = space.inner(projected, projected)
-        # a gradient of 0, or a direction that no frame sees: nothing is left to minimise
+        # with a gradient of 0, or a direction that no frame sees, nothing is left to minimise
         if self.gamma == 0 or energy == 0:
             self.finished = "exact solution"
             return space.norm(self.residual)

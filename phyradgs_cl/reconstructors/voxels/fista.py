@@ -6,10 +6,10 @@ of a subset, times the number of subsets, stands for that of all frames (Kim, Ra
 34 (2015) 167). L bounds the norm of AᵀA.
 
 The last 2/5 of the passes run on smaller voxels, whose means make up most of the result (``stages.py``). The passes before
-them only bring a first volume: they have more subsets, and few times in an exposure.
+them only provide their first volume: they have more subsets, and few times in an exposure.
 
-A run: ``MethodRun``, ``Stages``, ``Loop``, ``Iterations.step``, ``Fista.step``, ``System``, ``RayOperator``, a launch.
-``fista_passes`` already projects before its loop, for the step sizes and the ``PriorWeight``."""
+The calls of a run: ``MethodRun``, ``Stages``, ``Loop``, ``Iterations.step``, ``Fista.step``, ``System``, ``RayOperator``, a
+kernel. ``fista_passes`` already projects before its loop, for the step sizes and the ``PriorWeight``."""
 
 import logging
 import math
@@ -37,17 +37,17 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.algebra import HostSpace
 
 log = logging.getLogger(__name__)
-_VOLUMES = 16  # number of volumes in memory at one time, with the prior ``dct``
-_FRAMES = 3  # number of stacks of all frames in memory at one time
-_HELD = 9  # number of volumes that ``dct`` holds on the device
-_COPIES = 2  # number of further volumes on the device while a prior maps a volume of the host
-# Settings of the coarse passes, those before the passes on smaller voxels, measured in docs/results/settings.md.
+_VOLUMES = 16  # memory of a run in volumes, with the prior ``dct``
+_FRAMES = 3  # memory of a run in arrays of all frames
+_HELD = 9  # volumes that the prior ``dct`` holds on the device
+_COPIES = 2  # if volumes are on the host, the device holds two copies while a prior maps one
+# The passes before those on smaller voxels are coarse. Their settings were measured (docs/results/settings.md).
 _COARSE_PASSES = 0.6  # fraction of all passes that are coarse
-_COARSE_SUBSETS = 1.6  # number of subsets in coarse passes, over the option ``subsets``
-_COARSE_TIMES = 1 / 3  # number of times per exposure in coarse passes over that in others, but two at least
-_FAINTEST = 1e-6  # row sums of AᵀA below this fraction of the largest count as that large in the bound
-# Voxels are divided in grids whose slices (y, x) have at most this many voxels: it is worth its time at 64³, not at 128³.
-# The height does not count, so that every slab is treated alike.
+_COARSE_SUBSETS = 1.6  # a coarse pass has this many times ``subsets`` subsets
+_COARSE_TIMES = 1 / 3  # a coarse pass has this fraction of the times per exposure, but two at least
+_FAINTEST = 1e-6  # row sums of AᵀA below this fraction of the largest count as this fraction, so that the bound stays useful
+# Voxels are divided if a slice (y, x) has at most this many: it is worth its time at 64³, not at 128³.
+# Slices are not counted, so that thick and thin slabs of one scan are reconstructed in the same manner.
 _MOST_DIVIDED = 90**2
 
 
@@ -55,14 +55,14 @@ _MOST_DIVIDED = 90**2
 class FistaOptions(IterativeOptions):
     """Options of FISTA.
 
-    - prior: one of ``PRIORS``, a user's function, or its ``package.module:function``. A function takes (volume (nz, ny,
-      nx) in 1/mm, weight in 1/mm) and returns a volume; docs/methods.md says how to scale a denoiser. The prior piccs is
-      (1 − prior_share) TV(x) + prior_share TV(x − first volume).
-    - prior_weight: threshold relative to two errors of the gradient, added in squares: the noise of the frames, and edges
-      inside large voxels.
+    - prior: one of ``PRIORS``, a user's function, or its ``package.module:function``. A function takes (volume (nz, ny, nx)
+      in 1/mm, weight in 1/mm) and returns a volume; docs/methods.md says how to scale a denoiser.
+    - prior_share: s in the prior piccs, (1 − s) TV(x) + s TV(x − first volume).
+    - prior_weight: threshold relative to the error of the gradient. Two errors are added in squares: noise of the frames,
+      and edges inside large voxels.
     - subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0: 2 for slices of up to 90² voxels where memory
       allows, else 1.
-    - subsets: of the frames, with one step each, 1.6 times as many before smaller voxels; subsets whose steps diverge are
+    - subsets: of the frames, with one step each, 1.6 times as many before smaller voxels. If their steps diverge, they are
       joined two by two. tv_iterations: dual iterations per proximal map of TV.
     - transmission_weights: as in ``fista-tv``."""
 
@@ -70,7 +70,7 @@ class FistaOptions(IterativeOptions):
     """Options that may be a function."""
 
     TRIALS: ClassVar[tuple[int, int]] = (2, 7)
-    """Iterations of the short runs of ``estimate``: three of the five more are coarse, as in a whole run."""
+    """Iterations of the two short runs that ``estimate`` times: three of the five more are coarse, as in a whole run."""
 
     motion: Motion = PerRow()
     iterations: int = 35
@@ -93,7 +93,7 @@ class FistaOptions(IterativeOptions):
 
 
 class Accelerated(Algorithm):
-    """A proximal gradient method with FISTA's momentum, restarted where the momentum has overshot a minimum.
+    """A proximal gradient method with FISTA's momentum, which restarts when it has overshot a minimum.
 
     The restart is the gradient scheme of O'Donoghue and Candès, Found. Comput. Math. 15 (2015) 715."""
 
@@ -105,24 +105,24 @@ class Accelerated(Algorithm):
         self.prior = prior
         self.previous = self.volume
         self.momentum = 1.0  # tₖ
-        self.curvature = (_tight_curvature if has_long_steps else _curvature)(system) or 1.0  # L
+        self.curvature = (_tight_curvature if has_long_steps else _curvature)(system) or 1.0  # L, which bounds ‖AᵀA‖
 
     def start_from(self, volume: Any) -> None:
         self.volume = self.previous = volume
 
     @property
     def next_momentum(self) -> float:
-        """The momentum's number tₖ₊₁ of Eq. 4.2."""
+        """The number tₖ₊₁ of Eq. 4.2, from which the momentum follows."""
         return float((1 + np.sqrt(1 + 4 * self.momentum**2)) / 2)
 
     @property
     def extrapolation(self) -> float:
-        """The factor βₖ of the last change in the next point, Eq. 4.3."""
+        """The factor βₖ of Eq. 4.3, by which the last change is continued."""
         return (self.momentum - 1) / self.next_momentum
 
     def accept(self, point: Any, volume: Any) -> None:
         """Takes ``volume``, the result of the step from ``point``, as the present volume."""
-        # gradient restart: the step points against the last movement, so momentum carried the point past a minimum
+        # restart if the step points against the last movement: momentum then carried the point past a minimum
         is_uphill = self.system.space.turn(point, volume, self.volume) > 0
         self.momentum = 1.0 if is_uphill else self.next_momentum
         self.previous, self.volume = self.volume, volume
@@ -140,13 +140,13 @@ def _row_sums(system: System) -> Any:
 
 
 def _curvature(system: System) -> float:
-    """Returns the largest row sum of AᵀA in mm², a bound of its norm because no entry is negative."""
+    """Returns the largest row sum of AᵀA in mm², which bounds its norm because no entry is negative."""
     return system.space.largest(_row_sums(system))
 
 
 def _tight_curvature(system: System) -> float:
-    """Returns a bound in mm² of the norm of AᵀA, at the price of another pass: the largest (AᵀA x)/x of an x > 0 (Collatz
-    and Wielandt). Row sums as x make the bound a sixth smaller."""
+    """Returns a bound in mm² of the norm of AᵀA, for one more pass: the largest (AᵀA x)/x of an x > 0 (Collatz and
+    Wielandt). With row sums as x the bound is a sixth smaller than the largest row sum."""
     sums, space = _row_sums(system), system.space
     again = system.adjoint(system.apply_weights(system.forward(sums)))
     bound = space.largest(space.multiply(again, space.reciprocal(sums, _FAINTEST)))
@@ -154,7 +154,7 @@ def _tight_curvature(system: System) -> float:
 
 
 class Fista(Accelerated):
-    """FISTA with subsets. The residual of a pass is that of all subsets, each at the extrapolated point of its step."""
+    """FISTA with subsets. A pass's residual combines all subsets, each at the extrapolated point of its step."""
 
     def __init__(
         self, system: System, prior: Prior, weight: PriorWeight, *, subsets: int, nonnegative: bool,
@@ -168,7 +168,7 @@ class Fista(Accelerated):
         weight = self.weight.at(self.volume)
         self.prior.noise_share = self.weight.noise_share(weight)
         residual = self.system.space.sum_squares(self._update(subset, weight) for subset in self.subsets) ** 0.5
-        # larger subsets have another step length: momentum of the former ones would mislead
+        # joined subsets have another step length, for which the momentum so far would be wrong
         if self.subsets.join_if_diverging(residual):
             self.momentum, self.previous = 1.0, self.volume
         return residual
@@ -194,7 +194,7 @@ class Fista(Accelerated):
 
 
 def fista(scan: Scan, options: FistaOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the regularised volume of a scan in 1/mm. ``arguments``: the others of ``MethodRun``; no seed is used."""
+    """Returns the regularised volume of a scan in 1/mm. ``arguments``: as in ``MethodRun``; no seed is used."""
     run = MethodRun(scan, options, rt, **arguments)
     return run.result("fista", Stages(fista_stages(run, lambda: run), run))
 
@@ -203,8 +203,8 @@ METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initia
 
 
 def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
-    """Returns the passes on the scan's own voxels and, where the options or the grid ask for smaller voxels, those on
-    them. A stage that starts takes its run from ``now``, because the motion of the object may be known only then."""
+    """Returns the passes on the scan's own voxels and, if the options or the grid ask for them, those on smaller voxels. A
+    stage takes its run from ``now`` when it starts, because the motion of the object may be known only then."""
     options = run.options
     parts = options.subvoxels or (2 if _gains_from_subvoxels(run, 2) else 1)
     first = round(_COARSE_PASSES * options.iterations) if parts > 1 else 0
@@ -233,8 +233,8 @@ def fista_passes(
     has_few_times: bool = False,
 ) -> Iterations:  # fmt: skip
     """Returns ``passes`` passes from ``volume`` (nz, ny, nx; None: the method's own start), with every voxel divided into
-    ``parts`` along each side. subsets: takes the place of the option, unless 0. has_few_times: takes a third of the times
-    in an exposure."""
+    ``parts`` along each side. subsets: replaces the option, unless 0. has_few_times: takes a third of the times in an
+    exposure."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
     options, rt = replace(whole.options, iterations=passes), whole.rt
@@ -259,8 +259,8 @@ def fista_passes(
 
 
 def _gains_from_subvoxels(run: MethodRun, parts: int) -> bool:
-    """Returns whether the grid is small enough for smaller voxels, and every rank's device has room for the method's
-    volumes of smaller voxels."""
+    """Returns whether the grid is small enough for smaller voxels to be worth it, and every rank's device has room for the
+    method's volumes of them."""
     shape, rt = run.scan.grid.shape, run.rt
     if math.prod(shape[1:]) > _MOST_DIVIDED:
         return False

@@ -1,6 +1,6 @@
 """FISTA-TV: min ½‖p − A x‖² + λ TV(x), x ≥ 0, by accelerated proximal gradients.
 
-Beck and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419, on all frames at once; the momentum is that of ``fista.py``."""
+Beck and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419, on all frames at once, with the momentum of ``fista.py``."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,11 +15,10 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 @dataclass(frozen=True)
 class FistaTvOptions(IterativeOptions):
-    """Options of FISTA-TV. tv_weight: λ as a fraction of the largest value of Aᵀp, so that it holds for any unit and
-    dose.
+    """Options of FISTA-TV. tv_weight: λ as a fraction of the largest value of Aᵀp, so that it holds for any unit and dose.
 
-    tv_iterations: dual iterations per proximal map, each from the last dual. transmission_weights: least squares weighted
-    by transmission t (PWLS), ½ Σ t (p − A x)², with λ a fraction of the largest value of Aᵀ t p."""
+    tv_iterations: dual iterations per proximal map, each from the last dual. transmission_weights: least squares weighted by
+    transmission t (PWLS), ½ Σ t (p − A x)², with λ a fraction of the largest value of Aᵀ t p."""
 
     iterations: int = 100
     tv_weight: float = ranged(0.001, 0, 1e6)
@@ -28,10 +27,10 @@ class FistaTvOptions(IterativeOptions):
 
 
 class FistaTv(Accelerated):
-    """FISTA with TV on all frames at once. The residual of an iteration is that of its new volume.
+    """FISTA with TV on all frames at once. An iteration's residual belongs to its new volume.
 
-    A is linear, so that A y at the extrapolated point y follows from A xₖ and A xₖ₋₁. The intensity model replaces A x by
-    I(x) and Aᵀ by Jᵀ at x. I is not linear along the momentum's line; that error vanishes with the steps."""
+    A is linear, so A y at the extrapolated point y follows from A xₖ and A xₖ₋₁. The intensity model replaces A x by I(x)
+    and Aᵀ by Jᵀ at x. I is not linear between the two points; the error vanishes with the steps."""
 
     ARRAYS = ("volume", "previous", "projected", "projected_previous")
 

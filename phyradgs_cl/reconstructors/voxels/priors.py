@@ -1,8 +1,8 @@
 """The priors of ``fista``, as proximal maps, and their weight, relative to the error of the data term's gradient. A new
 prior is a line of ``PRIORS``: a class, whose map is in ``objective``, or ``OwnPrior`` of a function.
 
-A pixel of a frame differs from that of the best volume by its noise and by the discretisation error of voxels at edges. Both
-reach the gradient through Aᵀ. The constants are fitted (docs/results/settings.md)."""
+A pixel differs from the projection of the best volume by its noise and, at edges, by the discretisation error of voxels.
+Both reach the gradient through Aᵀ. The constants are fitted (docs/results/settings.md)."""
 
 import math
 import traceback
@@ -26,26 +26,26 @@ from phyradgs_cl.reconstructors.result import function_name
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime, Space
 
-# length of the source's path in an exposure over the standard deviation of its places, at five even times from start to end
+# The length of a path is this many standard deviations of five positions at even times from its start to its end.
 _SPREAD = 2.83
 _EDGES = 0.09  # error of a ray's path length at the object's edges, over a voxel's side
-_LEAST = 1e-4  # lower limit of the prior's weight, over the largest value of Aᵀp: it holds for frames without noise
-# The next five are factors on the option ``prior_weight`` in a prior's maps (docs/results/settings.md).
+_LEAST = 1e-4  # the prior's weight is at least this fraction of the largest value of Aᵀp, for frames without noise
+# The next five multiply the option ``prior_weight`` in a prior's maps. They were measured (docs/results/settings.md).
 _TV_ALONE = 1.6  # weight of TV in the prior ``tv``
 _TV_BEFORE_DCT = 0.8  # weight of TV in ``dct``
 _DCT = 1.5  # threshold of the block cosine transforms in ``dct``
 _TV_AT_REST = 0.5  # weight of TV before ridge steps, for scans that stop for each projection
-_DCT_AT_REST = 1.35  # threshold of the block cosine transforms before ridge steps, for scans that stop for each projection
-_RIDGE_NOISE = 17.0  # noise that a ridge step assumes, over the prior's weight, for fly-scans
-_RIDGE_NOISE_AT_REST = 20.0  # noise that a ridge step assumes, over the prior's weight, for scans that stop
-_RIDGE_LENGTH = 0.5  # factor on the regulariser's gradient in a ridge step
-_RIDGE_EVERY = 4  # number of maps of the other prior for each ridge step
-# noise of line integrals for which _TV_AT_REST and _RIDGE_NOISE_AT_REST hold; they follow the sixth root of the scan's noise
+_DCT_AT_REST = 1.35  # threshold of the block cosine transforms before ridge steps, for scans that stop
+_RIDGE_NOISE = 17.0  # noise that a ridge step assumes, relative to the prior's weight, for fly-scans
+_RIDGE_NOISE_AT_REST = 20.0  # noise that a ridge step assumes, relative to the prior's weight, for scans that stop
+_RIDGE_LENGTH = 0.5  # length of a ridge step: factor on the regulariser's gradient
+_RIDGE_EVERY = 4  # a ridge step follows each of this many maps of the other prior
+# The two factors for scans that stop hold for this noise of line integrals, and follow the sixth root of the scan's noise.
 _USUAL_NOISE = 0.01
-_LEAST_NOISE = 0.001  # lower limit of the scan's noise of line integrals that those two factors follow
-_LEAST_NOISE_SHARE = 0.1  # lower limit of noise_share (``Prior``) in ridge steps, for scans without noise
-_SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result, whose rest is the volume of the passes before
-_SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels in the result with the prior ``ridge``
+_LEAST_NOISE = 0.001  # some scans have no noise: it counts as at least this
+_LEAST_NOISE_SHARE = 0.1  # least noise_share (``Prior``) of a ridge step, because some scans have no noise
+_SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result; the larger voxels of the passes before have the rest
+_SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels with the prior ``ridge``, which leaves less noise
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ def _blur_mm(scan: Scan, motion: Motion) -> float:
 
 
 def adjoint_response(system: System) -> tuple[float, float]:
-    """Returns the response of Aᵀ in the middle half of a volume, in mm: the standard deviation for independent unit noise
-    of every ray, and the mean for a unit error of all rays."""
+    """Returns how Aᵀ responds in the middle half of a volume, in mm: the standard deviation for independent unit noise of
+    every ray, and the mean for a unit error of all rays."""
     noise = np.random.default_rng(0).standard_normal(system.measured.shape, np.float32)
     by_noise = system.adjoint(system.masked(system.apply_weights(system.space.array(noise))))
     by_ones = system.column_sums()
@@ -92,8 +92,7 @@ def adjoint_response(system: System) -> tuple[float, float]:
 
 
 class PriorWeight:
-    """The weight of a prior: ``strength`` times the error of the gradient Aᵀ(p − A x), which grows with the density of
-    x."""
+    """The weight of a prior: ``strength`` times the error of the gradient Aᵀ(p − A x), which grows with the density of x."""
 
     def __init__(self, system: System, error: FrameError, strength: float) -> None:
         self.space, self.error, self.strength = system.space, error, strength
@@ -108,8 +107,8 @@ class PriorWeight:
         return max(self.strength * math.hypot(by_noise, by_edges), self.least)
 
     def noise_share(self, weight: float) -> float:
-        """Returns the part of ``weight`` that is due to noise, 0 to 1. Edges make up most of a weight where views or
-        photons are many."""
+        """Returns which part of ``weight`` is due to noise, 0 to 1. With many views or photons, edges make up most of a
+        weight."""
         by_noise = self.strength * self.error.noise * self.noise_mm
         return min(by_noise / weight, 1.0) if weight > 0 else 1.0  # empty frames have no weight
 
@@ -122,11 +121,10 @@ def _density(space: Space[Any], volume: Any) -> float:
 
 @dataclass(frozen=True, eq=False)
 class PriorInputs:
-    """What a prior is made from. image (nz, ny, nx) in 1/mm and share: for piccs, its image and the weight of the change
-    from it.
+    """What a prior needs. tv_iterations: dual iterations per map. is_fly: frames expose over an arc. noise: standard
+    deviation of line integrals behind the object.
 
-    tv_iterations: dual iterations per map. is_fly: the scan's frames expose over an arc. noise: standard deviation of
-    line integrals behind the object."""
+    image (nz, ny, nx) in 1/mm, share: for piccs, its prior image, and the weight of the change from it."""
 
     rt: Runtime
     grid: Grid
@@ -143,8 +141,8 @@ class PriorInputs:
         return TvAndDct(self.tv(tv_share), DctProx(self.rt, self.grid.shape), dct_share)
 
     def dct_then_ridge(self) -> "Prior":
-        """Returns ``dct`` with ridge steps, or ``dct`` alone on small grids. For scans that stop, the ridge step does
-        more of the work, most of it where noise is low. Fly-scans of flat bodies would lose by that."""
+        """Returns ``dct`` with ridge steps, or ``dct`` alone on small grids. For scans that stop, the ridge step does more
+        of the work, most of it where noise is low. Fly-scans of flat bodies would lose by that."""
         if min(self.grid.shape) < RIDGE_EDGE:
             return self.tv_and_dct()
         ridge = RidgeStep(self.rt, self.grid.shape, learned_ridge())
@@ -158,24 +156,24 @@ class PriorInputs:
 class Prior:
     """Maps x to argmin over x' of ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or to an approximation of it.
 
-    A subclass that starts from its last result keeps that in ``state``. This class is the prior ``none``: x ≥ 0 alone."""
+    A subclass that starts from its last result keeps that in ``state``. This class is the prior ``none``: only x ≥ 0."""
 
     VOLUMES: ClassVar[int] = 0
-    """Number of volumes that the prior holds in memory beyond those of ``dct``."""
+    """How many more volumes than ``dct`` the prior holds in memory."""
 
     noise_share = 1.0
-    """Fraction, 0 to 1, of the present pass's weight that stands for noise; the rest stands for errors at voxels' edges."""
+    """Fraction, 0 to 1, of this pass's weight that is due to noise; the rest is due to the discretisation of edges."""
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         """Maps a volume (nz, ny, nx) of ``space``; ``weight`` in 1/mm."""
         return space.add(volume, volume, 0.0, nonnegative=nonnegative)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the arrays that the next map starts from."""
+        """Returns the arrays from which the next map starts."""
         return {}
 
     def restore(self, state: State) -> None:
-        """Continues from ``state``."""
+        """Continues from what ``state`` returned."""
 
 
 class TvPrior(Prior):
@@ -198,7 +196,7 @@ class TvPrior(Prior):
 class TvAndDct(Prior):
     """The prior dct: total variation, then a shrinkage of block cosine transforms, which works best on a smooth volume.
 
-    share: the threshold of the shrinkage over the prior's weight."""
+    share: threshold of the shrinkage, relative to the prior's weight."""
 
     def __init__(self, tv: TvPrior, shrink: DctProx, share: float) -> None:
         self.tv, self.shrink, self.share, self.turn = tv, shrink, share, 0
@@ -206,7 +204,7 @@ class TvAndDct(Prior):
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         smooth = self.tv(space, volume, weight, nonnegative=nonnegative)
         turn, out = self.turn, space.place(self.shrink.shape)
-        # the next map takes the next quarter of the shifts: four maps have all of them
+        # each map takes the next quarter of the blocks' shifts: four maps have all
         self.turn = (turn + 1) % len(TURNS)
         return self.shrink(smooth, self.share * weight, turn, nonnegative=nonnegative, out=out)
 
@@ -219,24 +217,22 @@ class TvAndDct(Prior):
 
 
 class ThenRidge(Prior):
-    """The prior ridge: the map ``before`` and, after every fourth of its maps, a step down the learned ridge
-    regulariser."""
+    """The prior ridge: the map ``before`` and, after each fourth of its maps, a step down the learned ridge regulariser."""
 
     VOLUMES = RidgeStep.VOLUMES
 
     def __init__(self, before: Prior, ridge: RidgeStep, noise_factor: float) -> None:
-        """Joins both maps. noise_factor: the noise that the ridge step assumes, over the part of the weight that is due
-        to noise."""
+        """Joins both maps. noise_factor: the noise that the ridge step assumes, over the part of the weight that is due to
+        noise."""
         self.before, self.ridge, self.noise_factor = before, ridge, noise_factor
-        self.maps = 0  # maps since the last step
+        self.maps = 0  # maps since the last ridge step
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         volume = self.before(space, volume, weight, nonnegative=nonnegative)
         self.maps = (self.maps + 1) % _RIDGE_EVERY
         if self.maps:
             return volume
-        # only a share of the weight stands for noise, the rest for edges: steps that took it all for noise lost 0.2 dB with
-        # 180 views
+        # only a part of the weight is due to noise, the rest to edges: steps that took all for noise lost 0.2 dB (180 views)
         sigma = self.noise_factor * weight * max(self.noise_share, _LEAST_NOISE_SHARE)
         out = space.place(self.ridge.shape)
         return self.ridge(volume, sigma=sigma, step=_RIDGE_LENGTH, nonnegative=nonnegative, out=out)
@@ -250,7 +246,7 @@ class ThenRidge(Prior):
 
 
 class Piccs(Prior):
-    """The prior piccs: (1 − share) TV(x) + share TV(x − image), as the map of the first term and then that of the second.
+    """The prior piccs: (1 − share) TV(x) + share TV(x − image), as the map of the first term and then of the second.
 
     Prior image constrained compressed sensing: Chen, Tang and Leng, Med. Phys. 35 (2008) 660."""
 
@@ -266,7 +262,7 @@ class Piccs(Prior):
             self._image_in_space = space.array(np.ascontiguousarray(self.image, np.float32))
         volume = self.plain(space, volume, (1 - self.share) * weight, nonnegative=nonnegative)
         change = space.add(volume, self._image_in_space, -1.0)
-        # a change may be negative; the sum below may not
+        # only the sum below must be nonnegative, not the change
         change = self.change(space, change, self.share * weight, nonnegative=False)
         return space.add(change, self._image_in_space, 1.0, nonnegative=nonnegative)
 
@@ -279,7 +275,7 @@ class Piccs(Prior):
 
 
 Denoiser = Callable[[np.ndarray, float], np.ndarray]
-"""(volume (nz, ny, nx) float32 in 1/mm, noise in 1/mm) → volume: a user's own prior (plug-and-play)."""
+"""A user's own prior (plug-and-play): from a volume (nz, ny, nx) float32 and its noise, both in 1/mm, to a volume."""
 
 
 class OwnPrior(Prior):
@@ -311,8 +307,7 @@ PRIORS: dict[str, Callable[[PriorInputs], Prior]] = {
 
 
 def prior_of(prior: str | Denoiser, inputs: PriorInputs) -> Prior:
-    """Returns a prior by its name in ``PRIORS``, or from a user's function, given as such or as
-    ``package.module:function``.
+    """Returns a prior by its name in ``PRIORS``, or from a user's function, given as such or as ``package.module:function``.
 
     Raises InputError for what is neither a name nor a function, and for piccs without an image."""
     if isinstance(prior, str) and prior in PRIORS:
@@ -331,8 +326,8 @@ def volumes_of(prior: str | Denoiser) -> int:
 
 
 def subvoxel_share(prior: str | Denoiser, shape: tuple[int, int, int]) -> float:
-    """Returns the weight of the smaller voxels in a result of ``shape`` (nz, ny, nx), 0 to 1. Larger voxels average
-    noise, of which ridge leaves less."""
+    """Returns the weight of the smaller voxels in a result of ``shape`` (nz, ny, nx), 0 to 1. It is larger with ridge: large
+    voxels average noise, of which ridge leaves less."""
     return _SUBVOXELS_WITH_RIDGE if prior == "ridge" and min(shape) >= RIDGE_EDGE else _SUBVOXELS
 
 

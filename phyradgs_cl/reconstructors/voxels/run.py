@@ -1,6 +1,6 @@
 """Runs an iterative voxel method on a scan: its options, its inputs, its convergence, the facts of its result.
 
-A method is a subclass of ``Algorithm``. ``voxel_method`` makes it an entry of the registry, and ``MethodRun`` runs it."""
+A method is a subclass of ``Algorithm``. ``voxel_method`` makes an entry of ``METHODS`` of it, and ``MethodRun`` runs it."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -21,8 +21,8 @@ from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ig
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-MOST_ITERATIONS = 1_000_000  # upper limit of the option ``iterations``
-# number of stacks of all frames that a system holds: measurement, mask, transmission, and those of computing a residual
+MOST_ITERATIONS = 1_000_000
+# Arrays of all frames that a system holds: measurement, mask, transmission, and what computing a residual takes.
 _SYSTEM_FRAMES = 6
 
 
@@ -30,16 +30,16 @@ _SYSTEM_FRAMES = 6
 class IterativeOptions(MotionOptions):
     """Options of every iterative method.
 
-    motion: static, micro-views, or per-row (every line at its own times). iterations: passes over all frames.
-    nonnegative: clip the volume at 0 after every update. tolerance: stop when an iteration changes the volume by less
-    than this fraction of its norm; 0 runs all iterations. detector_model: what the detector averages over a line's times:
-    line integrals (log), intensity, or what the scan states (scan)."""
+    motion: static, micro-views, or per-row (every line at its own times). iterations: passes over all frames. nonnegative:
+    clip the volume at 0 after every update. tolerance: stop when an iteration changes the volume by less than this fraction
+    of its norm; 0 runs all iterations. detector_model: what the detector averages over a line's times: line integrals (log),
+    intensity, or what the scan states (scan)."""
 
     transmission_weights: ClassVar[bool] = False
-    """Weights pixels by their transmission. Some methods have an option of this name."""
+    """Whether pixels are weighted by their transmission. Some methods have an option of this name."""
 
     noise_stop: ClassVar[float] = 0.0
-    """Ends the run where the residual is at most this many times the noise; 0: never. Some methods have such an option."""
+    """The run ends if the residual is at most this many times the noise; 0: never. Some methods have it as an option."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)
 
@@ -60,7 +60,7 @@ class Algorithm:
     NUMBERS: ClassVar[tuple[str, ...]] = ()
 
     finished: str | None = None
-    """Why the method stops before its last iteration; None while it goes on."""
+    """Why the method stops before its last iteration; None unless it does."""
 
     def __init__(self, system: System) -> None:
         self.system = system
@@ -71,7 +71,7 @@ class Algorithm:
         self.volume = volume
 
     def step(self) -> float:
-        """Does one iteration, which replaces ``volume``. Returns a norm of p − A x; each subclass says of which x."""
+        """Does one iteration, which replaces ``volume``. Returns a norm of p − A x; each subclass says for which x."""
         raise NotImplementedError
 
     def state(self) -> dict[str, np.ndarray]:
@@ -80,17 +80,17 @@ class Algorithm:
         return {**arrays, **{name: np.array(getattr(self, name)) for name in self.NUMBERS}}
 
     def restore(self, state: State) -> None:
-        """Continues from ``state``; the derivative of the intensity model is again that at ``volume``."""
+        """Continues from ``state``, with the derivative of the intensity model taken at ``volume`` again."""
         for name in self.ARRAYS:
             setattr(self, name, self.system.space.array(state[name]))
         for name in self.NUMBERS:
             setattr(self, name, state[name].item())
-        if self.system.intensity is not None:  # A is the same at every volume
+        if self.system.intensity is not None:  # J depends on the volume, A does not
             self.system.expected(self.volume)
 
 
 class WithFacts(Stepwise, Protocol):
-    """A ``Stepwise`` that has facts of its own for the result."""
+    """A ``Stepwise`` that adds facts to the result."""
 
     def facts(self, is_complete: bool) -> Mapping[str, object]:
         """Returns the facts after the last step. is_complete: the run came to its end, without an interruption."""
@@ -99,8 +99,8 @@ class WithFacts(Stepwise, Protocol):
 @dataclass(frozen=True, eq=False)
 class MethodRun:
     """A method's run on a scan. resume: the state to continue from. initial: the first volume (nz, ny, nx) in 1/mm; None:
-    the method's own start. deformation: how the object moves. state_times_s (K,): times of its states if it changes.
-    Seconds count from ``started``."""
+    the method's own start. deformation: how the object moves. state_times_s (K,): times of its states if it changes. Seconds
+    count from ``started``."""
 
     scan: Scan
     options: Any
@@ -114,8 +114,8 @@ class MethodRun:
     started: float = field(default_factory=time.perf_counter)
 
     def system(self, *, volumes: int, frames: int) -> System:
-        """Returns the scan's system, with its arrays on the device where all fit: ``volumes`` volumes and ``frames``
-        stacks of all frames, which the algorithm holds at one time, and the tables."""
+        """Returns the scan's system. Its arrays are on the device if all fit: ``volumes`` volumes and ``frames`` arrays of
+        all frames, which the algorithm holds at one time, and the tables."""
         system = System.of_scan(
             self.rt, self.scan, self.options.motion, self.options.detector_model, deformation=self.deformation,
             state_times_s=self.state_times_s, is_dense=self.initial is not None,
@@ -127,8 +127,8 @@ class MethodRun:
     def result(self, name: str, method: WithFacts) -> Reconstruction:
         """Runs a method in a loop. Returns its volume, convergence record and facts.
 
-        The record has a line per iteration: the residual ‖p − A x‖/‖p‖, the change ‖x − x'‖/‖x‖, and the seconds since
-        the start."""
+        The record has a line per iteration: the residual ‖p − A x‖/‖p‖, the change ‖x − x'‖/‖x‖, and the seconds since the
+        start."""
         loop = Loop(method, self.rt.ranks, self.report, self.started)
         loop.run(self.resume)
         facts: dict[str, object] = {
@@ -144,8 +144,8 @@ def voxel_method(
     name: str, default: IterativeOptions, make: Callable[[System, Any, MethodRun], Algorithm], *,
     volumes: int | Callable[[Scan, Any], int], frames: int,
 ) -> Method:
-    """Returns the algorithm that ``make`` builds as a method. volumes, frames: as in ``MethodRun.system``; volumes may be
-    a function of scan and options."""
+    """Returns the algorithm that ``make`` builds as a method. volumes, frames: as in ``MethodRun.system``; volumes may be a
+    function of scan and options."""
 
     def reconstruct(scan: Scan, options: Any, rt: Runtime, **arguments: Any) -> Reconstruction:
         run = MethodRun(scan, options, rt, **arguments)
@@ -156,7 +156,7 @@ def voxel_method(
 
 
 class Iterations:
-    """An algorithm with its residual and change, as the ``Stepwise`` that a ``Loop`` runs."""
+    """An algorithm with its residual and change; a ``Loop`` runs it as a ``Stepwise``."""
 
     quantity, remedy = "residual", "check the scan for extreme values, or lower the relaxation"
 
@@ -198,6 +198,6 @@ class Iterations:
         self.algorithm.restore(state)
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
-        """Returns the volume (nz, ny, nx) in 1/mm, for an object that changes the mean of its states, and its grid."""
+        """Returns the volume (nz, ny, nx) in 1/mm, which is the mean of the states if there are several, and its grid."""
         values = self.algorithm.system.space.numpy(self.algorithm.volume)
         return values if values.ndim == 3 else values.mean(0), self.grid

@@ -17,17 +17,17 @@ from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, voxel_method
 from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights, spread_order
 
-_WEIGHT_CACHE_BYTES = 1 << 29  # most bytes of the column weights of subsets that are kept
+_WEIGHT_CACHE_BYTES = 1 << 29  # column weights of subsets are kept up to this size; others are computed in every pass
 
 
 @dataclass(frozen=True)
 class SartOptions(IterativeOptions):
-    """Options of SART. relaxation: λ, the applied fraction of each correction; relaxation_reduction: its factor per
+    """Options of SART. relaxation: λ, which fraction of each correction is applied. relaxation_reduction: factor on it per
     iteration.
 
-    frames_per_subset: frames that are corrected for together, 1 for SART; a pass takes neighbours in time far apart.
-    noise_stop: the run ends when the residual falls to this many times the estimated noise of the measurement
-    (discrepancy principle, Morozov 1966); further iterations fit the noise. 0 runs all iterations."""
+    frames_per_subset: frames that are corrected for together, 1 for SART; they lie far apart in time. noise_stop: the run
+    ends when the residual falls to this many times the estimated noise of the measurement (discrepancy principle, Morozov
+    1966); further iterations would fit the noise. 0 runs all iterations."""
 
     relaxation: float = checks.ranged(1.0, 1e-6, 2)
     relaxation_reduction: float = checks.ranged(0.999, 1e-6, 1)
@@ -41,7 +41,7 @@ OS_SART = SartOptions(frames_per_subset=10)
 class Sart(Algorithm):
     """SART, x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i of the frames, with W = 1/(Aᵢ 1) and V = 1/(Aᵢᵀ 1).
 
-    The intensity model replaces Aᵢᵀ by Jᵢᵀ and Aᵢ x by Iᵢ(x). The residual of a pass takes every subset just before its
+    The intensity model replaces Aᵢᵀ by Jᵢᵀ and Aᵢ x by Iᵢ(x). A pass's residual combines all subsets, each just before its
     correction."""
 
     NUMBERS = ("relaxation",)
@@ -62,7 +62,7 @@ class Sart(Algorithm):
         return float(np.sqrt(squares))
 
     def _corrections(self) -> Iterator[Any]:
-        """Corrects the volume for all subsets. Yields the residual of each subset just before its correction."""
+        """Corrects the volume for all subsets. Yields the residual of each just before its correction."""
         space, clip = self.system.space, self.options.nonnegative
         for index, subset in enumerate(self.subsets):
             columns = self._columns(index)
@@ -72,13 +72,13 @@ class Sart(Algorithm):
             self.volume = space.add_product(self.volume, columns, update, self.relaxation, nonnegative=clip)
 
     def _columns(self, index: int) -> Any:
-        """Returns the column weights (nz, ny, nx) of a subset; computes them anew where the cache has no room for them."""
+        """Returns the column weights (nz, ny, nx) of a subset; computes them again if the cache has no room for them."""
         is_cached = index < len(self._column_weights)
         return self._column_weights[index] if is_cached else column_weights(self.subsets[index])
 
 
 def _cached_columns(volume_shape: tuple[int, ...], subsets: int) -> int:
-    """Returns how many of ``subsets`` subsets keep their column weights, each of a volume's size."""
+    """Returns how many of ``subsets`` subsets keep their column weights, each as large as a volume."""
     return min(subsets, max(_WEIGHT_CACHE_BYTES // (4 * math.prod(volume_shape)), 1))
 
 
@@ -103,10 +103,10 @@ class SirtOptions(IterativeOptions):
 
 
 class Sirt(Algorithm):
-    """SIRT, x ← x + λ C Aᵀ R (p − A x), with R = 1/(A 1) and C = 1/(Aᵀ 1). The intensity model replaces Aᵀ by Jᵀ and A x
-    by I(x).
+    """SIRT, x ← x + λ C Aᵀ R (p − A x), with R = 1/(A 1) and C = 1/(Aᵀ 1). The intensity model replaces Aᵀ by Jᵀ and A x by
+    I(x).
 
-    The residual of an iteration is that before its correction, of which √R ‖·‖ falls in every step."""
+    An iteration's residual is the one before its correction. Weighted by √R, its norm falls in every step."""
 
     def __init__(self, system: System, options: SirtOptions) -> None:
         super().__init__(system)

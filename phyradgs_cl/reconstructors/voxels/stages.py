@@ -1,7 +1,7 @@
 """Runs of several stages: each stage starts from the volume of the stage before it.
 
-``fista`` reconstructs voxels, then subvoxels: coarse voxels cannot represent edges. The last passes therefore run on voxels
-half as large; their block means make up most of the result."""
+``fista`` reconstructs voxels, then smaller voxels, because large ones cannot represent edges: the last passes run on voxels
+half as large, whose block means make up most of the result."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -15,15 +15,16 @@ from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.voxels.run import MethodRun, WithFacts
 
-_STAGE, _VOLUME = "stage", "volume_before"  # entries of a state: the present stage, and the volume that it started from
+_STAGE, _VOLUME = "stage", "volume_before"  # entries of a state: the stage's number, and the volume from which it started
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a run. make: returns the stage's method, which starts from a volume (nz, ny, nx) or, from None, anew.
+    """One stage of a run. make: returns the stage's method, which starts from a volume (nz, ny, nx); None: from its own
+    start.
 
-    merge: combines the stage's volume and that of the stages before it to the result (nz, ny, nx) of the whole run. end:
-    is called with the finished method."""
+    merge: combines the stage's volume and the one before it to the result (nz, ny, nx) of the run. end: takes the finished
+    method."""
 
     name: str
     iterations: int
@@ -33,7 +34,7 @@ class Stage:
 
 
 class Stages:
-    """Stages, one after the other, as one ``Stepwise`` that a ``Loop`` runs, reports, stops and resumes.
+    """Stages, one after the other, which a ``Loop`` runs, reports, stops and resumes as one ``Stepwise``.
 
     The first stage starts from the run's first volume, if any."""
 
@@ -62,7 +63,6 @@ class Stages:
 
     @property
     def is_last(self) -> bool:
-        """Whether no stage follows the present one."""
         return self._index == len(self.stages) - 1
 
     @property
@@ -75,7 +75,7 @@ class Stages:
         self.method.step()
 
     def advance(self) -> None:
-        """Ends the present stage, and frees its memory before the next one takes its own."""
+        """Ends the present stage. Frees its memory before the next stage takes its own: both together may not fit."""
         self.before, _ = self.present_volume()
         self.stage.end(self.method)
         self._note()
@@ -90,8 +90,8 @@ class Stages:
         self._facts.update(self.method.facts(True))
 
     def facts(self, is_complete: bool) -> Mapping[str, object]:
-        """Returns the facts of the last stage, with each stage's iterations and its seconds in this process. In a
-        complete run, ends remaining stages, which have no iterations."""
+        """Returns the facts of the last stage, with each stage's iterations and its seconds in this process. In a complete
+        run, stages without iterations end here."""
         while is_complete and not self.is_last:
             self.advance()
         self._note()

@@ -1,7 +1,7 @@
 """The linear system A x = p of a scan under a motion model, for the iterative methods.
 
-Its arrays stay on the device where everything fits there (``resident``), else on the host. A method computes with either
-through the system's ``space``. Over several ranks each projects its own frames; frames are gathered, volumes summed."""
+Its arrays are on the device if all fit there (``resident``), else on the host. A method computes with either through the
+system's ``space``. Each of several ranks projects its own frames; frames are gathered, volumes summed."""
 
 import logging
 import math
@@ -24,21 +24,21 @@ from phyradgs_cl.runtime import DeviceSpace, HostSpace, MemoryShortage, Runtime,
 
 log = logging.getLogger(__name__)
 
-_SHORTEST_PATH = 0.1  # lower limit of a ray's path length through the volume, as a fraction of the longest path
-_FAINTEST = 1e-6  # lower limit of the sum of path lengths over a voxel's rays, as a fraction of the largest sum
-_GROWTH = 1.2  # steps of subsets diverge where a pass leaves more than this many times the least residual so far
+_SHORTEST_PATH = 0.1  # shorter paths of rays count as this fraction of the longest: a division by less amplifies noise
+_FAINTEST = 1e-6  # voxels that rays hardly meet count as if they had this fraction of the largest sum of path lengths
+_GROWTH = 1.2  # steps of subsets diverge if a pass leaves this many times the least residual so far
 S = TypeVar("S", bound="SharedOperator")
 
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """The operator A and the measurement p (F, rows, columns) float32 of a scan. Volumes (nz, ny, nx) and frames are
-    arrays of ``space``.
+    """The operator A and the measurement p (F, rows, columns) float32 of a scan. Volumes (nz, ny, nx) and frames are arrays
+    of ``space``.
 
-    valid: (F, rows, columns) or (rows, columns), 1 or 0; None: all pixels are valid. Pixels that are not valid are 0 in
-    ``measured`` and in every residual, as if A had no rows for them.
+    valid: (F, rows, columns) or (rows, columns), 1 or 0; None: all pixels are valid. Invalid pixels are 0 in ``measured``
+    and in every residual, as if A had no rows for them.
 
-    intensity: set where the detector averages intensity. The measurement is then compared with I(x) in place of A x, and
+    intensity: set if the detector averages intensity. The measurement is then compared with I(x) in place of A x, and
     residuals go back through Jᵀ in place of Aᵀ; J is the derivative of I at the volume of the last comparison.
 
     transmission: (F, rows, columns) weights of pixels by their transmission, mean 1; None: equal weights."""
@@ -55,8 +55,8 @@ class System:
         cls, rt: Runtime, scan: Scan, motion: Motion, detector_model: str = "log", *, fewest_lines: int | None = None,
         deformation: Deformation | None = None, state_times_s: np.ndarray | None = None, is_dense: bool = False,
     ) -> "System":  # fmt: skip
-        """Returns the system of a scan under the motion model ``motion``. deformation: how the object moves.
-        state_times_s (K,): times in s of an object that changes; volumes are then stacks (K, nz, ny, nx).
+        """Returns the system of a scan under the motion model ``motion``. deformation: how the object moves. state_times_s
+        (K,): times in s of an object that changes; volumes are then stacks (K, nz, ny, nx).
 
         detector_model: log, intensity, or scan for the scan's own. fewest_lines: as in ``RayOperator``, for an object at
         rest. is_dense: as in ``subrays_of``."""
@@ -69,7 +69,7 @@ class System:
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
         intensity: IntensityOperator | SharedIntensity | None = None
-        if model == "intensity" and any(table.averages for table in tables):  # of one value both models are the same
+        if model == "intensity" and any(table.averages for table in tables):  # for single times both models agree
             alone = IntensityOperator(rt, scan.grid, shape, tables, projector, subrays)
             intensity = SharedIntensity(rt.ranks, alone) if rt.ranks.size > 1 else alone
         if rt.ranks.size > 1:
@@ -81,15 +81,16 @@ class System:
 
     def resident(self, rt: Runtime, volumes: int, frames: int) -> "System":
         """Returns the system with its arrays on the device, if that has room for the operators, ``volumes`` volumes, and
-        ``frames`` stacks of all frames.
+        ``frames`` arrays of all frames. Otherwise they stay on the host.
 
-        Otherwise the system stays on the host, as it does in bricks and on several ranks, which sum there."""
+        They also stay there with several ranks, which sum on the host, and for a volume that is projected part after
+        part."""
         kinds = RayOperator, WarpedOperator, IntensityOperator
         operators = [o for o in (self.operator, self.intensity) if isinstance(o, kinds)]
         if len(operators) < 1 + (self.intensity is not None):
             return self
         for operator in operators:
-            # operators of moving objects, and of intensities, hold volumes and frames of their own
+            # operators of moving objects, and of intensities, need further volumes and frames
             if not isinstance(operator, RayOperator):
                 more_volumes, more_frames = operator.holds
                 volumes, frames = volumes + more_volumes, frames + more_frames
@@ -107,8 +108,8 @@ class System:
         return replace(self, measured=space.array(self.measured), valid=valid, transmission=transmission, space=space)
 
     def leave_room(self, rt: Runtime, nbytes: int) -> bool:
-        """Frees the buffers of the ray operators where they leave less than ``nbytes`` of the memory limit. Returns
-        whether it did. The operators plan their buffers again at their next use."""
+        """Frees the buffers of the ray operators if they leave less than ``nbytes`` of the memory limit. Returns whether it
+        did. The operators plan their buffers again at their next use."""
         operators = [o for o in (self.operator, self.intensity) if isinstance(o, RayOperator | IntensityOperator)]
         planned_bytes = sum(operator.memory.planned_bytes for operator in operators)
         if rt.ledger.limit_bytes - max(planned_bytes, rt.ledger.held_bytes) >= nbytes:
@@ -126,19 +127,19 @@ class System:
         return self.operator.volume_shape
 
     def masked(self, frames: Any) -> Any:
-        """Returns frames with 0 at pixels that are not valid."""
+        """Returns frames with 0 at invalid pixels."""
         return frames if self.valid is None else self.space.multiply(frames, self.valid)
 
     def forward(self, volume: Any) -> Any:
-        """Returns A x (F, rows, columns), 0 at pixels that are not valid."""
+        """Returns A x (F, rows, columns), 0 at invalid pixels."""
         return self.masked(self.operator.forward(volume, self.space.place(self.operator.frames_shape)))
 
     def adjoint(self, frames: Any) -> Any:
-        """Returns Aᵀ y (nz, ny, nx) of frames y that are 0 at pixels that are not valid."""
+        """Returns Aᵀ y (nz, ny, nx) of frames y that are 0 at invalid pixels."""
         return self.operator.adjoint(frames, self.space.place(self.volume_shape))
 
     def expected(self, volume: Any) -> Any:
-        """Returns the expected measurement of x: A x or, in the intensity model, I(x); 0 at pixels that are not valid."""
+        """Returns the expected measurement of x: A x or, in the intensity model, I(x); 0 at invalid pixels."""
         return self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
 
     @property
@@ -146,19 +147,19 @@ class System:
         return self.operator.forward if self.intensity is None else self.intensity.expected
 
     def derivative(self, change: Any) -> Any:
-        """Returns A d or, in the intensity model, J d: the change of ``expected`` for a change d of the last volume
+        """Returns A d or, in the intensity model, J d: how ``expected`` changes with a change d of the volume last
         compared."""
         operator = self.operator if self.intensity is None else self.intensity
         return self.masked(operator.forward(change, self.space.place(self.operator.frames_shape)))
 
     def back(self, frames: Any) -> Any:
-        """Returns the transpose of ``derivative``: Aᵀ y, or Jᵀ y, of frames that are 0 at pixels that are not valid."""
+        """Returns the transpose of ``derivative``: Aᵀ y, or Jᵀ y, of frames that are 0 at invalid pixels."""
         operator = self.operator if self.intensity is None else self.intensity
         return operator.adjoint(frames, self.space.place(self.volume_shape))
 
     def residual(self, volume: Any) -> Any:
-        """Returns p − A x or, in the intensity model, p − I(x), dimensionless; 0 at pixels that are not valid."""
-        # the frames before their mask have no name: a name would keep their memory
+        """Returns p − A x or, in the intensity model, p − I(x), dimensionless; 0 at invalid pixels."""
+        # frames before the mask get no name, which would keep their memory
         expected = self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
         return self.space.add(self.measured, expected, -1.0)
 
@@ -178,7 +179,7 @@ class System:
         return self.adjoint(self.masked(self.apply_weights(self.space.full(self.measured.shape, 1.0))))
 
     def apply_weights(self, frames: Any) -> Any:
-        """Returns frames times their transmission weights; unchanged where there are none."""
+        """Returns frames times their transmission weights; the frames themselves if there are none."""
         return frames if self.transmission is None else self.space.multiply(frames, self.transmission)
 
     def transmission_weighted(self) -> "System":
@@ -201,8 +202,8 @@ def row_weights(system: System) -> Any:
     """Returns 1/(A 1) of every ray in 1/mm.
 
     A ray shorter than a tenth of the longest counts as that tenth. A ray that only grazes an edge of the volume would
-    otherwise put its noise on one or two voxels, and corners of the volume would become bright. TIGRE measures the paths
-    in a box that is a tenth larger, for the same reason."""
+    otherwise put its noise on one or two voxels, and corners of the volume would become bright. TIGRE measures paths in a
+    box that is a tenth larger, for the same reason."""
     return system.space.reciprocal(system.row_sums(), _SHORTEST_PATH)
 
 
@@ -218,7 +219,7 @@ def spread_order(count: int) -> list[int]:
 
 
 class OrderedSubsets:
-    """A system divided into ``count`` subsets: every count-th frame each, in an order that spreads them over the turn. H. M.
+    """A system divided into ``count`` subsets of every count-th frame, in an order that spreads them over the turn. H. M.
     Hudson and R. S. Larkin, IEEE Trans. Med. Imaging 13 (1994) 601."""
 
     def __init__(self, system: System, count: int) -> None:
@@ -232,13 +233,11 @@ class OrderedSubsets:
         return len(self._systems)
 
     def split(self, count: int) -> None:
-        """Divides the frames into ``count`` subsets."""
         frames = self.system.frames
         self._systems = [self.system.subset(range(first, frames, count)) for first in spread_order(count)]
 
     def join_if_diverging(self, residual: float) -> bool:
-        """Joins subsets two by two where the ``residual`` of a pass has grown so much that their steps diverge. Returns
-        whether it did."""
+        """Joins subsets two by two if the ``residual`` of a pass shows that their steps diverge. Returns whether it did."""
         diverges = residual > _GROWTH * self.least_residual and len(self) > 1
         if diverges:
             self.split(ceil_div(len(self), 2))
@@ -271,7 +270,7 @@ class SharedOperator:
 
     def subset(self: S, frames: Sequence[int]) -> S:
         """Returns the operator of the frames with the numbers ``frames``, in the order given, divided among the ranks
-        anew."""
+        again."""
         return type(self)(self.ranks, self.whole.subset(frames))
 
     def _gathered(self, part: np.ndarray | None) -> np.ndarray:
