@@ -120,7 +120,8 @@ def usage_text(error: Any, arguments: Sequence[str]) -> str:
     it returns what replaces them."""
     flag, param = str(getattr(error, "option_name", "")), getattr(error, "param", None)
     value = _value_of(param, arguments)
-    words = [(flag, ""), (flag.lstrip("-").replace("-", "_"), flag), *((f"{name} {value}", "") for name in getattr(param, "opts", ()))]
+    words = [(flag, ""), (flag.lstrip("-").replace("-", "_"), flag)]
+    words += [(f"{name} {value}", "") for name in getattr(param, "opts", ())]
     for left in filter(None, (removal(*word) for word in words)):
         return str(left)
     text = str(error.format_message()).replace("Value error, ", "")

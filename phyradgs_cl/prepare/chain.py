@@ -107,7 +107,7 @@ def one_by_one(
         earlier: Any = scan.provenance.get(PREPARED_KEY) or []
         if name in _ONCE and any(entry["step"] == name for entry in earlier):
             remedy = "leave it out, or start from the scan before that step"
-            raise InputError("--steps", f"{name}, which this scan has had", "other steps: this one is right only once", remedy)
+            raise InputError("--steps", f"{name}, which this scan has had", "a step to be done only once", remedy)
         scan, numbers = STEPS[name](scan, step_options, make_model)
         entry = {"step": name, **numbers, "options": asdict(step_options)}
         scan = replace(scan, provenance={**scan.provenance, PREPARED_KEY: [*earlier, entry]})
