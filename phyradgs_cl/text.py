@@ -5,8 +5,8 @@ import difflib
 import logging
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import fields
 from functools import partial
 from typing import Any
@@ -80,24 +80,39 @@ def clock(seconds: float) -> str:
     return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"
 
 
+def _is_warning(record: logging.LogRecord) -> bool:
+    return record.levelno >= logging.WARNING and record.name.startswith(f"{__package__}.")
+
+
 def _is_new(said: set[str], record: logging.LogRecord) -> bool:
     """Returns False for a warning of this package in words that are in ``said``, which it adds to."""
-    if record.levelno < logging.WARNING or not record.name.startswith(f"{__package__}."):
+    if not _is_warning(record):
         return True
     before = len(said)
     said.add(record.getMessage())
     return len(said) > before
 
 
+def each_warning_once() -> Any:
+    """Drops warnings of this package that the body repeats word for word: stages of a run meet the same scan. It is a
+    context and a decorator."""
+    return _filtered(lambda: partial(_is_new, set()))
+
+
+def without_warnings() -> AbstractContextManager[None]:
+    """Drops the warnings of this package in the body."""
+    return _filtered(lambda: lambda record: not _is_warning(record))
+
+
 @contextmanager
-def each_warning_once() -> Iterator[None]:
-    """Drops warnings of this package that the body repeats word for word: stages of a run meet the same scan."""
+def _filtered(make_filter: Callable[[], Callable[[logging.LogRecord], bool]]) -> Iterator[None]:
+    """Adds a filter to every handler of log records, which drops those for which it returns False."""
     handlers = [*logging.getLogger(__package__).handlers, *logging.getLogger().handlers, logging.lastResort]
-    filters = [(handler, partial(_is_new, set())) for handler in handlers if handler is not None]
-    for handler, is_new in filters:
-        handler.addFilter(is_new)
+    filters = [(handler, make_filter()) for handler in handlers if handler is not None]
+    for handler, one in filters:
+        handler.addFilter(one)
     try:
         yield
     finally:
-        for handler, is_new in filters:
-            handler.removeFilter(is_new)
+        for handler, one in filters:
+            handler.removeFilter(one)

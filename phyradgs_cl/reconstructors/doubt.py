@@ -1,13 +1,19 @@
-"""Error bars of voxels: the run is repeated on two scans that are synthesised from its own volume and its own residual.
+"""Error bars of voxels: the method runs on two more scans, which are made of the first one and its volume.
 
-The differences of their volumes from the first hold the noise of the scan, other causes of the residual, and what the method
-does to such an object: blur, prior, missing views. That is a wild bootstrap (Wu, Ann. Stat. 14 (1986) 1261): each frame's
-residual keeps its size and shape, but a random sign. The second scan has the opposite signs (antithetic variables).
-Numbers that make it a σ come from procedural volumes (benchmarks/doubt.py), and from held-out pixels where there are any."""
+- Iterative methods get scans that are synthesised from the volume and the residual. The differences of their volumes from
+  the first hold the noise, other causes of the residual, and what the method does to such an object: blur, prior, missing
+  views. That is a wild bootstrap (Wu, Ann. Stat. 14 (1986) 1261): each frame's residual keeps its size and shape, but a
+  random sign. The second scan has the opposite signs (antithetic variables).
+- Analytic methods get every second frame, and the others. Half the difference of both volumes has the noise of the whole
+  scan's volume, and the streaks of missing views. A synthesised scan would not show these: FDK returns them unchanged.
+
+The numbers that turn this into σ come from procedural volumes (benchmarks/doubt.py), and from held-out pixels if there are
+any."""
 
 import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -18,19 +24,21 @@ from numpy.typing import NDArray
 
 from phyradgs_cl import resource
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.altered.coarse import some_frames
 from phyradgs_cl.detector.noise_level import noise_map
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Gaussians, Grid, States
 from phyradgs_cl.metrics.coverage import object_voxels
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.projected import FRAMES_AT_A_TIME, FramePair, frame_pairs, spread_frames
 from phyradgs_cl.reconstructors.result import DOUBT, Progress, Reconstruction, Report
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.text import without_warnings
 
 MEASURED = ("fista", "fista-tv", "fdk", "asd-pocs", "cgls", "os-sart", "sart", "sirt")  # the law is fitted to the first 3
-FITTED_SIDE = 48  # voxels in x: on smaller grids bars of analytic methods were 2 to 5 times too narrow; fitted at 64
-RUNS = 3  # of the method: that of the scan, and two of synthesised scans
+RUNS = 3  # of the method: on the scan, and on two that are made of it
 PARTS = 2  # of a voxel along each side, for projections: the projector blurs by a voxel, which the scan did not
-NEAR = 0.55  # voxels: standard deviation of the Gaussian that smooths squares of differences; chosen with the law
+_EDGE = 0.8  # voxels: standard deviation of the Gaussian whose derivative gives the slope of edges
 _DENSEST = 3.0  # times the object's mean density: denser matter counts as this
 LEAST = 0.01  # of the RMS of σ: no voxel is certain
 _SLOPES = (0.00387, -0.01443, 0.05385, -0.20096, 0, 0.20096, -0.05385, 0.01443, -0.00387)  # of a spline of cell means, / 4
@@ -48,11 +56,13 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Law:
-    """The numbers of ``spread``, and how many times σ the 95 % bar is."""
+    """The numbers of ``spread``, and how many times σ the 95 % bar is. near: standard deviation in voxels."""
 
     shape: float
     noise: float
     density: float
+    slope: float
+    near: float
     multiple_95: float
 
 
@@ -65,13 +75,16 @@ def spread(first: Array, second: Array, third: Array, law: Law) -> Array:
     """Returns σ (nz, ny, nx) of the first of three volumes, or of images.
 
     The mean of both differences from the first is what the method does to the object. Half the difference between them is
-    noise, whose signs are opposite. The squares of both, smoothed over ``NEAR`` voxels, are weighed by ``shape``² and
+    noise, whose signs are opposite. The squares of both, smoothed over ``near`` voxels, are weighed by ``shape``² and
     ``noise``². Dense matter may have texture that all runs lack: it gets ``density``² of the object's mean variance, in
-    proportion to its density. σ is at least a hundredth of its RMS."""
+    proportion to its density. Edges may be blurred in all runs: they get ``slope``² times the square of the change of
+    density in a voxel. σ is at least a hundredth of its RMS."""
     one, two = (other.astype(np.float64) - first for other in (second, third))
-    shape, noise = (scipy.ndimage.gaussian_filter(part**2 / 4, NEAR) for part in (one + two, one - two))
+    shape, noise = (scipy.ndimage.gaussian_filter(part**2 / 4, law.near) for part in (one + two, one - two))
     variance = law.shape**2 * shape + law.noise**2 * noise
-    if (inside := object_voxels(first)).any():
+    if law.slope:
+        variance += (law.slope * scipy.ndimage.gaussian_gradient_magnitude(first.astype(np.float64), _EDGE)) ** 2
+    if law.density and (inside := object_voxels(first)).any():
         density = np.maximum(scipy.ndimage.gaussian_filter(first, 1.0), 0)
         times = np.minimum(density / density[inside].mean(), _DENSEST)
         variance += law.density**2 * np.mean(variance[inside]) * times
@@ -104,34 +117,38 @@ class Doubter:
 
     def run(self, once: Callable[..., Reconstruction], report: Report, resume: State | None) -> Reconstruction:
         """Returns the method's result with ``doubt``. once: runs the method on a scan from a state. resume: of any run."""
+        if self.kind == "analytic" and self.scan.frames < 2:
+            raise InputError("--doubt", "a single frame", "two frames or more, in two halves", "leave --doubt out")
         arrays = dict(resume or {})
         results = _restored({name: arrays.pop(name) for name in list(arrays) if name.startswith(_KEPT)}, self.scan.grid)
         while len(results) < RUNS:
-            scan = self.synthesised(results[0], len(results)) if results else self.scan
-            with report.through(partial(_counted, results=results)):
+            scan = self.scan_of_run(results[0], len(results)) if results else self.scan
+            half = without_warnings() if results and self.kind == "analytic" else nullcontext()  # it has wider gaps
+            with report.through(partial(_counted, results=results)), half:
                 result = once(scan, arrays or None)
             if result.state is not None:
                 return _interrupted(result, results)
             results, arrays = [*results, result], {}
         return self.finished(results)
 
-    def synthesised(self, result: Reconstruction, number: int) -> Scan:
-        """Returns the scan that the result's volume would give, with what ``number`` 1 adds, and 2 subtracts, in each frame.
+    def scan_of_run(self, result: Reconstruction, number: int) -> Scan:
+        """Returns the scan of run ``number`` 1 or 2: every second frame for an analytic method, else a synthesised one.
 
-        That is the residual by a random sign. Analytic methods leave missing views in it: white noise of its size."""
+        It has what the result's volume would give, and in each frame the residual by a random sign; 2 has all signs
+        opposite to those of 1."""
+        if self.kind == "analytic":
+            return some_frames(self.scan, np.arange(number - 1, self.scan.frames, 2))
         frames, sums = np.zeros(self.scan.projections.shape, np.float32), np.zeros(5)
         if self.rt.ranks.rank == 0:
             for pair in self._pairs(result, self.whole.frames):
-                rng, rms = np.random.default_rng([self.seed, pair.frame]), noise_map(pair.residual, pair.valid)
-                if self.kind == "iterative":
-                    added = rng.choice((-1, 1)) * pair.residual
-                else:
-                    added = rms * rng.standard_normal(rms.shape, np.float32)
-                noisy = pair.computed + (added if number == 1 else -added)
-                frames[pair.frame] = np.where(pair.valid, noisy, self.scan.projections[pair.frame])
-                images = (pair.residual**2, rms**2, pair.measured**2, np.abs(pair.measured), pair.valid)
-                sums += [np.sum(one[pair.valid], dtype=np.float64) for one in images]
-            if number == 1 and self.kind == "iterative" and sums.all():
+                sign = np.random.default_rng([self.seed, pair.frame]).choice((-1, 1)) * (1 if number == 1 else -1)
+                synthesised = pair.computed + sign * pair.residual
+                frames[pair.frame] = np.where(pair.valid, synthesised, self.scan.projections[pair.frame])
+                if number == 1:
+                    rms = noise_map(pair.residual, pair.valid)
+                    images = (pair.residual**2, rms**2, pair.measured**2, np.abs(pair.measured), pair.valid)
+                    sums += [np.sum(one[pair.valid], dtype=np.float64) for one in images]
+            if sums.all():
                 _warn_of(*(sums[:4] / sums[4]))
         return replace(self.scan, projections=self.rt.ranks.bcast(frames))
 
@@ -147,10 +164,10 @@ class Doubter:
     def finished(self, results: list[Reconstruction]) -> Reconstruction:
         """Returns the first result with σ, its facts, and the seconds of all runs."""
         law, first = fitted_law(self.kind), results[0]
-        sigma = spread(first.volume, results[1].volume, results[2].volume, law)
-        if not sigma.any():
+        if all(np.array_equal(first.volume, other.volume) for other in results[1:]):
             log.warning("all three runs have the same volume: there are no error bars; give the method more iterations")
             return first
+        sigma = spread(first.volume, results[1].volume, results[2].volume, law)
         if self.scan.metal is not None:
             log.warning("error bars do not hold in metal, whose voxels come from a first volume")
         facts: dict[str, Any] = {"runs": RUNS, "share": _SHARE, "multiple_95": law.multiple_95}

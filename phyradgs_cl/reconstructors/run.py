@@ -19,7 +19,7 @@ from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import State, with_identity, without_identity
-from phyradgs_cl.reconstructors.doubt import FITTED_SIDE, MEASURED, Doubter
+from phyradgs_cl.reconstructors.doubt import MEASURED, Doubter
 from phyradgs_cl.reconstructors.method import METHODS, check_able, method_of
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan, check_object_motion, preprocessing_of
 from phyradgs_cl.reconstructors.preprocess import prepared
@@ -72,7 +72,7 @@ def reconstruct(
     with report.through(run.shown), _naming_size_that_fits(rt, run.scan, plan), naming_host_memory():
         if plan.preprocessing.doubt:
             kind = "iterative" if hasattr(run.options, "iterations") else "analytic"
-            _warn_of_doubt(plan, kind, run.scan.grid)
+            _warn_of_doubt(plan)
             doubter = Doubter(rt, run.visible, run.scan, run.hidden, run.deformation, plan.seed, kind)
             result = doubter.run(once, report, state)
         else:
@@ -80,14 +80,11 @@ def reconstruct(
     return run.finished(result)
 
 
-def _warn_of_doubt(plan: RunPlan, kind: str, grid: Grid) -> None:
-    """Warns of methods and grids for which error bars were not measured."""
+def _warn_of_doubt(plan: RunPlan) -> None:
+    """Warns of methods for which error bars were not measured."""
     if plan.method not in MEASURED:
         text = "error bars were measured for %s: those of %s may be far too narrow; --holdout 2 widens them in part"
         log.warning(text, ", ".join(MEASURED), plan.method)
-    elif kind == "analytic" and grid.shape[2] < FITTED_SIDE and not plan.preprocessing.holdout:
-        text = "error bars of %s were fitted to grids of 64³ voxels: on smaller ones they were up to 5 times too narrow; "
-        log.warning(text + "give --holdout 2", plan.method)
 
 
 class _Prepared:
