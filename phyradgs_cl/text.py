@@ -32,7 +32,7 @@ def suggest_name(name: object, known_names: Iterable[str], otherwise: str) -> st
 
 
 def flattened(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields (name, value) of every value in nested tables, where a name such as ``rates.position`` has the tables' names."""
+    """Yields (name, value) of every value in nested tables. A name such as ``rates.position`` includes its table's."""
     for name, value in table.items():
         if isinstance(value, Mapping):
             yield from flattened(value, f"{prefix}{name}.")
@@ -41,7 +41,7 @@ def flattened(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns nested tables from dotted names, the inverse of ``flattened``. Where a name is repeated, the last value wins."""
+    """Inverts ``flattened``: returns nested tables from dotted names. Where a name is repeated, the last value wins."""
     tables: dict[str, Any] = {}
     for name, value in values.items():
         *groups, last = name.split(".")
