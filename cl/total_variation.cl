@@ -1,6 +1,5 @@
-/* Anisotropic total variation of a small volume (guard, then (z, y, pitch)): the mean absolute difference between neighbours
-   along each axis, and its gradient. A work-item takes every get_global_size(0)-th vector of a row: all of them on a CPU,
-   one voxel on a GPU. */
+/* Anisotropic total variation of a small volume (guard, then (z, y, pitch)), and its gradient: the weighted sum of absolute
+   differences between neighbours along each axis. On a CPU a work-item takes all vectors of a row, on a GPU one voxel. */
 #include "common/lanes.h"
 #include "common/group_sums.h"
 

@@ -1,5 +1,5 @@
-/* A Gaussian's record on a grid, in voxels. At the offset D from the centre, the value is density exp(-|U D|^2 / 2), with
-   U upper triangular. */
+/* A Gaussian on a grid, as a record in units of voxels. At the offset D from its centre, its value is
+   density exp(-|U D|^2 / 2), where U is upper triangular. */
 #include "common/falling_exp2.h"
 
 #ifndef VOXEL_SPACE
@@ -40,7 +40,7 @@ ALWAYS_INLINE voxel_row voxel_row_at(VOXEL_SPACE const float *voxel_record, cons
 
 ALWAYS_INLINE vf voxel_dx(const voxel_row r, const int x) { return ((float)(x - r.x_whole) + V_IOTA) - r.x_rest; }
 
-/* The values at dx, times `by`; 0 beyond the cutoff. */
+/* The values at offsets dx along the row, times `by`; 0 beyond the cutoff. */
 ALWAYS_INLINE vf voxel_value(const voxel_row r, const vf dx, const vf by, const float limit)
 {
     const vf a = r.u11 * dx + r.a0;
