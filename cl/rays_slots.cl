@@ -3,8 +3,9 @@
    else a column). */
 #include "common/ray_column.h"
 
-/* A share says on which lines a slot is part of a frame: its slot (or frame), lines [first, stop), where weights begin. */
-#define SHARE 4        /* ints of a share */
+/* A share tells on which lines a slot is part of a frame. Its ints: slot (or frame), lines [first, stop), where the weights
+   of these lines begin. */
+#define SHARE 4
 
 /* The weights of LANES pixels of column u, from row v on; 0 on lines outside the share. */
 RAY_INLINE vf weights_at(__global const float *weights, __global const int *share, const int by_row, const int u, const int v)

@@ -8,8 +8,8 @@
 
 #define TURN 16 /* side (x and z) of the tile that a work-item transposes, in voxels */
 
-/* Transposes a volume, with voxel (z, y, x) at from.x + y from.y + z from.z + x, to a guard, then (y, x, pitch) with BORDER
-   voxels around in y and x. These must be zero before. */
+/* Transposes a volume, so that z is along rows. Voxel (z, y, x) is at from.x + y from.y + z from.z + x. The result is a guard,
+   then (y, x, pitch), with a border of BORDER voxels in y and x that the kernel does not write: it must be zero. */
 __kernel void turn_upright(
     __global const float *volume, const long4 from, const int4 shape, const int column_pitch,
     __global float *columns)

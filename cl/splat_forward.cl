@@ -77,7 +77,8 @@ __kernel void splat_forward_pixels(ARGUMENTS)
     const int u = (int)get_global_id(0), v = (int)get_global_id(1);
     const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
     const int items = (int)(get_local_size(0) * get_local_size(1));
-    const int left = u - (int)get_local_id(0), top = v - (int)get_local_id(1); /* launches may be in parts: no group id */
+    /* Not from get_group_id, which restarts in each part of a launch. */
+    const int left = u - (int)get_local_id(0), top = v - (int)get_local_id(1);
     const int right = min(left + tile_w, width) - 1, bottom = min(top + tile_h, lines) - 1;
     const int tile = top / tile_h * tiles_u + left / tile_w;
     const tile_list list = list_of(tile_offsets, tile, capacity, count);

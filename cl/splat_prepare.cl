@@ -124,7 +124,7 @@ __kernel void splat_prepare(
 }
 #else
 
-#define MOVING_FIELD(rec) ((rec) - 6) /* `fields` lacks the record's six ints */
+#define MOVING_FIELD(rec) ((rec) - 6) /* index in `fields`, which lacks the record's six ints */
 #define POSES 3 /* poses of a cell: at the middle of the segment and at its two ends */
 
 /* The path of the centre in a segment, from one end to the other. is_in_front: of the source, at both ends. */

@@ -22,7 +22,7 @@ __kernel void voxel_forward(
     const int x = (int)get_global_id(0), y = (int)get_global_id(1), z_first = (int)get_global_id(2) * DEPTH;
     const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
     const int items = (int)(get_local_size(0) * get_local_size(1));
-    const int t = ((int)get_global_id(2) * tiles.y + y / tile.y) * tiles.x + x / tile.x; /* launches may be in parts: no group id */
+    const int t = ((int)get_global_id(2) * tiles.y + y / tile.y) * tiles.x + x / tile.x; /* get_group_id restarts in each part of a launch */
     const tile_list list = list_of(tile_offsets, t, capacity, count);
     float sum[DEPTH] = {0.0f};
     for (int done = 0; done < list.count; done += STAGED) {

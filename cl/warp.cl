@@ -14,7 +14,7 @@
    computed together. If they need more than MOST_TAPS, they are computed one by one. */
 #include "common/lanes.h"
 
-#define REACH 2 /* a coefficient acts on points less than so many voxels away */
+#define REACH 2 /* a coefficient acts on points less than this away, in voxels */
 #define BORDER 4
 #define TAPS (2 * REACH)
 #define MOST_TAPS (TAPS + 2)

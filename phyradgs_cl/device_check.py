@@ -35,7 +35,7 @@ from phyradgs_cl.runtime import DeviceSpace, HostSpace, Runtime
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 
 VALUE, GRADIENT = 1e-4, 1e-3  # upper limits of the difference from the float64 twin, relative to the largest value
-_GRIDDED = 5e-3  # the same where the inverse of a deformation is interpolated between voxels
+_GRIDDED = 5e-3  # upper limit of the difference where a deformation's inverse is interpolated between voxels
 SHAPE, GRID = (9, 12), Grid((5, 7, 6), (0.3, 0.24, 0.28), (0.1, -0.05, 0.1))
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 9, 4.1 / 12), (0.1, 0.2))
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.5))
@@ -92,7 +92,6 @@ def _problem(check: Callable[[Runtime], Iterator[Comparison]], rt: Runtime, agre
 
 
 def _algebra(rt: Runtime) -> Iterator[Comparison]:
-    """Checks the algebra of arrays, and the kernel that measures the device's speed."""
     host, there = HostSpace(), DeviceSpace(rt)
     a, b, c = (_noise((3, 1999), seed) - np.float32(0.3) for seed in range(3))
     x, y, z = there.array(a), there.array(b), there.array(c)

@@ -28,8 +28,8 @@ def pair_error(rt: Runtime) -> float:
 
 
 def carried(rt: Runtime) -> tuple[bool, bool, bool]:
-    """Returns whether whole numbers survive local memory, stored as ints; the same, stored as the bits of floats; and
-    whether the device keeps subnormal floats."""
+    """Returns three tests of the device: whether local memory keeps ints, whether it keeps ints that are stored as floats of
+    the same bits, and whether subnormal floats are kept."""
     numbers, tiny = np.arange(-8, _ITEMS - 8, dtype=np.int32), np.float32(1e-40)
     as_ints, as_floats, twice = rt.zeros(_ITEMS, np.int32), rt.zeros(_ITEMS), rt.zeros(_ITEMS, np.int32)
     kernel = rt.kernel("probes", "probe_numbers", LANES=1, FP64=0)

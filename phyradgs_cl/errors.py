@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 from phyradgs_cl.text import plain_text
 
-# Quoted text matches as a whole and is left as it is: it is a command line, in which options keep their dashes.
+# Quoted text matches as a whole and is not changed: it is a command line, in which options keep their dashes.
 _OPTION = re.compile(r"(?<!\w)'[^']*'|--set |(?<![\w-])--([a-z][a-z-]*)")
 _STATES = ("given ", "not ")  # beginnings of texts that read better without "found", as in "--bins: not a number"
 _OTHER_NAMES = {"with": "others", "readout": "readout_axis", "air-mm": "air", "water-mm": "water", "hu": "hounsfield"}

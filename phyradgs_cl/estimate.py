@@ -22,7 +22,7 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import Runtime
 
 _SPLAT_TRIALS = (20, 200)  # iterations of the two short runs (trials) of methods with Gaussians
-_TRIALS = (1, 3)  # the same for other methods, unless their options have ``TRIALS``
+_TRIALS = (1, 3)  # iterations of the two short runs of other methods, unless their options have ``TRIALS``
 _LEAST_DIFFERENCE_S = 0.3  # below this difference of the two times, timing noise matters: the second trial is prolonged
 _LONGEST_TRIAL = 200  # a trial of this many iterations is not prolonged, or estimating would take too long
 _FEWEST_BETWEEN = 5  # least number of iterations between rounds of density control in a trial

@@ -27,7 +27,7 @@ _LAUNCHERS = (
 _PATIENCE_S = 5.0  # a failing rank 0 waits this long for the others to fail too, then ends them
 _LATER_S = 0.5  # each further rank waits this much longer than the one before, so that only one reports
 _MOST_VALUES = 1 << 26  # values per MPI call: before MPI 4, a count of 2³¹ overflows
-_BITS = 62  # number of bits of an int64 that a sum may use, one less than it has
+_BITS = 62  # number of bits of an int64 that a sum may use: all except the sign and one as a reserve
 _NOT_FINITE = 100_000  # stands for the exponent of a row with NaN or infinity: larger than any float's exponent
 _BLOCK_VALUES = 1 << 20  # number of values that are summed at a time, which limits the memory for their integers
 

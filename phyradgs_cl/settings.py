@@ -52,8 +52,7 @@ class Settings:
             "seed": values.pop("seed", 0), "initial": None if initial is None else _initial_volume(initial, mu_water_per_mm),
             "object_motion": None if object_motion is None else _object_motion(object_motion),
         }  # fmt: skip
-        # Some preprocessing options share their name with an option of the method. On the command line the name means
-        # preprocessing, as --help says.
+        # A name that both a method and preprocessing have means preprocessing on the command line, as --help says.
         flags = [f.name for f in fields(methods.Preprocessing) if self.origins.get(f.name) == _flag(f.name)]
         method = method or methods.DEFAULT_METHOD
         refuse_removed(f"--motion {values.get('motion')}", self.origins.get("motion", ""))

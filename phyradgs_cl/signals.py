@@ -63,7 +63,7 @@ def answer_signals(*, takes_default: bool = True) -> Iterator[StopFlag]:
     replaced = {n: usual for n in _SIGNALS if (usual := signal.getsignal(n)) not in left_alone}
     for number in replaced:
         signal.signal(number, flag)
-        if hasattr(signal, "siginterrupt"):  # system calls go on: a driver's compiler fails where a read is cut short
+        if hasattr(signal, "siginterrupt"):  # else a signal interrupts reads, and a driver's compiler fails
             signal.siginterrupt(number, False)
     try:
         yield flag

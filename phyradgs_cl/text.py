@@ -10,8 +10,7 @@ from dataclasses import fields
 from functools import partial
 from typing import Any
 
-# Control characters (except tab and line feed) may move a terminal's cursor or end a string. Python reads bytes that are
-# not UTF-8 as lone surrogates, which cannot be written.
+# Control characters may move a terminal's cursor. Lone surrogates, which stand for bytes not in UTF-8, cannot be written.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 

@@ -12,7 +12,7 @@ typedef struct {
     int v_first, v_stop, last_start; /* last_start: the last line from which two vectors can be loaded */
     float sb, sc, da, ea, dz, ez;
     float inv;                      /* 1 / da; if LEAN, 1 / (da ez - dz ea) */
-    float bend, per_along;          /* 4 |ea / da|, 1 / |along| */
+    float bend, per_along;          /* 4 |ea / da|, by which lines beyond the ends are denser; 1 / |along| */
     float across, along;
     float first, last;              /* slopes of the first and the last line */
     float dense;                    /* largest number of lines per voxel, times ahead */

@@ -91,7 +91,7 @@ ALWAYS_INLINE cutoff_ellipse ellipse_of(const splat_view s, const float cutoff2)
     return e;
 }
 
-/* The pixels u_lo..u_hi of the lines v_lo..v_hi. */
+/* LANES boxes of pixels, with their bounds included. */
 typedef struct { vi u_lo, u_hi, v_lo, v_hi; } pixel_box;
 
 /* Narrows [lo, hi] to the pixels between whole + low and whole + high. */

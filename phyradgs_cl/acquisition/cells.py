@@ -14,8 +14,8 @@ from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames, is_paral
 _SAME_TIME = 1e-6  # times that differ by less than this fraction of a cell's duration are equal
 _NOTHING = 1e-9  # a smaller fraction of a line's window in a cell is rounding, and set to 0
 _INSTANT = 1e-9  # a window shorter than this fraction of the lit span is treated as a single time
-_OVERHANG = 0.1  # a segment of which a line's window covers no more than this fraction is not projected for this line
-_TURN_SAMPLES = 32  # the lit span is divided into so many intervals to find the gantry's highest speed
+_OVERHANG = 0.1  # a line leaves a segment out if its window covers at most this fraction of it
+_TURN_SAMPLES = 32  # number of intervals of the lit span in which the gantry's highest speed is sought
 _TURN_FACTOR = 0.32  # a frame's relative RMS error, over the square of the gantry's turn in a segment in rad
 _HARMLESS_PEAK = 4.0  # largest line integral up to which averaging intensities needs no more segments
 _MOST_SEGMENTS = 1000  # most segments that ``segments_for`` chooses for a frame
@@ -136,8 +136,7 @@ def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np
     cells = (start_s - origin_s) / step_s
     number = np.arange(len(edges_s) - 1) + 0.5
     if abs(cells - round(cells)) < _SAME_TIME:
-        # The frame starts a whole number of cells after frame 0. Counted from frame 0, cells of two frames at the same
-        # time get times with the same bits, and so the same pose. operators/rays/slots.py projects equal poses only once.
+        # Counted from frame 0, cells of two frames at the same time get equal bits, and so one pose, projected only once.
         start_s, number = origin_s, round(cells) + number
     return np.asarray(start_s + edges_s[0] + number * step_s)
 

@@ -146,7 +146,6 @@ def _finer_panel(geometry: Geometry, factor: int) -> dict[str, Any]:
 
 
 def _positive_mm(name: str, value: object, shape: tuple[int, ...]) -> None:
-    """Raises InputError unless ``value`` is a positive length, or a pair (v, u) of them."""
     if (checks.numbers(name, value, shape) <= 0).any():  # type: ignore[arg-type]
         expected = "two positive lengths in mm (v, u)" if shape else "a positive length in mm"
         raise InputError(name, checks.short_repr(value), expected)

@@ -1,4 +1,4 @@
-"""Motion models: each says from which poses, and with what weights, the lines of a frame are projected.
+"""Motion models: each gives the poses from which the lines of a frame are projected, and their weights.
 
 A model is a frozen class with ``cells(scan, frame)``, which returns ``TimeCells``. A user-defined class works in every
 method (docs/methods.md). For a stop-and-shoot scan every model of this module gives one pose per frame."""
@@ -23,13 +23,11 @@ from phyradgs_cl.fields import Deformation
 
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator that a model may suit: projectors of voxels, of Gaussians, and filtered backprojection."""
-# ``PerRow`` samples an exposure at one time per fine step of travel, up to _USUAL_TIMES. Where these are further apart than
-# a coarse step, it takes one time per coarse step, up to _MOST_TIMES.
-_USUAL_TIMES = 6
-_MOST_TIMES = 100
-_FINE_STEP_VOXELS = 0.3  # of the volume's rim
-_OBJECT_STEP_VOXELS = 0.7  # of the object's fastest part, if it moves: the rest of it travels less
-_COARSE_STEP_VOXELS = 3.6  # of either
+_USUAL_TIMES = 6  # most times per exposure by a fine step, with which ``PerRow`` samples slow motion
+_MOST_TIMES = 100  # most times per exposure by the coarse step, with which ``PerRow`` samples fast motion
+_FINE_STEP_VOXELS = 0.3  # ``PerRow`` takes one time in an exposure per this travel of the volume's rim
+_OBJECT_STEP_VOXELS = 0.7  # ... or per this travel of an object's fastest part: the rest of the object travels less
+_COARSE_STEP_VOXELS = 3.6  # ... or, where _USUAL_TIMES would be further apart than this, per this travel of either
 _SUB_INTERVALS = "Sub-intervals N of an exposure; for phyradgs means micro-views."
 _WEIGHT_TOLERANCE = 1e-3  # in a user-defined model, the sum of a line's weights may differ from 1 by this much
 
@@ -70,7 +68,7 @@ def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int
 
 
 class _Model(checks.Checked):
-    """Base of this module's models, with what help texts and reports need."""
+    """Base of this module's models, with words for help texts and reports."""
 
     poses: ClassVar[str] = ""  # a frame's poses in words, for the help of --motion; "" hides the model from the command line
     counts: ClassVar[str] = ""  # the model's numbers in words, appended to its name
@@ -266,14 +264,14 @@ def motion_facts(motion: Motion) -> dict[str, object]:
 
 
 def motion_in_words(facts: Mapping[str, object]) -> str:
-    """Returns a model's name and numbers in words, from what ``motion_facts`` returned."""
+    """Returns a model's name and numbers in words, from the result of ``motion_facts``."""
     name = str(facts.get("name"))
     having = [model for model in MODELS if model.name == name and all(f.name in facts for f in fields(model))]
     return name + (having[0].counts.format(**facts) if having else "")
 
 
 def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
-    """Returns the model from what ``motion_facts`` returned, or None for a user-defined one. Raises InputError or TypeError
+    """Returns the model from the result of ``motion_facts``, or None for a user-defined one. Raises InputError or TypeError
     for values out of range."""
     for model in MODELS:
         keys = [f.name for f in fields(model) if f.init]

@@ -61,7 +61,6 @@ def draw_windows(axes: "Axes", shutter: Shutter, lines: int, start_s: float = 0.
 
 
 def _outline(first_s: np.ndarray, last_s: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the corners (times, lines) of the area between a first and a last time of each line."""
     return np.concatenate([first_s, last_s[::-1]]), np.concatenate([line, line[::-1]])
 
 

@@ -113,7 +113,6 @@ class Protocol:
 
     @property
     def _arc_rad(self) -> float:
-        """The arc of an exposure in rad, negative for a clockwise gantry."""
         return float(np.copysign(np.deg2rad(self.exposure_deg), self.turns))
 
     def _wandering_encoder(self, jitter_rad: float, rng: np.random.Generator) -> EncoderTable:

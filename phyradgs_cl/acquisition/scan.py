@@ -206,8 +206,8 @@ class Scan:
         return self.on_grid(grid)
 
     def check_timing(self) -> None:
-        """Raises InputError for a trajectory that does not cover the time of every frame, for poses that are not finite,
-        and for an exposure too short for the precision of the scan's times."""
+        """Raises InputError for a trajectory that does not cover every frame, poses that are not finite, and an exposure too
+        short for the precision of the scan's times."""
         self.shutter.check_resolved(self.frame_start_s)
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # a gantry at rest has one pose
         for frame, start_s in enumerate(self.frame_start_s):

@@ -132,7 +132,7 @@ def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = N
 
 
 def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as ``line_integrals`` does, after ``check_not_counts``, since nobody stated what they are."""
+    """Returns frames as ``line_integrals`` does, after ``check_not_counts``: nobody stated their quantity."""
     values = checks.real_array("frames", frames)
     check_not_counts(values, "give −ln(counts / flats)", mask)
     return line_integrals(values, mask)
@@ -168,8 +168,8 @@ def _to_middle(pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
 def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[int, int], Grid]:
     """Returns poses (F, 12), the panel (rows, columns) and the grid of a TIGRE geometry.
 
-    angles_rad: (F,), or Euler angles (F, 3). Raises InputError for what a scan cannot have: a turned panel, a second or
-    third Euler angle, a volume that moves. Raises it also for attributes that are missing or no numbers."""
+    angles_rad: (F,), or Euler angles (F, 3). Raises InputError for features that scans here lack: a turned panel, a second
+    or third Euler angle, a volume that moves. Raises it also for attributes that are missing or no numbers."""
     if getattr(geo, "mode", None) not in (None, "cone", "parallel"):
         raise InputError("geo.mode", checks.short_repr(geo.mode), "'cone' or 'parallel'")
     angles = np.asarray(angles_rad)
@@ -210,7 +210,6 @@ def is_parallel_tigre(geo: Any) -> bool:
 
 
 def _of(geo: Any, name: str) -> Any:
-    """Returns an attribute of a TIGRE geometry. Raises InputError if it is missing."""
     if getattr(geo, name, None) is None:
         raise InputError(f"geo.{name}", "nothing", "TIGRE's attribute of this name", f"set geo.{name}")
     return getattr(geo, name)

@@ -248,6 +248,5 @@ def cubic_slope(offset: np.ndarray) -> np.ndarray:
 
 
 def _determinant(slopes: np.ndarray) -> np.ndarray:
-    """Returns det(I + slopes) (n,) of slopes (3, 3, n)."""
     (a, b, c), (d, e, f), (g, h, i) = slopes + np.eye(3)[:, :, None]
     return np.asarray(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))

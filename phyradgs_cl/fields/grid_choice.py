@@ -18,7 +18,7 @@ _MARGIN = "Width around the box, mm, that is reconstructed and discarded: for ob
 _SCAN = "the scan's"
 _LARGEST_MM = 1e9  # largest length in mm that an option takes; the smallest is 1e-9 mm
 _ROUNDING = 1e-6  # a box may exceed whole voxels by this much, in voxels, without needing one more: it is rounding
-# The same for a box that a user types, on the scan's grid: voxel sides are rarely round numbers, so it seldom fits exactly.
+# A typed box may exceed the scan's voxels by this much without needing one more: voxel sides are rarely round numbers.
 _TYPED = 0.01
 
 
@@ -96,7 +96,6 @@ class GridChoice:
         return grid.part(triple(int(-n) for n in around), self._whole(grid.shape + 2 * around, "--margin-mm"))
 
     def _box_mm(self, grid: Grid) -> np.ndarray:
-        """Returns the ends (3, 2) in mm of the chosen box, or of the box of ``grid`` if none was chosen."""
         if self.roi_mm is None:
             return grid.box_mm
         if len(self.roi_mm) == 6:

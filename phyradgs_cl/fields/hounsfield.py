@@ -23,12 +23,12 @@ Window = tuple[float, float, int]
 _FEWEST = 100  # least number of voxels of air and of water: the noise of their mean is then a tenth of a voxel's
 # Water's attenuation in 1/mm is 0.0097 at 500 keV and 0.53 at 10 keV. Outside these limits a warning is logged.
 _WATER_PER_MM = (0.009, 0.6)
-_AIR_BELOW = 0.25  # a lowest peak above this fraction of water's attenuation is not air, but for example fat
+_AIR_BELOW = 0.25  # a lowest peak above this fraction of water's attenuation is not air; it may be fat
 _ONE_MATERIAL = 0.4  # a box whose standard deviation is more than this times water minus air may hold two materials
-_BINS = 512  # number of bins of the histogram
+_BINS = 512
 _SMOOTH_BINS = 2.0  # standard deviation of the Gaussian that smooths the histogram, in bins
 _PROMINENT = 0.1  # a peak must rise above its surroundings by this fraction of its smoothed count
-_CERTAIN = 3.0  # and by this times the root of the count, which is eight times the noise after smoothing
+_CERTAIN = 3.0  # a peak must also rise by this times the root of its count, which is eight times the noise after smoothing
 _ZOOM = 2.5  # the last histogram ends at this times the upper end of water's peak, so that peaks span many bins
 _SHORTENED = 5  # the histogram's range is cut to a quarter so often at most: metal may be 1000 times denser than water
 _NUMBER = r"-?\d+\.?\d*(?:e[-+]\d+)?"

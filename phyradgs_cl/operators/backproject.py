@@ -24,7 +24,7 @@ _BLOCK_VOXELS = 128  # most voxels along z per work-item of the kernels for upri
 _COLUMN_ROWS = 512  # most detector rows to which these voxels may project
 # A column of voxels along z is upright if over its height u·depth and depth change by at most this fraction of the depth.
 _UPRIGHT = 1e-7
-# Largest lean of such an image, in detector columns per row. Beyond it the general kernel is faster.
+# Largest lean of the image of a column of voxels, in detector columns per row. Beyond it the general kernel is faster.
 _MOST_LEAN = 0.25
 LINE_SAMPLES = 4  # with one pose per line a voxel takes this many times longer than with one pose per view
 _WIDEST = 16  # width of the widest vector of voxels along z, which may reach beyond the volume
@@ -218,7 +218,6 @@ def volume_shape(brick: Brick) -> tuple[np.ndarray, np.ndarray, np.int32]:
 
 
 def _strides(brick: Brick) -> Strides:
-    """Returns the strides in floats of a brick in the padded layout."""
     _, ny, nx = brick.shape
     return Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))
 

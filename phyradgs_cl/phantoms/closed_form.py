@@ -57,7 +57,7 @@ def shepp_logan(
 _BEADS_PER_LAYER = 8
 _LAYER_HEIGHT = 0.27
 _CIRCLE_RADIUS = 0.52
-_BEAD_RADII = (0.12, 0.06, 0.09, 0.045)  # repeated around each circle
+_BEAD_RADII = (0.12, 0.06, 0.09, 0.045)  # taken in turn by the beads of a circle
 _BEAD_DENSITY = 0.85
 _HOLDER_DENSITY = 0.15
 _HOLDER_AXES = (0.85, 0.85, 0.7)  # the holder contains every bead and stays in the field of view

@@ -19,7 +19,7 @@ _REACH = 5.0  # a body counts in a union up to this distance, in blend widths: b
 
 @dataclass(frozen=True)
 class Capsule:
-    """A tapered capsule: what a sphere fills that moves from `p0` to `p1` while its radius goes from `r0` to `r1`."""
+    """A tapered capsule: the space swept by a sphere that moves from `p0` to `p1` as its radius goes from `r0` to `r1`."""
 
     p0: Point
     p1: Point
@@ -46,7 +46,7 @@ class Lattice:
         return (slice(0, self.count),) * 3
 
     def axis(self) -> Field:
-        """Returns the voxel centres (count,) along one axis; all three are alike."""
+        """Returns the voxel centres (count,) along any of the three axes."""
         return ((np.arange(self.count) + 0.5) * self.step - 1.0).astype(np.float32)
 
     def points(self, box: Box) -> tuple[Field, Field, Field]:

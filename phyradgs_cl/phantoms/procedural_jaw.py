@@ -195,7 +195,6 @@ def _add_tooth(volume: Field, lattice: Lattice, tooth: Tooth) -> None:
 
 
 def _roots(tooth: Tooth, top: float, tip: float) -> list[Capsule]:
-    """Returns the tooth's root, or its two roots side by side along the arc."""
     spread = 0.22 * tooth.width if tooth.roots == 2 else 0.0
     top = min(top, 0.26 * tooth.width) if tooth.roots == 2 else min(top, 0.42 * tooth.width)
     upper, lower = _GUM_Z + 0.02, _GUM_Z - 1.35 * tooth.height

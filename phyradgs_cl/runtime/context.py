@@ -225,8 +225,8 @@ class Runtime:
     ) -> None:
         """Enqueues ``items`` work-items, rounded up to whole work-groups. Kernels must ignore items past the last.
 
-        group: the sides of a work-group in work-items; missing sides are 1. An int asks for so many along the first axis;
-        on a GPU some lie along other axes if the first is short. Sides are halved until the kernel can run.
+        group: the sides of a work-group in work-items; missing sides are 1. An int is the side along the first axis; if this
+        axis is short, a GPU's group extends along other axes. Sides are halved until the kernel can run.
         samples: how long the launch takes, as the number of samples of rays that could be read in that time. On a GPU, more
         than ``most_samples`` are divided among several launches. Items keep their global ids, groups get new ids.
         args: a Python int becomes a C int, a Python float a C float. Give np.int64 for a long.

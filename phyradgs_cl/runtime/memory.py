@@ -16,9 +16,9 @@ from phyradgs_cl.runtime.device import DeviceInfo
 from phyradgs_cl.runtime.opencl import cl
 
 MEMORY_VARIABLE = "PHYRADGS_MEMORY"
-_SMALLER = 0.25  # after memory ran short, a second attempt uses this fraction of what the first could use
+_SMALLER = 0.25  # after memory ran short, a second attempt may use this fraction of the free memory
 _PLANNED = 0.9  # fraction of the free memory that operators may use; the rest is a reserve
-# The same where a GPU's driver does not say how much memory other programs and the screen use.
+# Fraction of the memory that operators may use if a GPU's driver does not say how much other programs and the screen use.
 _PLANNED_UNSEEN = 0.6
 _UNITS = {"": 1, "B": 1}
 for _power, _letter in enumerate("KMGT", start=1):

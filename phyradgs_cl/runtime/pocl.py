@@ -186,7 +186,6 @@ def use_library_target(device_address: int) -> str | None:
 
 
 def _text(memory: bytes) -> bytes | None:
-    """Returns the C string at the start of ``memory``, or None if no zero byte ends it."""
     text, end, _ = memory.partition(b"\0")
     return text if end else None
 

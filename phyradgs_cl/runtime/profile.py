@@ -9,7 +9,7 @@ import numpy as np
 from phyradgs_cl.runtime.opencl import cl
 
 _FOLD_AT = 20_000  # number of events that are kept before they are added up, which waits for the device
-_COPY_BYTES = 1 << 26  # size of the copy that measures the memory's rate: larger than caches
+_COPY_BYTES = 1 << 26  # size of the copy that measures the memory's rate: larger than most caches
 _STEPS = 20_000  # length of each chain of multiply-adds that measures the arithmetic rate
 _REPEATS = 5  # number of runs of each measurement; the fastest counts
 

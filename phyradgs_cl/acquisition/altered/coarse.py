@@ -14,7 +14,7 @@ from phyradgs_cl.fields import Grid
 
 MOST_FRAMES = 60
 QUICK_COLUMNS = 20  # most blocks of pixels along the panel's longer side, for quick searches of a parameter
-FINE_COLUMNS = 32  # the same for fine searches
+FINE_COLUMNS = 32  # most blocks of pixels along the panel's longer side, for fine searches of a parameter
 SMOOTHING = 0.8  # standard deviation of the Gaussian that smooths frames before pixels are averaged, in blocks
 _LEAST_VALID = 0.5  # a block with a smaller fraction of valid pixels is masked
 _MOST_VOXELS = 64  # most voxels along the grid's longest side, without the margin

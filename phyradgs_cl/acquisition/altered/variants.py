@@ -189,7 +189,6 @@ def _flipped(pose: np.ndarray, axis: int, count: int) -> np.ndarray:
 
 
 def _rotated(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-    """Returns poses (..., 12) rotated about z by angles (...) in rad."""
     cos, sin = np.cos(angle_rad)[..., None], np.sin(angle_rad)[..., None]
     vectors: np.ndarray = pose.reshape(*pose.shape[:-1], 4, 3).copy()
     x, y = vectors[..., 0].copy(), vectors[..., 1].copy()

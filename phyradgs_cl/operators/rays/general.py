@@ -22,8 +22,8 @@ def launch_forward(
     rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, volume: DeviceArray,
     frames: DeviceArray, *, add: bool = False,
 ) -> None:
-    """Projects a padded volume, or a brick of one, to padded frames with the numbers ``frame_list``. add: adds to what is
-    in ``frames``, as all bricks after the first must."""
+    """Projects a padded volume, or a brick of one, to padded frames with the numbers ``frame_list``. add: adds to frames, as
+    all bricks after the first must; else overwrites them."""
     blocks = ceil_div(layout.width, rt.lanes)
     kernel = rt.kernel("rays", "rays_forward", **_defines(layout, cells))
     items = blocks, layout.lines, frame_list.size
@@ -38,8 +38,8 @@ def launch_adjoint(
     rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, frames: DeviceArray,
     volume: DeviceArray, *, add: bool = False,
 ) -> None:
-    """Backprojects padded frames, with the numbers ``frame_list``, to a padded volume. add: adds to what the volume holds,
-    else overwrites it."""
+    """Backprojects padded frames, with the numbers ``frame_list``, to a padded volume. add: adds to the volume, else
+    overwrites it."""
     owned, kernel = _owners(rt, layout, cells)
     nz, ny, nx = layout.brick.shape
     columns, rows, slices = (ceil_div(n, side) for n, side in zip((nx, ny, nz), owned, strict=True))

@@ -145,14 +145,12 @@ class IntensityOperator:
         return least, [self._device.multiply(q, total) for q in p]
 
     def _launch(self, name: str, *arrays: DeviceArray) -> None:
-        """Launches a kernel of cl/cell_layers.cl over all pixels of the frames."""
         frames, rows, columns = self.frames_shape
         rt = self._device.rt
         sides = (np.int32(n) for n in (rows, columns, self._by_row))
         rt.launch(rt.kernel("cell_layers", name), (columns, rows, frames), *arrays, *sides, group=rt.group(on_cpu=16))
 
     def _uploaded(self) -> list[DeviceArray]:
-        """Returns the weights (F, lines) of each layer on the device. Uploads them at the first call."""
         if not self._line_weights:
             shape = (self.frames_shape[0], -1)
             # Extends the list in place, because copies of this operator share it.

@@ -43,8 +43,8 @@ class RayLayout:
     ) -> "RayLayout":
         """Returns the layout of the complete grid. Frames are stored line by line, as the panel is read along ``axis``.
 
-        detector_shape: (rows, columns). A CPU's vectors run along a line. If a panel with very few rows is read column by
-        column, vectors along its columns would be mostly empty. Then lines are rows all the same."""
+        detector_shape: (rows, columns). A CPU's vectors run along a line. In a panel with very few rows, vectors along
+        columns would be mostly empty. So its lines are always rows, even if it is read column by column."""
         (rows, columns), (along_v, along_u) = detector_shape, subrays
         shape = rows * along_v, columns * along_u
         is_across = axis == "columns" and not rt.pixel_items and shape[0] < rt.lanes
@@ -103,8 +103,8 @@ class RayLayout:
         return padded[BORDER:-BORDER, BORDER:-BORDER, :nx]
 
     def constants(self) -> tuple[np.ndarray | np.int32, ...]:
-        """Returns kernel arguments: the brick's shape (x, y, z), its first voxel, the pitch of its rows in floats, the voxel
-        size in mm, then lines and width of a frame and the pitch of its lines."""
+        """Returns arguments of kernels. Of the brick: shape (x, y, z), first voxel, pitch of rows in floats, voxel size in
+        mm. Of a frame: lines, width, pitch of lines."""
         nz, ny, nx = self.brick.shape
         dz, dy, dx = self.grid.voxel_size_mm
         return (
@@ -132,7 +132,7 @@ class RayCells:
     weight_at: DeviceArray
     is_parallel: bool
     is_across: bool
-    most_per_line: int  # most cells that serve one line of a frame
+    most_per_line: int  # largest number of cells that serve the same line of a frame
 
     @classmethod
     def upload(

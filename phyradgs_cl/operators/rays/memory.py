@@ -25,7 +25,7 @@ class RayMemory:
 
     A volume that does not fit is cut into bricks, as large as fit together with some frames. slot_floats: the floats of
     one frame's slots, 0 without slots. With slots the volume is also stored transposed, with z along rows, if both fit.
-    Several operators may share one memory if they run one after the other: each call writes what it reads."""
+    Several operators may share one memory if they run one after the other: no call needs an earlier one's values."""
 
     def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int, slot_floats: int = 0) -> None:
         self.rt, self.layout, self.most_frames = rt, layout, most_frames
@@ -42,8 +42,8 @@ class RayMemory:
         self._padded: dict[tuple[int, int, int], np.ndarray] = {}
 
     def plan(self, share: float = 1.0) -> list[Brick]:
-        """Returns the bricks of the volume. A ``share`` below 1 chooses them anew, for that fraction of the free memory.
-        Raises OutOfMemoryError if no brick fits."""
+        """Returns the bricks of the volume. A ``share`` below 1 makes new ones, for that fraction of the free memory. Raises
+        OutOfMemoryError if no brick fits."""
         if not self._bricks or share < 1:
             self.release()
             self._bricks, self._batch = self._planned(share)
@@ -126,7 +126,7 @@ class RayMemory:
     def write_volume(self, volume: Array, brick: Brick) -> tuple[RayLayout, DeviceArray]:
         """Copies a brick of a volume (nz, ny, nx) to the device. Returns its layout and the padded copy.
 
-        The padded array on the host is kept for the next call: allocating it anew takes longer than the copy."""
+        The padded array on the host is kept for the next call: allocating it takes longer than the copy."""
         layout, on_device = self.volume(brick)
         if isinstance(volume, DeviceArray):
             if self._bordered != brick.shape:

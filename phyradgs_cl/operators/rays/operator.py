@@ -71,8 +71,7 @@ class RayOperator:
         self._tables = list(tables)
         if subrays != SINGLE:
             tables = [table.finer(*subrays) for table in tables]
-        # The upright kernels are for CPUs. On a GPU the general kernel is fast enough, because neighbouring pixels read
-        # neighbouring addresses.
+        # The upright kernels are for CPUs. The general one is fast on GPUs, where neighbouring pixels read side by side.
         may_use_slots = not rt.pixel_items and (memory is None or memory.slot_floats > 0)
         self._upright = upright_of(grid, tables, rays_shape, rt.lanes, fewest_lines) if may_use_slots else None
         self._poses: UprightPoses | None = None
@@ -119,7 +118,6 @@ class RayOperator:
 
     @property
     def _is_upright(self) -> bool:
-        """Whether the upright kernels can be used, and memory has room for their slots."""
         return self._upright is not None and self.memory.slot_frames > 0
 
     def _forward_upright(self, columns: DeviceArray, part: slice, frames: DeviceArray) -> None:
@@ -182,7 +180,7 @@ class RayOperator:
         self, layout: RayLayout, part: slice, frames: DeviceArray, target: tuple[DeviceArray, Strides], add: bool
     ) -> None:
         """Backprojects the frames ``part``, stored column by column, to ``target``, a volume with its strides. add: adds to
-        what the volume holds, else overwrites it."""
+        the volume, else overwrites it."""
         assert self._upright is not None and self._poses is not None
         there, pitch_mm = self.memory.slots(), layout.constants()[3]
         each = layout.column_floats(self._axis)

@@ -75,8 +75,7 @@ class UprightPoses:
         table = self._table(cells, appears, slot, detector_shape)
         columns, rows = _largest(table)
         if (2 if leans else 1) * len(table) * columns * pitch_of(rows) > most_floats:
-            # Cells that share a pose serve lines far apart, and their slot would hold all lines in between. So each cell
-            # gets its own slot.
+            # A slot for cells whose lines are far apart would also hold all lines in between. So each cell gets its own.
             appears = slot = np.arange(len(cells))
             table = self._table(cells, appears, slot, detector_shape)
             columns, rows = _largest(table)
@@ -119,7 +118,6 @@ class UprightPoses:
 
 
 def _largest(table: np.ndarray) -> tuple[int, int]:
-    """Returns the number of columns of the widest slot, and the number of rows of the highest."""
     return int((table[:, 2] - table[:, 1]).max()), int((table[:, 4] - table[:, 3]).max())
 
 

@@ -15,11 +15,10 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 
 SINGLE = (1, 1)
 _WIDEST = 1.25  # largest distance of sub-rays in the grid's middle, in voxels
-# Largest distance of rays, in voxels, without sub-rays. A common scanner with as many voxels as pixels has 1.43. The volume
-# of least norm that fits such rays loses 4 % of its density at 1.5, 16 % at 1.9, and half at 2: there every second voxel
-# may be met by no ray.
 _FARTHEST = 1.45
-# The same for a method that begins with a volume of the object's density: voxels that no ray meets keep it.
+"""Largest distance of rays, in voxels, without sub-rays. A common scanner with as many voxels as pixels has 1.43. The volume
+of least norm that fits such rays loses 4 % of its density at 1.5, 16 % at 1.9, and half at 2, where rays may miss voxels."""
+# Largest distance of rays without sub-rays if a method begins with the object's density: voxels without a ray keep it.
 _FARTHEST_OF_DENSE = 2.0
 _ROUNDING = 1e-3  # a distance may exceed its limit by this fraction, so that rounding does not add rays
 _MOST = 8  # most sub-rays of a pixel along an axis: enough where single rays are 10 voxels apart

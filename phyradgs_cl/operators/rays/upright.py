@@ -22,8 +22,7 @@ _LINES = 128  # most pixels of a detector column per work-item
 # Least number of lines that a pose must serve on average: with fewer, slots cost more time than they save.
 FEWEST_LINES = 8
 _VOXELS = 512  # most voxels along z that the rays of a work-item may meet in one plane of voxels
-# Boxes of voxels (x, y, z) that a work-item of the adjoint may take. The first is best, because neighbouring columns of
-# voxels share rays. The result has the same bits with any of them.
+# Boxes of voxels (x, y, z) that a work-item of the adjoint may take: the largest is best, as neighbours share rays.
 _OWNED = ((16, 16, 128), (8, 8, 128), (8, 4, 128))
 _ITEMS_PER_UNIT = 4  # wanted work-items per compute unit: with fewer, some units would wait long for the last item
 _UPRIGHT = 1e-6  # a column of pixels does not lean if x and y change by at most this many voxels over the detector
@@ -125,8 +124,8 @@ def launch_upright_adjoint(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, values: DeviceArray,
     target: tuple[DeviceArray, Strides], *, add: bool = False,
 ) -> None:
-    """Backprojects slots, as ``split_slots`` writes them, to ``target``, a volume with its strides. add: adds to what the
-    volume holds, else overwrites it."""
+    """Backprojects slots, as ``split_slots`` writes them, to ``target``, a volume with its strides. add: adds to the volume,
+    else overwrites it."""
     shape, origin, *_ = layout.constants()
     (x, y, z), items = _owned(layout.brick.shape, rt.device.compute_units)
     rt.launch(

@@ -5,13 +5,13 @@ import numpy as np
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime import DeviceArray, LaterItem, MemoryShortage, Runtime
 
-_CHUNK = 512  # splats per work-item on a CPU
-_GROUP = 64  # splats per work-group on a GPU
+_CHUNK = 512  # number of splats that a CPU's work-item counts
+_GROUP = 64  # number of splats that a GPU's work-group counts
 _LARGEST_GROUP = 256  # most splats per work-group on a GPU, taken where _GROUP would give more than _MANY_COUNTS
 _MANY_COUNTS = 1 << 22  # number of counts, tiles × work-groups, above which their memory and time matter
-_SCANNED = 64  # counts per step of a work-group's prefix sum
+_SCANNED = 64  # number of counts that a work-group adds at a time in its prefix sum
 _SLACK = 1.5  # lists are allocated this many times larger than needed, because clouds grow
-_NEAR = 1.25  # lists less than this many times larger than needed are allocated anew, before they overflow
+_NEAR = 1.25  # lists less than this many times larger than needed are replaced by larger ones before they overflow
 # If lists overflow, every splat is tested at every pixel. A second on a fast GPU is the most that this may take.
 _MOST_CHECKS = 2**38
 _MOST_ENTRIES = 2**31 - 1  # most entries of all lists together: kernels use 32-bit indices

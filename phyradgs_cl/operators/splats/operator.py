@@ -38,7 +38,7 @@ class SplatPoint:
 
 
 class PlainRows:
-    """Converts parameter rows (11, G), in mm and 1/mm with quaternions of any length, to what kernels need: lengths in units
+    """Converts parameter rows (11, G), in mm and 1/mm with quaternions of any length, to the kernels' rows: lengths in units
     of ``length_mm``, and unit quaternions.
 
     line_integrals: densities become 1/``length_mm``, so that line integrals have no unit. Else they stay in 1/mm."""
@@ -62,7 +62,7 @@ class PlainRows:
 
     def leave(self, gradients: DeviceArray, point: SplatPoint, rows: DeviceArray, *, add: bool = False) -> None:
         """Converts gradients by the kernels' rows, (13, stride), to gradients by parameter rows in mm, (11, G), in ``rows``.
-        add: adds to what ``rows`` holds, else overwrites it."""
+        add: adds to ``rows``, else overwrites it."""
         rt, cloud = self.rt, point.gaussians
         rt.launch(
             self._leave, cloud.count, gradients, point.norms, cloud.count, cloud.stride, *self._units, add,
@@ -291,7 +291,6 @@ class VoxelOperator(GaussianOperator):
 
 
 def _check_rows(rows: np.ndarray) -> None:
-    """Raises InputError for parameter rows that would be rendered as NaN."""
     checks.finite(_ROWS, rows)
     if (rows[SCALE] <= 0).any() or not rows[QUATERNION].any(axis=0).all():
         raise InputError(_ROWS, "a scale or a quaternion's length of 0 or less", "scales and lengths above 0")

@@ -104,7 +104,6 @@ class SplatProjector:
         }
 
     def _cut(self, tile_w: int, tile_h: int) -> None:
-        """Divides the frame into tiles of ``tile_w`` × ``tile_h`` pixels, each with a list of its splats."""
         self.tile_w, self.tile_h = tile_w, tile_h
         tiles = (ceil_div(self.width, tile_w), ceil_div(self.lines, tile_h), 1)
         self.lists = TileLists(self.rt, (tile_w, tile_h, 1), tiles)

@@ -14,10 +14,10 @@ from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians, st
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 
 STATE_ROWS = 12  # rows of a Gaussian in a state: its centre x, y, z, and the 9 numbers of G
-_PROBED_SIDE = 9  # the inverse of a field is checked at so many points along each axis of the grid
-_PROBED_STATES = 16  # ... in so many states at even times, and in those in which a field moves most
+_PROBED_SIDE = 9  # number of points along each axis of the grid at which the inverse of a field is checked
+_PROBED_STATES = 16  # number of states at even times in which it is checked, besides those in which a field moves most
 _WRONG = 0.01  # largest accepted error of an inverse, in voxels
-_BEND = 0.25  # a point's path in a segment may deviate from a straight line by so many voxels; the blur is 0.3 of that
+_BEND = 0.25  # largest deviation of a point's path in a segment from a straight line, in voxels; the blur is 0.3 of it
 _MOST_SEGMENTS = 32  # most segments of a frame, even if paths then deviate more
 
 

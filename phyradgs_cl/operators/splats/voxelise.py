@@ -94,7 +94,6 @@ class Voxeliser:
         )  # fmt: skip
 
     def _index_of(self, grid: Grid) -> DeviceArray:
-        """Returns ``index_matrix`` on the device. Uploads it when the grid changes."""
         if self._index is None or self._index[0] != grid:
             self._index = grid, split_coefficients(self.rt, index_matrix(grid))
         return self._index[1]

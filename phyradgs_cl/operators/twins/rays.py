@@ -17,8 +17,8 @@ from phyradgs_cl.fields.gaussians import MEAN
 from phyradgs_cl.operators.rays.layout import some_cells
 from phyradgs_cl.operators.twins.splat import moving_frame, precision_matrices, splat_frame
 
-_REACH = 2  # a spline coefficient acts up to so many voxels away; points further outside the volume have the value 0
-_BORDER = 4  # spline coefficients are kept up to so many voxels outside the volume
+_REACH = 2  # a spline coefficient acts up to this far, in voxels; points further outside the volume have the value 0
+_BORDER = 4  # width in voxels around the volume in which spline coefficients are kept
 Volume = np.ndarray
 
 
@@ -178,15 +178,15 @@ def detector_position(
     offset = np.stack([x, y, z]).reshape(3, -1) - pose[0:3, None]
     basis = np.stack([pose[6:9], pose[9:12], pose[3:6] - pose[0:3]], -1)
     u, v, depth = np.linalg.solve(basis, offset).reshape(3, *grid.shape)
-    with np.errstate(divide="ignore", invalid="ignore"):  # depth 0: a voxel beside the source has no image
+    with np.errstate(divide="ignore", invalid="ignore"):  # depth may be 0: such a voxel has no image
         return u / depth, v / depth, depth
 
 
 def _seen(
     frame: np.ndarray, u: np.ndarray, ahead: np.ndarray, depth: np.ndarray, power: int, speed_power: int
 ) -> float:
-    """Returns what a frame adds to one voxel. Seen from each line's pose, the voxel is at pixel u (lines,) of the line, so
-    many lines ``ahead`` (lines,) of it, and at ``depth`` (lines,)."""
+    """Returns the contribution of a frame to one voxel. For the pose of each line: u (lines,) is the voxel's pixel along the
+    line, ahead (lines,) how many lines further it is, depth (lines,) its depth."""
     crossing = np.flatnonzero((ahead[:-1] >= 0) & (ahead[1:] <= 0))
     if crossing.size == 0 or depth.min() <= 0:
         return 0.0

@@ -125,8 +125,8 @@ def voxel_field(
     return volume
 
 
-_PANELS = 6  # the numerical integral over time has so many intervals
-_NODES = 12  # ... with so many Gauss–Legendre nodes each
+_PANELS = 6  # number of intervals of the numerical integral over time
+_NODES = 12  # number of Gauss–Legendre nodes in each
 
 
 @dataclass(frozen=True)

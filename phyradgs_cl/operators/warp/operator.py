@@ -1,10 +1,10 @@
 """The system matrix of a moving object: A x = Σ_k P_k W_k x, summed over its states k, and its exact transpose.
 
-W_k warps the volume x to state k. (If x is a stack of volumes of an object that changes, W_k takes volume k.) P_k projects
+W_k warps the volume x to state k. For an object that changes, x is a stack of volumes, and W_k takes volume k. P_k projects
 the result to the time cells for which the state stands (``states.py``). A cell may also be a blend of two states.
 
 ``FieldDerivative`` differentiates the frames A v by the displacement field w = Σ_r φ_r U_r. J is the derivative by the
-coefficients d_r of the fields U_r, B maps coefficients to voxels, w_k is the field in state k, and ∇v is the gradient of the
+coefficients d_r of the fields U_r. B maps coefficients to voxels. w_k is the field in state k, and ∇v the gradient of the
 cubic spline through the volume:
 
     J d = Σ_k P_k (∇v(y + w_k) · Σ_r φ_r,k B d_r),    Jᵀ y = Bᵀ Σ_k φ_r,k ∇v(y + w_k) P_kᵀ y"""
@@ -32,8 +32,8 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 
 # For every 12 frames one state more than MOST_STATES is allowed: with many frames, warps take little of the time.
 _FRAMES_PER_STATE = 12
-_REACH = 2  # a cubic spline's coefficient acts on points up to so many voxels away, as in cl/warp.cl
-_BORDER = 4  # coefficients are kept up to so many voxels outside the volume, as in cl/warp.cl
+_REACH = 2  # a cubic spline's coefficient acts up to this far, in voxels, as in cl/warp.cl
+_BORDER = 4  # width in voxels around the volume in which coefficients are kept, as in cl/warp.cl
 _SETTLES = 8  # width in voxels of further zeros around, over which coefficients decay to 3e-5
 
 

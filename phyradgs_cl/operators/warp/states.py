@@ -10,10 +10,8 @@ import numpy as np
 from phyradgs_cl.fields import Deformation, Grid
 
 MOST_STATES = 12
-# The displacement at any time may differ from the nearest state's by this much, in voxels, RMS over moving voxels: where
-# two states are blended, ...
-_SPACING = 0.6
-_SPACING_OF_NEAREST = 0.3  # ... and where the nearest state is used.
+_SPACING = 0.6  # largest distance of a time from a state if states are blended: RMS displacement of moving voxels, in voxels
+_SPACING_OF_NEAREST = 0.3  # largest such distance if the nearest state stands for a time, without a blend
 _MOVES = 0.1  # a voxel counts as moving if its squared displacement is at least this fraction of the largest one
 
 
@@ -37,11 +35,11 @@ class MotionStates:
         cls, deformation: Deformation, grid: Grid, times_s: np.ndarray, least_voxels: float = 0.0, blends: bool = True,
         most: int = MOST_STATES,
     ) -> "MotionStates":  # fmt: skip
-        """Chooses at most ``most`` states for times (T,) in s. Each next state is the one at the time that is furthest from
-        all states so far.
+        """Chooses at most ``most`` states for times (T,) in s. The next state is always the object at the time at which it
+        differs most from all states so far.
 
-        least_voxels: distances count a change of any weight by 1 as a displacement by at least so many voxels. So fields
-        that are still zero get several states too."""
+        least_voxels: changing a weight by 1 counts as a displacement by at least this. So fields that are still zero get
+        several states too."""
         units, fields_mm = np.eye(deformation.rank), unit_fields_mm(deformation, grid)
         voxel_mm = min(grid.voxel_size_mm)
         seen = np.unique(deformation.weights_at(times_s), axis=0)
@@ -77,7 +75,6 @@ class MotionStates:
 
     @cached_property
     def _has_effect(self) -> np.ndarray:
-        """Whether a field displaces any voxel, (R,) bool."""
         return np.array([field.any() for field in self.fields_mm])
 
     def shares(self, times_s: np.ndarray | Sequence[float]) -> np.ndarray:

@@ -10,14 +10,14 @@ from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
 
-_BORDER = 4  # coefficients are kept up to so many voxels outside the volume, as in cl/warp.cl: further ones are below 3e-3
+_BORDER = 4  # width in voxels around the volume in which coefficients are kept, as in cl/warp.cl: further ones are < 3e-3
 _MOST_OWNED = 8  # most slices for which a CPU's work-item sums; voxels near their ends are computed by two work-items
 _ITEMS_PER_UNIT = 4  # wanted work-items per compute unit, so that none waits long for the last
 _HEADROOM = 64  # weights with which voxels add to one may sum to this: the field then contracts by 4 along each axis
 _TOGETHER = 8, 8, 4  # box of voxels (x, y, z) of a GPU's work-group, which adds in local memory
-_SAMPLES = 16  # reading the 4³ coefficients of a voxel takes as long as so many samples of a ray
-_ADDED = 64  # adding to the 4³ coefficients of a voxel takes as long as so many samples of a ray
-_ROUNDING = 1e-3  # the range of displacements along z is widened by so many voxels, more than they are rounded
+_SAMPLES = 16  # time to read the 4³ coefficients of a voxel, in the time of a ray's sample
+_ADDED = 64  # time to add to the 4³ coefficients of a voxel, in the time of a ray's sample
+_ROUNDING = 1e-3  # width in voxels by which the range of displacements along z is widened: more than they are rounded
 
 
 class VolumeWarp:
@@ -136,7 +136,6 @@ class VolumeWarp:
         return self.rt.kernel("warp", name, RANK=len(self.states.fields_mm))
 
     def _layout(self) -> tuple[int, Strides]:
-        """Returns the number of floats and the strides of the coefficients in memory."""
         nz, ny, nx = self.shape
         slice_ = (ny + 2 * _BORDER) * pitch_of(nx)
         strides = Strides(GUARD + _BORDER * (slice_ + pitch_of(nx)), slice_, pitch_of(nx))
