@@ -191,7 +191,7 @@ __kernel void backproject_leaning(
         /* If the depth hardly changes, 1/depth is nearly linear, and a Newton step leaves a relative error of 1e-8. */
         const float inv_0 = 1.0f / depth_0, per_z = (1.0f / fma((float)count, m[10], depth_0) - inv_0) / (float)count;
         const int is_even = fabs((float)count * m[10]) <= EVEN_DEPTH * depth_0;
-        const int rises = m[2] * depth_0 > u_0 * m[10]; /* u along z */
+        const int rises = m[2] * depth_0 > u_0 * m[10]; /* whether u rises along z */
         int own = 0;         /* vectors that end before `until` project between this detector column and the next */
         float until = -1.0f;
         for (int k = start; k < stop; k += LANES) {
@@ -300,7 +300,7 @@ __kernel void backproject_lines(
         sums[k] = target[k * apart];
     vf sum = V_LOAD(sums);
     const int4 first = begin + origin;
-    const float4 a = convert_float4(first), b = a + TO_LAST(count); /* both ends of the vector */
+    const float4 a = convert_float4(first), b = a + TO_LAST(count); /* the first and the last voxel of the vector */
     const vf x = X_OF(first), z = Z_OF(first);
     const float y = (float)first.y;
     const int last = max(lines - 2, 0), step = lines > 1 ? 12 : 0, next_line = lines > 1 ? image_pitch : 0;

@@ -63,7 +63,7 @@ __kernel void rays_adjoint(
 {
     __local float tile[TILE_X * TILE_Y * TILE_Z]; /* the group has only one work-item */
     const int4 own = (int4)((int)get_group_id(0) * BRICK_X, (int)get_group_id(1) * BRICK_Y,
-                            (int)get_group_id(2) * BRICK_Z, 0); /* the first voxel in this volume; corner: in the grid */
+                            (int)get_group_id(2) * BRICK_Z, 0); /* own: first voxel in this volume; corner: in the grid */
     const int4 corner = origin + own, size = min((int4)(BRICK_X, BRICK_Y, BRICK_Z, 0), shape - own);
     const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
     __global float *voxels = volume + IMAGE_GUARD + (own.z + BORDER) * sz + (own.y + BORDER) * sy + own.x;

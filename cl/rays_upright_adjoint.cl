@@ -61,13 +61,13 @@ RAY_INLINE int2 lines_along(__global const float *cell, const int u, const int f
 /* What the rays of a detector column meet on each plane of a box of voxels. */
 typedef struct {
     int from[PLANES], stop[PLANES]; /* voxels [from, stop) along z that rays may touch; none if they miss the box */
-    int first[PLANES];              /* column of voxels at or below the first and the last ray */
+    int first[PLANES];              /* the lowest column of voxels that a ray may touch */
     int most[PLANES];               /* most lines whose rays may touch a voxel */
     float ahead[PLANES];            /* distance from the source, in planes */
     float at[PLANES];               /* where the plane of the rays is at the source's height */
 #if LEAN
     int is_between[PLANES];                      /* whether all rays pass between the first column and the next */
-    /* The first line that may touch voxel z of the box is first_line + (per_voxel + bend z) z, rounded. */
+    /* Rounded, first_line + (per_voxel + bend z) z is the first line that may touch voxel z of the box. */
     float first_line[PLANES], per_voxel[PLANES], bend[PLANES];
 #else
     float reach[PLANES];            /* distance of the farthest line that touches a voxel, in lines */
@@ -205,7 +205,7 @@ RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p
             continue;
         }
         const int2 base = bases_of_halves(r, lines, most);
-        if (base.x >= 0) { /* more lines than voxels */
+        if (base.x >= 0) { /* lines are denser than voxels */
             const vf v0 = V_LOAD(r.values + base.x), v1 = V_LOAD(r.values + base.x + LANES);
             const vf w0 = V_LOAD(r.values + base.y), w1 = V_LOAD(r.values + base.y + LANES);
             const vi is_upper = VI_IOTA >= LANES / 2;
@@ -274,7 +274,7 @@ __kernel void rays_upright_adjoint(
                 const int b_stop = b_first + (along_x ? ny : nx);
                 const int a_first = along_x ? origin.x + x_first : origin.y + y_first;
                 const int step = (along_x ? ADJOINT_X : 1) * (ADJOINT_Z + LANES); /* floats from one column to the next along b */
-                const int step_a = (along_x ? 1 : ADJOINT_X) * (ADJOINT_Z + LANES); /* and along a */
+                const int step_a = (along_x ? 1 : ADJOINT_X) * (ADJOINT_Z + LANES); /* floats along a */
                 const int2 planes = planes_between(cell, u, along_x, a_first, along_x ? nx : ny);
                 planes_t met;
                 meet_planes(r, cell[RAY_SOURCE + !along_x], planes, origin.z + z_first, nz, b_first, b_stop, &met);

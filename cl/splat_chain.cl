@@ -199,10 +199,10 @@ __kernel void splat_chain(
         __global float *by_state = by_states + (state - states);
         add_by_pull(by_state, stride, g.axes, straight, cell, by_ray, by_eu, by_ev);
 #if AFFINE && !PARALLEL
-        by_place = v3_scale(straight, w / v3_dot(straight, straight)); /* dL/d(length of the ray), which has no part in dL/dG */
+        by_place = v3_scale(straight, w / v3_dot(straight, straight)); /* by the ray's length, on which G has no effect */
 #endif
 #elif AFFINE
-        by_ray = v3_add(by_ray, v3_scale(ray, w / v3_dot(ray, ray))); /* dL/d(length of the ray), which has no part in the torque */
+        by_ray = v3_add(by_ray, v3_scale(ray, w / v3_dot(ray, ray))); /* by the ray's length, on which rotations have no effect */
 #endif
         by_s = v3_add(by_s, v3_scale(v3_mul(by_white_s, white), -1.0f));
 

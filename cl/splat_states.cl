@@ -36,7 +36,7 @@ static inline splines splines_at(const float place, const float per_spacing, con
 
 #define FIELD                                                                                                        \
     __global const float4 *controls, /* (RANK, nz, ny, nx) of x y z 0 */                                            \
-    const int4 counts,               /* nx, ny, nz */                                                               \
+    const int4 counts,               /* control points nx, ny, nz */                                                \
     const float4 origin, const float4 per_spacing,                                                                  \
     __global const float *shares,    /* (S, RANK) */                                                                \
     const int state_count
@@ -123,7 +123,7 @@ __kernel void splat_states(
             f = flow_at(controls, counts, origin, per_spacing, shares + s * RANK, place);
             const float4 off = place + f.shift - mean;
             const float4 a = f.along_x + (float4)(1, 0, 0, 0), b = f.along_y + (float4)(0, 1, 0, 0);
-            const float4 c = f.along_z + (float4)(0, 0, 1, 0); /* columns of G */
+            const float4 c = f.along_z + (float4)(0, 0, 1, 0); /* a, b, c: columns of G */
             const float det = dot(a, cross(b, c));
             float4 move = off;
             if (det > LEAST_DET)

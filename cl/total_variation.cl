@@ -9,7 +9,7 @@ static inline vf sign_of(vf d)
 }
 
 __kernel void total_variation(
-    __global const float *volume, const int4 shape, const int pitch, const float4 weight, /* per axis x y z */
+    __global const float *volume, const int4 shape, const int pitch, const float4 weight, /* of the axes x y z */
     __global float *gradient,
     __local float *tree,             /* (group's items) */
     __global float *sums)            /* (groups) */

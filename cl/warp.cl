@@ -20,7 +20,7 @@
 #define MOST_TAPS (TAPS + 2)
 #define SLAB 2048 /* coefficients in a group's local memory: 15 x 15 x 9 are needed if 8 x 8 x 4 voxels spread by a third */
 
-#define POLE -0.26794919f /* sqrt(3) - 2 */
+#define POLE -0.26794919f /* sqrt(3) - 2, the pole of the cubic spline filter */
 
 /* Solves c[k - 1] + 4 c[k] + c[k + 1] = 6 v[k] along a line, where v is zero beyond the ends. */
 #define SPLINE_COEFFICIENTS(type, load, store)            \
@@ -131,7 +131,7 @@ __kernel void warp_forward(
     __global const float *volume, /* coefficients, padded; strides: start, row, slice */
     const long4 strides,
     __global const float *fields, /* (RANK, 3: x y z, nz, ny, nx) in voxels; zeros follow, which vectors may read */
-    __global const float *shares, /* (RANK,) of the state */
+    __global const float *shares, /* (RANK,): the fields' weights in the state */
     const int4 shape,
     __global float *result)       /* (nz, ny, nx) */
 {
@@ -195,7 +195,7 @@ __kernel void warp_adjoint_rows(
     __global const float *values,  /* (nz, ny, nx); zeros follow, which vectors may read */
     __global const float *fields, __global const float *shares, const int4 shape,
     __global const float2 *slices, /* (nz,): smallest and largest displacement along z in a slice */
-    __global const float2 *rows,   /* (nz, ny): the same in a row */
+    __global const float2 *rows,   /* (nz, ny): smallest and largest displacement along z in a row */
     const int owned,               /* slices of a work-item */
     const long4 strides,
     __global float *result)        /* laid out like the coefficients of warp_forward; the kernel adds to it */

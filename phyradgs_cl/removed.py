@@ -47,6 +47,6 @@ def removal(word: str, subject: str = "") -> InputError | None:
 
 
 def refuse_removed(word: str, subject: str = "") -> None:
-    """Raises the InputError of ``removal`` for a word in ``REMOVED``."""
+    """Raises an InputError that says what to write instead, for a word in ``REMOVED``."""
     if (error := removal(word, subject)) is not None:
         raise error

@@ -75,7 +75,7 @@ ALWAYS_INLINE footprint_line footprint_within(SPLAT_SPACE const float *splat_rec
 #else
     if (cutoff2 > 0.0f) {
         const float per = 1.0f / line.s.l11, beta = line.s.b1 * per, gamma = line.s.b0 - beta * line.s.t0;
-        const float shrink = 1.0f - cutoff2 * line.s.inv_kappa, a = shrink - cutoff2 * beta * beta; /* both positive */
+        const float shrink = 1.0f - cutoff2 * line.s.inv_kappa, a = shrink - cutoff2 * beta * beta; /* both > 0, as the cutoff is an ellipse */
         const float left = shrink * (cutoff2 * gamma * gamma - line.s.k * a);
         const float middle = cutoff2 * beta * gamma / a, reach = sqrt(max(left, 0.0f)) / a;
         const float centre = line.u_rest - line.s.t0 * per, far = 4e6f;

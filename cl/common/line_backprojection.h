@@ -1,6 +1,6 @@
 /* What a view whose lines have their own poses adds to a voxel; for backproject.cl and backproject_moving.cl. */
 
-#define LINE_STEPS 6      /* most Newton steps */
+#define LINE_STEPS 6      /* most Newton steps to find the line that sees a voxel */
 #define LEAST_SPEED 0.1f  /* least `speed` of a voxel, since the Newton steps divide by it */
 
 static inline float line_position(__global const float *m, const float x, const float y, const float z, float *depth)
@@ -50,7 +50,7 @@ static inline int line_seeing(
 #endif
 
 static inline float line_added(
-    const float sum, /* the value so far */
+    const float sum, /* the voxel's value so far */
     __global const float *table, __global const float *image, const int lines, const int width, const int image_pitch,
     const float x, const float y, const float z,
     const float weight, const int filtered_across)

@@ -7,7 +7,7 @@
 /* A detector column and its rays, which lie in a plane. On plane i of voxels, `ahead` planes from the source, the ray of
    line v is at height c = sc + ahead (dz + v ez) / (da + v ea) and at b = sb + across ahead + along (c - sc). */
 typedef struct {
-    __global const float *values, *slopes; /* of line v; slopes, only if LEAN: (dz + v ez) / (da + v ea) */
+    __global const float *values, *slopes; /* of each line v; slopes, only if LEAN: (dz + v ez) / (da + v ea) */
     int is_cut;                     /* whether further lines have the other main axis */
     int v_first, v_stop, last_start; /* last_start: the last line from which two vectors can be loaded */
     float sb, sc, da, ea, dz, ez;
@@ -15,7 +15,7 @@ typedef struct {
     float bend, per_along;          /* 4 |ea / da|, by which lines beyond the ends are denser; 1 / |along| */
     float across, along;
     float first, last;              /* slopes of the first and the last line */
-    float dense;                    /* largest number of lines per voxel, times ahead */
+    float dense;                    /* largest number of lines per voxel, multiplied by `ahead` */
 } column_t;
 
 RAY_INLINE column_t column_of(__global const float *cell, const int u, const int along_x, const int2 lines)

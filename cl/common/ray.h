@@ -129,9 +129,9 @@ RAY_INLINE rays_t rays_through(__global const float *cell, const float4 pitch_mm
 typedef struct {
     float sa, sb, sc;
     vf gb, gc;
-    int a_first, b_first, b_last, c_first, c_last; /* voxels of the box */
-    vi first, last;                                /* planes of each ray */
-    int lo, hi;                                    /* planes of any ray */
+    int a_first, b_first, b_last, c_first, c_last; /* first and last voxel of the box on each axis */
+    vi first, last;                                /* planes that each ray meets in the box */
+    int lo, hi;                                    /* planes that any of the rays meets */
 } walk_t;
 
 /* Narrows [lo, hi] to the planes i on which the coordinate sb + g (i - sa) lies in (below, above). */

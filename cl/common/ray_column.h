@@ -83,7 +83,7 @@ RAY_INLINE int2 planes_between(__global const float *cell, const int u, const in
 RAY_INLINE int2 planes_within(const int2 planes, const float sa, const float sb, const float g0, const float g1,
                               const float below, const float above)
 {
-#if RAY_PARALLEL /* b = g + sb i */
+#if RAY_PARALLEL /* here b = g + sb i */
     const float per = 1.0f / (fabs(sb) > 1e-9f ? sb : 1e-9f), p = (below - fmax(g0, g1)) * per, q = (above - fmin(g0, g1)) * per;
     const float low = fmin(p, q) - CLIP_MARGIN, high = fmax(p, q) + CLIP_MARGIN;
 #else

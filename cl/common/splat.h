@@ -16,7 +16,7 @@
 #endif
 
 #ifndef SPLAT_SPACE
-#define SPLAT_SPACE __global /* memory of the records and of the cells' constants */
+#define SPLAT_SPACE __global /* address space of records and cells */
 #endif
 
 #if MOVING
@@ -27,7 +27,7 @@
 #define REC_L11 0
 #define REC_L12 1
 #define REC_L22 2
-#define REC_U_REST 3      /* u0 - REC_U_WHOLE */
+#define REC_U_REST 3      /* u0 minus its nearest integer, which is at REC_U_WHOLE */
 #define REC_V_REST 4
 #define REC_B1 5
 #define REC_B2 6
@@ -35,7 +35,7 @@
 #define REC_AMP 8         /* amp, including the density and the cell's weight */
 #define REC_U_WHOLE 9     /* int */
 #define REC_V_WHOLE 10    /* int */
-#define REC_U_LO 11       /* int: the pixels to visit; empty where HI < LO */
+#define REC_U_LO 11       /* int: first and last pixel to visit; none if HI < LO */
 #define REC_U_HI 12
 #define REC_V_LO 13
 #define REC_V_HI 14
@@ -57,11 +57,11 @@
 #define LAYERS(count) 1
 #endif
 
-/* The constants of a time cell: where each begins, in floats. */
+/* A time cell has CELL floats. The constants below are the indices at which they begin. */
 #define CELL 24
-#define CELL_SOURCE 0     /* 3; PARALLEL: the reversed direction of the rays */
-#define CELL_EU 3         /* 3: step to the next pixel across the lines */
-#define CELL_EV 6         /* 3: step to the next line */
+#define CELL_SOURCE 0     /* 3 floats: the source; PARALLEL: minus the rays' direction */
+#define CELL_EU 3         /* 3 floats: the step to the next pixel of a line */
+#define CELL_EV 6         /* 3 floats: the step to the next line */
 #define CELL_VOLUME 9     /* (eu x ev) . (first pixel - source) */
 #define CELL_WEIGHT 10
 #define CELL_D00 11       /* |d|^2 = D00 + u (DU + DUV v + DUU u) + v (DV + DVV v) */

@@ -23,11 +23,11 @@ from phyradgs_cl.fields import Deformation
 
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator that a model may suit: projectors of voxels, of Gaussians, and filtered backprojection."""
-_USUAL_TIMES = 6  # most times per exposure by a fine step, with which ``PerRow`` samples slow motion
-_MOST_TIMES = 100  # most times per exposure by the coarse step, with which ``PerRow`` samples fast motion
-_FINE_STEP_VOXELS = 0.3  # ``PerRow`` takes one time in an exposure per this travel of the volume's rim
-_OBJECT_STEP_VOXELS = 0.7  # ... or per this travel of an object's fastest part: the rest of the object travels less
-_COARSE_STEP_VOXELS = 3.6  # ... or, where _USUAL_TIMES would be further apart than this, per this travel of either
+_USUAL_TIMES = 6  # most times per exposure by which ``PerRow`` samples usual motion
+_MOST_TIMES = 100  # most times per exposure by which ``PerRow`` samples fast motion
+_FINE_STEP_VOXELS = 0.3  # travel of the volume's rim from one time of ``PerRow`` to the next
+_OBJECT_STEP_VOXELS = 0.7  # travel of an object's fastest part from one time to the next: the rest of it travels less
+_COARSE_STEP_VOXELS = 3.6  # travel of rim or object from one time to the next where _USUAL_TIMES are too few
 _SUB_INTERVALS = "Sub-intervals N of an exposure; for phyradgs means micro-views."
 _WEIGHT_TOLERANCE = 1e-3  # in a user-defined model, the sum of a line's weights may differ from 1 by this much
 

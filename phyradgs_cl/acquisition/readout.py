@@ -1,4 +1,4 @@
-"""Readout of a panel: the order of its lines; and frame rate, readout time and order in the terms of data sheets."""
+"""Readout of a panel: in which order lines are read, and how data sheets state this order, frame rate and readout time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

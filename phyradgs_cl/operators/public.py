@@ -174,7 +174,7 @@ class Operator:
 
 @dataclass(frozen=True)
 class Derivative:
-    """The derivative of an operator at one x. T: the function from dL/dy to dL/dx. Later calls do not affect it."""
+    """The derivative of an operator at one x. T: the function from dL/dy to dL/dx, which stays valid after later calls."""
 
     T: Map
 

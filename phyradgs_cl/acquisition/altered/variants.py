@@ -73,7 +73,7 @@ class AlteredTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class MappedTrajectory:
-    """Poses of ``base`` after ``change``, a function from a frame's number and its poses (..., 12) to new poses."""
+    """Poses of ``base``, changed by a function ``change`` of a frame's number and its poses (..., 12)."""
 
     base: Trajectory
     change: Callable[[int, np.ndarray], np.ndarray]

@@ -1,5 +1,5 @@
 """Warps W_k of a volume to the states k of a moving object, and their exact transposes (cl/warp.cl). For an object that
-changes, the unknown is a stack of volumes, and W_k takes volume k."""
+changes, each state has its own volume, and W_k takes volume k from their stack."""
 
 from dataclasses import dataclass
 
