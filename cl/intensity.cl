@@ -12,7 +12,7 @@ __kernel void intensity_merge(
     __global const float *layers,   /* layer_count images: guard, then (lines, pitch) */
     __global const float *weights,  /* (layer_count, lines): w_k of each line, 0 without a cell */
     const int layer_count, const int lines, const int width, const int pitch,
-    const float unit,               /* the line integral for which 1 stands in the images */
+    const float unit,               /* the line integral that is stored as 1 in the images */
     __global float *shares,         /* layer_count images: dM/d(w_k p_k) */
     __global float *merged)         /* guard, then (lines, pitch), padding is not written */
 {

@@ -10,8 +10,8 @@
      warp_adjoint_fixed GPUs: a group adds its voxels to integers, whose sums do not depend on the order.
      warp_adjoint_sum   adds these integers to the result.
      add_frames         adds the frames of a state to some frames of a stack.
-   Neighbouring voxels move alike. So LANES voxels need only a few more coefficients along an axis than one voxel, and are
-   computed together. If they need more than MOST_TAPS, they are computed one by one. */
+   Neighbouring voxels move nearly equally. So LANES voxels need only a few more coefficients along an axis than one voxel,
+   and are computed together. If they need more than MOST_TAPS, they are computed one by one. */
 #include "common/lanes.h"
 
 #define REACH 2 /* a coefficient acts on points less than this away, in voxels */

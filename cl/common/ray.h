@@ -23,8 +23,8 @@
 #define AHEAD_OF(start, i) ((float)(i) - (start))
 #endif
 
-/* ACROSS: a panel with few rows that is read column by column. Lines are its rows all the same, because vectors along the
-   short columns would be mostly empty. A cell then serves columns, each with its own weight. */
+/* ACROSS: a panel with few rows that is read column by column. Here its lines are its rows, because vectors along the short
+   columns would be mostly empty. A cell then serves columns, each with its own weight. */
 #ifndef ACROSS
 #define ACROSS 0
 #endif

@@ -1,10 +1,10 @@
 /* A splat that moves during a segment of a frame's time (docs/mathematics.md, "Exact in time").
    Time t goes from -1/2 to 1/2 in a segment. The splat's centre is displaced by t p, where p is its path. Shape and
-   amplitude are those at t = 0. V is a factor of S (V'V = S), turned so that V p = (speed, 0). A pixel at D is then at
+   amplitude are those at t = 0. V is a factor of S (V'V = S), turned so that V p = (speed, 0). For a pixel at D:
 
        along = V1.D,  across = V2.D,   q(t) = ((along - speed t)^2 + across^2) / Q
 
-   and its line integrates exp(-q/2) over the line's exposure [middle - half, middle + half] in the segment. */
+   Its line integrates exp(-q/2) over the line's exposure [middle - half, middle + half] in the segment. */
 #include "common/splat.h"
 
 /* Rows of the table of a cell's lines; a row has `time_pitch` floats. */

@@ -59,7 +59,7 @@ class ConeGeometry:
         return replace(self, **distances, **_scaled_panel(self, factor))
 
     def finer(self, factor: int) -> "ConeGeometry":
-        """Returns the geometry with every pixel cut into ``factor`` by ``factor``."""
+        """Returns the geometry with every pixel divided into ``factor`` by ``factor``."""
         return replace(self, **_finer_panel(self, factor))
 
     @property

@@ -68,7 +68,7 @@ class Shutter:
 
     @property
     def span_s(self) -> float:
-        """The time from the first line's opening to the last line's closing."""
+        """The time in s from the first line's opening to the last line's closing."""
         return self.exposure_s + self.readout_s
 
     @property
@@ -93,7 +93,7 @@ class Shutter:
         return time_s.clip(start_s, start_s + length_s)
 
     def lines(self, detector_shape: tuple[int, int]) -> int:
-        """Returns the number of lines along the readout axis of a panel (rows, columns)."""
+        """Returns how many lines a panel (rows, columns) reads one after the other: its rows, or its columns."""
         return self.readout.shape(detector_shape)[0]
 
     def delay_s(self, lines: int) -> np.ndarray:

@@ -62,7 +62,7 @@ class TimeCells:
 
     @property
     def ranges(self) -> list[slice]:
-        """The range of lines of every cell."""
+        """The lines that each cell serves, as slices."""
         return [slice(int(a), int(b)) for a, b in zip(self.line_start, self.line_stop, strict=True)]
 
     def weights_of(self, cell: int) -> np.ndarray:
@@ -85,7 +85,7 @@ class TimeCells:
 
     @property
     def averages(self) -> bool:
-        """Whether any line has more than one cell."""
+        """Whether any line averages over several cells."""
         return bool(self.layer_numbers.any())
 
     def scaled(self, factor: float) -> "TimeCells":

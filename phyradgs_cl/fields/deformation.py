@@ -106,7 +106,7 @@ class Deformation:
         return replace(self, control_mm=factor * self.control_mm, origin_mm=origin, spacing_mm=spacing)
 
     def weights_at(self, times_s: "ArrayLike") -> np.ndarray:
-        """Returns φ_r (n, R) at times (n,) in s."""
+        """Returns the weights φ_r (n, R) of the fields at times (n,) in s."""
         times = np.atleast_1d(np.asarray(times_s, np.float64))
         return np.stack([np.interp(times, self.times_s, column) for column in self.weights.T], -1)
 

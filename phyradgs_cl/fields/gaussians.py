@@ -73,7 +73,7 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Activation:
-    """Maps raw numbers to parameters: scale = min + (max − min)·sigmoid, density = softplus, quaternion normalised."""
+    """Maps raw numbers x to parameters: scale = min + (max − min) sigmoid(x), density = softplus(x), quaternion = x/|x|."""
 
     scale_min: float
     scale_max: float

@@ -1,4 +1,4 @@
-"""A regular voxel grid in world coordinates."""
+"""``Grid``, a regular voxel grid in world coordinates, and the metal in an object."""
 
 import math
 from collections.abc import Iterable
