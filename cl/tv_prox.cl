@@ -34,7 +34,7 @@ __kernel void tv_dual(
     __global const float *volume, const int4 shape, const float4 axis_weight,
     const float step, const float time_step, /* 1 / (Lipschitz constant · weight), for the three axes and for time */
     const float momentum,
-    __global const float *from,       /* `moved` of the last call; in the first call the dual */
+    __global const float *from,       /* `moved` as the last call wrote it; in the first call `dual` */
     __global float *dual, __global float *moved)
 {
     const int x = (int)get_global_id(0), y = (int)get_global_id(1), all = (int)get_global_id(2);

@@ -14,7 +14,7 @@ LASTING_S = 0.1, 1.0, 3.0
 # Largest relative error of sums of float pairs. A compiler that simplifies them leaves 6e-8, the error of a single float.
 PAIRS = 1e-12
 _ITEMS = 32  # number of work-items in a work-group of the probes
-_TRIED_STEPS = 1 << 14  # number of multiply-adds in a first short launch, which tells how long further ones last
+_TRIED_STEPS = 1 << 14  # number of multiply-adds in a first short launch, whose time gives the length of longer ones
 
 
 def pair_error(rt: Runtime) -> float:

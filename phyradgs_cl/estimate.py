@@ -100,7 +100,7 @@ class _Trials:
     def extrapolated(self, few: int, more: int, total: int) -> tuple[float, float]:
         """Returns the seconds of ``total`` iterations and of a single one, extrapolated from ``few`` and ``more``."""
         first_s = self.run(few) - self._control_s
-        again_s = self.run(few) - self._control_s  # the kernels are built now
+        again_s = self.run(few) - self._control_s  # without the building of kernels, which the first run did
         more = min(more, total)
         more_s = self.run(more) - self._control_s
         while more_s - again_s < _LEAST_DIFFERENCE_S and more < min(total, _LONGEST_TRIAL):

@@ -16,7 +16,7 @@ _NOTHING = 1e-9  # a smaller fraction of a line's window in a cell is rounding, 
 _INSTANT = 1e-9  # a window shorter than this fraction of the lit span is treated as a single time
 _OVERHANG = 0.1  # a line leaves a segment out if its window covers at most this fraction of it
 _TURN_SAMPLES = 32  # number of intervals of the lit span in which the gantry's highest speed is sought
-_TURN_FACTOR = 0.32  # a frame's relative RMS error, over the square of the gantry's turn in a segment in rad
+_TURN_FACTOR = 0.32  # measured relative RMS error of a frame, per squared radian that the gantry turns in a segment
 _HARMLESS_PEAK = 4.0  # largest line integral up to which averaging intensities needs no more segments
 _MOST_SEGMENTS = 1000  # most segments that ``segments_for`` chooses for a frame
 

@@ -23,8 +23,8 @@ from phyradgs_cl.fields import Deformation
 
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator that a model may suit: projectors of voxels, of Gaussians, and filtered backprojection."""
-_USUAL_TIMES = 6  # most times per exposure by which ``PerRow`` samples usual motion
-_MOST_TIMES = 100  # most times per exposure by which ``PerRow`` samples fast motion
+_USUAL_TIMES = 6  # ``PerRow`` samples an exposure at no more times than this, unless motion is fast
+_MOST_TIMES = 100  # ``PerRow`` samples an exposure at no more times than this, however fast the motion
 _FINE_STEP_VOXELS = 0.3  # travel of the volume's rim from one time of ``PerRow`` to the next
 _OBJECT_STEP_VOXELS = 0.7  # travel of an object's fastest part from one time to the next: the rest of it travels less
 _COARSE_STEP_VOXELS = 3.6  # travel of rim or object from one time to the next where _USUAL_TIMES are too few
@@ -221,7 +221,8 @@ class Exact(_Model):
     time_error: float = checks.option(0.005, "Relative error of averaging over time (exact).", "0.005", range=(1e-6, 1))
 
     def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
-        """Returns the ``TimeCells`` of one frame, one per segment. intensity_peak: as in ``segments_for``."""
+        """Returns the ``TimeCells`` of one frame, one per segment. intensity_peak: the largest line integral if the detector
+        averages intensities, else 0."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = _place(scan, frame)

@@ -145,9 +145,9 @@ class TimeCells:
 
     @cached_property
     def layer_numbers(self) -> np.ndarray:
-        """Distributes the cells to layers such that cells of a layer share no line: numbers (C,) from 0 on.
+        """The layer of each cell, (C,) from 0 on. Cells in the same layer share no line; layers are as few as possible.
 
-        There are as few layers as possible. Frames are drawn layer by layer where intensities are averaged."""
+        To average intensities, a frame's layers are projected one by one."""
         numbers = np.zeros(self.count, np.int64)
         free_from: list[int] = []
         for cell, (start, stop) in enumerate(zip(self.line_start, self.line_stop, strict=True)):

@@ -55,7 +55,7 @@ class TileLists:
         chunk = chunk_of(rt, self.total, count)
         chunks = max(ceil_div(count, chunk), 1)
         if self._counts.size < self.total * chunks:
-            self._counts = rt.empty(1, np.int32)  # frees the old memory first: the device need not hold both
+            self._counts = rt.empty(1, np.int32)  # frees the old memory now, so that the device need not hold both
             self._counts = rt.empty(self.total * chunks, np.int32)
         domain = extents, stride, count, chunk, chunks, self.tile, self.tiles
         group = chunk if rt.pixel_items else 1

@@ -175,7 +175,7 @@ class SplatProjector:
         rt = self.rt
         footprints = gaussians.stride * cells.count
         if self._records.size < footprints * RECORD_FLOATS[cells.moving]:
-            self._records = rt.empty(1)  # frees the old memory first: the device need not hold both
+            self._records = rt.empty(1)  # frees the old memory now, so that the device need not hold both
             self._records = rt.empty(footprints * RECORD_FLOATS[cells.moving])
         if self._is_visible.size < footprints:
             self._is_visible = rt.empty(1, np.uint8)

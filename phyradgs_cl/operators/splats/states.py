@@ -15,7 +15,7 @@ from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 
 STATE_ROWS = 12  # rows of a Gaussian in a state: its centre x, y, z, and the 9 numbers of G
 _PROBED_SIDE = 9  # number of points along each axis of the grid at which the inverse of a field is checked
-_PROBED_STATES = 16  # number of states at even times in which it is checked, besides those in which a field moves most
+_PROBED_STATES = 16  # number of evenly spaced times at which the inverse is checked, besides those of largest displacement
 _WRONG = 0.01  # largest accepted error of an inverse, in voxels
 _BEND = 0.25  # largest deviation of a point's path in a segment from a straight line, in voxels; the blur is 0.3 of it
 _MOST_SEGMENTS = 32  # most segments of a frame, even if paths then deviate more
@@ -39,7 +39,7 @@ class CloudStates:
         weights of the R displacement fields in each state."""
         rt, count, stride = self.rt, shares.shape[0], gaussians.stride
         if self._states.size < count * STATE_ROWS * stride:
-            self._states = rt.empty(1)  # frees the old memory first: the device need not hold both
+            self._states = rt.empty(1)  # frees the old memory now, so that the device need not hold both
             self._states = rt.empty((count, STATE_ROWS, stride))
         kernel, field = self._kernel("splat_states"), (*self._field, shares, np.int32(count))
         rt.launch(kernel, stride, gaussians.rows, stride, *field, self._states, group=rt.group(on_cpu=16))

@@ -15,8 +15,8 @@ _MOST_OWNED = 8  # most slices for which a CPU's work-item sums; voxels near the
 _ITEMS_PER_UNIT = 4  # wanted work-items per compute unit, so that none waits long for the last
 _HEADROOM = 64  # weights with which voxels add to one may sum to this: the field then contracts by 4 along each axis
 _TOGETHER = 8, 8, 4  # box of voxels (x, y, z) of a GPU's work-group, which adds in local memory
-_SAMPLES = 16  # time to read the 4³ coefficients of a voxel, in the time of a ray's sample
-_ADDED = 64  # time to add to the 4³ coefficients of a voxel, in the time of a ray's sample
+_SAMPLES = 16  # reading the 4³ coefficients of a voxel takes this many times longer than a ray's sample
+_ADDED = 64  # adding to the 4³ coefficients of a voxel takes this many times longer than a ray's sample
 _ROUNDING = 1e-3  # width in voxels by which the range of displacements along z is widened: more than they are rounded
 
 
