@@ -173,7 +173,7 @@ class Layers:
         self._split = rt.kernel("intensity", "intensity_split", IMAGE_GUARD=GUARD)
 
     def images(self, cells: DeviceCells) -> DeviceArray:
-        """Returns memory for the layers of ``cells``. Each is GUARD zeros and an image (lines, pitch); GUARD zeros follow."""
+        """Returns memory for the layers of ``cells``. Each is GUARD zeros and an image (lines, pitch), then GUARD zeros."""
         if cells.layers > self._count:
             self._count = cells.layers
             self._drawn, self._shares, self._by_layers = (
