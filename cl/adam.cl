@@ -34,7 +34,7 @@ __kernel void chain_activations(
     __global const float *raw, __global const float *gaussians, const int count, const int stride,
     const float scale_min, const float scale_max,
     const float density_weight,      /* the term's weight divided by the number of Gaussians */
-    __global float *gradients,       /* (13, stride) */
+    __global float *gradients,       /* (13, stride): dL/d(the 11 parameters), dL/d(centre u, v) */
     __global float *statistics)      /* (2, stride): sum of |dL/d(centre on the detector)|, iterations in view */
 {
     const int first = (int)get_global_id(0) * LANES;
@@ -69,7 +69,7 @@ __kernel void chain_activations(
 }
 
 __kernel void adam_step(
-    __global float *raw, __global const float *gradients, __global float *moments, /* (2, 11, stride) */
+    __global float *raw, __global const float *gradients, __global float *moments, /* (2, 11, stride): Adam's two moments */
     const int stride, const float16 rates,      /* learning rates of the 11 rows, including Adam's bias correction */
     const float beta1, const float beta2, const float epsilon)
 {

@@ -35,7 +35,7 @@ ALWAYS_INLINE vf lerp_of(const vf low, const vf high, const vf share) { return f
 __kernel void backproject(
     __global const float *projections, /* views of (guard, (rows, pitch)) */
     __global const float *matrices,    /* (views, 12): rows give u z, v z, z of a voxel index x y z */
-    __global const float *weights,     /* (views,) */
+    __global const float *weights,     /* (views,): the factor of each view in the sum */
     const int views, const int rows, const int width, const int image_pitch, const long image_step,
     const int4 shape, const int4 origin, const int volume_pitch,
     __global float *volume)
@@ -276,8 +276,8 @@ ALWAYS_INLINE vf samples_of(__global const float *line, const vf u, const int wi
 
 __kernel void backproject_lines(
     __global const float *projections, /* views of (guard, (lines, pitch)) */
-    __global const float *matrices,    /* (views, lines, 12) */
-    __global const float *weights,     /* (views,) */
+    __global const float *matrices,    /* (views, lines, 12): as in backproject, for the pose of each line */
+    __global const float *weights,     /* (views,): the factor of each view in the sum */
     const int views, const int lines, const int width, const int image_pitch, const long image_step,
     const int4 shape, const int4 origin, const int volume_pitch,
     const int filtered_across, /* 1 if the ramp filter ran across lines: the panel was read column by column */

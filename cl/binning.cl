@@ -10,7 +10,7 @@ __kernel void bin_count(
     const int stride, const int count, const int chunk, const int chunks,
     const int4 tile,             /* tile size along x, y, z */
     const int4 tiles,            /* number of tiles along x, y, z */
-    __global int *counts)        /* (tiles, chunks) */
+    __global int *counts)        /* (tiles, chunks): how many splats of a chunk touch a tile */
 {
     const int k = (int)get_global_id(0);
     if (k >= chunks)
@@ -123,7 +123,7 @@ __kernel void bin_count_group(
     const int stride, const int count, const int chunk, const int chunks,
     const int4 tile, const int4 tiles,
     __global int *counts,            /* (tiles, chunks), zero before */
-    __local int *boxes)              /* (6, chunk) */
+    __local int *boxes)              /* (6, chunk): tiles lo and hi along x, y, z of each splat */
 {
     const int item = GROUP_ITEM, k = (int)get_group_id(0);
     share_box(extents, stride, count, k * chunk + item, tile, boxes);

@@ -24,9 +24,9 @@ RAY_INLINE vf weights_at(__global const float *weights, __global const int *shar
 __kernel void merge_slots(
     __global const float *integrals,  /* guard, then (S, columns of a slot, slot_pitch) */
     const int slot_columns, const int slot_pitch,
-    __global const int *slots,        /* (S, SLOT) */
+    __global const int *slots,        /* (S, SLOT): poses, and the lines and columns that they serve */
     __global const int *frame_shares, /* (F + 1,): where each frame's shares begin */
-    __global const int *shares,       /* (E, SHARE) */
+    __global const int *shares,       /* (E, SHARE), frame after frame */
     __global const float *weights,
     const int by_row, const int width, const int height,
     const long4 to,                   /* a pixel is at to.x + u to.y + v to.z + frame to.w */

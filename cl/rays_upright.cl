@@ -202,7 +202,7 @@ RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, cons
 
 __kernel void rays_upright(
     __global const float *columns,    /* the whole volume, transposed by turn_upright */
-    __global const float *cells,      /* (C, RAY_CELL) */
+    __global const float *cells,      /* (C, RAY_CELL): one per pose */
     __global const int *slots,        /* (S, SLOT): poses, and the lines and columns that they serve */
     const int4 shape, const int4 origin, const int column_pitch, const float4 pitch_mm,
     const int block,                  /* lines per work-item, <= UPRIGHT_LINES */

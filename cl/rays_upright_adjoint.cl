@@ -229,7 +229,7 @@ RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p
 
 /* A work-item sums for a box of ADJOINT_X by ADJOINT_Y by ADJOINT_Z voxels. */
 __kernel void rays_upright_adjoint(
-    __global const float *values,     /* as split_slots writes them */
+    __global const float *values,     /* slots, as split_slots writes them */
     const int slot_columns, const int slot_pitch, const long slots_floats,
     __global const float *cells, __global const int *slots, const int slot_count,
     __global const float *matrices, const int matrix_stride, /* (12, matrix_stride): rows give u z, v z, z of a voxel index */

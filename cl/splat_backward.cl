@@ -97,9 +97,9 @@ ALWAYS_INLINE void visit(gatherer *own, const footprint_line line)
 #endif
 
 #define ARGUMENTS                                                                                                    \
-    __global float *records,          /* (stride, C, RECORD); the sums replace them */                               \
-    __global const uchar *is_visible, /* (stride, C) */                                                              \
-    __global const float *cells,      /* (C, CELL) */                                                                \
+    __global float *records,          /* (stride, C, RECORD); the sums replace the records */                       \
+    __global const uchar *is_visible, /* (stride, C): 1 where a splat has a record */                                \
+    __global const float *cells,      /* (C, CELL): the time cells of the frame */                                   \
     __global const float *line_times, /* MOVING: (C, TIME_ROWS, time_pitch) */                                       \
     const int time_pitch, const float4 path_limits,                                                                  \
     __global const float *images,     /* dL/dp: guard, then (lines, pitch), padding zero; LAYERED: one per layer */    \

@@ -67,16 +67,16 @@ static inline void add_by_pull(__global float *by_state, const int stride, const
 #endif
 
 __kernel void splat_chain(
-    __global const float *gaussians,      /* (11, stride) */
-    __global const float *cells,          /* (C, CELL) */
-    __global const coefficient *matrices, /* (C, POSES, 12) */
+    __global const float *gaussians,      /* (11, stride): mean, scale, quaternion, density */
+    __global const float *cells,          /* (C, CELL): the time cells of the frame */
+    __global const coefficient *matrices, /* (C, POSES, 12), as in splat_prepare */
     __global const float *records,        /* (stride, C, RECORD), with sums in them */
-    __global const uchar *is_visible,     /* (stride, C) */
+    __global const uchar *is_visible,     /* (stride, C): 1 where a splat has a record */
     const int cell_count, const int count, const int stride,
     const float half_width, const float half_lines,
     __global float *gradients,            /* (13, stride); DEFORMED: without the rows of the mean */
     __global const float *states,         /* DEFORMED: (S, STATE_ROWS, stride) */
-    __global const int *cell_states,      /* (C, POSES) */
+    __global const int *cell_states,      /* (C, POSES): the state of the object at each pose */
     __global float *by_states)            /* DEFORMED: like states, zero before; dL/d(states) is added */
 {
     const int first = (int)get_global_id(0) * LANES;

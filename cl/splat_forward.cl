@@ -51,14 +51,14 @@ ALWAYS_INLINE void add_line(const footprint_line line, const float limit, __glob
 #endif
 
 #define ARGUMENTS                                                                                                       \
-    __global const float *records,    /* (stride, C, RECORD) */                                                         \
-    __global const uchar *is_visible, /* (stride, C) */                                                                 \
-    __global const float *cells,      /* (C, CELL) */                                                                   \
+    __global const float *records,    /* (stride, C, RECORD), from splat_prepare.cl */                                  \
+    __global const uchar *is_visible, /* (stride, C): 1 where a splat has a record */                                   \
+    __global const float *cells,      /* (C, CELL): the time cells of the frame */                                      \
     __global const int *line_cells,   /* (lines, 2): first cell, and the cell after the last, that serve a line */      \
     __global const float *line_times, /* MOVING: (C, TIME_ROWS, time_pitch) */                                          \
     const int time_pitch,                                                                                               \
     const float4 path_limits,         /* MOVING: the longest paths for 1, 2 and 3 times (common/splat_moving.h) */      \
-    __global const int *tile_offsets, /* (tiles + 1,) */                                                                \
+    __global const int *tile_offsets, /* (tiles + 1,): where each tile's list of splats begins */                       \
     __global const int *tile_splat_ids, const int capacity, const int count,                                            \
     const int cell_count, const int lines, const int width, const int pitch,                                            \
     const int tile_w, const int tile_h, const int tiles_u, const float cutoff2,                                         \

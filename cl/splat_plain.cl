@@ -13,11 +13,11 @@ static inline float unit_of(const int row, const float per_mm, const float per_d
 
 /* Writes kernels' rows from users' rows. Columns from `count` on become unit Gaussians, which are never drawn. */
 __kernel void rows_enter(
-    __global const float *plain,  /* (11, count) */
+    __global const float *plain,  /* (11, count): a column is a Gaussian */
     const int count, const int stride,
     const float per_mm,           /* internal units of length in a mm */
     const float per_density,      /* internal units of density in 1/mm */
-    __global float *rows,         /* (11, stride) */
+    __global float *rows,         /* (11, stride): as in common/gaussian.h */
     __global float *norms)        /* (stride): lengths of the quaternions */
 {
     const int g = (int)get_global_id(0);
@@ -40,10 +40,10 @@ __kernel void rows_enter(
 
 /* Writes dL/d(users' rows) from dL/d(kernels' rows), or adds it to what is there if `add`. */
 __kernel void rows_leave(
-    __global const float *gradients, /* (13, stride) */
+    __global const float *gradients, /* (13, stride): dL/d(the 11 parameters), dL/d(centre u, v) */
     __global const float *norms,
     const int count, const int stride, const float per_mm, const float per_density, const int add,
-    __global float *plain)           /* (11, count) */
+    __global float *plain)           /* (11, count): a column is a Gaussian */
 {
     const int g = (int)get_global_id(0);
     if (g >= count)

@@ -69,9 +69,9 @@ ALWAYS_INLINE void write_extents(const pixel_box extent, const int first, const 
 
 #if !MOVING
 __kernel void splat_prepare(
-    __global const float *gaussians,      /* (11, stride) */
+    __global const float *gaussians,      /* (11, stride): mean, scale, quaternion, density */
     const int count, const int stride,
-    __global const float *cells,          /* (C, CELL) */
+    __global const float *cells,          /* (C, CELL): the time cells of the frame */
     __global const coefficient *matrices, /* (C, POSES, 12): rows give u z, v z and z of a world point */
     __global const int *cell_lines,       /* (C, 2): the lines [first, stop) of a cell */
     const int cell_count,
@@ -195,12 +195,12 @@ ALWAYS_INLINE vf reach2_of(const splat_view s, const cutoff_ellipse e, const cen
 __kernel void splat_prepare_moving(
     __global const float *gaussians, const int count, const int stride, /* arguments: see splat_prepare */
     __global const float *cells,
-    __global const coefficient *matrices, /* (C, POSES, 12) */
+    __global const coefficient *matrices, /* (C, POSES, 12): matrices for the middle, start and end of a segment */
     __global const int *cell_lines, const int cell_count, const int width, const float cutoff2,
     __global float *records, __global uchar *is_visible, __global int *extents,
     __global const float *states,
-    __global const int *cell_states,      /* (C, POSES) */
-    __global const float *line_times,     /* (C, TIME_ROWS, time_pitch) */
+    __global const int *cell_states,      /* (C, POSES): the state of the object at each pose */
+    __global const float *line_times,     /* (C, TIME_ROWS, time_pitch): see common/splat_moving.h */
     const int time_pitch)
 {
     const int first = (int)get_global_id(0) * LANES;

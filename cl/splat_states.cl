@@ -38,7 +38,7 @@ static inline splines splines_at(const float place, const float per_spacing, con
     __global const float4 *controls, /* (RANK, nz, ny, nx) of x y z 0 */                                            \
     const int4 counts,               /* control points nx, ny, nz */                                                \
     const float4 origin, const float4 per_spacing,                                                                  \
-    __global const float *shares,    /* (S, RANK) */                                                                \
+    __global const float *shares,    /* (S, RANK): the fields' weights in each state */                             \
     const int state_count
 
 static inline float4 control_at(__global const float4 *controls, const size_t points, __global const float *shares,
@@ -110,7 +110,7 @@ __kernel void splat_states(
     __global const float *gaussians, /* (11, stride): the reference */
     const int stride,
     FIELD,
-    __global float *states)          /* (S, STATE_ROWS, stride) */
+    __global float *states)          /* (S, STATE_ROWS, stride): centre x y z, rows of G */
 {
     const int g = (int)get_global_id(0);
     if (g >= stride)

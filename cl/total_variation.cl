@@ -9,10 +9,10 @@ static inline vf sign_of(vf d)
 }
 
 __kernel void total_variation(
-    __global const float *volume, const int4 shape, const int pitch, const float4 weight, /* of the axes x y z */
+    __global const float *volume, const int4 shape, const int pitch, const float4 weight, /* weight of each axis x, y, z */
     __global float *gradient,
-    __local float *tree,             /* (group's items) */
-    __global float *sums)            /* (groups) */
+    __local float *tree,             /* scratch for sums: a float per work-item of a group */
+    __global float *sums)            /* (groups): the variation in each group's voxels */
 {
     const int y = (int)get_global_id(1), z = (int)get_global_id(2);
     const int stop = y < shape.y ? pitch : 0;

@@ -84,7 +84,7 @@ __kernel void voxel_backward(
 __kernel void voxel_chain(
     __global const float *gaussians, __global const float *sums, const float4 pitch, const int stride,
     const int add, const float weight,
-    __global float *gradients)       /* (13, stride) */
+    __global float *gradients)       /* (13, stride); leaves the last two rows, dL/d(centre u, v) */
 {
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)

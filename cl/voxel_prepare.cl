@@ -5,15 +5,15 @@
 #include "common/voxel.h"
 
 __kernel void voxel_prepare(
-    __global const float *gaussians,      /* (11, stride) */
+    __global const float *gaussians,      /* (11, stride): mean, scale, quaternion, density */
     __global const coefficient *matrix,   /* (12): rows give the voxel index x, y, z of a world point */
     const float4 pitch,                   /* voxel size x, y, z */
     const int4 start,                     /* first voxel of the computed part, x y z */
     const int4 shape,                     /* voxels of the computed part along x, y, z */
     const int count, const int stride,
     const float cutoff2,
-    __global float *records,              /* (stride, VOXEL_RECORD) */
-    __global int *extents)                /* (6, stride) */
+    __global float *records,              /* (stride, VOXEL_RECORD): see common/voxel.h */
+    __global int *extents)                /* (6, stride): lo and hi along x, y, z; empty where hi < lo */
 {
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)

@@ -133,7 +133,7 @@ __kernel void warp_forward(
     __global const float *fields, /* (RANK, 3: x y z, nz, ny, nx) in voxels; zeros follow, which vectors may read */
     __global const float *shares, /* (RANK,): the fields' weights in the state */
     const int4 shape,
-    __global float *result)       /* (nz, ny, nx) */
+    __global float *result)       /* (nz, ny, nx): the warped volume */
 {
     const int first = (int)get_global_id(0) * LANES, y = get_global_id(1), z = get_global_id(2);
     if (first >= shape.x)
@@ -317,7 +317,7 @@ __kernel void warp_adjoint_sum(
 #endif
 
 __kernel void add_frames(
-    __global const float *frames, /* (n, pixels) */
+    __global const float *frames, /* (n, pixels): to be added to the stack */
     __global const int *places,   /* (n,): numbers of the frames in the stack */
     const int pixels, __global float *stack)
 {

@@ -21,7 +21,7 @@ static inline float line_sample(__global const float *line, const float u, const
    method from `line` on; v is linear from line to line. t: the fraction of the way to the next line. speed: the rate at
    which the readout crosses the voxel's image, in lines per line. depth, next_depth: of the voxel in the poses of both. */
 static inline int line_seeing(
-    __global const float *table, /* (lines, 12) */
+    __global const float *table, /* (lines, 12): a matrix for the pose of each line */
     const int lines, int line, const float x, const float y, const float z,
     float *t, float *speed, float *depth, float *next_depth)
 {

@@ -7,7 +7,7 @@
 /* A detector column and its rays, which lie in a plane. On the plane of voxels that is `ahead` planes from the source, line
    v has the height c = sc + ahead (dz + v ez) / (da + v ea), and b = sb + across ahead + along (c - sc). */
 typedef struct {
-    __global const float *values, *slopes; /* of each line v; slopes, only if LEAN: (dz + v ez) / (da + v ea) */
+    __global const float *values, *slopes; /* one per line v; slopes (LEAN only): (dz + v ez) / (da + v ea) */
     int is_cut;                     /* whether further lines have the other main axis */
     int v_first, v_stop, last_start; /* last_start: the last line from which two vectors can be loaded */
     float sb, sc, da, ea, dz, ez;

@@ -65,7 +65,7 @@ ALWAYS_INLINE moving_line moving_on_line(SPLAT_SPACE const float *splat_record, 
 typedef struct { vf z, across, b, q, rq, fall, c2, d2; vi drawn; } moving_pixel;
 
 #if AFFINE
-#define SQUARE_ROOT(x) (x) /* of Q and |d|^2, which are 1 */
+#define SQUARE_ROOT(x) (x) /* no root is needed: Q and |d|^2 are 1 */
 #else
 #define SQUARE_ROOT(x) sqrt(x)
 #endif

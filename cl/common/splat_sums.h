@@ -7,7 +7,7 @@
 #define SUM_BV 9
 #if MOVING
 #define SUMS 3           /* after ACROSS_V, before ACROSS_U: the chain rule still needs S */
-#define SUM_COUNT 12     /* in the coordinates of common/splat_moving.h, in which no digits are lost */
+#define SUM_COUNT 12     /* sums in the coordinates of common/splat_moving.h, which lose no digits */
 #define SUM_ZZ 2         /* dL/d(num) times z^2, z across and across^2 */
 #define SUM_ZC 3
 #define SUM_CC 4

@@ -326,7 +326,7 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
         offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), samples)
         times = np.asarray(frame_start_s, np.float64)[:, None] + offsets_s
         poses = np.concatenate([checked_poses(trajectory, f, t) for f, t in enumerate(times)])
-        time_s, at = np.unique(times.ravel(), return_index=True)  # frames may overlap in time
+        time_s, at = np.unique(times.ravel(), return_index=True)  # unique, because frames may overlap in time
         table = PoseTable(time_s, poses[at], "trajectory", is_parallel(trajectory))
         between = (time_s[:-1] + time_s[1:]) / 2  # midpoints between samples of any frames: these may overlap
         inside = [between[(t[0] < between) & (between < t[-1])] for t in times]

@@ -133,7 +133,7 @@ def voxel_sides_mm(option: str, value: Any) -> tuple[float, float, float]:
 
 def _numbers(option: str, value: Any, counts: tuple[int, ...], example: str) -> tuple[float, ...]:
     """Returns a number, or a sequence of numbers, as floats. counts: the lengths allowed. Raises InputError otherwise."""
-    value = value.ravel().tolist() if isinstance(value, np.ndarray) else value  # Grid.box_mm is (3, 2)
+    value = value.ravel().tolist() if isinstance(value, np.ndarray) else value  # an array may be (3, 2), as Grid.box_mm is
     parts = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
     parts = [part.item() if isinstance(part, np.generic) else part for part in parts]
     fits = len(parts) in counts and all(isinstance(n, int | float) and not isinstance(n, bool) for n in parts)

@@ -46,7 +46,7 @@ class VoxelPhantom:
         object.__setattr__(self, "volume", np.ascontiguousarray(self.volume, dtype=np.float32))
 
     def voxelise(self, grid: Grid, supersampling: int = 1) -> NDArray[np.float32]:
-        """Returns the volume (nz, ny, nx). Raises InputError for another grid: such a phantom is never resampled."""
+        """Returns the volume (nz, ny, nx). Raises InputError for a grid other than the phantom's: it is not resampled."""
         if grid != self.grid:
             remedy = "make the phantom at this resolution and size"
             raise InputError(f"grid for phantom {self.name}", str(grid), str(self.grid), remedy)
