@@ -35,7 +35,7 @@ __kernel void voxel_backward(
     __global float *sums)            /* (stride, SUMS): w, w x y z, w xx xy xz yy yz zz in voxels */
 {
     const int g = (int)get_global_id(0) / ACROSS;
-#if GROUP == 1 /* else there are as many groups as Gaussians; with a return before barriers PoCL 3.0 writes elsewhere */
+#if GROUP == 1 /* Larger groups need no test, and in PoCL 3.0 a return before barriers leads to wrong writes. */
     if (g >= count)
         return;
 #endif

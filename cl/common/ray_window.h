@@ -34,7 +34,7 @@ RAY_INLINE vi window_of(__global const float *matrix, const int stride, __global
     const vf dx = M(8), dy = M(9), dz = M(10);
     const vf depth = dx * at.x + dy * at.y + dz * at.z + M(11);
     const vf reach = fabs(dx) * half_size.x + fabs(dy) * half_size.y + fabs(dz) * half_size.z;
-    const vi ahead = depth > reach * 1.001f; /* else the plane through the source cuts the box, which gives no bound */
+    const vi ahead = depth > reach * 1.001f; /* a box cut by the plane through the source has no bound */
     const vf per = 1.0f / V_PICK(1.0f, depth, ahead), widest = 1.0f / V_PICK(1.0f, depth - reach, ahead);
     window_along((M(0) * at.x + M(1) * at.y + M(2) * at.z + M(3)) * per, M(0), M(1), M(2), dx, dy, dz, half_size,
                  widest, ahead, &w->u_lo, &w->u_hi);
