@@ -1,6 +1,5 @@
-/* Activations and one step of Adam on the raw parameters of all Gaussians: the chain through softplus, bounded sigmoid and
-   normalisation, the density term of the objective, the moments, and the step.
-   Twins: fields/gaussians.py and optim/__init__.py. */
+/* Activations of the raw (unconstrained) parameters of Gaussians by softplus, bounded sigmoid and normalisation; their chain
+   rule; and a step of Adam. Twins: fields/gaussians.py and optim/__init__.py. */
 #include "common/gaussian.h"
 
 static inline vf logistic(vf x) { return 1.0f / (1.0f + exp(-x)); }
@@ -30,12 +29,12 @@ __kernel void activate(
     V_STORE(softplus(V_LOAD(r + 10 * (size_t)stride)), g + 10 * (size_t)stride);
 }
 
-/* Replaces dL/d(parameters) by dL/d(raw parameters), and adds the density term's gradient, which needs no image. */
+/* Replaces dL/d(parameters) by dL/d(raw parameters). Adds the gradient of the objective's term that penalises density. */
 __kernel void chain_activations(
     __global const float *raw, __global const float *gaussians, const int count, const int stride,
     const float scale_min, const float scale_max,
-    const float density_weight,      /* the term's weight over the number of Gaussians */
-    __global float *gradients,       /* (13, stride) */
+    const float density_weight,      /* the term's weight divided by the number of Gaussians */
+    __global float *gradients,       /* (13, stride): dL/d(the 11 parameters), dL/d(centre u, v) */
     __global float *statistics)      /* (2, stride): sum of |dL/d(centre on the detector)|, iterations in view */
 {
     const int first = (int)get_global_id(0) * LANES;
@@ -70,8 +69,8 @@ __kernel void chain_activations(
 }
 
 __kernel void adam_step(
-    __global float *raw, __global const float *gradients, __global float *moments, /* (2, 11, stride) */
-    const int stride, const float16 rates,      /* learning rates of the 11 rows, with Adam's bias corrections */
+    __global float *raw, __global const float *gradients, __global float *moments, /* (2, 11, stride): Adam's two moments */
+    const int stride, const float16 rates,      /* learning rates of the 11 rows, including Adam's bias correction */
     const float beta1, const float beta2, const float epsilon)
 {
     const int first = (int)get_global_id(0) * LANES, row = (int)get_global_id(1);

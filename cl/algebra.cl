@@ -1,6 +1,6 @@
-/* Algebra of plain float arrays of any number of elements: updates element by element, and sums.
-   The bits of sums depend only on the device's shape: a work-item adds in a fixed order, then results are added. Sums are in
-   float64, or in pairs of floats where a device has none. Twin: HostSpace of runtime/algebra.py. */
+/* Element-wise operations and sums of float arrays. Sums are in float64, or in pairs of floats if the device lacks it.
+   They repeat bit for bit on a device, because work-items and then work-groups add in a fixed order.
+   Twin: HostSpace of runtime/algebra.py. */
 #include "common/precise.h"
 #pragma OPENCL FP_CONTRACT OFF
 
@@ -59,7 +59,7 @@ __kernel void add_product(
     store_some(fmax(load_some(x + at, rest) + product, (vf)(least)), result + at, rest);
 }
 
-/* result = x y, where y has `count` elements and is repeated along x (global index 1) */
+/* result = x y. y has `count` elements and repeats along x; global index 1 counts the repeats. */
 __kernel void multiply(
     __global const float *x, __global const float *y, const long count, __global float *result)
 {
@@ -130,7 +130,7 @@ static inline float share_of(const float2 step, const sum_t squares)
 }
 #endif
 
-/* Combines the results of a work-group in a tree; work-item 0 gets the result. */
+/* Combines the results `own` of a work-group's items in pairs, in a fixed order. Item 0 gets the result. */
 #define TREE(scratch, own, combined)                                                       \
     if (get_local_size(0) > 1) {                                                           \
         const int item = (int)get_local_id(0);                                             \
@@ -144,7 +144,8 @@ static inline float share_of(const float2 step, const sum_t squares)
             own = scratch[0];                                                              \
     }
 
-/* Writes each work-group's sum of x y. Work-item k takes vectors from first_by k on, one every `step`, within `span`. */
+/* parts = Σ x y, one sum per work-group. Work-item k adds the vectors at k first_by, k first_by + step, ..., up to
+   k first_by + span. */
 __kernel void dot_parts(
     __global const float *x, __global const float *y, const long count, const long first_by, const long step, const long span,
     __local sum_t *scratch, __global sum_t *parts)
@@ -159,7 +160,7 @@ __kernel void dot_parts(
         parts[get_group_id(0)] = own;
 }
 
-/* Writes each work-group's sum of (x - y) (y - z), over the elements of dot_parts. */
+/* parts = Σ (x - y) (y - z), one sum per work-group, over the same elements as dot_parts. */
 __kernel void turn_parts(
     __global const float *x, __global const float *y, __global const float *z, const long count, const long first_by,
     const long step, const long span, __local sum_t *scratch, __global sum_t *parts)
@@ -176,7 +177,7 @@ __kernel void turn_parts(
         parts[get_group_id(0)] = own;
 }
 
-/* The second level, by one work-group: writes the sum of all parts, or adds it to `whole` if `add`. */
+/* One work-group adds all `parts` and writes their sum to `whole`, or adds it there if `add`. */
 __kernel void dot_whole(
     __global const sum_t *parts, const int count, const int add, __local sum_t *scratch, __global sum_t *whole)
 {
@@ -188,7 +189,7 @@ __kernel void dot_whole(
         whole[0] = add ? sum_add(whole[0], own) : own;
 }
 
-/* Writes each work-group's largest x, or |x| if `absolute`. The host takes the largest of these parts. */
+/* parts = the largest x, or |x| if `absolute`, of each work-group. The host takes the largest of the parts. */
 __kernel void largest_parts(
     __global const float *x, const int absolute, const long count, const long first_by, const long step, const long span,
     __local float *scratch, __global float *parts)
@@ -203,7 +204,8 @@ __kernel void largest_parts(
         parts[get_group_id(0)] = own;
 }
 
-/* result = x − y step/√squares: a step of fixed length, a pair (high, low), against y; none where y is 0. */
+/* result = x − step y/√squares, where squares = ‖y‖²: a step of fixed length against y, or none if y is 0. `step` is given
+   as two floats (high, low). */
 __kernel void descend(
     __global const float *x, __global const float *y, const float2 step, __global const sum_t *squares, const long count,
     __global float *result)

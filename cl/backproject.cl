@@ -1,22 +1,23 @@
-/* Voxel-driven backprojection with FDK's distance weight: bilinear in the filtered projections, zero outside them.
+/* Voxel-driven backprojection with FDK's distance weight. Projections are interpolated bilinearly, and are zero outside.
    All kernels add to the volume, view after view, so that the bits do not depend on the number of launches. The volume may
-   be a brick of the grid, with its first voxel at `origin`. Twins: operators/twins/rays.py.
+   be a part of the grid (a brick), with its first voxel at `origin`. Twins: operators/twins/rays.py.
      backproject          any pose; a work-item takes LANES voxels along x and loops over the views
      backproject_upright  detector columns parallel to the volume's z; a work-item takes a column of voxels
-     backproject_leaning  columns that lean a little, as every calibrated panel's do
+     backproject_leaning  columns that lean a little against z, as on every calibrated panel
      backproject_lines    every line of a frame has its own pose (rolling shutter); a work-item takes
                           LANES voxels along x */
 #include "common/lanes.h"
 #include "common/line_backprojection.h"
 
-/* A sample's weight, 1/depth² as in FDK. With DISTANCE_POWER 1: 1/depth, the turn of a ray per turn of the source. */
+/* A sample's weight is divided by depth², as in FDK, or by depth with DISTANCE_POWER 1. inv = 1/depth. */
 #if DISTANCE_POWER == 1
 #define BY_DISTANCE(weight, inv) (weight) * (inv)
 #else
 #define BY_DISTANCE(weight, inv) (weight) * (inv) * (inv)
 #endif
 
-/* Linear interpolation at LANES places of a line in memory: by lookup in two vectors where `fits`, else by gathers. */
+/* Interpolates linearly at LANES places of a line in memory: by lookup in two vectors if these contain all places (`fits`),
+   else by gathers. */
 #ifdef V_LOOKUP
 #define COLUMN_SAMPLES(column, least, place, wv, fits)                                                       \
     ((fits) ? lerp_lookup(V_LOAD((column) + (least)), V_LOAD((column) + (least) + LANES), (place) - (least), wv) \
@@ -34,7 +35,7 @@ ALWAYS_INLINE vf lerp_of(const vf low, const vf high, const vf share) { return f
 __kernel void backproject(
     __global const float *projections, /* views of (guard, (rows, pitch)) */
     __global const float *matrices,    /* (views, 12): rows give u z, v z, z of a voxel index x y z */
-    __global const float *weights,     /* (views,) */
+    __global const float *weights,     /* (views,): the factor of each view in the sum */
     const int views, const int rows, const int width, const int image_pitch, const long image_step,
     const int4 shape, const int4 origin, const int volume_pitch,
     __global float *volume)
@@ -56,7 +57,7 @@ __kernel void backproject(
         const vf u = (m[0] * x + (m[1] * y + m[2] * z + m[3])) * inv;
         const vf v = (m[4] * x + (m[5] * y + m[6] * z + m[7])) * inv;
         const vi inside = (u >= 0.0f) & (u <= (float)(width - 1)) & (v >= 0.0f) & (v <= (float)(rows - 1)) & (depth > 0.0f);
-        /* Places outside may be too large for an integer, so the choice comes before the cast. */
+        /* Positions outside are replaced before they are converted, because they may be too large for an integer. */
         const vf us = V_PICK(0.0f, u, inside), vs = V_PICK(0.0f, v, inside);
         const vi column = min(V_INT(us), max(width - 2, 0)), row = min(V_INT(vs), max(rows - 2, 0));
         const vf wu = us - V_FLOAT(column), wv = vs - V_FLOAT(row);
@@ -67,14 +68,15 @@ __kernel void backproject(
         const vf upper = below + wu * (above - below);
         sum += V_PICK(0.0f, BY_DISTANCE(weights[f], inv) * (lower + wv * (upper - lower)), inside);
     }
-    /* The last vector may reach into the guard, where it must leave zeros. */
+    /* A last vector may reach into the padding, which must stay zero. */
     V_STORE(V_PICK(0.0f, sum, V_IOTA < (float)(shape.x - first)), target);
 }
 
 #ifdef COLUMN_ROWS
-/* Along z the detector column and the depth are constant and v is linear. Two columns are blended once for LANES voxels, or
-   for all voxels where these meet more rows than two vectors hold. Images are transposed: (columns, pitch) with v along a
-   row. The host limits blocks of voxels along z to at most COLUMN_ROWS rows. */
+/* Along z, a column of voxels keeps its detector column and depth, and v is linear. So two detector columns are blended
+   once for LANES voxels, or for all voxels if LANES voxels project to more rows than two vectors contain. Images are
+   transposed: (columns, pitch), v along a row. The host chooses `block` such that its voxels project to at most COLUMN_ROWS
+   rows. */
 __kernel void backproject_upright(
     __global const float *projections, __global const float *matrices, __global const float *weights,
     const int views, const int rows, const int width, const int image_pitch, const long image_step,
@@ -104,7 +106,7 @@ __kernel void backproject_upright(
         __global const float *a = projections + f * image_step + IMAGE_GUARD + (size_t)column * image_pitch;
         __global const float *b = a + (width > 1 ? image_pitch : 0);
 #ifdef V_LOOKUP
-        if (fabs(step) * (LANES - 1) < (float)(2 * LANES - 3)) { /* LANES voxels meet rows that two vectors hold */
+        if (fabs(step) * (LANES - 1) < (float)(2 * LANES - 3)) { /* two vectors contain the rows of LANES voxels */
             for (int z = 0; z < count; z += LANES) {
                 const vf v = start + step * (V_IOTA + (float)z);
                 const vi inside = (v >= 0.0f) & (v <= (float)(rows - 1));
@@ -121,20 +123,20 @@ __kernel void backproject_upright(
             continue;
         }
 #endif
-        const float at_low = -start / step, at_high = ((float)(rows - 1) - start) / step; /* z at both edges */
+        const float at_low = -start / step, at_high = ((float)(rows - 1) - start) / step; /* z at the first and last row */
         const int z_start = (int)clamp(ceil(fmin(at_low, at_high)), 0.0f, (float)count);
         const int z_stop = (int)clamp(floor(fmax(at_low, at_high)), -1.0f, (float)(count - 1)) + 1;
         if (z_start >= z_stop)
             continue;
         const float v_start = start + step * z_start, v_last = start + step * (z_stop - 1);
         const int base = clamp((int)fmin(v_start, v_last), 0, max(rows - 2, 0));
-        const int stop = min((int)fmax(v_start, v_last), rows - 1) + 2; /* row `rows` is in the guard, with zeros */
+        const int stop = min((int)fmax(v_start, v_last), rows - 1) + 2; /* row `rows` is padding, with zeros */
         for (int v = base; v < stop; v += LANES)
             V_STORE(low * V_LOAD(a + v) + high * V_LOAD(b + v), blended + (v - base));
         const float shift = start - base;
         for (int z = z_start; z < z_stop; ++z) {
             const float v = shift + step * z;
-            const int row = (int)v; /* rounding may leave v just below 0, where the cast still gives 0 */
+            const int row = (int)v; /* rounding may make v slightly negative, which still gives 0 */
             sum[z] += blended[row] + (v - row) * (blended[row + 1] - blended[row]);
         }
     }
@@ -142,10 +144,10 @@ __kernel void backproject_upright(
         target[z * slice] = sum[z];
 }
 
-#define EVEN_DEPTH 0.02f   /* largest relative change of the depth along a block for which 1/depth counts as nearly linear */
-#define VOXEL_MARGIN 0.01f /* margin in voxels, more than the rounding of where a column of voxels enters or leaves a view */
+#define EVEN_DEPTH 0.02f   /* 1/depth counts as nearly linear along a block if the depth changes by at most this fraction */
+#define VOXEL_MARGIN 0.01f /* where a column of voxels enters or leaves a view is rounded by less than this, in voxels */
 
-/* Narrows the range (low, high) of z to where start + per_z z >= 0. */
+/* Narrows the range `within` (low, high) of z to where start + per_z z >= 0. */
 ALWAYS_INLINE float2 narrowed(const float2 within, const float start, const float per_z)
 {
     const float root = -start / per_z;
@@ -154,7 +156,7 @@ ALWAYS_INLINE float2 narrowed(const float2 within, const float start, const floa
     return per_z > 0.0f ? (float2)(fmax(within.x, root), within.y) : (float2)(within.x, fmin(within.y, root));
 }
 
-/* As backproject_upright, but the detector column, the depth and the rows change a little along z. LANES voxels lie between
+/* As backproject_upright, but along z also the detector column and the depth change a little. LANES voxels project between
    two detector columns, or pass from one column to the next. */
 __kernel void backproject_leaning(
     __global const float *projections, __global const float *matrices, __global const float *weights,
@@ -186,11 +188,11 @@ __kernel void backproject_leaning(
         const int start = (int)clamp(seen.x - VOXEL_MARGIN, 0.0f, (float)count) / LANES * LANES;
         const int stop = (int)clamp(seen.y + VOXEL_MARGIN + 1.0f, 0.0f, (float)count);
         __global const float *image = projections + f * image_step + IMAGE_GUARD;
-        /* Where the depth hardly changes its inverse is nearly linear, and a Newton step leaves 1e-8 of it. */
+        /* If the depth hardly changes, 1/depth is nearly linear, and a Newton step leaves a relative error of 1e-8. */
         const float inv_0 = 1.0f / depth_0, per_z = (1.0f / fma((float)count, m[10], depth_0) - inv_0) / (float)count;
         const int is_even = fabs((float)count * m[10]) <= EVEN_DEPTH * depth_0;
-        const int rises = m[2] * depth_0 > u_0 * m[10]; /* u along z */
-        int own = 0;         /* vectors that end before `until` lie between this detector column and the next */
+        const int rises = m[2] * depth_0 > u_0 * m[10]; /* whether u rises along z */
+        int own = 0;         /* vectors that end before `until` project between this detector column and the next */
         float until = -1.0f;
         for (int k = start; k < stop; k += LANES) {
             const float end = (float)(k + LANES - 1);
@@ -212,7 +214,7 @@ __kernel void backproject_leaning(
             const vi row = min(V_INT(vs), last_row);
             const vf wv = vs - V_FLOAT(row);
             int column = own, to = own;
-            if (LANES == 1 || end >= until) { /* without this test of LANES a compiler makes vectors of its own */
+            if (LANES == 1 || end >= until) { /* the test of LANES keeps a compiler from making vectors itself */
                 const float u0 = clamp(V_FIRST(u), 0.0f, u_most), u1 = clamp(V_LAST(u), 0.0f, u_most);
                 own = min((int)u1, last_column);
                 column = min(own, (int)u0);
@@ -245,7 +247,7 @@ __kernel void backproject_leaning(
 }
 #endif
 
-/* Samples of a line at places u; 0 outside the line. */
+/* Interpolates a line of pixels at u; 0 outside the line. */
 ALWAYS_INLINE vf samples_of(__global const float *line, const vf u, const int width)
 {
     const vf most = (vf)(width - 1);
@@ -257,7 +259,8 @@ ALWAYS_INLINE vf samples_of(__global const float *line, const vf u, const int wi
     return V_PICK(0.0f, COLUMN_SAMPLES(line, least, place, us - V_FLOAT(place), fits), inside);
 }
 
-/* A vector of voxels lies along the lines (ALONG_Z: lines are columns), so that one or two lines see all of it. */
+/* A vector of voxels is parallel to the lines, so that one or two lines see all of it: along z if ALONG_Z (lines are
+   detector columns), else along x. */
 #ifdef ALONG_Z
 #define STRETCHED(begin) (begin).z *= LANES
 #define X_OF(first) ((vf)((first).x))
@@ -273,11 +276,11 @@ ALWAYS_INLINE vf samples_of(__global const float *line, const vf u, const int wi
 
 __kernel void backproject_lines(
     __global const float *projections, /* views of (guard, (lines, pitch)) */
-    __global const float *matrices,    /* (views, lines, 12) */
-    __global const float *weights,     /* (views,) */
+    __global const float *matrices,    /* (views, lines, 12): as in backproject, for the pose of each line */
+    __global const float *weights,     /* (views,): the factor of each view in the sum */
     const int views, const int lines, const int width, const int image_pitch, const long image_step,
     const int4 shape, const int4 origin, const int volume_pitch,
-    const int filtered_across, /* 1 where the ramp filter acted across lines: readout along columns */
+    const int filtered_across, /* 1 if the ramp filter ran across lines: the panel was read column by column */
     __global float *volume)
 {
     int4 begin = (int4)(get_global_id(0), get_global_id(1), get_global_id(2), 0);
@@ -297,7 +300,7 @@ __kernel void backproject_lines(
         sums[k] = target[k * apart];
     vf sum = V_LOAD(sums);
     const int4 first = begin + origin;
-    const float4 a = convert_float4(first), b = a + TO_LAST(count); /* both ends of the vector */
+    const float4 a = convert_float4(first), b = a + TO_LAST(count); /* the first and the last voxel of the vector */
     const vf x = X_OF(first), z = Z_OF(first);
     const float y = (float)first.y;
     const int last = max(lines - 2, 0), step = lines > 1 ? 12 : 0, next_line = lines > 1 ? image_pitch : 0;
@@ -309,7 +312,7 @@ __kernel void backproject_lines(
         const int of_b = line_seeing(table, lines, of_a, b.x, b.y, b.z, &t, &speed, &depth1, &next1);
         const int is_in_front = depth0 > 0.0f && next0 > 0.0f && depth1 > 0.0f && next1 > 0.0f;
         const int from = is_in_front ? min(of_a, of_b) : 0, to = is_in_front ? max(of_a, of_b) : last;
-        vi waits = V_IOTA < (float)count; /* lanes that have not found their line */
+        vi waits = V_IOTA < (float)count; /* lanes that have not yet found their line */
         for (int line = from; line <= to && V_ANY(waits); ++line) {
             __global const float *m = table + (size_t)line * 12, *n = m + step, *pixels = image + (size_t)line * image_pitch;
             const vf depth = PROJECTED(m, 2), next_depth = PROJECTED(n, 2);

@@ -1,13 +1,13 @@
-/* FDK's backprojection of an object that moves, and the places of its matter. A voxel x of the reference is at x + u(x) at a
-   view's time. u is blended from the displacements of two states, by the view's share of the second state. Otherwise the
+/* FDK's backprojection of an object that moves. At the time of a view, matter from voxel x of the reference is at x + u(x).
+   u is interpolated between the displacements of two states; weights.y is the second state's fraction. Otherwise the
    kernels are those of backproject.cl. Twins: operators/twins/rays.py.
-     push_displacement       u of one state, from u(x) = -w(x + u(x)); a work-item takes LANES voxels along x
+     push_displacement       solves u(x) = -w(x + u(x)) for one state; a work-item takes LANES voxels along x
      backproject_moving      any pose; a work-item takes LANES voxels along x and loops over the views
      backproject_lines_moving  every line of a frame has its own pose; a work-item takes one voxel */
 #include "common/lanes.h"
 #include "common/line_backprojection.h"
 
-#define PUSH_CLOSE 1e-4f /* voxels: a step this short ends the fixed point */
+#define PUSH_CLOSE 1e-4f /* the iteration for u ends when a step is shorter than this, in voxels */
 
 static inline vf lerp(const vf low, const vf high, const vf share) { return low + share * (high - low); }
 
@@ -17,7 +17,7 @@ static inline vf lerp(const vf low, const vf high, const vf share) { return low 
 #define V_BETWEEN(v, last) clamp((v), (vf)(0.0f), (vf)((float)(last)))
 #endif
 
-/* Trilinear interpolation in (nz, ny, nx). Outside, the faces' values continue. */
+/* Trilinear interpolation in a field (nz, ny, nx). Outside, the value of the nearest point of its surface is taken. */
 static inline vf sample_at(__global const float *field, const int4 shape, const vf x, const vf y, const vf z)
 {
     const vf px = V_BETWEEN(x, shape.x - 1), py = V_BETWEEN(y, shape.y - 1), pz = V_BETWEEN(z, shape.z - 1);
@@ -35,10 +35,10 @@ static inline vf sample_at(__global const float *field, const int4 shape, const 
 }
 
 __kernel void push_displacement(
-    __global const float *pull, /* (3: x y z, wide) voxels: w on a wider grid, with zeros for a vector's end */
-    const int4 wide, const int4 margin, /* voxels x y z of pull; index of the grid's first voxel in it */
+    __global const float *pull, /* (3: x y z, wide): w in voxels on a wider grid; zeros follow, which vectors may read */
+    const int4 wide, const int4 margin, /* sides x y z of the wider grid; where the grid begins in it */
     const int4 shape, const int most_steps,
-    __global float *push)       /* (3, shape), with room for a vector's end */
+    __global float *push)       /* (3: x y z, shape): u in voxels */
 {
     const int first = (int)get_global_id(0) * LANES, y = get_global_id(1), z = get_global_id(2);
     if (first >= shape.x)
@@ -77,10 +77,10 @@ __kernel void push_displacement(
 
 __kernel void backproject_moving(
     __global const float *projections, __global const float *matrices,
-    __global const float2 *weights, /* (views,): weight, and share of the second state */
+    __global const float2 *weights, /* (views,): weight, and the fraction of the second state */
     const int views, const int rows, const int width, const int image_pitch, const long image_step,
     const int4 shape, const int4 origin, const int volume_pitch,
-    __global const float *first_push, __global const float *second_push, /* (3: x y z, grid) voxels, with room for a vector */
+    __global const float *first_push, __global const float *second_push, /* (3: x y z, grid): u of both states in voxels */
     const int4 grid,
     __global float *volume)
 {
@@ -116,7 +116,7 @@ __kernel void backproject_moving(
         const vf upper = lerp(GATHER(image + next_row, at), GATHER(image + next_row + next, at), wu);
         sum += V_PICK(0.0f, weights[f].x * inv * inv * lerp(lower, upper, wv), inside);
     }
-    V_STORE(V_PICK(0.0f, sum, V_IOTA < (float)(shape.x - first)), target); /* the guard keeps its zeros */
+    V_STORE(V_PICK(0.0f, sum, V_IOTA < (float)(shape.x - first)), target); /* padding stays zero */
 }
 
 __kernel void backproject_lines_moving(

@@ -1,6 +1,6 @@
-/* Lists which splats touch which tile, by a stable counting sort without atomics. Chunks of splats are counted per tile, the
-   counts are summed up, then every chunk writes the indices of its splats. A list has the order of the splats, so sums over
-   a list always add in the same order.
+/* Lists the splats in each tile, by a stable counting sort without atomics. The splats are divided into chunks. First each
+   chunk counts its splats per tile, then the counts are summed to positions, then each chunk writes the indices of its
+   splats. A list keeps the order of the splats, so sums over a list always add in the same order.
    On CPUs a work-item takes a chunk (bin_count, bin_fill) or a tile (bin_within); bin_starts is one work-item.
    On GPUs (_group) a work-group takes a chunk, with a work-item per splat, or a tile; bin_starts_group is one work-group. */
 #include "common/group_sums.h"
@@ -10,7 +10,7 @@ __kernel void bin_count(
     const int stride, const int count, const int chunk, const int chunks,
     const int4 tile,             /* tile size along x, y, z */
     const int4 tiles,            /* number of tiles along x, y, z */
-    __global int *counts)        /* (tiles, chunks) */
+    __global int *counts)        /* (tiles, chunks): how many splats of a chunk touch a tile */
 {
     const int k = (int)get_global_id(0);
     if (k >= chunks)
@@ -32,7 +32,8 @@ __kernel void bin_count(
     }
 }
 
-/* For each tile, counts become positions within the tile, and the total goes to tile_offsets[tile + 1]. */
+/* For each tile, replaces the chunks' counts by where each chunk begins in the tile's list. Writes the list's length to
+   tile_offsets[tile + 1]. */
 __kernel void bin_within(const int total, const int chunks, __global int *counts, __global int *tile_offsets)
 {
     const int t = (int)get_global_id(0);
@@ -47,7 +48,7 @@ __kernel void bin_within(const int total, const int chunks, __global int *counts
     tile_offsets[t + 1] = sum;
 }
 
-/* Sums the tiles' counts to offsets. They stop at INT_MAX where there are more indices: the host then raises an error. */
+/* Sums the lengths of lists to offsets. Beyond INT_MAX entries these stay at INT_MAX, and the host raises an error. */
 __kernel void bin_starts(const int total, __global int *tile_offsets)
 {
     if (get_global_id(0) > 0)
@@ -88,7 +89,8 @@ __kernel void bin_fill(
     }
 }
 
-/* Writes the lowest and highest tile of the item's splat along x, y, z into `boxes` (6, items); empty without a splat. */
+/* Writes into `boxes` (6, items) the lowest and highest tile of the item's splat along x, y, z; an empty range if the item
+   has no splat. */
 ALWAYS_INLINE void share_box(
     __global const int *extents, const int stride, const int count, const int g, const int4 tile, __local int *boxes)
 {
@@ -100,7 +102,7 @@ ALWAYS_INLINE void share_box(
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-/* Returns how many of the items first..stop-1 have a tile in their boxes. */
+/* Returns how many of the items first..stop-1 have a splat that touches tile (x, y, z). */
 ALWAYS_INLINE int having(__local const int *boxes, const int first, const int stop, const int x, const int y, const int z)
 {
     const int items = GROUP_ITEMS;
@@ -121,16 +123,16 @@ __kernel void bin_count_group(
     const int stride, const int count, const int chunk, const int chunks,
     const int4 tile, const int4 tiles,
     __global int *counts,            /* (tiles, chunks), zero before */
-    __local int *boxes)              /* (6, chunk) */
+    __local int *boxes)              /* (6, chunk): tiles lo and hi along x, y, z of each splat */
 {
     const int item = GROUP_ITEM, k = (int)get_group_id(0);
     share_box(extents, stride, count, k * chunk + item, tile, boxes);
     FOR_TILES_OF(item, boxes, tiles, x, y, z, t)
-        if (having(boxes, 0, item, x, y, z) == 0) /* this item is the first of the chunk that has the tile */
+        if (having(boxes, 0, item, x, y, z) == 0) /* the first item of the chunk whose splat touches the tile counts */
             counts[(size_t)t * chunks + k] = having(boxes, item, chunk, x, y, z);
 }
 
-/* Returns the sum of `own` over the work-items before this one. `group_sum` becomes the sum over all. */
+/* Returns the sum of `own` over the work-items before this one. group_sum: the sum over all. */
 ALWAYS_INLINE long group_scan(const long own, __local long *scratch, long *group_sum)
 {
     const int item = GROUP_ITEM, items = GROUP_ITEMS;

@@ -1,7 +1,7 @@
-/* The intensity model over plain frames (F, rows, columns), one layer of time cells at a time. Line integrals p of layer k
-   have the weight w_k of their line. Frames are -log(sum w exp(-p)), and shares are w exp(-p) / sum w exp(-p), without
-   overflow. Weights are (F, lines); a line is a row, or a column where `by_row` is 0. A work-item takes one pixel.
-   Twin: detector/attenuation.py. */
+/* Averages intensities of frames (F, rows, columns) over their time cells, one layer of cells after the other. A layer gives
+   line integrals p, with a weight w per line. The frames are -log(sum w exp(-p)), and the softmax weights w exp(-p) /
+   sum w exp(-p), computed without overflow. Weights are (F, lines); a line is a row, or a column if `by_row` is 0. A
+   work-item takes one pixel. Twin: detector/attenuation.py. */
 
 #define PIXEL                                                                                              \
     const int u = (int)get_global_id(0), v = (int)get_global_id(1), f = (int)get_global_id(2);             \
@@ -10,7 +10,7 @@
     const size_t at = ((size_t)f * rows + v) * columns + u;                                                \
     const float weight = weights[by_row ? (size_t)f * rows + v : (size_t)f * columns + u];
 
-/* Keeps the least p of the layers so far that have weight, from infinity on. */
+/* least = the smallest p of all layers so far whose weight is not 0. It must be infinity before the first. */
 __kernel void layer_least(
     __global const float *p, __global const float *weights, __global float *least,
     const int rows, const int columns, const int by_row)
@@ -20,7 +20,7 @@ __kernel void layer_least(
         least[at] = fmin(least[at], p[at]);
 }
 
-/* Replaces p by w exp(least - p), and adds it to the sum over the layers so far. */
+/* Replaces p by w exp(least - p), and adds this to `total`, the sum over the layers so far. */
 __kernel void layer_seen(
     __global float *p, __global const float *weights, __global const float *least, __global float *total,
     const int rows, const int columns, const int by_row)
@@ -31,7 +31,7 @@ __kernel void layer_seen(
     total[at] += seen;
 }
 
-/* Replaces `least` by the average, and the sum by its inverse. Both are 0 where no layer has weight. */
+/* Replaces `least` by the frame, and `total` by its inverse. Both become 0 where all weights are 0. */
 __kernel void layer_average(const long count, __global float *least, __global float *total)
 {
     const size_t at = get_global_id(0);
@@ -42,7 +42,7 @@ __kernel void layer_average(const long count, __global float *least, __global fl
     total[at] = any ? 1.0f / total[at] : 0.0f;
 }
 
-/* Writes the weights themselves over all pixels of their lines. */
+/* Writes the weight of its line to each pixel. */
 __kernel void layer_weights(
     __global const float *weights, __global float *spread, const int rows, const int columns, const int by_row)
 {

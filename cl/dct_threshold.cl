@@ -1,10 +1,9 @@
-/* Shrinkage of all 4³ block DCTs of a volume, averaged (translation-invariant shrinkage, Coifman and Donoho 1995).
-   A coefficient c loses clamp(c, ±threshold); a block's mean loses nothing. The losses of all blocks are added in
-   ``excess``. The result is v − TURNS excess / (number of blocks that cover the voxel), because a call takes one of TURNS
-   blocks. Volumes are (z, y, pitch) with a guard.
-   A work-item has one block in registers and, along x, a vector of blocks one voxel apart. Blocks of one launch do not meet
-   in y and z, so no two add at the same time. Where work-items are the lanes they do not meet in x either.
-   Twin: objective/dct_prox.py. */
+/* Soft thresholding of the DCTs of all 4³ blocks of a volume, averaged over blocks (Coifman and Donoho 1995).
+   A coefficient c is reduced by clamp(c, ±threshold); a block's mean stays. `excess` sums by how much all blocks reduce each
+   voxel. A call takes only one of TURNS blocks, so the result is v − TURNS excess / (number of blocks that cover the voxel).
+   Volumes are a guard, then (z, y, pitch).
+   A work-item has LANES blocks in registers, one voxel apart along x. The blocks of a launch do not overlap in y and z, nor
+   in x if LANES is 1, so no two work-items add to the same voxel. Twin: objective/dct_prox.py. */
 #include "common/lanes.h"
 
 #define EDGE 4
@@ -12,7 +11,7 @@
 #define COS_1 0.65328148f /* cos(π/8)/√2 */
 #define COS_3 0.27059805f /* cos(3π/8)/√2 */
 
-/* Orthonormal DCT-II of four values ``step`` apart. */
+/* Orthonormal DCT-II of four values that are `step` apart. */
 static inline void forward_4(vf *v, const int step)
 {
     const vf outer = v[0] + v[3 * step], inner = v[step] + v[2 * step];
@@ -23,7 +22,7 @@ static inline void forward_4(vf *v, const int step)
     v[3 * step] = COS_3 * slope - COS_1 * middle;
 }
 
-/* The transpose of ``forward_4``. */
+/* The inverse of forward_4, which is its transpose. */
 static inline void inverse_4(vf *v, const int step)
 {
     const vf outer = 0.5f * (v[0] + v[2 * step]), inner = 0.5f * (v[0] - v[2 * step]);
@@ -34,7 +33,7 @@ static inline void inverse_4(vf *v, const int step)
     v[3 * step] = outer - slope;
 }
 
-/* Writes to `block` what the block or blocks at ``corner`` lose, in voxels. Unrolled loops keep the block in registers. */
+/* Writes to `block` by how much the voxels of LANES blocks at `corner` are reduced. Unrolled loops keep it in registers. */
 static inline void shrunk(__global const float *volume, const size_t corner, const int pitch, const size_t slice,
                           const float threshold, vf *block)
 {
@@ -71,7 +70,7 @@ static inline void shrunk(__global const float *volume, const size_t corner, con
 
 __kernel void dct_excess(
     __global const float *volume, const int4 shape, const int pitch,
-    const int4 shift,                /* shift of the first block, x y z; x counts where work-items are pixels */
+    const int4 shift,                /* first voxel of the first block, x y z; x only with BLOCK_PIXEL */
     const float threshold, __global float *excess)
 {
     const int y = EDGE * (int)get_global_id(1) + shift.y, z = EDGE * (int)get_global_id(2) + shift.z;
@@ -115,7 +114,7 @@ __kernel void dct_start(
     excess[IMAGE_GUARD + row * pitch + x] = 0.0f;
 }
 
-/* Writes the shrunk volume without padding. A work-item takes LANES voxels of a row. */
+/* Writes the resulting volume without padding. A work-item takes LANES voxels of a row. */
 __kernel void dct_end(
     __global const float *volume, __global const float *excess, const int4 shape, const int pitch, const int nonnegative,
     __global float *result)

@@ -1,18 +1,18 @@
-/* The intensity model over the cells of a frame: a detector adds photons, not line integrals.
+/* Averages intensities over the time cells of a frame, because a detector adds photons, not line integrals.
 
    The k-th cell of every line is drawn into the k-th layer as w_k p_k. The merged frame M is -ln(sum w_k exp(-p_k)), and
-   dM/d(w_k p_k) is the share exp(-p_k) / sum w_j exp(-p_j). Sums are of differences from the least p, so that
-   nearly equal times cost no digits, and nothing overflows. Twin: detector/attenuation.py. */
+   dM/d(w_k p_k) = exp(-p_k) / sum w_j exp(-p_j), called share. Sums are formed of differences from the smallest p, so that
+   nothing overflows and nearly equal p lose no digits. Twin: detector/attenuation.py. */
 #include "common/lanes.h"
 
-/* p_k of a pixel, from w_k p_k */
+/* p_k of a pixel, computed from w_k p_k */
 #define SEEN(k) (V_LOAD(layers + (size_t)(k) * layer_size + at) * unit / weights[(size_t)(k) * lines + v])
 
 __kernel void intensity_merge(
     __global const float *layers,   /* layer_count images: guard, then (lines, pitch) */
-    __global const float *weights,  /* (layer_count, lines): weight in a line's window, 0 for no cell */
+    __global const float *weights,  /* (layer_count, lines): w_k of each line, 0 without a cell */
     const int layer_count, const int lines, const int width, const int pitch,
-    const float unit,               /* the line integral that is 1 in the images */
+    const float unit,               /* the line integral that is stored as 1 in the images */
     __global float *shares,         /* layer_count images: dM/d(w_k p_k) */
     __global float *merged)         /* guard, then (lines, pitch), padding is not written */
 {

@@ -1,7 +1,7 @@
-/* L1 + D-SSIM of one frame and its gradient, as separable passes over images with zero padding.
-   Images are guard floats, then (lines, pitch), with pitch at least width + guard. Everything after the width is zero, so a
-   window may reach past either end. A work-item takes every get_global_size(0)-th vector of a line: all of them on a CPU,
-   one pixel on a GPU. Twin: objective/terms.py. */
+/* L1 + D-SSIM of one frame and its gradient. SSIM's window is separable: one pass along rows, one along columns.
+   Images are guard floats, then (lines, pitch), with pitch at least width + guard. All after the width is zero, so a window
+   may reach beyond either end. On a CPU a work-item takes all vectors of a line, on a GPU one pixel. Twin:
+   objective/terms.py. */
 #include "common/lanes.h"
 #include "common/group_sums.h"
 
@@ -12,7 +12,7 @@ static inline vf masked(__global const float *image, __global const float *mask,
     return V_LOAD(image + at) * V_LOAD(mask + at);
 }
 
-/* Pass over rows: the five moments x, y, xx, yy, xy, blurred along the line. */
+/* Pass along rows: window means of x, y, xx, yy and xy, where x is rendered and y measured. */
 __kernel void ssim_moments(
     __global const float *rendered, __global const float *measured, __global const float *mask,
     __constant float *window, const int lines, const int width, const int pitch,
@@ -40,14 +40,15 @@ __kernel void ssim_moments(
     V_STORE(xy, moments + 4 * image + row);
 }
 
-/* Pass over columns: dSSIM/d(mean(x), mean(xx), mean(xy)), and the sums over a work-group's pixels. */
+/* Pass along columns, which completes the means: SSIM's derivatives by mean(x), mean(xx) and mean(xy), and the sums over a
+   work-group's pixels. */
 __kernel void ssim_map(
     __global const float *moments, __global const float *rendered, __global const float *measured,
     __global const float *mask, __constant float *window,
     const int lines, const int width, const int pitch, const float c1, const float c2,
     __global float *partials,        /* 3 images */
-    __local float *tree,             /* (3, group's items) */
-    __global float *sums)            /* (groups, 3): ssim, |x - y|, masked pixels */
+    __local float *tree,             /* scratch for three sums: (3, group's items) */
+    __global float *sums)            /* (groups, 3): SSIM, mask · |x - y|, mask */
 {
     const int v = (int)get_global_id(1), stop = v < lines ? width : 0;
     const size_t image = IMAGE_GUARD + (size_t)lines * pitch;
@@ -81,7 +82,7 @@ __kernel void ssim_map(
     group_sums(own, 3, tree, sums + 3 * (get_group_id(1) * get_num_groups(0) + get_group_id(0)));
 }
 
-/* Pass over rows of the three derivative images. */
+/* Applies the window along rows to the three derivative images. */
 __kernel void ssim_spread(
     __global const float *partials, __constant float *window, const int lines, const int width, const int pitch,
     __global float *spread)          /* 3 images */
@@ -98,7 +99,7 @@ __kernel void ssim_spread(
     }
 }
 
-/* Pass over columns, and the gradient l1_weight sign(x - y) - ssim_weight dSSIM/dx. */
+/* Applies the window along columns, and writes the gradient l1_weight sign(x - y) - ssim_weight dSSIM/dx. */
 __kernel void image_gradient(
     __global const float *spread, __global const float *rendered, __global const float *measured,
     __global const float *mask, __constant float *window,

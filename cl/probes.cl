@@ -1,7 +1,8 @@
-/* Tests what a device and its compiler do with numbers, for `phyradgs devices --check`. Built with FP64 0 and LANES 1. */
+/* Tests whether a device and its compiler keep numbers exact, for `phyradgs devices --check`. Built with FP64 0, LANES 1. */
 #include "common/precise.h"
 
-/* x + y z as the sum (high, low) of a pair. low is lost where a compiler contracts or reorders the sums. */
+/* sums = x + y z, as two floats (high, low) whose sum is the result. A compiler that reorders or fuses the operations
+   loses `low`. */
 __kernel void probe_pairs(
     __global const float *x, __global const float *y, __global const float *z, const int count, __global float2 *sums)
 {
@@ -15,7 +16,8 @@ __kernel void probe_pairs(
     sums[k] = (float2)(sum.high, sum.low);
 }
 
-/* Passes whole numbers through local memory, as ints and as floats, and doubles a subnormal float. Groups have 32 items. */
+/* Passes whole numbers through local memory, as ints and as the bits of floats, and doubles a subnormal float.
+   Work-groups have 32 items. */
 __kernel void probe_numbers(
     __global const int *numbers, const float subnormal, __global int *as_ints, __global float *as_floats, __global int *twice)
 {

@@ -1,12 +1,13 @@
-/* Measures the device's best rate of multiply-adds on registers. The driver's own copies measure the rate of copies. */
+/* Measures how many multiply-adds on registers the device does per second at best. */
 #include "common/lanes.h"
 
-/* 8 independent chains of multiply-adds per work-item hide latency: 16 LANES `steps` floating-point operations. */
+/* Does 16 LANES `steps` floating-point operations per work-item, in 8 independent chains: a single chain would have to wait
+   for each result. */
 __kernel void multiply_add(const int steps, const float factor, __global float *out)
 {
     const vf a = (vf)(factor), b = (vf)(1.0f - factor);
     vf c0 = (vf)((float)(get_global_id(0) % 7)), c1 = c0 + 1.0f, c2 = c0 + 2.0f, c3 = c0 + 3.0f;
-    vf c4 = c0 + 4.0f, c5 = c0 + 5.0f, c6 = c0 + 6.0f, c7 = c0 + 7.0f; /* named variables: an array would be in memory */
+    vf c4 = c0 + 4.0f, c5 = c0 + 5.0f, c6 = c0 + 6.0f, c7 = c0 + 7.0f; /* no array: it would lie in memory */
     for (int step = 0; step < steps; ++step) {
         c0 = mad(c0, a, b);
         c1 = mad(c1, a, b);

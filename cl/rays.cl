@@ -1,20 +1,20 @@
-/* Ray-driven projector by Joseph's method over all time cells of many frames, in as few launches as the device allows. One
-   bilinear sample per plane of the ray's main axis (Joseph, IEEE Trans. Med. Imaging 1 (1982) 192). Frames and volumes are
-   padded rows; a volume has a border of zeros in y and z. Adjoints: rays_adjoint_cpu.cl, rays_adjoint_gpu.cl.
+/* Ray-driven projector by Joseph's method: one bilinear sample per plane of voxels across the ray's main axis (Joseph, IEEE
+   Trans. Med. Imaging 1 (1982) 192). A launch projects all time cells of many frames. Rows of frames and volumes are padded;
+   a volume has a border of zeros in y and z. Adjoints: rays_adjoint_cpu.cl, rays_adjoint_gpu.cl.
    Twin: operators/twins/rays.py. */
 #include "common/ray.h"
 
 __kernel void rays_forward(
     __global const float *volume,     /* guard, then (z, y, pitch) with a border of BORDER in y and z */
     __global const float *cells,      /* (C, RAY_CELL), frame after frame */
-    __global const int *cell_lines,   /* (C, 2): first line of a cell and the line after its last; ACROSS: columns */
-    __global const int *line_cells,   /* (F, lines, 2): first cell, and the cell after the last, that may serve a line */
+    __global const int *cell_lines,   /* (C, 2): lines [first, stop) that a cell serves; ACROSS: columns */
+    __global const int *line_cells,   /* (F, lines, 2): cells [first, stop) that may serve a line */
     __global const int *frame_list,   /* numbers of the frames to project */
-    __global const float *weights, __global const int *weight_at, /* weights of cells' lines, and each cell's start */
+    __global const float *weights, __global const int *weight_at, /* weights of the cells' lines; where a cell's begin */
     const int4 shape, const int4 origin, /* voxels of the volume, and its first voxel in the grid, x y z */
     const int volume_pitch, const float4 pitch_mm,
     const int lines, const int width, const int image_pitch,
-    const int add,                    /* 1: adds to the image, for one more brick of the volume */
+    const int add,                    /* 1: adds to the image, for a further part of the volume */
     __global float *image)            /* guard, then (listed frames, lines, pitch) */
 {
     const int u = (int)get_global_id(0) * LANES, v = (int)get_global_id(1), n = (int)get_global_id(2);

@@ -1,6 +1,7 @@
-/* Adjoint of rays.cl for CPUs. A work-item owns a brick of voxels. It follows the rays that may meet its brick plane by
-   plane, as the projector does, and adds their shares to a tile in local memory. The tile has a border of one voxel, whose
-   sums belong to the neighbours, which compute them again. Each voxel has one writer and a fixed order: no atomics. */
+/* Adjoint of rays.cl for CPUs. A work-item takes a box of voxels. It follows the rays that may meet the box plane by plane,
+   as the projector does, and adds to voxels in a tile of local memory. The tile has a border of one voxel, whose sums are
+   not used: the neighbouring work-items compute them too. So one work-item sums for a voxel, in a fixed order, without
+   atomics. */
 #include "common/ray.h"
 #include "common/ray_window.h"
 
@@ -8,7 +9,7 @@
 #define TILE_Y (BRICK_Y + 2)
 #define TILE_Z (BRICK_Z + 2)
 
-/* Adds the rays u_lo..u_hi of one line and cell to the tile. row: the line's values; own: the cell's weights. */
+/* Backprojects pixels u_lo..u_hi of a line, from one cell, into the tile. row: the line's values. own: the cell's weights. */
 RAY_INLINE void line_onto(__global const float *cell, __global const float *row, __global const float *own, const float4 pitch_mm,
                           const int u_lo, const int u_hi, const int v, const int4 corner, const int4 size,
                           __local float *tile)
@@ -17,7 +18,7 @@ RAY_INLINE void line_onto(__global const float *cell, __global const float *row,
         const vi real = VI_IOTA + u <= u_hi;
         const rays_t r = rays_through(cell, pitch_mm, (float)u + V_IOTA, (float)v);
         const vf value = V_LOAD(row + u) * (weight_of(own, u, v) * r.step_mm);
-        if (!V_ANY(value != 0.0f)) /* masked pixels, air */
+        if (!V_ANY(value != 0.0f)) /* masked pixels, or air */
             continue;
         for (int axis = 0; axis < 3; ++axis) {
             walk_t w;
@@ -60,17 +61,17 @@ __kernel void rays_adjoint(
     const int add,
     __global float *volume)
 {
-    __local float tile[TILE_X * TILE_Y * TILE_Z]; /* tile of the one work-item in the group */
+    __local float tile[TILE_X * TILE_Y * TILE_Z]; /* the group has only one work-item */
     const int4 own = (int4)((int)get_group_id(0) * BRICK_X, (int)get_group_id(1) * BRICK_Y,
-                            (int)get_group_id(2) * BRICK_Z, 0); /* first voxel in this volume; corner: in the grid */
+                            (int)get_group_id(2) * BRICK_Z, 0); /* own: first voxel in this volume; corner: in the grid */
     const int4 corner = origin + own, size = min((int4)(BRICK_X, BRICK_Y, BRICK_Z, 0), shape - own);
     const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
     __global float *voxels = volume + IMAGE_GUARD + (own.z + BORDER) * sz + (own.y + BORDER) * sy + own.x;
-    const float4 half_size = convert_float4(size + 1) * 0.5f; /* with the border */
+    const float4 half_size = convert_float4(size + 1) * 0.5f; /* includes the border */
     const float4 middle = convert_float4(corner) + convert_float4(size - 1) * 0.5f;
     for (int k = 0; k < TILE_X * TILE_Y * TILE_Z; ++k)
         tile[k] = 0.0f;
-    if (add) /* old values come first, so that frames add in one order however many launches they take */
+    if (add) /* begins with the old values, so that the order of sums does not depend on the number of launches */
         for (int z = 0; z < size.z; ++z)
             for (int y = 0; y < size.y; ++y)
                 for (int x = 0; x < size.x; ++x)

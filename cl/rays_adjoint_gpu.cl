@@ -1,5 +1,5 @@
-/* Adjoint of rays.cl for GPUs. A work-item is a voxel, and gathers from the rays whose samples touch it. A work-group is a
-   block of 4 x 4 x 4 voxels, or fewer along z. Its items search for its cells together. */
+/* Adjoint of rays.cl for GPUs. A work-item takes a voxel, and sums over the rays whose samples touch it. A work-group takes
+   a block of 4 x 4 x 4 voxels, or fewer along z. Its items search together for the time cells that see the block. */
 #include "common/ray.h"
 #include "common/ray_window.h"
 
@@ -7,9 +7,9 @@
 #ifndef BLOCK_Z
 #define BLOCK_Z BLOCK
 #endif
-#define FEW_CELLS 8    /* frames with at most this many time cells are not searched: it would take longer */
+#define FEW_CELLS 8    /* with at most this many time cells in a frame, searching would take longer than trying all */
 
-/* The weight of the voxel in the ray's sample, as in rays_forward. */
+/* The weight of the voxel in the ray's samples, times the length of ray per sample, as in rays_forward. */
 static inline float ray_weight(const rays_t r, __global const float *cell, const int4 voxel)
 {
     const int a = r.axis, b = a == 0 ? 1 : 0, c = a == 2 ? 1 : 2;
@@ -37,12 +37,12 @@ __kernel void rays_adjoint(
     const int add,
     __global float *volume)
 {
-    __local int range[2]; /* no cell outside of this range sees the block */
+    __local int range[2]; /* the first cell that sees the block, and the last + 1 */
     const int item = (int)get_local_id(0), items = (int)get_local_size(0);
     const int4 block = (int4)((int)get_global_id(0) / items * BLOCK, (int)get_global_id(1) * BLOCK,
-                              (int)get_global_id(2) * BLOCK_Z, 0); /* by global id: launches may hold some groups only */
+                              (int)get_global_id(2) * BLOCK_Z, 0); /* the group's id restarts in each part of a launch */
     const int4 own = block + (int4)(item % BLOCK, (item / BLOCK) % BLOCK, item / (BLOCK * BLOCK), 0);
-    const int4 corner = origin + block, voxel = origin + own; /* indices in the grid; own, block: in this volume */
+    const int4 corner = origin + block, voxel = origin + own; /* indices in the grid; own and block are in this volume */
     const int inside = own.x < shape.x && own.y < shape.y && own.z < shape.z;
     const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
     __global float *to = volume + IMAGE_GUARD + (own.z + BORDER) * sz + (own.y + BORDER) * sy + own.x;
@@ -53,7 +53,7 @@ __kernel void rays_adjoint(
         __global const float *frame = image + IMAGE_GUARD + (size_t)n * lines * image_pitch;
         int first = frame_cells[frame_list[n]], stop = frame_cells[frame_list[n] + 1];
         window_t w;
-        if (stop - first > FEW_CELLS) { /* all items of the group go the same way */
+        if (stop - first > FEW_CELLS) { /* the same for all items of a group, as barriers need */
             barrier(CLK_LOCAL_MEM_FENCE);
             if (item == 0) {
                 range[0] = stop;
@@ -62,7 +62,7 @@ __kernel void rays_adjoint(
             barrier(CLK_LOCAL_MEM_FENCE);
             for (int c = first + item; c < stop; c += items)
                 if (window_of(matrices, matrix_stride, cell_lines, width, c, stop, middle, around, &w)) {
-                    atomic_min(&range[0], c); /* the order does not matter for integers */
+                    atomic_min(&range[0], c); /* integers: the result does not depend on the order */
                     atomic_max(&range[1], c + 1);
                 }
             barrier(CLK_LOCAL_MEM_FENCE);

@@ -1,11 +1,13 @@
-/* Converts between frames and slots. A slot holds what the upright kernels project from one pose, for the part of the panel
-   that this pose serves. A frame is an average of slots with a weight for each line; the transpose spreads frames to slots.
-   A line is a detector row where `by_row`, else a column. */
+/* Averages slots to frames, and the transpose. A slot is a buffer for the line integrals from one pose, on the part of the
+   panel that this pose serves. A frame is an average of slots, with a weight for each line (a detector row if `by_row`,
+   else a column). */
 #include "common/ray_column.h"
 
-#define SHARE 4        /* ints of a share: slot (or frame), first line, line after the last, where its weights begin */
+/* A share tells on which lines a slot is part of a frame. Its ints: slot (or frame), lines [first, stop), where the weights
+   of these lines begin. */
+#define SHARE 4
 
-/* Weights of LANES pixels from row v on in column u; 0 where the share does not serve them. */
+/* The weights of LANES pixels of column u, from row v on; 0 on lines outside the share. */
 RAY_INLINE vf weights_at(__global const float *weights, __global const int *share, const int by_row, const int u, const int v)
 {
     const int first = share[1], stop = share[2];
@@ -22,12 +24,12 @@ RAY_INLINE vf weights_at(__global const float *weights, __global const int *shar
 __kernel void merge_slots(
     __global const float *integrals,  /* guard, then (S, columns of a slot, slot_pitch) */
     const int slot_columns, const int slot_pitch,
-    __global const int *slots,        /* (S, SLOT) */
-    __global const int *frame_shares, /* (F + 1,): starts of each frame's shares */
-    __global const int *shares,       /* (E, SHARE) */
+    __global const int *slots,        /* (S, SLOT): poses, and the lines and columns that they serve */
+    __global const int *frame_shares, /* (F + 1,): where each frame's shares begin */
+    __global const int *shares,       /* (E, SHARE), frame after frame */
     __global const float *weights,
     const int by_row, const int width, const int height,
-    const long4 to,                   /* start + u s0 + v s1 + frame s2 */
+    const long4 to,                   /* a pixel is at to.x + u to.y + v to.z + frame to.w */
     __global float *image)
 {
     const int u = (int)get_global_id(0), n = (int)get_global_id(1);
@@ -38,7 +40,7 @@ __kernel void merge_slots(
         vf total = (vf)(0.0f);
         for (int e = frame_shares[n]; e < frame_shares[n + 1]; ++e) {
             __global const int *share = shares + SHARE * e, *slot = slots + SLOT * (size_t)share[0];
-            if (by_row && v + LANES <= share[1]) /* shares begin in the order of their lines */
+            if (by_row && v + LANES <= share[1]) /* shares are sorted by their first line */
                 break;
             if (u < slot[SLOT_U] || u >= slot[SLOT_U_STOP] || v + LANES <= slot[SLOT_V] || v >= slot[SLOT_V_STOP])
                 continue;
@@ -46,7 +48,7 @@ __kernel void merge_slots(
             __global const float *column = integrals + IMAGE_GUARD
                 + ((size_t)share[0] * slot_columns + u - slot[SLOT_U]) * slot_pitch;
             const int own = v - slot[SLOT_V], most = slot_pitch - LANES;
-            /* Near the ends of the slot only some lanes are inside. */
+            /* At the ends of the slot only some lanes are inside. */
             const vf p = own >= 0 && own <= most
                 ? V_LOAD(column + own) : GATHER(column, min(max(own + VI_IOTA, 0), slot_pitch - 1));
             total += V_PICK(0.0f, weight * p, weight > 0.0f);
@@ -56,14 +58,14 @@ __kernel void merge_slots(
     }
 }
 
-/* The transpose of merge_slots, times the length of each ray from plane to plane. Where
-   columns lean the rays' slopes along z follow, slots_floats behind the values. */
+/* The transpose of merge_slots, times the length of each ray from one plane of voxels to the next. If LEAN, also writes the
+   rays' slopes along z, slots_floats after the values. */
 __kernel void split_slots(
     __global const float *turned,     /* guard, then (F, width, turned_pitch): frames with detector columns as rows */
     const long start, const int turned_pitch, /* start: floats before the first frame */
     __global const float *cells, __global const int *slots,
-    __global const int *slot_shares,  /* (S + 1,): starts of each slot's shares */
-    __global const int *shares,       /* (E, SHARE), by slot */
+    __global const int *slot_shares,  /* (S + 1,): where each slot's shares begin */
+    __global const int *shares,       /* (E, SHARE), slot after slot */
     __global const float *weights,
     const int by_row, const int width, const float4 pitch_mm,
     const int slot_columns, const int slot_pitch, const long slots_floats,

@@ -1,15 +1,15 @@
-/* The projector of rays.cl where detector columns are nearly parallel to the volume's z. The rays of a column then share
-   most of their work. Volumes are transposed, with z along a row: samples of neighbouring lines lie side by side.
+/* The projector of rays.cl for detector columns nearly parallel to the volume's z. The rays to such a column then share most
+   of their work. Volumes are transposed, with z along a row, so samples of neighbouring lines are side by side in memory.
    Samples and weights are those of rays.cl. A work-item takes a detector column of one pose.
-   LEAN 0: columns are parallel to z. Their rays cut a plane x = const (or y) at one y (or x), and two columns of voxels are
-   blended once for all of them. LEAN 1: this place changes a little from line to line.
+   LEAN 0: columns are parallel to z. All rays to a column meet a plane of voxels at the same x (or y), so two columns of
+   voxels are blended once for all of them. LEAN 1: this x changes a little from line to line.
    Twin: operators/twins/rays.py. */
 #include "common/ray_column.h"
 
-#define TURN 16 /* voxels along each side (x and z) of the tile that a work-item transposes */
+#define TURN 16 /* side (x and z) of the tile that a work-item transposes, in voxels */
 
-/* Copies (z, y, x), with voxel (z, y, x) at from.x + y from.y + z from.z + x, to guard, then (y, x, pitch) with a border of
-   BORDER in y and x. The border must hold zeros before. */
+/* Transposes a volume, so that z is along rows. Voxel (z, y, x) is at from.x + y from.y + z from.z + x. The result is a guard,
+   then (y, x, pitch), with a border of BORDER voxels in y and x that the kernel does not write: it must be zero. */
 __kernel void turn_upright(
     __global const float *volume, const long4 from, const int4 shape, const int column_pitch,
     __global float *columns)
@@ -33,7 +33,7 @@ __kernel void turn_upright(
             to[(size_t)x * column_pitch + z] = tile[z][x];
 }
 
-/* The planes of a detector column's rays along their main axis a, and the places where they cut: b = s_b + g_b (i - s_a). */
+/* The planes of voxels across the main axis a of a detector column's rays. On plane i a ray is at b = s_b + g_b (i - s_a). */
 typedef struct {
     float sa, sb, sc;
     int na, nb, a_first, b_first, b_last, c_first, c_last;
@@ -60,7 +60,7 @@ RAY_INLINE planes_t planes_of(__global const float *cell, const int along_x, con
     return r;
 }
 
-/* planes_of for plane i: a parallel beam counts as a cone beam with another source for every plane (common/ray.h). */
+/* planes_of for plane i. In a parallel beam each plane has another source (common/ray.h). */
 RAY_INLINE planes_t planes_from(planes_t r, const int i)
 {
 #if RAY_PARALLEL
@@ -71,33 +71,34 @@ RAY_INLINE planes_t planes_from(planes_t r, const int i)
     return r;
 }
 
-/* The voxel at or below a position on the clamped axis of a box from `first` to `last`. */
+/* The voxel at or below a position, which has been clamped to a box, and at most `last`. */
 RAY_INLINE int voxel_below(const float at, const int last) { return min((int)(at + 1.0f) - 1, last); }
 
-/* Whether the voxels of LANES lines, from g[0] to g[LANES - 1] along c, are within two vectors. */
+/* Whether two vectors contain the voxels that LANES lines meet along c, with slopes from g[0] to g[LANES - 1]. */
 #ifdef V_LOOKUP
 #define FIT_TWO_VECTORS(g, ahead) (fabs(((g)[LANES - 1] - (g)[0]) * (ahead)) < (float)(2 * LANES - 3))
 #endif
 
-/* Samples of LANES lines at z and z + 1, with share wc, in a column of voxels of which two vectors are loaded. */
+/* Interpolates for LANES lines between voxels z and z + 1 of a column, with weight wc of the second. low, high: two vectors
+   of the column. place: z, counted from their first voxel. */
 #define BETWEEN(low, high, place, wc) \
     fma((wc), V_LOOKUP(low, high, (place) + 1) - V_LOOKUP(low, high, place), V_LOOKUP(low, high, place))
 
 #if LEAN
-/* Adds to p what `count` lines meet on plane i. plane: its voxel b = c = 0 (counted in the grid). */
+/* Adds to p the samples of `count` lines on plane i. plane: where its voxel with b = c = 0 in the grid would be. */
 RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, const int i, const float *gb, const float *gc,
                              const int count, float *p, float *blended)
 {
     const float ahead = (float)i - r.sa, lowest = (float)(r.b_first - 1), highest = (float)(r.b_last + 1);
-    const int last = (count + LANES - 1) / LANES * LANES - 1; /* line of the last vector, beyond the last line */
+    const int last = (count + LANES - 1) / LANES * LANES - 1; /* where the last vector ends, beyond the last line */
     const float b0 = fma(gb[0], ahead, r.sb), b1 = fma(gb[last], ahead, r.sb);
     if (fmax(b0, b1) <= lowest || fmin(b0, b1) >= highest)
         return;
 #ifdef V_LOOKUP
     const int is_dense = FIT_TWO_VECTORS(gc, ahead) && FIT_TWO_VECTORS(gc + last + 1 - LANES, ahead);
     const int top = max(r.c_last + 2 - 2 * LANES, r.c_first - 1);
-    /* b rises or falls from line to line. A vector lies between two columns of voxels if its last line does, and the line
-       before its first one. */
+    /* b rises or falls from line to line. So all lines of a vector are between the same two columns of voxels if its last
+       line is, and the line before its first. */
     int j = voxel_below(clamp(b0, lowest, highest), r.b_last), is_between = is_dense && b0 >= lowest && b0 < highest;
 #endif
     for (int k = 0; k < count; k += LANES) {
@@ -154,7 +155,8 @@ RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, cons
     }
 }
 #else
-/* Adds to p what `count` lines meet on plane i. plane: its voxel b = c = 0 (counted in the grid). gb: those of all lines. */
+/* Adds to p the samples of `count` lines on plane i. plane: where its voxel with b = c = 0 in the grid would be. gb: its
+   first element is the slope of all lines. */
 RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, const int i, const float *gb, const float *gc,
                              const int count, float *p, float *blended)
 {
@@ -189,7 +191,7 @@ RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, cons
     }
     for (int k = 0; k < count; k += LANES) {
         vf wc;
-        /* Lanes beyond the last line may point outside of the blended voxels. */
+        /* Clamped, because lanes beyond the last line may point outside of the blended voxels. */
         const vi z = sample_at(V_LOAD(gc + k), r.sc, ahead, r.c_first, r.c_last, &wc) - base;
         const vi own = min(max(z, 0), stop - base - 2);
         const vf a = GATHER(blended, own), b = GATHER(blended + 1, own);
@@ -200,11 +202,11 @@ RAY_INLINE void sample_plane(__global const float *plane, const planes_t r, cons
 
 __kernel void rays_upright(
     __global const float *columns,    /* the whole volume, transposed by turn_upright */
-    __global const float *cells,      /* (C, RAY_CELL) */
-    __global const int *slots,        /* (S, SLOT): poses, and the parts of the panel that they serve */
+    __global const float *cells,      /* (C, RAY_CELL): one per pose */
+    __global const int *slots,        /* (S, SLOT): poses, and the lines and columns that they serve */
     const int4 shape, const int4 origin, const int column_pitch, const float4 pitch_mm,
     const int block,                  /* lines per work-item, <= UPRIGHT_LINES */
-    const long4 to,                   /* place of line integrals: start + u s0 + v s1 + slot s2, of a slot's own u and v */
+    const long4 to,                   /* a result is at to.x + u to.y + v to.z + slot to.w, counted in the slot */
     __global float *image)
 {
     __global const int *slot = slots + SLOT * (size_t)get_global_id(2);
@@ -213,11 +215,11 @@ __kernel void rays_upright(
     if (u >= slot[SLOT_U_STOP] || count <= 0)
         return;
     __global const float *cell = cells + (size_t)slot[SLOT_CELL] * RAY_CELL;
-    /* Room for lines and a vector that begins at any line; for voxels, a vector and the next voxel. */
+    /* With room for a vector that begins at the last line or voxel. */
     float total[UPRIGHT_LINES + LANES], p[UPRIGHT_LINES + LANES], gc[UPRIGHT_LINES + LANES], gb[UPRIGHT_LINES + LANES];
     float blended[UPRIGHT_VOXELS + 2 * LANES];
     const int first_along_x = is_along_x(cell, u, start), last_along_x = is_along_x(cell, u, start + count - 1);
-    for (int turn = 0; turn < 1 + (first_along_x != last_along_x); ++turn) { /* lines that lean may have both main axes */
+    for (int turn = 0; turn < 1 + (first_along_x != last_along_x); ++turn) { /* a column that leans may have both main axes */
         const int along_x = turn ? last_along_x : first_along_x;
         const planes_t r = planes_of(cell, along_x, shape, origin, column_pitch);
         for (int k = 0; k < count; k += LANES) {

@@ -1,12 +1,12 @@
-/* The adjoint of rays_upright.cl. A ray weighs voxels by its distance from their centres. Lines follow
-   each other along the voxels, so a vector of voxels gathers from a few neighbouring lines. Each voxel has one writer, in a
-   fixed order. LEAN as in ray_column.h. Twin: operators/twins/rays.py. */
+/* The adjoint of rays_upright.cl. A ray counts for the voxels around it, by its distance from their centres. Along z, voxels
+   and lines follow in the same order, so a vector of voxels sums over a few neighbouring lines. One work-item sums for a
+   voxel, in a fixed order. LEAN: see ray_column.h. Twin: operators/twins/rays.py. */
 #include "common/near_lines.h"
 
-#define LINE_MARGIN 0.01f /* lines added to each range, more than the rounding; lines too far from a voxel have weight 0 */
+#define LINE_MARGIN 0.01f /* lines by which ranges are widened, more than their rounding; lines too far away weigh 0 */
 #define PLANES ((ADJOINT_X > ADJOINT_Y ? ADJOINT_X : ADJOINT_Y) + LANES) /* planes of a box, in whole vectors */
 
-/* Floor and ceil of what an int can hold: PoCL's functions take ten times as long. */
+/* Floor and ceil, for numbers that an int can hold. PoCL's functions take ten times as long. */
 RAY_INLINE int whole_below(const float at)
 {
     const int whole = (int)at;
@@ -29,7 +29,7 @@ static inline int2 columns_of_box(__global const float *matrix, const int stride
         const float depth = M(8) * x + M(9) * y + M(10) * z + M(11);
         const float u = (M(0) * x + M(1) * y + M(2) * z + M(3)) / depth;
 #undef M
-        if (!(depth > 1e-3f)) /* the plane of the source cuts the box: no bound */
+        if (!(depth > 1e-3f)) /* the plane through the source cuts the box, which gives no bound */
             return (int2)(u_first, u_stop - 1);
         least = fmin(least, u);
         most = fmax(most, u);
@@ -38,7 +38,8 @@ static inline int2 columns_of_box(__global const float *matrix, const int stride
                   min(u_stop - 1, whole_below(clamp(most + LINE_MARGIN, -1.0f, (float)u_stop))));
 }
 
-/* Lines [first, stop) of a slot's column whose main axis is x, or y: all, none, or those on one side of a border. */
+/* The lines of a detector column, out of [first, stop), whose rays have the main axis x if `along_x`, else y. They are all,
+   none, or those on one side of a border, which is found by bisection. */
 RAY_INLINE int2 lines_along(__global const float *cell, const int u, const int first, const int stop, const int along_x)
 {
     const int begins = is_along_x(cell, u, first) == along_x;
@@ -57,20 +58,20 @@ RAY_INLINE int2 lines_along(__global const float *cell, const int u, const int f
     return begins ? (int2)(first, high) : (int2)(high, stop);
 }
 
-/* The voxels and lines that a detector column meets on each plane of a box. */
+/* What the rays of a detector column meet on each plane of a box of voxels. */
 typedef struct {
-    int from[PLANES], stop[PLANES]; /* voxels along z that its lines may touch; none where it misses the box */
-    int first[PLANES];              /* column of voxels at or below the lower of its first and last line */
-    int most[PLANES];               /* most lines that may touch a voxel */
-    float ahead[PLANES];            /* planes from the source */
-    float at[PLANES];               /* place of the rays' plane at the source's height */
+    int from[PLANES], stop[PLANES]; /* voxels [from, stop) along z that rays may touch; none if they miss the box */
+    int first[PLANES];              /* the lowest column of voxels that a ray may touch */
+    int most[PLANES];               /* most lines whose rays may touch a voxel */
+    float ahead[PLANES];            /* distance from the source, in planes */
+    float at[PLANES];               /* where the plane of the rays is at the source's height */
 #if LEAN
-    int is_between[PLANES];                      /* whether all lines pass between the first column and the next */
-    /* The first of these lines, not whole, is first_line + (per_voxel + bend z) z for voxel z of the box. */
+    int is_between[PLANES];                      /* whether all rays pass between the first column and the next */
+    /* Rounded, first_line + (per_voxel + bend z) z is the first line that may touch voxel z of the box. */
     float first_line[PLANES], per_voxel[PLANES], bend[PLANES];
 #else
-    float reach[PLANES];            /* lines from a voxel to the farthest line that touches it */
-    float slope[PLANES], at_zero[PLANES], per_slope[PLANES]; /* voxels to a line, the height of line 0, lines to a voxel */
+    float reach[PLANES];            /* distance of the farthest line that touches a voxel, in lines */
+    float slope[PLANES], at_zero[PLANES], per_slope[PLANES]; /* voxels per line, the height of line 0, lines per voxel */
 #endif
 } planes_t;
 
@@ -80,8 +81,8 @@ RAY_INLINE vi whole_below_all(const vf at)
     return whole - VI_PICK(0, 1, V_FLOAT(whole) > at);
 }
 
-/* Meets LANES planes at a time, which share divisions. sa: the source's place among planes. The box has columns from b_first
-   to b_stop and nz voxels from z_first on. */
+/* Fills `planes` for the planes `between`, LANES at a time. sa: the plane at which the source is. The box has columns from
+   b_first to b_stop, and nz voxels from z_first on. */
 RAY_INLINE void meet_planes(const column_t r, const float sa, const int2 between, const int z_first, const int nz,
                             const int b_first, const int b_stop, planes_t *planes)
 {
@@ -102,9 +103,9 @@ RAY_INLINE void meet_planes(const column_t r, const float sa, const int2 between
         const vi stop = VI_PICK(min(above, nz), from, misses);
         const vi column = whole_below_all(max(min(at0, at1), (float)(b_first - 2)));
 #if LEAN
-        /* Lines within a voxel of a height; a little more where lines beyond the ends are denser. */
+        /* The largest number of lines per voxel. Beyond both ends, lines may be a little denser (bend). */
         const vf per = r.dense / max(fabs(ahead), LEAST_SLOPE);
-        /* Lines at both ends. Between them they follow a parabola, and their turn bounds its error. */
+        /* The lines at both ends of the voxels. In between a parabola approximates the line; `turn` bounds its error. */
         const vf over0 = V_FLOAT(from + z_first) - sc, over1 = V_FLOAT(stop + z_first) - sc;
         const vf turn0 = ahead * r.ez - over0 * r.ea, turn1 = ahead * r.ez - over1 * r.ea;
         const vf per_turns = 1.0f / (turn0 * turn1);
@@ -114,7 +115,7 @@ RAY_INLINE void meet_planes(const column_t r, const float sa, const int2 between
         const vf reach = per * (1.0f + r.bend * per) + 0.15f * fabs(line1 - line0) * turn * turn + LINE_MARGIN;
         const vf bottom = V_FLOAT(from), top = V_FLOAT(stop);
         const vf per_height = 1.0f / max(top - bottom, 1.0f), per_voxel = (line1 - line0) * per_height;
-        const vf bend = -turn * per_voxel * per_height; /* turn (line1 - line0) t (1 - t) is added at share t of the way */
+        const vf bend = -turn * per_voxel * per_height; /* turn (line1 - line0) t (1 - t) is added at fraction t of the way */
         V_STORE(line0 - (per_voxel - bend * top) * bottom - reach + 1.0f, planes->first_line + p);
         V_STORE(per_voxel - bend * (bottom + top), planes->per_voxel + p);
         V_STORE(bend, planes->bend + p);
@@ -137,8 +138,8 @@ RAY_INLINE void meet_planes(const column_t r, const float sa, const int2 between
     }
 }
 
-/* Adds a detector column at plane p to columns of voxels that begin at voxel z_first. Column j is at
-   sums + (j - b_first) step for b_first <= j < b_stop, and at `beyond` elsewhere. */
+/* Adds what a detector column contributes on plane p to columns of voxels, which begin at voxel z_first. Column j is summed
+   at sums + (j - b_first) step if b_first <= j < b_stop. Others are other work-items' and are summed at `beyond`, unused. */
 RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p, const int z_first, const int b_first,
                            const int b_stop, float *sums, const int step, float *beyond)
 {
@@ -147,8 +148,8 @@ RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p
 #define COLUMN(j) ((j) < b_first || (j) >= b_stop ? beyond : sums + ((j) - b_first) * step)
 #if LEAN
     const float ahead = planes->ahead[p], first_line = planes->first_line[p], per_voxel = planes->per_voxel[p];
-    const float bend = planes->bend[p], start = r.sc - (float)z_first; /* place of the source among the box's voxels */
-    int j0 = j, j1 = j, next_look = planes->is_between[p] ? stop : from; /* lines pass between two columns up to it */
+    const float bend = planes->bend[p], start = r.sc - (float)z_first; /* the source's height in the box, in voxels */
+    int j0 = j, j1 = j, next_look = planes->is_between[p] ? stop : from; /* rays pass between two columns up to it */
     float *low = COLUMN(j), *high = COLUMN(j + 1), b_from = b_zero - (float)j;
     vf at = V_IOTA + (float)from;
     for (int z = from; z < stop; z += LANES, at += (float)LANES) {
@@ -160,7 +161,7 @@ RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p
             low = COLUMN(j0);
             high = COLUMN(j0 + 1);
             b_from = b_zero - (float)j0;
-            const float room = r.along > 0.0f ? (float)(j1 + 1) - at1 : at1 - (float)j0; /* to the next column */
+            const float room = r.along > 0.0f ? (float)(j1 + 1) - at1 : at1 - (float)j0; /* distance to the next column */
             if (j0 == j1)
                 next_look = z + (int)fmin(0.99f * room * r.per_along, (float)(ADJOINT_Z + LANES));
         }
@@ -204,7 +205,7 @@ RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p
             continue;
         }
         const int2 base = bases_of_halves(r, lines, most);
-        if (base.x >= 0) { /* more lines than voxels */
+        if (base.x >= 0) { /* lines are denser than voxels */
             const vf v0 = V_LOAD(r.values + base.x), v1 = V_LOAD(r.values + base.x + LANES);
             const vf w0 = V_LOAD(r.values + base.y), w1 = V_LOAD(r.values + base.y + LANES);
             const vi is_upper = VI_IOTA >= LANES / 2;
@@ -226,9 +227,9 @@ RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p
 #endif
 }
 
-/* A work-item owns ADJOINT_X by ADJOINT_Y columns of voxels. */
+/* A work-item sums for a box of ADJOINT_X by ADJOINT_Y by ADJOINT_Z voxels. */
 __kernel void rays_upright_adjoint(
-    __global const float *values,     /* as split_slots writes them */
+    __global const float *values,     /* slots, as split_slots writes them */
     const int slot_columns, const int slot_pitch, const long slots_floats,
     __global const float *cells, __global const int *slots, const int slot_count,
     __global const float *matrices, const int matrix_stride, /* (12, matrix_stride): rows give u z, v z, z of a voxel index */
@@ -272,8 +273,8 @@ __kernel void rays_upright_adjoint(
                 const int b_first = along_x ? origin.y + y_first : origin.x + x_first;
                 const int b_stop = b_first + (along_x ? ny : nx);
                 const int a_first = along_x ? origin.x + x_first : origin.y + y_first;
-                const int step = (along_x ? ADJOINT_X : 1) * (ADJOINT_Z + LANES); /* from one column to the next along b */
-                const int step_a = (along_x ? 1 : ADJOINT_X) * (ADJOINT_Z + LANES); /* and along a */
+                const int step = (along_x ? ADJOINT_X : 1) * (ADJOINT_Z + LANES); /* floats from one column to the next along b */
+                const int step_a = (along_x ? 1 : ADJOINT_X) * (ADJOINT_Z + LANES); /* floats along a */
                 const int2 planes = planes_between(cell, u, along_x, a_first, along_x ? nx : ny);
                 planes_t met;
                 meet_planes(r, cell[RAY_SOURCE + !along_x], planes, origin.z + z_first, nz, b_first, b_stop, &met);

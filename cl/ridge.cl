@@ -1,13 +1,13 @@
-/* The gradient of a weakly convex ridge regulariser, Wᵀ g(W v), and a step down it (Goujon, Neumayer and Unser 2024).
+/* The gradient Wᵀ g(W v) of a weakly convex ridge regulariser (Goujon, Neumayer and Unser 2024), and a step down it.
 
-   W is a chain of correlations of 3³: CHANNELS filters of the volume, then FILTERS of those channels. Only windows inside
-   the volume count: channels have n − 2 elements along an axis, responses n − 4, each at the first voxel of its window. A
-   response t becomes slope_up clamp(t, ±σ knot_up) − slope_down clamp(t, ±σ knot_down). ``table`` holds the first filters
-   (3, 3, 3, CHANNELS), the second filters as (CHANNELS, 3, 3, 3, FILTERS) and as (3, 3, 3, FILTERS, CHANNELS), then slopes
-   and knots of up and down.
+   W is two layers of 3³ correlations: CHANNELS filters of the volume, then FILTERS filters of these channels. Only windows
+   inside the volume count: channels have n − 2 elements along an axis, responses n − 4, stored at the first voxel of their
+   window. g maps a response t to slope_up clamp(t, ±σ knot_up) − slope_down clamp(t, ±σ knot_down). `table` holds the first
+   filters (3, 3, 3, CHANNELS), the second ones as (CHANNELS, 3, 3, 3, FILTERS) and as (3, 3, 3, FILTERS, CHANNELS), then the
+   slopes and knots.
 
-   Between kernels, RING slices of all channels are kept: (RING, channels, ny, pitch), slice z at z % RING, with zeros after
-   a row. A work-item takes a row, in vectors, or a voxel. Twin: objective/ridge.py. */
+   To save memory only RING slices of all channels are kept between kernels: (RING, channels, ny, pitch), slice z at
+   z % RING, with zeros after a row. A work-item takes a row, in vectors, or a voxel. Twin: objective/ridge.py. */
 #include "common/lanes.h"
 
 #define CHANNELS 4
@@ -24,7 +24,7 @@
 #define FOR_X(x, width) for (int x = 0; x < width; x += LANES)
 #endif
 
-/* The place of voxel 0 in a row of a channel of a ring. */
+/* Where a row of a channel begins among the RING slices. */
 static inline size_t row_of(const int4 shape, const int pitch, const int channels, const int c, const int y, const int z)
 {
     return IMAGE_GUARD + (((size_t)(z % RING) * channels + c) * shape.y + y) * pitch;
@@ -35,7 +35,7 @@ static inline vf inside(const vf value, const int x, const int width)
     return V_PICK(0.0f, value, (vf)(x) + V_IOTA < (float)width);
 }
 
-/* Writes the channels of the padded volume. z counts from ``first``, as in all kernels here. */
+/* Applies the first filters to the padded volume. In all kernels here, work-items along z begin at slice `first`. */
 __kernel void ridge_channels(
     __global const float *volume, const int4 shape, const int pitch, const int first, __constant const float *table,
     __global float *channels)
@@ -61,7 +61,7 @@ __kernel void ridge_channels(
     }
 }
 
-/* Writes the filters' responses after their curves: slope_up clamp(t, ±σ knot_up) − slope_down clamp(t, ±σ knot_down). */
+/* Applies the second filters, and then g. */
 __kernel void ridge_responses(
     __global const float *channels, const int4 shape, const int pitch, const int first, __constant const float *table,
     const float sigma, __global float *responses)
@@ -95,7 +95,7 @@ __kernel void ridge_responses(
     }
 }
 
-/* Applies the transpose of the second filters. Each k has its own sums, so that additions do not wait for one another. */
+/* Applies the transpose of the second filters. Each k has its own sums, so that additions need not wait for each other. */
 __kernel void ridge_channels_back(
     __global const float *responses, const int4 shape, const int pitch, const int first, __constant const float *table,
     __global float *channels)
@@ -131,7 +131,7 @@ __kernel void ridge_channels_back(
     }
 }
 
-/* Applies the transpose of the first filters, which gives the gradient. Writes v − step · gradient, without padding. */
+/* Applies the transpose of the first filters, which gives the gradient. Writes v − step · gradient without padding. */
 __kernel void ridge_step(
     __global const float *volume, __global const float *channels, const int4 shape, const int pitch, const int first,
     __constant const float *table, const float step, const int nonnegative, __global float *result)

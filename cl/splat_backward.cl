@@ -1,7 +1,7 @@
-/* Adjoint of the splat, first pass: sums over the footprint of a Gaussian in every time cell, which the chain rule reads.
-   Every Gaussian has one writer, without atomics: results repeat bit for bit.
-   splat_backward_rows: one work-item per Gaussian, with vectors along its lines (CPUs).
-   splat_backward_group: a work-group per Gaussian, with ACROSS items along a line and as many lines as fit (GPUs). */
+/* Adjoint of splat_forward.cl, first pass: for each Gaussian and time cell, sums over the splat's pixels that the chain rule
+   needs (splat_chain.cl). One work-item or work-group sums for a Gaussian, without atomics, so results repeat bit for bit.
+   splat_backward_rows: one work-item per Gaussian, with vectors along lines (CPUs).
+   splat_backward_group: one work-group per Gaussian, ACROSS items of it along a line (GPUs). */
 #if GROUP > 1
 #define SPLAT_SPACE __local
 #endif
@@ -19,7 +19,7 @@ ALWAYS_INLINE splat_sums no_sums(void)
     return sum;
 }
 
-/* Adds the contribution of the pixels u.. of a line. h: dL/d(pixels). */
+/* Adds what LANES pixels of a line, from u on, contribute. h: dL/d(pixels). */
 #if MOVING
 ALWAYS_INLINE void gather(splat_sums *sum, const footprint_line line, const int u, const float limit, const vf h)
 {
@@ -38,7 +38,7 @@ ALWAYS_INLINE void gather(splat_sums *sum, const footprint_line line, const int 
 #else
     const vf along = p.z + line.s.shift;
     const vf by_q = by_num * (m.e - (m.ezz + p.c2 * m.e) * p.rq);
-    const vf still = by_q * line.s.inv_kappa; /* Q depends on num at mid-time, not on means over the window */
+    const vf still = by_q * line.s.inv_kappa; /* Q depends on num at mid-time, not on means over the exposure */
     const vf sb = 2.0f * by_q * p.b;
     sum->of[SUM_IK] += by_q * (along * along + p.c2);
     sum->of[SUM_B] += sb;
@@ -97,9 +97,9 @@ ALWAYS_INLINE void visit(gatherer *own, const footprint_line line)
 #endif
 
 #define ARGUMENTS                                                                                                    \
-    __global float *records,          /* (stride, C, RECORD); the sums replace them */                               \
-    __global const uchar *is_visible, /* (stride, C) */                                                              \
-    __global const float *cells,      /* (C, CELL) */                                                                \
+    __global float *records,          /* (stride, C, RECORD); the sums replace the records */                       \
+    __global const uchar *is_visible, /* (stride, C): 1 where a splat has a record */                                \
+    __global const float *cells,      /* (C, CELL): the time cells of the frame */                                   \
     __global const float *line_times, /* MOVING: (C, TIME_ROWS, time_pitch) */                                       \
     const int time_pitch, const float4 path_limits,                                                                  \
     __global const float *images,     /* dL/dp: guard, then (lines, pitch), padding zero; LAYERED: one per layer */    \
@@ -128,9 +128,9 @@ __kernel void splat_backward_rows(ARGUMENTS)
 #else
 __kernel void splat_backward_group(ARGUMENTS)
 {
-    const int g = (int)get_global_id(0) / ACROSS, item = GROUP_ITEM; /* launches may hold some work-groups only */
+    const int g = (int)get_global_id(0) / ACROSS, item = GROUP_ITEM; /* a group's id restarts in each part of a launch */
     __local float tree[SUM_COUNT * GROUP], cell[CELL];
-    __local int record_as_int[RECORD]; /* ints, because a device may flush ints copied as floats */
+    __local int record_as_int[RECORD]; /* as ints: copied as floats, a device may set small ints to 0 */
     __local const float *splat_record = (__local const float *)record_as_int;
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
     for (int c = 0; c < cell_count; ++c) {
@@ -141,7 +141,7 @@ __kernel void splat_backward_group(ARGUMENTS)
             record_as_int[f] = ((__global const int *)records)[at * RECORD + f];
         for (int f = item; f < CELL; f += GROUP)
             cell[f] = cells[c * CELL + f];
-        barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); /* wait until all have read what sums overwrite */
+        barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE); /* waits until all items have read what the sums overwrite */
         __global const float *times = TIMES_OF(c, line_times, time_pitch);
         __global const float *image = images + LAYER_AT(cell, lines, pitch) + IMAGE_GUARD;
         splat_sums mine = no_sums();
@@ -151,7 +151,7 @@ __kernel void splat_backward_group(ARGUMENTS)
                 gather(&mine, line, u, limit, image[(size_t)v * pitch + u]);
         }
         group_sums(mine.of, SUM_COUNT, tree, records + at * RECORD + SUMS);
-        barrier(CLK_LOCAL_MEM_FENCE); /* wait until all have read what the next cell overwrites */
+        barrier(CLK_LOCAL_MEM_FENCE); /* waits until all items have read what the next cell overwrites */
     }
 }
 #endif

@@ -1,12 +1,12 @@
-/* Adjoint of the splat, second pass: from the pixel sums of every time cell to the gradients of mean, scale, rotation and
-   density. A work-item takes LANES Gaussians and loops over the cells in a fixed order. */
+/* Adjoint of splat_forward.cl, second pass: the chain rule from the sums of splat_backward.cl to gradients by mean, scale,
+   rotation and density. A work-item takes LANES Gaussians and loops over the cells in a fixed order. */
 #include "common/precise.h"
 #include "common/gradient.h"
 #include "common/splat_state.h"
 #include "common/splat_sums.h"
 
 #if MOVING
-#define TURNED 4 /* floats of the record that give S: d(along, across)/d(u, v) */
+#define TURNED 4 /* floats of the record that are still needed: d(along, across)/d(u, v), a factor of S */
 #define POSES 3  /* poses of a cell, as in splat_prepare.cl */
 #else
 #define TURNED 0
@@ -30,8 +30,9 @@ static inline vf torque_about(const vf forth, const vf back, const vf s2, const 
     return 0.5f * (forth * (s2 * inv3) + back * (s3 * inv2)) * out_of_round(s2, s3, inv2, inv3);
 }
 
-/* The torque is forth - back, the sum of (gradient x vector) over all vectors. Line integrals depend only on vectors over
-   scales, and a rotation does not change them there: forth s2 / s3 = back s3 / s2. So nothing cancels in this form. */
+/* The torque is forth - back, the sum of (gradient x vector) over all vectors. Line integrals depend only on vectors divided
+   by scales, and rotating these changes nothing: forth s2 / s3 = back s3 / s2. With this, the difference is formed without
+   losing digits. */
 static inline v3 torque_of(const v3 forth, const v3 back, const v3 s, const v3 inv)
 {
     return v3_make(torque_about(forth.x, back.x, s.y, s.z, inv.y, inv.z),
@@ -40,7 +41,7 @@ static inline v3 torque_of(const v3 forth, const v3 back, const v3 s, const v3 i
 }
 
 #if DEFORMED
-#define BY_PLACE by_place /* gradients of places go to the sums of the cell's state */
+#define BY_PLACE by_place /* the gradient by the centre in the cell's state, not in the reference */
 
 static inline void add_vector(__global float *rows, const int row, const int stride, const v3 by)
 {
@@ -50,7 +51,7 @@ static inline void add_vector(__global float *rows, const int row, const int str
     V_STORE(V_LOAD(at + 2 * (size_t)stride) + by.z, at + 2 * (size_t)stride);
 }
 
-/* Adds dL/dG of the 3x3 matrix G, which takes from_source, eu and ev from the object to the reference. */
+/* Adds dL/dG. The 3x3 matrix G takes from_source, eu and ev from the object's state to the reference. */
 static inline void add_by_pull(__global float *by_state, const int stride, const frame3 axes, const v3 from_source,
                                __global const float *cell, const v3 by_ray, const v3 by_eu, const v3 by_ev)
 {
@@ -66,17 +67,17 @@ static inline void add_by_pull(__global float *by_state, const int stride, const
 #endif
 
 __kernel void splat_chain(
-    __global const float *gaussians,      /* (11, stride) */
-    __global const float *cells,          /* (C, CELL) */
-    __global const coefficient *matrices, /* (C, POSES, 12) */
+    __global const float *gaussians,      /* (11, stride): mean, scale, quaternion, density */
+    __global const float *cells,          /* (C, CELL): the time cells of the frame */
+    __global const coefficient *matrices, /* (C, POSES, 12), as in splat_prepare */
     __global const float *records,        /* (stride, C, RECORD), with sums in them */
-    __global const uchar *is_visible,     /* (stride, C) */
+    __global const uchar *is_visible,     /* (stride, C): 1 where a splat has a record */
     const int cell_count, const int count, const int stride,
     const float half_width, const float half_lines,
     __global float *gradients,            /* (13, stride); DEFORMED: without the rows of the mean */
     __global const float *states,         /* DEFORMED: (S, STATE_ROWS, stride) */
-    __global const int *cell_states,      /* (C, POSES) */
-    __global float *by_states)            /* DEFORMED: like states, zeros to which the derivatives of L are added */
+    __global const int *cell_states,      /* (C, POSES): the state of the object at each pose */
+    __global float *by_states)            /* DEFORMED: like states, zero before; dL/d(states) is added */
 {
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)
@@ -87,7 +88,7 @@ __kernel void splat_chain(
 
     const vf zero = (vf)(0.0f);
     v3 by_mean = v3_make(zero, zero, zero), by_scale = by_mean;
-    v3 forth = by_mean, back = by_mean; /* sums of (gradient)_2 x_3 and (gradient)_3 x_2, cyclically: see torque_of */
+    v3 forth = by_mean, back = by_mean; /* the two parts of the torque, see torque_of */
     vf by_log_density = zero, by_u0 = zero, by_v0 = zero;
 
     for (int c = 0; c < cell_count; ++c) {
@@ -136,7 +137,8 @@ __kernel void splat_chain(
         const frame3 axes = seen.axes;
         __global const float *cell = cells + c * CELL;
         __global const coefficient *m = matrices + c * POSES * 12;
-        /* Lanes that are not drawn have sums of 0, and may be at the source. Any other place keeps them from 0/0. */
+        /* A Gaussian that is not drawn may be at the source, where its gradient would be 0/0. Its sums are 0, so any other
+           place serves for it. */
         const vi is_in_view = V_LOAD(visible) > 0.0f;
         const vf z = V_PICK((vf)(1.0f), wide_value(wide_dot(m + 8, mean.x, mean.y, mean.z)), is_in_view);
         const vf inv_z = 1.0f / z;
@@ -197,10 +199,10 @@ __kernel void splat_chain(
         __global float *by_state = by_states + (state - states);
         add_by_pull(by_state, stride, g.axes, straight, cell, by_ray, by_eu, by_ev);
 #if AFFINE && !PARALLEL
-        by_place = v3_scale(straight, w / v3_dot(straight, straight)); /* the object's motion does not change this length */
+        by_place = v3_scale(straight, w / v3_dot(straight, straight)); /* by the ray's length, on which G has no effect */
 #endif
 #elif AFFINE
-        by_ray = v3_add(by_ray, v3_scale(ray, w / v3_dot(ray, ray))); /* by the ray's length, which no rotation changes */
+        by_ray = v3_add(by_ray, v3_scale(ray, w / v3_dot(ray, ray))); /* by the ray's length, on which rotations have no effect */
 #endif
         by_s = v3_add(by_s, v3_scale(v3_mul(by_white_s, white), -1.0f));
 
@@ -243,7 +245,7 @@ __kernel void splat_chain(
 #endif
         }
 #elif FIXED_CONIC
-        /* The second pose places the centre. The first pose has the depth of the conic and of the density. */
+        /* The second pose gives the centre, the first the depth in shape and density. */
         __global const coefficient *n = m + 12;
         const vf inv = 1.0f / V_PICK((vf)(1.0f), wide_value(wide_dot(n + 8, mean.x, mean.y, mean.z)), is_in_view);
         add_by_centre(&by_mean, n, wide_value(wide_dot(n, mean.x, mean.y, mean.z)) * inv,

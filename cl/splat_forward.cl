@@ -1,15 +1,15 @@
-/* Micro-view accumulation and strip concatenation (paper, Eq. 3) in one gather: every tile of the merged frame sums its list
-   of splats over all time cells that serve its lines.
-   splat_forward_rows: a work-item owns a band of complete lines and adds vectors of pixels (CPUs).
-   splat_forward_pixels: a work-item owns a pixel, and a work-group a tile, whose records it reads once (GPUs).
-   Each pixel has one writer: no atomics. */
+/* Draws the splats of all time cells into the merged frame. Every tile sums its list of splats over the cells that serve its
+   lines, so that micro-views are accumulated and strips joined (paper, Eq. 3) in one pass.
+   splat_forward_rows: a work-item takes some complete lines and adds vectors of pixels (CPUs).
+   splat_forward_pixels: a work-item takes a pixel, and a work-group a tile, whose records it reads once (GPUs).
+   Each pixel is written by one work-item, without atomics. */
 #if BLOCK_PIXEL
 #define SPLAT_SPACE __local
 #endif
 #include "common/footprint.h"
 #include "common/tile.h"
 
-/* Adds a splat to the pixels of a line. With motion there is one loop per rule, so that no pixel tests the rule. */
+/* Adds a moving splat to the pixels of a line. Each integration rule has its own loop, so that no pixel tests the rule. */
 #define ADD_PIXELS(rule)                                                                            \
     for (int u = line.u_lo; u <= line.u_hi; u += LANES) {                                           \
         const moving_pixel p = moving_at(line.s, (float)u + V_IOTA, footprint_du(line, u), limit);  \
@@ -29,7 +29,7 @@ ALWAYS_INLINE void add_line(const footprint_line line, const float limit, __glob
         ADD_PIXELS(3)
 }
 
-/* The value at one pixel; 0 beyond the cutoff. */
+/* The values at LANES pixels from u on; 0 beyond the cutoff. */
 ALWAYS_INLINE vf value_at(const footprint_line line, const int u, const float limit)
 {
     const moving_pixel p = moving_at(line.s, (float)u + V_IOTA, footprint_du(line, u), limit);
@@ -51,33 +51,34 @@ ALWAYS_INLINE void add_line(const footprint_line line, const float limit, __glob
 #endif
 
 #define ARGUMENTS                                                                                                       \
-    __global const float *records,    /* (stride, C, RECORD) */                                                         \
-    __global const uchar *is_visible, /* (stride, C) */                                                                 \
-    __global const float *cells,      /* (C, CELL) */                                                                   \
+    __global const float *records,    /* (stride, C, RECORD), from splat_prepare.cl */                                  \
+    __global const uchar *is_visible, /* (stride, C): 1 where a splat has a record */                                   \
+    __global const float *cells,      /* (C, CELL): the time cells of the frame */                                      \
     __global const int *line_cells,   /* (lines, 2): first cell, and the cell after the last, that serve a line */      \
     __global const float *line_times, /* MOVING: (C, TIME_ROWS, time_pitch) */                                          \
     const int time_pitch,                                                                                               \
-    const float4 path_limits,         /* MOVING: the longest paths, in widths, that 1, 2 and 3 times serve */           \
-    __global const int *tile_offsets, /* (tiles + 1,) */                                                                \
+    const float4 path_limits,         /* MOVING: the longest paths for 1, 2 and 3 times (common/splat_moving.h) */      \
+    __global const int *tile_offsets, /* (tiles + 1,): where each tile's list of splats begins */                       \
     __global const int *tile_splat_ids, const int capacity, const int count,                                            \
     const int cell_count, const int lines, const int width, const int pitch,                                            \
     const int tile_w, const int tile_h, const int tiles_u, const float cutoff2,                                         \
-    const int layer_count,            /* LAYERED: images, each of guard and (lines, pitch); otherwise one for all cells */ \
+    const int layer_count,            /* LAYERED: number of images, each a guard and (lines, pitch) */                  \
     __global float *image             /* guard, then (lines, pitch) */
 
 #if BLOCK_PIXEL
-#define STAGED 32 /* records of splats that a work-group reads into local memory at a time */
+#define STAGED 32 /* number of records that a work-group reads into local memory at a time */
 
-/* Groups have tile_w by tile_h items. A line's cells lie between those of the tile's first and last line. */
+/* Groups have tile_w by tile_h items. Cells are sorted, so the first and last line give the cells of all lines of a tile. */
 __kernel void splat_forward_pixels(ARGUMENTS)
 {
-    __local int records_here[STAGED * RECORD]; /* ints, because a device may flush ints copied as floats */
+    __local int records_here[STAGED * RECORD]; /* as ints: copied as floats, a device may set small ints to 0 */
     __local float cells_here[STAGED * CELL];
-    __local int place[STAGED], cell_of[STAGED]; /* in records, -1 where the splat is not visible in this tile; its cell */
+    __local int place[STAGED], cell_of[STAGED]; /* index in records, -1 if not visible in this tile; and its cell */
     const int u = (int)get_global_id(0), v = (int)get_global_id(1);
     const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
     const int items = (int)(get_local_size(0) * get_local_size(1));
-    const int left = u - (int)get_local_id(0), top = v - (int)get_local_id(1); /* launches may hold some groups only */
+    /* Not from get_group_id, which restarts in each part of a launch. */
+    const int left = u - (int)get_local_id(0), top = v - (int)get_local_id(1);
     const int right = min(left + tile_w, width) - 1, bottom = min(top + tile_h, lines) - 1;
     const int tile = top / tile_h * tiles_u + left / tile_w;
     const tile_list list = list_of(tile_offsets, tile, capacity, count);
@@ -92,7 +93,7 @@ __kernel void splat_forward_pixels(ARGUMENTS)
     float sum = 0.0f;
     for (int done = 0; done < list.count * c_count; done += STAGED) {
         const int here = min(STAGED, list.count * c_count - done);
-        barrier(CLK_LOCAL_MEM_FENCE); /* wait until all have read what was there */
+        barrier(CLK_LOCAL_MEM_FENCE); /* waits until all items have read the last records */
         for (int k = item; k < here; k += items) {
             const int e = (done + k) / c_count, c = c_first + (done + k) % c_count;
             const int splat = listed_splat(list, tile_splat_ids, e) * cell_count + c;
@@ -175,7 +176,7 @@ __kernel void splat_forward_rows(ARGUMENTS)
         }
     }
     for (int layer = 0; layer < LAYERS(layer_count); ++layer)
-        for (int v = top; v <= bottom; ++v) {  /* vectors may have passed the last pixel: padding stays zero */
+        for (int v = top; v <= bottom; ++v) {  /* vectors may have written beyond the last pixel, but padding must be zero */
             __global float *row = image + layer * layer_size + IMAGE_GUARD + (size_t)v * pitch;
             for (int u = width; u < pitch; ++u)
                 row[u] = 0.0f;

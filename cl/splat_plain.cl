@@ -1,5 +1,5 @@
-/* Converts users' arrays, parameter rows (11, count) in mm with quaternions of any length, into internal rows
-   (11, stride) with unit quaternions, and back. Twins: NumPy's, in tests/operators/test_splat_plain.py. */
+/* Converts parameters of Gaussians as users give them (11, count), in mm and with quaternions of any length, to the rows
+   that kernels need (11, stride), with unit quaternions, and gradients back. Twins: tests/operators/test_splat_plain.py. */
 
 #define ROWS 11
 #define LENGTHS 6  /* rows that are lengths: mean and scale */
@@ -11,13 +11,13 @@ static inline float unit_of(const int row, const float per_mm, const float per_d
     return row < LENGTHS ? per_mm : row == DENSITY ? per_density : 1.0f;
 }
 
-/* Writes internal rows from plain rows. Columns from `count` on become unit Gaussians, which are never drawn. */
+/* Writes kernels' rows from users' rows. Columns from `count` on become unit Gaussians, which are never drawn. */
 __kernel void rows_enter(
-    __global const float *plain,  /* (11, count) */
+    __global const float *plain,  /* (11, count): a column is a Gaussian */
     const int count, const int stride,
     const float per_mm,           /* internal units of length in a mm */
     const float per_density,      /* internal units of density in 1/mm */
-    __global float *rows,         /* (11, stride) */
+    __global float *rows,         /* (11, stride): as in common/gaussian.h */
     __global float *norms)        /* (stride): lengths of the quaternions */
 {
     const int g = (int)get_global_id(0);
@@ -38,12 +38,12 @@ __kernel void rows_enter(
     norms[g] = norm;
 }
 
-/* Writes dL/d(plain rows) from dL/d(internal rows), or adds it to what is there if `add`. */
+/* Writes dL/d(users' rows) from dL/d(kernels' rows), or adds it to what is there if `add`. */
 __kernel void rows_leave(
-    __global const float *gradients, /* (13, stride) */
+    __global const float *gradients, /* (13, stride): dL/d(the 11 parameters), dL/d(centre u, v) */
     __global const float *norms,
     const int count, const int stride, const float per_mm, const float per_density, const int add,
-    __global float *plain)           /* (11, count) */
+    __global float *plain)           /* (11, count): a column is a Gaussian */
 {
     const int g = (int)get_global_id(0);
     if (g >= count)
@@ -56,7 +56,7 @@ __kernel void rows_leave(
     }
 }
 
-/* Copies a row of a matrix, times a factor, to a row of another. */
+/* Copies `count` floats, multiplied by a factor. */
 __kernel void row_copy(__global const float *from, const long from_start, const int count, const float factor,
                        const long to_start, __global float *to)
 {

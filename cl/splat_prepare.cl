@@ -1,22 +1,22 @@
 /* Projects every Gaussian from every time cell of a frame, in one launch. A work-item takes LANES Gaussians and loops over
-   the cells. For each cell it writes one record per Gaussian (common/splat.h): the splat and the box of its pixels. At the
-   end it writes the box around each Gaussian's splats in all cells, from which binning.cl makes the lists of the tiles.
-   splat_prepare: a cell is one pose. With FIXED_CONIC it places the centre only; conic and depth are those of another pose.
-   splat_prepare_moving: a cell is a segment of the frame, in which the centre moves from one end to the other
+   the cells. For each cell and Gaussian it writes a record (common/splat.h): the splat and the box of its pixels. At the end
+   it writes the box around all splats of a Gaussian, from which binning.cl makes the lists of tiles.
+   splat_prepare: a cell has one pose. With FIXED_CONIC this gives only the centre; another pose gives shape and depth.
+   splat_prepare_moving: a cell is a segment of the frame's time, in which the centre moves from one end to the other
    (common/splat_moving.h). Twin: operators/twins/splat.py. */
 #include "common/splat_view.h"
 #include "common/splat_state.h"
 #include "common/splat_moving.h"
 
-#define COMMON_FIELDS 9 /* floats of a record before its six ints; those of a moving splat come after the ints */
+#define COMMON_FIELDS 9 /* floats of a record before its six ints; a moving splat has more floats after them */
 #if MOVING
 #define FIELDS 12
 #else
 #define FIELDS COMMON_FIELDS
-#define POSES (1 + FIXED_CONIC) /* poses of a cell: that of the constants in `cells`, and that of the centre */
+#define POSES (1 + FIXED_CONIC) /* poses of a cell: first of the shape, last of the centre */
 #endif
 
-/* The fields that both kinds of record share. fields (FIELDS, LANES); bounds (6, LANES): centre, u lo hi, v lo hi. */
+/* Collects what both kinds of record have. fields (FIELDS, LANES); bounds (6, LANES): centre u v, u lo hi, v lo hi. */
 ALWAYS_INLINE void collect(const splat_centre centre, const splat_view s, const pixel_box box, __private float *fields,
                            __private int *bounds)
 {
@@ -32,7 +32,7 @@ ALWAYS_INLINE void collect(const splat_centre centre, const splat_view s, const 
     VI_STORE(box.u_hi, bounds + 3 * LANES);
 }
 
-/* Writes the records and flags of those of LANES Gaussians that are visible. record_step: records from one Gaussian to the
+/* Writes the flags of LANES Gaussians, and the records of the visible ones. record_step: records from one Gaussian to the
    next. */
 ALWAYS_INLINE void write_records(__private const float *fields, __private int *bounds, const pixel_box box,
                                  const size_t first_record, const size_t record_step, __global float *records,
@@ -69,17 +69,17 @@ ALWAYS_INLINE void write_extents(const pixel_box extent, const int first, const 
 
 #if !MOVING
 __kernel void splat_prepare(
-    __global const float *gaussians,      /* (11, stride) */
+    __global const float *gaussians,      /* (11, stride): mean, scale, quaternion, density */
     const int count, const int stride,
-    __global const float *cells,          /* (C, CELL) */
+    __global const float *cells,          /* (C, CELL): the time cells of the frame */
     __global const coefficient *matrices, /* (C, POSES, 12): rows give u z, v z and z of a world point */
-    __global const int *cell_lines,       /* (C, 2): first line, line after the last */
+    __global const int *cell_lines,       /* (C, 2): the lines [first, stop) of a cell */
     const int cell_count,
     const int width,                      /* pixels of a line */
-    const float cutoff2,                  /* squared Mahalanobis radius; 0 = no cutoff */
+    const float cutoff2,                  /* squared Mahalanobis radius of the cutoff; 0 for none */
     __global float *records,              /* (stride, C, RECORD), unchanged where nothing is visible */
     __global uchar *is_visible,           /* (stride, C): 1 where a record was written */
-    __global int *extents,                /* (6, stride): u lo hi, v lo hi, 0 0 over all cells */
+    __global int *extents,                /* (6, stride): box over all cells: u lo, hi, v lo, hi, 0, 0 */
     __global const float *states,         /* DEFORMED: (S, STATE_ROWS, stride) */
     __global const int *cell_states)      /* (C,): the state of each cell */
 {
@@ -124,14 +124,14 @@ __kernel void splat_prepare(
 }
 #else
 
-#define MOVING_FIELD(rec) ((rec) - 6) /* fields have none of the record's six ints */
+#define MOVING_FIELD(rec) ((rec) - 6) /* index in `fields`, which lacks the record's six ints */
 #define POSES 3 /* poses of a cell: at the middle of the segment and at its two ends */
 
-/* The path of the centre in a segment, from one end to the other, and whether both ends lie in front of the source. */
+/* The path of the centre in a segment, from one end to the other. is_in_front: of the source, at both ends. */
 typedef struct { vf u, v; vi is_in_front; } centre_path;
 
-/* Finds the path, and shifts the centre at mid-time so that the mean of the straight path is right. Over t from -1/2 to 1/2,
-   a path bent by s t^2 has the mean s/12, which is a sixth of the sum of its ends. */
+/* Finds the straight path, and shifts its middle so that its mean is that of the bent path. For t from -1/2 to 1/2, a bend
+   s t^2 has the mean s/12, a sixth of the sum of its values at both ends. */
 ALWAYS_INLINE centre_path path_of(__global const coefficient *end_matrices, const v3 means[2], splat_centre *middle)
 {
     centre_path path;
@@ -151,7 +151,7 @@ ALWAYS_INLINE centre_path path_of(__global const coefficient *end_matrices, cons
     return path;
 }
 
-/* Narrows [lo, hi] to the pixels within `reach` of the path between two times. */
+/* Narrows [lo, hi] to the pixels within `reach` of the path between the times `early` and `late`. */
 ALWAYS_INLINE void narrow_to_path(const vf whole, const vf rest, const vf path, const vf reach, const vf early,
                                   const vf late, vi *lo, vi *hi)
 {
@@ -159,8 +159,8 @@ ALWAYS_INLINE void narrow_to_path(const vf whole, const vf rest, const vf path, 
     narrow(whole, rest + min(from, to) - reach, rest + max(from, to) + reach, lo, hi);
 }
 
-/* The earliest and latest time at which any of the lines lo..hi integrates. Windows open and close in the order of the
-   lines, so the two outermost lines bound the others. */
+/* The earliest and latest time at which any of the lines lo..hi is exposed. Lines open and close in order, so only the first
+   and the last need be looked at. */
 ALWAYS_INLINE void times_of_lines(__global const float *times, const int pitch, const vi lo, const vi hi, vf *early, vf *late)
 {
     float from[LANES], to[LANES];
@@ -180,8 +180,8 @@ ALWAYS_INLINE void times_of_lines(__global const float *times, const int pitch, 
     *late = V_LOAD(to);
 }
 
-/* The squared cutoff about the path, in widths of the splat. S and Q: common/splat.h, of the segment's middle. slack bounds
-   the change of Q along the path: 0.75 is the longest time from the middle, 1.1 and 1.2 are margins. */
+/* The squared cutoff distance from the path, in widths of the splat. It is larger than cutoff2 by `slack`, because Q changes
+   along the path: 0.75 is the longest time from the middle, 1.1 and 1.2 are margins. */
 ALWAYS_INLINE vf reach2_of(const splat_view s, const cutoff_ellipse e, const centre_path path, const vf speed, const float cutoff2)
 {
     const vf tilt = fabs(s.b1) * (fabs(e.u) + e.half_u + 0.75f * fabs(path.u))
@@ -195,12 +195,12 @@ ALWAYS_INLINE vf reach2_of(const splat_view s, const cutoff_ellipse e, const cen
 __kernel void splat_prepare_moving(
     __global const float *gaussians, const int count, const int stride, /* arguments: see splat_prepare */
     __global const float *cells,
-    __global const coefficient *matrices, /* (C, POSES, 12) */
+    __global const coefficient *matrices, /* (C, POSES, 12): matrices for the middle, start and end of a segment */
     __global const int *cell_lines, const int cell_count, const int width, const float cutoff2,
     __global float *records, __global uchar *is_visible, __global int *extents,
     __global const float *states,
-    __global const int *cell_states,      /* (C, POSES) */
-    __global const float *line_times,     /* (C, TIME_ROWS, time_pitch) */
+    __global const int *cell_states,      /* (C, POSES): the state of the object at each pose */
+    __global const float *line_times,     /* (C, TIME_ROWS, time_pitch): see common/splat_moving.h */
     const int time_pitch)
 {
     const int first = (int)get_global_id(0) * LANES;
@@ -221,7 +221,7 @@ __kernel void splat_prepare_moving(
         /* The path in widths of the splat: its length and direction. */
         const vf wide_u = s.l11 * path.u + s.l12 * path.v, wide_v = s.l22 * path.v;
         const vf speed = sqrt(wide_u * wide_u + wide_v * wide_v);
-        const vi moves = speed > 1e-6f; /* without motion any direction will do */
+        const vi moves = speed > 1e-6f; /* a splat at rest may have any direction */
         const vf inv_speed = 1.0f / V_PICK(1.0f, speed, moves);
         const vf cosine = V_PICK(1.0f, wide_u * inv_speed, moves), sine = V_PICK(0.0f, wide_v * inv_speed, moves);
         vf reach2 = (vf)(MAXFLOAT);
@@ -232,7 +232,7 @@ __kernel void splat_prepare_moving(
             reach2 = reach2_of(s, e, path, speed, cutoff2);
             const vf root = sqrt(reach2 / (s.l11 * s.l11 * s.l22 * s.l22));
             const vf half_u = root * sqrt(s.l12 * s.l12 + s.l22 * s.l22) + 0.002f, half_v = root * s.l11 + 0.002f;
-            vf early = (vf)(-0.75f), late = (vf)(0.75f); /* lines may stay a quarter of a segment longer */
+            vf early = (vf)(-0.75f), late = (vf)(0.75f); /* lines may be exposed a quarter of a segment beyond its ends */
             narrow_to_path(centre.v_whole, centre.v_rest, path.v, half_v, early, late, &box.v_lo, &box.v_hi);
             times_of_lines(TIMES_OF(c, line_times, time_pitch), time_pitch, box.v_lo, box.v_hi, &early, &late);
             narrow_to_path(centre.u_whole, centre.u_rest, path.u, half_u, early, late, &box.u_lo, &box.u_hi);
@@ -241,7 +241,7 @@ __kernel void splat_prepare_moving(
         enclose(&extent, box, visible);
         float fields[FIELDS * LANES];
         int bounds[6 * LANES];
-        if (V_ANY(visible)) { /* the factor of S, turned so that the splat moves along its first axis */
+        if (V_ANY(visible)) { /* a factor of S, turned so that the splat moves along its first axis */
             V_STORE(s.l11 * cosine, fields + REC_ALONG_U * LANES);
             V_STORE(s.l12 * cosine + s.l22 * sine, fields + REC_ALONG_V * LANES);
             V_STORE(s.l22 * cosine - s.l12 * sine, fields + REC_ACROSS_V * LANES);

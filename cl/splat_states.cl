@@ -1,16 +1,15 @@
-/* Moves a cloud of Gaussians to the states of an object that moves, and takes gradients back. Twin:
-   operators/twins/rays.py. Pull convention, as everywhere: the object at y is the reference at y + w(y), so a
-   Gaussian whose mean is m in the reference lies at the y with y + w(y) = m. w is a sum of tensor cubic B-splines, 0 beyond
-   their control points; of a state it is the sum of shares[r] times the field r.
-     splat_states       a work-item moves a Gaussian to every state, by Newton steps from its place in the state before.
-     splat_states_back  a work-item adds up a Gaussian's gradients by its place and its G in every state.
-   A Gaussian has STATE_ROWS of common/splat_state.h in each state. */
+/* Moves Gaussians to the states of an object that moves, and takes gradients back. The object has at y what the reference
+   has at y + w(y), so a Gaussian at m in the reference is at the y with y + w(y) = m. w is a sum of cubic B-splines in
+   space, and 0 beyond their control points. In a state, w is the sum of the fields r times shares[r].
+     splat_states       a work-item moves a Gaussian to every state, by Newton steps from where it is in the state before.
+     splat_states_back  a work-item adds up a Gaussian's gradients by its place and by G = I + dw/dy in every state.
+   Each state of a Gaussian has the STATE_ROWS of common/splat_state.h. Twin: operators/twins/rays.py. */
 #define STATE_ROWS 12
 #define MOST_STEPS 50
-#define CLOSE 2e-5f     /* spacings of control points: a shorter step ends the search; the next would be its square */
-#define LEAST_DET 0.05f /* det G below which a Newton step is replaced by one of the fixed point y = m - w(y) */
+#define CLOSE 2e-5f     /* a step shorter than this, in control spacings, is the last: the next would be about its square */
+#define LEAST_DET 0.05f /* det G below which the step is y = m - w(y), since Newton's would be too long */
 
-/* The four B-splines along an axis that reach a point, and two derivatives. The first belongs to control point `first`. */
+/* The four B-splines along an axis that act on a point, with two derivatives, for control points from `first` on. */
 typedef struct { float value[4], slope[4], bend[4]; int first, start, stop; } splines;
 
 static inline splines splines_at(const float place, const float per_spacing, const int count)
@@ -37,9 +36,9 @@ static inline splines splines_at(const float place, const float per_spacing, con
 
 #define FIELD                                                                                                        \
     __global const float4 *controls, /* (RANK, nz, ny, nx) of x y z 0 */                                            \
-    const int4 counts,               /* nx, ny, nz */                                                               \
+    const int4 counts,               /* control points nx, ny, nz */                                                \
     const float4 origin, const float4 per_spacing,                                                                  \
-    __global const float *shares,    /* (S, RANK) */                                                                \
+    __global const float *shares,    /* (S, RANK): the fields' weights in each state */                             \
     const int state_count
 
 static inline float4 control_at(__global const float4 *controls, const size_t points, __global const float *shares,
@@ -51,7 +50,7 @@ static inline float4 control_at(__global const float4 *controls, const size_t po
     return sum;
 }
 
-/* w at a point, and its derivatives along x, y, z. */
+/* The displacement w at a point, and its derivatives along x, y, z. */
 typedef struct { float4 shift, along_x, along_y, along_z; } flow;
 
 static flow flow_at(__global const float4 *controls, const int4 counts, const float4 origin, const float4 per_spacing,
@@ -80,7 +79,7 @@ static flow flow_at(__global const float4 *controls, const int4 counts, const fl
     return f;
 }
 
-/* Returns d/d(point) of sum_ij by_pull[i][j] dw_i/dy_j. by_pull: rows i of three floats. */
+/* Returns the derivative by `point` of sum_ij by_pull[i][j] dw_i/dy_j. */
 static float4 by_curvature(__global const float4 *controls, const int4 counts, const float4 origin, const float4 per_spacing,
                            __global const float *shares, const float4 point, const float4 by_pull[3])
 {
@@ -111,7 +110,7 @@ __kernel void splat_states(
     __global const float *gaussians, /* (11, stride): the reference */
     const int stride,
     FIELD,
-    __global float *states)          /* (S, STATE_ROWS, stride) */
+    __global float *states)          /* (S, STATE_ROWS, stride): centre x y z, rows of G */
 {
     const int g = (int)get_global_id(0);
     if (g >= stride)
@@ -124,14 +123,14 @@ __kernel void splat_states(
             f = flow_at(controls, counts, origin, per_spacing, shares + s * RANK, place);
             const float4 off = place + f.shift - mean;
             const float4 a = f.along_x + (float4)(1, 0, 0, 0), b = f.along_y + (float4)(0, 1, 0, 0);
-            const float4 c = f.along_z + (float4)(0, 0, 1, 0); /* columns of G */
+            const float4 c = f.along_z + (float4)(0, 0, 1, 0); /* a, b, c: columns of G */
             const float det = dot(a, cross(b, c));
             float4 move = off;
             if (det > LEAST_DET)
                 move = (float4)(dot(off, cross(b, c)), dot(a, cross(off, c)), dot(a, cross(b, off)), 0.0f) / det;
             const float4 spacings = fabs(move * per_spacing);
             const float furthest = max(spacings.x, max(spacings.y, spacings.z));
-            place -= move / max(furthest, 1.0f); /* at most one spacing */
+            place -= move / max(furthest, 1.0f); /* moves by at most one control spacing */
             if (furthest <= CLOSE)
                 break;
         }

@@ -1,6 +1,6 @@
-/* A pixel as the mean over the rays of its block on a finer panel, and the transpose. Pixel (frame, row, column) of the
-   finer panel is at strides.s0 + frame strides.s3 + row strides.s2 + column strides.s1 floats. A work-item has a pixel of
-   plain frames (F, rows, columns), from frame ``first`` on. Twins: ``block_means`` and NumPy's repeat. */
+/* The value of a pixel as the mean over several rays, which are the pixels of a finer panel; and the transpose. Pixel
+   (frame, row, column) of the finer panel is at strides.s0 + frame strides.s3 + row strides.s2 + column strides.s1 floats.
+   A work-item takes a pixel of frames (F, rows, columns), from frame `first` on. Twins: block_means and NumPy's repeat. */
 
 static inline size_t block_of(const long4 strides, const int2 parts)
 {
@@ -13,7 +13,7 @@ static inline size_t pixel_of(const int first, const int rows, const int columns
     return ((first + get_global_id(2)) * (size_t)rows + get_global_id(1)) * columns + get_global_id(0);
 }
 
-/* parts: the rays of a pixel along a row, and along a column. */
+/* parts: the number of rays of a pixel along a row, and along a column. */
 __kernel void subray_means(
     __global const float *fine, const long4 strides, const int2 parts, __global float *frames, const int first,
     const int rows, const int columns)

@@ -1,6 +1,5 @@
-/* Anisotropic total variation of a small volume (guard, then (z, y, pitch)): the mean absolute difference between neighbours
-   along each axis, and its gradient. A work-item takes every get_global_size(0)-th vector of a row: all of them on a CPU,
-   one voxel on a GPU. */
+/* Anisotropic total variation of a small volume (guard, then (z, y, pitch)), and its gradient: the weighted sum of absolute
+   differences between neighbours along each axis. On a CPU a work-item takes all vectors of a row, on a GPU one voxel. */
 #include "common/lanes.h"
 #include "common/group_sums.h"
 
@@ -10,10 +9,10 @@ static inline vf sign_of(vf d)
 }
 
 __kernel void total_variation(
-    __global const float *volume, const int4 shape, const int pitch, const float4 weight, /* per axis x y z */
+    __global const float *volume, const int4 shape, const int pitch, const float4 weight, /* weight of each axis x, y, z */
     __global float *gradient,
-    __local float *tree,             /* (group's items) */
-    __global float *sums)            /* (groups) */
+    __local float *tree,             /* scratch for sums: a float per work-item of a group */
+    __global float *sums)            /* (groups): the variation in each group's voxels */
 {
     const int y = (int)get_global_id(1), z = (int)get_global_id(2);
     const int stop = y < shape.y ? pitch : 0;

@@ -1,9 +1,9 @@
 /* Gradient of the isotropic total variation, the sum of |backward difference| over voxels, for ASD-POCS (Sidky and Pan,
    Phys. Med. Biol. 53 (2008) 4777). Volumes (nz, ny, nx) have no padding; differences end at the first voxel. A work-item
-   takes one voxel. Twin: objective/tv.py. At the border in y and z the voxel itself is read: a branch would become masked
-   accesses outside the buffer (tv_prox.cl). */
+   takes one voxel. Twin: objective/tv.py. A voxel without a neighbour along y or z is compared with itself, because a branch
+   would be slow (see tv_prox.cl). */
 
-/* row and slice are 0 at y or z 0: the difference is then that of the voxel to itself. */
+/* row, slice: the distance in floats to the neighbours; 0 without one, which makes the difference 0. */
 static inline float3 backward_difference(__global const float *volume, const size_t at, const int x, const size_t row,
                                          const size_t slice)
 {
@@ -16,7 +16,7 @@ static inline float inverse_length(const float3 d, const float least)
     return 1.0f / (sqrt(d.x * d.x + d.y * d.y + d.z * d.z) + least);
 }
 
-/* least: added to the length of differences, which is 0 in flat regions. */
+/* least: added to the length of differences, by which the gradient divides; it is 0 in flat regions. */
 __kernel void tv_gradient(__global const float *volume, const int4 shape, const float least, __global float *gradient)
 {
     const int x = (int)get_global_id(0), y = (int)get_global_id(1), z = (int)get_global_id(2);

@@ -1,11 +1,11 @@
 /* Proximal map of the isotropic total variation by fast gradient projection on the dual (Beck and Teboulle, IEEE Trans.
-   Image Process. 18 (2009) 2419). Volumes (nz, ny, nx) have no padding. The dual has three planes, one per axis, with
-   forward differences that end at the last voxel. A work-item takes one voxel. Twin: objective/tv.py.
-   `shape`: voxels along x, y and z, and states of an object that changes. For several states (K, nz, ny, nx; build option
-   STATES) the dual has a fourth plane, the differences between a state and the next one. Its absolute value is added to the
-   length of the other three.
-   Neighbours beyond a border are read at the voxel itself. A branch would become a masked access to an address beyond the
-   buffer, which takes ten times as long although no lane needs it. */
+   Image Process. 18 (2009) 2419). Volumes (nz, ny, nx) have no padding. The dual variable has three components, one for the
+   forward differences along each axis. A work-item takes one voxel. Twin: objective/tv.py.
+   shape: voxels along x, y and z, and the number of states of an object that changes. With several states (K, nz, ny, nx;
+   build option STATES) the dual has a fourth component, for differences from a state to the next. The total variation then
+   has the absolute value of this difference, added to the length of the other three.
+   A voxel without a neighbour reads itself instead. A branch would be compiled to a masked access beyond the buffer, which
+   takes ten times as long although no lane needs it. */
 
 __kernel void tv_primal(
     __global const float *observed, __global const float *moved, /* (K, nz, ny, nx); (3 or 4, K, nz, ny, nx): x, y, z, time */
@@ -32,9 +32,9 @@ __kernel void tv_primal(
 
 __kernel void tv_dual(
     __global const float *volume, const int4 shape, const float4 axis_weight,
-    const float step, const float time_step, /* 1 / (Lipschitz constant · weight), of the three axes and of time */
+    const float step, const float time_step, /* 1 / (Lipschitz constant · weight), for the three axes and for time */
     const float momentum,
-    __global const float *from,       /* `moved` of the call before, or the dual in the first call */
+    __global const float *from,       /* `moved` as the last call wrote it; in the first call `dual` */
     __global float *dual, __global float *moved)
 {
     const int x = (int)get_global_id(0), y = (int)get_global_id(1), all = (int)get_global_id(2);

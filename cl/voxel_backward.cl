@@ -1,6 +1,6 @@
-/* Adjoint of the voxeliser: each Gaussian sums moments of value · dL/d(volume), then the chain rule gives its gradients.
-   A work-item takes a Gaussian, with vectors along its rows (CPUs), or a group of GROUP items does, with ACROSS along a row
-   (GPUs). */
+/* Adjoint of voxel_forward.cl. voxel_backward sums moments of value · dL/d(volume) over a Gaussian's voxels, and
+   voxel_chain makes gradients of them. On CPUs a work-item takes a Gaussian, with vectors along rows. On GPUs a work-group
+   of GROUP items does, ACROSS of them along a row. */
 #include "common/gradient.h"
 #include "common/group_sums.h"
 #include "common/voxel.h"
@@ -16,7 +16,7 @@
 #define PLACE_IN_ROW 0
 #endif
 
-/* The voxels of a row to visit: those of the box on a CPU; those within the cutoff on a GPU, where each costs time. */
+/* The voxels of a row to visit: of the bounding box on a CPU; only within the cutoff on a GPU, where each takes time. */
 ALWAYS_INLINE int2 voxel_span(const voxel_row r, const int lo, const int hi, const float limit)
 {
 #if GROUP > 1
@@ -35,7 +35,7 @@ __kernel void voxel_backward(
     __global float *sums)            /* (stride, SUMS): w, w x y z, w xx xy xz yy yz zz in voxels */
 {
     const int g = (int)get_global_id(0) / ACROSS;
-#if GROUP == 1 /* else groups are as many as Gaussians, and PoCL 3.0 makes stray writes of a return before barriers */
+#if GROUP == 1 /* Larger groups need no test, and in PoCL 3.0 a return before barriers leads to wrong writes. */
     if (g >= count)
         return;
 #endif
@@ -47,7 +47,7 @@ __kernel void voxel_backward(
     for (int z = record_as_int[VOX_LO + 2]; z <= record_as_int[VOX_HI + 2]; ++z)
         for (int y = record_as_int[VOX_LO + 1] + ROW_OF_GROUP; y <= record_as_int[VOX_HI + 1]; y += GROUP / ACROSS) {
             const voxel_row r = voxel_row_at(voxel_record, y, z);
-            if (r.k > limit) /* the row meets only a corner of the box, beyond the cutoff */
+            if (r.k > limit) /* the row crosses a corner of the bounding box, beyond the cutoff */
                 continue;
             const int2 span = voxel_span(r, record_as_int[VOX_LO], record_as_int[VOX_HI], limit);
             __global const float *row = by_volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;
@@ -70,7 +70,7 @@ __kernel void voxel_backward(
     const vf all[SUM_COUNT] = {w_, x_, y_, z_, xx, xy, xz, yy, yz, zz};
 #if GROUP > 1
     __local float tree[SUM_COUNT * GROUP];
-    if (record_as_int[VOX_HI + 2] >= record_as_int[VOX_LO + 2]) /* most Gaussians are far from a small volume */
+    if (record_as_int[VOX_HI + 2] >= record_as_int[VOX_LO + 2]) /* most Gaussians do not touch a small volume */
         group_sums(all, SUM_COUNT, tree, out);
     else
         for (int f = GROUP_ITEM; f < SUM_COUNT; f += GROUP)
@@ -84,7 +84,7 @@ __kernel void voxel_backward(
 __kernel void voxel_chain(
     __global const float *gaussians, __global const float *sums, const float4 pitch, const int stride,
     const int add, const float weight,
-    __global float *gradients)       /* (13, stride) */
+    __global float *gradients)       /* (13, stride); leaves the last two rows, dL/d(centre u, v) */
 {
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)
@@ -99,7 +99,7 @@ __kernel void voxel_chain(
     const v3 n = to_local(axes, v3_make(weight * pitch.x * V_LOAD(fields + LANES),
                                         weight * pitch.y * V_LOAD(fields + 2 * LANES),
                                         weight * pitch.z * V_LOAD(fields + 3 * LANES)));
-    /* Second moments in the world, then in the Gaussian's own frame. */
+    /* Second moments in world coordinates, then along the Gaussian's own axes. */
     const vf xx = weight * pitch.x * pitch.x * V_LOAD(fields + 4 * LANES);
     const vf xy = weight * pitch.x * pitch.y * V_LOAD(fields + 5 * LANES);
     const vf xz = weight * pitch.x * pitch.z * V_LOAD(fields + 6 * LANES);

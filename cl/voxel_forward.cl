@@ -1,13 +1,14 @@
-/* Voxeliser: every tile of voxels sums its list of Gaussians. With BLOCK_PIXEL 0 a work-item owns rows along x. With
-   BLOCK_PIXEL 1 it owns voxels along z; a work-group owns a tile, tile.x by tile.y items, and reads its records once. */
+/* Evaluates Gaussians on a voxel grid: every tile of voxels sums its list of Gaussians. BLOCK_PIXEL 0 (CPUs): a work-item
+   takes the rows of a tile. BLOCK_PIXEL 1 (GPUs): a work-group takes a tile, and an item voxels along z; records are read
+   once for all items. */
 #if BLOCK_PIXEL
 #define VOXEL_SPACE __local
 #endif
 #include "common/tile.h"
 #include "common/voxel.h"
 
-#define STAGED 32 /* records of Gaussians that a work-group reads into local memory at a time */
-#define DEPTH 8   /* voxels along z of a work-item: tile.z */
+#define STAGED 32 /* number of records of Gaussians that a work-group reads into local memory at a time */
+#define DEPTH 8   /* voxels along z of a work-item; equals tile.z */
 
 __kernel void voxel_forward(
     __global const float *records, __global const int *tile_offsets, __global const int *tile_splat_ids,
@@ -17,16 +18,16 @@ __kernel void voxel_forward(
 {
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
 #if BLOCK_PIXEL
-    __local int records_here[STAGED * VOXEL_RECORD]; /* ints, because a device may flush ints copied as floats */
+    __local int records_here[STAGED * VOXEL_RECORD]; /* as ints: copied as floats, a device may set small ints to 0 */
     const int x = (int)get_global_id(0), y = (int)get_global_id(1), z_first = (int)get_global_id(2) * DEPTH;
     const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
     const int items = (int)(get_local_size(0) * get_local_size(1));
-    const int t = ((int)get_global_id(2) * tiles.y + y / tile.y) * tiles.x + x / tile.x; /* launches may be parts */
+    const int t = ((int)get_global_id(2) * tiles.y + y / tile.y) * tiles.x + x / tile.x; /* get_group_id restarts in each part of a launch */
     const tile_list list = list_of(tile_offsets, t, capacity, count);
     float sum[DEPTH] = {0.0f};
     for (int done = 0; done < list.count; done += STAGED) {
         const int here = min(STAGED, list.count - done);
-        barrier(CLK_LOCAL_MEM_FENCE); /* wait until all have read what was there */
+        barrier(CLK_LOCAL_MEM_FENCE); /* waits until all items have read the last records */
         for (int f = item; f < here * VOXEL_RECORD; f += items) {
             const int e = done + f / VOXEL_RECORD;
             const size_t splat = (size_t)listed_splat(list, tile_splat_ids, e) * VOXEL_RECORD;
@@ -72,7 +73,7 @@ __kernel void voxel_forward(
         for (int z = z_lo; z <= z_hi; ++z)
             for (int y = y_lo; y <= y_hi; ++y) {
                 const voxel_row r = voxel_row_at(voxel_record, y, z);
-                if (r.k > limit) /* the row meets only a corner of the box, beyond the cutoff */
+                if (r.k > limit) /* the row crosses a corner of the bounding box, beyond the cutoff */
                     continue;
                 __global float *row = volume + IMAGE_GUARD + ((size_t)z * shape.y + y) * pitch;
                 for (int x = x_lo; x <= x_hi; x += LANES)

@@ -1,19 +1,19 @@
-/* Projects every Gaussian onto a grid: the triangular factor of its precision matrix, and its bounding box. A work-item
-   takes LANES Gaussians. */
+/* Computes for every Gaussian, in units of a grid's voxels, the triangular factor of its precision matrix and its bounding
+   box. A work-item takes LANES Gaussians. */
 #include "common/precise.h"
 #include "common/gaussian.h"
 #include "common/voxel.h"
 
 __kernel void voxel_prepare(
-    __global const float *gaussians,      /* (11, stride) */
+    __global const float *gaussians,      /* (11, stride): mean, scale, quaternion, density */
     __global const coefficient *matrix,   /* (12): rows give the voxel index x, y, z of a world point */
     const float4 pitch,                   /* voxel size x, y, z */
     const int4 start,                     /* first voxel of the computed part, x y z */
     const int4 shape,                     /* voxels of the computed part along x, y, z */
     const int count, const int stride,
     const float cutoff2,
-    __global float *records,              /* (stride, VOXEL_RECORD) */
-    __global int *extents)                /* (6, stride) */
+    __global float *records,              /* (stride, VOXEL_RECORD): see common/voxel.h */
+    __global int *extents)                /* (6, stride): lo and hi along x, y, z; empty where hi < lo */
 {
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)
@@ -28,13 +28,14 @@ __kernel void voxel_prepare(
     const v3 sx = v3_mul(scale, ex), sy = v3_mul(scale, ey), sz = v3_mul(scale, ez);
     const v3 wx = v3_mul(inv_scale, ex), wy = v3_mul(inv_scale, ey), wz = v3_mul(inv_scale, ez);
 
-    /* QR of the whitened voxel axes. Cross products come as cofactors, which do not cancel for needles. */
+    /* QR decomposition of the voxel axes in the Gaussian's whitened frame. Cross products are computed as cofactors, in
+       which thin Gaussians lose no digits. */
     const vf u11 = sqrt(v3_dot(wx, wx)), inv_u11 = 1.0f / u11;
     const vf u22 = sqrt(v3_dot(sz, sz)) * inv_det * inv_u11;
     const vf u23 = -v3_dot(sz, sy) * (inv_det * inv_u11) * (inv_det * inv_u11) / u22;
     const vf u33 = inv_det * inv_u11 / u22;
     vf rest[3];
-    /* Split in the frame of the complete grid, so that a part has the bits of the whole. */
+    /* The centre is split on the complete grid, so that a part of a volume gets the same bits as the whole. */
     const vf whole[3] = {wide_split(wide_dot(matrix, mean.x, mean.y, mean.z), rest) - (float)start.x,
                          wide_split(wide_dot(matrix + 4, mean.x, mean.y, mean.z), rest + 1) - (float)start.y,
                          wide_split(wide_dot(matrix + 8, mean.x, mean.y, mean.z), rest + 2) - (float)start.z};

@@ -1,28 +1,28 @@
-/* A volume seen through a displacement, (W v)(y) = v(y + w(y)), interpolated and zero outside the volume, and its exact
-   transpose. The displacement of a state is w = sum of shares[r] * fields[r], in voxels. Twin: operators/twins/rays.py.
-   It interpolates by cubic splines along each axis, which run through the voxels: their coefficients lie in the volume's
-   layout, from BORDER samples before it to BORDER behind it. M. Unser, A. Aldroubi and M. Eden, B-spline signal processing,
-   IEEE Trans. Signal Processing 41, 821-833 (1993).
-     spline_along_x     voxels to coefficients in place, along x; a work-item takes a row. Its own transpose.
-     spline_across_x    the same along y or z; a work-item takes LANES neighbouring lines.
+/* Warps a volume by a displacement, (W v)(y) = v(y + w(y)), and its exact transpose. In a state of an object that moves, the
+   displacement is w = sum of shares[r] * fields[r], in voxels. Twin: operators/twins/rays.py.
+   v interpolates the voxels by cubic splines, and is zero outside the volume. The splines' coefficients are stored like the
+   volume, with BORDER more around. M. Unser, A. Aldroubi and M. Eden, B-spline signal processing, IEEE Trans. Signal
+   Processing 41, 821-833 (1993).
+     spline_along_x     voxels to coefficients in place, along x (a symmetric map); a work-item takes a row.
+     spline_across_x    the same along y or z; a work-item takes LANES neighbouring lines of voxels.
      warp_forward       a work-item takes LANES voxels along x.
-     warp_adjoint_rows  CPUs: a work-item owns some slices of the result, to which it adds every voxel that reaches them.
-     warp_adjoint_fixed GPUs: a group adds its voxels to integers, whose sums do not depend on their order.
-     warp_adjoint_sum   adds such integers to the result.
-     add_frames         adds the frames of a state to some of a stack.
-   Near voxels move together. So LANES voxels meet a few more samples than one voxel does, and each sample is a vector of the
-   volume with its weights. Voxels further apart than MOST_TAPS along an axis allows are taken one by one. */
+     warp_adjoint_rows  CPUs: a work-item sums some slices of the result, over every voxel that reaches them.
+     warp_adjoint_fixed GPUs: a group adds its voxels to integers, whose sums do not depend on the order.
+     warp_adjoint_sum   adds these integers to the result.
+     add_frames         adds the frames of a state to some frames of a stack.
+   Neighbouring voxels move nearly equally. So LANES voxels need only a few more coefficients along an axis than one voxel,
+   and are computed together. If they need more than MOST_TAPS, they are computed one by one. */
 #include "common/lanes.h"
 
-#define REACH 2 /* voxels: the distance within which a sample counts */
+#define REACH 2 /* a coefficient acts on points less than this away, in voxels */
 #define BORDER 4
 #define TAPS (2 * REACH)
 #define MOST_TAPS (TAPS + 2)
-#define SLAB 2048 /* samples that a group holds: those of 8 x 8 x 4 voxels that spread by a third, 15 x 15 x 9 */
+#define SLAB 2048 /* coefficients in a group's local memory: 15 x 15 x 9 are needed if 8 x 8 x 4 voxels spread by a third */
 
-#define POLE -0.26794919f /* sqrt(3) - 2 */
+#define POLE -0.26794919f /* sqrt(3) - 2, the pole of the cubic spline filter */
 
-/* Solves c[k - 1] + 4 c[k] + c[k + 1] = 6 v[k] for a line of zeros beyond its ends. */
+/* Solves c[k - 1] + 4 c[k] + c[k + 1] = 6 v[k] along a line, where v is zero beyond the ends. */
 #define SPLINE_COEFFICIENTS(type, load, store)            \
     type sum = 0.0f;                                      \
     for (int k = 0; k < length; ++k) {                    \
@@ -39,8 +39,8 @@
 #define STORE_ONE(value, at) (*(at) = (value))
 
 __kernel void spline_along_x(
-    __global float *volume, const long start, /* the first row's first sample */
-    const long row,                           /* from one row to the next */
+    __global float *volume, const long start, /* the first element of the first row */
+    const long row,                           /* floats from one row to the next */
     const int rows, const int length)
 {
     if ((int)get_global_id(0) >= rows)
@@ -52,8 +52,8 @@ __kernel void spline_along_x(
 
 __kernel void spline_across_x(
     __global float *volume, const long start,
-    const long width, const long plane, /* neighbouring lines; from one plane of them to the next */
-    const long step, const int length)  /* from one sample of a line to the next */
+    const long width, const long plane, /* number of neighbouring lines; floats from one plane of them to the next */
+    const long step, const int length)  /* floats from one element of a line to the next */
 {
     if ((long)get_global_id(0) * LANES >= width)
         return;
@@ -61,7 +61,7 @@ __kernel void spline_across_x(
     SPLINE_COEFFICIENTS(vf, V_LOAD, V_STORE)
 }
 
-/* The cubic B-spline: the weight of a coefficient at a distance in voxels; 0 from REACH on. */
+/* The cubic B-spline: the weight of a coefficient at a distance in voxels. It is 0 from REACH on. */
 static inline float one_tap(const float distance)
 {
     const float x = fmin(fabs(distance), 2.0f), far = 2.0f - x;
@@ -73,9 +73,9 @@ static inline int first_tap(const float at)
     return (int)floor(at) + 1 - REACH;
 }
 
-/* Where LANES voxels look in the volume, and the coefficients around them with their weights: `count` along an axis from
-   `first` on. Along x, `first` moves with the lane. is_far: whether a lane needs others. is_outside: whether it looks
-   further than REACH beyond the volume, where it finds 0. */
+/* The coefficients along one axis that LANES voxels need, with their weights: `count` coefficients from `first` on. Along x,
+   `first` is one more in each lane. at: the displaced positions. is_far: whether a lane needs other coefficients.
+   is_outside: whether it is more than REACH outside the volume, where the value is 0. */
 typedef struct {
     vf at;
     vi is_far, is_outside;
@@ -92,8 +92,8 @@ static inline vf displacement(
     return sum;
 }
 
-/* Displacements mostly rise or fall along the lanes, so the first and the last lane have the range of all. This is tested.
-   */
+/* Displacements mostly rise or fall along the lanes, so the first and the last lane give the range of all. Lanes for which
+   this is wrong become is_far. */
 static inline Samples samples_of(const vf position, const vi lane, const int length)
 {
     Samples s;
@@ -128,12 +128,12 @@ static inline Samples samples_of(const vf position, const vi lane, const int len
     const Samples sz = samples_of((float)(z_) + displacement(fields, shares, voxels, 2, voxel), 0, shape.z);
 
 __kernel void warp_forward(
-    __global const float *volume, /* coefficients: rows with a pitch, in their border; `strides`: start, row, slice */
+    __global const float *volume, /* coefficients, padded; strides: start, row, slice */
     const long4 strides,
-    __global const float *fields, /* (RANK, 3: x y z, nz, ny, nx) voxels, and zeros for a vector's end */
-    __global const float *shares, /* (RANK,) of the state */
+    __global const float *fields, /* (RANK, 3: x y z, nz, ny, nx) in voxels; zeros follow, which vectors may read */
+    __global const float *shares, /* (RANK,): the fields' weights in the state */
     const int4 shape,
-    __global float *result)       /* (nz, ny, nx) */
+    __global float *result)       /* (nz, ny, nx): the warped volume */
 {
     const int first = (int)get_global_id(0) * LANES, y = get_global_id(1), z = get_global_id(2);
     if (first >= shape.x)
@@ -177,7 +177,7 @@ __kernel void warp_forward(
 #endif
     sum = ZERO_OUTSIDE(sum);
 #if LANES > 1
-    if (first + LANES > shape.x) { /* the next row is another work-item's */
+    if (first + LANES > shape.x) { /* another work-item writes the next row */
         float values[LANES];
         V_STORE(sum, values);
         for (int l = 0; first + l < shape.x; ++l)
@@ -188,17 +188,17 @@ __kernel void warp_forward(
     V_STORE(sum, result + voxel);
 }
 
-/* Whether voxels of slice z, with such displacements along z, count in the slices of a work-item. */
+/* Whether voxels of slice z, with displacements along z in `range`, add to the slices of this work-item. */
 #define REACHES(range) (z + (range).y > (float)(z_start - REACH) && z + (range).x < (float)(z_stop - 1 + REACH))
 
 __kernel void warp_adjoint_rows(
-    __global const float *values,  /* (nz, ny, nx), and zeros for a vector's end */
+    __global const float *values,  /* (nz, ny, nx); zeros follow, which vectors may read */
     __global const float *fields, __global const float *shares, const int4 shape,
-    __global const float2 *slices, /* (nz,): least and largest displacement along z in a slice */
-    __global const float2 *rows,   /* (nz, ny): the same in a row */
+    __global const float2 *slices, /* (nz,): smallest and largest displacement along z in a slice */
+    __global const float2 *rows,   /* (nz, ny): smallest and largest displacement along z in a row */
     const int owned,               /* slices of a work-item */
     const long4 strides,
-    __global float *result)        /* coefficients like those of warp_forward; the kernel adds to them */
+    __global float *result)        /* laid out like the coefficients of warp_forward; the kernel adds to it */
 {
     const int z_start = (int)get_global_id(0) * owned - BORDER, z_stop = min(z_start + owned, shape.z + BORDER);
     if (z_start >= z_stop)
@@ -249,15 +249,15 @@ __kernel void warp_adjoint_rows(
 }
 
 #if LANES == 1
-/* Neighbouring voxels add to the same samples. So a group sums in a slab of local memory, and its items add the slab to the
-   result: a few global atomics for a voxel in place of 64. A group whose voxels move too far apart adds at once. */
+/* Neighbouring voxels add to the same coefficients. So a group sums in a slab of local memory, and then adds the slab to the
+   result: a few global atomics per voxel instead of 64. A group whose voxels move too far apart adds to the result at once. */
 __kernel void warp_adjoint_fixed(
     __global const float *values, __global const float *fields, __global const float *shares, const int4 shape,
-    const float scale,     /* integers per unit, such that no sum overflows */
+    const float scale,     /* the integer that stands for 1, such that no sum overflows */
     const long4 strides,
-    __global int *result)  /* zeros in the layout of coefficients */
+    __global int *result)  /* laid out like the coefficients, zero before */
 {
-    __local int slab[SLAB], low[3], high[3]; /* the group's first samples, least and largest along x, y and z */
+    __local int slab[SLAB], low[3], high[3]; /* smallest and largest first coefficient of the group along x, y, z */
     const int3 at = (int3)((int)get_global_id(0), (int)get_global_id(1), (int)get_global_id(2));
     const int item = (int)((get_local_id(2) * get_local_size(1) + get_local_id(1)) * get_local_size(0) + get_local_id(0));
     const int items = (int)(get_local_size(0) * get_local_size(1) * get_local_size(2));
@@ -317,8 +317,8 @@ __kernel void warp_adjoint_sum(
 #endif
 
 __kernel void add_frames(
-    __global const float *frames, /* (n, pixels) */
-    __global const int *places,   /* (n,): places of the frames in the stack */
+    __global const float *frames, /* (n, pixels): to be added to the stack */
+    __global const int *places,   /* (n,): numbers of the frames in the stack */
     const int pixels, __global float *stack)
 {
     const int pixel = get_global_id(0), frame = get_global_id(1);

@@ -12,7 +12,7 @@ except PackageNotFoundError:  # run from a checkout that is not installed
 
 
 def resource(name: str) -> Path:
-    """Returns the path of ``cl``, ``data`` or ``cli.py``: inside the package in a wheel, next to it in a checkout.
+    """Returns the path of ``cl``, ``data`` or ``cli.py``. A wheel has them inside the package, a checkout next to it.
 
     Raises FileNotFoundError where both are missing."""
     package = Path(__file__).resolve().parent

@@ -1,4 +1,4 @@
-"""Entry point: loads the command line, cli.py inside the package or next to it, and runs it."""
+"""Entry point of the command ``phyradgs``: loads cli.py, which is inside the package or next to it, and runs it."""
 
 import importlib.util
 import signal
@@ -9,7 +9,7 @@ from phyradgs_cl import resource
 
 
 def load_cli() -> ModuleType:
-    """Loads and returns the module cli.py. Raises ImportError or FileNotFoundError where the installation lacks it."""
+    """Loads cli.py and returns the module. Raises ImportError or FileNotFoundError where the installation lacks it."""
     spec = importlib.util.spec_from_file_location("phyradgs_cl_cli", resource("cli.py"))
     if spec is None or spec.loader is None:
         raise ImportError("cli.py cannot be loaded: install phyradgs-cl again")
@@ -20,10 +20,10 @@ def load_cli() -> ModuleType:
 
 
 def main() -> None:
-    """Runs the command line and exits with its status; Ctrl-C gives one line and status 130 at any time."""
+    """Runs the command line and exits with its status. Ctrl-C prints one line instead of a traceback, with status 130."""
     try:
         status = load_cli().run(sys.argv[1:])
-    except KeyboardInterrupt:  # while libraries load
+    except KeyboardInterrupt:  # pressed while libraries load; later the command line handles it
         sys.stderr.write("phyradgs: interrupted, nothing written\n")
         status = 130
     for number in (signal.SIGINT, signal.SIGTERM):  # a signal while the interpreter ends would print a traceback

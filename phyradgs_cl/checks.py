@@ -1,4 +1,4 @@
-"""Checks values from users and files. Each check raises InputError about its ``subject``, or returns."""
+"""Checks values from users and files. A wrong value raises InputError, whose message begins with ``subject``."""
 
 import importlib
 import math
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.text import suggest_name
 
-_LONGEST = 80  # most characters of a value in a message
+_LONGEST = 80  # number of characters at which a value is cut in a message, so that the message stays readable
 T = TypeVar("T")
 
 
@@ -41,22 +41,23 @@ def within(subject: str, value: float, lowest: float, highest: float) -> None:
 
 
 def option(default: T, help: str = "", usual: bool | str = True, **known: Any) -> T:
-    """Returns a dataclass's field with what its checks and the command line know about it.
+    """Returns a dataclass field for an option, with its help text and its limits.
 
-    usual: in words, the value of an option that is not given; True is the default. known: for ``fields_within`` its
-    ``range`` (lowest, highest), the ``words`` that it may be, ``is_positive``, and its ``subject`` in messages."""
+    usual: what help texts name as the default, in words; True names ``default``. known: limits that ``fields_within``
+    checks: ``range`` (lowest, highest), the allowed ``words``, ``is_positive``; and the ``subject`` of its messages."""
     return field(default=default, metadata={"help": help, "usual": usual, **known})
 
 
 def ranged(default: T, lowest: float, highest: float, subject: str = "") -> T:
-    """Returns a dataclass's field with a default, whose bounds ``fields_within`` checks."""
+    """Returns a dataclass field for a number from ``lowest`` to ``highest``, as ``fields_within`` checks it."""
     return option(default, range=(lowest, highest), subject=subject)
 
 
 def fields_within(named: str | Callable[[str], str], options: object) -> None:
-    """Raises InputError for a field of a dataclass, or of a base class, that is not what ``option`` says; None passes.
-    Numbers in tuples are checked one by one. ``named``: what comes before a field's name in messages, or a function of
-    the name."""
+    """Raises InputError for a field of a dataclass that breaks the limits given to ``option``. None passes.
+
+    Fields of base classes are checked too, and each number of a tuple. ``named``: the text before a field's name in
+    messages, or a function from the name to the subject of the message."""
     own = [one for kind in reversed(type(options).__mro__) for one in getattr(kind, "__dataclass_fields__", {}).values()]
     for name, one in {one.name: one for one in own if one.metadata}.items():
         known, value = one.metadata, getattr(options, name)
@@ -73,8 +74,7 @@ def fields_within(named: str | Callable[[str], str], options: object) -> None:
 
 
 class Checked:
-    """Options as a dataclass whose fields are checked when it is made. PREFIX: what comes before a field's name in
-    messages."""
+    """Base of option dataclasses: checks its fields when it is made. PREFIX: the text before a field's name in messages."""
 
     PREFIX = ""
 
@@ -83,7 +83,7 @@ class Checked:
 
 
 def one_of(subject: str, value: object, allowed: Iterable[object]) -> None:
-    """Raises InputError unless ``value`` is among ``allowed``, which the message lists."""
+    """Raises InputError unless ``value`` is among ``allowed``. The message lists them."""
     choices = list(allowed)
     if value not in choices:
         remedy = suggest_name(value, (choice for choice in choices if isinstance(choice, str)), "")
@@ -91,7 +91,7 @@ def one_of(subject: str, value: object, allowed: Iterable[object]) -> None:
 
 
 def finite(subject: str, array: ArrayLike) -> None:
-    """Raises InputError, with the index of the first, if any element of ``array`` (any shape) is NaN or infinite."""
+    """Raises InputError if ``array`` (any shape) has NaN or infinite values. The message has the index of the first."""
     good = np.isfinite(np.asarray(array))
     if not good.all():
         count = int(good.size - np.count_nonzero(good))
@@ -100,7 +100,7 @@ def finite(subject: str, array: ArrayLike) -> None:
 
 
 def shape(subject: str, array: ArrayLike, expected: Sequence[int | None]) -> None:
-    """Raises InputError unless ``array`` has the shape ``expected``, in which None stands for any length."""
+    """Raises InputError unless ``array`` has the shape ``expected``. None in it stands for any length."""
     found = np.shape(array)
     fits = len(found) == len(expected) and all(e in (None, f) for f, e in zip(found, expected, strict=True))
     if not fits:
@@ -109,7 +109,7 @@ def shape(subject: str, array: ArrayLike, expected: Sequence[int | None]) -> Non
 
 
 def numbers(subject: str, value: ArrayLike, expected: Sequence[int | None] | None = None) -> NDArray[np.float64]:
-    """Returns ``value`` as float64. Raises InputError unless it is real, finite and of the shape ``expected``, if given."""
+    """Returns ``value`` as float64. Raises InputError unless it is real and finite, with the shape ``expected`` if given."""
     array = real_array(subject, value)
     if expected is not None:
         shape(subject, array, expected)
@@ -118,7 +118,7 @@ def numbers(subject: str, value: ArrayLike, expected: Sequence[int | None] | Non
 
 
 def rising(subject: str, value: ArrayLike) -> NDArray[np.float64]:
-    """Returns times (n,) as float64. Raises InputError unless there is one at least, and they rise."""
+    """Returns times (n,) as float64. Raises InputError unless there is at least one and each is later than the last."""
     times = numbers(subject, value, (None,))
     if len(times) == 0 or (np.diff(times) <= 0).any():
         raise InputError(subject, short_repr(times.tolist()), "at least one time, rising")
@@ -126,10 +126,10 @@ def rising(subject: str, value: ArrayLike) -> NDArray[np.float64]:
 
 
 def real_array(subject: str, value: ArrayLike) -> np.ndarray:
-    """Returns ``value`` as an array of its real type. Raises InputError for anything but real numbers."""
+    """Returns ``value`` as an array, its type unchanged. Raises InputError unless it holds integers or floats."""
     try:
         array = np.asarray(value)
-    except ValueError as error:  # NumPy's message is long
+    except ValueError as error:  # NumPy's own message is too long for one line
         raise InputError(subject, "lists of unequal length", "an array of numbers") from error
     if array.dtype.kind not in "iuf":
         raise InputError(subject, short_repr(value), "numbers")
@@ -144,7 +144,7 @@ def whole(subject: str, value: float, lowest: int, highest: int) -> None:
 
 
 def package(name: str, use: str, install: str) -> ModuleType:
-    """Imports a package. Raises InputError, with the command that installs it, where it is missing. ``use``: its purpose."""
+    """Imports a package. Where it is missing, raises InputError with the command that installs it. ``use``: its purpose."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -152,7 +152,7 @@ def package(name: str, use: str, install: str) -> ModuleType:
 
 
 def short_repr(value: object) -> str:
-    """Returns the repr of a wrong value, cut to 80 characters for a message."""
+    """Returns the repr of a wrong value for a message, cut to 80 characters."""
     try:
         text = repr(value)
     except ValueError:  # Python refuses to print whole numbers of thousands of digits
@@ -163,7 +163,7 @@ def short_repr(value: object) -> str:
 
 
 def is_number(value: object) -> bool:
-    """Returns whether ``value`` is a finite number and no bool."""
+    """Returns whether ``value`` is a finite number. A bool is not."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return False
     return isinstance(value, int) or math.isfinite(value)  # isfinite fails on whole numbers beyond floats

@@ -1,7 +1,7 @@
-"""Compares every kernel on a device with float64 on the host, on small problems.
+"""Compares every kernel on a device, on small problems, with its twin: the same mathematics in float64 NumPy on the host.
 
-Gradients are compared with central differences of the twins. Limits are several times the rounding of float32 on a
-conforming device, and far below the error of a wrong kernel."""
+Gradients are compared with central differences of the twins. The limits are several times the rounding of float32, and far
+below the error of a wrong kernel."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -34,13 +34,13 @@ from phyradgs_cl.optim import DeviceAdam, adam_step
 from phyradgs_cl.runtime import DeviceSpace, HostSpace, Runtime
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 
-VALUE, GRADIENT = 1e-4, 1e-3  # upper limits of the difference from float64 twins, over the largest number
-_GRIDDED = 5e-3  # upper limit of the difference where an inverse is computed from a field's values at voxels
+VALUE, GRADIENT = 1e-4, 1e-3  # upper limits of the difference from the float64 twin, relative to the largest value
+_GRIDDED = 5e-3  # upper limit of the difference where a deformation's inverse is interpolated between voxels
 SHAPE, GRID = (9, 12), Grid((5, 7, 6), (0.3, 0.24, 0.28), (0.1, -0.05, 0.1))
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 9, 4.1 / 12), (0.1, 0.2))
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.5))
 PARALLEL = CircularOrbit(ParallelGeometry(SHAPE, (2.6 / 9, 2.7 / 12), (0.1, 0.2)), ConstantSpeed(0.3, 0.5))
-UNIT = 2.0  # line integral of the value 1 in images of the intensity model
+UNIT = 2.0  # line integral that the pixel value 1 stands for, where intensities are averaged
 STEP = 1e-6  # half the step of central differences
 Comparison = tuple[np.ndarray, np.ndarray, float]
 """Computed, expected, and the largest difference allowed, relative to the largest number expected."""
@@ -48,8 +48,10 @@ Comparison = tuple[np.ndarray, np.ndarray, float]
 
 @dataclass(frozen=True)
 class Verdict:
-    """The result of a device's check. agreeing: kernels that agree with their twins. failures: the other kernels, in
-    words. group_limits: the largest work-group, by name, of kernels that use work-groups."""
+    """The result of a device's check.
+
+    agreeing: the kernels that agree with their twins. failures: a text about each of the others. group_limits: the
+    largest work-group that the driver allows, in work-items, by kernel; only for kernels that use work-groups."""
 
     device: str
     agreeing: frozenset[str]
@@ -63,12 +65,12 @@ class Verdict:
 
 
 def check_device(device: str | None = None, **launch_shape: bool | int) -> Verdict:
-    """Builds and runs every kernel of a device; ``launch_shape``: options of Runtime."""
+    """Builds and runs every kernel on a device and compares it with its twin. ``launch_shape``: options of Runtime."""
     agreeing: set[str] = set()
     failures: list[str] = []
     limits: dict[str, int] = {}
     for check in CHECKS:
-        rt = Runtime(device, **launch_shape)  # type: ignore[arg-type]  # a new Runtime: the kernels that it has built are those that have run
+        rt = Runtime(device, **launch_shape)  # type: ignore[arg-type]  # a new Runtime for each check: its list of built kernels then says which ones this check ran
         if problem := _problem(check, rt, agreeing):
             suspects = sorted(rt.built_kernels - agreeing) or sorted(rt.built_kernels)
             failures.append(f"{', '.join(suspects)} ({problem})" if suspects else problem)
@@ -77,7 +79,7 @@ def check_device(device: str | None = None, **launch_shape: bool | int) -> Verdi
 
 
 def _problem(check: Callable[[Runtime], Iterator[Comparison]], rt: Runtime, agreeing: set[str]) -> str:
-    """Returns the first problem in words. Without any, returns "" and adds the kernels that ran to ``agreeing``."""
+    """Returns the first problem in words, or "" if there is none. Adds kernels that ran without one to ``agreeing``."""
     try:
         for computed, expected, limit in check(rt):
             off = float(np.abs(np.asarray(computed, np.float64) - expected).max() / (np.abs(expected).max() or 1.0))
@@ -90,7 +92,6 @@ def _problem(check: Callable[[Runtime], Iterator[Comparison]], rt: Runtime, agre
 
 
 def _algebra(rt: Runtime) -> Iterator[Comparison]:
-    """Compares the algebra of arrays, and the kernel that measures rates."""
     host, there = HostSpace(), DeviceSpace(rt)
     a, b, c = (_noise((3, 1999), seed) - np.float32(0.3) for seed in range(3))
     x, y, z = there.array(a), there.array(b), there.array(c)
@@ -110,7 +111,7 @@ def _algebra(rt: Runtime) -> Iterator[Comparison]:
 
 
 def _numbers(rt: Runtime) -> Iterator[Comparison]:
-    """Compares what kernels rely on: pairs of floats where there is no float64, whole numbers in local memory."""
+    """Checks what kernels rely on: whole numbers in local memory, and pairs of floats if the device lacks float64."""
     error = pair_error(rt)
     yield np.array(0.0 if rt.fp64 else error), np.zeros(()), PAIRS
     yield np.array(float(carried(rt)[0])), np.ones(()), 0.0
@@ -121,7 +122,7 @@ def _binning(rt: Runtime) -> Iterator[Comparison]:
     extents = np.zeros((6, 704), np.int32)
     for axis, size in enumerate(np.multiply(tile, tiles)):
         extents[2 * axis : 2 * axis + 2] = np.sort(rng.integers(0, size, (2, 704)), axis=0)
-    extents[1, ::5] = extents[0, ::5] - 1  # nowhere
+    extents[1, ::5] = extents[0, ::5] - 1  # an empty interval: this Gaussian is in no tile
     lists = TileLists(rt, tile, tiles)
     lists.build(rt.upload(extents), count, 704)
     first, last = (extents[k::2, :count] // np.array(tile)[:, None] for k in (0, 1))
@@ -206,7 +207,7 @@ def _voxels(rt: Runtime) -> Iterator[Comparison]:
 def _rays(rt: Runtime) -> Iterator[Comparison]:
     volume, frames = _noise(GRID.shape, 5), _noise((1, *SHAPE), 13)
     still, table, _ = _tables()
-    tall = (32, 5)  # lines enough for the vectors of any CPU
+    tall = (32, 5)  # enough lines to fill a CPU's widest vectors
     orbit = CircularOrbit(ConeGeometry(5.0, 7.5, tall, (3.9 / 32, 4.1 / 5)), ConstantSpeed(0.3, 0.5))
     upright = static_cells(orbit, Shutter(0.8, 0.6), 0, 0.2, tall[0])
     common = common_time_cells(orbit, Shutter(0.8, 0.6), 0, np.array([0.2]), tall[0], 3)
@@ -231,15 +232,15 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
     yield rt.download(operator.adjoint(rt.upload(frames))), twins.ray_volume(shares, GRID, finer), VALUE
     intensity = operators.IntensityOperator(rt, GRID, SHAPE, [table])
     mean, averaged = (twins.ray_frame(volume, GRID, table, SHAPE, model) for model in ("log", "intensity"))
-    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # at 0: the mean
+    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # about the volume 0 this is the plain mean
     yield rt.download(intensity.expected(on_device))[0], averaged, VALUE
     found = rt.download(intensity.adjoint(rt.upload(frames)))
     yield found, twins.intensity_volume(frames[0], volume, GRID, table), VALUE
 
 
 def _warps(rt: Runtime) -> Iterator[Comparison]:
-    """Compares ``VolumeWarp``, its transpose, and a ``WarpedOperator`` with their twins. A small field keeps neighbouring
-    voxels neighbours; a large one scatters them."""
+    """Checks ``VolumeWarp``, its transpose and ``WarpedOperator``, with a small deformation that keeps neighbouring voxels
+    neighbours, and with a large one that scatters them."""
     volume, times_s = _noise(GRID.shape, 22), np.array([0.0, 1.0, 2.0])
     for size_mm in (0.1, 3.0):
         control_mm = size_mm * (_noise((2, 5, 5, 5, 3), 20) - 0.5)
@@ -352,7 +353,7 @@ CHECKS = (
     _numbers, _algebra, _binning, _splats, _splats_of_moving_objects, _layered_splats, _plain_splats, _voxels, _rays, _warps,
     _backprojections, _moving_backprojections, _image_terms, _variation, _optimiser,
 )  # fmt: skip
-"""Ordered by dependence: a kernel that has agreed is not suspected later."""
+"""In this order because a kernel that has agreed is not suspected in later checks, which also use it."""
 
 
 def _noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
@@ -360,7 +361,7 @@ def _noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
 
 
 def _cloud(count: int = 3) -> np.ndarray:
-    """Returns parameter rows (11, G) float64, whose values float32 holds exactly."""
+    """Returns parameters of ``count`` random Gaussians, (11, G) float64 with values that float32 holds exactly."""
     rng = np.random.default_rng(count)
     turn = rng.normal(size=(4, count))
     parts = [
@@ -371,8 +372,7 @@ def _cloud(count: int = 3) -> np.ndarray:
 
 
 def _tables(orbit: CircularOrbit = ORBIT) -> tuple[TimeCells, TimeCells, TimeCells]:
-    """Returns three tables of cells: with one pose, with micro-views, and with lines that integrate while the gantry
-    moves."""
+    """Returns three kinds of time cells: a single pose, micro-views, and lines that integrate while the gantry moves."""
     rolling = orbit, Shutter(0.8, 0.6, "columns", -1), 0, 0.2, SHAPE[1]
     still = static_cells(orbit, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0])
     return still, micro_view_cells(*rolling, 3, 2), exact_cells(*rolling, 3)
@@ -381,7 +381,7 @@ def _tables(orbit: CircularOrbit = ORBIT) -> tuple[TimeCells, TimeCells, TimeCel
 def _differences(
     function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, h: np.ndarray | float = 1.0
 ) -> np.ndarray:
-    """Returns central differences (11, G) of Σ ``h`` · ``function``(rows)."""
+    """Returns the derivative (11, G) of Σ ``h`` · ``function``(rows) by each parameter, as central differences."""
     result = np.zeros_like(rows)
     for index in np.ndindex(*rows.shape):
         ends = []
@@ -394,6 +394,6 @@ def _differences(
 
 
 def _by_class(found: np.ndarray, expected: np.ndarray) -> Iterator[Comparison]:
-    """Yields gradients (11, G) found and expected, one class of parameters at a time, because their sizes differ."""
+    """Yields comparisons of gradients (11, G), each kind of parameter on its own because their magnitudes differ."""
     for part in (MEAN, SCALE, QUATERNION, DENSITY):
         yield found[part], expected[part], GRADIENT

@@ -1,5 +1,5 @@
-"""What `phyradgs devices --check` says of a device beside right or wrong: how it treats numbers, what it allows, how long a
-launch may last, and times. An owner's output then tells where results of another device differ."""
+"""Facts of a device that `phyradgs devices --check` prints: how it rounds, what it allows, how long a launch may last, and
+its speed. They help to find out why results on a user's device differ from those on another."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -10,16 +10,16 @@ from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.runtime import Runtime
 
 LASTING_S = 0.1, 1.0, 3.0
-"""Durations of launches that are tried on GPUs, in s: drivers of screens end those of 2 to 5 s."""
-# largest relative error of sums in pairs of floats; a compiler that contracts them leaves 6e-8, that of one float
+"""Durations of launches that are tried on GPUs, in s. Drivers of GPUs with a screen end launches of 2 to 5 s."""
+# Largest relative error of sums of float pairs. A compiler that simplifies them leaves 6e-8, the error of a single float.
 PAIRS = 1e-12
 _ITEMS = 32  # number of work-items in a work-group of the probes
-_TRIED_STEPS = 1 << 14  # number of multiply-adds of each chain in a first launch, which gives the speed
+_TRIED_STEPS = 1 << 14  # number of multiply-adds in a first short launch, whose time gives the length of longer ones
 
 
 def pair_error(rt: Runtime) -> float:
-    """Returns the largest relative error of products and sums in pairs of floats: at most ``PAIRS`` where the driver
-    keeps them."""
+    """Returns the largest relative error of sums in which two floats stand for a float64. It is at most ``PAIRS`` unless
+    the driver's compiler simplifies the pairs away."""
     (x, y, z), sums = np.random.default_rng(1).uniform(0.5, 1, (3, 256)).astype(np.float32), rt.empty((256, 2))
     kernel = rt.kernel("probes", "probe_pairs", LANES=1, FP64=0)
     rt.launch(kernel, 256, *map(rt.upload, (x, y, z)), 256, sums, group=rt.group(on_cpu=16))
@@ -28,8 +28,8 @@ def pair_error(rt: Runtime) -> float:
 
 
 def carried(rt: Runtime) -> tuple[bool, bool, bool]:
-    """Returns whether local memory keeps whole numbers, stored as ints and as floats, and whether subnormal floats are
-    kept."""
+    """Returns three tests of the device: whether local memory keeps ints, whether it keeps ints that are stored as floats of
+    the same bits, and whether subnormal floats are kept."""
     numbers, tiny = np.arange(-8, _ITEMS - 8, dtype=np.int32), np.float32(1e-40)
     as_ints, as_floats, twice = rt.zeros(_ITEMS, np.int32), rt.zeros(_ITEMS), rt.zeros(_ITEMS, np.int32)
     kernel = rt.kernel("probes", "probe_numbers", LANES=1, FP64=0)
@@ -40,15 +40,14 @@ def carried(rt: Runtime) -> tuple[bool, bool, bool]:
 
 
 def longest_launch(make: Callable[[], Runtime], lasting_s: Sequence[float]) -> str:
-    """Returns in words how long a launch may last: tries launches of about ``lasting_s`` seconds each, up to one that
-    fails.
+    """Tries launches of about ``lasting_s`` seconds until one fails. Returns in words how long a launch may last.
 
-    make: returns a new Runtime for each try, because a driver that ends a launch leaves its context dead."""
+    make: returns a new Runtime for each try. After a driver has ended a launch, nothing works in its OpenCL context."""
     lived_s, steps = 0.0, _TRIED_STEPS
     for wanted_s in (0.01, *lasting_s):
         try:
             rt = make()
-            _spin(rt, 1)  # builds
+            _spin(rt, 1)  # builds the kernel, so that its build is not timed
             each_s = max(lived_s or _spin(rt, steps), 1e-6) / steps
             steps = int(min(wanted_s / each_s, 2**31 - 1))
             lived_s = _spin(rt, steps)
@@ -58,7 +57,7 @@ def longest_launch(make: Callable[[], Runtime], lasting_s: Sequence[float]) -> s
 
 
 def _spin(rt: Runtime, steps: int) -> float:
-    """Returns the seconds of a launch with one work-group, in which each chain has ``steps`` multiply-adds."""
+    """Returns the seconds that one work-group takes for ``steps`` multiply-adds, each of which needs the one before."""
     out, started = rt.zeros(_ITEMS), time.perf_counter()
     rt.launch(rt.kernel("rates", "multiply_add"), _ITEMS, steps, np.float32(0.5), out, group=_ITEMS)
     rt.finish()
@@ -66,11 +65,10 @@ def _spin(rt: Runtime, steps: int) -> float:
 
 
 def probe_lines(device: str | None, limits: dict[str, int], check_s: float, **launch_shape: bool | int) -> Iterator[str]:
-    """Yields lines of text about a device: driver, treatment of numbers, work-groups, speed and, on GPUs, the longest
-    launch.
+    """Yields lines of text about a device: driver, rounding, work-groups, speed and, on GPUs, the longest launch.
 
     limits: the largest work-group by kernel. check_s: seconds that the comparison with the twins took. launch_shape:
-    options of ``Runtime``. A probe that raises DeviceError ends the lines with that failure."""
+    options of ``Runtime``. Where a probe raises DeviceError, its message is the last line."""
 
     def make(profile: bool = False) -> Runtime:
         return Runtime(device, profile=profile, **launch_shape)  # type: ignore[arg-type]

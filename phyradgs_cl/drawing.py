@@ -1,5 +1,5 @@
-"""What figures in notebooks, reports and the documentation share: colours, axes, curves, images. matplotlib is imported
-when something is drawn."""
+"""Colours, axes, curves and images for the figures of notebooks, reports and the documentation. matplotlib is slow to
+import, so it is imported when something is drawn."""
 
 import importlib
 import math
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# On the page of a report each colour is a variable of this name, which a dark page changes.
+# In a report's page each colour is a CSS variable of this name, so that a dark theme can change it.
 COLOURS = {
     "ink": "#1b2430",
     "soft": "#5a6675",
@@ -27,13 +27,13 @@ COLOURS = {
 }
 INK, SOFT, FAINT, ACCENT, EXPOSED, EDGE, SAMPLE, BOX = COLOURS.values()
 _LONGEST_BAR = 0.3  # largest length of the scale bar, as a fraction of a picture's width
-_LOG_RATIO = 20.0  # ratio of the largest to the smallest value above which an axis is logarithmic
+_LOG_RATIO = 20.0  # an axis is logarithmic where the largest value is more than this many times the smallest
 
 
 def new_figure(width_inch: float, height_inch: float) -> "Figure":
-    """Returns an empty figure. Where pyplot is imported it is a figure of pyplot, so that ``show()`` finds it."""
+    """Returns an empty figure. If the user has imported pyplot, pyplot makes it, so that ``plt.show()`` shows it."""
     if "ipykernel" in sys.modules:
-        with suppress(ImportError):  # makes a cell show, once, the figure that it returns
+        with suppress(ImportError):  # with this backend a notebook shows a returned figure, and shows it once
             importlib.import_module("matplotlib_inline.backend_inline")
     elif "matplotlib.pyplot" in sys.modules:
         return sys.modules["matplotlib.pyplot"].figure(figsize=(width_inch, height_inch), layout="constrained")
@@ -54,7 +54,7 @@ def style_axes(axes: "Axes", x_label: str, y_label: str) -> None:
 
 
 def draw_curve(axes: "Axes", x: Sequence[float], y: Sequence[float], x_label: str, y_label: str) -> None:
-    """Draws a curve; the vertical axis is logarithmic where positive values differ by more than a factor of 20."""
+    """Draws a curve. The vertical axis is logarithmic if all values are positive and span more than a factor of 20."""
     axes.plot(x, y, color=ACCENT, lw=1.8)
     if 0 < _LOG_RATIO * min(y) < max(y):
         axes.set_yscale("log")
@@ -64,8 +64,8 @@ def draw_curve(axes: "Axes", x: Sequence[float], y: Sequence[float], x_label: st
 def draw_image(
     axes: "Axes", image: np.ndarray, title: str, *, size_mm: tuple[float, float] | None = None, **how: Any
 ) -> None:
-    """Draws an image (rows, columns), row 0 at the bottom, with a colour bar. size_mm: height and width, for a scale bar.
-    how: further arguments of ``imshow``."""
+    """Draws an image (rows, columns), row 0 at the bottom, with a colour bar. size_mm: height and width of the image; with
+    them a scale bar is drawn. how: further arguments of ``imshow``."""
     rows, columns = image.shape
     height, width = (rows, columns) if size_mm is None else size_mm
     drawn = axes.imshow(image, origin="lower", extent=(0, width, 0, height), **how)
@@ -81,6 +81,6 @@ def draw_image(
 
 
 def round_length(most: float) -> float:
-    """Returns the largest length of 1, 2 or 5 times a power of ten that is at most ``most``."""
+    """Rounds a length down to 1, 2 or 5 times a power of ten, for a scale bar."""
     power = 10.0 ** math.floor(math.log10(most))
     return max(f * power for f in (1, 2, 5) if f * power <= most * (1 + 1e-9))

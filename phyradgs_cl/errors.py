@@ -1,6 +1,6 @@
-"""The package's exceptions. Each message is one line: subject, found value, expected value, remedy.
+"""The package's exceptions. Each message is one line: subject, value found, value expected, remedy.
 
-Scripts distinguish exit statuses (docs/trouble.md). Status 1 is Python's own, for a defect of this program."""
+Each kind of error has an exit status, which scripts can test (docs/trouble.md). Python itself exits with 1 after a bug."""
 
 import re
 from collections.abc import Iterator
@@ -8,22 +8,23 @@ from contextlib import contextmanager
 
 from phyradgs_cl.text import plain_text
 
-_OPTION = re.compile(r"(?<!\w)'[^']*'|--set |(?<![\w-])--([a-z][a-z-]*)")  # quoted text matches whole, and stays
-_STATES = ("given ", "not ")  # begin a state of the subject, which reads without "found"
+# Quoted text matches as a whole and is not changed: it is a command line, in which options keep their dashes.
+_OPTION = re.compile(r"(?<!\w)'[^']*'|--set |(?<![\w-])--([a-z][a-z-]*)")
+_STATES = ("given ", "not ")  # beginnings of texts that read better without "found", as in "--bins: not a number"
 _OTHER_NAMES = {"with": "others", "readout": "readout_axis", "air-mm": "air", "water-mm": "water", "hu": "hounsfield"}
-"""By option, without dashes: the argument in Python, where it has another name."""
+"""Options of the command line, without dashes, whose argument in Python has another name."""
 
 
 class PhyradgsError(Exception):
     """Base of every error that this package raises on purpose.
 
-    subject: an option, a file with its HDF5 path, a device. found: the wrong value or state. expected: a right one.
-    remedy: an imperative. ``exit_code``: the command line's exit status."""
+    subject: what is wrong, as an option, a file with its HDF5 path or a device. found: the wrong value or state. expected:
+    what would be right. remedy: what to do, as an imperative. ``exit_code``: the command line's exit status."""
 
     exit_code = 2
 
     def __init__(self, subject: str, found: str = "", expected: str = "", remedy: str = "") -> None:
-        super().__init__(subject, found, expected, remedy)  # all four, so that pickling keeps them
+        super().__init__(subject, found, expected, remedy)  # pickling keeps only what is passed here
         self.subject = subject
         self.found = found
         self.expected = expected
@@ -42,38 +43,38 @@ class InputError(PhyradgsError):
 
 
 class NumericalError(PhyradgsError):
-    """Raised where numbers of an iteration are no longer finite."""
+    """Raised where an iteration has diverged: its values are NaN or infinite."""
 
     exit_code = 3
 
 
 class OutputError(PhyradgsError):
-    """Raised where a result cannot be written: no room, no permission, or another run writes it."""
+    """Raised where a result cannot be written: the disk is full, permission is missing, or another run writes it."""
 
     exit_code = 4
 
 
 class DeviceError(PhyradgsError):
-    """Raised where there is no OpenCL device, it fails, or a kernel does not build on it."""
+    """Raised where there is no OpenCL device, where it fails, or where a kernel does not build on it."""
 
     exit_code = 5
 
 
 class NoSuchDeviceError(InputError, DeviceError):
-    """Raised where the named device does not exist, which is a wrong option."""
+    """Raised where the device that the user named does not exist. Its exit status is that of a wrong option."""
 
     exit_code = 2
 
 
 class OutOfMemoryError(DeviceError):
-    """Raised where the memory of the device or of the machine is exhausted."""
+    """Raised where the device or the machine has too little memory."""
 
     exit_code = 6
 
 
 @contextmanager
 def naming_arguments() -> Iterator[None]:
-    """Makes errors of the body name Python's arguments instead of options: ``time_error`` instead of ``--time-error``."""
+    """Makes errors raised in the body name Python's arguments, as ``time_error``, not options, as ``--time-error``."""
     try:
         yield
     except PhyradgsError as error:

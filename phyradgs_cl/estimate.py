@@ -1,6 +1,8 @@
-"""Estimates the time and memory of a reconstruction from a few of its iterations. Two short runs of different length give
-the time per iteration and the time of everything else. A cloud of Gaussians grows under density control, so its short runs
-go through the whole schedule in fewer iterations."""
+"""Estimates the time and memory of a reconstruction from two short runs of different length. They give the time per
+iteration, and the time of everything else.
+
+Density control adds Gaussians during a run and makes iterations slower. Short runs of a method with Gaussians therefore go
+through the whole schedule of density control, in fewer iterations."""
 
 import resource
 import sys
@@ -19,20 +21,20 @@ from phyradgs_cl.reconstructors import Reconstruction, RunPlan, method_of, recon
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import Runtime
 
-_SPLAT_TRIALS = (20, 200)  # iterations of the short and of the longer trial, for splats
-_TRIALS = (1, 3)  # iterations of both trials for other methods that state no ``TRIALS``
-_LEAST_DIFFERENCE_S = 0.3  # the longer trial is prolonged until the trials' times differ by this, to stand out from noise
-_LONGEST_TRIAL = 200  # number of iterations from which on a trial is not prolonged
+_SPLAT_TRIALS = (20, 200)  # iterations of the two short runs (trials) of methods with Gaussians
+_TRIALS = (1, 3)  # iterations of the two short runs of other methods, unless their options have ``TRIALS``
+_LEAST_DIFFERENCE_S = 0.3  # below this difference of the two times, timing noise matters: the second trial is prolonged
+_LONGEST_TRIAL = 200  # a trial of this many iterations is not prolonged, or estimating would take too long
 _FEWEST_BETWEEN = 5  # least number of iterations between rounds of density control in a trial
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The time ``seconds`` and the memory of a whole run.
+    """The estimated time ``seconds`` and memory of a whole run.
 
-    trial_seconds: the time that the trials took. around_s: the part of ``seconds`` outside the method, for reading,
-    comparing and writing. host_bytes: the process's largest resident memory, with its buffers on a CPU device.
-    device_bytes: the largest memory in buffers at one time."""
+    trial_seconds: the time that estimating took. around_s: the part of ``seconds`` for reading, comparing and writing.
+    host_bytes: the most resident memory of the process; with a CPU device this includes the OpenCL buffers.
+    device_bytes: the most memory in OpenCL buffers at one time."""
 
     seconds: float
     host_bytes: int
@@ -58,9 +60,10 @@ class Estimate:
 def estimate(
     scan: Scan, plan: RunPlan, rt: Runtime, around: Callable[[Reconstruction], float] | None = None
 ) -> Estimate:
-    """Returns the time and memory of a plan, from short runs of it. A method without iterations, or without checkpoints,
-    runs once as a whole. around: returns the seconds that a run spends outside the method, from its result. The first
-    trial builds the kernels, as the run will."""
+    """Estimates the time and memory of a run from short trials. A method without iterations or checkpoints runs as a whole.
+
+    around: from a result, returns the seconds that the run will spend outside the method. The first trial also builds the
+    kernels; their build is part of the estimate, since the run will build them again."""
     started = time.perf_counter()
     trials, total = _Trials(scan, plan, rt), getattr(plan.options, "iterations", None)
     few, more = getattr(plan.options, "TRIALS", _SPLAT_TRIALS if isinstance(plan.options, SplatOptions) else _TRIALS)
@@ -79,13 +82,13 @@ def estimate(
 
 
 class _Trials:
-    """Short runs of one plan. result, device_bytes: those of the last run, which is the longest."""
+    """Makes short runs of one plan. ``result`` and ``device_bytes`` belong to the latest run."""
 
     def __init__(self, scan: Scan, plan: RunPlan, rt: Runtime) -> None:
         self.scan, self.plan, self.rt = scan, plan, rt
 
     def run(self, iterations: int | None) -> float:
-        """Runs some iterations, or, for None, the method as a whole. Returns the seconds that it took."""
+        """Runs that many iterations, or all of the method for None. Returns the seconds that it took."""
         options = self.plan.options
         plan = self.plan if iterations is None else replace(self.plan, options=shortened(options, iterations))
         self.rt.reset_peak()
@@ -95,9 +98,9 @@ class _Trials:
         return time.perf_counter() - started
 
     def extrapolated(self, few: int, more: int, total: int) -> tuple[float, float]:
-        """Returns the seconds of ``total`` iterations, and those of a single one, from runs of ``few`` and of ``more``."""
+        """Returns the seconds of ``total`` iterations and of a single one, extrapolated from ``few`` and ``more``."""
         first_s = self.run(few) - self._control_s
-        again_s = self.run(few) - self._control_s  # without the building of kernels
+        again_s = self.run(few) - self._control_s  # without the building of kernels, which the first run did
         more = min(more, total)
         more_s = self.run(more) - self._control_s
         while more_s - again_s < _LEAST_DIFFERENCE_S and more < min(total, _LONGEST_TRIAL):
@@ -109,17 +112,17 @@ class _Trials:
 
     @property
     def _control_s(self) -> float:
-        """The seconds that the last run spent in density control, which is no part of an iteration."""
+        """The seconds that the last run spent in density control. They are not counted as iterations."""
         return float(self.result.facts.get("density_control_seconds", 0.0))
 
     def _rounds_due(self, total: int) -> float:
-        """Returns the number of rounds of density control in the whole run over that in the last trial; 0 without any."""
+        """Returns how many times more rounds of density control the whole run has than the last trial had; 0 if none."""
         rounds = self.result.facts.get("density_control_rounds", 0)
         return sum(self.plan.options.control.is_due(i, total) for i in range(1, total + 1)) / rounds if rounds else 0.0
 
 
 def shortened(options: Any, iterations: int) -> Any:
-    """Returns the options of the same run in fewer iterations, with the schedule of splats shortened in proportion."""
+    """Returns options of the same run in fewer iterations. The schedule of density control is shortened in proportion."""
     if not isinstance(options, SplatOptions) or iterations >= options.iterations:
         return replace(options, iterations=min(iterations, options.iterations))
     share, control = iterations / options.iterations, options.control
@@ -130,7 +133,7 @@ def shortened(options: Any, iterations: int) -> Any:
 
 
 def seconds_around(path: Path, scan: Scan, result: Reconstruction) -> float:
-    """Returns the seconds of the work that ``reconstruct`` does after the method: hash, comparison with a truth, file."""
+    """Times what ``reconstruct`` does besides the method: hashes the scan, compares with the truth, writes the volume."""
     started = time.perf_counter()
     sha256_of(path)
     if scan.reference is not None and result.volume.shape == scan.reference.shape:
@@ -141,8 +144,8 @@ def seconds_around(path: Path, scan: Scan, result: Reconstruction) -> float:
 
 
 def peak_host_bytes() -> int:
-    """Returns the largest resident memory in bytes of this process so far. On Linux it is read from /proc, since getrusage
-    would include the parent's."""
+    """Returns the most resident memory of this process so far, in bytes. Linux's getrusage may also count the parent's
+    memory, so it is read from /proc there."""
     if peak_bytes := in_use_bytes("VmHWM:"):
         return peak_bytes
     largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,9 +1,9 @@
-"""The processes (ranks) that work on the same scan: their launch, communication and parts of the work. Failures of some end
-all. Sums of floats have the same bits for any order and number of ranks.
+"""Lets several MPI processes (ranks) work on one scan: how they were launched, how they communicate and share the work.
 
-mpi4py is imported only where several processes were launched. For a sum every row is scaled by a power of two and rounded to
-integers of 64 bits, with the largest scale for which the sum cannot overflow. Adding integers is exact and associative. For
-64 terms the parts of a float32 below 2⁻³⁷ of its row's largest are rounded off."""
+Sums over ranks have the same bits for any order and number of ranks. Each row of values is scaled by a power of two and
+rounded to 64-bit integers, whose addition is exact. The scale is the largest for which the sum cannot overflow. A sum of 64
+terms loses what is below 2⁻³⁷ of the largest value in its row. mpi4py is imported only where mpiexec or srun started several
+processes."""
 
 import os
 import time
@@ -17,24 +17,24 @@ import numpy as np
 
 from phyradgs_cl.errors import InputError
 
-# Environment variables of each launcher for (rank, size, rank on this machine, ranks on this machine).
+# The variables in which each launcher states rank, number of ranks, rank on this machine, and ranks on this machine.
 _NAMES = ("RANK", "SIZE", "LOCAL_RANK", "LOCAL_SIZE")
 _LAUNCHERS = (
     *(tuple(f"{mpi}_COMM_WORLD_{name}" for name in _NAMES) for mpi in ("OMPI", "MV2")),
     ("PMI_RANK", "PMI_SIZE", "MPI_LOCALRANKID", "MPI_LOCALNRANKS"),
     ("PMIX_RANK", "SLURM_STEP_NUM_TASKS", "SLURM_LOCALID", "SLURM_STEP_TASKS_PER_NODE"),
 )
-_PATIENCE_S = 5.0  # longest time that rank 0 waits for other failing ranks
-_LATER_S = 0.5  # time that each next rank waits longer, so that only one reports
-_MOST_VALUES = 1 << 26  # most values in one call of MPI: before version 4, its counts end at 2³¹
-_BITS = 62  # most bits of an int64 that a sum may use
-_NOT_FINITE = 100_000  # number that stands for the exponent of a row that is not finite: more than any float's
-_BLOCK_VALUES = 1 << 20  # most values that are summed at a time
+_PATIENCE_S = 5.0  # a failing rank 0 waits this long for the others to fail too, then ends them
+_LATER_S = 0.5  # each further rank waits this much longer than the one before, so that only one reports
+_MOST_VALUES = 1 << 26  # values per MPI call: before MPI 4, a count of 2³¹ overflows
+_BITS = 62  # number of bits of an int64 that a sum may use: all except the sign and one as a reserve
+_NOT_FINITE = 100_000  # stands for the exponent of a row with NaN or infinity: larger than any float's exponent
+_BLOCK_VALUES = 1 << 20  # number of values that are summed at a time, which limits the memory for their integers
 
 
 @dataclass(frozen=True)
 class Launch:
-    """Rank ``rank`` of ``size`` processes, ``local_rank`` of ``local_size`` on this machine; 0 of 1 for a single process."""
+    """This process's number ``rank`` among all ``size`` processes, and ``local_rank`` among those on this machine."""
 
     rank: int = 0
     size: int = 1
@@ -43,7 +43,7 @@ class Launch:
 
 
 def launched(environment: Mapping[str, str] = os.environ) -> Launch:
-    """Reads from the environment how mpiexec (MPICH, Open MPI, MVAPICH, Intel MPI) or srun started this process."""
+    """Reads from environment variables how mpiexec (MPICH, Open MPI, MVAPICH, Intel MPI) or srun started this process."""
     for names in _LAUNCHERS:
         rank, size, local_rank, local_size = (_count(environment.get(name)) for name in names)
         if rank is None or size is None or size < 2:
@@ -58,24 +58,24 @@ def launched(environment: Mapping[str, str] = os.environ) -> Launch:
 
 
 def _count(text: str | None) -> int | None:
-    """Returns the count in ``text``; None for other text. SLURM writes 4(x2) for four on each of two machines."""
+    """Returns the number at the start of ``text``, or None. SLURM writes 4(x2) for four on each of two machines."""
     number = (text or "").split("(")[0].split(",")[0]
     return int(number) if number.isdigit() else None
 
 
 class Communicator:
-    """``size`` processes (ranks) with one scan; this class itself is a single process.
+    """Communication among the ``size`` processes (ranks) of a run. This base class stands for a single process.
 
-    All ranks call every method except the last two, in the same order. ``sent_bytes`` counts what this rank has given to
-    sums and gathers."""
+    All ranks must call the methods in the same order, except ``all_fail`` and ``abort``. ``sent_bytes`` counts what this
+    rank has given to sums and gathers."""
 
     rank, size, local_rank, local_size = 0, 1, 0, 1
     sent_bytes = 0
 
     def allreduce_sum(self, values: np.ndarray) -> None:
-        """Sums contiguous ``values`` over all ranks, in place: integers, or numbers that are 0 on all ranks except one.
+        """Sums contiguous ``values`` over all ranks, in place. They must be integers, or 0 on all ranks except one.
 
-        Both are exact in any order of summation; for other values there is ``exact_sum``."""
+        Such sums are exact in any order. For other values take ``exact_sum``."""
 
     def allreduce_max(self, values: np.ndarray) -> None:
         """Replaces contiguous ``values`` by their maxima over all ranks, in place."""
@@ -93,7 +93,7 @@ class Communicator:
         return values
 
     def all_fail(self) -> bool:
-        """Waits, on a rank that fails, for the others. Returns True if all ranks fail within a few seconds."""
+        """Called by a rank that fails. Returns True if all other ranks fail too, within a few seconds."""
         return True
 
     def abort(self, status: int) -> NoReturn:
@@ -106,7 +106,7 @@ class Mpi(Communicator):
 
     def __init__(self, comm: Any, launch: Launch) -> None:
         self._comm = comm
-        self._failing = comm.Dup()  # failing ranks meet here, whatever the others do
+        self._failing = comm.Dup()  # used by failing ranks alone, so that calls of the others do not interfere
         self.rank, self.size = comm.rank, comm.size
         self.local_rank, self.local_size = launch.local_rank, launch.local_size
         self.sent_bytes = 0
@@ -180,9 +180,9 @@ def launched_ranks() -> Communicator:
 
 @contextmanager
 def failing_together(ranks: Communicator, report_error: Callable[[BaseException], int]) -> Iterator[None]:
-    """Raises an exception of the body where all ranks have one; if only some fail, reports it and ends all ranks.
+    """Lets an exception of the body pass if all ranks have one. If only some fail, reports it and ends all ranks.
 
-    The others would wait for a failed rank for ever. ``report_error`` prints the error and returns the exit status."""
+    Otherwise the other ranks would wait for ever. ``report_error`` prints the error and returns the exit status."""
     try:
         yield
     except BaseException as error:
@@ -192,14 +192,14 @@ def failing_together(ranks: Communicator, report_error: Callable[[BaseException]
 
 
 def span(count: int, parts: int, part: int) -> range:
-    """Returns the ``part``-th of ``parts`` consecutive ranges of 0 … count−1, whose lengths differ by at most one."""
+    """Divides 0 … count−1 into ``parts`` ranges, equally long within one, and returns the one of number ``part``."""
     return range(part * count // parts, (part + 1) * count // parts)
 
 
 def exact_sum(ranks: Communicator, parts: Sequence[np.ndarray], shape: tuple[int, int], terms: int) -> np.ndarray:
-    """Sums all ranks' ``parts``, each of ``shape`` (rows, n) float32; ``terms`` counts them over all ranks.
+    """Sums the ``parts`` of all ranks, arrays (rows, n) float32. Returns the sum (rows, n) float32 on every rank.
 
-    Returns the sum (rows, n) float32 on every rank. Rows with a non-finite number become NaN. ``parts`` may be empty."""
+    terms: the number of arrays over all ranks. ``parts`` may be empty. A row with NaN or infinity becomes NaN."""
     exponents = _largest_exponents(ranks, parts, shape[0])
     not_finite = exponents >= _NOT_FINITE
     shift = _BITS - max(terms - 1, 0).bit_length() - np.where(not_finite, 0, exponents)
@@ -217,19 +217,18 @@ def exact_sum(ranks: Communicator, parts: Sequence[np.ndarray], shape: tuple[int
 
 
 def as_integers(values: np.ndarray, shift: np.ndarray, not_finite: np.ndarray) -> np.ndarray:
-    """Returns values (rows, n) times 2^shift (rows,), rounded to int64; 0 in rows that are not finite."""
-    wide = np.multiply(values, np.ldexp(1.0, shift)[:, None], dtype=np.float64)  # exact, as a power of two
+    """Returns values (rows, n) times 2^shift (rows,), rounded to int64. Rows that are ``not_finite`` (rows,) become 0."""
+    wide = np.multiply(values, np.ldexp(1.0, shift)[:, None], dtype=np.float64)  # exact: the factor is a power of two
     if not_finite.any():
         wide[not_finite] = 0
     return np.rint(wide, out=wide).astype(np.int64)
 
 
 def _largest_exponents(ranks: Communicator, parts: Sequence[np.ndarray], rows: int) -> np.ndarray:
-    """Returns for each row (rows,) int64 the least e with |values| < 2^e over all ranks; ``_NOT_FINITE`` where not
-    finite."""
+    """Returns the least e with |values| < 2^e over all ranks, (rows,) int64, or ``_NOT_FINITE``."""
     exponents = np.full(rows, -300, np.int64)
     for part in parts:
-        largest = np.abs(part).max(axis=1, initial=0.0).astype(np.float64)  # NaN where there is one
+        largest = np.abs(part).max(axis=1, initial=0.0).astype(np.float64)  # NaN for a row with a NaN
         finite = np.isfinite(largest)
         part_exponents = np.frexp(np.where(finite, largest, 0.0))[1].astype(np.int64)
         part_exponents[largest == 0] = -300

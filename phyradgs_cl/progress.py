@@ -1,4 +1,5 @@
-"""Shows a command's progress on stderr: a line rewritten on a terminal or in a notebook, else a line every ten seconds."""
+"""Shows a command's progress on stderr. A terminal or a notebook shows one line that changes; a file or a pipe gets a new
+line every ten seconds."""
 
 import sys
 import time
@@ -9,8 +10,8 @@ import typer
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.text import clock
 
-_OVER = "\r\x1b[K"  # clears the line
-_TERMINAL_EVERY_S = 0.2  # least time between two lines on a terminal
+_OVER = "\r\x1b[K"  # clears a terminal's line
+_TERMINAL_EVERY_S = 0.2  # least time between two changes of the line on a terminal
 _ELSEWHERE_EVERY_S = 10.0  # least time between two lines in a file or pipe
 
 
@@ -24,13 +25,12 @@ def _in_notebook() -> bool:
 
 
 class Ticker:
-    """Shows a count of finished ``noun``s, with the rate and the time left. As a context it ends the line that it
-    rewrites."""
+    """Shows how many ``noun``s are done, the rate and the time left. As a context manager it ends the open line."""
 
     def __init__(self, noun: str) -> None:
         self.noun = noun
         self.is_terminal = has_reader()
-        self._width = 0  # of the last line: a notebook cannot clear it, so spaces overwrite it
+        self._width = 0  # characters of the last line: a notebook cannot clear a line, so spaces must cover it
         self.started = self.last = time.monotonic()
         self.first: int | None = None
         self.first_share = 0.0
@@ -43,25 +43,25 @@ class Ticker:
         self.end_line()
 
     def end_line(self) -> None:
-        """Ends the open line with a line feed if it counts; clears it if it shows a stage."""
+        """Ends the open line. A line with a count stays; a line that names a stage is cleared."""
         if self.is_open:
             _write("" if self.is_counting else self._over(""), ends_line=self.is_counting)
         self.is_open = False
 
     def stage(self, text: str) -> None:
-        """Shows the current stage in place of the line, on a terminal; elsewhere nothing."""
+        """Replaces the line on a terminal by the name of the current stage. Elsewhere shows nothing."""
         if self.is_terminal:
             _write(self._over(text), ends_line=False)
             self.is_open, self.is_counting = True, False
 
     def end(self, text: str) -> None:
-        """Replaces the line by a last one that stays, on a terminal; elsewhere it shows nothing."""
+        """Replaces the line on a terminal by a last one that stays. Elsewhere shows nothing."""
         if self.is_terminal:
             _write(self._over(text), ends_line=False)
             self.is_open = self.is_counting = True
 
     def note(self, text: str) -> None:
-        """Prints a line that stays, above the one that is rewritten."""
+        """Prints a line that stays; the progress goes on in a new line below it."""
         _write(self._over(text) if self.is_open else text)
         self.is_open = self.is_counting = False
 
@@ -70,8 +70,8 @@ class Ticker:
         self.show(p.iteration, p.iterations, f"  {p.quantity} {p.loss:.5f}{cloud}")
 
     def show(self, done: int, total: int, more: str = "", share: float | None = None) -> None:
-        """Shows ``done`` of ``total`` and ``more``, unless the last line is too recent. share: the fraction of the work that
-        is done, where the counted things differ in length."""
+        """Shows ``done`` of ``total``, then ``more``, unless the last line is too recent. share: the fraction of the work
+        that is done, if it differs from done / total."""
         now = time.monotonic()
         if share is None:
             share = done / total if total else 0.0
@@ -86,7 +86,7 @@ class Ticker:
         self.is_open = self.is_counting = self.is_terminal
 
     def _over(self, line: str) -> str:
-        """Returns the text that replaces the open line by ``line``."""
+        """Returns what must be written to show ``line`` in place of the open line."""
         if not _in_notebook():
             return f"{_OVER}{line}"
         before, self._width = self._width, len(line)

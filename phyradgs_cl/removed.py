@@ -1,4 +1,4 @@
-"""Options and values that the program no longer has, and what to write in their place."""
+"""Options and values of earlier versions that no longer exist, and what to write instead."""
 
 from phyradgs_cl.errors import InputError
 
@@ -41,16 +41,16 @@ REMOVED = {
     "--what drift": "correct the frames by 'phyradgs prepare --steps air'",
     "--what start": "leave it out: another start only turns the object about the axis",
 }
-"""The remedy by word: a value with its option, or an option in Python's spelling, with its method where others keep it."""
+"""What to do instead, by removed word: an option in Python's spelling, an option with its value, or a command. A word that
+other methods still have starts with ``--method`` and the method that lost it."""
 
 
 def removal(word: str, subject: str = "") -> InputError | None:
-    """Returns the InputError, with the remedy, for a word in ``REMOVED``; None for other words. subject: what the message
-    names."""
+    """Returns the error for a word in ``REMOVED``, or None for other words. subject: the start of its message."""
     return InputError(subject or word, "a word of an earlier version", "", REMOVED[word]) if word in REMOVED else None
 
 
 def refuse_removed(word: str, subject: str = "") -> None:
-    """Raises the error of ``removal``, if there is one."""
+    """Raises an InputError that says what to write instead, for a word in ``REMOVED``."""
     if (error := removal(word, subject)) is not None:
         raise error

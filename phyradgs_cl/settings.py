@@ -1,4 +1,4 @@
-"""Reads options by name from a configuration file and the command line, and turns them into a plan of a run."""
+"""Reads the options of a run from a configuration file and the command line, and makes a checked plan of them."""
 
 import json
 import re
@@ -28,8 +28,8 @@ else:
 
 @dataclass(frozen=True)
 class Settings:
-    """Options by name, unchecked, and the place where each was given, for errors. device: as from ``device_wish``.
-    memory: limit of the device's memory in bytes; None for all that the device has."""
+    """Options by name, not yet checked. origins: where each was given, for error messages. device: an index, cpu, gpu or
+    part of a name; None for the best. memory: limit of the device's memory in bytes; None for all that the device has."""
 
     values: Mapping[str, Any]
     origins: Mapping[str, str]
@@ -40,9 +40,10 @@ class Settings:
     def plan(
         self, initial: Path | None = None, object_motion: Path | None = None, mu_water_per_mm: float | None = None
     ) -> methods.RunPlan:
-        """Returns the checked plan of a run. ``initial``: the file of a volume to start from. ``object_motion``: the file of
-        the object's deformation. ``mu_water_per_mm``: water's attenuation, for a first volume in Hounsfield units. Raises
-        InputError for options that are unknown, wrong or out of range."""
+        """Returns the checked plan of a run. Raises InputError for options that are unknown, wrong or out of range.
+
+        initial: the file of a volume to start from. object_motion: the file of the object's deformation. mu_water_per_mm:
+        water's attenuation, which converts an ``initial`` volume in Hounsfield units."""
         if mu_water_per_mm is not None and initial is None:
             raise InputError("--mu-water-per-mm", "given without --initial", "a first volume in Hounsfield units")
         values = dict(self.values)
@@ -51,7 +52,7 @@ class Settings:
             "seed": values.pop("seed", 0), "initial": None if initial is None else _initial_volume(initial, mu_water_per_mm),
             "object_motion": None if object_motion is None else _object_motion(object_motion),
         }  # fmt: skip
-        # an option of the command line means preprocessing, as --help says, also if the method has one of this name
+        # A name that both a method and preprocessing have means preprocessing on the command line, as --help says.
         flags = [f.name for f in fields(methods.Preprocessing) if self.origins.get(f.name) == _flag(f.name)]
         method = method or methods.DEFAULT_METHOD
         refuse_removed(f"--motion {values.get('motion')}", self.origins.get("motion", ""))
@@ -59,7 +60,7 @@ class Settings:
             return methods.plan_run(method, values, preset=preset, of_preprocessing=flags, **run)
 
     def preprocessing(self, defaults: Mapping[str, object]) -> methods.Preprocessing:
-        """Returns the checked preprocessing alone, without a method, with ``defaults`` for options that were not given."""
+        """Returns checked options of preprocessing alone. ``defaults`` stand for those that were not given."""
         with self.naming_origins():
             return methods.preprocessing_of({**defaults, **self.values})
 
@@ -69,7 +70,7 @@ class Settings:
 
     @contextmanager
     def naming_origins(self, method: str = "") -> Iterator[None]:
-        """Makes errors of the body name the key in the file, or the --set, that holds the wrong option."""
+        """Makes an error raised in the body name where the wrong option was given: a key in the file, or a --set."""
         try:
             yield
         except PhyradgsError as error:
@@ -91,8 +92,9 @@ class Settings:
 def read_settings(
     config: Path | None, given: Mapping[str, object], assignments: Sequence[str] = ()
 ) -> Settings:
-    """Reads a configuration file. ``assignments`` NAME=VALUE replace its values, and options ``given``, if not None, replace
-    both. Raises InputError for a wrong file, assignment, device or memory."""
+    """Reads a configuration file. ``assignments`` NAME=VALUE override it, and ``given`` options, unless None, override both.
+
+    Raises InputError for a wrong file, assignment, device or memory."""
     values: dict[str, Any] = {} if config is None else read_toml(config, f"--config {config}")
     origins = {key: f"config {config}: {key}" for key in values}
     for text in assignments:
@@ -104,7 +106,7 @@ def read_settings(
             origins[key] = _flag(key)
     device, memory = values.pop("device", None), values.pop("memory", None)
     if isinstance(device, int) and not isinstance(device, bool) and 0 <= device < 1_000_000:
-        device = str(device)  # in TOML an index is a number
+        device = str(device)  # the index of a device may be a number in TOML
     device = device_wish(device, origins.get("device", "--device"))
     memory = None if memory is None else bytes_of(memory, origins.get("memory", "--memory"))
     return Settings(values, origins, config, device, memory)
@@ -130,7 +132,7 @@ def _flag(key: str) -> str:
 
 
 def _origin_of(subject: str, origins: Mapping[str, str]) -> str | None:
-    """Returns where the option that ``subject`` names was given, with its dotted name in a file; None where it was not."""
+    """Returns where the user gave the option that ``subject`` names, in a file with its dotted name; None if nowhere."""
     words = re.findall(r"option ([\w-]+)", subject) or re.sub(r"\(.*\)", "", subject).split()[-1:]
     first, *rest = [part for word in words for part in word.lstrip("-").split(".")] or [""]
     origin = origins.get(first.replace("-", "_"))
@@ -138,7 +140,7 @@ def _origin_of(subject: str, origins: Mapping[str, str]) -> str | None:
 
 
 def assignment(text: str) -> dict[str, Any]:
-    """Parses NAME=VALUE as TOML; a value that is not TOML is text, as in prior=dct. Raises InputError for other text."""
+    """Parses NAME=VALUE. The value is TOML, or text without quotation marks as in prior=dct. Raises InputError otherwise."""
     name, sign, value = text.partition("=")
     if not (sign and name.strip()):
         raise InputError("--set", repr(text), "NAME=VALUE", "write for example tv_weight=0.002")
@@ -149,7 +151,7 @@ def assignment(text: str) -> dict[str, Any]:
 
 
 def merge(settings: dict[str, Any], changes: Mapping[str, Any]) -> None:
-    """Puts ``changes`` into ``settings`` in place, merging nested tables."""
+    """Overrides ``settings`` by ``changes``, in place. Of nested tables only the entries in ``changes`` are replaced."""
     for key, value in changes.items():
         if isinstance(value, Mapping) and isinstance(settings.get(key), dict):
             merge(settings[key], value)
@@ -158,8 +160,8 @@ def merge(settings: dict[str, Any], changes: Mapping[str, Any]) -> None:
 
 
 def device_wish(value: object, subject: str = "--device") -> str | None:
-    """Returns the wanted device, or None for the best one. Raises InputError about ``subject`` for empty text, which would
-    match every name."""
+    """Returns the text that names a device, or None for the best one. Raises InputError about ``subject`` for anything
+    else, and for empty text: it would match every device's name."""
     if value is None:
         return None
     if not isinstance(value, str) or not value.strip():

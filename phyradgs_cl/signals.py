@@ -1,7 +1,8 @@
-"""Handles Ctrl-C and SIGTERM by one flag that both set. The first signal raises KeyboardInterrupt, except in a loop of
-iterations and while a result is written: there it waits. A second one, over a second later, always raises. The flag is
-installed while the outermost block is open, and nothing is kept in the module. Signals belong to the main thread; in other
-threads the blocks do nothing. A signal that the user has set to be ignored stays ignored."""
+"""Handles Ctrl-C and SIGTERM so that a stopped run still writes its result.
+
+The first signal raises KeyboardInterrupt. In a loop of iterations, and while a result is written, it only sets a flag, and
+the exception comes later. A second signal, more than a second after the first, always raises. Python delivers signals to
+the main thread, so the functions here do nothing in other threads. A signal that the user ignores stays ignored."""
 
 import signal
 import threading
@@ -15,16 +16,16 @@ from phyradgs_cl.errors import DeviceError
 NOTHING = "interrupted, nothing written"
 COMPLETE = "interrupted, the output is complete"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_SAME_PRESS_S = 1.0  # a signal within this time of the first counts as the same: wrappers (timeout, uv) send it again
+_SAME_PRESS_S = 1.0  # wrappers such as timeout and uv repeat a signal: within this time both count as one
 
 
 class InterruptedAfterwards(KeyboardInterrupt):
-    """Raised where a signal came during work that was nevertheless finished."""
+    """Raised after work that a signal did not stop, once it is finished."""
 
 
 class StopFlag:
-    """Handles both signals. waits: the first signal only sets the flag. keeps: it waits also after the end of a loop.
-    farewell: the command line's message when a signal has ended it."""
+    """The handler of both signals. waits: the first signal only sets the flag. keeps: this also holds after a loop of
+    iterations, until its result is written. farewell: what the command line prints when a signal has ended it."""
 
     def __init__(self) -> None:
         self.waits = self.keeps = False
@@ -50,8 +51,9 @@ class StopFlag:
 
 @contextmanager
 def answer_signals(*, takes_default: bool = True) -> Iterator[StopFlag]:
-    """Installs a flag as the signals' handler and yields it, or yields the flag that is installed already. takes_default:
-    also replaces a default handler, as SIGTERM's, which ends the process at once."""
+    """Installs a ``StopFlag`` as the handler of both signals and yields it; an outer block's flag is used again.
+
+    takes_default: also replace the system's default action, which for SIGTERM ends the process at once."""
     is_main = threading.current_thread() is threading.main_thread()
     installed, flag = _installed() if is_main else None, StopFlag()
     if installed is not None or not is_main:
@@ -61,7 +63,7 @@ def answer_signals(*, takes_default: bool = True) -> Iterator[StopFlag]:
     replaced = {n: usual for n in _SIGNALS if (usual := signal.getsignal(n)) not in left_alone}
     for number in replaced:
         signal.signal(number, flag)
-        if hasattr(signal, "siginterrupt"):  # system calls continue: a compiler in a driver would see a short read
+        if hasattr(signal, "siginterrupt"):  # an interrupted read makes a driver's compiler fail
             signal.siginterrupt(number, False)
     try:
         yield flag
@@ -72,11 +74,10 @@ def answer_signals(*, takes_default: bool = True) -> Iterator[StopFlag]:
 
 @contextmanager
 def stop_on_interrupt(waits: bool = True) -> Iterator[StopFlag]:
-    """Makes the first signal in the body, as a loop of iterations, wait: it only sets ``is_set`` of the flag that is
-    yielded. With ``waits`` False it waits only where it waits around the body.
+    """Yields a flag whose ``is_set`` tells a loop of iterations that a signal came; the first signal does not raise.
 
-    A device that fails after a signal has only lost its compiler, which got the signal too: this raises
-    KeyboardInterrupt."""
+    waits: False leaves it to the block around this one whether the first signal raises. A driver's compiler gets the
+    signal too and may die, which makes the device fail. Such a DeviceError becomes KeyboardInterrupt."""
     with answer_signals(takes_default=False) as flag:
         before, flag.waits = flag.waits, flag.waits or waits
         try:
@@ -86,13 +87,13 @@ def stop_on_interrupt(waits: bool = True) -> Iterator[StopFlag]:
                 raise
             raise KeyboardInterrupt from error
         finally:
-            flag.waits = before or (flag.keeps and flag.waits)  # after a loop the block around it still keeps its result
+            flag.waits = before or (flag.keeps and flag.waits)  # the loop's result is yet to be written
 
 
 @contextmanager
 def keep_finished_work() -> Iterator[None]:
-    """Makes signals wait from the first loop in the body to the end of the body, so that the loop's result is written.
-    Then raises InterruptedAfterwards if a signal has waited."""
+    """Delays signals from the first loop of iterations in the body to the end of the body, so that the loop's result is
+    written. Then raises InterruptedAfterwards if a signal has come."""
     with stop_on_interrupt(waits=False) as flag:
         keeps, flag.keeps = flag.keeps, True
         try:
@@ -104,7 +105,7 @@ def keep_finished_work() -> Iterator[None]:
 
 @contextmanager
 def finish_despite_interrupt() -> Iterator[None]:
-    """Makes a signal wait during short work such as writing. Then raises InterruptedAfterwards if one has waited."""
+    """Delays signals during short work such as writing. Then raises InterruptedAfterwards if one has come."""
     with stop_on_interrupt() as flag:
         yield
     flag.farewell = COMPLETE
@@ -118,7 +119,7 @@ def exit_status() -> int:
 
 
 def farewell() -> str:
-    """Returns the message of the command line for a command that a signal has ended."""
+    """Returns what the command line prints when a signal has ended a command."""
     flag = _installed()
     return NOTHING if flag is None else flag.farewell
 
@@ -128,7 +129,7 @@ def _installed() -> StopFlag | None:
 
 
 def _raise_what_waited(flag: StopFlag) -> None:
-    """Raises InterruptedAfterwards at the end of the outermost block that has made a signal wait."""
+    """Raises InterruptedAfterwards if a signal was delayed, unless an outer block still delays it."""
     if flag.is_set and not flag.waits:
         flag.farewell = COMPLETE
         raise InterruptedAfterwards

@@ -1,5 +1,4 @@
-"""Makes text of files, users and other programs printable, compares names with known ones, formats numbers and times, and
-keeps warnings from being repeated."""
+"""Helpers for text: makes it printable, suggests known names, formats numbers and times, drops repeated warnings."""
 
 import difflib
 import logging
@@ -11,29 +10,28 @@ from dataclasses import fields
 from functools import partial
 from typing import Any
 
-# Control characters except tab and line feed move a terminal's cursor or end a string. Half surrogate pairs stand in Python
-# for bytes that are not UTF-8, and cannot be encoded.
+# Control characters may move a terminal's cursor. Lone surrogates, which stand for bytes not in UTF-8, cannot be written.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 
 
 def plain_text(text: str) -> str:
-    """Returns ``text`` with U+FFFD in place of each character that a terminal, a page or a file may refuse."""
+    """Replaces each character that a terminal, a web page or a file may refuse by U+FFFD, the replacement character."""
     return _UNPRINTABLE.sub("\ufffd", text)
 
 
 def flag_of(name: str) -> str:
-    """Returns the option of the command line for a field or an argument: ``--start-deg`` for ``start_deg``."""
+    """Returns the command-line option of a field or an argument: ``--start-deg`` for ``start_deg``."""
     return "--" + name.replace("_", "-")
 
 
 def suggest_name(name: object, known_names: Iterable[str], otherwise: str) -> str:
-    """Returns the advice to use the known name that is most similar, or ``otherwise``."""
+    """Returns "did you mean …?" with the most similar known name, or ``otherwise`` if none is similar."""
     close = difflib.get_close_matches(str(name)[:200], list(known_names), n=1)
     return f"did you mean {close[0]!r}?" if close else otherwise
 
 
 def flattened(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields (dotted name, value) of every value in nested tables."""
+    """Yields (name, value) of every value in nested tables. A name such as ``rates.position`` includes its table's."""
     for name, value in table.items():
         if isinstance(value, Mapping):
             yield from flattened(value, f"{prefix}{name}.")
@@ -42,7 +40,7 @@ def flattened(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns nested tables from dotted names, the inverse of ``flattened``; the last of two values for one name counts."""
+    """Inverts ``flattened``: returns nested tables from dotted names. Where a name is repeated, the last value wins."""
     tables: dict[str, Any] = {}
     for name, value in values.items():
         *groups, last = name.split(".")
@@ -56,7 +54,7 @@ def nested(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def repr_of_changes(thing: Any) -> str:
-    """Returns the repr of a dataclass with the fields that differ from their defaults; arrays as their shape."""
+    """Returns the repr of a dataclass, with only the fields that differ from their defaults. Arrays show their shape."""
     texts = []
     for field in fields(thing):
         value = getattr(thing, field.name)
@@ -70,7 +68,7 @@ def repr_of_changes(thing: Any) -> str:
 
 
 def to_digits_of(value: float, deviation: float) -> str:
-    """Returns a value as text with the decimals of two significant digits of its deviation."""
+    """Returns a value as text, with as many decimals as two significant digits of its standard deviation have."""
     return f"{value:.{max(0, 1 - math.floor(math.log10(max(deviation, 1e-12))))}f}"
 
 
@@ -85,7 +83,7 @@ def _is_warning(record: logging.LogRecord) -> bool:
 
 
 def _is_new(said: set[str], record: logging.LogRecord) -> bool:
-    """Returns False for a warning of this package in words that are in ``said``, which it adds to."""
+    """Returns False for a warning of this package that is in ``said`` already. Adds a new one to ``said``."""
     if not _is_warning(record):
         return True
     before = len(said)
@@ -105,8 +103,13 @@ def without_warnings() -> AbstractContextManager[None]:
 
 
 @contextmanager
+<<<<<<< HEAD
 def _filtered(make_filter: Callable[[], Callable[[logging.LogRecord], bool]]) -> Iterator[None]:
     """Adds a filter to every handler of log records, which drops those for which it returns False."""
+=======
+def each_warning_once() -> Iterator[None]:
+    """Drops this package's warnings that the body repeats word for word, as when several stages of a run check one scan."""
+>>>>>>> wa
     handlers = [*logging.getLogger(__package__).handlers, *logging.getLogger().handlers, logging.lastResort]
     filters = [(handler, make_filter()) for handler in handlers if handler is not None]
     for handler, one in filters:

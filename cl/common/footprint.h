@@ -1,11 +1,11 @@
-/* The pixels that a splat covers in one cell, line by line. The projector and its adjoint share them. */
+/* The pixels that a splat covers from one time cell, line by line. The projector and its adjoint both use this. */
 #include "common/splat_moving.h"
 
-/* A splat on one line, and its pixels u_lo..u_hi on it. */
+/* A splat on one line, with its pixels u_lo..u_hi there. dv: the line minus the splat's centre. */
 typedef struct {
 #if MOVING
     moving_line s;
-    float amp, speed, middle, half_time; /* amp: peak times the share of the line's window in this segment */
+    float amp, speed, middle, half_time; /* amp: the peak times the fraction of the line's exposure in this segment */
 #else
     splat_line s;
 #endif
@@ -41,7 +41,7 @@ ALWAYS_INLINE footprint_line footprint_at(SPLAT_SPACE const float *splat_record,
     return line;
 }
 
-/* footprint_at of one line, whose times it looks up. `times`: the cell's (TIME_ROWS, time_pitch), if splats move. */
+/* footprint_at for line v. If splats move, it reads the line's times from `times`, the cell's (TIME_ROWS, time_pitch). */
 ALWAYS_INLINE footprint_line footprint_alone(SPLAT_SPACE const float *splat_record, SPLAT_SPACE const float *cell,
                                              __global const float *times, const int time_pitch, const int v,
                                              const float4 path_limits)
@@ -55,15 +55,15 @@ ALWAYS_INLINE footprint_line footprint_alone(SPLAT_SPACE const float *splat_reco
 #endif
 }
 
-/* The offset of the pixels u.. of a line from the splat's centre. */
+/* The offsets of LANES pixels, from u on, from the splat's centre. */
 ALWAYS_INLINE vf footprint_du(const footprint_line line, const int u)
 {
     return ((float)(u - line.u_whole) + V_IOTA) - line.u_rest;
 }
 
 #if GROUP > 1
-/* footprint_alone with only the pixels within the cutoff. With t = l11 du + t0 and B = beta t + gamma, num <= cutoff2 Q is a
-   quadratic in t. It does not depend on the distance of the line from the centre, so needles lose no digits. */
+/* footprint_alone, but with only the pixels within the cutoff. With t = l11 du + t0 and B = beta t + gamma, the condition
+   num <= cutoff2 Q is quadratic in t. Solved in t instead of du, it keeps its digits also for needles (thin Gaussians). */
 ALWAYS_INLINE footprint_line footprint_within(SPLAT_SPACE const float *splat_record, SPLAT_SPACE const float *cell,
                                               __global const float *times, const int time_pitch, const int v,
                                               const float4 path_limits, const float cutoff2)
@@ -75,7 +75,7 @@ ALWAYS_INLINE footprint_line footprint_within(SPLAT_SPACE const float *splat_rec
 #else
     if (cutoff2 > 0.0f) {
         const float per = 1.0f / line.s.l11, beta = line.s.b1 * per, gamma = line.s.b0 - beta * line.s.t0;
-        const float shrink = 1.0f - cutoff2 * line.s.inv_kappa, a = shrink - cutoff2 * beta * beta; /* both positive */
+        const float shrink = 1.0f - cutoff2 * line.s.inv_kappa, a = shrink - cutoff2 * beta * beta; /* both > 0, as the cutoff is an ellipse */
         const float left = shrink * (cutoff2 * gamma * gamma - line.s.k * a);
         const float middle = cutoff2 * beta * gamma / a, reach = sqrt(max(left, 0.0f)) / a;
         const float centre = line.u_rest - line.s.t0 * per, far = 4e6f;

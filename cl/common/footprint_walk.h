@@ -1,5 +1,5 @@
-/* Calls visit(visitor, line) in order for every line v_lo..v_hi on which a splat covers pixels. The including file defines
-   `visit` and the type VISITOR before. */
+/* Calls visit(visitor, line) for each of the lines v_lo..v_hi on which a splat covers pixels, in order. The file that
+   includes this must first define `visit` and the type VISITOR. */
 ALWAYS_INLINE void walk_footprint(__global const float *splat_record, __global const float *cell, __global const float *times,
                                   const int time_pitch, const float4 path_limits, const float cutoff2,
                                   const int v_lo, const int v_hi, VISITOR *visitor)

@@ -1,5 +1,5 @@
-/* The layout of Gaussians and of their rotation. Parameters are rows of a (11, stride) matrix: mean x y z, scale 1 2 3,
-   quaternion w x y z (unit), density. */
+/* Gaussians: their parameters in memory, and their rotation. The rows of a matrix (11, stride) are mean x y z, scale 1 2 3,
+   unit quaternion w x y z, density. */
 #include "common/lanes.h"
 
 #define ROW_MEAN 0
@@ -19,7 +19,7 @@ static inline v3 v3_mul(v3 a, v3 b) { return v3_make(a.x * b.x, a.y * b.y, a.z *
 static inline v3 v3_add(v3 a, v3 b) { return v3_make(a.x + b.x, a.y + b.y, a.z + b.z); }
 static inline v3 v3_scale(v3 a, vf s) { return v3_make(a.x * s, a.y * s, a.z * s); }
 
-/* The columns of the rotation matrix R of a unit quaternion: the Gaussian's own axes in the world. */
+/* The columns of the rotation matrix R: the Gaussian's axes in world coordinates. */
 typedef struct { v3 a, b, c; } frame3;
 
 static inline frame3 quaternion_frame(vf w, vf x, vf y, vf z)
@@ -36,7 +36,7 @@ static inline v3 to_world(frame3 f, v3 v)
     return v3_add(v3_add(v3_scale(f.a, v.x), v3_scale(f.b, v.y)), v3_scale(f.c, v.z));
 }
 
-/* LANES Gaussians of a (11, stride) matrix, from `first` on. */
+/* LANES Gaussians, one per lane. */
 typedef struct { v3 mean, scale, inv_scale; vf qw, qx, qy, qz, density; frame3 axes; } gaussian;
 
 static inline gaussian gaussian_load(__global const float *gaussians, const int first, const int stride)

@@ -1,13 +1,13 @@
-/* Rows of a gradient matrix (13, stride): dL/d(parameters), then dL/d(centre on the detector), (u, v), for density control.
-   The gradient of a rotation is the torque, dL/d(small rotation about the Gaussian's own axes). It is stored as the tangent
-   2 q (0, torque) of the unit quaternion. */
+/* Gradients (13, stride): dL/d(the 11 parameters), then dL/d(centre on the detector) (u, v), which density control reads.
+   By a rotation, L is first differentiated as a torque: dL/d(small rotation about the Gaussian's own axes). The torque is
+   stored as a gradient by the unit quaternion, 2 q (0, torque). */
 #include "common/gaussian.h"
 
 #define ROW_STATISTIC 11 /* first of the two rows dL/d(centre on the detector) */
-#define ROUND 4e-6f      /* largest difference of two scales, over their sum, that counts as equal: it may be rounding */
+#define ROUND 4e-6f      /* scales whose difference over their sum is below this may differ by rounding only */
 
-/* The factor s3 / s2 - s2 / s3 of the torque about the third axis. Two scales that differ only by rounding count as equal:
-   otherwise the torque would be rounding too, and Adam would make it a step of full length. */
+/* The factor s3 / s2 - s2 / s3 in the torque about an axis across scales s2 and s3. It is 0 if they differ by rounding only.
+   Else the torque would be rounding too, and Adam would make a step of full length of it. */
 static inline vf out_of_round(const vf s2, const vf s3, const vf inv2, const vf inv3)
 {
     const vf more = s3 - s2, both = s3 + s2;
@@ -31,7 +31,7 @@ static inline void gradient_store(__global float *out, const int stride, const i
     }
 }
 
-/* Collects sums (.., 16) of LANES Gaussians, `step` floats apart, into one vector per field. */
+/* Copies `fields` sums of LANES Gaussians, which are `step` floats apart, to `buffer`: one vector per field. */
 static inline void gather_sums(__global const float *sums, const size_t step, const int fields, __private float *buffer)
 {
     for (int lane = 0; lane < LANES; ++lane)

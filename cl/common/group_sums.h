@@ -1,6 +1,6 @@
-/* Sums over the items of a work-group, in a tree: the bits do not depend on which item comes first. All items call it.
-   `own`: the calling item's part of each of `fields` sums. `tree`: (fields, items) of local memory. `sums` gets one number
-   per field. */
+/* Sums over the items of a work-group, in pairs and a fixed order, so that results repeat bit for bit. All items must call
+   it. `own`: the item's part of each of `fields` sums. `tree`: local memory (fields, items). `sums`: receives `fields`
+   results. */
 #include "common/lanes.h"
 
 #define GROUP_ITEM ((int)(get_local_id(1) * get_local_size(0) + get_local_id(0)))

@@ -1,5 +1,5 @@
-/* Vectors of LANES floats. With LANES 1 they are scalars, for which OpenCL differs: comparisons give 1 instead of -1, and
-   select and any do not exist. These macros hide the difference. */
+/* Vectors of LANES floats. With LANES 1 they are scalars, for which OpenCL has other rules: a true comparison gives 1, not
+   -1, and there is no select or any. These macros hide the difference. */
 #ifndef LANES
 #error "build with -DLANES=1, 4, 8 or 16"
 #endif
@@ -33,9 +33,10 @@ static inline float v_sum(vf v) { return v; }
 typedef LANE_TYPE(float, LANES) vf;
 typedef LANE_TYPE(int, LANES) vi;
 #ifdef __clang__
-/* PoCL's vloadn and vstoren move a vector in up to four parts. A load of the whole vector soon after must wait for all. */
+/* Replaces PoCL's vloadn and vstoren, which move a vector in up to four parts. A load of the whole vector soon after would
+   have to wait for all of them. */
 typedef LANE_TYPE(float, LANES) __attribute__((aligned(4))) vf_anywhere;
-#define WIDE_ALIGNED __attribute__((aligned(64))) /* a vector at a multiple of LANES lies in one line of the cache */
+#define WIDE_ALIGNED __attribute__((aligned(64))) /* so that a vector at a multiple of LANES lies in one cache line */
 #define V_OVERLOAD ALWAYS_INLINE __attribute__((overloadable))
 V_OVERLOAD vf v_load(__private const float *p) { return *(__private const vf_anywhere *)p; }
 V_OVERLOAD vf v_load(__global const float *p) { return *(__global const vf_anywhere *)p; }
@@ -85,7 +86,7 @@ static inline float v_sum(vf v)
 #endif
 #endif
 
-/* Loads p[i] in each lane, element by element: through an array in memory the wide load would wait for all narrow stores. */
+/* Loads p[i] in each lane. No array in between: loading a vector from it would have to wait for LANES narrow stores. */
 #if LANES == 1
 #define GATHER(p, i) ((p)[i])
 #elif LANES == 4
@@ -100,8 +101,8 @@ static inline float v_sum(vf v)
 #endif
 #endif
 
-/* V_LOOKUP(low, high, i) takes in each lane element i of the 2 LANES elements of two vectors. It is defined where the
-   processor has an instruction for it, which takes a fraction of a gather's time. */
+/* V_LOOKUP(low, high, i) picks, in each lane, element i of the 2 LANES elements of two vectors. It is defined only if the
+   processor has an instruction for it, which is much faster than GATHER. */
 #ifdef __has_builtin
 #if LANES == 16 && defined(__AVX512F__) && __has_builtin(__builtin_ia32_vpermi2varps512)
 typedef float v_table __attribute__((vector_size(64)));

@@ -1,7 +1,7 @@
-/* The value that a voxel receives from a view whose lines have their own poses; backproject.cl, backproject_moving.cl. */
+/* What a view whose lines have their own poses adds to a voxel; for backproject.cl and backproject_moving.cl. */
 
-#define LINE_STEPS 6      /* most Newton steps */
-#define LEAST_SPEED 0.1f  /* lower limit of the lines that a voxel crosses per line of the readout; the steps divide by it */
+#define LINE_STEPS 6      /* most Newton steps to find the line that sees a voxel */
+#define LEAST_SPEED 0.1f  /* least `speed` of a voxel, since the Newton steps divide by it */
 
 static inline float line_position(__global const float *m, const float x, const float y, const float z, float *depth)
 {
@@ -17,11 +17,11 @@ static inline float line_sample(__global const float *line, const float u, const
     return line[column] + (u - column) * (line[column + (width > 1)] - line[column]);
 }
 
-/* Returns the line that is open where a voxel is: v(pose of line r) = r. Newton's method solves it on the piecewise linear v
-   between lines, from `line` on. `t`: share of the way to the next line; `speed`: rate at
-   which the voxel crosses lines; depth, next_depth: the voxel's in the poses of both lines. */
+/* Finds the line r onto which its own pose projects the voxel: v(pose of line r) = r. Returns the line below, by Newton's
+   method from `line` on; v is linear from line to line. t: the fraction of the way to the next line. speed: the rate at
+   which the readout crosses the voxel's image, in lines per line. depth, next_depth: of the voxel in the poses of both. */
 static inline int line_seeing(
-    __global const float *table, /* (lines, 12) */
+    __global const float *table, /* (lines, 12): a matrix for the pose of each line */
     const int lines, int line, const float x, const float y, const float z,
     float *t, float *speed, float *depth, float *next_depth)
 {
@@ -42,7 +42,7 @@ static inline int line_seeing(
     return line;
 }
 
-/* A sample's weight: that of BY_DISTANCE (backproject.cl) at the depth `middle` between both lines, divided by `scale`. */
+/* A sample's weight: BY_DISTANCE of backproject.cl, at the depth `middle` between both lines, divided by `scale`. */
 #if DISTANCE_POWER == 1 /* see backproject.cl */
 #define BY_LINE(weight, middle, scale) ((weight) / ((middle) * (scale)))
 #else
@@ -50,7 +50,7 @@ static inline int line_seeing(
 #endif
 
 static inline float line_added(
-    const float sum, /* the value so far */
+    const float sum, /* the voxel's value so far */
     __global const float *table, __global const float *image, const int lines, const int width, const int image_pitch,
     const float x, const float y, const float z,
     const float weight, const int filtered_across)

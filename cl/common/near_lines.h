@@ -1,21 +1,21 @@
-/* The lines of a detector column near a column of voxels, and what they add to it (rays_upright_adjoint.cl).
-   LEAN as in ray_column.h. */
+/* Which pixels (lines) of a detector column have rays near a column of voxels along z, and what these rays add to it
+   (rays_upright_adjoint.cl). LEAN: see ray_column.h. */
 #include "common/ray_column.h"
 
-#define LEAST_SLOPE 1e-6f /* voxels per line, lower limit: near the source all lines have one height */
+#define LEAST_SLOPE 1e-6f /* least distance of lines, in voxels: at the source it is 0 */
 
-/* A detector column and the course of its rays. At plane i, ahead of the source, line v is at the height
-   c = sc + ahead (dz + v ez) / (da + v ea) and at b = sb + across ahead + along (c - sc). The rays lie in a plane. */
+/* A detector column and its rays, which lie in a plane. On the plane of voxels that is `ahead` planes from the source, line
+   v has the height c = sc + ahead (dz + v ez) / (da + v ea), and b = sb + across ahead + along (c - sc). */
 typedef struct {
-    __global const float *values, *slopes; /* of line v; slopes where columns lean: (dz + v ez) / (da + v ea) */
-    int is_cut;                     /* whether lines of the slot beyond the last follow the other main axis */
-    int v_first, v_stop, last_start; /* last_start: the last place where two vectors may begin */
+    __global const float *values, *slopes; /* one per line v; slopes (LEAN only): (dz + v ez) / (da + v ea) */
+    int is_cut;                     /* whether further lines have the other main axis */
+    int v_first, v_stop, last_start; /* last_start: the last line from which two vectors can be loaded */
     float sb, sc, da, ea, dz, ez;
-    float inv;                      /* 1 / da; where columns lean, 1 / (da ez - dz ea) */
-    float bend, per_along;          /* 4 |ea / da|, 1 / |along| */
+    float inv;                      /* 1 / da; if LEAN, 1 / (da ez - dz ea) */
+    float bend, per_along;          /* 4 |ea / da|, by which lines beyond the ends are denser; 1 / |along| */
     float across, along;
-    float first, last;              /* slope (dz + v ez) / (da + v ea) of the first and the last line */
-    float dense;                    /* largest number of lines per voxel, times ahead */
+    float first, last;              /* slopes of the first and the last line */
+    float dense;                    /* largest number of lines per voxel, multiplied by `ahead` */
 } column_t;
 
 RAY_INLINE column_t column_of(__global const float *cell, const int u, const int along_x, const int2 lines)
@@ -52,12 +52,12 @@ RAY_INLINE column_t column_of(__global const float *cell, const int u, const int
     return r;
 }
 
-/* The lines that may touch LANES voxels of a column: `most` lines from `first` on, in each lane. */
+/* The lines whose rays may touch LANES voxels of a column: in each lane, a fixed number of lines from `first` on. */
 typedef struct {
     vi first;
-    int base;  /* begin of two vectors of lines that hold them all, if they do */
-    int some;  /* whether any line touches */
-    int dense; /* whether two vectors hold them */
+    int base;  /* first line of two vectors that contain the lines of all lanes, if `dense` */
+    int some;  /* whether any ray may touch */
+    int dense; /* whether two vectors contain the lines of all lanes */
 } near_lines_t;
 
 RAY_INLINE near_lines_t near_lines(const column_t r, const vi first, const int most)
@@ -72,8 +72,8 @@ RAY_INLINE near_lines_t near_lines(const column_t r, const vi first, const int m
 }
 
 #ifdef V_LOOKUP
-/* Begin of two vectors of lines for the lower and for the upper half of the voxels; negative where these do not hold them.
-   */
+/* The first lines of two vectors for the lower half of the voxels, and of two for the upper half; negative if that is not
+   enough. */
 RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, const int most)
 {
     const int begin = V_FIRST(lines.first), before = V_END_OF_HALF(lines.first);
@@ -85,11 +85,11 @@ RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, cons
 #endif
 
 #if LEAN
-/* Line first + m of each lane. Values are 0 beyond the last line. */
+/* Slope and value of line first + m in each lane. Beyond the last line the value is 0. */
 #define GATHER_SLOPE(m) GATHER(r.slopes, min(lines.first + (m), r.v_stop - 1))
 #define GATHER_VALUE(m) V_PICK(0.0f, GATHER(r.values, min(lines.first + (m), r.v_stop - 1)), lines.first + (m) < r.v_stop)
 
-/* The vectors in which LANES voxels look up their lines. Lines beyond the last have the other main axis, or are 0. */
+/* Loads the vectors in which LANES voxels look up their lines, and sets lines of the other main axis to 0. */
 #define LINE_VECTORS                                                                                       \
     vf v0 = V_LOAD(r.values + lines.base), v1 = V_LOAD(r.values + lines.base + LANES);                     \
     const vf c0 = V_LOAD(r.slopes + lines.base), c1 = V_LOAD(r.slopes + lines.base + LANES);               \
@@ -99,7 +99,7 @@ RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, cons
         v1 = V_PICK(0.0f, v1, VI_IOTA + (lines.base + LANES) < r.v_stop);                                  \
     }
 
-/* Runs `body` for all lines that may touch LANES voxels, with a line's value and its height above the voxel (off). */
+/* Runs `body` for all lines that may touch LANES voxels, with `value` of the line, and `off`, its height over the voxel. */
 #define OF_LINES(value_of, slope_of, next, body)                                                           \
     for (int m = 0; m < most; ++m, next) {                                                                 \
         const vf value = value_of, off = fma(slope_of, (vf)(ahead), under);                                \
@@ -116,8 +116,8 @@ RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, cons
 #define EACH_LINE(body) OF_LINES(GATHER_VALUE(m), GATHER_SLOPE(m), (void)0, body)
 #endif
 
-/* Adds to LANES voxels of two columns, between which all their lines pass. under: the source's height less
-   the voxels'. b: the place of the rays' plane at the voxels' heights, from the first column on. */
+/* Adds to LANES voxels of two columns, if all rays pass between these. under: the source's height minus the voxels'. b: the
+   place of the rays at the voxels' heights, from the first column on. */
 RAY_INLINE void add_between(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                             const vf b, float *low, float *high)
 {
@@ -128,7 +128,7 @@ RAY_INLINE void add_between(const column_t r, const near_lines_t lines, const in
     V_STORE(V_LOAD(high) + far, high);
 }
 
-/* Adds to LANES voxels of three columns, where lines pass the second on both sides. b: from the second column on. */
+/* Adds to LANES voxels of three columns, if rays pass on both sides of the second. b: from the second column on. */
 RAY_INLINE void add_around(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                            const vf b, float *low, float *middle, float *high)
 {
@@ -140,7 +140,7 @@ RAY_INLINE void add_around(const column_t r, const near_lines_t lines, const int
     V_STORE(V_LOAD(high) + after, high);
 }
 
-/* Adds to LANES voxels of one column, where lines pass from one column to the next. b: from this column on. */
+/* Adds to LANES voxels of one column, if rays pass over more than three columns. b: from this column on. */
 RAY_INLINE void add_across(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                            const vf b, float *own)
 {

@@ -1,6 +1,6 @@
-/* A dot product a·x + t, with a result split into an integer and a small rest. Positions on a detector of 1000 pixels need
-   more than float32's 24 bits. They use float64 where the device has it, otherwise pairs of floats with error-free sums and
-   products. Coefficients come from the host as double or as (high, low). */
+/* Dot products a·x + t whose result is split into an integer and a small rest. Positions on a detector with 1000 pixels need
+   more than the 24 bits of float32. They are computed in float64 or, if the device lacks it, in pairs of floats (high, low)
+   with error-free sums and products. The host gives coefficients in the same form. */
 #include "common/lanes.h"
 
 #if FP64
@@ -22,7 +22,7 @@ static inline vwide wide_dot(__global const coefficient *row, vf x, vf y, vf z)
 }
 static inline vf wide_value(vwide a) { return WIDE_FLOAT(a); }
 
-/* Returns the whole number nearest to a/b, at most 1e6, and the rest, |rest| <= 1/2. */
+/* Returns the integer nearest to a/b, limited to ±1e6. rest: a/b minus this integer. */
 static inline vf wide_ratio(vwide a, vwide b, vf *rest)
 {
     vwide ratio = a / b;
@@ -32,7 +32,7 @@ static inline vf wide_ratio(vwide a, vwide b, vf *rest)
 }
 #define COEFFICIENT(c) convert_float(c)
 
-/* Returns the whole number nearest to a, at most 1e6, and the rest, |rest| <= 1/2. */
+/* Returns the integer nearest to a, limited to ±1e6. rest: a minus this integer. */
 static inline vf wide_split(vwide a, vf *rest)
 {
     vf whole = clamp(rint(WIDE_FLOAT(a)), -1e6f, 1e6f);
@@ -43,7 +43,8 @@ static inline vf wide_split(vwide a, vf *rest)
 typedef struct { vf high, low; } vwide;
 typedef float2 coefficient;
 
-/* Error-free sums and products. Nothing in them may become a multiply-add; the host leaves -cl-mad-enable out too. */
+/* Error-free sums and products. They are wrong if the compiler fuses a multiplication and an addition, so the pragma forbids
+   it, and the host leaves -cl-mad-enable out. */
 static inline vwide wide_sum(vwide a, vf b)
 {
 #pragma OPENCL FP_CONTRACT OFF

@@ -1,12 +1,12 @@
-/* Joseph's samples along LANES rays of one detector line, for the projector and its adjoints on CPUs and GPUs.
-   Everything is in voxel indices (x, y, z). All kernels take axis, planes and weights from here, and fma fixes the rounding,
-   so a ray has the same samples in all of them.
-   RAY_PARALLEL: the rays of a cell have one direction. RAY_SOURCE is this direction over its main component. RAY_D00, RAY_EU
-   and RAY_EV give where rays cut the plane 0 of the main axis, with 1, 0, 0 along it. On a plane i these are the rays of a
-   cone beam whose source is one plane before, at the direction times i (START_OF, AHEAD_OF). */
+/* Joseph's samples along LANES rays to one detector line: one bilinear sample on each plane of voxels across the main axis.
+   All is in voxel indices (x, y, z). The projector and its adjoints, on CPUs and GPUs, take axis, planes and weights from
+   here. Explicit fma fixes the rounding, so a ray has the same samples in all of them.
+   RAY_PARALLEL: the rays of a cell have the same direction. RAY_SOURCE is the direction divided by its component along the
+   main axis. RAY_D00, RAY_EU and RAY_EV tell where rays meet plane 0; along the main axis they are 1, 0, 0. On plane i these
+   rays equal the rays of a cone beam with its source one plane before, at i times the direction (START_OF, AHEAD_OF). */
 #include "common/lanes.h"
 
-#define RAY_CELL 16    /* floats per cell */
+#define RAY_CELL 16    /* floats per time cell */
 #define RAY_SOURCE 0
 #define RAY_D00 3      /* from source to pixel (0, 0) */
 #define RAY_EU 6
@@ -16,15 +16,15 @@
 #define RAY_PARALLEL 0
 #endif
 #if RAY_PARALLEL
-#define START_OF(start, i) fma((start), (float)(i), 0.0f) /* rounded here: no later sum can fuse the product */
+#define START_OF(start, i) fma((start), (float)(i), 0.0f) /* fma rounds here: no later sum can fuse the product */
 #define AHEAD_OF(start, i) 1.0f
 #else
 #define START_OF(start, i) (start)
 #define AHEAD_OF(start, i) ((float)(i) - (start))
 #endif
 
-/* ACROSS: a panel of few rows that is read along columns. Its rows are still the kernels' lines, so that a vector
-   holds neighbouring columns. A cell then serves columns, and every column has its own weight. */
+/* ACROSS: a panel with few rows that is read column by column. Here its lines are its rows, because vectors along the short
+   columns would be mostly empty. A cell then serves columns, each with its own weight. */
 #ifndef ACROSS
 #define ACROSS 0
 #endif
@@ -44,8 +44,8 @@ static inline own_t weight_of(__global const float *weights, const int u, const 
 #endif
 }
 
-#define BORDER 1       /* zero voxels around a volume in y and z; in x the rows' padding does this */
-#define CLIP_MARGIN 0.01f /* planes beyond a clipped end: more than its rounding; samples there have weight 0 */
+#define BORDER 1       /* zero voxels around a volume in y and z; in x the padding of rows is zero */
+#define CLIP_MARGIN 0.01f /* planes by which a clipped range is widened, more than its rounding; samples there weigh 0 */
 
 #if RAY_LONG           /* a volume of 2^31 floats or more */
 typedef long index_t;
@@ -95,7 +95,7 @@ static inline int v_largest(vi v)
 }
 #endif
 
-/* Inlined: a call would copy structs of vectors through memory, which takes longer than the computation. */
+/* Always inlined: a call would pass structs of vectors through memory, which takes longer than the computation. */
 #ifdef __clang__
 #define RAY_INLINE static inline __attribute__((always_inline))
 #else
@@ -124,17 +124,17 @@ RAY_INLINE rays_t rays_through(__global const float *cell, const float4 pitch_mm
     return r;
 }
 
-/* Rays along one main axis a through a box of voxels. The position on plane i is s_b + g_b (i - s_a), likewise for c. In a
-   parallel beam s_b i replaces s_b, and 1 replaces i - s_a. */
+/* LANES rays with main axis a through a box of voxels. On plane i they are at b = s_b + g_b (i - s_a), and likewise at c. In
+   a parallel beam i s_b replaces s_b, and 1 replaces i - s_a. */
 typedef struct {
     float sa, sb, sc;
     vf gb, gc;
-    int a_first, b_first, b_last, c_first, c_last; /* voxels of the box */
-    vi first, last;                                /* planes of each ray */
-    int lo, hi;                                    /* planes of any ray */
+    int a_first, b_first, b_last, c_first, c_last; /* first and last voxel of the box on each axis */
+    vi first, last;                                /* planes that each ray meets in the box */
+    int lo, hi;                                    /* planes that any of the rays meets */
 } walk_t;
 
-/* Narrows [lo, hi] to the planes where the other coordinate, sb + g (i - sa), lies in (below, above). */
+/* Narrows [lo, hi] to the planes i on which the coordinate sb + g (i - sa) lies in (below, above). */
 RAY_INLINE void clip_planes(const vf g, const float sa, const float sb, const float below, const float above,
                         vf *lo, vf *hi)
 {
@@ -152,8 +152,8 @@ RAY_INLINE void clip_planes(const vf g, const float sa, const float sb, const fl
     *hi = V_PICK(*hi, min(*hi, max(p, q) + CLIP_MARGIN), oblique);
 }
 
-/* Finds the planes of those of the rays `which` whose main axis is this one. box = (first voxel, number of voxels). Returns
-   0 if no ray meets it. */
+/* Finds on which planes the rays `which` meet a box of voxels (first voxel `corner`, sides `size`), for rays with this main
+   axis. Returns 0 if none does. */
 RAY_INLINE int rays_enter(const rays_t r, __global const float *cell, const int axis, const vi which,
                       const int4 corner, const int4 size, walk_t *w)
 {
@@ -173,7 +173,7 @@ RAY_INLINE int rays_enter(const rays_t r, __global const float *cell, const int 
     const vf inv = 1.0f / V_PICK(1.0f, da, own);
     w->gb = V_PICK(0.0f, db * inv, own);
     w->gc = V_PICK(0.0f, dc * inv, own);
-    /* Planes between source and detector, then those on which both other coordinates touch the box. */
+    /* Planes between source and detector, then planes on which both other coordinates touch the box. */
     vf lo = (vf)(a0), hi = (vf)(a0 + na - 1);
 #if !RAY_PARALLEL
     lo = max(lo, min((vf)(w->sa), w->sa + da));
@@ -192,8 +192,8 @@ RAY_INLINE int rays_enter(const rays_t r, __global const float *cell, const int 
     return w->lo <= w->hi;
 }
 
-/* The voxel at or below a position, and the weight of the next voxel. Beyond the box it is in the border of zeros. PoCL's
-   floor is slow. Positions start at -1, so cutting off the fraction of position + 1 does the same. */
+/* The voxel at or below a position, and the weight of the next voxel (share). Outside the box it is in the border of zeros.
+   PoCL's floor is slow. Positions are at least -1, so converting position + 1 to an integer does the same. */
 RAY_INLINE vi sample_at(const vf g, const float s, const float ahead, const int first, const int last, vf *share)
 {
     const vf at = min(max(fma(g, (vf)(ahead), (vf)(s)), (float)first - 1.0f), (float)last + 1.0f);

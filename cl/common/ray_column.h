@@ -1,8 +1,9 @@
-/* The rays of one detector column, LANES lines at a time, and the table of slots (operators/rays/slots.py).
-   LEAN 0: the column is parallel to the volume's z, and all its rays have one direction along x and y. */
+/* The rays to one detector column, LANES lines (pixels of the column) at a time, and the table of slots: the buffers for the
+   line integrals of one pose each (operators/rays/slots.py).
+   LEAN 0: the column is parallel to the volume's z, so all its rays have the same direction in x and y. */
 #include "common/ray.h"
 
-#define SLOT 8         /* ints of a slot: pose, and columns and lines [first, stop) of the panel that the pose serves */
+#define SLOT 8         /* ints of a slot: its pose, and the columns and lines [first, stop) that the pose serves */
 #define SLOT_CELL 0
 #define SLOT_U 1
 #define SLOT_U_STOP 2
@@ -11,7 +12,7 @@
 
 typedef struct { vf x, y, z; } column_rays_t; /* from the source to pixels, in voxels */
 
-/* One component of the ray to a pixel, as in rays_through. */
+/* One component of the ray to a pixel, computed as in rays_through. */
 RAY_INLINE float ray_component(__global const float *cell, const int axis, const int u, const int v)
 {
     const float line = LEAN || axis == 2 ? fma((float)v, cell[RAY_EV + axis], cell[RAY_D00 + axis]) : cell[RAY_D00 + axis];
@@ -33,7 +34,7 @@ RAY_INLINE column_rays_t column_rays(__global const float *cell, const int u, co
     return d;
 }
 
-/* The main axis is x or y here. Rays that are steeper along z take the general kernel. */
+/* Whether the main axis is x, else y. It is never z: such scans take the general kernel. */
 RAY_INLINE vi column_along_x(__global const float *cell, const column_rays_t d)
 {
 #if RAY_PARALLEL
@@ -52,7 +53,7 @@ RAY_INLINE int is_along_x(__global const float *cell, const int u, const int v)
 #endif
 }
 
-/* The length in mm of each ray from one plane to the next. */
+/* The length of each ray from one plane to the next, in mm. */
 RAY_INLINE vf column_steps_mm(__global const float *cell, column_rays_t d, const float4 pitch_mm)
 {
 #if RAY_PARALLEL
@@ -64,8 +65,8 @@ RAY_INLINE vf column_steps_mm(__global const float *cell, column_rays_t d, const
     return sqrt(lx * lx + ly * ly + lz * lz) / max(fabs(d.x), fabs(d.y));
 }
 
-/* First and last of `count` planes i along the main axis that lie between source and detector. Columns lean only where the
-   whole volume does; operators/rays/upright.py ensures this. */
+/* The first and last of `count` planes along the main axis that are between source and detector. If LEAN, all are:
+   operators/rays/upright.py ensures this. */
 RAY_INLINE int2 planes_between(__global const float *cell, const int u, const int along_x, const int first, const int count)
 {
 #if LEAN || RAY_PARALLEL
@@ -78,11 +79,11 @@ RAY_INLINE int2 planes_between(__global const float *cell, const int u, const in
 #endif
 }
 
-/* The planes on which b = sb + g (i - sa) may lie between two bounds, for all slopes from g0 to g1. */
+/* Narrows `planes` to those on which b = sb + g (i - sa) may be between two bounds for any slope g from g0 to g1. */
 RAY_INLINE int2 planes_within(const int2 planes, const float sa, const float sb, const float g0, const float g1,
                               const float below, const float above)
 {
-#if RAY_PARALLEL /* b = g + sb i */
+#if RAY_PARALLEL /* here b = g + sb i */
     const float per = 1.0f / (fabs(sb) > 1e-9f ? sb : 1e-9f), p = (below - fmax(g0, g1)) * per, q = (above - fmin(g0, g1)) * per;
     const float low = fmin(p, q) - CLIP_MARGIN, high = fmax(p, q) + CLIP_MARGIN;
 #else

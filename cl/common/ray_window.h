@@ -1,9 +1,9 @@
-/* Finds the pixels whose rays may meet a box of voxels, so that the adjoint need not try all cells and pixels. */
+/* Finds the pixels whose rays may meet a box of voxels, so that the adjoint need not try every cell and pixel. */
 #include "common/ray.h"
 
 typedef struct { vi u_lo, u_hi, v_lo, v_hi; } window_t;
 
-/* Narrows [lo, hi] to the possible values of (m . p) / depth for p in the box; `at` is the value in its middle. */
+/* Narrows [lo, hi] to the values that (m . p) / depth can have for points p of the box. at: the value in its middle. */
 RAY_INLINE void window_along(const vf at, const vf mx, const vf my, const vf mz, const vf dx, const vf dy, const vf dz,
                              const float4 half_size, const vf widest, const vi ahead, vi *lo, vi *hi)
 {
@@ -15,9 +15,9 @@ RAY_INLINE void window_along(const vf at, const vf mx, const vf my, const vf mz,
     *hi = VI_PICK(*hi, min(*hi, to), ahead);
 }
 
-/* Pixels to which a box of half-size `half_size` about a voxel index `at` may project, in LANES neighbouring cells. No pixel
-   is missed. They lie within each cell's lines and the ``others`` of the detector. Returns which cells see the box.
-   matrix (12, stride) maps a voxel index to u z, v z and z; cell_lines (C, 2). Cells from `stop` on do not count. */
+/* Finds all pixels to which points of a box may be projected, from LANES neighbouring cells, on the lines that each serves.
+   The box has its middle at voxel index `at`. others: the pixels of a line. Returns which cells see the box; cells from
+   `stop` on do not count. matrix (12, stride): rows give u z, v z and z of a voxel index. cell_lines (C, 2). */
 RAY_INLINE vi window_of(__global const float *matrix, const int stride, __global const int *cell_lines, const int others,
                         const int cell, const int stop, const float4 at, const float4 half_size, window_t *w)
 {
@@ -34,7 +34,7 @@ RAY_INLINE vi window_of(__global const float *matrix, const int stride, __global
     const vf dx = M(8), dy = M(9), dz = M(10);
     const vf depth = dx * at.x + dy * at.y + dz * at.z + M(11);
     const vf reach = fabs(dx) * half_size.x + fabs(dy) * half_size.y + fabs(dz) * half_size.z;
-    const vi ahead = depth > reach * 1.001f; /* otherwise the plane of the source cuts the box: no bound */
+    const vi ahead = depth > reach * 1.001f; /* a box cut by the plane through the source has no bound */
     const vf per = 1.0f / V_PICK(1.0f, depth, ahead), widest = 1.0f / V_PICK(1.0f, depth - reach, ahead);
     window_along((M(0) * at.x + M(1) * at.y + M(2) * at.z + M(3)) * per, M(0), M(1), M(2), dx, dy, dz, half_size,
                  widest, ahead, &w->u_lo, &w->u_hi);

@@ -1,22 +1,22 @@
-/* The record of a Gaussian projected from one time cell, and its value at a pixel.
+/* A splat (a Gaussian projected from one time cell): its record in memory, and its value at a pixel.
 
-   D = (u - u0, v - v0) is the offset of a pixel from the centre. num = D'SD, with S from the Gram form, stored as its
-   triangular factor L. B = 1 + b.D, and Q = B^2 + num/kappa. The line integral of the Gaussian along the pixel's ray is
+   D = (u - u0, v - v0) is the offset of a pixel from the splat's centre. num = D'SD; the triangular factor L of S is stored.
+   B = 1 + b.D, and Q = B^2 + num/kappa. The line integral of the Gaussian along the pixel's ray is
        p = amp * sqrt(|d|^2 / Q) * exp(-num / (2 Q))
-   with d the vector from source to pixel. This is exact, perspective included: docs/mathematics.md.
-   The affine (R2-Gaussian) splat has Q = 1 and |d| of the central ray. */
+   where d goes from the source to the pixel. This is exact, with perspective: see docs/mathematics.md.
+   The affine model (R2-Gaussian) takes Q = 1, and |d| of the central ray for all pixels. */
 #include "common/falling_exp2.h"
 
 #ifndef PARALLEL
-#define PARALLEL 0 /* the rays of a cell have one direction; AFFINE, which is exact then, must be 1 */
+#define PARALLEL 0 /* the rays of a cell are parallel; AFFINE must be 1 then, and is exact */
 #endif
 
 #ifndef DEFORMED
-#define DEFORMED 0 /* Gaussians are in a state of an object that moves: common/splat_state.h */
+#define DEFORMED 0 /* the object moves, and Gaussians with it: common/splat_state.h */
 #endif
 
 #ifndef SPLAT_SPACE
-#define SPLAT_SPACE __global /* memory of the records and of the cells' constants */
+#define SPLAT_SPACE __global /* address space of records and cells */
 #endif
 
 #if MOVING
@@ -27,28 +27,28 @@
 #define REC_L11 0
 #define REC_L12 1
 #define REC_L22 2
-#define REC_U_REST 3      /* u0 - REC_U_WHOLE */
+#define REC_U_REST 3      /* u0 minus its nearest integer, which is at REC_U_WHOLE */
 #define REC_V_REST 4
 #define REC_B1 5
 #define REC_B2 6
 #define REC_INV_KAPPA 7
-#define REC_AMP 8         /* density times ray factor times cell weight */
+#define REC_AMP 8         /* amp, including the density and the cell's weight */
 #define REC_U_WHOLE 9     /* int */
 #define REC_V_WHOLE 10    /* int */
-#define REC_U_LO 11       /* int: the pixels to visit; empty where HI < LO */
+#define REC_U_LO 11       /* int: first and last pixel to visit; none if HI < LO */
 #define REC_U_HI 12
 #define REC_V_LO 13
 #define REC_V_HI 14
-#if MOVING                /* the factor V of S instead of L, rotated into the direction of motion: common/splat_moving.h */
+#if MOVING                /* instead of L another factor V of S, turned to the direction of motion: common/splat_moving.h */
 #define REC_ALONG_U 0
 #define REC_ALONG_V 1
 #define REC_ACROSS_V 2
 #define REC_ACROSS_U 15
-#define REC_SPEED 16      /* path over the segment, in widths of the splat */
-#define REC_REACH2 17     /* cutoff for |(along, across)|^2, enlarged by the largest Q */
+#define REC_SPEED 16      /* length of the path in the segment, in widths of the splat */
+#define REC_REACH2 17     /* limit of |(along, across)|^2, which includes the largest Q */
 #endif
 
-/* Floats from the first image to a cell's image. All cells of a frame share one image, except with LAYERED. */
+/* Floats from the first image to the image of a cell. All cells of a frame share one image, unless LAYERED. */
 #if LAYERED
 #define LAYER_AT(cell, lines, pitch) ((size_t)(cell)[CELL_LAYER] * (IMAGE_GUARD + (size_t)(lines) * (pitch)))
 #define LAYERS(count) (count)
@@ -57,11 +57,11 @@
 #define LAYERS(count) 1
 #endif
 
-/* The constants of a cell, in floats. */
+/* A time cell has CELL floats. The constants below are the indices at which they begin. */
 #define CELL 24
-#define CELL_SOURCE 0     /* 3; PARALLEL: the reversed direction of the rays */
-#define CELL_EU 3         /* 3: step to the next pixel across the lines */
-#define CELL_EV 6         /* 3: step to the next line */
+#define CELL_SOURCE 0     /* 3 floats: the source; PARALLEL: minus the rays' direction */
+#define CELL_EU 3         /* 3 floats: the step to the next pixel of a line */
+#define CELL_EV 6         /* 3 floats: the step to the next line */
 #define CELL_VOLUME 9     /* (eu x ev) . (first pixel - source) */
 #define CELL_WEIGHT 10
 #define CELL_D00 11       /* |d|^2 = D00 + u (DU + DUV v + DUU u) + v (DV + DVV v) */
@@ -70,9 +70,9 @@
 #define CELL_DUU 14
 #define CELL_DUV 15
 #define CELL_DVV 16
-#define CELL_LAYER 17     /* LAYERED: the image into which the cell is drawn; no line has two cells in one image */
+#define CELL_LAYER 17     /* LAYERED: the image into which the cell is drawn; each line has at most one cell in an image */
 
-/* The constants of a splat along one line. */
+/* What is constant of a splat along one line. */
 typedef struct {
     float l11, t0, k, b1, b0, inv_kappa, amp, d0, d1, d2;
 } splat_line;
@@ -93,7 +93,7 @@ static inline splat_line splat_on_line(SPLAT_SPACE const float *splat_record, SP
     return s;
 }
 
-/* The value at pixels u, whose offset from the centre is du; also num, B and 1/Q. */
+/* The value at pixels u, whose offset from the centre is du. Also returns num, B and 1/Q. */
 static inline vf splat_value(splat_line s, vf u, vf du, vf *num_out, vf *big_b, vf *inv_q)
 {
     vf t = s.l11 * du + s.t0;

@@ -1,34 +1,35 @@
-/* A splat that moves through one segment of a frame (docs/mathematics.md, "Exact in time").
-   In units of the segment's length, time t goes from -1/2 to 1/2 about its middle. The centre is at t p; conic and amplitude
-   are those of the middle. With V'V = S, turned so that V p = (speed, 0), a pixel lies at
+/* A splat that moves during a segment of a frame's time (docs/mathematics.md, "Exact in time").
+   Time t goes from -1/2 to 1/2 in a segment. The splat's centre is displaced by t p, where p is its path. Shape and
+   amplitude are those at t = 0. V is a factor of S (V'V = S), turned so that V p = (speed, 0). For a pixel at D:
 
        along = V1.D,  across = V2.D,   q(t) = ((along - speed t)^2 + across^2) / Q
 
-   and a line integrates exp(-q/2) over its own part [middle - half, middle + half] of the segment. */
+   Its line integrates exp(-q/2) over the line's exposure [middle - half, middle + half] in the segment. */
 #include "common/splat.h"
 
-/* Rows of a cell's table of lines, of `time_pitch` floats each. */
+/* Rows of the table of a cell's lines; a row has `time_pitch` floats. */
 #define TIME_MIDDLE 0
 #define TIME_HALF 1
-#define TIME_WEIGHT 2 /* share of the line's window in this segment */
+#define TIME_WEIGHT 2 /* fraction of the line's exposure that lies in this segment */
 #define TIME_ROWS 3
 #define TIMES_OF(c, line_times, time_pitch) ((line_times) + (size_t)(c) * TIME_ROWS * (time_pitch))
 
 #if MOVING
 #define LANE(type, v, lane) (((type *)&(v))[lane])
-#define CLOSED 0 /* the rule: closed form, or the number of Gauss-Legendre times */
+#define CLOSED 0 /* a rule that integrates in closed form; other rules are the number of Gauss-Legendre times */
 #define GAUSS_2 0.57735026919f
 #define GAUSS_3 0.77459666924f
 #define ROOT_HALF 0.70710678119f
 #define ROOT_HALF_PI 1.25331413732f
 
-/* The constants of a moving splat along one line. z = along - speed * middle. */
+/* What is constant of a moving splat along one line. z = along - speed * middle. */
 typedef struct {
     float z1, z0, c1, c0, shift, b1, b0, inv_kappa, amplitude, half_path, d0, d1, d2;
     int rule;
 } moving_line;
 
-/* Which rule meets the error bound, from the path in the line's window over the splat's width. limits: for 1, 2, 3 times. */
+/* The fastest rule that is accurate enough. path: during the line's exposure, in widths of the splat. limits: the longest
+   paths for 1, 2 and 3 times. */
 ALWAYS_INLINE int moving_rule(const float path, const float4 limits)
 {
     return path <= limits.x ? 1 : (path <= limits.y ? 2 : (path <= limits.z ? 3 : CLOSED));
@@ -59,12 +60,12 @@ ALWAYS_INLINE moving_line moving_on_line(SPLAT_SPACE const float *splat_record, 
     return s;
 }
 
-/* A pixel relative to the splat: z and across, Q, 1/Q and the factor of squares in the exponent, across^2, |d|^2 (1 in the
-   affine model), and whether it is drawn. */
+/* A pixel relative to the splat. fall: the factor of squares in the exponent of 2. c2: across^2. d2: |d|^2, or 1 if AFFINE.
+   drawn: whether it is within the cutoff. */
 typedef struct { vf z, across, b, q, rq, fall, c2, d2; vi drawn; } moving_pixel;
 
 #if AFFINE
-#define SQUARE_ROOT(x) (x) /* of Q and |d|^2, which are 1 */
+#define SQUARE_ROOT(x) (x) /* no root is needed: Q and |d|^2 are 1 */
 #else
 #define SQUARE_ROOT(x) sqrt(x)
 #endif
@@ -92,7 +93,7 @@ ALWAYS_INLINE moving_pixel moving_at(const moving_line s, const vf u, const vf d
     return p;
 }
 
-/* 1 - erf|x| = 1/D, D = (1 + ...)^16 (Abramowitz and Stegun 7.1.28, to 3e-7). Beyond 5 it is 0. */
+/* Returns D, where 1 - erf|x| = 1/D with an error of 3e-7 (Abramowitz and Stegun 7.1.28). Beyond |x| = 5 D is constant. */
 ALWAYS_INLINE vf erf_complement(const vf x)
 {
     const vf t = min(fabs(x), 5.0f);
@@ -117,7 +118,7 @@ ALWAYS_INLINE vf moving_exp(const vf z, const moving_pixel p)
     return falling_exp2((z * z + p.c2) * p.fall);
 }
 
-/* The pixel's line integral, averaged over its line's window. `rule` is a constant where this is inlined. */
+/* The pixel's line integral, averaged over its line's exposure. `rule` is a constant where this is inlined. */
 ALWAYS_INLINE vf moving_value(const int rule, const moving_line s, const moving_pixel p)
 {
     if (rule == CLOSED) {
@@ -135,7 +136,7 @@ ALWAYS_INLINE vf moving_value(const int rule, const moving_line s, const moving_
     return factor * (0.27777777778f * ends + 0.44444444444f * moving_exp(p.z, p));
 }
 
-/* Means over the window of E = exp(-q/2) with z = along - speed t: E, E z, E z^2, E t, E t z. */
+/* Means over the line's exposure of E, E z, E z^2, E t and E t z, where E = exp(-q/2) and z = along - speed t. */
 typedef struct { vf e, ez, ezz, et, etz; } moving_means;
 
 ALWAYS_INLINE void moving_add(moving_means *m, const moving_line s, const moving_pixel p, const float weight,
@@ -150,8 +151,8 @@ ALWAYS_INLINE void moving_add(moving_means *m, const moving_line s, const moving
     m->etz += ez * time;
 }
 
-/* The closed form. With the values e at both ends, int E z = Q (e1 - e0)/speed and
-   int E z^2 = Q (int E + (z1 e1 - z0 e0)/speed). Nothing here subtracts large numbers. */
+/* The closed form. With E = e0 and e1 at both ends, int E z = Q (e1 - e0)/speed and
+   int E z^2 = Q (int E + (z1 e1 - z0 e0)/speed). No large numbers are subtracted, so no digits are lost. */
 ALWAYS_INLINE moving_means moving_closed(const moving_line s, const moving_pixel p, const float speed)
 {
     moving_means m;
@@ -189,8 +190,9 @@ ALWAYS_INLINE moving_means moving_all_means(const moving_line s, const moving_pi
     return m;
 }
 
-/* Pixels of LANES lines from `v` on that the splat reaches within each line's window: the discs at its two ends (in whitened
-   coordinates) and the flat sides between them. Lines that are not open during the segment get no pixels. */
+/* Finds the pixels that the splat reaches during each line's exposure, for LANES lines at distances dv. In coordinates
+   (along, across) the region is a disc at either end of the path, and a rectangle between them. Lines that are not exposed
+   in this segment get no pixels. */
 ALWAYS_INLINE void moving_span(SPLAT_SPACE const float *splat_record, const vf dv, const vf middle, const vf half_time,
                                const vf weight, const int cuts, vi *u_lo, vi *u_hi)
 {

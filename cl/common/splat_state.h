@@ -1,13 +1,13 @@
-/* A Gaussian in a state of an object that moves (cl/splat_states.cl). The reference at y + w(y) is the object at y, and
-   G = I + dw/dy. A Gaussian of the reference with the precision P has the precision G' P G at the place to which w takes it.
-   So a vector v has the coordinates R' G v in the Gaussian's own frame: G' R replaces the axes R. */
+/* A Gaussian of an object that moves, in one of its states (cl/splat_states.cl). The object has at y what the reference
+   has at y + w(y), and G = I + dw/dy. A Gaussian with precision P in the reference has precision G' P G in the state. So a
+   vector v has the coordinates R' G v in the Gaussian's own axes: G' R replaces the axes R. */
 #include "common/gaussian.h"
 #include "common/splat.h"
 
-#define STATE_ROWS 12 /* floats of a Gaussian in a state: its place x y z, then the rows of G */
+#define STATE_ROWS 12 /* floats of a Gaussian in a state: its centre x y z, then the rows of G */
 
 #if DEFORMED
-/* Place of the rows of LANES Gaussians in the states (S, STATE_ROWS, stride). */
+/* Where LANES Gaussians of a state begin in the array (S, STATE_ROWS, stride). */
 #define STATE_AT(state, first, stride) ((size_t)(state) * STATE_ROWS * (stride) + (first))
 
 ALWAYS_INLINE v3 state_vector(__global const float *rows, const int row, const int stride)

@@ -1,11 +1,11 @@
-/* A Gaussian projected from one time cell: its centre on the detector, its splat, and the pixels within the cutoff.
-   The formulas are derived in docs/mathematics.md. */
+/* Projects Gaussians from one time cell: centre on the detector, splat, and pixels within the cutoff. docs/mathematics.md
+   derives the formulas. */
 #include "common/precise.h"
 #include "common/gaussian.h"
 #include "common/splat.h"
 
-/* Smallest depth of a centre that is drawn, over the detector's depth. Closer to the source's plane float32 cannot tell
-   depths apart, and derivatives grow with the inverse depth. */
+/* Gaussians whose depth is less than this fraction of the detector's depth are not drawn. So near to the source float32
+   cannot tell depths apart, and derivatives, which grow with 1/depth, are huge. */
 #define NEAREST 1e-6f
 
 /* A position in pixels: u = u_whole + u_rest, and likewise v. Depth 1 is on the detector. */
@@ -22,7 +22,7 @@ ALWAYS_INLINE splat_centre project_centre(__global const coefficient *matrix, co
     return centre;
 }
 
-/* The splat of common/splat.h. is_drawn: the Gaussian lies in front of the source. */
+/* LANES splats, see common/splat.h. is_drawn: the Gaussian is in front of the source. */
 typedef struct { vf l11, l12, l22, b1, b2, inv_kappa, amplitude; vi is_drawn; } splat_view;
 
 ALWAYS_INLINE splat_view view_splat(const gaussian g, __global const float *cell, const vf z)
@@ -40,7 +40,7 @@ ALWAYS_INLINE splat_view view_splat(const gaussian g, __global const float *cell
     const vf root = rsqrt(kappa);
     s.is_drawn = (z > NEAREST) & (kappa > 0.0f);
 
-    /* S in Gram form has no difference of large numbers, so needles lose no digits. */
+    /* As inner products of gu and gv, S needs no difference of large numbers, so thin Gaussians lose no digits. */
     const v3 gu = v3_scale(v3_mul(g.scale, v3_cross(ray, eu)), inv_det);
     const v3 gv = v3_scale(v3_mul(g.scale, v3_cross(ray, ev)), inv_det);
     const vf gu_length = sqrt(v3_dot(gu, gu));
@@ -65,8 +65,8 @@ ALWAYS_INLINE splat_view view_splat(const gaussian g, __global const float *cell
     return s;
 }
 
-/* The ellipse q <= cutoff2 as offsets from the splat's centre: its middle (u, v) and half its extent along u and v.
-   is_bounded: it is an ellipse. Otherwise the Gaussian reaches the plane of the source. */
+/* The ellipse q <= cutoff2: its middle (u, v), relative to the splat's centre, and half its extent along u and v.
+   is_bounded: 0 if the Gaussian reaches the plane through the source, where it is no ellipse. */
 typedef struct { vf u, v, half_u, half_v; vi is_bounded; } cutoff_ellipse;
 
 /* q <= cutoff2 is D'TD - 2 c b.D - c <= 0 with T = S (1 - c/kappa) - c b b'. */
@@ -78,7 +78,7 @@ ALWAYS_INLINE cutoff_ellipse ellipse_of(const splat_view s, const float cutoff2)
     const vf t11 = l11 * l11 * shrink - cutoff2 * b1 * b1;
     const vf t12 = l11 * l12 * shrink - cutoff2 * b1 * b2;
     const vf t22 = (l12 * l12 + l22 * l22) * shrink - cutoff2 * b2 * b2;
-    /* det T = shrink^2 det S - c shrink b' adj(S) b, again without large differences. */
+    /* det T = shrink^2 det S - c shrink b' adj(S) b, in this form again without differences of large numbers. */
     const vf s_b1 = l11 * b2 - l12 * b1, s_b2 = l22 * b1;
     const vf det = shrink * (shrink * (l11 * l22) * (l11 * l22) - cutoff2 * (s_b1 * s_b1 + s_b2 * s_b2));
     e.is_bounded = (shrink > 0.0f) & (det > 0.0f) & (t11 > 0.0f);
@@ -91,7 +91,7 @@ ALWAYS_INLINE cutoff_ellipse ellipse_of(const splat_view s, const float cutoff2)
     return e;
 }
 
-/* The pixels u_lo..u_hi of the lines v_lo..v_hi. */
+/* LANES boxes of pixels, with their bounds included. */
 typedef struct { vi u_lo, u_hi, v_lo, v_hi; } pixel_box;
 
 /* Narrows [lo, hi] to the pixels between whole + low and whole + high. */
@@ -102,7 +102,7 @@ ALWAYS_INLINE void narrow(const vf whole, const vf low, const vf high, vi *lo, v
     *hi = min(*hi, V_INT(floor(clamp(whole + high, -far, far))));
 }
 
-/* Empties the boxes of splats that are not drawn. Returns which are drawn: those in front, with pixels in their box. */
+/* Empties the boxes of splats that are not drawn or contain no pixel. Returns which splats remain. */
 ALWAYS_INLINE vi close_box(pixel_box *box, const vi is_drawn)
 {
     const vi is_visible = is_drawn & (box->u_hi >= box->u_lo) & (box->v_hi >= box->v_lo);
@@ -113,7 +113,7 @@ ALWAYS_INLINE vi close_box(pixel_box *box, const vi is_drawn)
     return is_visible;
 }
 
-/* The smallest box around all visible splats of a Gaussian. */
+/* The box from which `enclose` starts. */
 ALWAYS_INLINE pixel_box empty_box(void)
 {
     pixel_box box;

@@ -1,6 +1,6 @@
-/* The splats of a tile, in their order: tile_splat_ids[tile_offsets[tile]] to tile_splat_ids[tile_offsets[tile + 1] - 1], as
-   binning.cl writes them. Where a list does not fit into `capacity`, its tile tries all splats: slower, with the same
-   result. */
+/* The splats of a tile, as binning.cl lists them, from tile_splat_ids[tile_offsets[tile]] up to before
+   tile_splat_ids[tile_offsets[tile + 1]]. If the list did not fit into `capacity`, all splats are taken: slower, with the
+   same result. */
 #include "common/lanes.h"
 
 typedef struct { int is_written, first, count; } tile_list;

@@ -1,4 +1,4 @@
-"""The acquisition: geometry, trajectory, shutter, time cells, motion models, and the scan that holds them."""
+"""How a scan is acquired: geometry, trajectory, shutter, motion models with their time cells, and the scan itself."""
 
 from phyradgs_cl.acquisition.geometry import ConeGeometry, ParallelGeometry, pixel_centres, transpose_pose
 from phyradgs_cl.acquisition.motion import (

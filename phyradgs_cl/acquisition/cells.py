@@ -1,4 +1,6 @@
-"""Builders of ``TimeCells``, one for each motion model."""
+"""Builds the ``TimeCells`` of a frame, by one function for each motion model.
+
+"Lit span" means the time from a frame's first light on the panel to its last, and a line's "window" its exposure."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -9,31 +11,30 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames, is_parallel
 
-_SAME_TIME = 1e-6  # times that differ by less than this fraction of a time cell count as equal
-_NOTHING = 1e-9  # a smaller fraction of a line's window that lies in a time cell is rounding, and becomes 0
-_INSTANT = 1e-9  # a line's window up to this fraction of the frame's lit span counts as an instant
-_OVERHANG = 0.1  # a line's window that covers at most this fraction of the first or last segment that it meets leaves it out
-_TURN_SAMPLES = 32  # number of intervals of the lit span in which the speed of the view's turn is measured
-_TURN_FACTOR = 0.32  # a frame's relative RMS error per squared radian of the view's turn in a segment
-_HARMLESS_PEAK = 4.0  # averages of intensities need no more segments up to this largest line integral
+_SAME_TIME = 1e-6  # times that differ by less than this fraction of a cell's duration are equal
+_NOTHING = 1e-9  # a smaller fraction of a line's window in a cell is rounding, and set to 0
+_INSTANT = 1e-9  # a window shorter than this fraction of the lit span is treated as a single time
+_OVERHANG = 0.1  # a line leaves a segment out if its window covers at most this fraction of it
+_TURN_SAMPLES = 32  # number of intervals of the lit span in which the gantry's highest speed is sought
+_TURN_FACTOR = 0.32  # measured relative RMS error of a frame, per squared radian that the gantry turns in a segment
+_HARMLESS_PEAK = 4.0  # largest line integral up to which averaging intensities needs no more segments
 _MOST_SEGMENTS = 1000  # most segments that ``segments_for`` chooses for a frame
 
 
 Served = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Indices of the cells that serve a line, their [first, stop) lines, and the order that sorts them by first line."""
+"""Indices of the cells that serve any line, their [first, stop) lines, and the order that sorts them by first line."""
 
 
 def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
-    """Returns one cell of all lines at the middle of the frame's lit span, in which any line is open. No other single
-    pose fits a frame better."""
+    """Returns one cell of all lines, at the middle of the frame's lit span. No other single pose fits a frame better."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.middle_s, lines)
 
 
 def static_start_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int
 ) -> TimeCells:
-    """Returns one cell of all lines at the frame's first light. A volume then comes out rotated by half the arc of the
-    lit span."""
+    """Returns one cell of all lines, at the frame's first light. The volume is then rotated by half of the arc that the
+    gantry turns in the lit span."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.lit_span_s[0], lines)
 
 
@@ -41,9 +42,10 @@ def micro_view_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, strips: int,
     sub_intervals: int
 ) -> TimeCells:
-    """Returns M strips × N sub-intervals at t = t_f + (j+½)/M·T_ro + (k+½)/N·T_exp (paper, Eq. 2).
+    """Divides the lines into M ``strips`` and the exposure into N ``sub_intervals``, and returns a cell for each pair.
 
-    With a pulsed beam the N sub-intervals divide the lit part of the strip's window. Strips without a line have no cells."""
+    Its time is t_f + (j+½)/M·T_ro + (k+½)/N·T_exp (paper, Eq. 2). With a pulsed beam the sub-intervals divide the part of
+    the exposure with light. Strips without a line have no cells."""
     share = (np.arange(sub_intervals) + 0.5) / sub_intervals
     ranges = np.array(shutter.strip_ranges(lines, strips))
     strip = np.flatnonzero(ranges[:, 1] > ranges[:, 0])
@@ -59,7 +61,7 @@ def centre_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, strips: int,
     sub_intervals: int
 ) -> TimeCells:
-    """Returns the cells of ``micro_view_cells`` with the pose of ``static_cells`` as their ``conic_pose``."""
+    """Returns the cells of ``micro_view_cells``, with the pose of ``static_cells`` as ``conic_pose``."""
     table = micro_view_cells(trajectory, shutter, frame, start_s, lines, strips, sub_intervals)
     return replace(table, conic_pose=static_cells(trajectory, shutter, frame, start_s, lines).pose[0])
 
@@ -67,9 +69,9 @@ def centre_cells(
 def per_line_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, samples: int
 ) -> TimeCells:
-    """Returns ``samples`` cells for every line, at the midpoints of equal parts of its exposure.
+    """Returns ``samples`` cells for every line, at the middles of equal parts of its exposure.
 
-    The error falls with samples⁻² for fields that are smooth over the motion between two times."""
+    The error falls with samples⁻² if the object is smooth over the motion from one sample to the next."""
     opens_s, closes_s = shutter.line_windows_s(lines).T
     share = (np.arange(samples) + 0.5) / samples
     times = (start_s + opens_s[:, None] + share * (closes_s - opens_s)[:, None]).ravel()
@@ -81,16 +83,16 @@ def per_line_cells(
 def common_time_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, frame_start_s: np.ndarray, lines: int, samples: int
 ) -> TimeCells:
-    """Returns cells on one grid of times for all lines, from first light to last. A cell lasts exposure / ``samples``.
+    """Divides the lit span into cells of length exposure / ``samples``, which all lines share.
 
-    A line takes from each cell the fraction of its own window that lies in the cell: P(v) = Σ_k w_k(v) P(θ(t_k), v). Here
-    t_k is the cell's middle and w_k(v) = |window(v) ∩ cell k| / |window(v)|. So one projection from a pose serves many
-    lines. This is the paper's strip concatenation with fractional strips.
+    A line weights each cell by the fraction of its window in the cell: P(v) = Σ_k w_k(v) P(θ(t_k), v), where t_k is the
+    cell's middle and w_k(v) = |window(v) ∩ cell k| / |window(v)|. So one projection from a pose serves many lines. This is
+    the paper's strip concatenation with fractional strips.
 
-    frame_start_s (F,): the starts of all frames in s. Frames that start a whole number of cells after frame 0 share poses
-    where they overlap in time, as in a scan without gaps. In an exposure of 0 s, or where a cell is shorter than the
-    readout of a line, no lines share a cell: the result is ``per_line_cells``. With a pulsed beam, the exposure is its
-    longest lit part."""
+    frame_start_s (F,): the starts of all frames in s. In a scan without gaps, frames overlap in time because of the
+    readout. They share poses there if they start a whole number of cells after frame 0. With an exposure of 0 s, or cells
+    shorter than the readout of a line, sharing is useless: the result is ``per_line_cells``. With a pulsed beam, the
+    exposure counts as the longest time that a line receives light."""
     start_s = float(frame_start_s[frame])
     windows_s = shutter.line_windows_s(lines)
     length_s = float(np.ptp(windows_s, axis=1).max())
@@ -105,11 +107,12 @@ def common_time_cells(
     return replace(table, line_share=share[used][order])
 
 
-@lru_cache(maxsize=8)  # all frames of a scan have the same windows
+@lru_cache(maxsize=8)  # windows are the same in all frames of a scan
 def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray, Served]:
-    """Returns cells' edges (K + 1,) in s, ``_shares`` (K, lines) of lines' windows in them, and their ``_served_lines``.
+    """Returns the edges (K + 1,) in s of the cells, the ``_shares`` (K, lines) of windows in them, and ``_served_lines``.
 
-    windows: bytes of the windows (lines, 2), in s after a frame's start. The arrays are cached: do not write to them."""
+    windows: the bytes of the windows (lines, 2) in s after a frame's start; bytes can be a key of the cache. The returned
+    arrays are cached too: do not write to them."""
     windows_s = np.frombuffer(windows, np.float64).reshape(-1, 2)
     first_s, last_s = float(windows_s.min()), float(windows_s.max())
     step_s = float(np.ptp(windows_s, axis=1).max()) / samples
@@ -119,7 +122,7 @@ def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _served_lines(served: np.ndarray) -> Served:
-    """Returns ``Served`` from a table, bool (K, lines), of the lines that each of K cells serves."""
+    """Returns ``Served`` for a bool array (K, lines) that is True where a cell serves a line."""
     used = np.flatnonzero(served.any(axis=1))
     line_start = served[used].argmax(axis=1)
     line_stop = served.shape[1] - served[used, ::-1].argmax(axis=1)
@@ -127,29 +130,25 @@ def _served_lines(served: np.ndarray) -> Served:
 
 
 def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np.ndarray:
-    """Returns the middles (K,) in s of a frame's cells, whose edges (K + 1,) are in s after the frame's start.
-
-    Frames that start a whole number of cells after frame 0 get the same bits for the same time, so that they share
-    poses."""
+    """Returns the middles (K,) in s of a frame's cells, whose edges (K + 1,) are in s after the frame's start."""
     step_s = edges_s[1] - edges_s[0]
     start_s, origin_s = float(frame_start_s[frame]), float(frame_start_s[0])
     cells = (start_s - origin_s) / step_s
     number = np.arange(len(edges_s) - 1) + 0.5
     if abs(cells - round(cells)) < _SAME_TIME:
-        # Cells of two frames that cover the same time then get times with the same bits, and so the same pose: ``slots.py``
-        # of operators/rays projects equal poses once.
+        # Counted from frame 0, cells of two frames at the same time get equal bits, and so one pose, projected only once.
         start_s, number = origin_s, round(cells) + number
     return np.asarray(start_s + edges_s[0] + number * step_s)
 
 
 def _shares(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
-    """Returns the fraction (K, lines) of each line's window (lines, 2) that lies in each cell between ``edges_s`` (K +
-    1,). Columns sum to 1."""
+    """Returns the fraction (K, lines) of each line's window (lines, 2) in each cell, whose edges are ``edges_s`` (K + 1,).
+    The fractions of a line sum to 1."""
     opens, closes = windows_s.T
     length_s = closes - opens
     overlap = np.minimum(closes, edges_s[1:, None]) - np.maximum(opens, edges_s[:-1, None])
     share = np.maximum(overlap, 0) / np.where(length_s > 0, length_s, 1)
-    # A window of no length overlaps with nothing: it belongs to the cell in which it lies.
+    # A window of length 0 has no overlap with any cell: it counts to the cell that contains it.
     moment = np.clip(np.searchsorted(edges_s, opens, side="right") - 1, 0, len(edges_s) - 2)
     share[:, length_s <= 0] = 0
     share[moment[length_s <= 0], np.flatnonzero(length_s <= 0)] = 1
@@ -160,16 +159,15 @@ def _shares(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
 def exact_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, segments: int
 ) -> TimeCells:
-    """Returns ``segments`` equal segments of the frame's lit span, within which splats move (docs/mathematics.md).
+    """Divides the frame's lit span into equal ``segments``, within which Gaussians move on the panel (docs/mathematics.md).
 
-    Every line integrates over its own window. A gantry at rest, or a lit span of 0 s, gives the result of
-    ``static_cells``."""
+    Every line integrates over its own window. For a gantry at rest, or a lit span of 0 s, returns ``static_cells``."""
     first_s, last_s = shutter.lit_span_s
     if last_s <= first_s:
         return static_cells(trajectory, shutter, frame, start_s, lines)
     edges_s = np.linspace(first_s, last_s, segments + 1)
     times = _line_times(shutter.line_windows_s(lines), edges_s)
-    # Projecting a cell that no line sees would be wasted work.
+    # Leaves out cells that no line sees: projecting them would be wasted work.
     used, line_start, line_stop, order = _served_lines(times[:, 2] > 0)
     middle_s = start_s + (edges_s[:-1] + edges_s[1:])[used] / 2
     ends_s = start_s + np.stack([edges_s[:-1], edges_s[1:]], -1)[used][order]
@@ -181,14 +179,13 @@ def exact_cells(
 
 
 def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
-    """Returns ``TimeCells.line_times`` (K, 3, lines) for windows (lines, 2) and edges of equal segments (K + 1,), both in
-    s.
+    """Returns ``TimeCells.line_times`` (K, 3, lines), for windows (lines, 2) in s and edges (K + 1,) in s of equal segments.
 
-    A window that reaches at most ``_OVERHANG`` of a segment into it counts to the neighbouring segment alone, to save
-    footprints."""
+    The part of a window in a segment of which it covers at most ``_OVERHANG`` counts to the next segment, so that fewer
+    Gaussians must be projected."""
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
-    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in segments' lengths after first light
+    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # after first light, in units of a segment's length
     first, last = _segments_of_lines(opens, closes, count)
     index = np.arange(count)[:, None]
     start = np.where(index == first, opens, index)
@@ -201,9 +198,9 @@ def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
 
 
 def _segments_of_lines(opens: np.ndarray, closes: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the first and last segment (lines,) of every line's window, given in segments' lengths after first light.
+    """Returns the first and last segment (lines,) of every line's window. Times are in units of a segment's length.
 
-    A segment at either end is left out where the window covers at most ``_OVERHANG`` of it."""
+    A segment at either end is left out if the window covers at most ``_OVERHANG`` of it."""
     first = np.clip(np.floor(opens), 0, count - 1)
     last = np.clip(np.ceil(closes) - 1, first, count - 1)
     first = np.where((first < last) & (first + 1 - opens <= _OVERHANG), first + 1, first)
@@ -215,12 +212,13 @@ def segments_for(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, time_error: float,
     intensity_peak: float = 0.0
 ) -> int:
-    """Returns how many segments keep the error of straight paths and constant conics below ``time_error`` (relative RMS).
+    """Returns how many segments keep a frame's relative RMS error below ``time_error``.
 
-    Both errors grow with the square of the view's turn in a segment. The factor was measured (benchmarks/time_exact.py)
-    for Gaussians of 0.5 to 4 % of the half-width. intensity_peak: the largest line integral where the detector averages
-    intensities, else 0. There half the variance of the line integrals in a segment is a further error, smaller than the
-    others up to a peak of 4; a larger peak takes more segments."""
+    In a segment, Gaussians move along straight lines and keep their shape. The error grows with the square of the gantry's
+    turn in a segment. The factor was measured (benchmarks/time_exact.py) for Gaussians of 0.5 to 4 % of the half-width.
+    intensity_peak: the largest line integral if the detector averages intensities, else 0. Then half the variance of the
+    line integrals in a segment is a further error. Up to a peak of 4 it is smaller than the others; above, more segments
+    are needed."""
     first_s, last_s = shutter.lit_span_s
     pose = trajectory.pose(frame, start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1))
     fastest_rad = float(np.max(_turns_rad(pose))) * _TURN_SAMPLES
@@ -230,7 +228,7 @@ def segments_for(
 
 
 def _turns_rad(pose: np.ndarray) -> np.ndarray:
-    """Returns the angles (T − 1,) between successive poses (T, 12): the larger of the turns of source and detector."""
+    """Returns the angle in rad from each pose (T, 12) to the next, (T − 1,), of source or panel, whichever turns more."""
     u_hat, _, normal = np.moveaxis(body_frames(pose), -1, 0)
     source = pose[:, :3] / np.maximum(np.linalg.norm(pose[:, :3], axis=1, keepdims=True), 1e-300)
     chords = [np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (u_hat, normal, source)]
@@ -246,7 +244,7 @@ def cell_table(
     trajectory: Trajectory, shutter: Shutter, frame: int, time_s: np.ndarray, line_start: np.ndarray,
     line_stop: np.ndarray, weight: np.ndarray, lines: int
 ) -> TimeCells:
-    """Returns the cells at times (C,) in s, sorted by their first lines."""
+    """Returns the cells at times (C,) in s with the poses that the trajectory has then, sorted by their first lines."""
     order = np.argsort(line_start, kind="stable")
     return TimeCells(
         pose=trajectory.pose(frame, time_s[order]), time_s=time_s[order],

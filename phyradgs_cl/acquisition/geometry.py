@@ -1,7 +1,7 @@
 """Geometry of cone and parallel beams: positions of source and detector at a gantry angle, and the field of view.
 
-A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0), the step from column to column (û·du)
-and the step from row to row (v̂·dv). A parallel beam has the rays' direction, towards the panel, in place of the source.
+A *pose* is 12 numbers in world coordinates (mm): source, centre of pixel (0, 0), step to the next column (û·du), step to
+the next row (v̂·dv), x y z each. For a parallel beam, the direction of the rays towards the panel replaces the source.
 Operators take poses, never angles."""
 
 import math
@@ -16,19 +16,19 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
 POSE_LENGTH = 12
-# largest distance of the source from the axis, in voxels: float32 displaces rays by 6 % of a voxel, at 1e7 voxels by half
+# Largest distance of the source from the axis, in voxels. Here float32 displaces rays by 6 % of a voxel, at 1e7 by half.
 _MOST_VOXELS_AWAY = 1e6
-_STEEP = 1e-2  # lower limit of the squared sine of a ray's angle to z: where a steeper ray passes the axis is undetermined
+_STEEP = 1e-2  # least squared sine of a ray's angle to z: the height at which a steeper ray passes the axis is too uncertain
 
 
 @dataclass(frozen=True)
 class ConeGeometry:
     """A circular cone-beam orbit about +z with a flat panel, in mm.
 
-    ``source_to_axis_mm`` and ``source_to_detector_mm`` are measured along the central ray. ``detector_shape`` counts (rows,
-    columns). ``pixel_size_mm`` is (dv, du); one number stands for square pixels. ``detector_offset_mm`` (v, u) shifts the
-    panel's centre from the central ray. A positive v shifts it up, to higher rows. A positive u shifts it to higher
-    columns, to the right seen from the source.
+    ``source_to_axis_mm`` and ``source_to_detector_mm`` are measured along the central ray. ``detector_shape`` is (rows,
+    columns). ``pixel_size_mm`` is (dv, du), or one number for square pixels. ``detector_offset_mm`` (v, u) is the panel's
+    centre minus the central ray. A positive v moves the panel up, in the direction of rising rows. A positive u moves it in
+    the direction of rising columns, to the right seen from the source.
 
     Raises InputError for lengths and counts that are not above 0, and for a panel nearer to the source than the axis."""
 
@@ -47,7 +47,8 @@ class ConeGeometry:
         _check_panel(self)
 
     def pose(self, angle_rad: np.ndarray | float) -> np.ndarray:
-        """Returns poses (..., 12) float64 at gantry angles (...). The source is at (DSO cos θ, DSO sin θ, 0)."""
+        """Returns poses (..., 12) float64 at gantry angles θ (...). The source is at (DSO cos θ, DSO sin θ, 0), where DSO
+        is ``source_to_axis_mm``."""
         radial, panel = _panel_at(self, angle_rad)
         panel[..., :3] -= (self.source_to_detector_mm - self.source_to_axis_mm) * radial
         return np.concatenate([self.source_to_axis_mm * radial, panel], -1)
@@ -58,12 +59,12 @@ class ConeGeometry:
         return replace(self, **distances, **_scaled_panel(self, factor))
 
     def finer(self, factor: int) -> "ConeGeometry":
-        """Returns the geometry with every pixel cut into ``factor`` by ``factor``."""
+        """Returns the geometry with every pixel divided into ``factor`` by ``factor``."""
         return replace(self, **_finer_panel(self, factor))
 
     @property
     def magnification(self) -> float:
-        """The magnification at the axis: the size of an object's image on the detector over the object's size."""
+        """How many times larger the image of an object at the axis is than the object."""
         return self.source_to_detector_mm / self.source_to_axis_mm
 
 
@@ -71,10 +72,9 @@ class ConeGeometry:
 class ParallelGeometry:
     """A circular parallel-beam orbit about +z with a flat panel across the rays, in mm.
 
-    Distances do not matter: the panel's plane contains the axis. ``detector_shape`` counts (rows, columns).
-    ``pixel_size_mm`` is (dv, du); one number stands for square pixels. ``detector_offset_mm`` (v, u) shifts the panel's
-    centre from the ray through the axis, as in ``ConeGeometry``. A positive u shifts it to higher columns, to the right
-    along the rays.
+    The panel's distance does not matter, so its plane is taken to contain the axis. ``detector_shape`` is (rows, columns).
+    ``pixel_size_mm`` is (dv, du), or one number for square pixels. ``detector_offset_mm`` (v, u) is the panel's centre minus
+    the ray through the axis, with signs as in ``ConeGeometry``.
 
     Raises InputError for lengths and counts that are not above 0."""
 
@@ -86,8 +86,8 @@ class ParallelGeometry:
         _check_panel(self)
 
     def pose(self, angle_rad: np.ndarray | float) -> np.ndarray:
-        """Returns poses (..., 12) float64 at gantry angles (...). Rays run along (−cos θ, −sin θ, 0), away from a cone
-        beam's source."""
+        """Returns poses (..., 12) float64 at gantry angles θ (...). Rays run along (−cos θ, −sin θ, 0), as the central ray
+        of a cone beam does at the same angle."""
         radial, panel = _panel_at(self, angle_rad)
         return np.concatenate([-radial, panel], -1)
 
@@ -101,7 +101,7 @@ class ParallelGeometry:
 
     @property
     def magnification(self) -> float:
-        """The magnification, 1: parallel rays do not magnify."""
+        """1, because parallel rays do not magnify."""
         return 1.0
 
 
@@ -110,8 +110,8 @@ GEOMETRIES = (ConeGeometry, ParallelGeometry)
 
 
 def _check_panel(geometry: Geometry) -> None:
-    """Converts a geometry's fields to tuples, so that geometries can be compared. Raises InputError for shapes, lengths
-    and offsets out of range."""
+    """Converts the panel's fields to tuples, so that geometries can be compared. Raises InputError for shapes, lengths and
+    offsets out of range."""
     counts = checks.numbers("detector_shape", geometry.detector_shape, (2,))
     if (counts < 1).any() or (counts != np.floor(counts)).any():
         raise InputError("detector_shape", str(geometry.detector_shape), "two counts (rows, columns) of at least 1")
@@ -124,8 +124,8 @@ def _check_panel(geometry: Geometry) -> None:
 
 
 def _panel_at(geometry: Geometry, angle_rad: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the unit vector (..., 3) from the axis to the source, and the panel's 9 numbers (..., 9) of the poses in
-    mm. The panel's plane contains the axis."""
+    """Returns the unit vector (..., 3) from the axis to the source, and the last 9 numbers (..., 9) of poses in mm, for a
+    panel whose plane contains the axis."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
     u_hat = np.stack([-sin, cos, zero], -1)
@@ -146,7 +146,6 @@ def _finer_panel(geometry: Geometry, factor: int) -> dict[str, Any]:
 
 
 def _positive_mm(name: str, value: object, shape: tuple[int, ...]) -> None:
-    """Raises InputError unless ``value`` is a positive length, or a pair (v, u) of them."""
     if (checks.numbers(name, value, shape) <= 0).any():  # type: ignore[arg-type]
         expected = "two positive lengths in mm (v, u)" if shape else "a positive length in mm"
         raise InputError(name, checks.short_repr(value), expected)
@@ -161,10 +160,10 @@ def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarr
 
 
 def plain_geometry(pose: np.ndarray, panel: tuple[int, int], is_parallel: bool = False) -> Geometry:
-    """Returns the circular geometry nearest to poses (F, 12), by their mean distances and offsets.
+    """Returns the circular geometry with the mean distances and offsets of poses (F, 12).
 
-    The detector's distance is that of its plane. Its offset goes from the foot of the source on that plane (in a parallel
-    beam, of the axis) to the panel's middle."""
+    The distance to the detector is measured at right angles to it. The offset is measured from the point of its plane that
+    is nearest to the source (in a parallel beam, to the origin) to the panel's middle."""
     source, first, step_u, step_v = (pose[:, i : i + 3] for i in (0, 3, 6, 9))
     pitch_u, pitch_v = (np.linalg.norm(step, axis=1, keepdims=True) for step in (step_u, step_v))
     u_hat, v_hat = step_u / pitch_u, step_v / pitch_v
@@ -176,13 +175,13 @@ def plain_geometry(pose: np.ndarray, panel: tuple[int, int], is_parallel: bool =
     means = [float(np.mean(x)) for x in (to_axis, np.abs(away), pitch_v, pitch_u, offset_v, offset_u)]
     if is_parallel:
         return ParallelGeometry(panel, (means[2], means[3]), (means[4], means[5]))
-    to_detector = max(means[:2])  # the plane of a panel that does not turn with the source may be nearer than the axis
+    to_detector = max(means[:2])  # a panel that does not turn with the source may be nearer than the axis
     return ConeGeometry(means[0], to_detector, panel, (means[2], means[3]), (means[4], means[5]))
 
 
 def towards_source(pose: np.ndarray, is_parallel: bool) -> np.ndarray:
-    """Returns vectors (..., 3) from the axis towards the origin of the rays, for poses (..., 12). They lead to the source;
-    in a parallel beam they have length 1."""
+    """Returns vectors (..., 3) from the origin to the source, for poses (..., 12). In a parallel beam they are unit vectors
+    against the rays."""
     return -pose[..., :3] if is_parallel else pose[..., :3]
 
 
@@ -192,10 +191,11 @@ def transpose_pose(pose: np.ndarray) -> np.ndarray:
 
 
 def field_of_view_mm(geometry: Geometry) -> tuple[float, float, float]:
-    """Returns half the sides (z, y, x) of the box about the origin that the beam fills in every view of a full turn.
+    """Returns half the sides (z, y, x) in mm of the field of view of a full turn, a box about the origin.
 
-    The radius is DSO·sin(atan(half width/DSD)), with the far edge of a shifted panel. The height is the cone's at that
-    radius behind the axis. A parallel beam fills half the panel's width and height, up to its far edges."""
+    The radius is DSO·sin(atan(half width/DSD)), where the half width reaches to the farther edge of a shifted panel. The
+    height is the cone's height at that radius behind the axis. In a parallel beam the box reaches to the panel's farther
+    edges."""
     sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)
     half_height_mm, half_width_mm = (count * pitch / 2 + abs(offset) for count, pitch, offset in sides)
     if isinstance(geometry, ParallelGeometry):
@@ -207,11 +207,11 @@ def field_of_view_mm(geometry: Geometry) -> tuple[float, float, float]:
 
 
 def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
-    """Returns the cube as wide as a full turn's field of view, lower where the panel has few rows.
+    """Returns the grid of a full turn's field of view: a cube, or lower if the panel sees less along z.
 
-    A voxel is as large as a pixel at the axis: along z the pitch of rows, along y and x that of columns. In a parallel beam
-    the grid is as high as the panel. poses (F, 12): of a gantry that travels along z, as in a helix; the grid is longer by
-    the travel."""
+    Voxels are as large as pixels at the axis: the pitch of rows along z, the pitch of columns along y and x. In a parallel
+    beam the grid is as high as the panel. poses (F, 12): if they travel along z, as in a helix, the grid is longer by the
+    travel."""
     half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
     high_mm, wide_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     wide = max(1, math.ceil(2 * radius_mm / wide_mm))
@@ -219,15 +219,15 @@ def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
     if isinstance(geometry, ConeGeometry):
         high = min(max(1, round(wide * wide_mm / high_mm)), high)
     low_mm, top_mm = (0.0, 0.0) if poses is None else _travel_mm(poses, geometry)
-    if top_mm - low_mm < high_mm:  # a wobble of the gantry is no travel
+    if top_mm - low_mm < high_mm:  # less than a voxel: a wobble of the gantry
         return Grid((high, wide, wide), (high_mm, wide_mm, wide_mm))
     high += math.ceil((top_mm - low_mm) / high_mm)
     return Grid((high, wide, wide), (high_mm, wide_mm, wide_mm), ((low_mm + top_mm) / 2, 0.0, 0.0))
 
 
 def _travel_mm(poses: np.ndarray, geometry: Geometry) -> tuple[float, float]:
-    """Returns the lowest and highest z in mm at which rays of poses (F, 12) to the panel's middle pass the z axis. The
-    geometry's offset of the panel is taken out first."""
+    """Returns the lowest and highest z in mm at which the central rays of poses (F, 12) pass the z axis. The central ray
+    ends at the panel's middle minus the geometry's offset."""
     (rows, columns), (off_v, off_u) = geometry.detector_shape, geometry.detector_offset_mm
     start, first, step_u, step_v = (poses[:, i : i + 3] for i in (0, 3, 6, 9))
     at_v, at_u = ((n - 1) / 2 - off / pitch for n, off, pitch in
@@ -240,7 +240,7 @@ def _travel_mm(poses: np.ndarray, geometry: Geometry) -> tuple[float, float]:
 
 
 def check_distances(geometry: Geometry, grid: Grid) -> None:
-    """Raises InputError for a source so far away that float32 cannot tell its rays from parallel ones."""
+    """Raises InputError for a source so far away that float32 misplaces its rays."""
     if isinstance(geometry, ParallelGeometry):
         return
     source_mm, voxel_mm = geometry.source_to_axis_mm, min(grid.voxel_size_mm)
@@ -259,7 +259,7 @@ def misses(grid: Grid, geometry: Geometry) -> bool:
 
 
 def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_parallel: bool = False) -> str:
-    """Returns "behind the panel" or "beside the rays" for a grid that no ray of a pose (12,) meets; otherwise ""."""
+    """Returns why no ray of a pose (12,) meets a grid: "behind the panel" or "beside the rays"; "" if rays meet it."""
     corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(-1, 3)
     if is_parallel:
         basis = np.stack([pose[6:9], pose[9:12], pose[0:3]], -1)
@@ -277,12 +277,12 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_par
     inward = sides * np.sign(sides @ rays.sum(axis=0))[:, None]
     if (corners @ away > rays[0] @ away).all():
         return "behind the panel"
-    planes = np.concatenate([inward, away[None]])  # the sides of the pyramid of rays, and the source's own plane
+    planes = np.concatenate([inward, away[None]])  # the sides of the pyramid of rays, and the plane through the source
     return "beside the rays" if (corners @ planes.T < 0).all(axis=0).any() else ""
 
 
 def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
-    """Returns the distance in mm of the panel of a pose (12,) behind the middle of ``grid``. Below half the grid's width the
+    """Returns how far the panel of a pose (12,) is behind the middle of ``grid``, in mm. Below half the grid's width the
     panel stands inside the grid, and rays end there."""
     source, first, step_u, step_v = pose.reshape(4, 3)
     away = np.cross(step_u, step_v)
@@ -291,7 +291,7 @@ def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
 
 
 def cuts(grid: Grid, whole: Grid, geometry: Geometry) -> bool:
-    """Returns whether ``grid`` ends, by more than a voxel, inside the visible part of the box of ``whole``."""
+    """Returns whether ``grid`` misses more than a voxel of the part of ``whole`` in the field of view, on any side."""
     half_mm = np.array(field_of_view_mm(geometry))
     low_mm, high_mm = np.clip(whole.box_mm.T, -half_mm, half_mm)
     begin_mm, end_mm = grid.box_mm.T

@@ -1,7 +1,7 @@
-"""Motion models. Each turns a frame of a scan into time cells.
+"""Motion models: each gives the poses from which the lines of a frame are projected, and their weights.
 
-A model is a frozen class with ``cells(scan, frame)``. A user-defined class works in every method (docs/methods.md).
-On a stop-and-shoot scan every model of this module gives one pose per frame."""
+A model is a frozen class with ``cells(scan, frame)``, which returns ``TimeCells``. A user-defined class works in every
+method (docs/methods.md). For a stop-and-shoot scan every model of this module gives one pose per frame."""
 
 import math
 from collections.abc import Mapping
@@ -22,28 +22,27 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation
 
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
-"""The kinds of operator: ray projectors, splat projectors, and filtered backprojection."""
-_USUAL_TIMES = 6  # most times per exposure that ``PerRow`` chooses for usual motion, by the two fine steps below
-_MOST_TIMES = 100  # most times per exposure that ``PerRow`` chooses for fast motion, by the coarse step below
-_FINE_STEP_VOXELS = 0.3  # travel of the volume's rim, in voxels, for which ``PerRow`` takes one time
-_OBJECT_STEP_VOXELS = 0.7  # travel of the object's fastest part, in voxels, for one time: the rest of it travels less
-_COARSE_STEP_VOXELS = 3.6  # travel of rim or object, in voxels, for one time where _USUAL_TIMES are too few
+"""The kinds of operator that a model may suit: projectors of voxels, of Gaussians, and filtered backprojection."""
+_USUAL_TIMES = 6  # ``PerRow`` samples an exposure at no more times than this, unless motion is fast
+_MOST_TIMES = 100  # ``PerRow`` samples an exposure at no more times than this, however fast the motion
+_FINE_STEP_VOXELS = 0.3  # travel of the volume's rim from one time of ``PerRow`` to the next
+_OBJECT_STEP_VOXELS = 0.7  # travel of an object's fastest part from one time to the next: the rest of it travels less
+_COARSE_STEP_VOXELS = 3.6  # travel of rim or object from one time to the next where _USUAL_TIMES are too few
 _SUB_INTERVALS = "Sub-intervals N of an exposure; for phyradgs means micro-views."
-_WEIGHT_TOLERANCE = 1e-3  # largest difference from 1 of the sum of a line's weights in a user-defined model
+_WEIGHT_TOLERANCE = 1e-3  # in a user-defined model, the sum of a line's weights may differ from 1 by this much
 
 
 class Motion(Protocol):
-    """The interface of a motion model. Its ``name``, if it has one, and dataclass fields go into a result's provenance."""
+    """The interface of a motion model. A result's provenance lists its ``name``, if any, and its dataclass fields."""
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """Returns the time cells of one frame. The weights of every line sum to 1."""
 
 
 def rim_travel_voxels(scan: Scan) -> float:
-    """Returns the travel of the grid's rim, seen from the panel, during a line's exposure, in voxels of a slice (y, x).
+    """Returns how far the grid's rim moves, relative to the panel, during a line's exposure, in voxels of a slice (y, x).
 
-    The rim stands for the middles of the box's four sides around the axis. On a circular orbit they move relative to the
-    panel by r Δθ; where the panel does not turn, by its shift. The largest travel in the first, middle and last frame
-    counts; a gantry at rest has 0."""
+    The rim is represented by the middles of the grid's four sides around the axis. On a circular orbit they move by r Δθ.
+    The largest travel in the first, middle and last frame counts. For a gantry at rest it is 0."""
     if not scan.is_fly:
         return 0.0
     half_x_mm, half_y_mm = scan.grid.size_mm[2] / 2, scan.grid.size_mm[1] / 2
@@ -54,7 +53,7 @@ def rim_travel_voxels(scan: Scan) -> float:
 
 
 def _travel_mm(scan: Scan, frame: int, points_mm: np.ndarray) -> float:
-    """Returns the largest travel in mm of points (P, 3), in the panel's coordinates, during the first line's exposure."""
+    """Returns the largest travel in mm of points (P, 3), relative to the panel, during the first line's exposure."""
     start_s = float(scan.frame_start_s[frame])
     pose = scan.trajectory.pose(frame, np.array([start_s, start_s + scan.shutter.exposure_s]))
     panel, column, row = pose[:, 3:6], pose[:, 6:9], pose[:, 9:12]
@@ -69,31 +68,30 @@ def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int
 
 
 class _Model(checks.Checked):
-    """What help, checks and reports know about a model of this module."""
+    """Base of this module's models, with words for help texts and reports."""
 
-    poses: ClassVar[str] = ""  # in the help of --motion: a frame's poses; without it the command line lacks the model
-    counts: ClassVar[str] = ""  # its numbers in words, after its name
-    is_implied: ClassVar[bool] = True  # whether a number of its own, such as --strips, means the model
+    poses: ClassVar[str] = ""  # a frame's poses in words, for the help of --motion; "" hides the model from the command line
+    counts: ClassVar[str] = ""  # the model's numbers in words, appended to its name
+    is_implied: ClassVar[bool] = True  # whether giving one of its numbers, such as --strips, chooses the model
 
 
 @dataclass(frozen=True)
 class Static(_Model):
-    """One pose per frame, at the middle of its lit span, in which any line is open. This model ignores the motion of the
-    gantry."""
+    """One pose per frame, in the middle between its first and its last light. This model ignores the gantry's motion."""
 
     poses: ClassVar = "one"
     operators: ClassVar = (RAYS, SPLATS, LINE_POSES)
     name: str = field(default="static", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """Returns the ``TimeCells`` of one frame: one cell, at the middle of the lit span."""
+        """Returns the ``TimeCells`` of one frame: one cell, in the middle between first and last light."""
         return cells.static_cells(*_place(scan, frame))
 
 
 @dataclass(frozen=True)
 class StaticStart(_Model):
-    """One pose per frame, at first light. The volume comes out rotated by half the lit span's arc against that of
-    ``static``."""
+    """One pose per frame, at its first light. Compared with ``static``, the volume is rotated by half of the arc that the
+    gantry turns from a frame's first light to its last."""
 
     operators: ClassVar = (RAYS, SPLATS, LINE_POSES)
     name: str = field(default="static-start", init=False, repr=False)
@@ -105,7 +103,9 @@ class StaticStart(_Model):
 
 @dataclass(frozen=True)
 class MicroViews(_Model):
-    """M ``strips`` of lines × N ``sub_intervals`` poses per frame (paper, Eq. 2). Raises InputError for counts below 1."""
+    """M × N poses per frame: N ``sub_intervals`` of the exposure of each of M ``strips`` of lines (paper, Eq. 2).
+
+    Raises InputError for numbers below 1."""
 
     poses: ClassVar = "M×N"
     counts: ClassVar = " {strips} × {sub_intervals}"
@@ -123,10 +123,10 @@ class MicroViews(_Model):
 
 @dataclass(frozen=True)
 class Centres(MicroViews):
-    """``MicroViews`` in which only the centres of splats move, as in GS-on-the-Move (the paper's reference 21).
+    """``MicroViews`` that move only the Gaussians' centres on the panel, as in GS-on-the-Move (the paper's reference 21).
 
-    ``strips`` of lines × ``sub_intervals`` poses per frame move the centres. Conics, extents and densities on the panel are
-    those of the middle of the frame's lit span. Raises InputError for counts below 1."""
+    The shapes and densities of Gaussians on the panel are computed for one pose per frame, that of ``Static``. ``strips``
+    and ``sub_intervals`` are those of ``MicroViews``. Raises InputError for numbers below 1."""
 
     poses: ClassVar = "M×N for centres of splats"
     is_implied: ClassVar = False
@@ -142,10 +142,11 @@ class Centres(MicroViews):
 
 @dataclass(frozen=True)
 class PerRow(_Model):
-    """Every line averages over its own window. Lines of a frame take their poses from one grid of times.
+    """Every line averages over its own exposure, at times that all lines of a frame share.
 
-    ``sub_intervals`` counts the times in an exposure; 0 takes as many as the scan needs (``of``). The weight of a line in
-    a cell is the fraction of its window that lies there. Raises InputError for a count below 0."""
+    ``sub_intervals`` is the number of times in an exposure; 0 takes as many as the scan needs (``of``). Each time stands
+    for a cell of the frame's time, and a line weights it by the fraction of its exposure in the cell. Raises InputError for
+    a number below 0."""
 
     poses: ClassVar = "one per line"
     counts: ClassVar = ", times per exposure: {sub_intervals}"
@@ -154,11 +155,11 @@ class PerRow(_Model):
     sub_intervals: int = checks.ranged(0, 0, 10_000)
 
     def of(self, scan: Scan, object_mm_per_s: float = 0.0) -> "PerRow":
-        """Returns the model with as many times as the scan needs; a stated number stays. object_mm_per_s: speed of the
+        """Returns the model with as many times as the scan needs. A stated number stays. object_mm_per_s: the speed of the
         object's fastest part.
 
-        It takes one time per 0.3 voxels of the rim's travel in an exposure, or per 0.7 voxels of the object's, up to 6
-        times. These serve up to 22 voxels; longer travel takes one time per 3.6 voxels (measured in
+        In an exposure it takes one time per 0.3 voxels that the rim moves, or per 0.7 voxels that the object moves, but at
+        most 6. These suffice up to 22 voxels. Longer travel takes one time per 3.6 voxels (measured in
         docs/results/settings.md)."""
         if self.sub_intervals:
             return self
@@ -178,8 +179,8 @@ class PerRow(_Model):
 
 @dataclass(frozen=True)
 class OwnTimes(_Model):
-    """Every line has ``sub_intervals`` poses in its own exposure, as in the simulator. ``per-row`` is faster and as exact.
-    Raises InputError for a count below 1."""
+    """Every line has ``sub_intervals`` poses of its own in its exposure, as in the simulator. ``per-row`` is as exact and
+    faster. Raises InputError for a number below 1."""
 
     operators: ClassVar = (RAYS,)
     name: str = field(default="own-times", init=False, repr=False)
@@ -195,7 +196,7 @@ class OwnTimes(_Model):
 
 @dataclass(frozen=True)
 class LineMiddles(_Model):
-    """One pose per line, at the middle of its exposure: the model ``per-row`` of filtered backprojection."""
+    """One pose per line, at the middle of its exposure. This is what ``per-row`` means in filtered backprojection."""
 
     operators: ClassVar = (LINE_POSES,)
     name: str = field(default="per-row", init=False, repr=False)
@@ -207,10 +208,11 @@ class LineMiddles(_Model):
 
 @dataclass(frozen=True)
 class Exact(_Model):
-    """``segments`` of a frame's time, in which splats move. Every line integrates over its own window.
+    """Gaussians move on the panel during a frame, which is divided into ``segments`` of time. Every line integrates over
+    its own exposure.
 
-    0 segments takes as many as keep a frame's error below ``time_error``, relative to the frame's RMS. ``time_error``
-    also bounds the error of quadrature over time. Raises InputError for numbers out of range."""
+    0 segments takes as many as keep a frame's error below ``time_error``, relative to its RMS. ``time_error`` also limits
+    the error of the numerical integration over time. Raises InputError for numbers out of range."""
 
     poses: ClassVar = "integrals over time, of splats"
     operators: ClassVar = (SPLATS,)
@@ -219,7 +221,8 @@ class Exact(_Model):
     time_error: float = checks.ranged(0.005, 1e-6, 1)
 
     def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
-        """Returns the ``TimeCells`` of one frame, one per segment. intensity_peak: as in ``segments_for``."""
+        """Returns the ``TimeCells`` of one frame, one per segment. intensity_peak: the largest line integral if the detector
+        averages intensities, else 0."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = _place(scan, frame)
@@ -229,17 +232,17 @@ class Exact(_Model):
 
 MODELS = (Static, StaticStart, MicroViews, Centres, PerRow, OwnTimes, Exact, LineMiddles)
 MOTIONS = tuple(dict.fromkeys(model.name for model in MODELS))
-"""The names of the models."""
+"""The names of all models."""
 
 
 def motions_for(*operators: str) -> tuple[Motion, ...]:
-    """Returns the models, with their default numbers, that suit one of these types of operator: RAYS, SPLATS or
-    LINE_POSES."""
+    """Returns the models, with their default numbers, that suit any of the given operators: RAYS, SPLATS, LINE_POSES."""
     return tuple(model() for model in MODELS if set(operators) & set(model.operators))
 
 
 def motion_of(motion: str | Motion) -> Motion:
-    """Returns the model of a name, with its default numbers, or the given model. Raises InputError for an unknown name."""
+    """Returns the model with a name and its default numbers. Returns a model unchanged. Raises InputError for an unknown
+    name."""
     if not isinstance(motion, str):
         return motion
     if motion not in MOTIONS:
@@ -248,13 +251,13 @@ def motion_of(motion: str | Motion) -> Motion:
 
 
 def with_times(motion: Motion, scan: Scan, deformation: Deformation | None = None) -> Motion:
-    """Returns ``motion``; a ``PerRow`` without a number of times gets the number that scan and deformation need."""
+    """Returns ``motion``, but a ``PerRow`` without a number of times with the number that scan and deformation need."""
     speed_mm_per_s = 0.0 if deformation is None else deformation.fastest_mm_per_s
     return motion.of(scan, speed_mm_per_s) if isinstance(motion, PerRow) else motion
 
 
 def motion_facts(motion: Motion) -> dict[str, object]:
-    """Returns a model's name and fields for the provenance. Values that JSON cannot hold become their ``repr``."""
+    """Returns a model's name and fields for a result's provenance. Values that JSON cannot hold become their ``repr``."""
     values: dict[str, Any] = asdict(motion) if is_dataclass(motion) and not isinstance(motion, type) else {}
     values = {key: value.item() if isinstance(value, np.generic) else value for key, value in values.items()}
     plain = {key: value if isinstance(value, int | float | str) else repr(value) for key, value in values.items()}
@@ -262,14 +265,15 @@ def motion_facts(motion: Motion) -> dict[str, object]:
 
 
 def motion_in_words(facts: Mapping[str, object]) -> str:
-    """Returns a model's name and numbers in words, from its facts."""
+    """Returns a model's name and numbers in words, from the result of ``motion_facts``."""
     name = str(facts.get("name"))
     having = [model for model in MODELS if model.name == name and all(f.name in facts for f in fields(model))]
     return name + (having[0].counts.format(**facts) if having else "")
 
 
 def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
-    """Inverts ``motion_facts``. Returns None for a user-defined model. Values out of range raise InputError or TypeError."""
+    """Returns the model from the result of ``motion_facts``, or None for a user-defined one. Raises InputError or TypeError
+    for values out of range."""
     for model in MODELS:
         keys = [f.name for f in fields(model) if f.init]
         if model.name == facts.get("name") and all(key in facts for key in keys):
@@ -278,7 +282,7 @@ def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
 
 
 def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
-    """Raises InputError for one of ``MODELS`` whose class none of ``taken`` has, and for a value that is no model."""
+    """Raises InputError for a value that is no model, and for a model of this module that is not among ``taken``."""
     if isinstance(motion, type) and hasattr(motion, "cells"):
         raise InputError("--motion", f"the class {motion.__name__}", "a model", f"write {motion.__name__}()")
     if not callable(getattr(motion, "cells", None)):
@@ -288,7 +292,7 @@ def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
 
 
 class MotionOptions(checks.Checked):
-    """Options of a method, whose motion is one of ``MOTIONS`` or of a class of the user's own."""
+    """Base of a method's options: checks that ``motion`` is one of ``MOTIONS`` or of a user-defined class."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]]
     motion: Motion
@@ -299,7 +303,7 @@ class MotionOptions(checks.Checked):
 
 
 def check_own_motion(motion: Motion | None, scan: Scan) -> None:
-    """Raises InputError where a user-defined model's cells of the first frame do not fit the scan."""
+    """Raises InputError if the cells that a user-defined model returns for the first frame do not fit the scan."""
     if motion is None or isinstance(motion, MODELS):
         return
     subject, table = f"motion {type(motion).__name__}", motion.cells(scan, 0)

@@ -1,4 +1,4 @@
-"""Summarises a scan in two or three lines with its blur, and refuses or warns of numbers that no scanner has."""
+"""Summarises a scan in two or three lines, and finds numbers that no scanner has, as from a wrong unit."""
 
 import logging
 import math
@@ -15,39 +15,39 @@ if TYPE_CHECKING:
     from phyradgs_cl.acquisition.scan import Scan
 
 log = logging.getLogger(__name__)
-OPAQUE = 50.0  # largest line integral that a panel can measure; most pixels above it mean an error, a few a warning
-FEW = 0.01  # largest fraction of a panel's pixels that may be broken without a warning
-_WIDEST_DEG = 120.0  # upper limit of a panel's fan and cone angles; dental scanners have 30°, nano-CT 60°
-_LARGEST_PITCH_MM = 5.0  # largest pitch of real pixels: a wide fan with larger ones has wrong pixel sizes
-_LEAST_DISTANCE_MM = 10.0  # least real distance from source to panel: a wide fan with a shorter one has wrong distances
-_WRONG_UNIT = 100.0  # upper limit of readout over frame time: milliseconds given as seconds make it some hundreds
-_SHORT_READOUT_S = 0.5e-3  # a shorter readout of _MANY_LINES lines or more is warned of: panels take some ms
-_MANY_LINES = 100  # least number of lines for the warning of a short readout
-_SLOW_FPS = 2.0  # a lower frame rate is warned of where the median step between frames exceeds _LARGE_STEP_DEG
-_LARGE_STEP_DEG = 10.0  # largest step of the gantry between frames without a warning of a low frame rate
-_TIMES = 17  # number of angles sampled in an exposure: between two of them no gantry makes half a turn
-_SLACK = 1e-3  # relative tolerance: times and angles come rounded
-_MANY_FRAMES = 10  # least number of frames for the warning of radians: fewer may lie within a few degrees on purpose
+OPAQUE = 50.0  # no panel can measure a larger line integral
+FEW = 0.01  # fraction of pixels above OPAQUE that is ignored, since some pixels of a panel may be broken
+_WIDEST_DEG = 120.0  # a fan or cone angle above this is refused: dental scanners have 30°, nano-CT 60°
+_LARGEST_PITCH_MM = 5.0  # pixels larger than this are not real, so they are named as the cause of too wide a fan
+_LEAST_DISTANCE_MM = 10.0  # a panel nearer to the source than this is not real, so distances are named as the cause
+_WRONG_UNIT = 100.0  # a readout of more frame times than this is refused: ms given as s make it some hundreds
+_SHORT_READOUT_S = 0.5e-3  # a shorter readout causes a warning, for panels of _MANY_LINES: real ones take some ms
+_MANY_LINES = 100
+_SLOW_FPS = 2.0  # a lower frame rate causes a warning if the gantry turns more than _LARGE_STEP_DEG between frames
+_LARGE_STEP_DEG = 10.0
+_TIMES = 17  # number of angles sampled in an exposure: no gantry makes half a turn from one to the next
+_SLACK = 1e-3  # relative tolerance, because stated times and angles are rounded
+_MANY_FRAMES = 10  # fewer frames may lie within a few degrees on purpose, so they cause no warning about radians
 _ASIDE = 0.1  # a panel off centre by more than this fraction of its width was displaced for a wider field of view
 
 
 def summary(scan: "Scan") -> str:
-    """Returns one line about a scan's timing, one about its sizes, and one about the blur of a fly-scan. Values that the
-    provenance lists as assumed are marked."""
+    """Returns a line about a scan's timing, a line about its sizes and, for a fly-scan, a line about its blur. Values that
+    nobody stated, as the provenance lists them, are marked "(assumed)"."""
     return "\n".join(filter(None, (_timing(scan), _sizes(scan), blur_line(scan))))
 
 
 def blur_facts(scan: "Scan") -> dict[str, float]:
-    """Returns ``blur_at_rim_px`` and ``blur_at_half_radius_px`` of a fly-scan, in columns; an empty dict at rest.
+    """Returns ``blur_at_rim_px`` and ``blur_at_half_radius_px`` of a fly-scan, in columns; {} for a gantry at rest.
 
-    In an exposure with arc Δθ a point at radius r moves by r·Δθ, and blurs most where it moves at right angles to its ray.
-    With the magnification M its image moves by M·r·Δθ, and M·r is the image's largest distance from the axis. So the blur is
-    the arc times a radius on the panel, whatever M is. This is the first order in r/R, with R from source to axis. A point
-    nearer to the source is magnified up to R/(R − r) times as much, one nearer to the panel down to R/(R + r) times.
+    The blur is Δθ times the radius on the panel, in columns. Δθ is the arc of an exposure. A point at radius r moves by
+    r·Δθ, and its image by M·r·Δθ where it moves at right angles to the ray, with the magnification M. M·r is its largest
+    distance from the axis on the panel. This is the first order in r/R, with R from source to axis: a point nearer to the
+    source blurs up to R/(R − r) times as much, one nearer to the panel down to R/(R + r) times.
 
-    The arc is the median over the frames; only the time that a line is open with the beam on counts. The rim is the largest
-    radius that every view sees, up to the panel's nearer side. A panel more than a tenth of its width off centre was
-    displaced for a wider field of view, which opposite views complete: its rim is the farther side."""
+    Δθ is the median over the frames, while a line is open and the beam on. The rim is the largest radius that every view
+    sees, which the panel's nearer side limits. A panel more than a tenth of its width off centre was displaced for a wider
+    field of view, where opposite views complete each other: its rim is the farther side."""
     if not scan.is_fly:
         return {}
     windows_s = scan.shutter.line_windows_s(scan.lines)
@@ -61,13 +61,13 @@ def blur_facts(scan: "Scan") -> dict[str, float]:
 
 
 def blur_line(scan: "Scan") -> str:
-    """Returns a line such as "blur at the rim: 1.4 px, at half radius 0.7 px" of a fly-scan; "" of a scan at rest."""
+    """Returns a line such as "blur at the rim: 1.4 px, at half radius 0.7 px", or "" for a gantry at rest."""
     facts = blur_facts(scan)
     return "blur at the rim: {:.2g} px, at half radius {:.2g} px".format(*facts.values()) if facts else ""
 
 
 def _cone_deg(geometry: Geometry) -> tuple[float, float]:
-    """Returns the full angles (cone along v, fan along u) in degrees of the panel at the source; 0 in a parallel beam."""
+    """Returns the full cone angle (along v) and fan angle (along u) in degrees; 0 in a parallel beam."""
     if isinstance(geometry, ParallelGeometry):
         return 0.0, 0.0
     sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)
@@ -78,12 +78,13 @@ def _cone_deg(geometry: Geometry) -> tuple[float, float]:
 
 
 def _frame_time_s(scan: "Scan") -> float:
-    """Returns the median time from frame to frame; NaN for a single frame."""
+    """Returns the median time in s from a frame's start to the next frame's; NaN for a single frame."""
     return float(np.median(np.diff(scan.frame_start_s))) if scan.frames > 1 else math.nan
 
 
 def _source_angle_rad(scan: "Scan", first_s: float, last_s: float) -> np.ndarray:
-    """Returns the source's angle (F, T) about the axis at T times after each frame's start, unwrapped within a frame."""
+    """Returns the source's angle (F, T) in rad about the axis, without jumps, at T times from ``first_s`` to ``last_s``
+    after each frame's start."""
     delay_s = np.linspace(first_s, last_s, _TIMES)
     poses = np.stack([scan.trajectory.pose(f, t + delay_s) for f, t in enumerate(scan.frame_start_s)])
     source = towards_source(poses, scan.is_parallel)
@@ -138,10 +139,10 @@ def _joined(values: tuple[float, ...]) -> str:
 def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> None:
     """Raises InputError for sizes and times that no scanner has, and for line integrals so large that they must be counts.
 
-    Warns of times most likely in a wrong unit, of angles that look like radians and of line integrals that may be counts.
-    ``named`` translates ``source_to_axis_mm``, ``source_to_detector_mm``, ``pixel_size_mm``, ``grid``, ``readout_s``,
-    ``exposure_s``, ``frame_time_s``, ``angles`` and ``quantity`` to the caller's names. ``is_timed``: False where nobody
-    stated a time, which makes the frame rate meaningless."""
+    Warns of times that are probably in a wrong unit, angles that look like radians, and line integrals that may be counts.
+    named: translates ``source_to_axis_mm``, ``source_to_detector_mm``, ``pixel_size_mm``, ``grid``, ``readout_s``,
+    ``exposure_s``, ``frame_time_s``, ``angles`` and ``quantity`` to what the user wrote. is_timed: False if nobody stated
+    times, so that the frame rate means nothing."""
     _check_panel(scan.geometry, named)
     _check_voxels(scan.grid, scan.geometry, named("grid"))
     angle_deg = np.rad2deg(np.unwrap(_source_angle_rad(scan, 0.0, scan.shutter.exposure_s)[:, 0]))
@@ -157,8 +158,8 @@ def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> 
 
 
 def _check_opaque(scan: "Scan", subject: str) -> None:
-    """Raises InputError where most pixels are darker than a panel can measure, as counts would be read, whose air is
-    bright. Warns where some pixels are that dark."""
+    """Raises InputError if most line integrals are larger than a panel can measure: they are counts then, which are large
+    in air. Warns if more than a few are."""
     pairs = zip(scan.projections, scan.valid, strict=True)
     counts = [(np.count_nonzero(frame[valid] > OPAQUE), np.count_nonzero(valid)) for frame, valid in pairs]
     opaque, valid_pixels = np.sum(counts, axis=0).tolist()
@@ -173,7 +174,7 @@ def _check_opaque(scan: "Scan", subject: str) -> None:
 
 
 def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:
-    """Warns, and returns True, where the angles (F,) of many frames lie within 2π degrees: they may be radians."""
+    """Returns whether the angles (F,) of many frames lie within 2π degrees; then warns that they may be radians."""
     span_deg = float(np.ptp(angle_deg))
     looks_so = len(angle_deg) >= _MANY_FRAMES and 0 < span_deg <= 2 * np.pi * (1 + _SLACK)
     if looks_so:
@@ -183,8 +184,8 @@ def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:
 
 
 def _check_panel(geometry: Geometry, named: Named) -> None:
-    """Raises InputError for a panel with too wide a fan. The error names the distances where they are too short for any
-    panel and the pixels are not too large, otherwise the pixels."""
+    """Raises InputError for too wide a fan or cone. The message blames the distances if they are too short and the pixels
+    are not too large, else the pixels."""
     widest_deg = max(_cone_deg(geometry))
     if isinstance(geometry, ParallelGeometry) or widest_deg <= _WIDEST_DEG:
         return
@@ -228,7 +229,7 @@ def _longer_than_a_frame(subject: str, stated: str, time_s: float, frame_s: floa
 
 
 def _warn_of_slow_frames(frame_s: float, angle_deg: np.ndarray, subject: str) -> None:
-    """Warns of a low frame rate where the gantry turns far between two frames. angle_deg (F,): the frames' angles."""
+    """Warns of a low frame rate if the gantry turns far from frame to frame. angle_deg (F,): the frames' angles."""
     step_deg = float(np.median(np.abs(np.diff(angle_deg))))
     if _SLOW_FPS * frame_s > 1 and step_deg > _LARGE_STEP_DEG:
         log.warning("%s: %.3g fps and %.3g° from frame to frame; is the rate right?", subject, 1 / frame_s, step_deg)

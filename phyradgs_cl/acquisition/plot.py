@@ -1,4 +1,4 @@
-"""Figures of a scan: a frame, and the exposure windows of its lines."""
+"""Figures of a scan: a frame, and when its lines are exposed."""
 
 from typing import TYPE_CHECKING
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
     from phyradgs_cl.acquisition.scan import Scan
 
-_MOST_CORNERS = 129  # most points along the opening, and along the closing, side of an outline
+_MOST_CORNERS = 129  # most points on either side of an outline: a panel may have thousands of lines
 
 
 def plot_frame(scan: "Scan", frame: int = 0) -> "Figure":
-    """Returns a figure of one frame (rows, columns), and of the times in s at which its lines are open.
+    """Draws one frame's line integrals (rows, columns), with the panel's size in mm, and the times in s of its lines.
 
-    The frame's line integrals are drawn in mm on the panel. Raises InputError for a frame number out of range."""
+    Raises InputError for a frame number out of range."""
     checks.whole("frame", frame, 0, scan.frames - 1)
     figure = new_figure(10, 4.2)
     picture, windows = figure.subplots(1, 2, width_ratios=(1, 1.1))
@@ -48,7 +48,8 @@ def plot_frame(scan: "Scan", frame: int = 0) -> "Figure":
 
 
 def draw_windows(axes: "Axes", shutter: Shutter, lines: int, start_s: float = 0.0) -> None:
-    """Draws the times in s, after ``start_s``, at which each line opens and closes, and the part with a pulsed beam on."""
+    """Draws when each line is exposed, in s, for a frame that starts at ``start_s``. With a pulsed beam also draws when
+    lines are open without light."""
     line = np.unique(np.linspace(0, lines - 1, _MOST_CORNERS).round().astype(int))
     lit_s = shutter.line_windows_s(lines)[line] + start_s
     if shutter.pulse_s is not None:
@@ -60,12 +61,11 @@ def draw_windows(axes: "Axes", shutter: Shutter, lines: int, start_s: float = 0.
 
 
 def _outline(first_s: np.ndarray, last_s: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the corners (times, lines) of a window between a first and a last time per line."""
     return np.concatenate([first_s, last_s[::-1]]), np.concatenate([line, line[::-1]])
 
 
 def _turned_deg(scan: "Scan", frame: int) -> tuple[float, float]:
-    """Returns the source's azimuth in degrees when a frame's first line opens, and when its last line closes."""
+    """Returns the source's angle about z in degrees when a frame's first line opens and when its last line closes."""
     times_s = scan.frame_start_s[frame] + np.array([0.0, scan.shutter.span_s])
     source = towards_source(scan.trajectory.pose(frame, times_s), scan.is_parallel)
     first, last = np.rad2deg(np.unwrap(np.arctan2(source[:, 1], source[:, 0])))

@@ -1,4 +1,4 @@
-"""Scan protocols: number of frames, arc of an exposure and readout, for simulations."""
+"""Scan protocols for simulations: number of frames, turns, arc of an exposure, readout and pulse."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,17 +14,17 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.text import flag_of
 
 _PULSE = "When the beam is on, in exposures after a frame's start."
-_FEWEST_TURNS = 1e-3  # least number of turns in either direction
-_MOST_TURNS = 10_000  # largest number of turns in either direction
+_FEWEST_TURNS = 1e-3  # least number of turns, in either direction
+_MOST_TURNS = 10_000
 
 
 @dataclass(frozen=True)
 class Protocol:
     """``views`` frames in ``turns`` turns at constant speed, each exposing an arc of ``exposure_deg`` (paper, section 3.1).
 
-    The gantry turns clockwise, seen from above, where ``turns`` is below 0. ``readout_ratio`` is T_ro/T_exp, and
-    ``exposure_s`` is T_exp. ``pulse``: (start, length) of the time that the beam is on, in exposures after a frame's start;
-    None: always. Raises InputError for values out of range."""
+    A negative ``turns`` means clockwise, seen from above. ``start_deg``: the gantry's angle at the start. ``exposure_s``
+    is the exposure T_exp, ``readout_ratio`` is T_ro/T_exp. ``pulse``: (start, length) of the time when the beam is on, after
+    a frame's start, in units of T_exp; None means always. Raises InputError for values out of range."""
 
     views: int = checks.option(25, "Frames of the scan.", "protocol's", range=(1, 100_000))
     exposure_deg: float = checks.option(14.4, "Arc of one exposure, degrees.", "protocol's", range=(0, 3600))
@@ -56,7 +56,7 @@ class Protocol:
         return 360.0 * self.turns / self.views
 
     def at_rate(self, fps: float, readout_ms: float | None = None, named: Named = str) -> "Protocol":
-        """Returns the protocol with the exposure time and readout ratio of ``fps`` frames per second and a readout in ms.
+        """Returns the protocol with the exposure time that gives ``fps`` frames per second, and with a readout in ms.
 
         Raises InputError for an arc of 0, and for a readout longer than a frame."""
         checks.positive(named("fps"), fps)
@@ -76,14 +76,14 @@ class Protocol:
         return Shutter(self.exposure_s, self.readout_ratio * self.exposure_s, axis, direction, pulse_s)
 
     def frame_start_s(self) -> np.ndarray:
-        """Returns the frames' opening times (F,) in s, |step| / arc exposures apart; with an arc of 0, one after the
-        other."""
+        """Returns when the frames open, (F,) in s. They are as far apart as the gantry takes for a step; with an arc of 0
+        they follow each other directly."""
         if self.exposure_deg == 0:
             return np.arange(self.views) * self.shutter().span_s
         return np.arange(self.views) * abs(self.step_deg) / self.exposure_deg * self.exposure_s
 
     def window_s(self) -> tuple[float, float]:
-        """Returns the times in s at which the first line opens and the last one closes."""
+        """Returns when the scan's first line opens and its last one closes, in s."""
         start_s = self.frame_start_s()
         return float(start_s[0]), float(start_s[-1]) + self.shutter().span_s
 
@@ -93,10 +93,10 @@ class Protocol:
     def orbit(
         self, geometry: Geometry, jitter_deg: float = 0.0, rng: np.random.Generator | None = None
     ) -> CircularOrbit:
-        """Returns the trajectory. A stop-and-shoot gantry rests at the mid-window angles of the same fly-scan.
+        """Returns the trajectory. A stop-and-shoot gantry rests where the same fly-scan would be in the middle of a frame.
 
-        Jitter adds a random angle of standard deviation ``jitter_deg`` at one knot per frame, linear between knots; the
-        encoder records it. Raises InputError for jitter of a fly-scan without an arc or without ``rng``."""
+        jitter_deg: the standard deviation of a random angle per frame, linear in between, that is added to a fly-scan's
+        angles and that the encoder records. Raises InputError for jitter without an arc or without ``rng``."""
         first = self.angle_start_rad()
         arc_rad = self._arc_rad
         if not self.is_fly:
@@ -113,7 +113,6 @@ class Protocol:
 
     @property
     def _arc_rad(self) -> float:
-        """The arc of an exposure in rad; negative for a clockwise gantry."""
         return float(np.copysign(np.deg2rad(self.exposure_deg), self.turns))
 
     def _wandering_encoder(self, jitter_rad: float, rng: np.random.Generator) -> EncoderTable:
@@ -133,8 +132,8 @@ PROTOCOLS = {
 
 
 def make_protocol(name: str, **changes: Any) -> Protocol:
-    """Returns the protocol ``name`` with the ``changes`` of fields that are not None. Raises InputError for an unknown
-    name."""
+    """Returns the protocol ``name`` with fields changed by those ``changes`` that are not None. Raises InputError for an
+    unknown name."""
     if name not in PROTOCOLS:
         raise InputError("protocol", repr(name), f"one of {', '.join(PROTOCOLS)}")
     return replace(PROTOCOLS[name], **{k: v for k, v in changes.items() if v is not None})

@@ -1,4 +1,4 @@
-"""Readout of a panel: the order of its lines, and the terms of data sheets for order, frame rate and time."""
+"""Readout of a panel: in which order lines are read, and how data sheets state this order, frame rate and readout time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,17 +9,18 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.errors import InputError
 
-# Readout axis and direction, by the side of the panel that is read first, seen from the source.
+# (readout axis, direction) for each side of the panel, seen from the source, that may be read first.
 FIRST_LINES = {"bottom": ("rows", 1), "top": ("rows", -1), "left": ("columns", 1), "right": ("columns", -1)}
 SIDES = tuple(FIRST_LINES)
 Named = Callable[[str], str]
-"""Translates a field's name for messages: to an argument, an option of the command line or a key of a TOML file."""
+"""Translates a field's name to what the user wrote, for messages: an argument, an option or a key of a TOML file."""
 
 
 @dataclass(frozen=True)
 class Readout:
-    """The readout of a panel along ``axis``, "rows" or "columns": what one line is. Orders frames and poses as operators
-    need them, whose rows are the lines read out."""
+    """The ``axis`` of readout: whether a line that is read at a time is one of the "rows" or "columns" of the panel.
+
+    Operators need frames and poses as (lines, width); this converts them from (rows, columns) and back."""
 
     axis: str
 
@@ -29,11 +30,11 @@ class Readout:
         return (rows, columns) if self.axis == "rows" else (columns, rows)
 
     def frames(self, frames: np.ndarray) -> np.ndarray:
-        """Returns a view of frames (..., rows, columns) as (..., lines, width), or of the latter as the former."""
+        """Returns a view of frames (..., rows, columns) as (..., lines, width). Also converts them back."""
         return frames if self.axis == "rows" else frames.swapaxes(-1, -2)
 
     def poses(self, pose: np.ndarray) -> np.ndarray:
-        """Returns poses (..., 12) for frames in the order (lines, width), or those for the order (rows, columns)."""
+        """Returns poses (..., 12) for frames in the order (lines, width). Also converts them back."""
         return pose if self.axis == "rows" else transpose_pose(pose)
 
     def spread(self, by_line: np.ndarray) -> np.ndarray:
@@ -44,8 +45,8 @@ class Readout:
 def readout_order(
     first: str | None, axis: str | None, direction: int | None, named: Named = str
 ) -> tuple[str | None, int | None]:
-    """Returns readout axis and direction. ``first``, a key of ``FIRST_LINES``, states both. Raises InputError where the
-    arguments contradict each other."""
+    """Returns the readout axis and direction: what ``first``, a key of ``FIRST_LINES``, means if given, else ``axis`` and
+    ``direction``. Raises InputError if the arguments contradict each other."""
     if first is None:
         return axis, direction
     checks.one_of(named("first"), first, FIRST_LINES)
@@ -57,8 +58,8 @@ def readout_order(
 
 
 def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = str) -> float | None:
-    """Returns the seconds between frames, from ``fps`` or else ``frame_time_s``; None without either. Raises InputError
-    where both are given and differ."""
+    """Returns the seconds between frames, from ``fps`` or else ``frame_time_s``; None without either. Raises InputError if
+    both are given and differ."""
     if fps is None:
         return frame_time_s
     checks.positive(named("fps"), fps)
@@ -66,8 +67,8 @@ def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = 
 
 
 def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named = str) -> float | None:
-    """Returns a time in s, from ``in_ms`` or else ``in_s``; None without either. Raises InputError where both are given
-    and differ. word: "exposure" or "readout", for the message."""
+    """Returns a time in s, from ``in_ms`` or else ``in_s``; None without either. Raises InputError if both are given and
+    differ. word: "exposure" or "readout", for the message."""
     if in_ms is None:
         return in_s
     checks.at_least(named(f"{word}_ms"), in_ms, 0)
@@ -75,7 +76,7 @@ def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named 
 
 
 def check_readout(readout_ms: float | None, readout_ratio: float | None, fps: float | None, named: Named = str) -> None:
-    """Raises InputError for a ratio or a time out of range, for both together, and for a time in ms without a rate."""
+    """Raises InputError for a readout ratio or time out of range, for both together, and for a time in ms without fps."""
     if readout_ratio is not None:
         checks.within(named("readout_ratio"), readout_ratio, 0, 1000)
     if readout_ms is None:

@@ -1,4 +1,4 @@
-"""A scan: its line integrals, geometry, timing and trajectory, and the grid to reconstruct."""
+"""``Scan``: line integrals with their geometry, timing and trajectory, and the grid to reconstruct."""
 
 import logging
 from dataclasses import dataclass, field, replace
@@ -33,16 +33,16 @@ from phyradgs_cl.fields import Gating, Grid, GridChoice, Metal, MovingTruth
 
 log = logging.getLogger(__name__)
 DETECTOR_MODELS = ("log", "intensity")
-MODELS_OF_METHODS = ("scan", *DETECTOR_MODELS)  # "scan": that of the scan
+MODELS_OF_METHODS = ("scan", *DETECTOR_MODELS)  # "scan" takes the detector model that the scan states
 APPLIED = ("flats_applied", "darks_applied")
-"""The provenance's keys of the numbers of flats and darks that were applied to the counts."""
+"""Keys of a scan's provenance under which the numbers of applied flats and darks are stored."""
 _TITLE = "cone-beam scan"
-LARGEST_LAG = 0.9  # upper limit of ``Scan.lag``: no panel has nearly as much; towards 1 a frame holds hardly anything new
+LARGEST_LAG = 0.9  # largest ``Scan.lag``: no panel has nearly as much, and near 1 a frame would show hardly anything new
 
 
 @dataclass(frozen=True)
 class Saturation:
-    """The largest raw count, and the fraction of raw pixels clipped at it."""
+    """Saturation of the raw counts. level: the largest count. share: the fraction of pixels clipped at it."""
 
     level: float
     share: float
@@ -53,19 +53,19 @@ class Scan:
     """One scan of a cone or a parallel beam, in line integrals.
 
     - projections (F, nv, nu) float32: −ln(I/I0), dimensionless. Row 0 is the lowest.
-    - geometry and grid in mm, shutter in s. A panel scaled to the axis is moved behind the object.
+    - geometry and grid in mm, shutter in s. Some programs state a panel scaled to the axis: it is moved behind the object.
     - trajectory: anything with ``pose(frame, time_s)``, also a user-defined class.
-    - frame_start_s (F,): the times at which each frame's first line opens, in s.
-    - is_fly: False for stop-and-shoot scans, whatever the exposure time.
-    - detector_model: the quantity that the detector averages over an exposure, "log" (line integrals) or "intensity".
+    - frame_start_s (F,): when each frame's first line opens, in s.
+    - is_fly: False if the gantry stops for every frame (stop-and-shoot), whatever the exposure time.
+    - detector_model: what the detector averages over an exposure, "log" (line integrals) or "intensity".
     - pixel_mask (nv, nu) or (F, nv, nu): non-zero for pixels not to be used. Lines that a pulsed beam misses are added.
-    - reference (nz, ny, nx): the true volume in 1/mm on ``grid``. moving_truth: the true states on ``grid`` and the
-      deformation of a simulated object that moves.
+    - reference (nz, ny, nx): the true volume in 1/mm on ``grid``. moving_truth: true volumes and motion of a simulated
+      object that moves.
     - gating: a signal or phase of a moving object, recorded with the frames.
     - metal: the metal that is put back into volumes. The mask hides its shadow (docs/prepare.md).
-    - lag: the share λ of the recorded intensity that stems from earlier frames (detector/effects.py). The projections
+    - lag: the fraction λ of the recorded intensity that comes from earlier frames (detector/effects.py). The projections
       still contain it.
-    - saturation: None where raw counts were not examined. title and provenance are stored in files.
+    - saturation: None if raw counts were not examined. title and provenance are stored in files.
 
     Raises InputError for shapes that do not fit each other, and for line integrals that are not finite."""
 
@@ -87,7 +87,7 @@ class Scan:
     gating: Gating | None = None
     metal: Metal | None = None
     _checked: np.ndarray | None = field(default=None, kw_only=True)
-    """The projections that are known to be finite: ``replace`` with the same array does not look at them again."""
+    """Projections already known to be finite: ``dataclasses.replace`` need not check the same array again."""
 
     def __post_init__(self) -> None:
         self._check_kinds()
@@ -139,7 +139,7 @@ class Scan:
 
     @property
     def is_parallel(self) -> bool:
-        """True for a parallel beam: poses begin with the direction of the rays."""
+        """True for a parallel beam, whose poses begin with the direction of the rays."""
         return is_parallel(self.trajectory)
 
     def __repr__(self) -> str:
@@ -172,18 +172,18 @@ class Scan:
 
     @property
     def valid(self) -> np.ndarray:
-        """The pixels that may be used, a bool view (F, nv, nu)."""
+        """True for pixels that may be used: a bool view (F, nv, nu)."""
         unmasked = True if self.pixel_mask is None else np.asarray(self.pixel_mask) == 0
         return np.broadcast_to(unmasked, self.projections.shape)
 
     @property
     def lines(self) -> int:
-        """The number of lines along the readout axis."""
+        """The number of lines that the shutter reads one after the other: rows or columns."""
         return self.shutter.lines(self.geometry.detector_shape)
 
     def on_grid(self, grid: Grid) -> "Scan":
-        """Returns the scan with another grid. A known true volume is cut to the new grid where the old one contains it,
-        else dropped."""
+        """Returns the scan with another grid. A true volume is cut to the new grid if the old one contains it, else
+        dropped."""
         if grid == self.grid:
             return self
         part = grid.slices_in(self.grid)
@@ -206,15 +206,15 @@ class Scan:
         return self.on_grid(grid)
 
     def check_timing(self) -> None:
-        """Raises InputError for a trajectory that does not cover every frame's window, and for poses that are not finite.
-        Raises InputError also for an exposure too short for the precision of the scan's times."""
+        """Raises InputError for a trajectory that does not cover every frame, poses that are not finite, and an exposure too
+        short for the precision of the scan's times."""
         self.shutter.check_resolved(self.frame_start_s)
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # a gantry at rest has one pose
         for frame, start_s in enumerate(self.frame_start_s):
             checked_poses(self.trajectory, frame, np.array([start_s, start_s + last_s]))
 
     def warn_of_near_panel(self) -> None:
-        """Warns where the panel stands inside the grid as the first frame opens. No ray sees the part behind the panel."""
+        """Warns if the panel stands inside the grid as the first frame opens: no ray sees the part behind the panel."""
         if self.is_parallel:  # rays do not end at the panel
             return
         (pose,) = checked_poses(self.trajectory, 0, np.array(self.frame_start_s[:1]))
@@ -224,7 +224,7 @@ class Scan:
             log.warning(text, behind_mm)
 
     def warn_of_blind_places(self) -> None:
-        """Warns of a grid beside an orbit's field of view, and of a panel that sees no part of the rotation axis."""
+        """Warns, for a circular orbit, of a grid outside the field of view and of a panel that misses the rotation axis."""
         if not isinstance(self.trajectory, CircularOrbit):
             return
         fitting = default_grid(self.geometry)
@@ -242,9 +242,9 @@ class Scan:
             log.warning(text, half_panel_mm, offset_mm, offset_mm * pitch_mm)
 
     def warn_of_negative_integrals(self) -> None:
-        """Warns of line integrals whose sum is below 0, of which most methods make a volume of zeros.
+        """Warns of line integrals with a negative sum, from which most methods make a volume of zeros.
 
-        Raises InputError where frames have become NaN or infinite since the scan was made of them."""
+        Raises InputError if frames have become NaN or infinite since the scan was made."""
         total = float(np.sum(self.projections, where=self.valid, dtype=np.float64))
         if not np.isfinite(total):
             checks.finite("projections", np.where(self.valid, self.projections, 0))
@@ -253,7 +253,7 @@ class Scan:
             log.warning(text, total / np.count_nonzero(self.valid))
 
     def check_sight(self) -> None:
-        """Raises InputError for a grid that no ray meets at the start of any frame, because its volume would be 0.
+        """Raises InputError for a grid that no ray meets at the start of any frame, as its volume would be 0.
 
         Warns of a panel inside the grid."""
         self.warn_of_near_panel()
@@ -275,5 +275,5 @@ class Scan:
 
 
 def applied_facts(flats: int, darks: int) -> dict[str, object]:
-    """Returns the provenance's entries for the numbers of flats and darks that were applied; 0 has no entry."""
+    """Returns the entries of a scan's provenance for the numbers of applied flats and darks, without those that are 0."""
     return {name: count for name, count in zip(APPLIED, (flats, darks), strict=True) if count}

@@ -1,9 +1,9 @@
 """Makes stop-and-shoot scans from poses and from the geometries of ASTRA and TIGRE, without either package.
 
-ASTRA's ``cone_vec`` (F, 12) is source, centre of the panel, step from column to column, and step from row to row, x y z
-each. ``parallel3d_vec`` begins with the direction of the rays. TIGRE's cone equals ours: source at (DSO cos α, DSO sin α,
-0), columns along the turn, row 0 the lowest. Its pairs are (v, u) and its triples (z, y, x). ``COR`` shifts source and
-panel along the columns. Both packages put the rotation axis along z."""
+ASTRA's ``cone_vec`` (F, 12) is source, centre of the panel, step to the next column, step to the next row, x y z each.
+``parallel3d_vec`` begins with the direction of the rays. TIGRE's cone beam has our conventions: the source is at
+(DSO cos α, DSO sin α, 0), columns rise in the direction of the turn, row 0 is the lowest. Its pairs are (v, u), its triples
+(z, y, x). ``COR`` shifts source and panel in the direction of the columns. In both packages the rotation axis is z."""
 
 import logging
 from collections.abc import Iterable
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from phyradgs_cl.acquisition.scan import Scan
 
 log = logging.getLogger(__name__)
-_MOST_RAD = 20 * np.pi  # largest range of angles given as rad, ten turns: over a larger range they are most likely degrees
+_MOST_RAD = 20 * np.pi  # angles in rad that span more than these ten turns are most likely degrees
 _OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # fields of ``Scan``
 
 
@@ -43,10 +43,10 @@ def from_poses(
 
     frames (F, rows, columns): line integrals. poses (F, 12) in mm: source, centre of pixel (0, 0), step to the next column,
     step to the next row, x y z each. With ``is_parallel`` they begin with the direction of the rays, of any length, in place
-    of the source. grid: None takes the field of view of a full turn, and the travel along z. others: the fields
+    of the source. grid: None takes the field of view of a full turn, longer if the poses travel along z. others: the fields
     detector_model, pixel_mask, reference, title, lag and provenance of ``Scan``.
 
-    Raises InputError for shapes that do not fit, for raw counts, and for poses from which no ray meets the grid."""
+    Raises InputError for shapes that do not fit, raw counts, and poses from which no ray meets the grid."""
     values = _uncounted(frames, others.get("pixel_mask"))
     checks.shape("frames", values, (None, None, None))
     table = checks.numbers("poses", poses, (len(values), POSE_LENGTH))
@@ -69,11 +69,11 @@ def from_astra(
     cls: "type[Scan]", /, frames: "ArrayLike", vectors: "ArrayLike", grid: Grid | None = None, *,
     is_parallel: bool = False, **others: Any,
 ) -> "Scan":
-    """Makes a stop-and-shoot scan from the vectors of an ASTRA geometry ``cone_vec``; ``astra_vectors`` inverts it.
+    """Makes a stop-and-shoot scan from an ASTRA geometry ``cone_vec`` or ``parallel3d_vec``. Inverse: ``astra_vectors``.
 
     frames (F, rows, columns): line integrals. ASTRA's order is (rows, F, columns): give ``sinogram.swapaxes(0, 1)``. vectors
-    (F, 12) in mm: source, centre of the panel, step from column to column, step from row to row. With ``is_parallel`` they
-    are those of ``parallel3d_vec``, which begin with the direction of the rays. grid, others: as in ``from_poses``. Raises
+    (F, 12) in mm: source, centre of the panel, step to the next column, step to the next row. is_parallel: the vectors are
+    those of ``parallel3d_vec``, which begin with the direction of the rays. grid, others: as in ``from_poses``. Raises
     InputError for shapes that do not fit."""
     values, table = _uncounted(frames, others.get("pixel_mask")), np.asarray(vectors)
     checks.shape("vectors", table, (None, POSE_LENGTH))
@@ -86,12 +86,11 @@ def from_astra(
 
 
 def from_tigre(cls: "type[Scan]", /, geo: Any, angles: "ArrayLike", frames: "ArrayLike", **others: Any) -> "Scan":
-    """Makes a stop-and-shoot scan from a TIGRE geometry, without TIGRE installed.
+    """Makes a stop-and-shoot scan from a TIGRE geometry. TIGRE need not be installed.
 
-    geo: anything with TIGRE's attributes in mm: DSD, DSO, nDetector, dDetector (v, u), nVoxel, dVoxel (z, y, x), and
-    optionally offDetector (v, u), offOrigin (z, y, x) and COR, each one value for all frames or one per frame.
+    geo: anything with TIGRE's attributes in mm: DSD, DSO (not needed for geo.mode "parallel"), nDetector, dDetector (v, u),
+    nVoxel, dVoxel (z, y, x). Optional are offDetector (v, u), offOrigin (z, y, x) and COR, each for all frames or per frame.
     angles (F,) in radians. frames (F, v, u): line integrals as TIGRE's ``Ax`` gives them. others: fields of ``Scan``.
-    With geo.mode "parallel" the distances are not needed.
 
     Raises InputError for a turned panel, and for attributes that are missing or do not fit."""
     check_others(others)
@@ -101,10 +100,10 @@ def from_tigre(cls: "type[Scan]", /, geo: Any, angles: "ArrayLike", frames: "Arr
 
 
 def astra_vectors(scan: "Scan") -> np.ndarray:
-    """Returns ASTRA's ``cone_vec`` or ``parallel3d_vec`` (F, 12) in mm, each frame at the middle of its lit window.
+    """Returns ASTRA's ``cone_vec`` or ``parallel3d_vec`` (F, 12) in mm, for the middle of each frame's exposure.
 
-    ``from_astra`` inverts it. ASTRA stacks frames as (rows, F, columns), ``scan.projections.swapaxes(0, 1)``; volumes are
-    (z, y, x)."""
+    Inverse: ``from_astra``. ASTRA takes frames as (rows, F, columns): give it ``scan.projections.swapaxes(0, 1)``. Its
+    volumes are (z, y, x), as here."""
     times_s = scan.frame_start_s + scan.shutter.middle_s
     vectors = np.stack([scan.trajectory.pose(f, np.array(t)) for f, t in enumerate(times_s)]).astype(np.float64)
     vectors[:, 3:6] += _to_middle(vectors, scan.geometry.detector_shape)
@@ -112,8 +111,8 @@ def astra_vectors(scan: "Scan") -> np.ndarray:
 
 
 def check_others(others: Iterable[str], arguments: Iterable[str] = ()) -> None:
-    """Raises InputError for a keyword that is neither an optional field of ``Scan`` nor one of the caller's
-    ``arguments``."""
+    """Raises InputError for a keyword among ``others`` that is no optional field of ``Scan``. arguments: further names that
+    the message lists as allowed."""
     allowed = (*arguments, *_OTHERS)
     for name in others:
         if name not in _OTHERS:
@@ -121,7 +120,7 @@ def check_others(others: Iterable[str], arguments: Iterable[str] = ()) -> None:
 
 
 def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = None) -> None:
-    """Raises InputError for frames that look like raw counts: whole numbers, or many unmasked values above 50."""
+    """Raises InputError for frames that look like raw counts: integers, or many unmasked values above 50."""
     if frames.dtype.kind in "iu":
         raise InputError("frames", f"whole numbers ({frames.dtype}) without flats", "line integrals", remedy)
     opaque = frames > OPAQUE
@@ -133,15 +132,15 @@ def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = N
 
 
 def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns ``line_integrals`` of frames whose quantity nobody stated. Raises InputError for counts."""
+    """Returns frames as ``line_integrals`` does, after ``check_not_counts``: nobody stated their quantity."""
     values = checks.real_array("frames", frames)
     check_not_counts(values, "give −ln(counts / flats)", mask)
     return line_integrals(values, mask)
 
 
 def line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as float32, with 0 for masked pixels that are not finite. Raises InputError where an unmasked pixel
-    is not finite."""
+    """Returns frames as float32, with 0 for masked pixels that are not finite. Raises InputError if an unmasked pixel is
+    not finite."""
     values = checks.real_array("projections", frames)
     with np.errstate(over="ignore"):
         values = values.astype(np.float32, copy=False)
@@ -153,7 +152,7 @@ def line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
 
 
 def poses_of_astra(vectors: ArrayLike, panel: tuple[int, int]) -> np.ndarray:
-    """Returns poses (F, 12) in mm of ASTRA's ``cone_vec`` (F, 12) in mm and a panel (rows, columns)."""
+    """Returns the poses (F, 12) in mm of ASTRA's vectors (F, 12) in mm, for a panel (rows, columns)."""
     table = checks.numbers("vectors", vectors, (None, POSE_LENGTH))
     pose: np.ndarray = table.copy()
     pose[:, 3:6] -= _to_middle(pose, panel)
@@ -169,8 +168,8 @@ def _to_middle(pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
 def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[int, int], Grid]:
     """Returns poses (F, 12), the panel (rows, columns) and the grid of a TIGRE geometry.
 
-    angles_rad: (F,), or Euler angles (F, 3). Raises InputError for geometries that a scan cannot hold: a turned panel, a
-    second or third Euler angle, or a volume that moves. Raises it too for attributes that are missing or no numbers."""
+    angles_rad: (F,), or Euler angles (F, 3). Raises InputError for features that scans here lack: a turned panel, a second
+    or third Euler angle, a volume that moves. Raises it also for attributes that are missing or no numbers."""
     if getattr(geo, "mode", None) not in (None, "cone", "parallel"):
         raise InputError("geo.mode", checks.short_repr(geo.mode), "'cone' or 'parallel'")
     angles = np.asarray(angles_rad)
@@ -206,12 +205,11 @@ def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[i
 
 
 def is_parallel_tigre(geo: Any) -> bool:
-    """Returns whether a TIGRE geometry has parallel beams."""
+    """Returns whether a TIGRE geometry has a parallel beam."""
     return bool(getattr(geo, "mode", None) == "parallel")
 
 
 def _of(geo: Any, name: str) -> Any:
-    """Returns an attribute of a TIGRE geometry. Raises InputError where it is missing."""
     if getattr(geo, name, None) is None:
         raise InputError(f"geo.{name}", "nothing", "TIGRE's attribute of this name", f"set geo.{name}")
     return getattr(geo, name)
@@ -225,8 +223,8 @@ def _counts(geo: Any, name: str, length: int) -> np.ndarray:
 
 
 def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.ndarray:
-    """Returns an attribute (F, length) of a TIGRE geometry, which may be given once or per frame. ``absent`` stands for a
-    missing attribute, except for DSO and DSD. Raises InputError where these are missing, and for other shapes."""
+    """Returns an attribute of a TIGRE geometry, given for all frames or per frame, as (F, length). A missing one counts as
+    ``absent``. Raises InputError if DSO or DSD is missing, and for other shapes."""
     value = _of(geo, name) if name in ("DSO", "DSD") else getattr(geo, name, None)
     table = checks.numbers(f"geo.{name}", absent if value is None else value)
     per_frame = (frames,) if length == 1 else (frames, length)

@@ -9,8 +9,8 @@ from phyradgs_cl.acquisition.readout import FIRST_LINES, Readout
 from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")
-_STEPS = 1000  # least number of float64 steps in an exposure: times within it are then exact to a thousandth
-_DARK = 1e-9  # a line's lit window up to this fraction of the longest is rounding: the beam's pulse misses the line
+_STEPS = 1000  # least number of float64 steps in an exposure: its parts are then exact to a thousandth
+_DARK = 1e-9  # a line exposed for less than this fraction of the longest exposure is missed by the pulsed beam
 
 
 @dataclass(frozen=True)
@@ -18,10 +18,9 @@ class Shutter:
     """Exposure and readout of one frame, in s (paper, section 2.1).
 
     Line r of H opens ``r/(H−1)·readout_s`` after the frame's start and stays open for ``exposure_s``. A readout of 0 is a
-    global shutter. ``axis``: "rows" or "columns", what one line is. ``direction``: +1 reads index 0 first, −1 the last index
-    first. ``pulse_s`` (start after the frame's start, length): the time that the beam is on; None: always. A line sees the
-    part of its window in the pulse. Raises InputError for times below 0, other axes or directions, and a pulse that
-    misses the frame."""
+    global shutter. ``axis``: "rows" or "columns", whichever the panel reads one after the other. ``direction``: +1 reads
+    index 0 first, −1 the last index. ``pulse_s`` (start, length): when the beam is on, after the frame's start; None means
+    always. Raises InputError for times below 0, other axes or directions, and a pulse that misses the frame."""
 
     exposure_s: float
     readout_s: float = 0.0
@@ -50,7 +49,7 @@ class Shutter:
             raise InputError("pulse_s", found, expected, "correct the pulse, or leave it out")
 
     def check_resolved(self, frame_start_s: np.ndarray, subject: str = "exposure_s") -> None:
-        """Raises InputError for an exposure below the precision of opening times (F,), because its angles would be noise."""
+        """Raises InputError if float64 opening times (F,) are too coarse for the exposure: its angles would be noise."""
         latest_s = float(np.max(np.abs(frame_start_s), initial=0.0)) + self.span_s
         shortest_s = _STEPS * float(np.spacing(latest_s))
         if 0 < self.exposure_s < shortest_s:
@@ -59,7 +58,7 @@ class Shutter:
 
     @property
     def readout(self) -> Readout:
-        """The order of the lines, which puts frames and poses in the order (lines, width)."""
+        """Puts frames and poses into the order (lines, width)."""
         return Readout(self.axis)
 
     @property
@@ -69,49 +68,49 @@ class Shutter:
 
     @property
     def span_s(self) -> float:
-        """The time from the first line's opening to the last line's closing."""
+        """The time in s from the first line's opening to the last line's closing."""
         return self.exposure_s + self.readout_s
 
     @property
     def lit_span_s(self) -> tuple[float, float]:
-        """First and last light in seconds after the frame's start. Without a pulse this is the whole span."""
+        """When the frame's first and last light falls on the panel, in s after its start: ``span_s``, cut to the pulse."""
         first_s, last_s = self.in_pulse(np.array([0.0, self.span_s]))
         return float(first_s), float(last_s)
 
     @property
     def middle_s(self) -> float:
-        """The middle of the lit span: the best time for a single pose."""
+        """The middle of ``lit_span_s`` in s after the frame's start: the best time for a single pose."""
         first_s, last_s = self.lit_span_s
         return first_s + (last_s - first_s) / 2
 
     def in_pulse(self, time_s: np.ndarray) -> np.ndarray:
-        """Returns times (...) after the frame's start, moved to the nearest moment with beam.
+        """Moves times (...) after the frame's start to the nearest moment at which the beam is on.
 
-        The ends of a window become those of its part in the pulse. Where the pulse misses the window, they become equal."""
+        This cuts a window to the pulse. Both ends become equal if the pulse misses the window."""
         if self.pulse_s is None:
             return time_s
         start_s, length_s = self.pulse_s
         return time_s.clip(start_s, start_s + length_s)
 
     def lines(self, detector_shape: tuple[int, int]) -> int:
-        """Returns the number of lines along the readout axis of a panel (rows, columns)."""
+        """Returns how many lines a panel (rows, columns) reads one after the other: its rows, or its columns."""
         return self.readout.shape(detector_shape)[0]
 
     def delay_s(self, lines: int) -> np.ndarray:
-        """Returns the opening time τ (lines,) of every line index, in seconds after the frame's start."""
+        """Returns when each line opens, (lines,) in s after the frame's start."""
         order = np.arange(lines) if self.direction > 0 else np.arange(lines)[::-1]
         return order / max(lines - 1, 1) * self.readout_s
 
     def line_windows_s(self, lines: int) -> np.ndarray:
-        """Returns first and last light (lines, 2) of every line index, in seconds after the frame's start.
+        """Returns when each line receives light, from and to, (lines, 2) in s after the frame's start.
 
-        Without a pulse these are opening and closing. A line that the pulse misses has two equal times."""
+        Without a pulse the line opens and closes then. A line that the pulse misses has two equal times."""
         delay = self.delay_s(lines)
         return self.in_pulse(np.stack([delay, delay + self.exposure_s], -1))
 
     def lit_share(self, lines: int) -> np.ndarray:
-        """Returns each line's lit time (lines,) as a fraction of the longest; all 1 without a pulse. Raises InputError if
-        all are 0."""
+        """Returns how long each line receives light, (lines,) as a fraction of the longest; all 1 without a pulse. Raises
+        InputError if all are 0."""
         if self.pulse_s is None:
             return np.ones(lines)
         seen_s = np.diff(self.line_windows_s(lines))[:, 0]
@@ -122,7 +121,7 @@ class Shutter:
         return np.where(seen_s > _DARK * longest_s, seen_s / longest_s, 0.0)
 
     def strip_ranges(self, lines: int, strips: int) -> list[tuple[int, int]]:
-        """Returns the lines [start, stop) of M strips in reading order. Line r of H is in strip floor(r·M/H); a strip may be
+        """Divides the lines into ``strips`` and returns the lines [start, stop) of each, in reading order. Strips may be
         empty."""
         edges = [checks.ceil_div(strip * lines, strips) for strip in range(strips + 1)]
         ranges = list(zip(edges[:-1], edges[1:], strict=True))

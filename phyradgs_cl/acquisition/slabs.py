@@ -1,4 +1,4 @@
-"""Slabs of a parallel scan: detector rows, and the slices of the volume that no other rows see."""
+"""Slabs of a parallel-beam scan: a few detector rows, which suffice to reconstruct the slices in front of them."""
 
 from dataclasses import replace
 
@@ -11,24 +11,24 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 
 HALO_ROWS = 4
-"""Detector rows read beyond each side of a slab: slices between two rows need both, and priors compare neighbours."""
+"""Rows that are read beyond each side of a slab: a slice between two rows needs both, and priors compare neighbours."""
 
 
 def check_has_slabs(scan: Scan, subject: str, found: str) -> None:
-    """Raises InputError where ``has_slabs`` is False, because slices then need rows of the whole panel. subject: the
-    option to name; found: its value."""
+    """Raises InputError if ``has_slabs`` is False: slices then need rows of the whole panel. subject: the option that asked
+    for a slab. found: its value."""
     if not has_slabs(scan):
         expected = "all rows: only in a parallel beam about z does a slice need few of them"
         raise InputError(subject, found, expected, "take --roi-mm, with --margin-mm")
 
 
 def has_slabs(scan: Scan) -> bool:
-    """Returns whether few detector rows see a slice: in a parallel beam about z."""
+    """Returns whether only few detector rows see a slice, as in a parallel beam that turns about z."""
     return isinstance(scan.geometry, ParallelGeometry) and isinstance(scan.trajectory, CircularOrbit)
 
 
 def check_rows(scan: Scan, first: int, stop: int) -> None:
-    """Raises InputError for rows [first, stop) that the panel does not have, and where ``has_slabs`` is False."""
+    """Raises InputError for rows [first, stop) that the panel does not have, or if ``has_slabs`` is False."""
     rows, found = scan.geometry.detector_shape[0], f"{first}:{stop}"
     check_has_slabs(scan, "--rows", found)
     if not 0 <= first < stop <= rows:
@@ -36,7 +36,7 @@ def check_rows(scan: Scan, first: int, stop: int) -> None:
 
 
 def slab(scan: Scan, first: int, stop: int) -> Scan:
-    """Returns the scan of detector rows [first, stop) alone, on the same grid. Its lines keep their times.
+    """Returns the scan with only the detector rows [first, stop), which keep their times. The grid stays the same.
 
     Raises InputError as ``check_rows`` does."""
     check_rows(scan, first, stop)
@@ -59,8 +59,8 @@ def slab(scan: Scan, first: int, stop: int) -> Scan:
 
 
 def slices_of(scan: Scan, first: int, stop: int) -> slice:
-    """Returns the slices of the scan's grid whose centres lie on detector rows [first, stop). Slices beyond the panel
-    belong to its first or last row, so that all rows have all slices."""
+    """Returns the slices of the scan's grid whose centres lie on detector rows [first, stop). Slices beyond the panel count
+    to its first or last row, so that the slabs of all rows together have every slice."""
     rows, pitch_mm = scan.geometry.detector_shape[0], scan.geometry.pixel_size_mm[0]
     row = (scan.grid.axes_mm()[0] - scan.geometry.detector_offset_mm[0]) / pitch_mm + (rows - 1) / 2
     number = np.clip(np.floor(row + 0.5), 0, rows - 1)
@@ -69,7 +69,7 @@ def slices_of(scan: Scan, first: int, stop: int) -> slice:
 
 
 def part_of(grid: Grid, slices: slice) -> Grid:
-    """Returns the grid of the slices ``slices``; ``grid`` itself for all slices."""
+    """Returns the part of ``grid`` with the given slices, or ``grid`` itself for all slices."""
     if slices == slice(0, grid.shape[0]):
         return grid
     return grid.part(triple((slices.start, 0, 0)), triple((slices.stop - slices.start, *grid.shape[1:])))

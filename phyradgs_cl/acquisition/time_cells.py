@@ -1,8 +1,8 @@
-"""Time cells: one table of (pose, lines, weight) per frame, which drives every operator.
+"""Time cells: the poses of a frame, with the lines of pixels that each pose serves and its weight. Operators read them.
 
-A frame is a sum over cells. The pixel lines [line_start, line_stop) receive ``weight`` times the projection from the
-cell's pose. The weights of a line sum to 1. A *still* cell has one pose. A *moving* cell is a segment of the frame's time,
-with a pose at either end. ``cells.py`` builds these tables."""
+A frame is a weighted sum of projections, one per cell. A cell adds ``weight`` times the projection from its pose to the
+lines [line_start, line_stop). The weights of a line sum to 1. A *still* cell has one pose. A *moving* cell is a segment of
+the frame's time, with a pose at either end. ``cells.py`` builds these tables."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,18 +20,17 @@ class TimeCells:
     """The time cells of one frame, sorted by line_start.
 
     - pose (C, 12) in mm, for the detector's own rows and columns, whatever the readout axis. time_s (C,) in s.
-    - line_start, line_stop (C,): count lines along the readout ``axis``, which has ``lines`` lines. weight (C,).
-    - line_share (C, lines): the fraction of each line's window that lies in a still cell; it multiplies the weight. None:
-      1.
-
-    - end_poses (C, 2, 12) in mm, end_times_s (C, 2) in s: at the ends of moving cells, whose ``weight`` is 1; None for
-      still cells. Objects that move need the times.
-    - line_times (C, 3, lines): the part of each line's window in a segment. The numbers are the part's middle and half
-      its length, in units of the segment's length from its mid-time, and its fraction of the whole window.
+    - line_start, line_stop (C,): the lines of a cell, counted along the readout ``axis``. The panel has ``lines`` lines.
+      weight (C,).
+    - line_share (C, lines): for still cells, a further factor of the weight: the fraction of each line's exposure that
+      lies in the cell. None means 1.
+    - end_poses (C, 2, 12) in mm, end_times_s (C, 2) in s: at both ends of moving cells, whose ``weight`` is 1; None for
+      still cells. The times are needed if the object moves.
+    - line_times (C, 3, lines): for moving cells, the part of each line's exposure in the cell: its middle (from the cell's
+      mid-time) and half its length, both over the cell's length, then the fraction of the exposure that it is.
     - is_parallel: poses begin with the direction of parallel rays.
-
-    - conic_pose (12,): for splats only. The cells' poses then place the centres of Gaussians, whose shapes and densities
-      on the panel are those of this pose.
+    - conic_pose (12,): for Gaussians only. Cells then move only the Gaussians' centres on the panel; their shapes and
+      densities there are computed for this pose.
 
     Methods raise InputError for user-defined cells that do not fit the scan."""
 
@@ -55,7 +54,7 @@ class TimeCells:
         return len(self.weight)
 
     def line_weights(self) -> np.ndarray:
-        """Returns the sum of the weights (lines,) of each line. It is 1 for a complete table."""
+        """Returns the sum of each line's weights, (lines,). It is 1 if the table is complete."""
         total = np.zeros(self.lines)
         for cell, lines in enumerate(self.ranges):
             total[lines] += self.weights_of(cell)
@@ -63,7 +62,7 @@ class TimeCells:
 
     @property
     def ranges(self) -> list[slice]:
-        """The range of lines of every cell."""
+        """The lines that each cell serves, as slices."""
         return [slice(int(a), int(b)) for a, b in zip(self.line_start, self.line_stop, strict=True)]
 
     def weights_of(self, cell: int) -> np.ndarray:
@@ -76,17 +75,17 @@ class TimeCells:
 
     @property
     def readout(self) -> Readout:
-        """The order of the lines, which puts frames and poses in the order (lines, width)."""
+        """Puts frames and poses into the order (lines, width)."""
         return Readout(self.axis)
 
     @property
     def is_moving(self) -> bool:
-        """Whether poses change within a cell. Only splats can be projected over such cells."""
+        """Whether poses change within a cell. Only Gaussians can be projected over such cells."""
         return self.end_poses is not None
 
     @property
     def averages(self) -> bool:
-        """Whether any line has more than one cell."""
+        """Whether any line averages over several cells."""
         return bool(self.layer_numbers.any())
 
     def scaled(self, factor: float) -> "TimeCells":
@@ -98,8 +97,7 @@ class TimeCells:
         return replace(self, pose=self.pose * factors, end_poses=ends, conic_pose=conic)
 
     def finer(self, rows: int, columns: int) -> "TimeCells":
-        """Returns still cells for pixels cut into ``rows`` by ``columns`` parts. All parts of a line have the line's
-        times."""
+        """Returns the still cells for pixels divided into ``rows`` by ``columns``. The parts of a line keep its times."""
         pose, (of_line, _) = self.pose.copy(), self.readout.shape((rows, columns))
         pose[:, 6:9] /= columns
         pose[:, 9:12] /= rows
@@ -109,8 +107,8 @@ class TimeCells:
         return replace(self, pose=pose, line_share=share, **lines)
 
     def still(self) -> "TimeCells":
-        """Returns the cells unchanged, for ray operators. Raises InputError for moving cells and conic poses, which need
-        splats."""
+        """Returns the cells unchanged, for projectors of voxels. Raises InputError for moving cells and conic poses, which
+        only Gaussians can use."""
         if self.is_moving:
             raise InputError("--motion", "cells with motion", "still cells: only splats move", "take --motion per-row")
         if self.conic_pose is not None:
@@ -118,7 +116,7 @@ class TimeCells:
         return self
 
     def line_poses(self) -> np.ndarray:
-        """Returns each line's pose (lines, 12), that of the cell nearest to its mid-exposure. A table of a single cell
+        """Returns one pose per line, (lines, 12): that of the cell nearest to its mid-exposure. A table with a single cell
         gives (1, 12).
 
         Raises InputError for a line without a cell."""
@@ -139,16 +137,17 @@ class TimeCells:
         return self.pose[cell[nearest[first]]]
 
     def line_cells(self) -> np.ndarray:
-        """Returns for each line a range [first, stop) of cells, (lines, 2), that holds the line's cells, and maybe
-        others."""
+        """Returns a range [first, stop) of cells for each line, (lines, 2). It includes all cells that serve the line, and
+        may include others."""
         line = np.arange(self.lines)
         first = np.searchsorted(np.maximum.accumulate(self.line_stop), line, side="right")
         return np.stack([first, np.searchsorted(self.line_start, line, side="right")], -1)
 
     @cached_property
     def layer_numbers(self) -> np.ndarray:
-        """The layer (C,) of every cell, from 0 on. A line has at most one cell in a layer; layers are as few as
-        possible."""
+        """The layer of each cell, (C,) from 0 on. Cells in the same layer share no line; layers are as few as possible.
+
+        To average intensities, a frame's layers are projected one by one."""
         numbers = np.zeros(self.count, np.int64)
         free_from: list[int] = []
         for cell, (start, stop) in enumerate(zip(self.line_start, self.line_stop, strict=True)):
@@ -161,7 +160,7 @@ class TimeCells:
 
     @cached_property
     def layer_weights(self) -> np.ndarray:
-        """The weight (layers, lines) of each line's cell in each layer of ``layer_numbers``; 0 without a cell."""
+        """The weight (layers, lines) of the cell that serves a line in each layer of ``layer_numbers``; 0 if none does."""
         weights = np.zeros((int(self.layer_numbers.max(initial=-1)) + 1, self.lines))
         for cell, lines in enumerate(self.ranges):
             weights[self.layer_numbers[cell], lines] = self.weights_of(cell)

@@ -1,4 +1,4 @@
-"""Trajectories: the gantry angle θ(t), or whole poses, at any time of a frame."""
+"""Trajectories: where source and panel are at any time, from the gantry's angle θ(t) or from measured poses."""
 
 from dataclasses import dataclass, field, fields, replace
 from typing import Protocol
@@ -20,19 +20,19 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.text import repr_of_changes
 
-_LEAST_SPAN_S = 1e-6  # least time over which ``sampled`` samples a frame, also one without duration
-_MOST_SAMPLES = 1024  # ``sampled`` tries no finer table once it has more samples per frame
-_LEAST_INCIDENCE = 1e-6  # lower limit of the sine of the angle between rays and panel
-_AT_AXIS = 1e-6  # a panel at most this far from the axis, in source-to-axis distances, counts as at the axis
-_AWAY = 2.0  # a panel at the axis is moved behind the object: factor on its distance from the source and on its sizes
-_SAME_PLACE = 1e-9  # largest difference of equal poses, as a fraction of their largest number: float64 rounds orbits by less
+_LEAST_SPAN_S = 1e-6  # ``sampled`` needs two different times in a frame, also in one without duration
+_MOST_SAMPLES = 1024  # ``sampled`` gives up when more samples per frame are not close enough
+_LEAST_INCIDENCE = 1e-6  # least sine of the angle between rays and panel
+_AT_AXIS = 1e-6  # a panel within this fraction of the source-to-axis distance is at the axis
+_AWAY = 2.0  # how many times further from the source a panel at the axis is moved, and how many times larger it becomes
+_SAME_PLACE = 1e-9  # poses that differ by less, relative to their largest number, are equal: float64 rounds by less
 
 
 class Trajectory(Protocol):
-    """The interface of a trajectory: poses (..., 12) in mm of a frame at times (...) in seconds.
+    """The interface of a trajectory: poses (..., 12) in mm of a frame at times (...) in s.
 
-    A user-defined class with this method works in every reconstruction method; ``save_scan`` samples it into a table. The
-    trajectory of a parallel beam has an attribute ``is_parallel`` that is True."""
+    A user-defined class with this method works in every reconstruction method. ``save_scan`` stores it as a table of poses.
+    A class for parallel beams must also have an attribute ``is_parallel`` that is True."""
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s. A pose is source, centre of pixel (0,
@@ -40,12 +40,12 @@ class Trajectory(Protocol):
 
 
 def is_parallel(trajectory: Trajectory) -> bool:
-    """Returns whether poses begin with the direction of parallel rays: whether the trajectory's ``is_parallel`` is True."""
+    """Returns the trajectory's attribute ``is_parallel``; False if it has none."""
     return bool(getattr(trajectory, "is_parallel", False))
 
 
 class Kinematics(Protocol):
-    """The interface of kinematics: gantry angles (...) of a frame at times (...) in seconds."""
+    """The interface of kinematics: the gantry's angles (...) of a frame at times (...) in s."""
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns angles (...) in rad of frame number ``frame`` at times (...) s, counterclockwise seen from above."""
@@ -53,8 +53,7 @@ class Kinematics(Protocol):
 
 @dataclass(frozen=True)
 class ConstantSpeed:
-    """A constant speed: θ(t) = θ0 + ω t, with ``angle_start_rad`` at time 0 and ``speed_rad_per_s``. Raises InputError
-    for inf or NaN."""
+    """A constant speed: θ(t) = ``angle_start_rad`` + ``speed_rad_per_s`` t. Raises InputError for infinite values or NaN."""
 
     angle_start_rad: float
     speed_rad_per_s: float
@@ -84,10 +83,10 @@ class SpeedRamp(ConstantSpeed):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EncoderTable:
-    """Measured θ(t): samples ``time_s`` (T,) in s and ``angle_rad_table`` (T,) in rad, linear between them.
+    """Measured θ(t): ``angle_rad_table`` (T,) in rad at ``time_s`` (T,) in s, linear in between.
 
-    An encoder's jumps by a turn are taken out where the other steps between samples are small. Raises InputError for times
-    that do not increase, and for times beyond the table."""
+    Jumps by a whole turn, as an encoder makes at 360°, are removed if the other steps between samples are small. Raises
+    InputError for times that do not increase, and for times beyond the table."""
 
     time_s: np.ndarray
     angle_rad_table: "NDArray[np.float64]"
@@ -110,11 +109,11 @@ class EncoderTable:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FrameSweeps:
-    """A constant speed in each frame, from its angle as the exposure starts to its angle as it ends.
+    """A constant speed in each frame, given by the gantry's angles at start and end of the exposure of the first line.
 
-    The speed continues through the readout. Equal angles are a gantry at rest (stop-and-shoot). ``start_s`` (F,): the
-    opening of each frame's first line, in s. ``exposure_s``: the exposure of a line. ``angle_start_rad``, ``angle_end_rad``
-    (F,) in rad: an end that jumped by a turn, as from 355° to 4°, is taken back to its start.
+    The speed continues through the readout. Equal angles mean a gantry at rest (stop-and-shoot). ``start_s`` (F,): when
+    each frame's first line opens, in s. ``exposure_s``: the exposure of a line. ``angle_start_rad``, ``angle_end_rad``
+    (F,) in rad. A jump by a turn between them, as from 355° to 4°, is removed.
 
     Raises InputError for arrays of unequal length, infinite values and NaN."""
 
@@ -144,8 +143,8 @@ class FrameSweeps:
 
 
 def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
-    """Returns an orbit whose encoder table is ``by_s`` longer at either end, at the speed there. Other trajectories stay
-    unchanged."""
+    """Extends an orbit's encoder table by ``by_s`` at either end, at the speed there. Returns other trajectories as they
+    are."""
     if not (isinstance(trajectory, CircularOrbit) and isinstance(trajectory.kinematics, EncoderTable)):
         return trajectory
     table = trajectory.kinematics
@@ -160,14 +159,14 @@ def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
 
 
 def _is_without_jumps(steps_rad: np.ndarray) -> bool:
-    """Returns whether no step (N,) exceeds half a turn, or steps of a quarter turn and more are usual."""
+    """Returns whether steps (N,) between angles are real: none exceeds half a turn, or half of them a quarter turn."""
     size_rad = np.abs(steps_rad)
     return bool(size_rad.max(initial=0) <= np.pi or np.median(size_rad) >= np.pi / 2)
 
 
 @dataclass(frozen=True, eq=False)
 class CircularOrbit:
-    """A circular ``geometry`` in mm, at the angles of its ``kinematics``: anything with angle_rad(frame, time_s).
+    """A circular orbit: a ``geometry`` in mm at the angles of ``kinematics``, anything with angle_rad(frame, time_s).
 
     Raises InputError for other objects."""
 
@@ -200,8 +199,8 @@ class PoseTable:
 
     A pose is source, centre of pixel (0, 0), step to the next column, step to the next row, x y z each. With
     ``is_parallel`` it begins with the direction of the rays, of any length, in place of the source.
-    Rotations are interpolated by slerp, and the other numbers linearly in the body's own frame. A linear interpolation in
-    world coordinates would shrink an orbit (by 1 mm at 1 m over 5°).
+    The panel's rotation is interpolated by slerp, and the rest linearly in axes that turn with the panel. Linear
+    interpolation in world coordinates would shrink an orbit (by 1 mm at 1 m over 5°).
     Raises InputError for times that do not increase, steps that span no panel, and times beyond the table."""
 
     time_s: np.ndarray
@@ -224,7 +223,7 @@ class PoseTable:
             table = unit_directions(self.subject, table)
         object.__setattr__(self, "table", table)
         frames = body_frames(table)
-        # Seen from the turning panel, the vectors of a pose hardly change, so linear interpolation is exact enough there.
+        # In axes that turn with the panel a pose hardly changes, so linear interpolation is exact enough.
         in_body = np.einsum("tji,tkj->tki", frames, table.reshape(-1, 4, 3)).reshape(-1, POSE_LENGTH)
         object.__setattr__(self, "_in_body", in_body)
         turns = scipy.spatial.transform.Rotation.from_matrix(frames)
@@ -242,8 +241,8 @@ class PoseTable:
 
 
 def unit_directions(subject: str, poses: np.ndarray) -> np.ndarray:
-    """Returns a parallel beam's poses (F, 12) with directions of length 1. Raises InputError for a direction that runs along
-    the panel or has length 0."""
+    """Returns a parallel beam's poses (F, 12) with directions of length 1. Raises InputError if a direction has length 0 or
+    runs along the panel."""
     length = np.linalg.norm(poses[:, :3], axis=1)
     across = np.cross(poses[:, 6:9], poses[:, 9:12])
     towards = np.abs(np.einsum("ci,ci->c", across, poses[:, :3]))
@@ -256,18 +255,17 @@ def unit_directions(subject: str, poses: np.ndarray) -> np.ndarray:
 def resting_poses(
     poses: np.ndarray, middle_s: np.ndarray, span_s: float, subject: str = "poses", is_parallel: bool = False
 ) -> PoseTable:
-    """Returns a pose table for a gantry that stops for every frame. Each pose (F, 12) holds for ``span_s``, at least 0.5
-    s, about its ``middle_s`` (F,) in s."""
-    half_s = max(span_s / 2, 0.25) * (1 - 1e-10)  # two frames in a row must not share a time
+    """Returns a pose table for a gantry that stops for every frame. Each of the poses (F, 12) holds from half of ``span_s``
+    (at least 0.25 s) before ``middle_s`` (F,) to as long after it."""
+    half_s = max(span_s / 2, 0.25) * (1 - 1e-10)  # successive frames must not share a time
     time_s = np.stack([middle_s - half_s, middle_s + half_s], -1).ravel()
     return PoseTable(time_s, np.repeat(poses, 2, axis=0), subject, is_parallel)
 
 
 def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarray) -> CircularOrbit | PoseTable:
-    """Returns a circular orbit where the poses (F, 12) of a gantry at rest are those of ``geometry``; otherwise a pose
-    table."""
+    """Returns a circular orbit if ``geometry`` has the poses (F, 12) of a gantry at rest; otherwise a pose table."""
     is_parallel = isinstance(geometry, ParallelGeometry)
-    side = -1 if is_parallel else 1  # rays run away from where a source would be
+    side = -1 if is_parallel else 1  # a direction of rays points away from the source's side
     angle_rad = np.arctan2(side * poses[:, 1], side * poses[:, 0])
     if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME_PLACE * np.abs(poses).max()):
         return CircularOrbit(geometry, FrameSweeps(middle_s, 0.0, angle_rad, angle_rad))
@@ -275,11 +273,11 @@ def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarr
 
 
 def behind_axis(geometry: Geometry, trajectory: Trajectory) -> tuple[Geometry, Trajectory]:
-    """Returns geometry and trajectory with a panel at the axis moved away from the source, to where it meets the same
+    """Returns geometry and trajectory with a panel at the axis moved away from the source, and enlarged to see the same
     rays.
 
-    No real panel stands in its object: such a panel's sizes were scaled to the axis. Rays would end at it, within the
-    object. User-defined trajectories and panels elsewhere stay as they are."""
+    Some programs state a panel scaled to the axis. Rays end at the panel, so there they would end within the object.
+    User-defined trajectories and panels elsewhere stay as they are."""
     if not isinstance(geometry, ConeGeometry):
         return geometry, trajectory
     if geometry.source_to_detector_mm > (1 + _AT_AXIS) * geometry.source_to_axis_mm:
@@ -301,14 +299,14 @@ def behind_axis(geometry: Geometry, trajectory: Trajectory) -> tuple[Geometry, T
 
 
 def _is_off_axis(poses: np.ndarray) -> bool:
-    """Returns whether any panel's plane, with poses (T, 12), misses the origin."""
+    """Returns whether the panel's plane misses the origin in any of the poses (T, 12)."""
     normal = body_frames(poses)[..., 2]
     from_axis_mm = np.abs(np.einsum("ti,ti->t", poses[:, 3:6], normal))
     return bool((from_axis_mm > _AT_AXIS * np.linalg.norm(poses[:, :3], axis=1)).any())
 
 
 def grid_of_scan(geometry: Geometry, trajectory: Trajectory, frame_start_s: np.ndarray) -> Grid:
-    """Returns ``default_grid``, longer by the travel of a gantry that moves on no circle."""
+    """Returns ``default_grid``, which is longer if the gantry travels along z."""
     if isinstance(trajectory, CircularOrbit):
         return default_grid(geometry)
     poses = [checked_poses(trajectory, f, np.array([t])) for f, t in enumerate(frame_start_s)]
@@ -319,18 +317,18 @@ _AS_TABLE = "give it as a PoseTable"
 
 
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
-    """Returns a pose table within ``error_mm`` of a user-defined trajectory, over ``span_s`` from each frame's start
+    """Samples a user-defined trajectory into a pose table within ``error_mm``, over ``span_s`` from each frame's start
     (F,).
 
-    Raises InputError where a fine table is not close enough, as for frames that overlap in time with different poses."""
+    Raises InputError if even a fine table is not close enough, as for frames that overlap in time with different poses."""
     samples = 2
     while True:
         offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), samples)
         times = np.asarray(frame_start_s, np.float64)[:, None] + offsets_s
         poses = np.concatenate([checked_poses(trajectory, f, t) for f, t in enumerate(times)])
-        time_s, at = np.unique(times.ravel(), return_index=True)  # frames may overlap in time
+        time_s, at = np.unique(times.ravel(), return_index=True)  # unique, because frames may overlap in time
         table = PoseTable(time_s, poses[at], "trajectory", is_parallel(trajectory))
-        between = (time_s[:-1] + time_s[1:]) / 2  # samples of all frames count, also of overlapping ones
+        between = (time_s[:-1] + time_s[1:]) / 2  # midpoints between samples of any frames: these may overlap
         inside = [between[(t[0] < between) & (between < t[-1])] for t in times]
         errors = (np.abs(table.pose(f, t) - trajectory.pose(f, t)).max(initial=0.0) for f, t in enumerate(inside))
         worst_mm = max(errors)
@@ -341,13 +339,13 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
             overlap = np.any(np.sort(times[:, 0])[1:] < np.sort(times[:, -1])[:-1])
             remedy = "take frames that do not overlap in time: a file has one pose at a time" if overlap else _AS_TABLE
             raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", remedy)
-        # The former samples are among the new ones.
+        # Halves the intervals; the former samples are among the new ones.
         samples = 2 * samples - 1
 
 
 def checked_poses(trajectory: Trajectory, frame: int, time_s: np.ndarray) -> np.ndarray:
-    """Returns poses (T, 12) of a trajectory at times (T,) s. Raises InputError where a user-defined trajectory returns
-    other shapes or numbers that are not finite."""
+    """Returns poses (T, 12) of a trajectory at times (T,) s. Raises InputError if a user-defined trajectory returns another
+    shape, or numbers that are not finite."""
     subject = f"trajectory {type(trajectory).__name__}"
     return checks.numbers(subject, trajectory.pose(frame, time_s), (*time_s.shape, POSE_LENGTH))
 
@@ -355,8 +353,8 @@ def checked_poses(trajectory: Trajectory, frame: int, time_s: np.ndarray) -> np.
 def _checked_table(
     subject: str, times: np.ndarray, rows: np.ndarray, row: tuple[int, ...], what: str, expected: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns increasing times (T,) and finite rows (T, *row), float64. Raises InputError for times that do not increase
-    and rows of another shape or not finite."""
+    """Returns times (T,) and rows (T, *row) as float64. Raises InputError for times that do not increase, and for rows of
+    another shape or not finite."""
     time_s, table = checks.numbers(f"{subject} times", times), checks.numbers(f"{subject} {what}", rows)
     if time_s.ndim != 1 or time_s.size < 2 or table.shape != (time_s.size, *row):
         raise InputError(subject, f"shapes {time_s.shape} and {table.shape}", expected)
@@ -366,7 +364,7 @@ def _checked_table(
 
 
 def body_frames(table: np.ndarray) -> np.ndarray:
-    """Returns the right-handed orthonormal frames (T, 3, 3) of poses (T, 12). Their columns are û, v̂ and the normal."""
+    """Returns orthonormal right-handed axes (T, 3, 3) of the panels of poses (T, 12), with columns û, v̂ and normal."""
     u_hat = table[:, 6:9] / np.linalg.norm(table[:, 6:9], axis=1, keepdims=True)
     normal = np.cross(u_hat, table[:, 9:12])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -374,7 +372,7 @@ def body_frames(table: np.ndarray) -> np.ndarray:
 
 
 def _check_covered(subject: str, frame: int, t: np.ndarray, table_s: np.ndarray) -> None:
-    """Raises InputError for times beyond a table, by more than a nanosecond, which covers the rounding of stored times."""
+    """Raises InputError for times beyond a table. A nanosecond is tolerated, because stored times are rounded."""
     slack = 1e-9 * max(1.0, abs(table_s[-1]))
     if t.size and (t.min() < table_s[0] - slack or t.max() > table_s[-1] + slack):
         found = f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s"

@@ -1,4 +1,4 @@
-"""The attenuation field: a voxel volume on a grid or a cloud of radiative Gaussians, and its deformation in time."""
+"""The attenuation of an object: voxels on a grid or a cloud of radiative Gaussians, and its deformation in time."""
 
 from phyradgs_cl.fields.deformation import Deformation, control_points
 from phyradgs_cl.fields.gaussians import Activation, Gaussians

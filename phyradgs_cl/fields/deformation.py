@@ -1,8 +1,8 @@
-"""A deforming object: displacement fields of low rank in time, on tensor cubic B-splines in space.
+"""A deforming object: a sum of a few displacement fields with weights in time. The fields are cubic B-splines in space.
 
     w(y, t) = Σ_r φ_r(t) U_r(y),   U_r(y) = Σ_c control_c,r β³((y − origin) / spacing − c)
 
-Pull convention: at time t the object has at point y the attenuation that the reference volume has at y + w(y, t).
+At time t, the object has at point y the attenuation that the reference volume has at y + w(y, t).
 D. Rueckert et al., Nonrigid registration using free-form deformations, IEEE Trans. Med. Imaging 18, 712-721 (1999)."""
 
 from dataclasses import dataclass, replace
@@ -15,21 +15,20 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import Grid
 
-_LEVELS = 16  # steps, up to a field's largest weight, to which the folding check rounds weights: equal states count once
-_MOST_STEPS = 200  # most iterations of the fixed point that inverts a field: enough for a contraction of 0.93
-_FLAT = 1e-4  # where the displacement has a smaller slope, in mm per mm, the Jacobian determinant counts as 1
-_CLOSE = 1e-6  # the fixed point ends at a change below this fraction of the smallest control spacing
+_LEVELS = 16  # the folding check rounds weights to this many levels, so that few different states must be checked
+_MOST_STEPS = 200  # most iterations that invert a field: enough if each makes the error 0.93 times as large
+_FLAT = 1e-4  # where the displacement has a smaller slope, in mm per mm, the folding check leaves points out
+_CLOSE = 1e-6  # the inversion stops at a change below this fraction of the smallest control spacing
 
 
 @dataclass(frozen=True, eq=False)
 class Deformation:
     """How an object moves and deforms during a scan.
 
-    control_mm: (R, nz, ny, nx, 3) coefficients of the fields U_r, components x, y, z. Coefficients outside of the array are
-    0, so the field falls smoothly to 0 within two spacings beyond the outermost control points. origin_mm: the control point
-    (0, 0, 0), x, y, z. spacing_mm: the distance of control points, one length or three (x, y, z). times_s: (T,) rising, on
-    the clock of ``Scan.frame_start_s``. weights: (T, R) φ_r at these times. They are linear between two times, and constant
-    before the first and after the last. A field of unit weight has its displacements in mm.
+    control_mm: (R, nz, ny, nx, 3) coefficients of the R fields U_r at control points, components x, y, z. Beyond the
+    outermost control points the fields fall smoothly to 0 within two spacings. origin_mm: the position x, y, z of control
+    point (0, 0, 0). spacing_mm: the distance of control points, one length or three (x, y, z). times_s: (T,) rising, on the
+    clock of ``Scan.frame_start_s``. weights: (T, R) φ_r at these times, linear in between and constant outside.
 
     Raises InputError for other shapes, values that are not finite, lengths that are not above 0, and times that do not
     rise."""
@@ -60,17 +59,16 @@ class Deformation:
     def of_displacements(
         cls, displacements_mm: np.ndarray, grid: Grid, times_s: "ArrayLike", spacing_mm: float, rank: int = 2
     ) -> "Deformation":
-        """Returns the deformation closest to dense displacements w (T, nz, ny, nx, 3) in mm, x y z, at times (T,).
+        """Returns the deformation closest to displacements w, as image registration gives them at every voxel.
 
-        They are at the voxel centres of ``grid``, as image registration gives them.
-
-        Singular values make them at most ``rank`` fields, on control points ``spacing_mm`` apart, whose weights have a
-        largest size of 1. Raises InputError for other shapes, values that are not finite, and times that do not rise."""
+        displacements_mm: (T, nz, ny, nx, 3) in mm, x y z, at the voxel centres of ``grid`` and times_s (T,). A singular
+        value decomposition makes them ``rank`` fields or fewer, on control points ``spacing_mm`` apart. The largest weight
+        of each is 1. Raises InputError for other shapes, values that are not finite, and times that do not rise."""
         times_s = checks.numbers("times_s", times_s, (None,))
         dense_mm = checks.numbers("displacements_mm", displacements_mm, (len(times_s), *grid.shape, 3))
         checks.whole("rank", rank, 1, 1000)
         rows = dense_mm.reshape(len(times_s), -1)
-        squares, vectors = np.linalg.eigh(rows @ rows.T)  # a small matrix, unlike that of singular values of the rows
+        squares, vectors = np.linalg.eigh(rows @ rows.T)  # (T, T): much smaller than ``rows``
         weights = vectors[:, ::-1][:, : min(rank, len(times_s))]
         largest = np.abs(weights).max(0)
         fields_mm = (weights * largest).T @ rows
@@ -93,12 +91,12 @@ class Deformation:
 
     @property
     def reach_mm(self) -> np.ndarray:
-        """Bounds (R,) in mm of the displacements by each field of unit weight: its longest control vector."""
+        """The longest control vector of each field, (R,) in mm. At weight 1 the field displaces no point further."""
         return np.asarray(np.linalg.norm(self.control_mm, axis=-1).max(axis=(1, 2, 3)))
 
     @property
     def fastest_mm_per_s(self) -> float:
-        """A bound in mm/s of the speed at which any point's displacement changes."""
+        """A speed in mm/s that no point of the object exceeds."""
         rates_per_s = np.abs(np.diff(self.weights, axis=0)) / np.diff(self.times_s)[:, None]
         return float((rates_per_s @ self.reach_mm).max(initial=0.0))
 
@@ -108,12 +106,12 @@ class Deformation:
         return replace(self, control_mm=factor * self.control_mm, origin_mm=origin, spacing_mm=spacing)
 
     def weights_at(self, times_s: "ArrayLike") -> np.ndarray:
-        """Returns φ_r (n, R) at times (n,) in s."""
+        """Returns the weights φ_r (n, R) of the fields at times (n,) in s."""
         times = np.atleast_1d(np.asarray(times_s, np.float64))
         return np.stack([np.interp(times, self.times_s, column) for column in self.weights.T], -1)
 
     def displacement_mm(self, points_mm: "ArrayLike", weights: "ArrayLike") -> np.ndarray:
-        """Returns w (n, 3) float64 in mm at points (n, 3), x y z, for one state's weights (R,)."""
+        """Returns w (n, 3) float64 in mm at points (n, 3), x y z, for fields weighted by ``weights`` (R,)."""
         control_mm = self._state(weights)
         place = self._in_spacings(np.asarray(points_mm, np.float64)).T[::-1]
         components = [
@@ -123,10 +121,10 @@ class Deformation:
         return np.stack(components, -1)
 
     def jacobian(self, points_mm: "ArrayLike", weights: "ArrayLike") -> np.ndarray:
-        """Returns ∂w_i/∂y_j (n, 3, 3) at points (n, 3), x y z, for one state's weights (R,)."""
+        """Returns ∂w_i/∂y_j (n, 3, 3) at points (n, 3), x y z, for fields weighted by ``weights`` (R,)."""
         control_mm = np.pad(self._state(weights), [(1, 1)] * 3 + [(0, 0)])
         place = self._in_spacings(np.asarray(points_mm, np.float64))[..., None]
-        taps = np.floor(place).astype(np.int64) + np.arange(-1, 3)  # (n, 3, 4): all control points that reach the points
+        taps = np.floor(place).astype(np.int64) + np.arange(-1, 3)  # (n, 3, 4): the control points that act on each point
         values, slopes = cubic(place - taps), cubic_slope(place - taps) / np.reshape(self.spacing_mm, (3, 1))
         last = np.reshape(control_mm.shape[2::-1], (3, 1)) - 1
         x, y, z = np.moveaxis(np.clip(taps + 1, 0, last), 1, 0)
@@ -135,22 +133,23 @@ class Deformation:
         return np.stack([np.einsum("na,nb,nc,nabci->ni", *three, vectors) for three in factors], -1)
 
     def on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
-        """Returns w (nz, ny, nx, 3) float32 in mm at the voxel centres of ``grid``, components x, y, z, for one state."""
+        """Returns w (nz, ny, nx, 3) float32 in mm, x y z, at the voxel centres of ``grid`` for ``weights`` (R,)."""
         along_z, along_y, along_x = self.bases(grid)
         rows = np.einsum("zk,kyxi->zyxi", along_z, self._state(weights), optimize=True)
         planes = np.einsum("yk,zkxi->zyxi", along_y, rows, optimize=True).astype(np.float32)
         return np.einsum("xk,zyki->zyxi", along_x.astype(np.float32), planes, optimize=True)
 
     def inverse_on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
-        """Returns u (nz, ny, nx, 3) float32 in mm with u(x) = −w(x + u(x)): matter at x of the reference is at x + u(x).
+        """Returns u (nz, ny, nx, 3) float32 in mm: matter at x in the reference volume has moved to x + u(x).
 
-        It is a fixed point, reached from u = 0. Raises InputError where it does not converge, as where the field folds."""
+        u(x) = −w(x + u(x)) is iterated from u = 0. Raises InputError where this does not converge, as where the field
+        folds."""
         z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
         centres_mm = np.stack([x.ravel(), y.ravel(), z.ravel()], -1)
         return self.inverse_mm(centres_mm, weights).reshape(*grid.shape, 3).astype(np.float32)
 
     def inverse_mm(self, points_mm: np.ndarray, weights: "ArrayLike") -> np.ndarray:
-        """Returns the displacement u of ``inverse_on_grid_mm``, (n, 3) float64 in mm, at points (n, 3), x y z."""
+        """Returns the displacement u of ``inverse_on_grid_mm`` at points (n, 3), x y z, as (n, 3) float64 in mm."""
         moved_mm = np.zeros_like(points_mm)
         for _ in range(_MOST_STEPS):
             next_mm = -self.displacement_mm(points_mm + moved_mm, weights)
@@ -161,11 +160,11 @@ class Deformation:
         raise InputError("deformation", found, "a field whose gradient stays below 1", "use a smoother or smaller field")
 
     def smallest_determinant(self, grid: Grid | None = None) -> float:
-        """Returns the smallest det(I + ∂w/∂y) over the voxel centres of ``grid`` and the states of ``times_s``. Matter folds
-        where it is not above 0.
+        """Returns the smallest det(I + ∂w/∂y) over the voxel centres of ``grid`` and ``times_s``. If it is 0 or less, the
+        deformation folds matter over itself.
 
-        Without a grid, the points are half a spacing of the control points apart. Weights are rounded to a 16th of each
-        field's largest, and slopes below 1e-4 count as 0."""
+        Without a grid, points half a control spacing apart are tested. To save time, weights are rounded to a 16th of each
+        field's largest weight, and slopes below 1e-4 count as 0."""
         grid = grid or self._half_spacing_grid()
         slopes = np.stack([self._slopes(grid, control_mm) for control_mm in self.control_mm])  # (R, 3, 3, n)
         largest = np.abs(self.weights).max(axis=0)
@@ -181,15 +180,15 @@ class Deformation:
         return smallest
 
     def _state(self, weights: "ArrayLike") -> np.ndarray:
-        """Returns the control vectors (nz, ny, nx, 3) in mm of the state with weights (R,)."""
+        """Returns the fields' control vectors summed with ``weights`` (R,), as (nz, ny, nx, 3) in mm."""
         return np.tensordot(checks.numbers("weights", weights, (self.rank,)), self.control_mm, 1)
 
     def _in_spacings(self, points_mm: np.ndarray) -> np.ndarray:
         return (points_mm - self.origin_mm) / self.spacing_mm
 
     def bases(self, grid: Grid, slope_along: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns β³ (voxels, control points) along z, y and x at the voxel centres of ``grid``. slope_along: the axis
-        (0: z) along which it is the slope of β³ in 1/mm instead; None: no axis."""
+        """Returns β³ (voxels, control points) along z, y and x at the voxel centres of ``grid``. slope_along: an axis
+        (0: z) for which the slope of β³ in 1/mm is returned instead."""
         matrices = []
         spacing_mm = np.broadcast_to(self.spacing_mm, 3)
         for axis, centres_mm in enumerate(grid.axes_mm()):
@@ -220,15 +219,15 @@ def control_points(
 ) -> tuple[tuple[float, float, float], tuple[int, int, int]]:
     """Returns origin x, y, z in mm and counts (nz, ny, nx) of control points that cover a grid and ``margin_mm`` around it.
 
-    The outermost stand at least one spacing further out, so that four of them along each axis reach every point."""
+    They extend one spacing or more beyond, since a spline at a point needs the nearest four control points per axis."""
     counts = [int(np.ceil((side_mm + 2 * margin_mm) / spacing_mm)) + 3 for side_mm in grid.size_mm]
     first_mm = [middle - (n - 1) / 2 * spacing_mm for middle, n in zip(grid.offset_mm, counts, strict=True)]
     return (first_mm[2], first_mm[1], first_mm[0]), (counts[0], counts[1], counts[2])
 
 
 def fitted_control_mm(fields_mm: np.ndarray, grid: Grid, spacing_mm: float) -> tuple[np.ndarray, tuple[float, float, float]]:
-    """Returns control vectors (R, cz, cy, cx, 3) whose splines follow fields (R, nz, ny, nx, 3) on ``grid`` best, and their
-    origin in mm. Splines are a product over the axes, so least squares along one axis after the other give them."""
+    """Fits splines to fields (R, nz, ny, nx, 3) on ``grid``. Returns control vectors (R, cz, cy, cx, 3) and their origin in
+    mm. The basis is a product over the axes, so the least squares are solved along one axis after the other."""
     origin_mm, counts = control_points(grid, spacing_mm)
     empty = Deformation(np.zeros((1, *counts, 3)), origin_mm, spacing_mm, np.zeros(1), np.zeros((1, 1)))
     inverses = [np.linalg.pinv(matrix, rcond=1e-3) for matrix in empty.bases(grid)]
@@ -237,18 +236,17 @@ def fitted_control_mm(fields_mm: np.ndarray, grid: Grid, spacing_mm: float) -> t
 
 
 def cubic(offset: np.ndarray) -> np.ndarray:
-    """Returns the centred cubic B-spline β³ at offsets in spacings. It is 0 beyond ±2."""
+    """Returns the centred cubic B-spline β³ at offsets in units of the control spacing. It is 0 beyond ±2."""
     size = np.abs(offset)
     return np.asarray(np.maximum(2 - size, 0) ** 3 - 4 * np.maximum(1 - size, 0) ** 3) / 6
 
 
 def cubic_slope(offset: np.ndarray) -> np.ndarray:
-    """Returns the derivative of β³ at offsets in spacings."""
+    """Returns the derivative of β³ at offsets in units of the control spacing."""
     size = np.abs(offset)
     return np.asarray(-np.sign(offset) * (np.maximum(2 - size, 0) ** 2 - 4 * np.maximum(1 - size, 0) ** 2)) / 2
 
 
 def _determinant(slopes: np.ndarray) -> np.ndarray:
-    """Returns det(I + slopes) (n,) of slopes (3, 3, n)."""
     (a, b, c), (d, e, f), (g, h, i) = slopes + np.eye(3)[:, :, None]
     return np.asarray(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))

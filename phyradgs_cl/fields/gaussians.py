@@ -1,4 +1,4 @@
-"""Radiative Gaussians: parameters with units, and the unconstrained ("raw") numbers that are optimised.
+"""Radiative Gaussians: their parameters with units, and the unconstrained ("raw") numbers that the optimiser changes.
 
 The field of one Gaussian is ρ exp(−½ (x−μ)ᵀ Σ⁻¹ (x−μ)) with Σ = R diag(s²) Rᵀ (paper, section 2)."""
 
@@ -19,9 +19,9 @@ _DENSITY_FLOOR = 1e-12
 class Gaussians:
     """A cloud of G Gaussians.
 
-    mean (G, 3) and scale (G, 3), x y z, in one unit of length (mm outside the reconstruction). Unit quaternion (G, 4), w x y
-    z. density (G,): attenuation per that length. Raises InputError for other shapes, infinite values or NaN, and for scales
-    that are not above 0."""
+    mean (G, 3), x y z, and scale (G, 3): in the same unit of length, which is mm outside the reconstruction. quaternion
+    (G, 4): w x y z, of length 1. density (G,): attenuation per unit of length. Raises InputError for other shapes, infinite
+    values or NaN, and for scales that are not above 0."""
 
     mean: np.ndarray
     scale: np.ndarray
@@ -46,7 +46,7 @@ class Gaussians:
         return len(self.mean)
 
     def rows(self) -> np.ndarray:
-        """Returns the parameters (11, G) float64 in the order of the kernels."""
+        """Returns the parameters (11, G) float64, in the order that kernels read: mean, scale, quaternion, density."""
         q = self.quaternion
         if self.count:
             q = q / np.linalg.norm(q, axis=1, keepdims=True)
@@ -62,7 +62,7 @@ class Gaussians:
     def of_covariance(cls, mean: np.ndarray, covariance: np.ndarray, density: np.ndarray) -> "Gaussians":
         """Makes a cloud from means (G, 3), covariances (G, 3, 3) and densities (G,)."""
         variance, axes = np.linalg.eigh(covariance)
-        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # makes a rotation of a reflection
+        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # eigenvectors may form a reflection: no quaternion fits
         x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(axes).as_quat().T
         return cls(mean, np.sqrt(variance), np.stack([w, x, y, z], -1), density)
 
@@ -73,7 +73,7 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Activation:
-    """Maps raw numbers to parameters: scale = min + (max − min)·sigmoid, density = softplus, quaternion normalised."""
+    """Maps raw numbers x to parameters: scale = min + (max − min) sigmoid(x), density = softplus(x), quaternion = x/|x|."""
 
     scale_min: float
     scale_max: float
@@ -87,7 +87,8 @@ class Activation:
         return rows
 
     def invert(self, rows: np.ndarray) -> np.ndarray:
-        """Returns raw rows for parameter rows (11, G). Scales stay a little inside their bounds."""
+        """Returns raw rows for parameter rows (11, G). Scales are kept a little inside their bounds, where the sigmoid's
+        inverse is finite."""
         raw = np.array(rows, dtype=np.float64)
         span = self.scale_max - self.scale_min
         raw[SCALE] = scipy.special.logit(np.clip((rows[SCALE] - self.scale_min) / span, 1e-4, 1 - 1e-4))

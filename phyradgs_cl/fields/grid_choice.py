@@ -1,4 +1,4 @@
-"""The grid that a user wants for a volume in place of the scan's grid."""
+"""Options by which a user chooses another grid for a volume than the scan's."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,10 +16,9 @@ _VOXEL = "Sides of a voxel, mm; the box stays."
 _ROI = "Box of the volume about the axis, mm, or its sides about the scan's middle; the voxels stay."
 _MARGIN = "Width around the box, mm, that is reconstructed and discarded: for objects larger than box or panel."
 _SCAN = "the scan's"
-_LARGEST_MM = 1e9  # upper limit in mm of a length that an option takes; the lower limit of widths is 1e-9 mm
-_ROUNDING = 1e-6  # a box's end and a voxel's face at most this far apart, in voxels, count as one place
-# a typed box's end and a face of the scan's voxels at most this far apart, in voxels, count as one place: the voxels' sides
-# are rarely round numbers
+_LARGEST_MM = 1e9  # largest length in mm that an option takes; the smallest is 1e-9 mm
+_ROUNDING = 1e-6  # a box may exceed whole voxels by this much, in voxels, without needing one more: it is rounding
+# A typed box may exceed the scan's voxels by this much without needing one more: voxel sides are rarely round numbers.
 _TYPED = 0.01
 
 
@@ -67,11 +66,11 @@ class GridChoice:
             raise InputError("--size", "all three", expected, "leave one out")
 
     def of(self, grid: Grid) -> Grid:
-        """Returns the chosen grid in place of ``grid``; ``grid`` itself where nothing is chosen.
+        """Returns the chosen grid in place of ``grid``, or ``grid`` itself if nothing is chosen.
 
-        A box alone takes the voxels of ``grid`` that it meets by more than a hundredth, continued beyond ``grid``. The
-        volume is then a part of the volume on ``grid``. A size alone keeps the box. A voxel alone keeps the box too, with
-        its sides rounded up to whole voxels. Raises InputError for too many voxels."""
+        With ``roi_mm`` alone, it has the voxels of ``grid`` (continued outside it) that overlap the box by more than a
+        hundredth of a voxel. ``size`` alone keeps the box of ``grid``. ``voxel_mm`` alone also keeps it, with its sides
+        rounded up to whole voxels. Raises InputError for too many voxels."""
         box_mm = self._box_mm(grid)
         sides_mm = box_mm[:, 1] - box_mm[:, 0]
         if self.size is not None:
@@ -90,14 +89,13 @@ class GridChoice:
         return Grid(self._whole(shape), triple(np.broadcast_to(voxel_mm, 3)), triple(box_mm.mean(1)))
 
     def with_margin(self, grid: Grid) -> Grid:
-        """Returns ``grid`` enlarged by ``margin_mm`` in whole voxels. Raises InputError for too many voxels."""
+        """Returns ``grid`` enlarged by ``margin_mm``, in whole voxels. Raises InputError for too many voxels."""
         if self.margin_mm is None:
             return grid
         around = np.ceil(np.divide(self.margin_mm, grid.voxel_size_mm) - _TYPED)
         return grid.part(triple(int(-n) for n in around), self._whole(grid.shape + 2 * around, "--margin-mm"))
 
     def _box_mm(self, grid: Grid) -> np.ndarray:
-        """Returns the ends (3, 2) of the chosen box, or those of ``grid``."""
         if self.roi_mm is None:
             return grid.box_mm
         if len(self.roi_mm) == 6:
@@ -110,7 +108,7 @@ class GridChoice:
         return np.maximum(np.round(float(self.size or 1) * proportion / proportion.max()), 1)
 
     def _cut(self, grid: Grid, box_mm: np.ndarray) -> Grid:
-        """Returns the voxels of ``grid``, continued beyond it, that a box (3, 2) meets."""
+        """Returns the grid of those voxels of ``grid``, continued outside it, that overlap a box (3, 2) in mm."""
         low, high = (box_mm.T - grid.box_mm[:, 0]) / grid.voxel_size_mm
         start = np.floor(low + _TYPED)
         shape = self._whole(np.maximum(np.ceil(high - _TYPED) - start, 1))
@@ -126,8 +124,7 @@ class GridChoice:
 
 
 def voxel_sides_mm(option: str, value: Any) -> tuple[float, float, float]:
-    """Returns the sides of a voxel (z, y, x) in mm from one length or three. Raises InputError, which names ``option``,
-    for other values."""
+    """Returns voxel sides (z, y, x) in mm from one length or three. Raises InputError about ``option`` for other values."""
     sides_mm = _numbers(option, value, (1, 3), "0.5 or 1,0.5,0.5")
     for side_mm in sides_mm:
         checks.within(option, side_mm, 1 / _LARGEST_MM, _LARGEST_MM)
@@ -135,8 +132,8 @@ def voxel_sides_mm(option: str, value: Any) -> tuple[float, float, float]:
 
 
 def _numbers(option: str, value: Any, counts: tuple[int, ...], example: str) -> tuple[float, ...]:
-    """Returns a number, or a sequence of numbers, as finite floats. ``counts``: how many there may be."""
-    value = value.ravel().tolist() if isinstance(value, np.ndarray) else value  # Grid.box_mm is (3, 2)
+    """Returns a number, or a sequence of numbers, as floats. counts: the lengths allowed. Raises InputError otherwise."""
+    value = value.ravel().tolist() if isinstance(value, np.ndarray) else value  # an array may be (3, 2), as Grid.box_mm is
     parts = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
     parts = [part.item() if isinstance(part, np.generic) else part for part in parts]
     fits = len(parts) in counts and all(isinstance(n, int | float) and not isinstance(n, bool) for n in parts)

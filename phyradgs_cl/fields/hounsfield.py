@@ -1,4 +1,5 @@
-"""Hounsfield units of a volume: two points, air and water, fitted to boxes or to the peaks of its histogram."""
+"""Converts attenuation to Hounsfield units. The attenuation of air and water comes from two boxes in the volume, or from the
+peaks of its histogram."""
 
 import logging
 import re
@@ -16,29 +17,28 @@ log = logging.getLogger(__name__)
 HOUNSFIELD = "hounsfield"
 """The key of a volume's scale in its provenance."""
 Box = tuple[float, ...]
-"""Z0, Z1, Y0, Y1, X0, X1 in mm."""
+"""A box in world coordinates: Z0, Z1, Y0, Y1, X0, X1 in mm."""
 Window = tuple[float, float, int]
-"""Both ends of a histogram's peak at half its height, in 1/mm, and the number of voxels between them."""
-_FEWEST = 100  # least number of voxels of air and of water: their mean has a tenth of a voxel's noise
-# range of water's attenuation in 1/mm, outside which a warning is logged: 0.0097 at 500 keV and 0.53 at 10 keV, rounded
-# outwards
+"""A peak of a histogram: where it falls to half its height below and above, in 1/mm, and the voxels in between."""
+_FEWEST = 100  # least number of voxels of air and of water: the noise of their mean is then a tenth of a voxel's
+# Water's attenuation in 1/mm is 0.0097 at 500 keV and 0.53 at 10 keV. Outside these limits a warning is logged.
 _WATER_PER_MM = (0.009, 0.6)
-_AIR_BELOW = 0.25  # largest ratio of the lowest peak's attenuation to water's: a higher lowest peak is not air, but fat, say
-_ONE_MATERIAL = 0.4  # largest standard deviation of a box's voxels, as a fraction of water minus air, without a warning
-_BINS = 512  # number of bins of the histogram
+_AIR_BELOW = 0.25  # a lowest peak above this fraction of water's attenuation is not air; it may be fat
+_ONE_MATERIAL = 0.4  # a box whose standard deviation is more than this times water minus air may hold two materials
+_BINS = 512
 _SMOOTH_BINS = 2.0  # standard deviation of the Gaussian that smooths the histogram, in bins
-_PROMINENT = 0.1  # least prominence of a peak, as a fraction of its smoothed count
-_CERTAIN = 3.0  # least prominence of a peak over the root of its smoothed count: eight times the noise of smoothed counts
-_ZOOM = 2.5  # largest ratio of the last histogram's upper end to that of water's peak
-_SHORTENED = 5  # most times that the histogram's range is cut to a quarter: metal may be a thousand times denser than water
+_PROMINENT = 0.1  # a peak must rise above its surroundings by this fraction of its smoothed count
+_CERTAIN = 3.0  # a peak must also rise by this times the root of its count, which is eight times the noise after smoothing
+_ZOOM = 2.5  # the last histogram ends at this times the upper end of water's peak, so that peaks span many bins
+_SHORTENED = 5  # the histogram's range is cut to a quarter so often at most: metal may be 1000 times denser than water
 _NUMBER = r"-?\d+\.?\d*(?:e[-+]\d+)?"
 _NOTE = re.compile(rf"values in HU(?:, water ({_NUMBER}), air ({_NUMBER}) 1/mm)?")
 
 
 @dataclass(frozen=True)
 class Hounsfield:
-    """A scale of Hounsfield units: attenuation of water, 0 HU, and of air, −1000 HU, in 1/mm. fitted: in words, to what
-    the scale was fitted. Raises InputError for water outside 1e-6 to 1e3, and for air that is not below it."""
+    """The scale of Hounsfield units: the attenuation in 1/mm of water (0 HU) and of air (−1000 HU). fitted: what the scale
+    was fitted to, in words. Raises InputError for water outside 1e-6 to 1e3, and for air that is not below it."""
 
     water_per_mm: float
     air_per_mm: float = 0.0
@@ -52,7 +52,7 @@ class Hounsfield:
             raise InputError("Hounsfield units", found, "air below water", "exchange or move the boxes")
 
     def of(self, per_mm: np.ndarray) -> np.ndarray:
-        """Returns attenuation (z, y, x) in 1/mm as float32 in HU. Raises InputError where float32 does not hold them."""
+        """Converts attenuation (z, y, x) in 1/mm to float32 in HU. Raises InputError where float32 overflows."""
         hu = np.subtract(per_mm, self.water_per_mm, dtype=np.float32)
         with np.errstate(over="ignore"):
             hu *= 1000.0 / (self.water_per_mm - self.air_per_mm)
@@ -60,28 +60,28 @@ class Hounsfield:
         return hu
 
     def per_mm(self, hu: np.ndarray) -> np.ndarray:
-        """Returns values (z, y, x) in HU as float32 in 1/mm."""
+        """Converts values (z, y, x) in HU to float32 in 1/mm."""
         values = np.multiply(hu, (self.water_per_mm - self.air_per_mm) / 1000, dtype=np.float32)
         values += np.float32(self.water_per_mm)
         return values
 
     @property
     def note(self) -> str:
-        """What an exported file says of its values; ``of_note`` reads it."""
+        """A note about the values, for exported files; ``of_note`` reads it again."""
         return f"values in HU, water {self.water_per_mm:.9g}, air {self.air_per_mm:.9g} 1/mm"
 
     @property
     def line(self) -> str:
-        """What the scale was fitted to, for one line."""
+        """What the scale was fitted to, or its two values, as one line of text."""
         return self.fitted or f"water {self.water_per_mm:.4g}, air {self.air_per_mm:.4g} 1/mm"
 
     def facts(self) -> dict[str, object]:
-        """Returns what a volume's provenance holds of the scale."""
+        """Returns the scale as entries of a volume's provenance (the record of how it was made)."""
         return {HOUNSFIELD: asdict(self)}
 
 
 def of_facts(facts: Mapping[str, object]) -> Hounsfield | None:
-    """Returns the scale in a volume's provenance; None without a scale. Raises InputError for a damaged one."""
+    """Returns the scale in a volume's provenance, or None. Raises InputError for a damaged one."""
     if (stored := facts.get(HOUNSFIELD)) is None:
         return None
     try:
@@ -92,7 +92,7 @@ def of_facts(facts: Mapping[str, object]) -> Hounsfield | None:
 
 
 def of_note(text: str) -> tuple[bool, Hounsfield | None]:
-    """Returns whether a file's note says that its values are HU, and the scale, where it states one."""
+    """Returns whether a file's note says that its values are HU, and the scale if the note states it."""
     found = _NOTE.search(text)
     if found is None or found[1] is None:
         return found is not None, None
@@ -102,10 +102,11 @@ def of_note(text: str) -> tuple[bool, Hounsfield | None]:
 def fitted(
     values: np.ndarray, grid: Grid, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0
 ) -> Hounsfield:
-    """Fits the scale of a volume (z, y, x) in 1/mm to the means of two boxes. A box that is None becomes the volume's own
-    peak: the lowest is air, the largest above it water. ``insert_hu``: the HU of the second point, where it is not water.
+    """Fits the scale of a volume (z, y, x) in 1/mm to the means of two boxes, of air and of water.
 
-    Raises InputError for less than 100 voxels, air that is not below water, and where no two peaks can be air and water."""
+    Without a box of air, the lowest peak of the histogram is air. Without a box of water, the largest peak above is water.
+    insert_hu: the HU of the material in the second box, if it is not water. Raises InputError for fewer than 100 voxels, air
+    that is not below water, and a histogram without two peaks that can be air and water."""
     checks.within("--insert-hu", insert_hu, -900, 30_000)
     if values.min() < -10:  # no attenuation in 1/mm
         raise InputError("--hu", f"values from {values.min():g}, as of Hounsfield units", "attenuation in 1/mm")
@@ -142,7 +143,7 @@ def _mean(name: str, voxels: np.ndarray, is_peak: bool) -> tuple[float, str]:
 
 
 def _inside(option: str, values: np.ndarray, grid: Grid, box: Box) -> np.ndarray:
-    """Returns the voxels whose centres lie in a box. Raises InputError for other than six numbers, rising in pairs."""
+    """Returns the voxels whose centres lie in a box. Raises InputError unless it has six numbers, rising in pairs."""
     ends_mm = checks.numbers(option, np.asarray(box), (6,)).reshape(3, 2)
     if (ends_mm[:, 0] >= ends_mm[:, 1]).any():
         raise InputError(option, checks.short_repr(box), "Z0 below Z1, Y0 below Y1, X0 below X1")
@@ -151,8 +152,8 @@ def _inside(option: str, values: np.ndarray, grid: Grid, box: Box) -> np.ndarray
 
 
 def _peaks(values: np.ndarray) -> tuple[Window, Window]:
-    """Returns the windows of air and of water in the histogram. Metal is so dense that both may lie in a few bins, so the
-    histogram is shortened until it shows two peaks, and once more to end beyond water."""
+    """Returns the histogram's peaks of air and of water. With metal in the volume, both may lie in the first few bins. So
+    the histogram's range is shortened until it shows two peaks, and then once more to end not far above water."""
     lowest, highest = (float(v) for v in np.percentile(values, (0.1, 99.9)))
     for _ in range(_SHORTENED + 1):
         if len(windows := _windows(values, lowest, highest)) > 1:
@@ -167,12 +168,12 @@ def _peaks(values: np.ndarray) -> tuple[Window, Window]:
 
 
 def _largest(windows: list[Window]) -> Window:
-    """Returns the window with most voxels above the lowest."""
+    """Returns the peak with most voxels, except the lowest peak."""
     return max(windows[1:], key=lambda window: window[2])
 
 
 def _windows(values: np.ndarray, lowest: float, highest: float) -> list[Window]:
-    """Returns the windows of the peaks that hold enough voxels, from low to high."""
+    """Returns the peaks of the histogram that hold enough voxels, from low to high attenuation."""
     if not lowest < highest:
         return []
     counts, edges = np.histogram(values, _BINS, (lowest, highest))

@@ -1,4 +1,4 @@
-"""An object that moves or changes: its volumes at some times, a gating signal, and its volume in any state."""
+"""An object that moves or changes during a scan: its volumes at some times, a gating signal, and its deformed volume."""
 
 import os
 from collections.abc import Sequence
@@ -14,17 +14,17 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.deformation import Deformation
 from phyradgs_cl.fields.volume import Grid, triple
 
-_SLAB_VOXELS = 1 << 18  # most voxels that one thread displaces at a time: coordinates need six times their memory
-_BORDER = 8  # width in voxels of the zeros around a volume: a spline's coefficients fall to 3e-5 within it
+_SLAB_VOXELS = 1 << 18  # voxels that a thread deforms at a time: their coordinates need six times the memory of voxels
+_BORDER = 8  # zeros around a volume, in voxels: over this width the spline's coefficients fall to 3e-5
 
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """Volumes of an object at some times.
+    """Volumes of an object at K times ("states").
 
     times_s: (K,) in s, rising, on the clock of the scan's frames. volumes: (K, nz, ny, nx) float32 in 1/mm at these times,
     on the scan's grid. Raises InputError for shapes that do not fit, times that do not rise, values that are not finite, and
-    for no state at all."""
+    K = 0."""
 
     times_s: np.ndarray
     volumes: np.ndarray
@@ -36,13 +36,13 @@ class States:
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """The time in s that the states describe, from half a step before the first to half a step after the last."""
+        """The interval in s that the volumes describe, from half a step before the first to half a step after the last."""
         steps_s = np.diff(self.times_s) if len(self.times_s) > 1 else np.zeros(1)
         return float(self.times_s[0] - steps_s[0] / 2), float(self.times_s[-1] + steps_s[-1] / 2)
 
     def at(self, time_s: float) -> np.ndarray:
-        """Returns the volume (nz, ny, nx) float32 at a time. It is interpolated linearly between two states; before the
-        first and after the last one it is constant. Raises InputError for anything but a finite number."""
+        """Returns the volume (nz, ny, nx) float32 at a time in s: linear between two stated volumes, constant before the
+        first and after the last. Raises InputError for anything but a finite number."""
         place = float(np.interp(checks.numbers("time_s", time_s, ()), self.times_s, np.arange(len(self.times_s))))
         first, share = int(place), np.float32(place - int(place))
         after = self.volumes[min(first + 1, len(self.volumes) - 1)]
@@ -51,17 +51,17 @@ class States:
 
 @dataclass(frozen=True, eq=False)
 class MovingTruth(States):
-    """True volumes of a simulated object. deformation: that of the scan's reference; None if no field describes it."""
+    """True volumes of a simulated moving object. deformation: its motion relative to ``Scan.reference``, if known."""
 
     deformation: Deformation | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Gating:
-    """A signal that tells how far the object's motion is at some times.
+    """A signal that tells the state of the object's motion, as a breathing belt or an ECG does.
 
-    times_s: (n,) rising, on the clock of ``Scan.frame_start_s``. values: (n,) of any unit and sign; with ``is_phase``
-    rising phases in cycles, of which only the part of a cycle counts.
+    times_s: (n,) rising, on the clock of ``Scan.frame_start_s``. values: (n,) of any unit and sign. is_phase: the values
+    are rising phases in cycles, of which only the fraction of a cycle matters.
 
     Raises InputError for shapes that differ, values that are not finite, and times that do not rise."""
 
@@ -76,12 +76,12 @@ class Gating:
 
     @property
     def steps(self) -> np.ndarray:
-        """The difference (n − 1,) from each value to the next. Of phases it is from 0 to below 1."""
+        """The difference (n − 1,) from each value to the next. For phases it is at least 0 and below 1 cycle."""
         steps = np.diff(self.values)
         return steps % 1.0 if self.is_phase else steps
 
     def at(self, times_s: np.ndarray) -> np.ndarray:
-        """Returns the values (m,) at times (m,), linear between two stated values. Phases may be 1 or more."""
+        """Returns the values (m,) at times (m,) in s, linear between two stated values. Phases may be 1 or more."""
         before = np.clip(np.searchsorted(self.times_s, times_s, "right") - 1, 0, len(self.times_s) - 1)
         lengths_s, steps = np.append(np.diff(self.times_s), 1.0), np.append(self.steps, 0.0)
         share = np.clip((np.asarray(times_s) - self.times_s[before]) / lengths_s[before], 0, 1)
@@ -89,11 +89,11 @@ class Gating:
 
 
 def deformed(volume: np.ndarray, grid: Grid, deformation: Deformation, weights: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Returns the object (nz, ny, nx) float32 in 1/mm at one state's weights (R,), as ``deformation.weights_at`` gives them.
+    """Returns a deformed volume (nz, ny, nx) float32 in 1/mm: v(y + w(y)) at every voxel centre y.
 
-    It is v(y + w(y)) at every voxel centre y, by cubic splines through the voxels of the reference ``volume`` (nz, ny, nx)
-    in 1/mm on ``grid``. Outside of it v is 0. A state at rest is the volume itself. Raises InputError for shapes that do not
-    fit."""
+    v interpolates the reference ``volume`` (nz, ny, nx) in 1/mm on ``grid`` by cubic splines, and is 0 outside it. w is the
+    displacement of ``deformation`` with ``weights`` (R,), as ``deformation.weights_at`` gives them for a time. Where w is 0
+    everywhere, the volume is returned unchanged. Raises InputError for shapes that do not fit."""
     if not isinstance(deformation, Deformation):
         raise InputError("deformation", checks.short_repr(deformation), "a Deformation")
     checks.shape("volume", checks.real_array("volume", volume), grid.shape)
@@ -102,9 +102,9 @@ def deformed(volume: np.ndarray, grid: Grid, deformation: Deformation, weights: 
 
 
 class SplineVolume:
-    """A volume (nz, ny, nx) float32 in 1/mm with values between its voxels too, by cubic splines. Outside it is 0.
+    """A volume (nz, ny, nx) float32 in 1/mm, interpolated by cubic splines. It is 0 outside.
 
-    Splines undershoot near edges, so values are limited to the least voxel, or 0, from below."""
+    Splines undershoot near edges, so no value is returned below the least voxel, or below 0 if that is less."""
 
     def __init__(self, volume: np.ndarray, grid: Grid) -> None:
         self.volume, self.grid = volume, grid
@@ -112,8 +112,7 @@ class SplineVolume:
         self._coefficients: np.ndarray | None = None
 
     def deformed(self, deformation: Deformation, weights: np.ndarray) -> np.ndarray:
-        """Returns v(y + w(y)) (nz, ny, nx) float32 at every voxel centre y, for a state's weights (R,). At rest it is the
-        volume."""
+        """Returns v(y + w(y)) (nz, ny, nx) float32 at every voxel centre y, for displacements w with ``weights`` (R,)."""
         if not np.any(deformation.reach_mm * np.abs(weights)):
             return self.volume
         if self._coefficients is None:
@@ -127,7 +126,7 @@ class SplineVolume:
         return np.concatenate(slabs)
 
     def _slab(self, deformation: Deformation, weights: np.ndarray, first: int, part: Grid) -> np.ndarray:
-        """Returns the deformed slices of ``part`` of the grid. ``first``: its first slice."""
+        """Returns the deformed slices of ``part``, a part of the grid that begins at slice ``first``."""
         shift = deformation.on_grid_mm(part, weights) / np.array(self.grid.voxel_size_mm[::-1], np.float32)
         nz, ny, nx = part.shape
         voxels = np.ogrid[first : first + nz, :ny, :nx]

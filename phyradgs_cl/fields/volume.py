@@ -1,4 +1,4 @@
-"""A regular voxel grid in world coordinates."""
+"""``Grid``, a regular voxel grid in world coordinates, and the metal in an object."""
 
 import math
 from collections.abc import Iterable
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from xarray import DataArray
 
 MOST_VOXELS = 2**38
-"""The most voxels of a grid: a terabyte of float32. Larger requests come from damaged files."""
-_SAME_PLACE = 1e-3  # largest distance in voxels at which voxels of two grids count as one: grids may be stored in float32
+"""The most voxels of a grid: a terabyte of float32. Larger numbers come from damaged files."""
+_SAME_PLACE = 1e-3  # voxels of two grids this close, in voxels, are at the same place: float32 rounds stored grids
 T = TypeVar("T")
 
 
 def triple(values: Iterable[T]) -> tuple[T, T, T]:
-    """Returns three values (z, y, x) as a tuple of that length."""
+    """Returns three values (z, y, x) as a tuple whose length type checkers know."""
     z, y, x = values
     return z, y, x
 
@@ -29,8 +29,8 @@ def triple(values: Iterable[T]) -> tuple[T, T, T]:
 class Grid:
     """A box of voxels centred at ``offset_mm``. All triples are (z, y, x), like the arrays.
 
-    shape: counts. voxel_size_mm: sides of a voxel in mm. Raises InputError for counts below 1, lengths that are not finite,
-    and sides that are not above 0."""
+    shape: numbers of voxels. voxel_size_mm: sides of a voxel. Raises InputError for numbers below 1, lengths that are not
+    finite, and sides that are not above 0."""
 
     shape: tuple[int, int, int]
     voxel_size_mm: tuple[float, float, float]
@@ -51,7 +51,7 @@ class Grid:
 
     @classmethod
     def cube(cls, count: int, side_mm: float) -> "Grid":
-        """Returns a centred cube of ``count``³ voxels with a side of ``side_mm``. Raises InputError for numbers not above
+        """Returns a cube of ``count``³ voxels and side ``side_mm`` about the origin. Raises InputError unless both are above
         0."""
         checks.whole("count", count, 1, MOST_VOXELS)
         checks.positive("side_mm", side_mm)
@@ -59,34 +59,34 @@ class Grid:
 
     @property
     def size_mm(self) -> tuple[float, float, float]:
-        """The sides (z, y, x) of the box."""
+        """The sides (z, y, x) of the whole box in mm."""
         return triple(n * d for n, d in zip(self.shape, self.voxel_size_mm, strict=True))
 
     @property
     def box_mm(self) -> np.ndarray:
-        """The ends (3, 2) float64 of the box along z, y and x."""
+        """Where the box begins and ends along z, y and x: (3, 2) float64 in mm."""
         half_mm, centre_mm = np.array(self.size_mm) / 2, np.array(self.offset_mm)
         return np.stack([centre_mm - half_mm, centre_mm + half_mm], -1)
 
     @property
     def half_longest_mm(self) -> float:
-        """Half the longest side, which is the unit of length inside the reconstruction."""
+        """Half the longest side in mm. Inside the reconstruction it is the unit of length."""
         return max(self.size_mm) / 2
 
     @property
     def first_centre_mm(self) -> tuple[float, float, float]:
-        """The centre (z, y, x) of voxel (0, 0, 0)."""
+        """The centre (z, y, x) of voxel (0, 0, 0) in mm."""
         sides = zip(self.shape, self.voxel_size_mm, self.offset_mm, strict=True)
         return triple(offset - (n - 1) / 2 * d for n, d, offset in sides)
 
     def axes_mm(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns the coordinates of voxel centres, z (nz,), y (ny,), x (nx,), float64."""
+        """Returns the coordinates of voxel centres in mm, z (nz,), y (ny,), x (nx,), float64."""
         sides = zip(self.first_centre_mm, self.shape, self.voxel_size_mm, strict=True)
         return triple(first + np.arange(n) * d for first, n, d in sides)
 
     def data_array(self, values: np.ndarray, unit: str, times_s: np.ndarray | None = None) -> "DataArray":
         """Returns values (nz, ny, nx), or (K, nz, ny, nx) at ``times_s`` (K,), as xarray's DataArray with coordinates in mm
-        and s. ``unit``: that of the values. Raises InputError where xarray is not installed."""
+        and s. ``unit``: the unit of the values. Raises InputError where xarray is not installed."""
         xarray = checks.package("xarray", "the package of labelled arrays", "xarray")
         axes = {name: (name, axis, {"units": "mm"}) for name, axis in zip("zyx", self.axes_mm(), strict=True)}
         if times_s is not None:
@@ -95,7 +95,7 @@ class Grid:
         return xarray.DataArray(values, axes, list(axes), facts["long_name"], facts)
 
     def is_close(self, other: "Grid") -> bool:
-        """Returns whether two grids are equal up to the rounding of files."""
+        """Returns whether two grids are equal, apart from the rounding of numbers stored in files."""
         near_mm = 1e-5 * max(self.size_mm)
         same_voxels = np.allclose(self.voxel_size_mm, other.voxel_size_mm, rtol=1e-5)
         return self.shape == other.shape and same_voxels and np.allclose(self.offset_mm, other.offset_mm, atol=near_mm)
@@ -106,7 +106,7 @@ class Grid:
         return Grid(shape, self.voxel_size_mm, triple(first + (s + (n - 1) / 2) * d for first, s, n, d in sides))
 
     def slices_in(self, whole: "Grid") -> tuple[slice, slice, slice] | None:
-        """Returns the place (z, y, x) of this grid in ``whole``, or None where it is no part of it."""
+        """Returns the slices (z, y, x) of ``whole`` that are this grid, or None if it is no part of ``whole``."""
         if not np.allclose(self.voxel_size_mm, whole.voxel_size_mm, rtol=1e-5):
             return None
         exact = np.subtract(self.first_centre_mm, whole.first_centre_mm) / whole.voxel_size_mm
@@ -116,7 +116,7 @@ class Grid:
         return triple(slice(int(s), int(s) + n) for s, n in zip(start, self.shape, strict=True))
 
     def in_shape(self, shape: tuple[int, int, int]) -> "Grid":
-        """Returns the same box in ``shape`` (z, y, x) voxels."""
+        """Returns the same box divided into ``shape`` (z, y, x) voxels."""
         return Grid(shape, triple(side / n for side, n in zip(self.size_mm, shape, strict=True)), self.offset_mm)
 
     def finer(self, parts: int) -> "Grid":
@@ -130,8 +130,8 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class Metal:
-    """Attenuation (nz, ny, nx) float32 in 1/mm of the metal on ``grid``, 0 elsewhere. Raises InputError for another
-    shape."""
+    """The metal in an object: attenuation (nz, ny, nx) float32 in 1/mm on ``grid``, 0 where there is none. Raises
+    InputError for another shape."""
 
     values: np.ndarray
     grid: Grid

@@ -1,6 +1,5 @@
-"""Operators between fields and frames: splats, voxels of splats, rays, and FDK's backprojection.
-
-An operator knows its domain, its range and its transpose. It knows no algorithm."""
+"""Operators between objects and frames: projectors of voxels (rays) and of Gaussians (splats), voxelisation of Gaussians,
+and FDK's backprojection. An operator has a domain, a range and a transpose. Algorithms are elsewhere."""
 
 from phyradgs_cl.operators.backproject import backproject, backproject_lines
 from phyradgs_cl.operators.rays.intensity import IntensityOperator

@@ -1,6 +1,7 @@
-"""Voxel-driven backprojection with FDK's distance weight, from one pose per frame or one pose per line.
+"""Voxel-driven backprojection with FDK's distance weight, with one pose per frame or one pose per line.
 
-If memory is short, the volume is computed in bricks and views are uploaded in smaller parts, with the same bits."""
+If memory is short, the volume is computed part by part and fewer views are uploaded at a time. The result has the same
+bits."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -16,17 +17,17 @@ from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.runtime import Array, DeviceArray, Room, Runtime, SameArray, attempts
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of, unpad_rows
 
-_VIEWS_PER_LAUNCH = 64  # most views of a launch: a work-item reads a few lines of each, which should stay in the cache
-_BYTES_A_LAUNCH = 1 << 28  # most bytes of the frames that are uploaded together
-_VIEWS_SHARE = 0.25  # largest fraction of the free device memory for the frames that are uploaded together
-_BLOCK_VOXELS = 128  # most voxels along z per work-item of the upright kernel
-_COLUMN_ROWS = 512  # most detector rows to which the voxels of a work-item may project
-# columns of voxels are upright where u·depth and depth change over the volume's height by at most this fraction of the depth
+_VIEWS_PER_LAUNCH = 64  # most views of a launch: the few lines of each that a work-item reads should stay in the cache
+_BYTES_A_LAUNCH = 1 << 28  # most bytes of frames that are uploaded together
+_VIEWS_SHARE = 0.25  # fraction of the free device memory that these frames may take; the volume needs the rest
+_BLOCK_VOXELS = 128  # most voxels along z per work-item of the kernels for upright columns of voxels
+_COLUMN_ROWS = 512  # most detector rows to which these voxels may project
+# A column of voxels along z is upright if over its height u·depth and depth change by at most this fraction of the depth.
 _UPRIGHT = 1e-7
-# largest lean of a column of voxels, in detector columns crossed per row crossed: beyond it the general kernel is faster
+# Largest lean of the image of a column of voxels, in detector columns per row. Beyond it the general kernel is faster.
 _MOST_LEAN = 0.25
-LINE_SAMPLES = 4  # time of a voxel in a view with a pose for every line, in samples of a view with one pose
-_WIDEST = 16  # number of voxels of the widest vector, which may reach beyond the end of a column
+LINE_SAMPLES = 4  # with one pose per line a voxel takes this many times longer than with one pose per view
+_WIDEST = 16  # width of the widest vector of voxels along z, which may reach beyond the volume
 Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
 
@@ -34,11 +35,11 @@ def backproject(
     rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid, *, is_parallel: bool = False,
     power: int = 2,
 ) -> SameArray:
-    """Returns Σ_f weight_f / z^power · frame_f(u, v) at every voxel centre, with z the voxel's depth over the detector's.
+    """Returns Σ_f weight_f / z^power · frame_f(u, v) at every voxel centre. z is the voxel's depth over the detector's.
 
-    frames (F, rows, columns) are interpolated bilinearly, 0 outside; pose (F, 12) mm; weight (F,). power: 2 for FDK's
-    distance weight, or 1. z is 1 in a parallel beam. The volume (nz, ny, nx) float32 lies where ``frames`` do: on the
-    device or the host. Raises OutOfMemoryError where not even a brick fits."""
+    frames (F, rows, columns) are interpolated bilinearly, and 0 outside; pose (F, 12) mm; weight (F,). power: 2 for FDK's
+    distance weight, or 1. In a parallel beam z is 1. The volume (nz, ny, nx) float32 is on the device if ``frames`` are,
+    else on the host. Raises OutOfMemoryError if not even the smallest part of it fits."""
     matrices = voxel_matrices(pose, grid, is_parallel)
     block, leans = (0, False) if rt.pixel_items else _upright_block(matrices, grid)
     views = Views(frames, bool(block), matrices, weight)
@@ -56,10 +57,10 @@ def backproject_lines(
 ) -> SameArray:
     """Backprojects frames (F, rows, columns) in which every line along ``axis`` has its own pose: pose (F, lines, 12) mm.
 
-    A voxel reads the line whose pose projects the voxel onto that line, interpolated between neighbouring lines. Its
-    value is divided by the rate at which the voxel crosses lines: once for the angular step, and once more for the
-    filter's scale where frames were filtered across lines (``axis`` columns). See docs/mathematics.md. power: as in
-    ``backproject``; with 1 the frames count as unfiltered."""
+    A voxel reads the line onto which that line's pose projects it, interpolated between neighbouring lines. The value is
+    divided by the rate at which the voxel crosses lines: once because the angular step changes, and once more because the
+    ramp filter's scale changes if it ran across lines (``axis`` columns). See docs/mathematics.md. power: as in
+    ``backproject``; 1 means frames that were not filtered."""
     pose = Readout(axis).poses(pose)
     matrices = voxel_matrices(pose.reshape(-1, 12), grid, is_parallel).reshape(len(pose), -1)
     views = Views(frames, axis == "columns", matrices, weight)
@@ -68,8 +69,9 @@ def backproject_lines(
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """The views to backproject. frames (F, rows, columns); is_turned: kernels get them transposed. matrices (F, 12 ·
-    poses): ``voxel_matrices`` of a frame's poses. weight (F,): FDK's weights."""
+    """The views to backproject: frames (F, rows, columns) and FDK's weight (F,).
+
+    is_turned: kernels get the frames transposed. matrices (F, 12 · poses): the ``voxel_matrices`` of each frame's poses."""
 
     frames: Array
     is_turned: bool
@@ -78,7 +80,7 @@ class Views:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(lines, width) of a frame in the kernels: (columns, rows) where it is transposed."""
+        """The shape of a frame in the kernels: (columns, rows) if it is transposed, else (rows, columns)."""
         _, rows, columns = self.frames.shape
         return (columns, rows) if self.is_turned else (rows, columns)
 
@@ -88,7 +90,7 @@ class Views:
         return 4 * count * int(2 * GUARD + rows * pitch_of(width) + self.matrices.shape[1] + 1)
 
     def padded(self, rt: Runtime, part: slice) -> DeviceArray:
-        """Returns the frames ``part`` on the device, (n, floats of a padded frame), transposed where ``is_turned``."""
+        """Copies the n frames ``part`` to the device, padded and transposed if ``is_turned``. Returns (n, floats)."""
         count, (rows, width) = part.stop - part.start, self.shape
         pitch = pitch_of(width)
         each = 2 * GUARD + rows * pitch
@@ -105,7 +107,7 @@ class Views:
         return rt.upload(on_host)
 
     def parts(self, room: Room) -> Iterator[slice]:
-        """Yields slices of consecutive views that are on the device together, for one launch each."""
+        """Yields slices of the views such that each fits into the memory of one launch."""
         most_bytes = min(_BYTES_A_LAUNCH, room.largest_bytes, int(_VIEWS_SHARE * room.free_bytes))
         count = max(1, min(_VIEWS_PER_LAUNCH, most_bytes // self.bytes(1)))
         for first in range(0, len(self.matrices), count):
@@ -116,8 +118,8 @@ _Launch = Callable[[Arguments, Brick, DeviceArray], None]
 
 
 def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch) -> Array:
-    """Returns the volume (nz, ny, nx) that ``launch`` fills. One that does not fit is filled brick by brick; their sides
-    along z are multiples of ``step`` voxels. Raises OutOfMemoryError where no brick fits."""
+    """Returns a volume (nz, ny, nx), which ``launch`` fills for some views and one brick at a time. If it fits, the whole
+    volume is one brick; else sides along z are multiples of ``step``. Raises OutOfMemoryError if no brick fits."""
     is_resident = isinstance(views.frames, DeviceArray)
     volume: Array = rt.empty(grid.shape) if is_resident else np.empty(grid.shape, np.float32)
 
@@ -132,7 +134,7 @@ def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch)
             for part in parts:
                 images = _images(rt, views, part)
                 launch(images, brick, padded)
-                del images  # frees their memory for the next part
+                del images  # frees their memory before the next views are uploaded
             if isinstance(volume, DeviceArray):
                 move(rt, (padded, _strides(brick)), (volume, Strides.plain(grid.shape, brick.start)), brick.shape)
             else:
@@ -152,7 +154,7 @@ def _general(rt: Runtime, power: int, images: Arguments, brick: Brick, volume: D
 
 
 def _lines(rt: Runtime, power: int, is_turned: bool, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
-    """Launches the kernel for one pose per line. Its vectors run along z where lines are detector columns
+    """Launches the kernel for one pose per line. Its vectors of voxels are along z if lines are detector columns
     (``is_turned``), else along x."""
     nz, ny, nx = brick.shape
     along_z = {"ALONG_Z": 1} if is_turned and rt.lanes > 1 else {}
@@ -164,8 +166,8 @@ def _lines(rt: Runtime, power: int, is_turned: bool, images: Arguments, brick: B
 
 
 def _upright(rt: Runtime, name: str, power: int, block: int, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
-    """Launches one of the kernels ``name`` for upright columns. ``images``: arguments of transposed frames, whose width
-    is the number of detector rows."""
+    """Launches kernel ``name``, for upright columns of voxels. ``images`` holds transposed frames, so their width is the
+    number of detector rows."""
     nz, ny, nx = brick.shape
     sizes = {"BLOCK_VOXELS": _BLOCK_VOXELS, "COLUMN_ROWS": _COLUMN_ROWS}
     kernel = rt.kernel("backproject", name, **_defines(power), **sizes)
@@ -175,16 +177,15 @@ def _upright(rt: Runtime, name: str, power: int, block: int, images: Arguments, 
 
 
 def _defines(power: int) -> dict[str, int]:
-    """Returns the build options for ``power``. The kernels' default is FDK's 2."""
+    """Returns the build options for ``power``. It is left out for FDK's 2, the kernels' default."""
     return {"IMAGE_GUARD": GUARD} if power == 2 else {"IMAGE_GUARD": GUARD, "DISTANCE_POWER": power}
 
 
 def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:
-    """Returns the voxels along z per work-item of the kernels for upright columns, 0 where they do not apply, and whether
-    columns lean.
+    """Returns how many voxels along z a work-item of the kernels for upright columns takes, and whether columns lean.
 
-    In upright columns u and depth (rows 0 and 2 of a matrix) do not change with z. All voxels must lie in front of the
-    source, with those by which a column's last vector exceeds the volume."""
+    0 means that the general kernel is needed. In an upright column of voxels, u and depth (rows 0 and 2 of a matrix) do not
+    change with z. All voxels must be in front of the source, also those that a last vector reads beyond the volume."""
     nz, ny, nx = grid.shape
     corners = np.array([[x, y, z, 1] for x in (0, nx - 1) for y in (0, ny - 1) for z in (0, nz - 1 + _WIDEST)])
     depth = matrices[:, 8:12] @ corners.T
@@ -202,7 +203,7 @@ def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:
 
 
 def _images(rt: Runtime, views: Views, part: slice) -> Arguments:
-    """Returns the kernels' first arguments: padded frames, matrices and weights on the device, and their sizes."""
+    """Uploads the views ``part``. Returns the kernels' first arguments: frames, matrices, weights and their sizes."""
     images, (rows, width) = views.padded(rt, part), views.shape
     count, each = images.shape
     sizes = (np.int32(count), np.int32(rows), np.int32(width), np.int32(pitch_of(width)), np.int64(each))
@@ -217,7 +218,6 @@ def volume_shape(brick: Brick) -> tuple[np.ndarray, np.ndarray, np.int32]:
 
 
 def _strides(brick: Brick) -> Strides:
-    """Returns the strides in floats of a brick with padded rows."""
     _, ny, nx = brick.shape
     return Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))
 

@@ -1,4 +1,4 @@
-"""Cuts volumes into bricks that fit on a device: first along z, then along y, never along x."""
+"""Cuts a volume that does not fit on a device into boxes ("bricks") that do: first along z, then along y, never along x."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -12,14 +12,14 @@ Shape = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Brick:
-    """A box of voxels of a volume: [start, start + shape), both (z, y, x)."""
+    """A box of voxels of a volume: [start, start + shape), each (z, y, x)."""
 
     start: Shape
     shape: Shape
 
     @property
     def box(self) -> tuple[slice, slice, slice]:
-        """The brick as slices of the volume (z, y, x)."""
+        """The slices (z, y, x) by which an array of the whole volume is indexed."""
         z, y, x = (slice(s, s + n) for s, n in zip(self.start, self.shape, strict=True))
         return z, y, x
 
@@ -32,12 +32,11 @@ def cut(
     shape: Shape, steps: tuple[int, int], needs: Callable[[Shape], tuple[int, ...]], room: Room,
     share: float = 1.0,
 ) -> list[Brick]:
-    """Returns bricks of a volume of ``shape``, as large as ``share`` (0 to 1) of the free memory allows, in the order z,
-    y.
+    """Cuts a volume of ``shape`` into bricks, as large as ``share`` (0 to 1) of the free memory in ``room`` allows.
 
-    Sides are multiples of ``steps`` (z, y), except the last along an axis. ``needs`` returns the bytes of each buffer for
-    a brick of shape (z, y, x). A brick of the smallest size may take all of the free memory. Raises OutOfMemoryError
-    where it does not fit."""
+    The sides of bricks are multiples of ``steps`` (z, y), except at the volume's end. needs: returns the bytes of each
+    buffer that a brick of shape (z, y, x) takes. A brick of the smallest size may take all of the free memory. Raises
+    OutOfMemoryError if it does not fit."""
     nz, ny, nx = shape
     smallest = (min(steps[0], nz), min(steps[1], ny), nx)
     if not room.holds(*needs(smallest)):
@@ -53,7 +52,7 @@ def cut(
 
 
 def _candidates(shape: Shape, steps: tuple[int, int]) -> Iterator[Shape]:
-    """Yields shapes (z, y, x) of bricks, from the whole volume down to the smallest, of ``steps`` (z, y)."""
+    """Yields possible shapes (z, y, x) of bricks, from the whole volume down to one of ``steps`` (z, y)."""
     nz, ny, nx = shape
     for dz in _parts(nz, steps[0]):
         yield dz, ny, nx
@@ -62,7 +61,7 @@ def _candidates(shape: Shape, steps: tuple[int, int]) -> Iterator[Shape]:
 
 
 def _parts(count: int, step: int) -> Iterator[int]:
-    """Yields the lengths of equal parts, from one of ``count`` downwards; all but ``count`` are multiples of ``step``."""
+    """Yields lengths into which ``count`` may be divided, the longest first. All but ``count`` are multiples of ``step``."""
     last = count + 1
     for pieces in range(1, ceil_div(count, step) + 1):
         fair = ceil_div(count, pieces)

@@ -1,4 +1,4 @@
-"""The interface of operators for programs: values, transposes, frames, SciPy; arrays on host or device."""
+"""Operators as user programs see them: y = A(x), transposes, some frames, SciPy; for arrays on host or device."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,32 +13,33 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import DeviceArray, Runtime, adopted, is_cl_array, lent
 
 Values = np.ndarray | DeviceArray
-"""float32 in C order, on the host or on the device."""
+"""float32 values in C order, on the host or the device."""
 Map = Callable[[Any], Any]
-"""A function from ``Values`` to ``Values``; its result is on the host or the device, where its argument is."""
+"""A function from ``Values`` to ``Values``. Its result is on the device if its argument is, else on the host."""
 Shape = tuple[int | None, ...]
 
 
 def to_user_array(rt: Runtime, values: Values) -> Any:
-    """Returns a result in the caller's kind of array: NumPy's, or pyopencl's on the device."""
+    """Returns a result as users get it: pyopencl's Array if it is on the device, else a NumPy array."""
     return lent(values, rt.queue) if isinstance(values, DeviceArray) else values
 
 
 def moved_to(rt: Runtime, values: Values, on_device: bool) -> Any:
-    """Returns values on the device or on the host, copied only if they are elsewhere."""
+    """Returns values on the device, or on the host. They are copied only if they are not there."""
     if isinstance(values, DeviceArray):
         return values if on_device else rt.download(values)
     return rt.upload(values) if on_device else values
 
 
 def computed(rt: Runtime, on_device: bool, function: Callable[[Any], Values], values: Values) -> Any:
-    """Applies a function that needs its argument on the device, or on the host. Returns the result where ``values`` are."""
+    """Applies a function that needs its argument on the device (``on_device``), or on the host. The result is on the same
+    side as ``values``."""
     return moved_to(rt, function(moved_to(rt, values, on_device)), isinstance(values, DeviceArray))
 
 
 def on_host(name: str, values: Any) -> np.ndarray:
-    """Returns numbers as NumPy's float32 in C order. Other libraries' arrays on the host enter by DLPack, without a copy.
-    Raises InputError about ``name`` for anything else."""
+    """Returns an array on the host as NumPy's float32 in C order. Arrays of other libraries are read by DLPack, without a
+    copy. Raises InputError about ``name`` for anything else."""
     has_dlpack = hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray)
     try:
         array = np.from_dlpack(values) if has_dlpack else np.asarray(values)
@@ -51,18 +52,18 @@ def on_host(name: str, values: Any) -> np.ndarray:
 
 
 class Operator:
-    """A differentiable map between arrays of two shapes, on a device: ``y = A(x)``, and ``A.derivative(x).T(y)``.
+    """A differentiable map between arrays, computed on a device: ``y = A(x)``, and ``A.derivative(x).T(y)``.
 
-    domain_shape, range_shape: shapes of x and y; None is any length. ``A.frames([3, 7])`` is the operator of some frames;
-    ``A.intensity`` is the operator of a detector that averages photons.
+    domain_shape, range_shape: shapes of x and y; None stands for any length. ``A.frames([3, 7])`` is the operator to only
+    these frames. ``A.intensity`` is the operator of a detector that averages photons.
 
-    Host arrays (NumPy's, or others' by DLPack) give NumPy's float32 arrays. pyopencl Arrays (float32, C order, on
-    ``queue``) give such Arrays, and nothing is copied between host and device. An operator, its transpose and its frames
-    share their memory on the device: use one at a time.
+    Host arrays (NumPy's, or others by DLPack) give NumPy float32 arrays. pyopencl Arrays (float32, C order, on ``queue``)
+    give such Arrays, and nothing is copied between host and device. An operator, its transpose and its ``frames`` share
+    memory on the device: use one at a time.
 
     Operators come from ``ray_operator``, ``splat_operator`` and ``voxel_operator``. To write another one: rt is its
     Runtime; domain and range_ are (name, shape); at maps x to (y, the function from dL/dy to dL/dx); frames and intensity
-    make the operators of some frames and of averaged photons, where they exist.
+    make the operators of the same names, if they exist.
 
     Raises InputError, before anything is computed, for arrays of another shape, type or device."""
 
@@ -79,7 +80,7 @@ class Operator:
 
     @property
     def domain_shape(self) -> Shape:
-        """Shape of x: (nz, ny, nx) of a volume in 1/mm, (11, None) of parameter rows of Gaussians."""
+        """Shape of x: (nz, ny, nx) of a volume in 1/mm, or (11, None) of the parameters of Gaussians."""
         return self._domain[1]
 
     @property
@@ -89,12 +90,12 @@ class Operator:
 
     @property
     def queue(self) -> Any:
-        """The pyopencl.CommandQueue (in order) of the Arrays that the operator takes."""
+        """The in-order pyopencl.CommandQueue on which Arrays for the operator must be."""
         return self.rt.queue
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(size of y, size of x) of a ``LinearOperator``, for SciPy. Raises InputError for any other operator."""
+        """(size of y, size of x), which SciPy needs of a ``LinearOperator``. Raises InputError for other operators."""
         raise self._not_linear()
 
     def __matmul__(self, x: Any) -> Any:
@@ -104,10 +105,9 @@ class Operator:
         return InputError(repr(self), "an operator that is not linear in x", "a LinearOperator", self._instead)
 
     def to_device(self, values: Any) -> Any:
-        """Copies an x or a y, or a stack of them, to a pyopencl Array, float32, on ``queue``, to start a loop there.
+        """Copies an x or a y, or a stack of them, to a pyopencl Array (float32) on ``queue``, for a loop on the device.
 
-        Raises InputError for anything but an array of real numbers, and for last axes that are neither those of x nor of y.
-        """
+        Raises InputError unless it is an array of real numbers whose last axes have the shape of x or of y."""
         array = on_host("values", values)
         sides = self.domain_shape, self.range_shape
         if not any(_ends_with(array.shape, side) for side in sides):
@@ -116,11 +116,11 @@ class Operator:
         return to_user_array(self.rt, self.rt.upload(array))
 
     def __call__(self, x: Any) -> Any:
-        """Returns y = A(x): from ``domain_shape`` to ``range_shape``, on the device where x is."""
+        """Returns y = A(x), from ``domain_shape`` to ``range_shape``, on the device if x is there, else on the host."""
         return to_user_array(self.rt, self._value(x)[0])
 
     def vjp(self, x: Any) -> tuple[Any, Callable[[Any], Any]]:
-        """Returns A(x), and the function from dL/dy to dL/dx at this x, which later calls do not change."""
+        """Returns A(x), and the function from dL/dy to dL/dx at this x. Later calls do not affect that function."""
         y, back = self._value(x)
 
         def by_x(by_y: Any) -> Any:
@@ -129,16 +129,16 @@ class Operator:
         return to_user_array(self.rt, y), by_x
 
     def derivative(self, x: Any) -> Any:
-        """Returns the derivative at x, whose ``T`` maps dL/dy (range_shape) to dL/dx (domain_shape). It computes A(x)."""
+        """Returns the derivative at x. Its ``T`` maps dL/dy (range_shape) to dL/dx (domain_shape). Computes A(x) for it."""
         return Derivative(self.vjp(x)[1])
 
     @property
     def T(self) -> "LinearOperator":  # noqa: N802
-        """The exact transpose of a ``LinearOperator``; InputError for any other operator."""
+        """The exact transpose of a ``LinearOperator``. Raises InputError for other operators."""
         raise self._not_linear()
 
     def frames(self, chosen: Sequence[int]) -> Any:
-        """Returns the operator of some of the frames, by their numbers from 0, in this order. It shares all memory.
+        """Returns the operator to some of the frames, given by their numbers from 0, in this order. It shares all memory.
 
         Raises InputError for numbers of missing frames, for no number, and for an operator without frames."""
         if self._frames is None:
@@ -151,9 +151,9 @@ class Operator:
 
     @cached_property
     def intensity(self) -> "Operator":
-        """The operator of a detector that averages photons over an exposure: −ln Σ w exp(−p) over a line's times.
+        """The operator of a detector that averages photons: −ln Σ w exp(−p), with weights w, over the times of an exposure.
 
-        Without it a line is Σ w p. Raises InputError where it does not exist (transposes, voxels)."""
+        The plain operator averages line integrals, Σ w p. Raises InputError for transposes and operators to voxels."""
         if self._intensity is None:
             raise InputError("intensity", repr(self), "an operator from something to line integrals")
         return self._intensity()
@@ -166,7 +166,7 @@ class Operator:
         return self._at(self._to_array(self._domain, x))
 
     def _to_array(self, side: tuple[str, Shape], values: Any) -> Values:
-        """Returns an x or a y as float32 in C order, on the host or the device where it is; copied only if it must be."""
+        """Returns an x or a y as float32 in C order, on the side where it is. Copies only what is not so already."""
         array = adopted(side[0], values, self.queue) if is_cl_array(values) else on_host(side[0], values)
         checks.shape(side[0], array, side[1])  # type: ignore[arg-type]
         return array
@@ -174,19 +174,19 @@ class Operator:
 
 @dataclass(frozen=True)
 class Derivative:
-    """The derivative of an operator at one x. T: the function from dL/dy to dL/dx, whatever is computed later."""
+    """The derivative of an operator at one x. T: the function from dL/dy to dL/dx, which stays valid after later calls."""
 
     T: Map
 
 
 class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy has no types
-    """An ``Operator`` that is linear, and therefore a scipy.sparse.linalg.LinearOperator too.
+    """An ``Operator`` that is linear, so that it is a scipy.sparse.linalg.LinearOperator too.
 
-    ``A.T`` is the exact transpose, at any time. For SciPy, ``A.shape`` is (size of y, size of x), and vectors are flat,
-    float32, in C order: ``scipy.sparse.linalg.lsqr(A, y.ravel())``, ``A @ x.ravel()``, ``A.T @ A``.
+    ``A.T`` is the exact transpose. For SciPy, ``A.shape`` is (size of y, size of x), and vectors are flat, float32, in C
+    order: ``scipy.sparse.linalg.lsqr(A, y.ravel())``, ``A @ x.ravel()``, ``A.T @ A``.
 
-    rt, domain, range_, parts: those of ``Operator``. forward, adjoint: the two functions of values. Raises InputError as
-    ``Operator`` does."""
+    rt, domain, range_, parts: as for ``Operator``. forward, adjoint: the functions from x to y and from y to x. Raises
+    InputError as ``Operator`` does."""
 
     def __init__(
         self, rt: Runtime, domain: tuple[str, Shape], range_: tuple[str, Shape], forward: Map, adjoint: Map,
@@ -201,11 +201,11 @@ class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy ha
 
     @property
     def T(self) -> "LinearOperator":  # noqa: N802
-        """The exact transpose: frames (F, rows, columns) to x, by the forward weights."""
+        """The exact transpose, from y, as frames (F, rows, columns), to x. It has the same weights as the operator."""
         return LinearOperator(self.rt, self._range, self._domain, *self._pair[::-1])
 
     def derivative(self, x: Any) -> "LinearOperator":
-        """Returns the operator itself: it is linear."""
+        """Returns the operator itself, because it is linear."""
         return self
 
     def _matvec(self, x: np.ndarray) -> Any:
@@ -217,7 +217,7 @@ class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy ha
     def _transpose(self) -> "LinearOperator":
         return self.T
 
-    _adjoint = _transpose  # of real numbers
+    _adjoint = _transpose  # the same for real numbers
 
 
 def _is_index(number: object, count: int) -> bool:

@@ -1,8 +1,8 @@
-"""Phantoms are objects of known attenuation, for simulations and as the truth of comparisons; ``make_phantom`` makes one.
+"""Phantoms: objects of known attenuation, to simulate scans and to compare reconstructions with. See ``make_phantom``.
 
-All have ``name``, ``kind`` and ``voxelise(grid)``. An "analytic" phantom also has ``line_integrals(source, target)`` in
-closed form, and a "moving" phantom has them at any time. A "voxel" phantom has ``volume`` and ``grid``. Attenuation scales
-with 1 / half-size, so that line integrals do not depend on the size."""
+All have ``name``, ``kind`` and ``voxelise(grid)``. An "analytic" phantom also has exact ``line_integrals(source, target)``,
+and a "moving" phantom has them at any time. A "voxel" phantom has ``volume`` and ``grid``. Attenuation scales with
+1 / half-size, so that line integrals do not depend on the size."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class VoxelPhantom:
         object.__setattr__(self, "volume", np.ascontiguousarray(self.volume, dtype=np.float32))
 
     def voxelise(self, grid: Grid, supersampling: int = 1) -> NDArray[np.float32]:
-        """Returns the volume (nz, ny, nx). Raises InputError for another grid, because nothing is resampled."""
+        """Returns the volume (nz, ny, nx). Raises InputError for a grid other than the phantom's: it is not resampled."""
         if grid != self.grid:
             remedy = "make the phantom at this resolution and size"
             raise InputError(f"grid for phantom {self.name}", str(grid), str(self.grid), remedy)
@@ -54,7 +54,7 @@ class VoxelPhantom:
 
 
 Phantom = EllipsoidPhantom | MovingPhantom | VoxelPhantom
-# (half_size_mm, resolution, seed) -> phantom. Closed forms ignore the last two.
+# (half_size_mm, resolution, seed) -> phantom. Phantoms without voxels ignore the last two.
 Factory = Callable[[float, int, int], Phantom]
 
 
@@ -76,10 +76,10 @@ PHANTOMS: dict[str, Factory] = {
 
 
 def make_phantom(name: str, half_size_mm: float, resolution: int = 128, seed: int = 0) -> Phantom:
-    """Returns the phantom of a name, a key of ``PHANTOMS``, in a cube of side 2 · ``half_size_mm`` about the origin.
+    """Returns the phantom ``name``, a key of ``PHANTOMS``, in a cube of side 2 · ``half_size_mm`` about the origin.
 
-    Voxel phantoms have ``resolution`` voxels per side; ``seed`` draws the shape and texture of procedural ones. Raises
-    InputError for an unknown name, and for a size or count that is not positive."""
+    Voxel phantoms have ``resolution`` voxels per side, and ``seed`` varies their shape and texture. Raises InputError for
+    an unknown name, and for a size or number that is not positive."""
     one_of("phantom", name, PHANTOMS)
     positive("half_size_mm", half_size_mm)
     positive("resolution", resolution)

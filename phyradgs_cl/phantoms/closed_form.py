@@ -1,4 +1,4 @@
-"""Phantoms in closed form: Shepp and Logan's head, circles of beads, and the moving sphere of RTK's tests."""
+"""Phantoms with exact line integrals: Shepp and Logan's head, circles of beads, and the moving sphere of RTK's tests."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -11,7 +11,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms.ellipsoids import Array, Body, Ellipsoid, EllipsoidPhantom, Triple, rotation_about_z
 
-# Shepp-Logan: centre x, y, z | semi-axes a, b, c | rotation about z in degrees. Lengths are in half-sizes.
+# Shepp-Logan: centre x, y, z; semi-axes; rotation about z in degrees. Lengths are in units of ``half_size_mm``.
 _BODIES = (
     (0.0, 0.0, 0.0, 0.69, 0.92, 0.9, 0.0),
     (0.0, 0.0, 0.0, 0.6624, 0.874, 0.88, 0.0),
@@ -28,8 +28,8 @@ _GREY_LEVELS = {
     "toft": (1.0, -0.8, -0.2, -0.2, 0.2, 0.2, 0.1, 0.1, 0.2, -0.2),
     "kak-slaney": (2.0, -0.98, -0.02, -0.02, 0.02, 0.02, 0.01, 0.01, 0.02, -0.02),
 }
-_OUTER, _INNER, _SWING = 60 / 64, 8 / 64, 8 / 64  # RTK's mm over half of its box of 128 mm
-_STEPS = 8  # number of frames of RTK's cycle, in which the sphere goes forth and back
+_OUTER, _INNER, _SWING = 60 / 64, 8 / 64, 8 / 64  # RTK's lengths in mm, divided by 64 mm, half the side of its box
+_STEPS = 8  # number of frames in which RTK's sphere goes forth and back
 
 
 def shepp_logan(
@@ -53,20 +53,20 @@ def shepp_logan(
     return EllipsoidPhantom(tuple(bodies), "shepp-logan")
 
 
-# Spheres: lengths are in half-sizes, densities in 1 / half-size.
+# The phantom of beads. Lengths are in units of ``half_size_mm``, densities in units of 1 / ``half_size_mm``.
 _BEADS_PER_LAYER = 8
 _LAYER_HEIGHT = 0.27
 _CIRCLE_RADIUS = 0.52
-_BEAD_RADII = (0.12, 0.06, 0.09, 0.045)  # the radii repeat around a layer
+_BEAD_RADII = (0.12, 0.06, 0.09, 0.045)  # taken in turn by the beads of a circle
 _BEAD_DENSITY = 0.85
 _HOLDER_DENSITY = 0.15
-_HOLDER_AXES = (0.85, 0.85, 0.7)  # the holder contains every bead and fits into the scanner's cylinder
+_HOLDER_AXES = (0.85, 0.85, 0.7)  # the holder contains every bead and stays in the field of view
 
 
 def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
-    """Returns two horizontal circles of dense beads, the second turned by half a step, in a light holder.
+    """Returns two horizontal circles of dense beads in a light holder. The beads of one stand above gaps of the other.
 
-    Round edges show blur and distortion, as in the phantoms that calibrate cone-beam scanners. The cube of side 2 ·
+    Their round edges show blur and distortion, as in the phantoms that calibrate cone-beam scanners. The cube of side 2 ·
     ``half_size_mm`` is about the origin. A bead attenuates 1 / ``half_size_mm``, the holder 0.15 times that."""
     positive("half_size_mm", half_size_mm)
     unit = 1.0 / half_size_mm
@@ -76,7 +76,7 @@ def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
         for i in range(_BEADS_PER_LAYER):
             angle = 2 * np.pi * (i + layer / 2) / _BEADS_PER_LAYER
             x, y = _CIRCLE_RADIUS * np.cos(angle), _CIRCLE_RADIUS * np.sin(angle)
-            # The second layer starts elsewhere in the list, so that large beads do not stand above large ones.
+            # The second circle begins with another radius, so that large beads do not stand above large ones.
             radius = _BEAD_RADII[(i + 2 * layer) % len(_BEAD_RADII)] * half_size_mm
             centre = (float(x) * half_size_mm, float(y) * half_size_mm, height * half_size_mm)
             bodies.append(Ellipsoid(centre, (radius,) * 3, _BEAD_DENSITY * unit))
@@ -85,10 +85,11 @@ def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
 
 @dataclass(frozen=True)
 class MovingBody:
-    """A body that goes from end to end of a line and back at constant speed.
+    """A body that moves forth and back along a line at constant speed.
 
-    body: at the middle of its line. swing_mm: (x, y, z) from the middle to the end that it reaches after half a period;
-    it starts at the other end. period_s: the time there and back. Raises InputError for a period that is not positive."""
+    body: its place at the middle of the line. swing_mm: (x, y, z) from the middle to one end. It starts at the other end,
+    and reaches this one after half a period. period_s: the time forth and back. Raises InputError for a period that is not
+    positive."""
 
     body: Body
     swing_mm: Triple
@@ -99,7 +100,7 @@ class MovingBody:
         positive("period_s", self.period_s)
 
     def shift_mm(self, time_s: ArrayLike) -> Array:
-        """Returns the shift (n, 3), x y z in mm, from the middle of its line at times (n,) in s."""
+        """Returns the body's displacement (n, 3), x y z in mm, from the middle of its line at times (n,) in s."""
         phase = np.atleast_1d(np.asarray(time_s, np.float64)) / self.period_s
         way = np.interp(phase, [0.0, 0.5, 1.0], [-1.0, 1.0, -1.0], period=1.0)
         return np.outer(way, self.swing_mm)
@@ -137,7 +138,7 @@ class MovingPhantom:
 
     @property
     def reach_mm(self) -> float:
-        """The radius of a ball about the origin that holds every body at any time."""
+        """The radius in mm of a ball about the origin that contains every body at all times."""
         ends = [body.at(part * body.period_s) for body in self.moving for part in (0.0, 0.5)]
         return EllipsoidPhantom((*self.resting, *ends), self.name).reach_mm
 
@@ -147,7 +148,7 @@ class MovingPhantom:
         return max(4 * float(np.linalg.norm(body.swing_mm)) / body.period_s for body in self.moving)
 
     def at(self, time_s: float) -> EllipsoidPhantom:
-        """Returns the phantom as it is at a time in s, at rest."""
+        """Returns a phantom at rest that equals this one at a time in s."""
         return EllipsoidPhantom((*self.resting, *(body.at(time_s) for body in self.moving)), self.name)
 
     def line_integrals(self, source: ArrayLike, target: ArrayLike, time_s: ArrayLike) -> Array:
@@ -168,11 +169,12 @@ class MovingPhantom:
 
 
 def moving_sphere(half_size_mm: float, period_s: float = float(_STEPS)) -> MovingPhantom:
-    """Returns a ball in which a small hole goes to and fro along y, in a cube of side 2 · ``half_size_mm`` about the origin.
+    """Returns a ball in which a small sphere, half as dense, moves along y. The cube of side 2 · ``half_size_mm`` is about
+    the origin.
 
-    With 64 mm it has the lengths of RTK's tests: a ball of 60 mm that holds one of 8 mm, which moves by ±8 mm in 8 frames of
-    1 s (S. Rit et al., J. Phys. Conf. Ser. 489, 012079, 2014). The ball attenuates 1 / ``half_size_mm`` and the hole half of
-    that, like RTK's densities of 2 and −1."""
+    With 64 mm it has the lengths of RTK's tests: a ball of radius 60 mm, and in it one of 8 mm that moves by ±8 mm in 8
+    frames of 1 s (S. Rit et al., J. Phys. Conf. Ser. 489, 012079, 2014). The ball attenuates 1 / ``half_size_mm`` and the
+    small sphere half of that, as with RTK's added densities of 2 and −1."""
     positive("half_size_mm", half_size_mm)
     outer, inner, swing = (share * half_size_mm for share in (_OUTER, _INNER, _SWING))
     ball = Ellipsoid((0.0, 0.0, 0.0), (outer,) * 3, 1 / half_size_mm)

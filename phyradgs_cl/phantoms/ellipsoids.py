@@ -1,7 +1,7 @@
-"""Phantoms of additive ellipsoids and cylinders, with line integrals in closed form.
+"""Phantoms made of ellipsoids and cylinders whose attenuations add up, with exact line integrals.
 
-An affine map takes an ellipsoid to the unit ball and a ray to a ray. The chord follows from the ray's distance to the
-centre (Kak and Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, section 3.1)."""
+An affine map takes an ellipsoid to the unit ball, and a ray to a ray. The length of the ray inside follows from its distance
+to the centre (Kak and Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, section 3.1)."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -18,12 +18,12 @@ Triple = tuple[float, float, float]
 Matrix = tuple[Triple, Triple, Triple]
 
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_PARALLEL = 1e-30  # smallest divisor, in place of 0, for a ray along a cylinder's axis, which meets its side nowhere
-RAYS_PER_CHUNK = 1 << 15  # most rays projected at a time: the intermediates, 2-3 MB, stay in a core's cache
+_PARALLEL = 1e-30  # stands for a divisor of 0, which a ray along or across a cylinder's axis gives
+RAYS_PER_CHUNK = 1 << 15  # most rays projected at a time: their intermediate arrays, 2-3 MB, stay in a core's cache
 
 
 def rotation_about_z(angle_rad: float) -> Matrix:
-    """Returns the rotation from an ellipsoid's own axes to the world's, counter-clockwise seen from +z."""
+    """Returns the matrix that rotates counter-clockwise about z, seen from +z: an ellipsoid's ``rotation``."""
     c, s = float(np.cos(angle_rad)), float(np.sin(angle_rad))
     return ((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0))
 
@@ -32,9 +32,9 @@ def rotation_about_z(angle_rad: float) -> Matrix:
 class Ellipsoid:
     """A solid ellipsoid, whose attenuation adds to that of other bodies.
 
-    Centre (x, y, z); semi-axes along the columns of the 3x3 ``rotation``. A negative ``attenuation_per_mm`` carves a
-    hole. Raises InputError for semi-axes that are not positive, values that are not finite, and a matrix that is no
-    rotation."""
+    The centre is (x, y, z). The columns of the 3x3 ``rotation`` are the directions of the semi-axes. A negative
+    ``attenuation_per_mm`` makes a hole in other bodies. Raises InputError for semi-axes that are not positive, values that
+    are not finite, and a matrix that is not orthogonal."""
 
     centre_mm: Triple
     semi_axes_mm: Triple
@@ -56,7 +56,7 @@ class Ellipsoid:
 
     @property
     def to_unit_ball(self) -> Array:
-        """The matrix (3, 3) that maps a world vector (x, y, z) in mm to the frame where the surface has radius 1."""
+        """The matrix (3, 3) that maps vectors (x, y, z) in mm to a frame in which the ellipsoid is the unit ball."""
         return np.asarray(self.rotation).T / np.asarray(self.semi_axes_mm)[:, None]
 
     @property
@@ -66,7 +66,7 @@ class Ellipsoid:
 
     @property
     def ends_mm(self) -> tuple[Triple, Triple]:
-        """The ends of a line segment, from which no point of the body is further than ``reach_mm``."""
+        """The ends of a line segment in the body; every point of the body is within ``reach_mm`` of this segment."""
         return self.centre_mm, self.centre_mm
 
     @property
@@ -79,9 +79,9 @@ class Ellipsoid:
         o = (start - np.asarray(self.centre_mm)) @ to_ball
         d = step @ to_ball
         dd = np.einsum("ij,ij->i", d, d)
-        dd[dd == 0] = 1.0  # a segment without length has fraction 0 later
+        dd[dd == 0] = 1.0  # avoids a division by 0; a segment without length has line integral 0
         nearest = -np.einsum("ij,ij->i", o, d) / dd
-        # The distance of the foot point is precise; the discriminant's terms would cancel for far sources.
+        # From the point of the ray nearest to the centre: the quadratic formula would lose digits for far sources.
         foot = o + nearest[:, None] * d
         half = np.sqrt(np.maximum(1.0 - np.einsum("ij,ij->i", foot, foot), 0.0) / dd)
         return np.clip(nearest + half, 0.0, 1.0) - np.clip(nearest - half, 0.0, 1.0)
@@ -89,7 +89,7 @@ class Ellipsoid:
     def contains(self, x: Array, y: Array, z: Array) -> NDArray[np.bool_]:
         """Returns whether points, given by coordinates in mm that broadcast, lie inside, bool (...)."""
         cx, cy, cz = self.centre_mm
-        # The sum has one term per axis before it broadcasts, so coordinates of a grid stay one-dimensional.
+        # Each product is formed before broadcasting, so a grid's coordinates stay one-dimensional for as long as possible.
         rows = [m[0] * (x - cx) + m[1] * (y - cy) + m[2] * (z - cz) for m in self.to_unit_ball]
         return rows[0] ** 2 + rows[1] ** 2 + rows[2] ** 2 <= 1.0
 
@@ -173,7 +173,7 @@ class EllipsoidPhantom:
 
     @property
     def reach_mm(self) -> float:
-        """The radius of a ball about the origin that holds every body."""
+        """The radius in mm of a ball about the origin that contains every body."""
         return max(float(np.linalg.norm(body.ends_mm, axis=1).max()) + body.reach_mm for body in self.ellipsoids)
 
     def line_integrals(self, source: ArrayLike, target: ArrayLike) -> Array:
@@ -186,7 +186,7 @@ class EllipsoidPhantom:
         flat = result.reshape(-1)
         for first in range(0, flat.size, RAYS_PER_CHUNK):
             chunk = slice(first, min(first + RAYS_PER_CHUNK, flat.size))
-            # Indexing the broadcast views copies only a chunk's points.
+            # Copies the points of one chunk only; reshaping the broadcast arrays would copy all.
             where = np.unravel_index(np.arange(chunk.start, chunk.stop), result.shape) if result.ndim else ()
             p = start[where].reshape(-1, 3)
             flat[chunk] = self._segments(p, end[where].reshape(-1, 3) - p)
@@ -207,7 +207,7 @@ class EllipsoidPhantom:
         return total
 
     def voxelise(self, grid: Grid, supersampling: int = 2) -> NDArray[np.float32]:
-        """Returns mean attenuation (nz, ny, nx) float32 in 1/mm, over ``supersampling`` points along a voxel's axes."""
+        """Returns attenuation (nz, ny, nx) float32 in 1/mm, a mean over ``supersampling``³ points in each voxel."""
         if supersampling < 1:
             raise InputError("supersampling", str(supersampling), "an integer of at least 1")
         volume = np.zeros(grid.shape)
@@ -229,7 +229,7 @@ def _broadcast_points(source: ArrayLike, target: ArrayLike) -> tuple[Array, Arra
 
 
 def _add_ellipsoid(volume: Array, ellipsoid: Body, grid: Grid, samples: int) -> None:
-    """Adds a body to ``volume`` (nz, ny, nx) in place, within its box, one slice at a time."""
+    """Adds a body to ``volume`` (nz, ny, nx) in place. Samples only its bounding box, slice by slice, to save memory."""
     offsets = (np.arange(samples) + 0.5) / samples - 0.5
     centre, half = ellipsoid.centre_mm[::-1], ellipsoid.half_box_mm[::-1]
     ranges, fine = [], []

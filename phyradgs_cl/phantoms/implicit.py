@@ -1,7 +1,7 @@
-"""Implicit bodies for procedural phantoms: signed distances, smooth unions, band-limited texture.
+"""Bodies for procedural phantoms: signed distances, smooth unions, band-limited texture.
 
-They are functions of position in the cube [-1, 1]^3, averaged over voxels, so that every resolution samples the same object.
-Distances are positive outside. Points are (x, y, z); arrays are (z, y, x), float32."""
+They are functions of position in the cube [-1, 1]^3, averaged over voxels, so every resolution shows the same object.
+Distances are negative inside a body. Points are (x, y, z); arrays are (z, y, x), float32."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ Field = NDArray[np.float32]
 Box = tuple[slice, slice, slice]
 Point = tuple[float, float, float]
 
-FAR = np.float32(4.0)  # distance in half-sides of the phantom's cube that is larger than any inside it
-_REACH = 5.0  # distance in blend widths beyond which a body no longer counts in a union (exp(-5) = 0.7 %)
+FAR = np.float32(4.0)  # stands for a large distance: no two points of the cube are this far apart
+_REACH = 5.0  # a body counts in a union up to this distance, in blend widths: beyond, its part is below exp(-5) = 0.7 %
 
 
 @dataclass(frozen=True)
 class Capsule:
-    """A tapered capsule: the sphere of radius `r0` at `p0` swept to radius `r1` at `p1`."""
+    """A tapered capsule: the space swept by a sphere that moves from `p0` to `p1` as its radius goes from `r0` to `r1`."""
 
     p0: Point
     p1: Point
@@ -27,7 +27,7 @@ class Capsule:
     r1: float
 
     def grown(self, width: float) -> "Capsule":
-        """Returns the capsule with ``width`` added to both radii."""
+        """Returns the capsule with radii larger by ``width``."""
         return Capsule(self.p0, self.p1, self.r0 + width, self.r1 + width)
 
 
@@ -46,7 +46,7 @@ class Lattice:
         return (slice(0, self.count),) * 3
 
     def axis(self) -> Field:
-        """Returns the coordinates (count,) of one axis."""
+        """Returns the voxel centres (count,) along any of the three axes."""
         return ((np.arange(self.count) + 0.5) * self.step - 1.0).astype(np.float32)
 
     def points(self, box: Box) -> tuple[Field, Field, Field]:
@@ -62,13 +62,13 @@ class Lattice:
         return (z, y, x)
 
     def coverage(self, distance: Field) -> Field:
-        """Returns the fraction of each voxel that lies inside a body at ``distance``. It is linear in the distance across
-        one voxel."""
+        """Returns the fraction of each voxel inside a body at signed ``distance``, as if its surface were flat and parallel
+        to a voxel's face."""
         return np.clip(0.5 - distance / np.float32(self.step), 0.0, 1.0)
 
 
 def capsule_distance(capsule: Capsule, x: Field, y: Field, z: Field) -> Field:
-    """Returns the distance to a tapered capsule, for coordinates that broadcast. It is exact for equal radii."""
+    """Returns the signed distance to a capsule, for coordinates that broadcast. It is exact for equal radii."""
     a, b = np.asarray(capsule.p0), np.asarray(capsule.p1)
     axis = (b - a).astype(np.float32)
     length2 = np.float32(max(float(axis @ axis), 1e-12))
@@ -79,12 +79,12 @@ def capsule_distance(capsule: Capsule, x: Field, y: Field, z: Field) -> Field:
 
 
 def ellipsoid_distance(centre: Point, semi_axes: Point, x: Field, y: Field, z: Field) -> Field:
-    """Returns the first-order distance to an axis-aligned ellipsoid, exact on the surface and in sign."""
+    """Returns the signed distance to an axis-aligned ellipsoid, to first order: it is exact near the surface."""
     return ratio_distance([(p - c) for p, c in zip((x, y, z), centre, strict=True)], semi_axes)
 
 
 def ratio_distance(offsets: Sequence[Field], semi_axes: Sequence[ArrayLike]) -> Field:
-    """Returns the first-order distance to the surface Σ (offset / semi-axis)² = 1. Semi-axes may be arrays."""
+    """Returns the signed distance, to first order, to the surface Σ (offset / semi-axis)² = 1. Semi-axes may be arrays."""
     scaled = sum((o / np.asarray(s, np.float32)) ** 2 for o, s in zip(offsets, semi_axes, strict=True))
     slopes = sum((o / np.asarray(s, np.float32) ** 2) ** 2 for o, s in zip(offsets, semi_axes, strict=True))
     radius = np.sqrt(scaled)
@@ -92,25 +92,25 @@ def ratio_distance(offsets: Sequence[Field], semi_axes: Sequence[ArrayLike]) -> 
 
 
 def capsule_box(lattice: Lattice, capsules: Sequence[Capsule], margin: float) -> Box:
-    """Returns the voxels within ``margin`` of the capsules' common bounding box."""
+    """Returns the box of voxels around all ``capsules``, widened by ``margin``."""
     ends = np.array([p for c in capsules for p in (c.p0, c.p1)])
     radii = np.array([r for c in capsules for r in (c.r0, c.r1)])[:, None] + margin
     return lattice.box((ends - radii).min(axis=0), (ends + radii).max(axis=0))
 
 
 def add_to_union(union: Field, box: Box, distance: Field, blend: float) -> None:
-    """Adds a body in place to a smooth union, which is stored as a sum of exp(-distance / blend)."""
+    """Adds a body to a smooth union of bodies, in place. The union is stored as the sum of exp(-distance / blend)."""
     union[box] += np.exp(np.clip(-distance / np.float32(blend), -60.0, 60.0))
 
 
 def union_distance(union: Field, blend: float) -> Field:
-    """Returns the distance to the union that ``add_to_union`` has stored; FAR where no body is near."""
+    """Returns the signed distance to a union made by ``add_to_union``, or FAR where no body is near."""
     with np.errstate(divide="ignore"):
         return np.minimum(-np.float32(blend) * np.log(union), FAR)
 
 
 def capsule_union(lattice: Lattice, capsules: Sequence[Capsule], blend: float, box: Box) -> Field:
-    """Returns the distance to the smooth union of capsules within a box of voxels."""
+    """Returns the signed distance to the smooth union of capsules, for a box of voxels."""
     x, y, z = lattice.points(box)
     union = np.zeros((z.size, y.size, x.size), dtype=np.float32)
     for capsule in capsules:
@@ -122,7 +122,7 @@ def capsule_union(lattice: Lattice, capsules: Sequence[Capsule], blend: float, b
 
 
 def _intersect(part: Box, box: Box) -> Box:
-    """Returns ``part`` cut to ``box`` and counted from the box's first voxel."""
+    """Returns the intersection of two boxes, with indices that count from the first voxel of ``box``."""
     z, y, x = (
         slice(max(p.start, b.start) - b.start, max(min(p.stop, b.stop) - b.start, 0))
         for p, b in zip(part, box, strict=True)
@@ -133,20 +133,20 @@ def _intersect(part: Box, box: Box) -> Box:
 def texture(
     lattice: Lattice, wavelengths: tuple[float, float], waves: int, rng: np.random.Generator
 ) -> Field:
-    """Draws isotropic noise (n, n, n) float32 of unit variance: ``waves`` random cosines between two wavelengths.
+    """Draws isotropic noise (n, n, n) float32 of variance 1: a sum of ``waves`` random cosines, averaged over each voxel.
 
-    They are averaged over each voxel. The draws from ``rng`` do not depend on the resolution."""
+    Their wavelengths lie between the two given ones. The numbers drawn from ``rng`` do not depend on the resolution."""
     direction = rng.standard_normal((waves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     k = 2 * np.pi * direction / rng.uniform(*wavelengths, waves)[:, None]  # rad per unit length
     phase = rng.uniform(0, 2 * np.pi, waves)
-    mean = np.prod(np.sinc(k * lattice.step / (2 * np.pi)), axis=1)  # mean of a cosine over a voxel
+    mean = np.prod(np.sinc(k * lattice.step / (2 * np.pi)), axis=1)  # how much averaging over a voxel damps each cosine
     amplitude = np.sqrt(2.0 / waves) * mean
     axis = lattice.axis().astype(np.float64)
     ex, ey, ez = (np.exp(1j * np.outer(axis, k[:, i])).astype(np.complex64) for i in range(3))
     ez = ez * (amplitude * np.exp(1j * phase)).astype(np.complex64)
     n = lattice.count
-    # cos(a + b + c) is the real part of a product, so one matrix product per slice replaces n^3 cosines.
+    # cos(a + b + c) is the real part of e^ia e^ib e^ic, so a matrix product per slice replaces n^3 cosines.
     noise = np.empty((n, n, n), dtype=np.float32)
     for i in range(n):
         noise[i] = ((ey * ez[i]) @ ex.T).real

@@ -1,7 +1,7 @@
-"""A foot-like voxel phantom: tarsals, metatarsals and phalanges in soft tissue, drawn from scratch.
+"""A foot-like voxel phantom: tarsals, metatarsals and phalanges in soft tissue, made of tapered capsules.
 
-Bones are tapered capsules with a cortical shell and a trabecular inside. Toes point to +z, the big toe to -x, the sole to
--y. Lengths are in units of half the cube's side."""
+Bones have a cortical shell with trabeculae inside. Toes point to +z, the big toe to -x, the sole to -y. Lengths are in
+units of half the cube's side."""
 
 from itertools import pairwise
 
@@ -13,13 +13,12 @@ from phyradgs_cl.phantoms.implicit import Capsule, Field, Lattice, Point
 
 Bone = tuple[Capsule, ...]
 
-# Relative attenuations of bone and marrow, and of soft tissue.
+# Attenuation of each tissue; dense bone is near 1.
 _CORTICAL, _TRABECULAR, _MARROW = 0.92, 0.56, 0.36
 _MUSCLE, _FAT, _SKIN = 0.24, 0.18, 0.27
-# Lengths from here on are in half-sides of the phantom's cube.
 _SHELL = 0.022  # thickness of cortical bone
 _SKIN_DEPTH, _FAT_DEPTH = 0.018, 0.06  # thickness of the skin, and of skin and fat together
-_JOINT_BLEND, _SKIN_BLEND = 0.012, 0.022  # widths over which bodies that touch are blended into one
+_JOINT_BLEND, _SKIN_BLEND = 0.012, 0.022  # widths over which bodies that touch merge smoothly
 
 # Tarsals and the stumps of the leg. Each bone is a chain of (x, y, z, radius).
 _TARSALS: tuple[tuple[tuple[float, float, float, float], ...], ...] = (
@@ -33,7 +32,7 @@ _TARSALS: tuple[tuple[tuple[float, float, float, float], ...], ...] = (
     ((-0.14, 0.09, 0.12, 0.062), (-0.14, 0.09, 0.14, 0.058)),  # intermediate cuneiform
     ((0.00, 0.07, 0.12, 0.062), (0.01, 0.07, 0.15, 0.060)),  # lateral cuneiform
 )
-# Rays of the forefoot: base x, y, z; head x, y, z; thickness; joints of the toe along z.
+# Metatarsals with their toes: base x, y, z; head x, y, z; relative thickness; z of the toe's joints and tip.
 _RAYS: tuple[tuple[Point, Point, float, tuple[float, ...]], ...] = (
     ((-0.31, 0.00, 0.23), (-0.41, -0.13, 0.51), 1.75, (0.51, 0.71, 0.86)),
     ((-0.15, 0.06, 0.20), (-0.19, -0.10, 0.56), 1.25, (0.56, 0.71, 0.80, 0.87)),
@@ -41,7 +40,7 @@ _RAYS: tuple[tuple[Point, Point, float, tuple[float, ...]], ...] = (
     ((0.14, 0.00, 0.14), (0.20, -0.12, 0.46), 1.15, (0.46, 0.59, 0.66, 0.72)),
     ((0.26, -0.05, 0.10), (0.38, -0.14, 0.38), 1.20, (0.38, 0.50, 0.565, 0.62)),
 )
-# Parts besides the bones over which the skin is stretched: sole, arch, ball, leg.
+# Flesh that is not around a bone: sole, arch, ball, leg.
 _FLESH = (
     Capsule((0.07, -0.21, -0.66), (0.21, -0.17, 0.25), 0.18, 0.13),
     Capsule((-0.03, -0.05, -0.40), (-0.14, -0.11, 0.38), 0.23, 0.16),
@@ -51,9 +50,8 @@ _FLESH = (
 
 
 def foot(grid_shape: int, seed: int) -> Field:
-    """Returns the phantom (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder.
-
-    A ``seed`` gives the same foot at every resolution. Raises InputError for fewer than 4 voxels."""
+    """Returns the phantom (n, n, n) float32 (z, y, x) in [0, 1], with air exactly 0. It fits into the cube's inscribed
+    cylinder. A ``seed`` gives the same foot at every resolution. Raises InputError for fewer than 4 voxels."""
     at_least("grid_shape", grid_shape, 4)
     rng = np.random.default_rng(seed)
     bones = [_chain([(p[:3], p[3]) for p in chain], rng) for chain in _TARSALS]
@@ -78,7 +76,7 @@ def _chain(points: list[tuple[Point, float]], rng: np.random.Generator) -> Bone:
 
 
 def _long_bone(start: Point, end: Point, radius: float, rng: np.random.Generator) -> Bone:
-    """Returns a bone between two joints: wide at both ends, with a waist, and a gap for the cartilage."""
+    """Returns a bone between two joints: wide at both ends, narrower in the middle, with a gap for the cartilage."""
     a, b = np.asarray(start), np.asarray(end)
     length = float(np.linalg.norm(b - a))
     unit = (b - a) / length
@@ -92,7 +90,7 @@ def _long_bone(start: Point, end: Point, radius: float, rng: np.random.Generator
 
 
 def _toe(head: Point, thickness: float, joints: tuple[float, ...], rng: np.random.Generator) -> list[Bone]:
-    """Returns the phalanges from a metatarsal's head onwards. The toe bends slightly to the sole."""
+    """Returns the phalanges of the toe that begins at a metatarsal's head. The toe bends slightly to the sole."""
     bones = []
     for i, (z0, z1) in enumerate(pairwise(joints)):
         spread = 0.15 * head[0]
@@ -103,7 +101,7 @@ def _toe(head: Point, thickness: float, joints: tuple[float, ...], rng: np.rando
 
 
 def _soft_tissue(lattice: Lattice, cover: list[Capsule], ripple: Field, rng: np.random.Generator) -> Field:
-    """Returns muscle, a layer of fat and the skin, stretched over `cover` and the flesh. Air is 0."""
+    """Returns the attenuation of muscle, fat and skin in the union of the capsules `cover` and `_FLESH`. Air is 0."""
     distance = implicit.capsule_union(lattice, [*cover, *_FLESH], _SKIN_BLEND, lattice.everything) + ripple
     muscle = np.float32(_MUSCLE) + np.float32(0.02) * implicit.texture(lattice, (0.12, 0.4), 48, rng)
     whole = lattice.coverage(distance)
@@ -113,7 +111,7 @@ def _soft_tissue(lattice: Lattice, cover: list[Capsule], ripple: Field, rng: np.
 
 
 def _add_bone(volume: Field, lattice: Lattice, bone: Bone, ripple: Field, grain: Field) -> None:
-    """Replaces the content of `volume` by a bone: cortical shell, trabeculae, and fatty marrow in the middle."""
+    """Puts a bone into `volume`: a cortical shell, trabeculae inside, and fatty marrow in the middle."""
     box = implicit.capsule_box(lattice, bone, 0.05)
     distance = implicit.capsule_union(lattice, bone, _JOINT_BLEND, box) + ripple[box]
     outer = lattice.coverage(distance)

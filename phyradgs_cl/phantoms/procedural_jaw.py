@@ -1,6 +1,6 @@
-"""A jaw-like voxel phantom: a mandible with its rami and a row of teeth in soft tissue, drawn from scratch.
+"""A jaw-like voxel phantom: a mandible with its rami and a row of teeth in soft tissue, made of simple bodies.
 
-The body is an elliptic section swept along a horizontal arc. Rami and roots are tapered capsules; crowns are small
+The mandible's body is an ellipse moved along a horizontal arc. Rami and roots are tapered capsules. Crowns are small
 ellipsoids with an enamel cap. The chin points to -y, the teeth to +z. Lengths are in units of half the cube's side."""
 
 from dataclasses import dataclass
@@ -12,14 +12,13 @@ from phyradgs_cl.checks import at_least
 from phyradgs_cl.phantoms import implicit
 from phyradgs_cl.phantoms.implicit import Capsule, Field, Lattice, Point
 
-# Attenuations, as fractions of enamel's.
+# Attenuation of each tissue, as a fraction of enamel's.
 _CORTICAL, _TRABECULAR, _NERVE = 0.85, 0.50, 0.28
 _ENAMEL, _DENTINE, _PULP = 1.0, 0.72, 0.30
 _MUSCLE, _FAT = 0.24, 0.18
-# Lengths from here on are in half-sides of the phantom's cube.
 _SHELL = 0.035  # thickness of cortical bone
 _ENAMEL_DEPTH, _FAT_DEPTH = 0.020, 0.05  # thickness of enamel, and of fat
-_BONE_BLEND, _FLESH_BLEND = 0.025, 0.04  # widths over which bodies that touch are blended into one
+_BONE_BLEND, _FLESH_BLEND = 0.025, 0.04  # widths over which bodies that touch merge smoothly
 
 # The arc of the mandible: x = A sin(phi), y = Y0 - B cos(phi), phi from -_PHI_END to +_PHI_END.
 _ARC_A, _ARC_B, _ARC_Y0 = 0.60, 0.86, 0.22
@@ -41,7 +40,7 @@ _FIRST_GAP = 0.006
 
 @dataclass(frozen=True)
 class Tooth:
-    """A tooth at (x, y) on the arc, with the arc's unit direction there. Sizes are those of `_TEETH`."""
+    """A tooth with its centre (x, y) on the arc. along: the arc's unit direction there. Sizes as in `_TEETH`."""
 
     centre: tuple[float, float]
     along: tuple[float, float]
@@ -52,9 +51,8 @@ class Tooth:
 
 
 def jaw(grid_shape: int, seed: int) -> Field:
-    """Returns the phantom (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, inside the cube's inscribed cylinder.
-
-    A ``seed`` gives the same jaw at every resolution. Raises InputError for fewer than 4 voxels."""
+    """Returns the phantom (n, n, n) float32 (z, y, x) in [0, 1], with air exactly 0. It fits into the cube's inscribed
+    cylinder. A ``seed`` gives the same jaw at every resolution. Raises InputError for fewer than 4 voxels."""
     at_least("grid_shape", grid_shape, 4)
     rng = np.random.default_rng(seed)
     teeth = _teeth(rng)
@@ -73,7 +71,7 @@ def _arc(phi: float) -> tuple[float, float]:
 
 
 def _teeth(rng: np.random.Generator) -> list[Tooth]:
-    """Returns fourteen teeth side by side along the arc. Their sizes differ a little for every seed."""
+    """Returns fourteen teeth side by side along the arc. ``rng`` varies their sizes a little."""
     phi = np.linspace(0.0, _PHI_END, 2000)
     x, y = _ARC_A * np.sin(phi), _ARC_Y0 - _ARC_B * np.cos(phi)
     length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
@@ -93,7 +91,7 @@ def _teeth(rng: np.random.Generator) -> list[Tooth]:
 
 
 def _arc_distance(lattice: Lattice) -> Field:
-    """Returns the horizontal distance (1, n, n) of every column of voxels from the arc."""
+    """Returns the horizontal distance (1, n, n) of each vertical column of voxels from the arc."""
     axis = lattice.axis()
     x, y = axis[None, :], axis[:, None]
     nearest = np.full((lattice.count, lattice.count), np.inf, dtype=np.float32)
@@ -141,7 +139,7 @@ def _bone_distance(lattice: Lattice) -> Field:
 
 
 def _soft_tissue(lattice: Lattice, bone: Field, teeth: list[Tooth], rng: np.random.Generator) -> Field:
-    """Returns gums, cheeks and the floor of the mouth with a layer of fat. The airway and the outside are 0."""
+    """Returns the attenuation of gums, cheeks and the floor of the mouth under a layer of fat. Air is 0."""
     x, y, z = lattice.points(lattice.everything)
     union = np.zeros_like(bone)
     implicit.add_to_union(union, lattice.everything, bone - np.float32(0.075), _FLESH_BLEND)
@@ -162,7 +160,7 @@ def _soft_tissue(lattice: Lattice, bone: Field, teeth: list[Tooth], rng: np.rand
 
 
 def _fill_bone(volume: Field, lattice: Lattice, distance: Field, rng: np.random.Generator) -> None:
-    """Replaces the content of `volume` by cortical bone around trabeculae, which surround the nerve's canal."""
+    """Puts the bone into `volume`: a cortical shell, trabeculae inside, and in them the canal of the nerve."""
     _, _, z = lattice.points(lattice.everything)
     outer = lattice.coverage(distance)
     inner = lattice.coverage(distance + np.float32(_SHELL))
@@ -197,7 +195,6 @@ def _add_tooth(volume: Field, lattice: Lattice, tooth: Tooth) -> None:
 
 
 def _roots(tooth: Tooth, top: float, tip: float) -> list[Capsule]:
-    """Returns the tooth's root, or its two roots side by side along the arc, from the crown's middle down."""
     spread = 0.22 * tooth.width if tooth.roots == 2 else 0.0
     top = min(top, 0.26 * tooth.width) if tooth.roots == 2 else min(top, 0.42 * tooth.width)
     upper, lower = _GUM_Z + 0.02, _GUM_Z - 1.35 * tooth.height
@@ -206,5 +203,5 @@ def _roots(tooth: Tooth, top: float, tip: float) -> list[Capsule]:
 
 
 def _on(tooth: Tooth, shift: float, z: float) -> Point:
-    """Returns the point at height `z`, moved from the tooth's centre along the arc."""
+    """Returns the point at height `z` that lies `shift` along the arc from the tooth's centre."""
     return (tooth.centre[0] + shift * tooth.along[0], tooth.centre[1] + shift * tooth.along[1], z)

@@ -1,4 +1,4 @@
-"""Devices, programs, buffers and launches. Only this folder imports pyopencl."""
+"""OpenCL devices, programs, buffers and launches. Only this folder imports pyopencl."""
 
 from phyradgs_cl.runtime.algebra import DeviceSpace, HostSpace, Space
 from phyradgs_cl.runtime.context import Runtime

@@ -1,7 +1,7 @@
-"""Algebra of arrays with one interface: on the device by kernels (cl/algebra.cl), on the host by NumPy.
+"""Sums, products and norms of arrays behind one interface (``Space``), for host and device: NumPy or cl/algebra.cl.
 
-A method is written once, over a ``Space``. Every function returns a new array or a number; only numbers come back from a
-device. Sums are deterministic: the same arrays on the same device give the same bits."""
+An iterative method is written once, in terms of a ``Space``. Every function returns a new array, which stays on the device,
+or a number on the host. The same arrays on the same device always give the same bits."""
 
 import weakref
 from collections import defaultdict
@@ -16,29 +16,29 @@ from phyradgs_cl.runtime.memory import DeviceArray
 
 A = TypeVar("A")
 Shape = tuple[int, ...]
-_CPU_SPAN = 1 << 14  # least number of elements that a CPU's work-item sums
-_GPU_GROUP = 256  # most work-items of a GPU's work-group
-_GPU_GROUPS = 512  # most work-groups, or a CPU's work-items, of a sum
-_ITEMS = 64  # most work-items of a CPU's work-group in element-wise kernels
+_CPU_SPAN = 1 << 14  # least number of elements that a CPU's work-item sums, so that the work outweighs its start
+_GPU_GROUP = 256  # largest work-group on a GPU, in work-items
+_GPU_GROUPS = 512  # a sum's largest number of work-groups on a GPU, or of work-items on a CPU
+_ITEMS = 64  # work-group of element-wise kernels on a CPU, in work-items
 
 
 class Space(Protocol, Generic[A]):
-    """Arrays on one side, host or device, and their algebra. Operands have one shape unless a method states another."""
+    """Arrays on the host or on a device, and their algebra. Operands have the same shape unless a method says otherwise."""
 
     def array(self, values: np.ndarray) -> A:
-        """Returns host values as an array of this space, which may share their memory."""
+        """Returns NumPy values as an array of this space. Both may share memory."""
 
     def numpy(self, x: A) -> np.ndarray:
-        """Returns the values on the host. Both may share memory."""
+        """Returns the values as a NumPy array. Both may share memory."""
 
     def full(self, shape: Shape, value: float) -> A: ...
 
     def place(self, shape: Shape) -> A | None:
-        """Returns memory for a result, as the argument ``out`` of operators; None on the host, where operators make their
-        own."""
+        """Returns device memory for an operator's result, its argument ``out``. Returns None on the host, where operators
+        allocate their results."""
 
     def take(self, x: A, chosen: Sequence[int]) -> A:
-        """Returns the ``chosen`` entries along the first axis, in the order given."""
+        """Returns the entries with indices ``chosen`` along the first axis, in that order."""
 
     def add(self, x: A, y: A, scale: float = 1.0, *, nonnegative: bool = False) -> A:
         """Returns x + ``scale`` y, clipped at 0 if ``nonnegative``."""
@@ -50,29 +50,29 @@ class Space(Protocol, Generic[A]):
         """Returns x + ``scale`` y z element by element, clipped at 0 if ``nonnegative``."""
 
     def multiply(self, x: A, y: A) -> A:
-        """Returns x y element by element. y may have only the last axes of x."""
+        """Returns x y element by element. y may lack the first axes of x; it then repeats along them."""
 
     def reciprocal(self, x: A, share: float) -> A:
-        """Returns 1/x, where x counts as at least ``share`` of its largest value; 0 where x is 0 or less."""
+        """Returns 1/max(x, ``share`` · largest x) where x > 0, else 0. So small values of x give no huge result."""
 
     def inner(self, x: A, y: A) -> float:
         """Returns Σ x y, with the accuracy of float64."""
 
     def turn(self, x: A, y: A, z: A) -> float:
-        """Returns Σ (x − y)(y − z): above 0 where the steps from z to y and from y to x point the same way."""
+        """Returns Σ (x − y)(y − z). It is positive if the steps from z to y and from y to x point the same way."""
 
     def norm(self, x: A) -> float:
         """Returns √Σ x²."""
 
     def sum_squares(self, arrays: Iterable[A]) -> float:
-        """Returns Σ ‖x‖² over ``arrays``, which may come from a generator. A device sends back one number for all."""
+        """Returns Σ ‖x‖² over ``arrays``, which may be a generator. A device sends back only the sum of all."""
 
     def largest(self, x: A, *, absolute: bool = False) -> float:
-        """Returns the largest x, or the largest |x|."""
+        """Returns the largest x, or the largest |x| if ``absolute``."""
 
 
 class HostSpace:
-    """NumPy's arrays of any float type. This is a ``Space``, and the twin of ``DeviceSpace``."""
+    """The ``Space`` of NumPy arrays of any float type. Tests compare ``DeviceSpace`` with it."""
 
     def array(self, values: np.ndarray) -> np.ndarray:
         return values
@@ -108,7 +108,7 @@ class HostSpace:
         return x * y
 
     def reciprocal(self, x: np.ndarray, share: float) -> np.ndarray:
-        # An array without a number above 0 has no scale, and every result is 0.
+        # Without any x above 0 every result is 0; 1.0 merely avoids a division by 0.
         least = share * max(self.largest(x), 0.0) or 1.0
         return np.where(x > 0, 1 / np.maximum(x, least), 0).astype(np.float32)
 
@@ -129,16 +129,16 @@ class HostSpace:
 
 
 class DeviceSpace:
-    """Float32 arrays of one device. This ``Space`` reuses the memory of released arrays."""
+    """The ``Space`` of float32 arrays on one device. New arrays reuse the memory of released ones."""
 
     def __init__(self, rt: Runtime) -> None:
         self.rt = rt
         self._unused: dict[int, list[DeviceArray]] = defaultdict(list)
-        # partial sums of work-groups; their sum; the sum over several arrays, between which other sums may be made
+        # Sums of work-groups; their total; the total over several arrays, which must survive other sums in between.
         self._parts, self._whole, self._total = (rt.empty(count, np.float64) for count in (_GPU_GROUPS, 1, 1))
 
     def empty(self, shape: Shape) -> DeviceArray:
-        """Returns uninitialised memory. Earlier work may still read it, because the queue is in order."""
+        """Returns uninitialised memory. Queued work may still read it, which does no harm: the queue is in order."""
         unused = self._unused[int(np.prod(shape, dtype=np.int64))]
         memory = unused.pop() if unused else self.rt.empty(shape)
         array = DeviceArray(memory.buffer, tuple(shape), memory.dtype)
@@ -188,9 +188,9 @@ class DeviceSpace:
         return self._each("reciprocal", x, np.float32(share * max(self.largest(x), 0.0) or 1.0))
 
     def descend(self, x: DeviceArray, y: DeviceArray, step: float) -> DeviceArray:
-        """Returns x − ``step`` y/‖y‖, or x where y is 0. No number comes back from the device."""
+        """Returns x − ``step`` y/‖y‖, or x if y is all 0. The host need not wait, since ‖y‖ stays on the device."""
         self._sum("dot_parts", self._whole, y, y)
-        # The step is split into a high and a low float, because not every device has float64.
+        # Two floats, the step rounded and the rest, keep its precision on devices without float64.
         high = np.float32(step)
         return self._each("descend", x, y, np.array([high, step - float(high)], np.float32), self._whole)
 
@@ -216,8 +216,8 @@ class DeviceSpace:
         return float(self.rt.download(self._parts).view(np.float32)[:groups].max())
 
     def _each(self, name: str, x: DeviceArray, *others: Any, period: int = 0) -> DeviceArray:
-        """Launches an element-wise kernel of x and the other arguments. period: the length of a shorter second operand,
-        which repeats along x; 0 where it has the length of x."""
+        """Launches an element-wise kernel with x and the other arguments. period: the size of a second operand that is
+        smaller than x and repeats along it; 0 if it has the size of x."""
         result, count = self.empty(x.shape), period or x.size
         items = ceil_div(count, self.rt.lanes), x.size // max(count, 1)
         kernel = self.rt.kernel("algebra", name)
@@ -231,14 +231,14 @@ class DeviceSpace:
         return float(values[0] if self.rt.fp64 else values.view(np.float32).astype(np.float64).sum())
 
     def _sum(self, name: str, whole: DeviceArray, *arrays: DeviceArray, add: bool = False) -> None:
-        """Sums over arrays on the device into ``whole``, or adds to it. The named kernel makes the first level."""
+        """Writes a sum over arrays to ``whole``, or adds it there. Kernel ``name`` sums in work-groups, another the rest."""
         groups = self._reduce(name, *arrays, scratch=8)
         kernel = self.rt.kernel("algebra", "dot_whole")
         group = self.rt.group(1, _GPU_GROUP, kernel)
         self.rt.launch(kernel, group, self._parts, groups, add, self.rt.local(8 * group), whole, group=group)
 
     def _reduce(self, name: str, *arguments: Any, scratch: int) -> int:
-        """Launches the first level of a sum over the first array. Returns the number of results in ``_parts``."""
+        """Launches kernel ``name``, whose work-groups write partial results to ``_parts``. Returns their number."""
         kernel = self.rt.kernel("algebra", name)
         count, group = arguments[0].size, self.rt.group(1, _GPU_GROUP, kernel)
         if self.rt.pixel_items:  # on a GPU, neighbouring work-items read neighbouring elements
@@ -255,14 +255,14 @@ class DeviceSpace:
 
 
 def norm(values: np.ndarray) -> float:
-    """Returns the Euclidean norm of a host's array of any shape, summed in float64."""
+    """Returns the Euclidean norm of a NumPy array of any shape, summed in float64."""
     return inner(values, values) ** 0.5
 
 
 def inner(a: np.ndarray, b: np.ndarray) -> float:
-    """Returns the inner product of two arrays of one shape on the host, summed in float64.
+    """Returns the inner product of two NumPy arrays of the same shape, summed in float64.
 
-    BLAS is avoided: its threads wait for cores that the device uses, which took most of a small run."""
+    BLAS is avoided: its threads wait for cores that a CPU device keeps busy, which took most of the time of small runs."""
     return float(np.einsum("i,i->", a.ravel(), b.ravel(), dtype=np.float64))
 
 

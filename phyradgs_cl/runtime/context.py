@@ -1,4 +1,4 @@
-"""A runtime: one device, one in-order queue, the programs built for the device, and its buffers."""
+"""``Runtime``: one OpenCL device with its in-order command queue, the programs built for it, and its buffers."""
 
 import logging
 import math
@@ -24,21 +24,20 @@ Sides = tuple[int, ...]
 
 LANE_CHOICES = (1, 4, 8, 16)
 _FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'
-_TILE_ITEMS = 256  # most work-items of a work-group that shares a tile
-_FEWEST_ITEMS = 32  # least number of work-items that a kernel must be able to run in one work-group
+_TILE_ITEMS = 256  # largest work-group that shares a tile of pixels, in work-items
+_FEWEST_ITEMS = 32  # a device whose work-groups must be smaller than this is refused
 
 
 class Runtime:
-    """Owns everything OpenCL. First declare (``kernel``), then allocate (``empty``, ``upload``), then call (``launch``).
+    """One OpenCL device and all that runs on it: declare a ``kernel``, make arrays (``empty``, ``upload``), then ``launch``.
 
-    - lanes: the width of vectors in kernels. It is wide on CPUs; on GPUs, where work-items are the lanes, it is 1. None
-      takes the device's width.
-    - fp64: False selects the fallback by pairs of float32.
-    - pixel_items: the launch shape. True is a work-item per pixel in small groups (GPUs, needs ``lanes`` 1), False a
-      work-item per band of lines (CPUs).
+    - lanes: the number of floats in a kernel's vectors; None takes the device's width. It is 1 on GPUs, where neighbouring
+      work-items do the work of a CPU's vector.
+    - fp64: False makes kernels use pairs of float32 in place of float64.
+    - pixel_items: True gives each work-item one pixel (GPUs, needs ``lanes`` 1), False several lines of pixels (CPUs).
     - memory: the limit of the sum of its buffers in bytes, or as text like 2GiB.
-    - ranks: the processes that work on the same scan, each with its own Runtime. Where a machine has several devices, each
-      rank takes the next device."""
+    - ranks: the MPI processes that work on the same scan, each with its own Runtime. On a machine with several devices,
+      each rank takes another one."""
 
     # Most samples of rays in one GPU launch: a display driver kills launches of seconds; this takes 0.1 s on a slow GPU.
     most_samples = 2**29
@@ -68,7 +67,7 @@ class Runtime:
         self.pixel_items = self.device.kind != "cpu" if pixel_items is None else pixel_items
         if self.pixel_items and self.lanes != 1:
             raise DeviceError("lanes", str(self.lanes), "1 where work-items are pixels")
-        # A CPU's driver may allocate at a buffer's first use, and end the process where memory is short.
+        # Else a CPU's driver may allocate at a buffer's first use, and end the process if memory is short by then.
         at_once = cl.mem_flags.ALLOC_HOST_PTR if self.device.kind == "cpu" else 0
         self._memory_flags = cl.mem_flags.READ_WRITE | at_once
         self.profile = profile
@@ -78,14 +77,14 @@ class Runtime:
         self._kernels: dict[tuple[str, str, tuple[str, ...]], Kernel] = {}
 
     def kernel(self, program: str, name: str, **defines: int | float | bool) -> Kernel:
-        """Declares the kernel ``name`` of ``cl/<program>.cl``. The first launch builds it, once for all its declarations."""
+        """Declares the kernel ``name`` of ``cl/<program>.cl``. Its first launch builds it; equal declarations share it."""
         merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
         flags = [f"-D{name}={_literal(value)}" for name, value in sorted(merged.items())]
         key = (program, name, ("-cl-std=CL1.2", _FUSING, *flags))
         return self._kernels.setdefault(key, Kernel(*key))
 
     def compile(self, kernel: Kernel) -> "cl.Kernel":
-        """Returns the built kernel. A program is built once for all its kernels."""
+        """Returns the kernel in built form. Building a program builds all of its kernels."""
         if kernel.built is None:
             key = (kernel.program, kernel.options)
             if key not in self._programs:
@@ -95,12 +94,12 @@ class Runtime:
 
     @property
     def built_kernels(self) -> set[str]:
-        """The names of the kernels that have been launched."""
+        """The names of the kernels that have been built, which happens at their first launch."""
         return {kernel.function_name for kernel in self._kernels.values() if kernel.built is not None}
 
     @property
     def group_limits(self) -> dict[str, int]:
-        """The largest work-group in work-items, by name, of the kernels that ``most_items`` was called for."""
+        """The largest work-group in work-items, by kernel; only of kernels for which the driver has been asked."""
         return {one.function_name: one.most_items for one in self._kernels.values() if one.most_items is not None}
 
     def _build(self, program: str, options: tuple[str, ...]) -> "cl.Program":
@@ -120,13 +119,13 @@ class Runtime:
 
     @staticmethod
     def _allowed(source: str, options: tuple[str, ...]) -> list[str]:
-        """Returns the build options. Sums of pairs of floats lose the option that fuses multiply and add, because some
-        drivers ignore the pragma against it."""
+        """Returns the build options. Programs with float pairs lose the one that fuses multiply and add: it would destroy
+        the pairs' low parts, and some drivers ignore the pragma against fusing."""
         has_pairs = "-DFP64=0" in options and _PAIRS in source
         return [option for option in options if not (has_pairs and option == _FUSING)]
 
     def empty(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:
-        """Returns uninitialised memory. Raises MemoryShortage where the device, or the limit, has too little."""
+        """Returns an array with undefined values. Raises MemoryShortage where the device or the limit has too little."""
         shape = (int(shape),) if isinstance(shape, (int, np.integer)) else tuple(int(n) for n in shape)
         kind = np.dtype(dtype)
         nbytes = max(int(np.prod(shape, dtype=np.int64)), 1) * kind.itemsize
@@ -141,7 +140,7 @@ class Runtime:
         return array
 
     def room(self) -> Room:
-        """Returns the memory in bytes that an operator may plan with now, in all and in one buffer."""
+        """Returns the device memory that an operator may use now, in all and in one buffer, in bytes."""
         return self.ledger.room(self.device.largest_allocation_bytes)
 
     @property
@@ -171,7 +170,7 @@ class Runtime:
 
     @naming_failures("a copy to it")
     def write(self, array: DeviceArray, values: np.ndarray) -> None:
-        """Copies host values (same size) into an existing array. The host array may be reused afterwards."""
+        """Copies NumPy values (same size) into an existing array, and waits until they may be overwritten."""
         values = np.ascontiguousarray(values, dtype=array.dtype)
         if values.size:
             cl.enqueue_copy(self.queue, array.buffer, values, is_blocking=True)
@@ -187,7 +186,7 @@ class Runtime:
 
     @naming_failures("a copy from it")
     def read_item(self, array: DeviceArray, index: int) -> np.generic:
-        """Returns element ``index`` of a flat array, after all work enqueued before."""
+        """Waits for all work enqueued before, and returns element ``index`` of the flattened array."""
         value = np.empty(1, array.dtype)
         offset = index * array.dtype.itemsize
         cl.enqueue_copy(self.queue, value, array.buffer, src_offset=offset, is_blocking=True)
@@ -196,8 +195,7 @@ class Runtime:
 
     @naming_failures("a copy from it")
     def read_item_later(self, array: DeviceArray, index: int) -> LaterItem:
-        """Returns element ``index`` of a flat array as it will be after the work enqueued so far, without waiting for the
-        device."""
+        """Asks for element ``index`` of the flattened array, as it will be after all work enqueued so far. Does not wait."""
         value = np.empty(1, array.dtype)
         offset = index * array.dtype.itemsize
         event = cl.enqueue_copy(self.queue, value, array.buffer, src_offset=offset, is_blocking=False)
@@ -210,7 +208,7 @@ class Runtime:
         self, source: DeviceArray, target: DeviceArray, *, nbytes: int | None = None, source_offset: int = 0,
         target_offset: int = 0,
     ) -> None:
-        """Copies bytes of one device array to another: the whole source, or ``nbytes`` from and to the offsets."""
+        """Copies one device array to another: all of the source, or ``nbytes``. Offsets are in bytes."""
         count = source.nbytes if nbytes is None else nbytes
         to, of = target.buffer, source.buffer
         event = cl.enqueue_copy(
@@ -225,15 +223,14 @@ class Runtime:
     def launch(
         self, kernel: Kernel, items: int | tuple[int, ...], *args: Any, group: int | tuple[int, ...] = 1, samples: int = 0
     ) -> None:
-        """Enqueues at least ``items`` work-items, rounded up to whole work-groups: a kernel must do nothing past its last
-        item.
+        """Enqueues ``items`` work-items, rounded up to whole work-groups. Kernels must ignore items past the last.
 
-        group: the sides of a work-group, missing ones 1. An int is a number of work-items along the first axis; on a GPU
-        they also lie along other axes where the first is short. Sides are halved until the kernel can run. samples: the
-        work of all items, as the number of ray samples that take as long to read; on a GPU more than ``most_samples`` are
-        divided among launches. Items then keep their global ids, and groups get new ones. Python's whole numbers become
-        int, its other numbers float: give np.int64 for a long, and np.float32 for a float that may be whole. Raises
-        DeviceError, or MemoryShortage, where a launch fails."""
+        group: the sides of a work-group in work-items; missing sides are 1. An int is the side along the first axis; if this
+        axis is short, a GPU's group extends along other axes. Sides are halved until the kernel can run.
+        samples: how long the launch takes, as the number of samples of rays that could be read in that time. On a GPU, more
+        than ``most_samples`` are divided among several launches. Items keep their global ids, groups get new ids.
+        args: a Python int becomes a C int, a Python float a C float. Give np.int64 for a long.
+        Raises DeviceError, or MemoryShortage, where a launch fails."""
         shape = (items,) if isinstance(items, (int, np.integer)) else items
         if min(shape) < 1:
             return
@@ -243,20 +240,20 @@ class Runtime:
         arrays = [a for a in args if isinstance(a, DeviceArray)]
         nbytes = sum(a.nbytes for a in arrays) if self.profile else 0
         pieces = ceil_div(samples, self.most_samples) if self.pixel_items else 1
-        try:  # no decorator: a step has thousands of launches
+        try:  # not ``naming_failures``: an iteration may have thousands of launches, and its calls would take time
             built = self.compile(kernel)
             built.set_args(*map(_argument, args))
             for first, part in _parts(rounded, local, pieces):
                 event = cl.enqueue_nd_range_kernel(self.queue, built, part, local, first)
                 self._record(kernel.function_name, event, nbytes if first is None or not any(first) else 0)
                 if first is not None:
-                    self.queue.flush()  # or the driver may hand over several as one
+                    self.queue.flush()  # without it the driver may give the GPU several launches at once
         except cl.Error as error:
             raise self.ledger.error(f"a launch of {kernel.function_name}", error, self.queue) from error
 
     def _sides(self, items: int, shape: Sides) -> Sides:
-        """Returns the sides of a work-group of ``items``: all along the first axis. On a GPU with a shorter first axis
-        the rest goes along another axis that it divides, because items past the end would idle."""
+        """Returns the sides of a work-group of ``items`` work-items, all along the first axis. If this axis of ``shape`` is
+        shorter, items past its end would idle on a GPU, so factors of 2 move to another axis that they divide."""
         sides = [int(items), *([1] * (len(shape) - 1))]
         while self.pixel_items and sides[0] % 2 == 0 and sides[0] // 2 >= shape[0]:
             axis = next((k for k in range(1, len(shape)) if shape[k] % (2 * sides[k]) == 0), None)
@@ -266,15 +263,15 @@ class Runtime:
         return tuple(sides)
 
     def group(self, on_cpu: int = 1, on_gpu: int = 64, *kernels: Kernel) -> int:
-        """Returns the work-items of a work-group for this kind of device. A GPU's number is halved until all ``kernels``
-        can run in it: their items share local memory, so ``launch`` must not halve it."""
+        """Returns the work-items of a work-group, ``on_cpu`` or ``on_gpu``. On a GPU it is halved until ``kernels`` can run.
+        Name kernels that size local memory by the group here, because a later halving by ``launch`` would break them."""
         while self.pixel_items and any(on_gpu > self.most_items(kernel) for kernel in kernels):
             on_gpu //= 2
         return on_gpu if self.pixel_items else on_cpu
 
     def most_items(self, kernel: Kernel) -> int:
-        """Returns the largest work-group, in work-items, in which a kernel can run. Its registers may allow fewer than
-        the device."""
+        """Returns the largest work-group in which a kernel can run, in work-items. A kernel that uses many registers may
+        allow fewer than the device."""
         if kernel.most_items is None:
             kernel.most_items = self._asked(kernel, "WORK_GROUP_SIZE")
         return kernel.most_items
@@ -283,8 +280,7 @@ class Runtime:
         return int(self.compile(kernel).get_work_group_info(getattr(cl.kernel_work_group_info, name), self.device.handle))
 
     def _fitting(self, kernel: Kernel, group: tuple[int, ...]) -> tuple[int, ...]:
-        """Returns sides of a work-group, halved until the kernel can run in them. Raises DeviceError below 32
-        work-items."""
+        """Halves the sides of a work-group until the kernel can run. Raises DeviceError if it allows fewer than 32 items."""
         if math.prod(group) == 1:
             return group
         most, sides = self.most_items(kernel), list(group)
@@ -296,8 +292,8 @@ class Runtime:
         return tuple(sides)
 
     def tile(self, kernel: Kernel | None = None) -> tuple[int, int]:
-        """Returns (width, lines) of a work-group's tile of pixels on a GPU: as wide as items run in lockstep, and as many
-        lines as ``kernel``, or the device, allows."""
+        """Returns the (width, lines) of the tile of pixels that a GPU's work-group takes. The width is the number of
+        work-items that run in lockstep; ``kernel``, or the device, limits the lines."""
         rates = self.kernel("rates", "multiply_add")
         if self._multiple is None:
             self._multiple = min(max(self._asked(rates, "PREFERRED_WORK_GROUP_SIZE_MULTIPLE"), 16), 64)
@@ -306,8 +302,8 @@ class Runtime:
         return width, most // width
 
     def shape_of_lines(self, kernel: Kernel, width: int, *rows: int) -> tuple[tuple[int, ...], tuple[int, int], int]:
-        """Returns work-items, work-group and number of groups of a kernel over ``rows`` of ``width`` pixels. A work-item
-        takes a whole line on a CPU, and a pixel on a GPU."""
+        """Returns work-items, work-group and number of groups of a kernel over ``rows`` (one count per axis) of ``width``
+        pixels. A work-item takes one row on a CPU, and one pixel on a GPU."""
         items, group = ((width, *rows), self.tile(kernel)) if self.pixel_items else ((1, *rows), (1, 1))
         sides = (*group, *([1] * (len(rows) - 1)))
         return items, group, math.prod(ceil_div(n, side) for n, side in zip(items, sides, strict=True))
@@ -322,28 +318,26 @@ class Runtime:
             self._profile.add(name, event, nbytes)
 
     def kernel_uses(self) -> dict[str, KernelUse]:
-        """Returns launches, seconds and bytes by kernel since the last call, the longest time first. Needs
-        ``profile=True``."""
+        """Returns what each kernel used since the last call, the one with the most time first. Needs ``profile=True``."""
         self.queue.finish()
         return self._profile.uses()
 
     def best_rates(self) -> Rates:
-        """Measures the device's best rates: bytes copied and floating-point operations per second. Needs
-        ``profile=True``."""
+        """Measures how fast the device copies and calculates at best. Needs ``profile=True``."""
         kernel = self.compile(self.kernel("rates", "multiply_add"))
         return measure_rates(self.queue, kernel, self.lanes, self.device.compute_units, self.group())
 
 
 def default_lanes(device: DeviceInfo) -> int:
-    """Returns the vector width: a CPU's native width, or 1 where work-items are the lanes."""
+    """Returns the number of floats in a kernel's vectors: a CPU's native width, or 1 on other devices."""
     if device.kind != "cpu":
         return 1
     return max((n for n in LANE_CHOICES if n <= device.vector_width), default=1)
 
 
 def _parts(items: Sides, group: Sides, pieces: int) -> Iterator[tuple[Sides | None, Sides]]:
-    """Yields the first item and the number of work-items, per axis, of each of ``pieces`` launches or more; whole groups
-    stay together. One piece has None as its first item."""
+    """Divides a launch of ``items`` into ``pieces`` or more, each of whole work-groups. Yields, per axis, the first item
+    and the number of items of each piece; the first item is None for an undivided launch."""
     if pieces <= 1:
         yield None, items
         return

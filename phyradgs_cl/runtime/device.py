@@ -1,4 +1,4 @@
-"""The OpenCL devices of this machine, the choice among them, and the versions on which results depend."""
+"""Lists this machine's OpenCL devices, chooses one, and reports the versions on which results depend."""
 
 import logging
 import os
@@ -19,14 +19,14 @@ from phyradgs_cl.runtime.opencl import cl
 
 DEVICE_VARIABLE = "PHYRADGS_DEVICE"
 _NEVER_BY_DEFAULT = ("oclgrind", "fpga", "emulat")
-_RIGHT_MESA = 25  # least major version of Mesa whose rusticl computes right sums; an older one causes a warning
+_RIGHT_MESA = 25  # rusticl, the OpenCL of Mesa, computes wrong sums before this major version
 log = logging.getLogger(__name__)
 _targets: dict[int, str | None] = {}
 
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """One OpenCL device, with the properties that matter for the choice among devices."""
+    """One OpenCL device, with the properties by which one is chosen. by_default: may be chosen without being named."""
 
     index: int
     name: str
@@ -44,7 +44,7 @@ class DeviceInfo:
 
     @property
     def rank(self) -> tuple[int, int, int, int, int]:
-        """The rank of a device, larger being better: eligible, GPU before CPU, own memory, wider vectors, more units."""
+        """Orders devices, the best one largest: may be chosen unnamed, GPU before CPU, own memory, wider vectors, units."""
         kind = {"gpu": 2, "cpu": 1}.get(self.kind, 0)
         unified = bool(self.handle.host_unified_memory)
         return (int(self.by_default), kind, int(not unified), self.vector_width, self.compute_units)
@@ -69,10 +69,9 @@ def list_devices() -> list[DeviceInfo]:
 def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, str]:
     """Returns the device to use, and the reason in words. Raises DeviceError where no device fits.
 
-    ``wish`` (or the environment variable PHYRADGS_DEVICE) is an index, ``cpu``, ``gpu`` or a part of a device's or
-    platform's name, or a list of such words with commas. ``turn`` is this process's number among those of one machine:
-    process ``turn`` takes the entry of that number in the list. Without a list or an index it takes the next device of
-    the same name."""
+    wish (or the environment variable PHYRADGS_DEVICE): an index, ``cpu``, ``gpu``, a part of a device's or platform's
+    name, or a list of these with commas. turn: this process's number among the processes on this machine. Process k takes
+    entry k of a list. If ``wish`` is no list and no index, process k takes the k-th further device of the same name."""
     source = "--device"
     if not wish:
         wish, source = os.environ.get(DEVICE_VARIABLE), DEVICE_VARIABLE
@@ -120,7 +119,7 @@ def _wished(wish: str, source: str, devices: list[DeviceInfo]) -> tuple[DeviceIn
 
 def _describe(index: int, of: "cl.Platform", device: "cl.Device") -> DeviceInfo:
     is_pocl = "portable computing language" in of.name.lower()
-    # Device types are bit fields: PoCL answers ALL | CPU.
+    # A device's type is a bit field: PoCL reports ALL | CPU, so == does not work.
     kind = "gpu" if device.type & cl.device_type.GPU else "accelerator"
     kind = "cpu" if device.type & cl.device_type.CPU else kind
     if is_pocl:
@@ -143,7 +142,7 @@ def _describe(index: int, of: "cl.Platform", device: "cl.Device") -> DeviceInfo:
 
 
 def known_fault(device: DeviceInfo) -> str | None:
-    """Returns a known fault of a device's driver in words; None without one."""
+    """Returns a known fault of the device's driver in words, or None."""
     version = re.search(r"\d+", device.handle.driver_version)
     if device.platform.lower() == "rusticl" and version and int(version[0]) < _RIGHT_MESA:
         return f"rusticl of Mesa {device.handle.driver_version} computes wrong sums: install Mesa {_RIGHT_MESA} or newer"
@@ -152,7 +151,7 @@ def known_fault(device: DeviceInfo) -> str | None:
 
 @cache
 def warn_of_fault(device: DeviceInfo) -> None:
-    """Warns where a device's driver has a known fault."""
+    """Warns, once per device, of a known fault of its driver."""
     if fault := known_fault(device):
         log.warning("%s: %s", device.name, fault)
 

@@ -1,7 +1,7 @@
-"""The layout of images and volumes in device memory: GUARD floats, then rows with a pitch (rows, pitch).
+"""The padded layout of images and volumes in device memory: GUARD zeros, then rows that start ``pitch`` floats apart.
 
-Every row ends in at least GUARD zeros. A vector of pixels may therefore start or end outside a row without a test. In
-kernels GUARD is ``IMAGE_GUARD``."""
+Every row is followed by at least GUARD zeros. Kernels can thus read a vector of pixels that starts or ends outside a row
+without testing for it. Kernels call GUARD ``IMAGE_GUARD``."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from phyradgs_cl.runtime.memory import Array, DeviceArray, SameArray
 
 GUARD = 16  # number of floats before the first row, and least number of zeros after each row
 
-_TILE = 16  # number of rows, and of columns, that a CPU's work-item transposes at a time
+_TILE = 16  # a CPU's work-item transposes a tile of this many rows and columns, which stays in the cache
 
 
 @dataclass(frozen=True)
 class Strides:
-    """The place of element (z, y, x) of a volume or stack of images: ``start`` + z ``slice`` + y ``row`` + x, in floats."""
+    """Where a volume lies in memory: element (z, y, x) is at ``start`` + z ``slice`` + y ``row`` + x, counted in floats."""
 
     start: int
     slice: int
@@ -28,7 +28,7 @@ class Strides:
 
     @classmethod
     def plain(cls, shape: Sequence[int], first: Sequence[int] = (0, 0, 0)) -> "Strides":
-        """Returns the strides of C-contiguous (nz, ny, nx), from element ``first`` on."""
+        """Returns the strides of a part of a C-contiguous array (nz, ny, nx) that begins at element ``first``."""
         _, ny, nx = shape
         return cls((first[0] * ny + first[1]) * nx + first[2], ny * nx, nx)
 
@@ -40,7 +40,7 @@ def move(
     rt: Runtime, source: tuple[DeviceArray, Strides], target: tuple[DeviceArray, Strides],
     shape: Sequence[int], *, turned: bool = False,
 ) -> None:
-    """Copies (nz, ny, nx) floats from one layout to another on the device. turned: transposes to (nz, nx, ny)."""
+    """Copies (nz, ny, nx) floats on the device, from one array and layout to another. turned: transposes to (nz, nx, ny)."""
     nz, ny, nx = (int(n) for n in shape)
     (from_array, from_strides), (to_array, to_strides) = source, target
     ends = from_array, from_strides.vector(), to_array, to_strides.vector(), np.int32(ny), np.int32(nx)
@@ -55,13 +55,13 @@ def move(
 
 
 def beside(rt: Runtime, volume: Array, out: DeviceArray | None) -> tuple[DeviceArray, DeviceArray]:
-    """Returns a volume of either side on the device, and device memory for a result of its shape: ``out`` if given."""
+    """Returns a host's or device's volume on the device, and memory for a result of its shape: ``out``, or new memory."""
     there = volume if isinstance(volume, DeviceArray) else rt.upload(volume, np.float32)
     return there, rt.empty(volume.shape) if out is None else out
 
 
 def brought_to(rt: Runtime, like: SameArray, result: DeviceArray) -> SameArray:
-    """Returns a device's result on the side of ``like``: as a device array, or as NumPy's."""
+    """Returns a device's result as a NumPy array if ``like`` is one; else unchanged."""
     return cast(SameArray, result if isinstance(like, DeviceArray) else rt.download(result))
 
 
@@ -70,12 +70,12 @@ def pitch_of(width: int) -> int:
 
 
 def padded_zeros(rt: Runtime, rows: int, width: int, images: int = 1) -> DeviceArray:
-    """Returns zeroed memory for ``images`` images or volumes of ``rows`` rows."""
+    """Returns zeros in the padded layout, for ``images`` images or volumes with ``rows`` rows each."""
     return rt.zeros(images * (GUARD + rows * pitch_of(width)) + GUARD)
 
 
 def pad_rows(values: np.ndarray) -> np.ndarray:
-    """Returns images or volumes (..., rows, width) as flat float32 in the padded layout."""
+    """Returns an image or volume (..., rows, width) as flat float32 in the padded layout."""
     width = values.shape[-1]
     rows = int(np.prod(values.shape[:-1], dtype=np.int64))
     flat = np.zeros(2 * GUARD + rows * pitch_of(width), np.float32)

@@ -1,4 +1,4 @@
-"""Device memory: arrays, the limit and its ledger, the driver's errors, and arrays of pyopencl."""
+"""Device memory: arrays, a limit of their sum, errors of drivers, and exchange of arrays with pyopencl."""
 
 import logging
 import os
@@ -16,25 +16,25 @@ from phyradgs_cl.runtime.device import DeviceInfo
 from phyradgs_cl.runtime.opencl import cl
 
 MEMORY_VARIABLE = "PHYRADGS_MEMORY"
-_SMALLER = 0.25  # fraction of the first attempt's memory that a second attempt plans with, after memory was short
-_PLANNED = 0.9  # largest fraction of the free memory that plans may use
-# largest fraction of the memory that plans may use if a GPU's driver does not say what other programs and the screen use
+_SMALLER = 0.25  # after memory ran short, a second attempt may use this fraction of the free memory
+_PLANNED = 0.9  # fraction of the free memory that operators may use; the rest is a reserve
+# Fraction of the memory that operators may use if a GPU's driver does not say how much other programs and the screen use.
 _PLANNED_UNSEEN = 0.6
 _UNITS = {"": 1, "B": 1}
 for _power, _letter in enumerate("KMGT", start=1):
     _UNITS |= {_letter: 1024**_power, f"{_letter}IB": 1024**_power, f"{_letter}B": 1000**_power}
 log = logging.getLogger(__name__)
-# Mem object allocation failure, out of resources, out of host memory, invalid buffer size.
+# OpenCL's codes: allocation failure, out of resources, out of host memory, invalid buffer size.
 _MEMORY_CODES = (-4, -5, -6, -61)
 
 
 class MemoryShortage(OutOfMemoryError):
-    """Raised for a buffer that is too large for the device or the limit. Smaller bricks may fit."""
+    """Raised for a buffer that is too large for the device or the limit. Work in smaller parts of a volume may fit."""
 
 
 @dataclass(eq=False)
 class DeviceArray:
-    """An array in device memory: a buffer with a shape and a type, C-contiguous."""
+    """A C-contiguous array in device memory."""
 
     buffer: "cl.Buffer"
     shape: tuple[int, ...]
@@ -51,7 +51,7 @@ class DeviceArray:
 
 @dataclass(eq=False)
 class LaterItem:
-    """A number that the device may still be computing."""
+    """A number that the device may still be computing, so that the host need not wait for it."""
 
     _values: np.ndarray
     _event: "cl.Event"
@@ -67,13 +67,13 @@ class LaterItem:
 
 
 Array = np.ndarray | DeviceArray
-"""Plain C-contiguous values. Operators return host arrays for host arrays, and device arrays for device arrays."""
+"""C-contiguous values on host or device. Operators return a NumPy array for a NumPy array, a device array for another."""
 SameArray = TypeVar("SameArray", bound=Array)
 
 
 @dataclass
 class Traffic:
-    """Counts the bytes sent to the device and back, and the host's waits for the device."""
+    """Counts the bytes sent to the device and back, and how often the host waited for the device."""
 
     bytes_up: int = 0
     bytes_down: int = 0
@@ -87,7 +87,7 @@ class Traffic:
 
 @dataclass(frozen=True)
 class Room:
-    """Free device memory that an operator may plan with, and the largest single buffer, both in bytes."""
+    """The device memory that an operator may still use, and the largest single buffer, both in bytes."""
 
     free_bytes: int
     largest_bytes: int
@@ -101,7 +101,7 @@ class Room:
 
 
 class MemoryLedger:
-    """Counts the device memory in use against a limit, in bytes."""
+    """Counts the device memory in use, in bytes, and refuses buffers beyond a limit."""
 
     def __init__(self, device: DeviceInfo, limit_bytes: int | None) -> None:
         self.device = device
@@ -120,7 +120,7 @@ class MemoryLedger:
 
     @contextmanager
     def reserved(self, nbytes: int) -> Iterator[None]:
-        """Reserves ``nbytes`` in the body of a ``with``: ``room`` then leaves them free."""
+        """Makes ``room`` leave ``nbytes`` free in the body of a ``with``, for buffers that are made later."""
         self.reserved_bytes += nbytes
         try:
             yield
@@ -128,8 +128,8 @@ class MemoryLedger:
             self.reserved_bytes -= nbytes
 
     def room(self, largest_bytes: int) -> Room:
-        """Returns nine tenths of the memory left of the limit, in buffers of at most ``largest_bytes``. Takes six tenths
-        where a GPU's driver does not report its free memory and the user has set no limit."""
+        """Returns what operators may use of the memory that is left: nine tenths, in buffers of at most ``largest_bytes``.
+        It is six tenths if a GPU's driver does not report its free memory and the user has set no limit."""
         free_bytes = max(self.limit_bytes - self.held_bytes - self.reserved_bytes, 0)
         return Room(int(self.planned * free_bytes), min(largest_bytes, self.limit_bytes))
 
@@ -148,11 +148,11 @@ class MemoryLedger:
             raise MemoryShortage(subject, found, expected, remedy)
 
     def error(self, work: str, error: "cl.Error", queue: "cl.CommandQueue | None" = None) -> DeviceError:
-        """Returns an error of the driver as a DeviceError, or as a MemoryShortage where memory ran out.
+        """Returns an OpenCL error as a DeviceError, or as a MemoryShortage if memory ran out. work: what failed.
 
-        Some drivers report a shortage only at a launch or a wait. ``work`` names what failed: a kernel, or "a copy". With a
-        dead ``queue`` it was no shortage: drivers say "out of resources" also of a kernel that crashed or ran too long."""
-        code = getattr(error, "code", 0)  # pyopencl may raise an error without a code, as for a build
+        Some drivers report a shortage only at a launch or a wait. They also say "out of resources" after a kernel that
+        crashed or ran too long. Then ``queue`` no longer works, which tells the two apart."""
+        code = getattr(error, "code", 0)  # some errors of pyopencl have no code, as those of builds
         is_dead = queue is not None and not answers(queue)
         if not is_dead and (isinstance(error, cl.MemoryError) or code in _MEMORY_CODES):
             remedy = f"set a limit with --memory or {MEMORY_VARIABLE}, or use a smaller problem"
@@ -167,7 +167,7 @@ class MemoryLedger:
 
 
 def answers(queue: "cl.CommandQueue") -> bool:
-    """Returns whether a queue still works. After a driver has ended a kernel, every call fails in this context."""
+    """Returns whether a queue still works. After a driver has ended a kernel, every call in its context fails."""
     try:
         word = cl.Buffer(queue.context, cl.mem_flags.READ_WRITE, 4)
         cl.enqueue_fill_buffer(queue, word, np.zeros(1, np.float32), 0, 4)
@@ -178,7 +178,7 @@ def answers(queue: "cl.CommandQueue") -> bool:
 
 
 def reported_bytes(device: DeviceInfo) -> int | None:
-    """Returns a device's free memory in bytes as AMD's drivers report it; None for other drivers."""
+    """Returns the device's free memory in bytes, which only AMD's drivers report; None for others."""
     with suppress(cl.Error, AttributeError):
         if "cl_amd_device_attribute_query" in device.handle.extensions:
             return int(device.handle.global_free_memory_amd[0]) * 1024  # type: ignore[index]
@@ -186,7 +186,7 @@ def reported_bytes(device: DeviceInfo) -> int | None:
 
 
 def memory_limit(wish: str | int | None) -> int | None:
-    """Returns the bytes that ``wish``, or else the environment variable PHYRADGS_MEMORY, allows; None without a limit.
+    """Returns the limit in bytes that ``wish`` or the environment variable PHYRADGS_MEMORY sets; None if neither does.
     Raises InputError for text that is no size."""
     if wish is not None:
         return bytes_of(wish, "--memory")
@@ -195,8 +195,8 @@ def memory_limit(wish: str | int | None) -> int | None:
 
 
 def bytes_of(wish: str | int, subject: str) -> int:
-    """Returns the bytes of a text such as 2GiB, 1.5 GB or 512M, or of a plain number. K, M, G and T alone are powers of
-    1024, as with iB. Raises InputError, about ``subject``, for other text."""
+    """Returns the number of bytes that a text such as 2GiB, 1.5 GB or 512M, or a plain number, means. K, M, G and T alone
+    mean powers of 1024, as KiB does. Raises InputError about ``subject`` for other text."""
     text = "" if isinstance(wish, bool) else str(wish)
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
     factor = _UNITS.get(match.group(2).upper()) if match else None
@@ -212,8 +212,8 @@ def mebibytes(nbytes: int) -> str:
 
 
 class Attempt:
-    """One attempt at work in bricks, which may fail because memory is short. As a context it gives the fraction of the
-    free memory to plan with."""
+    """One attempt at work that is divided to fit the memory. As a context manager it gives the fraction of the free memory
+    to use. It catches a MemoryShortage of the first attempt, so that a second can follow."""
 
     has_failed = False
 
@@ -226,27 +226,28 @@ class Attempt:
     def __exit__(self, kind: object, error: object, at: object) -> bool:
         self.has_failed = isinstance(error, MemoryShortage) and self.share == 1
         if self.has_failed:
-            log.warning("%s: %s; trying again with smaller bricks", self.what, str(error))  # the error keeps its buffers
+            # As text, because a log record that held the error would keep its buffers alive.
+            log.warning("%s: %s; trying again with smaller bricks", self.what, str(error))
         return self.has_failed
 
 
 def attempts(what: str) -> Iterator[Attempt]:
-    """Yields an attempt with all of the free memory; after a shortage, with a warning, one with a quarter of it."""
+    """Yields an attempt that may use all of the free memory. If memory runs short, warns and yields one with a quarter."""
     yield (first := Attempt(what, 1.0))
     if first.has_failed:
         yield Attempt(what, _SMALLER)
 
 
 def is_cl_array(value: object) -> bool:
-    """Returns whether a value is a pyopencl.array.Array, without importing pyopencl where nobody has."""
+    """Returns whether a value is a pyopencl.array.Array. It cannot be one if nobody has imported that module yet."""
     module = sys.modules.get("pyopencl.array")
     return module is not None and isinstance(value, module.Array)
 
 
 def adopted(name: str, array: Any, queue: "cl.CommandQueue") -> DeviceArray:
-    """Returns a float32 Array of pyopencl (C order) as a DeviceArray on the same memory. A view of another array is copied.
+    """Returns pyopencl's float32 Array (C order) as a DeviceArray on the same memory. An Array with an offset is copied.
 
-    Raises InputError, with ``name`` as its subject, for another context, queue or type."""
+    Raises InputError about ``name`` for an Array of another context, queue or type."""
     remedy = "make it with the operator's to_device, or on its queue"
     if array.context != queue.context:
         raise InputError(name, "an Array of another OpenCL context", "the operator's context", remedy)
@@ -260,7 +261,7 @@ def adopted(name: str, array: Any, queue: "cl.CommandQueue") -> DeviceArray:
 
 
 def lent(array: DeviceArray, queue: "cl.CommandQueue") -> Any:
-    """Returns a DeviceArray as an Array of pyopencl on the same memory. The ledger counts it while the Array exists."""
+    """Returns a DeviceArray as pyopencl's Array on the same memory, which counts as used until the Array is released."""
     import pyopencl.array
 
     shared = pyopencl.array.Array(queue, array.shape, array.dtype, data=array.buffer)

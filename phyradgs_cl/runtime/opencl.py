@@ -1,7 +1,7 @@
-"""Loads pyopencl when it is first used, and holds kernels with their sources.
+"""Loads pyopencl at its first use, and reads the sources of kernels from ``cl/``.
 
-Sources are files of ``cl/`` with their headers pasted in, because an include path fails on a folder with a space. ``#line``
-marks keep file and line in the compiler's messages."""
+Headers are pasted into the sources, because OpenCL's include path fails on a folder with a space in its name. ``#line``
+directives keep file and line right in the compiler's messages."""
 
 import re
 from collections.abc import Callable
@@ -38,7 +38,7 @@ _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 class Kernel:
     """The kernel ``function_name`` of ``cl/<program>.cl``, built with ``options`` at its first launch.
 
-    ``most_items``: the largest work-group in work-items, once the driver has been asked for it."""
+    ``most_items``: the largest work-group that the driver allows, in work-items; None until it has been asked."""
 
     program: str
     function_name: str
@@ -49,7 +49,7 @@ class Kernel:
 
 @cache
 def kernel_source(name: str) -> str:
-    """Returns the text of ``cl/<name>.cl`` with every header pasted once."""
+    """Returns the text of ``cl/<name>.cl`` with its headers pasted in, each once."""
     pasted: set[str] = set()
     return "\n".join(_expand(f"{name}.cl", pasted))
 
@@ -71,8 +71,8 @@ def _expand(relative: str, pasted: set[str]) -> list[str]:
 
 
 def naming_failures(work: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorates a method of ``Runtime``: OpenCL's errors become DeviceError, or MemoryShortage, that name ``work``, such
-    as "a copy". Drivers queue work, so a launch may also fail in a later call that waits."""
+    """Decorates a method of ``Runtime``: an OpenCL error becomes a DeviceError or MemoryShortage that names ``work``, as
+    "a copy". Drivers only queue work, so a failed launch may show in a later call, which waits for it."""
 
     def decorate(method: Callable[P, R]) -> Callable[P, R]:
         @wraps(method)

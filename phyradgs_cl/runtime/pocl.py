@@ -1,12 +1,15 @@
-"""Builds PoCL's kernels for the processor for which PoCL's own library was compiled.
+"""Makes PoCL (OpenCL on CPUs) fast and safe: sets its cache and threads, and the processor for which it builds kernels.
 
-PoCL links every kernel with a library of built-in functions (fma, min, vload16, ...), of which its wheel has one per family
-of x86 processors. LLVM inlines a function only where the caller has every instruction set of the callee. PoCL 3.0 builds
-kernels for the name that LLVM 14 gives the host, which differs from the library's. An Ice Lake lacks CLWB in LLVM's list,
-so every built-in stays a call, 3 times as slow. An unknown processor is "generic", which builds nothing (pocl/pocl issue
-1049). A Zen 4 is taken for a Zen 3 without AVX-512, on which LLVM aborts ("Cannot select: i64 = fma").
+PoCL links each kernel with a library of built-in functions (fma, min, vload16, ...). Its wheel has one such library for each
+family of x86 processors. LLVM inlines a function only if the caller's processor has all instruction sets of the function's.
+PoCL 3.0 builds kernels for the processor that LLVM 14 takes the host for, which may differ from the library's:
 
-PoCL has no setting for the name, but its device record points to it. Here the pointer is changed to the library's name."""
+- Ice Lake lacks CLWB in LLVM's list, so no built-in is inlined, and kernels are 3 times slower.
+- An unknown processor becomes "generic", for which no kernel builds (pocl/pocl issue 1049).
+- Zen 4 is taken for a Zen 3 without AVX-512, and LLVM aborts ("Cannot select: i64 = fma").
+
+PoCL has no setting for the processor's name. Its record of the device in memory points to the name, so this pointer is
+changed to the name of the library's processor."""
 
 import contextlib
 import ctypes
@@ -27,11 +30,11 @@ from phyradgs_cl.parallel import Launch, launched
 
 log = logging.getLogger(__name__)
 
-_RECORD_BYTES = 2048  # number of bytes of PoCL's device record that are searched
-_LONGEST_TEXT = 64  # most bytes of a name in it
+_RECORD_BYTES = 2048  # number of bytes of PoCL's device record that are searched for the name
+_LONGEST_TEXT = 64  # bytes that are read of a text to which the record points
 _TRIPLE = re.compile(rb"x86_64-[a-z0-9_]+-linux-gnu\Z")
 _PROCESSOR = re.compile(rb"[a-z0-9][a-z0-9.-]*\Z")
-_USER_SPACE = 1 << 47  # upper limit of the addresses of a process
+_USER_SPACE = 1 << 47  # addresses of a process on x86-64 are below this
 CACHE_VARIABLE = "POCL_CACHE_DIR"
 AVX512_TARGET = "skylake-avx512"
 _AVX = {"avx", "cx16", "popcnt"}
@@ -44,21 +47,22 @@ _LIBRARIES = (
     ({"sse4_1", "cx16"}, "penryn"),
     ({"ssse3", "cx16"}, "core2"),
 )
-"""Flags of /proc/cpuinfo by which PoCL chooses a library, and the processor for which this library was compiled."""
+"""PoCL's libraries, as (flags, processor): PoCL takes the first one whose flags are all in /proc/cpuinfo. ``processor`` is
+LLVM's name of the processor for which the library was compiled."""
 _OLDEST_TARGET = "athlon64"
 THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
-_MOST_THREADS = 1024  # largest number of threads that POCL_MAX_PTHREAD_COUNT may state
+_MOST_THREADS = 1024  # largest POCL_MAX_PTHREAD_COUNT that is accepted
 _NO_CACHE_VARIABLE = "PYOPENCL_NO_CACHE"
 _unusable: tuple[Path, str] | None = None
 _kept_alive: list[ctypes.Array[ctypes.c_char]] = []
 
 
 def prepare_environment() -> None:
-    """Gives PoCL a kernel cache for this processor, unless the user has chosen one. Call it before pyopencl loads.
+    """Chooses a kernel cache that works, unless the user has chosen one. Call it before pyopencl loads.
 
-    PoCL names its cache after the LLVM target, so two unknown processors would share binaries. Without a writable cache PoCL
-    has no device. A cache that may not be executed (a mount with noexec) ends the process. In both cases the cache is in the
-    temporary folder. pyopencl's cache is switched off where it cannot be written. Raises InputError for a number of threads
+    PoCL names its own cache after LLVM's target, so two unknown processors would share binaries. If the cache cannot be
+    written, PoCL finds no device. If it is on a mount with noexec, PoCL ends the process. In both cases the temporary folder
+    is used instead. pyopencl's cache is switched off where it cannot be written. Raises InputError for a number of threads
     that PoCL would crash on or ignore."""
     global _unusable
     if platform.system() != "Linux":
@@ -83,7 +87,7 @@ def prepare_environment() -> None:
 
 
 def _share_cores(launch: Launch) -> None:
-    """Limits PoCL to this process's part of the cores, unless the launcher has bound its processes to cores."""
+    """Limits PoCL to this rank's share of the machine's cores, unless the launcher (as mpiexec) binds ranks to cores."""
     cores = os.cpu_count() or 1
     is_bound = len(os.sched_getaffinity(0)) < cores
     if launch.local_size > 1 and not is_bound:
@@ -97,12 +101,12 @@ def _check_threads(wish: str | None) -> None:
 
 
 def unusable_cache() -> Path | None:
-    """Returns a cache that cannot be written or executed, until ``warn_of_cache`` has named it."""
+    """Returns the user's kernel cache if it cannot be used and ``warn_of_cache`` has not yet warned; else None."""
     return _unusable and _unusable[0]
 
 
 def warn_of_cache() -> None:
-    """Warns once that kernels are kept in the temporary folder. Call it where PoCL is used."""
+    """Warns once if kernels are kept in the temporary folder. Called when PoCL is used, since others need no cache."""
     global _unusable
     if _unusable is not None:
         text = "PoCL's kernel cache %s cannot be %s: kernels are kept in %s; set %s to a folder that can"
@@ -118,9 +122,9 @@ def _caches() -> Path:
 
 
 def _fault_of(folder: Path) -> str | None:
-    """Returns what cannot be done with files in a folder, "written" or "executed"; None for a folder that may hold kernels.
+    """Returns "written" or "executed" if that cannot be done with files in a folder; None for a folder that works.
 
-    On a mount with noexec, the operating system refuses to map an executable page of a file."""
+    On a mount with noexec the operating system refuses to map a page of a file as executable."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
@@ -136,7 +140,7 @@ def _fault_of(folder: Path) -> str | None:
 
 
 def _temporary_cache() -> Path:
-    """Returns a folder that only this user can write, because its binaries are executed. Raises OSError without one."""
+    """Returns a temporary folder that only this user can write, as its binaries are executed. Raises OSError without one."""
     places = [Path(place) for place in (tempfile.gettempdir(), "/var/tmp", "/dev/shm")]
     place = next((place for place in places if _fault_of(place) is None), None)
     if place is None:
@@ -151,7 +155,7 @@ def _temporary_cache() -> Path:
 
 
 def library_target() -> str | None:
-    """Returns LLVM's name of the processor for which PoCL's library on this machine was compiled. None off x86-64."""
+    """Returns LLVM's name of the processor for which the library that PoCL uses here was compiled; None if not x86-64."""
     if platform.machine() not in ("x86_64", "AMD64"):
         return None
     flags = _cpu_flags()
@@ -159,10 +163,10 @@ def library_target() -> str | None:
 
 
 def use_library_target(device_address: int) -> str | None:
-    """Names the library's processor in the record of a PoCL 3.0 CPU device, and returns that name.
+    """Writes the name of the library's processor into a PoCL 3.0 CPU device's record, and returns it.
 
-    The record holds the target triple and, next to it, the processor's name. Where the two are not found, nothing is changed
-    and None is returned. From 3.1 on PoCL names the library's processor itself."""
+    The record has a pointer to LLVM's target triple and, next to it, one to the processor's name. If the two are not found,
+    nothing is changed and None is returned. PoCL 3.1 and later name the library's processor themselves."""
     target = library_target()
     if target is None or platform.system() != "Linux":
         return None
@@ -182,14 +186,13 @@ def use_library_target(device_address: int) -> str | None:
 
 
 def _text(memory: bytes) -> bytes | None:
-    """Returns the C string at the start of ``memory``; None where no zero byte ends it."""
     text, end, _ = memory.partition(b"\0")
     return text if end else None
 
 
 @contextlib.contextmanager
 def _own_memory() -> Iterator[Callable[[int, int], bytes]]:
-    """Yields a reader of this process's memory, which returns b'' for an unmapped address instead of crashing."""
+    """Yields a function that reads this process's memory. An unmapped address gives b'' instead of a crash."""
     handle = os.open("/proc/self/mem", os.O_RDONLY)
 
     def read(address: int, count: int) -> bytes:
@@ -209,7 +212,7 @@ def _cpu_flags() -> set[str]:
 
 
 def cpu_facts(described: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
-    """Reads Linux's description of its first processor ("model name", "flags", …). Without such a file it is empty."""
+    """Returns the entries of /proc/cpuinfo for the first processor ("model name", "flags", …); none without that file."""
     facts: dict[str, str] = {}
     with contextlib.suppress(OSError):
         for line in described.read_text().split("\n\n", 1)[0].splitlines():
@@ -219,7 +222,7 @@ def cpu_facts(described: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
 
 
 def cpu_name(facts: dict[str, str] | None = None) -> str:
-    """Returns the processor's name, with family and model where they are known: generations may share a name."""
+    """Returns the processor's name, with family and model if known, because several generations may share a name."""
     facts = cpu_facts() if facts is None else facts
     name = facts.get("model name") or platform.processor() or platform.machine()
     if "cpu family" in facts and "model" in facts:

@@ -1,5 +1,5 @@
-"""A run's device time by kernel: launches, seconds and bytes. Seconds are those of OpenCL's events. Bytes count each buffer
-of a launch once. The device's best rates are measured by copies of the driver and by a kernel of multiply-adds."""
+"""Device time by kernel: launches, seconds and bytes. OpenCL's events give the seconds. Bytes are the sizes of a launch's
+buffers. For comparison, the driver's copies and a kernel of multiply-adds measure the best rates of the device."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -8,15 +8,15 @@ import numpy as np
 
 from phyradgs_cl.runtime.opencl import cl
 
-_FOLD_AT = 20_000  # most events that are kept; adding up more waits for the queue
-_COPY_BYTES = 1 << 26  # bytes of the copy that measures the memory's rate
-_STEPS = 20_000  # multiply-adds of each chain in the run that measures the arithmetic rate
-_REPEATS = 5  # runs of each measurement, of which the fastest counts
+_FOLD_AT = 20_000  # number of events that are kept before they are added up, which waits for the device
+_COPY_BYTES = 1 << 26  # size of the copy that measures the memory's rate: larger than most caches
+_STEPS = 20_000  # length of each chain of multiply-adds that measures the arithmetic rate
+_REPEATS = 5  # number of runs of each measurement; the fastest counts
 
 
 @dataclass
 class KernelUse:
-    """Launches, seconds and bytes of one kernel in a run."""
+    """What one kernel used in a run: launches, seconds, and bytes of its buffers."""
 
     launches: int = 0
     seconds: float = 0.0
@@ -24,7 +24,7 @@ class KernelUse:
 
 
 class Profile:
-    """Collects the events of a queue that measures times."""
+    """Collects the events of a command queue that was made with profiling, and adds them up by kernel."""
 
     def __init__(self) -> None:
         self._events: list[tuple[str, cl.Event, int]] = []
@@ -36,7 +36,7 @@ class Profile:
             self._fold()
 
     def uses(self) -> dict[str, KernelUse]:
-        """Returns the uses by kernel since the last call, the longest first."""
+        """Returns what each kernel used since the last call, the one with the most time first."""
         self._fold()
         uses = dict(sorted(self._uses.items(), key=lambda item: -item[1].seconds))
         self._uses = defaultdict(KernelUse)
@@ -54,14 +54,14 @@ class Profile:
 
 @dataclass(frozen=True)
 class Rates:
-    """The device's measured rates: bytes moved (read and written), and floating-point operations, per second."""
+    """The device's measured rates: bytes copied (read and written both count) and floating-point operations per second."""
 
     copy_bytes_per_s: float
     flops_per_s: float
 
 
 def profile_text(uses: dict[str, KernelUse], wall_s: float) -> str:
-    """Formats a table of ``uses`` (of ``Profile.uses``), with the kernels' fraction of ``wall_s``."""
+    """Formats what ``Profile.uses`` returns as a table. Its last line compares the kernels' time with ``wall_s``."""
     busy_s = sum(use.seconds for use in uses.values())
     rows = [("kernel", "launches", "seconds", "share", "ms each", "GB/s")]
     for name, use in uses.items():
@@ -77,7 +77,7 @@ def profile_text(uses: dict[str, KernelUse], wall_s: float) -> str:
 def measure_rates(
     queue: "cl.CommandQueue", multiply_add: "cl.Kernel", lanes: int, units: int, group: int
 ) -> Rates:
-    """Measures the rates of copies and of multiply-adds, each the best of a few runs. ``queue`` needs profiling."""
+    """Measures the rates of copies and multiply-adds, each as the best of several runs, on a ``queue`` with profiling."""
     context = queue.context
     source, target = (cl.Buffer(context, cl.mem_flags.READ_WRITE, _COPY_BYTES) for _ in range(2))
     cl.enqueue_fill_buffer(queue, source, np.zeros(1, np.float32), 0, _COPY_BYTES)

@@ -1,1 +1,1 @@
-"""Scans derived from a stated scan: coarser, with corrected or altered geometry and timing, or with summed frames."""
+"""Scans derived from a scan: coarser, with corrected or altered geometry and timing, or with summed frames."""

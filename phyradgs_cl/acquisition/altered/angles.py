@@ -1,36 +1,36 @@
-"""Angles of the source, or of parallel rays, about the axis of rotation (+z). They come from poses or from a scan."""
+"""Angles about the axis of rotation (+z): of the source, or of the direction of parallel rays."""
 
 import numpy as np
 
 from phyradgs_cl.acquisition.scan import Scan
 
-_ACROSS = 1e-3  # a ray counts as perpendicular to the axis where the cosine of the angle between them is below this
+_ACROSS = 1e-3  # a ray is perpendicular to the axis if the cosine of their angle is below this
 
 
 def azimuth_rad(pose: np.ndarray) -> np.ndarray:
-    """Returns the angles (...) of poses (..., 12) about +z, in (-π, π]: those of the source, or of the rays' direction."""
+    """Returns the angles (...) about +z, in (-π, π], of the source, or of the rays' direction, in poses (..., 12)."""
     return np.asarray(np.arctan2(pose[..., 1], pose[..., 0]))
 
 
 def start_azimuths_rad(scan: Scan) -> np.ndarray:
-    """Returns the source's angle (F,) about +z, in (-π, π], when each frame's first line opens."""
+    """Returns ``azimuth_rad`` (F,) when each frame's first line opens."""
     starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
     return azimuth_rad(np.concatenate(starts))
 
 
 def middle_poses(scan: Scan) -> np.ndarray:
-    """Returns the poses (F, 12) at the middle of every frame's lit span (``Shutter.middle_s``)."""
+    """Returns the poses (F, 12) in the middle of each frame (``Shutter.middle_s``)."""
     times_s = np.asarray(scan.frame_start_s) + scan.shutter.middle_s
     return np.stack([scan.trajectory.pose(f, times_s[f : f + 1])[0] for f in range(scan.frames)])
 
 
 def has_opposite_views(scan: Scan) -> bool:
-    """Returns whether views half a turn apart are mirror images: those of parallel rays at right angles to the axis."""
+    """Returns whether views half a turn apart are mirror images: rays are parallel and at right angles to the axis."""
     return scan.is_parallel and bool((np.abs(middle_poses(scan)[:, 2]) < _ACROSS).all())
 
 
 def exposure_arc_rad(scan: Scan) -> float:
-    """Returns the arc in rad, without sign, of one line's exposure in the middle frame; 0 for a gantry at rest."""
+    """Returns the angle in rad, without sign, that the gantry turns in one line's exposure in the scan's middle frame."""
     if not scan.is_fly:
         return 0.0
     frame = scan.frames // 2
@@ -40,5 +40,5 @@ def exposure_arc_rad(scan: Scan) -> float:
 
 
 def wrapped(angle: np.ndarray | float) -> np.ndarray:
-    """Returns angles (...) in rad, wrapped to [-π, π)."""
+    """Returns angles (...) in rad, moved by whole turns into [-π, π)."""
     return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi

@@ -1,4 +1,4 @@
-"""Makes a scan small enough to be reconstructed many times: fewer frames, blocks of pixels, coarse voxels."""
+"""Makes a scan small enough to be reconstructed many times: fewer frames, pixels averaged in blocks, larger voxels."""
 
 import math
 from dataclasses import replace
@@ -12,22 +12,22 @@ from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.fields import Grid
 
-MOST_FRAMES = 60  # most frames of a coarse scan
-QUICK_COLUMNS = 20  # most blocks of pixels along the detector's longer side in quick searches
-FINE_COLUMNS = 32  # most blocks of pixels along the detector's longer side in fine searches
-SMOOTHING = 0.8  # standard deviation of the Gaussian that smooths frames before binning, in blocks
+MOST_FRAMES = 60
+QUICK_COLUMNS = 20  # most blocks of pixels along the panel's longer side, for quick searches of a parameter
+FINE_COLUMNS = 32  # most blocks of pixels along the panel's longer side, for fine searches of a parameter
+SMOOTHING = 0.8  # standard deviation of the Gaussian that smooths frames before pixels are averaged, in blocks
 _LEAST_VALID = 0.5  # a block with a smaller fraction of valid pixels is masked
-_MOST_VOXELS = 64  # most voxels along the longest side of the grid's box, without the margin
-_MARGIN = 1  # voxels added on each side of the box: without them, too small a size fits an object that fills it better
-_OBJECT_SHARE = 0.02  # a column shows the object above this fraction of the largest line integral
-_LEAST_COLUMNS = 12  # least number of blocks across a panel, if it has as many columns
-_NARROW = 3  # factor by which blocks shrink on a panel lower than two of them: a single row of blocks tells little
+_MOST_VOXELS = 64  # most voxels along the grid's longest side, without the margin
+_MARGIN = 1  # voxels added on each side: with an object as large as the grid, too small a pixel size would fit better
+_OBJECT_SHARE = 0.02  # a column shows the object if its largest line integral is above this fraction of the scan's
+_LEAST_COLUMNS = 12  # least number of blocks from left to right, if the panel has as many columns
+_NARROW = 3  # on a panel lower than two blocks, blocks are this much smaller: a single row of blocks tells little
 
 
 def coarse(scan: Scan, columns: int) -> Scan:
-    """Returns the scan with at most 60 frames, pixels averaged in blocks, a grid to match, and no reference.
+    """Returns the scan with at most 60 frames, pixels averaged in blocks, a coarse grid, and no reference.
 
-    The panel's longer side has at most ``columns`` blocks, unless too few rows or columns of blocks would be left."""
+    The panel's longer side has at most ``columns`` blocks, or more if the other side would have too few."""
     shape = scan.geometry.detector_shape
     block = min(math.ceil(max(shape) / columns), max(1, shape[1] // _LEAST_COLUMNS))
     if 2 * block > shape[0]:
@@ -37,11 +37,10 @@ def coarse(scan: Scan, columns: int) -> Scan:
 
 
 def smooth(scan: Scan, pixels: float | tuple[float, float]) -> Scan:
-    """Returns the scan with frames smoothed by a Gaussian, so that blocks of their pixels do not alias. Masked pixels
-    have no weight.
+    """Returns the scan with frames smoothed by a Gaussian, so that averaging blocks does not alias. Masked pixels are left
+    out.
 
-    pixels: the standard deviation in pixels, or a pair of them (across rows, across columns). Up to 0.5 the scan stays as
-    it is."""
+    pixels: the standard deviation in pixels, or a pair (v, u). Up to 0.5 the scan is returned unchanged."""
     v_px, u_px = pixels if isinstance(pixels, tuple) else (pixels, pixels)
     if max(v_px, u_px) <= 0.5:
         return scan
@@ -55,14 +54,14 @@ def smooth(scan: Scan, pixels: float | tuple[float, float]) -> Scan:
 
 
 def fewer_frames(scan: Scan, most: int) -> Scan:
-    """Returns the scan with at most ``most`` frames, spread evenly."""
+    """Returns the scan with at most ``most`` of its frames, spread evenly."""
     if scan.frames <= most:
         return scan
     return some_frames(scan, np.unique(np.linspace(0, scan.frames - 1, most).round().astype(int)))
 
 
 def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
-    """Returns the scan with the frames of the given indices alone. The trajectory keeps the frame numbers of the file."""
+    """Returns the scan with only the frames of the given indices. Its trajectory still knows their original numbers."""
     trajectory = altered_trajectory(scan)
     mask = scan.pixel_mask
     return replace(
@@ -75,11 +74,10 @@ def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
 
 
 def binned(scan: Scan, block: int) -> Scan:
-    """Returns the scan with ``block`` × ``block`` pixels averaged to one, and without its reference. A block is no larger
-    than the panel.
+    """Returns the scan with blocks of ``block`` × ``block`` pixels averaged to one, and without its reference.
 
-    Only the valid pixels of a block are averaged; a block with fewer than half of them valid is masked. The last rows and
-    columns that fill no block are dropped. A block of lines opens at the mean of its lines' times."""
+    Only valid pixels are averaged. A block is masked if fewer than half of its pixels are valid. Last rows and columns that
+    fill no block are dropped. A block of lines opens at the mean of its lines' times."""
     if block == 1:
         return replace(scan, reference=None, moving_truth=None)
     height, width = blocks = tuple(min(block, count) for count in scan.geometry.detector_shape)
@@ -101,8 +99,8 @@ def binned(scan: Scan, block: int) -> Scan:
 
 
 def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
-    """Returns a grid of the same box with a margin of one voxel. Its voxels are about as large as a pixel of ``geometry``
-    at the axis, and no finer than those of ``grid``."""
+    """Returns a coarse grid of the same box, with a margin of one voxel. Its voxels are about as large as a pixel of
+    ``geometry`` at the axis, and not finer than those of ``grid``."""
     height_mm, width_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     least_mm = max(max(grid.size_mm) / _MOST_VOXELS, min(grid.voxel_size_mm))
     wanted_mm = (max(height_mm, least_mm), *(max(width_mm, least_mm),) * 2)
@@ -113,12 +111,11 @@ def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
 
 
 def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
-    """Returns a coarse scan with its grid about the axis cut to the object that the frames show.
+    """Returns a coarse scan whose grid is cut to the object that the frames show, about the axis.
 
-    spare_columns: pixels added to the object's radius, because the axis may be off by as many.
-
-    With few frames, voxels of air let a wrong hypothesis fit better than the right one, and a panel's grid has much air.
-    A scan whose grid is off the axis, or whose frames show nothing, stays as it is."""
+    The grid of a panel has much air. With few frames, voxels of air let a wrong geometry fit better than the right one.
+    spare_columns: pixels added to the object's radius, as the axis may be off by as many. A scan whose grid is off the axis,
+    or whose frames show nothing, is returned unchanged."""
     geometry, grid = scan.geometry, scan.grid
     columns = np.where(scan.valid, scan.projections, 0).max((0, 1))
     shown = np.flatnonzero(columns > _OBJECT_SHARE * columns.max())
@@ -138,7 +135,8 @@ def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
 
 
 def _binned_panel(geometry: Geometry, height: int, width: int) -> Geometry:
-    """Returns the panel of whole blocks of ``height`` × ``width`` pixels. Pixels dropped at the far end move its middle."""
+    """Returns the panel with blocks of ``height`` × ``width`` as pixels. Rows and columns that fill no block are dropped,
+    which moves the panel's middle."""
     (rows, columns), (pitch_v_mm, pitch_u_mm) = geometry.detector_shape, geometry.pixel_size_mm
     offset_v_mm, offset_u_mm = geometry.detector_offset_mm
     offset_mm = offset_v_mm - rows % height / 2 * pitch_v_mm, offset_u_mm - columns % width / 2 * pitch_u_mm
@@ -149,11 +147,11 @@ def _binned_panel(geometry: Geometry, height: int, width: int) -> Geometry:
 
 
 def _binned_shutter(scan: Scan, block: int) -> tuple[Shutter, float]:
-    """Returns the shutter of blocks of lines, and the delay in s of the first block after the frame's start."""
+    """Returns the shutter for blocks of lines, and the time in s after the frame's start when the first block opens."""
     shutter, lines = scan.shutter, scan.lines
     line_s = shutter.readout_s / max(lines - 1, 1)
     blocks = lines // block
-    dropped = lines - blocks * block if shutter.direction < 0 else 0  # the far end is read first
+    dropped = lines - blocks * block if shutter.direction < 0 else 0  # dropped lines at the far end are read first
     # a block of lines opens at the mean of its lines
     later_s = (dropped + (block - 1) / 2) * line_s
     pulse_s = shutter.pulse_s and (shutter.pulse_s[0] - later_s, shutter.pulse_s[1])

@@ -1,4 +1,4 @@
-"""A scan with corrected or planted errors of its panel, distances, timing and single views."""
+"""A scan with changes of its panel, distances, timing and single views: to correct errors, or to simulate them."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,12 +14,11 @@ from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_par
 
 @dataclass(frozen=True)
 class GeometryCorrection:
-    """Differences from a scan's stated geometry and timing. All zeros leave the scan as stated.
+    """Differences from a scan's stated geometry and timing. With all zeros the scan stays as stated.
 
-    Offsets move the panel along its own columns and rows. Roll rotates it in its plane; tilts rotate it about v and u
-    through its middle. Distances move source and panel away from the axis. Times lengthen readout and exposure. turn_rad
-    rotates all views about the axis, and lift_mm raises them along it; a turned or lowered object would explain turn_rad
-    and lift_mm as well."""
+    Offsets move the panel in its plane, along u and v. Roll rotates it in its plane; tilts rotate it about v or u through
+    its middle. Distances move source and panel away from the axis. Times are added to readout and exposure. turn_rad
+    rotates all views about the axis, and lift_mm raises them along it; a turned or lowered object has the same effect."""
 
     offset_u_mm: float = 0.0
     offset_v_mm: float = 0.0
@@ -36,8 +35,7 @@ class GeometryCorrection:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Corrections of single views: a rotation (F,) about the axis in rad, and the panel's shifts (F, 2) along v and u in
-    mm."""
+    """Corrections of single views: rotations (F,) about the axis, and shifts (F, 2) of the panel along v and u."""
 
     turn_rad: np.ndarray
     shift_mm: np.ndarray
@@ -45,8 +43,9 @@ class Views:
 
 @dataclass(frozen=True, eq=False)
 class Sway:
-    """A rigid motion of the object: rotations about x, y and z in rad, then shifts along them in mm. All six are cubic
-    splines of time with coefficients (n, 6), between ``start_s`` and ``end_s``, and constant before and after."""
+    """A rigid motion of the object: rotations about x, y and z in rad, and shifts along them in mm.
+
+    All six are cubic splines of time from ``start_s`` to ``end_s``, with coefficients (n, 6), and constant outside."""
 
     coefficients: np.ndarray
     start_s: float
@@ -54,7 +53,7 @@ class Sway:
 
     @classmethod
     def none(cls, scan: Scan, count: int) -> "Sway":
-        """Returns a motion of zeros, in ``count`` splines over the scan."""
+        """Returns a motion of zeros with ``count`` splines over the duration of a scan."""
         starts_s = np.asarray(scan.frame_start_s, np.float64)
         return cls(np.zeros((count, 6)), float(starts_s.min()), float(starts_s.max() + scan.shutter.span_s))
 
@@ -68,7 +67,7 @@ class Sway:
 
 
 def splines(fraction: np.ndarray, count: int) -> np.ndarray:
-    """Returns ``count`` cubic splines (..., count), which sum to 1, at fractions (...) of the whole time, 0 to 1."""
+    """Returns ``count`` cubic B-splines (..., count), which sum to 1, at fractions (...) from 0 to 1 of their interval."""
     knots = np.concatenate([np.zeros(3), np.linspace(0, 1, count - 2), np.ones(3)])
     basis: np.ndarray = BSpline.design_matrix(np.clip(np.ravel(fraction), 0, 1), knots, 3).toarray()
     return basis.reshape(*np.shape(fraction), count)
@@ -76,8 +75,8 @@ def splines(fraction: np.ndarray, count: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class PerturbedTrajectory:
-    """Poses of ``base`` after ``correction``, for a panel of ``shape`` (rows, columns). ``views`` then corrects single
-    views, or lets the object move."""
+    """Poses of ``base`` changed by ``correction``, for a panel of ``shape`` (rows, columns). ``views`` further corrects
+    single views, or lets the object move."""
 
     base: Trajectory
     shape: tuple[int, int]
@@ -91,7 +90,7 @@ class PerturbedTrajectory:
 
     @cached_property
     def _turn(self) -> np.ndarray:
-        """The panel's corrected u, v and normal as columns (3, 3), in components along the stated u, v and normal."""
+        """The rotation (3, 3) by roll and tilts. Its columns are the new u, v and normal in terms of the stated ones."""
         angles_rad = [self.correction.tilt_u_rad, self.correction.tilt_v_rad, self.correction.roll_rad]
         return np.asarray(Rotation.from_rotvec(angles_rad).as_matrix())
 
@@ -109,8 +108,8 @@ class PerturbedTrajectory:
         return np.concatenate(vectors, -1)
 
     def _with_moved_panel(self, pose: np.ndarray, shift_v_mm: float, shift_u_mm: float) -> list[np.ndarray]:
-        """Returns source (or direction), first pixel, column step and row step, each (..., 3), after the correction of
-        all views and one view's shifts of the panel."""
+        """Returns source (or direction), first pixel, column step and row step, each (..., 3), after ``correction`` and a
+        view's shifts of the panel."""
         correction = self.correction
         source, first, column, row = np.moveaxis(pose.reshape(*pose.shape[:-1], 4, 3), -2, 0)
         pitch_u_mm, pitch_v_mm = (np.linalg.norm(step, axis=-1, keepdims=True) for step in (column, row))
@@ -129,11 +128,11 @@ class PerturbedTrajectory:
 
 
 def _seen_by(motion: np.ndarray, vectors: list[np.ndarray], places: int) -> list[np.ndarray]:
-    """Returns four vectors (..., 3) in the coordinates of an object that has rotated and shifted by ``motion`` (..., 6).
+    """Returns a pose's four vectors (..., 3) in the coordinates of an object that has moved by ``motion`` (..., 6).
 
-    The last two vectors are steps. Of the first two, the last ``places`` (1 or 2) are points, which a shift moves; a
-    direction is not."""
-    # An object that turns and shifts sees the scanner shifted back, then turned back.
+    places: the number of points among the vectors, which the shift moves: 2 for source and first pixel, or 1 if the first
+    vector is a direction."""
+    # Seen from an object that turns and shifts, the scanner shifts back, then turns back.
     back = Rotation.from_rotvec(motion[..., :3].reshape(-1, 3)).as_matrix().reshape(*motion.shape[:-1], 3, 3)
     shifted = np.stack(vectors, -2)
     shifted[..., 2 - places : 2, :] -= motion[..., None, 3:]
@@ -141,9 +140,9 @@ def _seen_by(motion: np.ndarray, vectors: list[np.ndarray], places: int) -> list
 
 
 def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | None = None) -> Scan:
-    """Returns the scan with its geometry and timing after a correction. Its frames are unchanged.
+    """Returns the scan with its geometry and timing changed by ``correction``, and the same frames.
 
-    Offsets and distances of a circular orbit stay numbers of its geometry. Other corrections make the trajectory a
+    A circular orbit stays one if only offsets, distances and times change. Other corrections make the trajectory a
     ``PerturbedTrajectory``."""
     shutter, geometry, trajectory = scan.shutter, scan.geometry, scan.trajectory
     source_mm = correction.source_distance_mm
@@ -167,6 +166,6 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
 
 
 def scan_course(scan: Scan) -> np.ndarray:
-    """Returns when each frame (F,) begins, as a fraction of the scan: −1/2 for the first, 1/2 for the last."""
+    """Returns when each frame begins, (F,), as a fraction of the scan: −1/2 for the first frame, 1/2 for the last."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     return np.asarray((starts_s - starts_s.min()) / max(np.ptp(starts_s), 1e-30) - 0.5)

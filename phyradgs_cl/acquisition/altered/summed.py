@@ -1,4 +1,4 @@
-"""Makes fly-scans of dense scans: a panel that integrates while the gantry turns sums what it would record at rest."""
+"""Makes a fly-scan from a scan with many projections: a panel that integrates while the gantry turns records their sum."""
 
 import logging
 from dataclasses import replace
@@ -19,19 +19,19 @@ from phyradgs_cl.acquisition.trajectory import (
 from phyradgs_cl.errors import InputError
 
 log = logging.getLogger(__name__)
-_UNEVEN = 0.01  # intervals between frames are uneven where their range exceeds this fraction of their mean
+_UNEVEN = 0.01  # intervals between frames are uneven if their range exceeds this fraction of their mean
 
 
 def sum_frames(
     scan: Scan, count: int, readout_ratio: float = 0.0, readout: str = "rows", readout_direction: int = 1
 ) -> Scan:
-    """Returns a fly-scan without gaps, in which each frame sums the intensities of ``count`` successive projections.
+    """Makes a fly-scan without gaps, in which each frame sums the intensities of ``count`` successive projections.
 
-    scan: F projections (F, rows, columns); each stands for an interval in s, in which the gantry turns evenly. count: the
-    projections in an exposure. readout_ratio, readout, readout_direction: those of the new panel, as in ``fly_scan``. A line
-    whose exposure begins within a projection takes a fraction of it. Frames that would need projections beyond the last are
-    left out. Photons, detector and object are those of the dense scan. The result is a true test of a motion model if the
-    object moves by less than a pixel from projection to projection.
+    scan: F projections (F, rows, columns); each stands for the interval in s until the next, in which the gantry turns
+    evenly. count: the projections in an exposure. readout_ratio, readout, readout_direction: of the new panel, as in
+    ``fly_scan``. A line whose exposure begins within a projection takes a fraction of it. Frames that would need further
+    projections are left out. Photons, detector and object are those of the given scan, so the result is a real test of a
+    motion model. For this the object must move by less than a pixel from projection to projection.
 
     Raises InputError for a count that no frame can have, a rolling shutter or lag in ``scan``, and uneven intervals."""
     if not isinstance(scan, Scan):
@@ -60,8 +60,8 @@ def sum_frames(
 
 
 def _interval_s(scan: Scan) -> tuple[float, float]:
-    """Returns the interval between projections, and the time at which the first projection's interval begins, both in s.
-    Raises InputError for a rolling shutter, for lag, and for uneven intervals."""
+    """Returns the interval between projections, and when the first projection's interval begins, both in s. Raises
+    InputError for a rolling shutter, lag and uneven intervals."""
     remedy = "give a scan whose frames are short, or of a gantry at rest"
     if scan.is_fly and scan.shutter.readout_s > 0:
         raise InputError("scan", f"a readout of {scan.shutter.readout_s:g} s", "a global shutter", remedy)
@@ -75,7 +75,8 @@ def _interval_s(scan: Scan) -> tuple[float, float]:
 
 
 def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, int]:
-    """Returns a trajectory through the projections' poses, and how many projections at either end lie outside of it."""
+    """Returns a continuous trajectory through the projections' poses, and how many projections at either end it does not
+    cover for their whole interval."""
     middle_s = first_s + (np.arange(scan.frames) + 0.5) * step_s
     own_s = scan.frame_start_s + scan.shutter.middle_s
     if isinstance(scan.trajectory, CircularOrbit):
@@ -94,16 +95,16 @@ def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, i
 
 
 def _shares(delay: np.ndarray, count: int) -> np.ndarray:
-    """Returns the fraction (projections, lines) of each projection's interval that lies in each line's exposure of
-    ``count`` projections. delay (lines,): the opening of a line after the frame's start, in projections."""
+    """Returns what fraction of each projection's interval a line is exposed, (projections, lines). count: the exposure in
+    intervals. delay (lines,): when each line opens, in intervals after the frame's start."""
     number = np.arange(int(np.ceil(delay.max() - 1e-9)) + count)[:, None]
     overlap = np.minimum(number + 1, delay + count) - np.maximum(number, delay)
     return np.where(overlap > 1e-9, overlap, 0.0)
 
 
 def _sum(scan: Scan, start: int, share: np.ndarray, readout: Readout) -> tuple[np.ndarray, np.ndarray]:
-    """Returns one frame's line integrals (rows, columns), summed over projections from ``start`` on with the fractions
-    ``share``, and its masked pixels: those that any of these projections masks."""
+    """Returns a frame's line integrals (rows, columns) and masked pixels. It sums intensities from projection ``start`` on,
+    times the fractions ``share``. A pixel is masked if any of these projections masks it."""
     total, is_masked = np.zeros(scan.projections.shape[1:]), np.zeros(scan.projections.shape[1:], bool)
     for number, lines in enumerate(share, start):
         of_lines = np.broadcast_to(readout.spread(lines), total.shape)

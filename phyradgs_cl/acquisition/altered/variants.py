@@ -1,7 +1,7 @@
-"""The same frames under another hypothesis, such as reversed rotation or readout, or a panel shifted or mirrored.
+"""The same frames under another assumption: reversed rotation or readout, or a panel that is shifted, mirrored or resized.
 
-A pose (..., 12) is four vectors: the source (or the direction of parallel rays), the middle of the first pixel, the step
-to the next column, and the step to the next row."""
+A pose (..., 12) is four vectors: the source (or the direction of parallel rays), the centre of pixel (0, 0), the step to
+the next column, and the step to the next row."""
 
 import math
 from collections.abc import Callable
@@ -22,14 +22,14 @@ _STEPS = _ROW_STEP, _COLUMN_STEP  # index: axis 0 (v), axis 1 (u)
 
 @dataclass(frozen=True, eq=False)
 class AlteredTrajectory:
-    """Poses of ``base`` for a ``panel`` (rows, columns), altered in the order of the fields.
+    """Poses of ``base`` for a ``panel`` (rows, columns), altered by the following fields in their order.
 
-    - is_reversed: the gantry turns the other way. The poses are mirrored, so that columns run backwards; the panel's
-      offset_u_mm stays on its side.
-    - shift_px: the panel moves along u, in its own columns.
-    - images: maps poses (..., 12) to those of frames that lie otherwise on the panel. None leaves the frames as stated.
-    - blocks: rows and columns in a block of pixels.
-    - frames (F,): the frames of ``base`` in use. None takes all."""
+    - is_reversed: the gantry turns the other way. Poses are mirrored at y = 0, then columns are reversed again; the offset
+      ``offset_u_mm`` of the panel keeps its sign.
+    - shift_px: a shift of the panel along u, in columns.
+    - images: changes poses (..., 12) to suit frames that are mirrored, say. None leaves the frames as stated.
+    - blocks: the (rows, columns) of pixels that are averaged to one.
+    - frames (F,): the numbers of the frames of ``base`` that are used. None takes all."""
 
     base: Trajectory
     panel: tuple[int, int]
@@ -73,7 +73,7 @@ class AlteredTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class MappedTrajectory:
-    """Poses of ``base`` mapped by ``change``, a function of a frame's number and its poses (..., 12) that returns poses."""
+    """Poses of ``base``, changed by a function ``change`` of a frame's number and its poses (..., 12)."""
 
     base: Trajectory
     change: Callable[[int, np.ndarray], np.ndarray]
@@ -88,7 +88,7 @@ class MappedTrajectory:
 
 
 def altered_trajectory(scan: Scan) -> AlteredTrajectory:
-    """Returns the scan's trajectory as an ``AlteredTrajectory``, whose fields can be changed."""
+    """Returns the scan's trajectory as an ``AlteredTrajectory``, in which ``replace`` can change fields."""
     trajectory = scan.trajectory
     if isinstance(trajectory, AlteredTrajectory):
         return trajectory
@@ -102,24 +102,24 @@ def with_trajectory(scan: Scan, **changes: Any) -> Scan:
 
 
 def reversed_rotation(scan: Scan) -> Scan:
-    """Returns the scan with the gantry turning the other way."""
+    """Returns the scan as if the gantry turned the other way."""
     return with_trajectory(scan, is_reversed=True)
 
 
 def reversed_readout(scan: Scan) -> Scan:
-    """Returns the scan with the last line read first."""
+    """Returns the scan as if its lines were read in the opposite order."""
     return replace(scan, shutter=replace(scan.shutter, direction=-scan.shutter.direction))
 
 
 def shifted(scan: Scan, pixels: float) -> Scan:
-    """Returns the scan with its panel moved along u by ``pixels`` columns of the recorded scan, also where the scan is
-    binned."""
+    """Returns the scan with its panel moved along u by ``pixels`` columns. Columns of the recorded scan count, even if
+    blocks of them are averaged."""
     return with_trajectory(scan, shift_px=pixels)
 
 
 def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
-    """Returns the scan with the poses of its frames rotated about z by ``angle_rad`` (F,). Within a frame the gantry
-    turns ``speed`` times as fast."""
+    """Returns the scan with each frame's poses rotated about z by ``angle_rad`` (F,). Within a frame the gantry turns
+    ``speed`` times as fast."""
     first_rad = start_azimuths_rad(scan)
 
     def change(frame: int, pose: np.ndarray) -> np.ndarray:
@@ -130,8 +130,8 @@ def turned(scan: Scan, angle_rad: np.ndarray, speed: float = 1.0) -> Scan:
 
 
 def stretched(scan: Scan, v: float, u: float) -> Scan:
-    """Returns the scan with pixels ``v`` times as high and ``u`` times as wide about the panel's middle. The grid grows
-    with the pixels if it then fits the panel's view better."""
+    """Returns the scan with pixels ``v`` times as high and ``u`` times as wide, about the panel's middle. The grid grows
+    with the pixels if it then fits the field of view better."""
     rows, columns = scan.geometry.detector_shape
 
     def change(_: int, pose: np.ndarray) -> np.ndarray:
@@ -150,8 +150,8 @@ def stretched(scan: Scan, v: float, u: float) -> Scan:
 
 
 def mirrored(scan: Scan, axis: str) -> Scan:
-    """Returns the scan with its frames mirrored along ``axis``, u or v, on the panel as stated. Lines along that axis are
-    then read in the opposite order."""
+    """Returns the scan as if its frames were mirrored along ``axis``, u or v. If lines are read along that axis, their order
+    is reversed too."""
     number = ("v", "u").index(axis)
     is_read_along = scan.shutter.axis == ("rows", "columns")[number]
     images = partial(_flipped, axis=number, count=altered_trajectory(scan).panel[number])
@@ -161,7 +161,7 @@ def mirrored(scan: Scan, axis: str) -> Scan:
 def resized(scan: Scan, factor: float, keeps_axis: bool) -> Scan:
     """Returns a cone beam's scan with pixels ``factor`` times as large.
 
-    keeps_axis: the central ray stays at its pixel, as with shorter distances. Otherwise the panel's offset stays in mm."""
+    keeps_axis: the central ray keeps its pixel, as if distances had changed instead. Else the panel's middle stays."""
     trajectory = altered_trajectory(scan)
     rows, columns = trajectory.panel
 
@@ -181,7 +181,7 @@ def resized(scan: Scan, factor: float, keeps_axis: bool) -> Scan:
 
 
 def _flipped(pose: np.ndarray, axis: int, count: int) -> np.ndarray:
-    """Returns poses (..., 12) of frames whose ``count`` rows (axis 0) or columns (axis 1) run backwards."""
+    """Returns poses (..., 12) for frames whose ``count`` rows (axis 0) or columns (axis 1) are in reverse order."""
     step = _STEPS[axis]
     pose[..., _FIRST] += (count - 1) * pose[..., step]
     pose[..., step] *= -1
@@ -189,7 +189,6 @@ def _flipped(pose: np.ndarray, axis: int, count: int) -> np.ndarray:
 
 
 def _rotated(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-    """Returns poses (..., 12) rotated about z by angles (...) in rad."""
     cos, sin = np.cos(angle_rad)[..., None], np.sin(angle_rad)[..., None]
     vectors: np.ndarray = pose.reshape(*pose.shape[:-1], 4, 3).copy()
     x, y = vectors[..., 0].copy(), vectors[..., 1].copy()

@@ -1,1 +1,1 @@
-"""Ray-driven projector (Joseph) with its matched adjoint, of one frame and of whole scans."""
+"""Ray-driven projector of volumes (Joseph's method) with its exact transpose."""

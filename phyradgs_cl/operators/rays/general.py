@@ -1,4 +1,4 @@
-"""Launches of the general ray-driven projector (Joseph) and its matched adjoint, over the cells of many frames at a time.
+"""Launches the general ray-driven projector (Joseph's method) and its exact transpose, for many frames at a time.
 
 Kernels: ``cl/rays.cl``, ``rays_adjoint_gpu.cl``, ``rays_adjoint_cpu.cl``."""
 
@@ -10,20 +10,20 @@ from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD
 
-# On a CPU a work-item of the adjoint owns a brick of voxels (x, y, z), in local memory with a border of 1 around it.
+# On a CPU, each work-item of the adjoint sums for its own box of voxels (x, y, z), which it keeps in local memory.
 _BRICK = (32, 32, 8)
-_SMALL_BRICK = (24, 24, 8)  # brick of 27 kB for devices with no more than the 32 kB of local memory that OpenCL guarantees
-_BLOCK = 4  # voxels along each side of the block that a GPU's work-group owns (fewer along z); as in cl/rays_adjoint_gpu.cl
-_SAMPLES_PER_VOXEL = 4  # estimated number of samples of one pose's rays that touch a voxel
-_LONG_FROM = 2**31  # least number of floats of a volume whose indices need 64 bits
+_SMALL_BRICK = (24, 24, 8)  # takes 27 kB, for devices with only the 32 kB of local memory that OpenCL guarantees
+_BLOCK = 4  # on a GPU, each work-group sums for a cube of this side (less along z if groups are small), in voxels
+_SAMPLES_PER_VOXEL = 4  # estimated number of samples of rays, per pose, that touch a voxel
+_LONG_FROM = 2**31  # a volume with this many floats needs indices of 64 bits
 
 
 def launch_forward(
     rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, volume: DeviceArray,
     frames: DeviceArray, *, add: bool = False,
 ) -> None:
-    """Projects a padded volume, or brick, to padded frames. frame_list: numbers of the frames. add: adds line integrals
-    to those in ``frames``, as the second brick of a volume must."""
+    """Projects a padded volume, or a brick of one, to padded frames with the numbers ``frame_list``. add: adds to frames, as
+    all bricks after the first must; else overwrites them."""
     blocks = ceil_div(layout.width, rt.lanes)
     kernel = rt.kernel("rays", "rays_forward", **_defines(layout, cells))
     items = blocks, layout.lines, frame_list.size
@@ -38,15 +38,15 @@ def launch_adjoint(
     rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, frames: DeviceArray,
     volume: DeviceArray, *, add: bool = False,
 ) -> None:
-    """Backprojects padded frames into a padded volume. frame_list: numbers of the frames. add: adds to the volume, else
-    replaces it."""
+    """Backprojects padded frames, with the numbers ``frame_list``, to a padded volume. add: adds to the volume, else
+    overwrites it."""
     owned, kernel = _owners(rt, layout, cells)
     nz, ny, nx = layout.brick.shape
     columns, rows, slices = (ceil_div(n, side) for n, side in zip((nx, ny, nz), owned, strict=True))
     group = rt.group(1, math.prod(owned))
     each = _SAMPLES_PER_VOXEL * nz * ny * nx * cells.most_per_line
     for first, stop in _parts(rt, frame_list.size, each):
-        adds = add or first > 0  # a launch continues the sums of the launch before: the same bits as one launch
+        adds = add or first > 0  # the launch continues the sums of the one before, so the bits are those of a single launch
         rt.launch(
             kernel, (columns * group, rows, slices), frames, cells.cells, cells.cell_lines, cells.matrices,
             cells.matrix_stride, cells.frame_cells, frame_list, cells.weights, cells.weight_at, first, stop,
@@ -55,7 +55,7 @@ def launch_adjoint(
 
 
 def _owners(rt: Runtime, layout: RayLayout, cells: RayCells) -> tuple[tuple[int, int, int], Kernel]:
-    """Returns the voxels (x, y, z) that a CPU's work-item, or a GPU's work-group, sums alone, and the adjoint's kernel."""
+    """Returns the adjoint's kernel, after the box of voxels (x, y, z) for which one work-item or work-group sums."""
     owned, defines = (_BLOCK,) * 3 if rt.pixel_items else brick_of(rt), _defines(layout, cells)
     if not rt.pixel_items:
         defines |= dict(zip(("BRICK_X", "BRICK_Y", "BRICK_Z"), owned, strict=True))
@@ -67,22 +67,22 @@ def _owners(rt: Runtime, layout: RayLayout, cells: RayCells) -> tuple[tuple[int,
 
 
 def _parts(rt: Runtime, frames: int, samples_per_frame: int) -> Iterator[tuple[int, int]]:
-    """Yields the frames [first, stop) of each launch. On a CPU one launch takes all frames."""
+    """Divides the frames among launches, so that none takes too long on a GPU. Yields [first, stop) of each."""
     step = max(rt.most_samples // samples_per_frame, 1) if rt.pixel_items else frames
     for first in range(0, frames, step):
         yield first, min(first + step, frames)
 
 
 def brick_of(rt: Runtime) -> tuple[int, int, int]:
-    """Returns the voxels (x, y, z) that a CPU's work-item sums alone: the larger of two bricks, 14 % faster, if local
-    memory holds it."""
+    """Returns the box of voxels (x, y, z) for which a CPU's work-item sums. The larger of two is 14 % faster, and is taken
+    if local memory can hold it."""
     tile_bytes = 4 * math.prod(n + 2 for n in _BRICK)
     return _BRICK if rt.device.handle.local_mem_size >= tile_bytes else _SMALL_BRICK
 
 
 def owner_steps(rt: Runtime) -> tuple[int, int]:
-    """Returns (z, y) voxels that one work-item or work-group sums: bricks of a multiple of them give the bits of the
-    uncut volume."""
+    """Returns the height and width (z, y) of the box of voxels for which one work-item or work-group sums. A volume cut
+    into multiples of it gets the same bits as the whole volume."""
     x, y, z = brick_of(rt)
     return (_BLOCK, _BLOCK) if rt.pixel_items else (z, y)
 

@@ -1,8 +1,8 @@
-"""The intensity model at a volume: I(x) = −ln Σ w exp(−A_k x), its exact derivative J and Jᵀ.
+"""Projector of a detector that averages intensities: I(x) = −ln Σ_k w_k exp(−A_k x), with its derivative J and Jᵀ.
 
-A_k is the projector of the k-th cell of every line. J = Σ_k s_k A_k with each pixel's softmax weight s_k = w_k exp(−p_k) /
-Σ_j w_j exp(−p_j). Jᵀ y = Σ_k A_kᵀ (s_k y). This takes one launch of the linear projector for each cell of a line; together
-they cost as much as one launch over all cells. Twins in twins/rays.py: ``ray_frame`` with its intensity model,
+A_k is the linear projector of the k-th time cell of every line, and p_k = A_k x. J = Σ_k s_k A_k, where a pixel's weight is
+s_k = w_k exp(−p_k) / Σ_j w_j exp(−p_j), called softmax. Jᵀ y = Σ_k A_kᵀ (s_k y). The linear projector runs once per k;
+together this takes as long as projecting all cells at once. Twins in twins/rays.py: ``ray_frame`` with its intensity model,
 ``intensity_volume``."""
 
 from collections.abc import Callable, Sequence
@@ -24,12 +24,12 @@ _HOST = HostSpace()
 
 
 class IntensityOperator:
-    """Computes frames I(x), and the derivative J and Jᵀ at the last volume given to ``expected``. Without one, J is A:
-    that of x = 0.
+    """Computes frames I(x), and the derivative J and Jᵀ at the volume x last given to ``expected``. Before that x is 0,
+    where J averages line integrals.
 
-    Arguments and arrays are those of ``RayOperator``. The cells of a frame are split into layers with at most one cell
-    per line; the operator keeps one stack of softmax weights (F, rows, columns) per layer. projector: makes the operator
-    A_k of a layer."""
+    Arguments and arrays are those of ``RayOperator``. The cells of a frame are divided into layers in which every line has
+    at most one cell. Softmax weights (F, rows, columns) are kept for each layer. projector: makes the operator A_k of a
+    layer."""
 
     def __init__(
         self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells],
@@ -38,7 +38,7 @@ class IntensityOperator:
         ones, weights = layered(tables)
         self.frames_shape = (len(tables), *detector_shape)
         self._operators: list[Any] = []
-        # One memory for all layers, which run one after the other. The operator over all cells needs the largest.
+        # All layers share one memory, since they run one after the other. The operator of all cells needs the most.
         memory = RayOperator(rt, grid, detector_shape, tables, subrays=subrays).memory
         for part in ones:
             self._operators.append(projector(rt, grid, detector_shape, part, memory=memory))
@@ -50,18 +50,18 @@ class IntensityOperator:
 
     @property
     def memory(self) -> RayMemory:
-        """The buffers that the projectors of all layers share."""
+        """The buffers of the projectors, shared by all layers."""
         return cast(RayMemory, self._operators[0].memory)
 
     @property
     def holds(self) -> tuple[int, int]:
-        """Numbers of volumes and of stacks of frames on the device besides ``memory``: each layer's line integrals and
-        weights."""
+        """The numbers of volumes and of stacks of frames on the device besides ``memory``, such as each layer's line
+        integrals and weights."""
         return 2, 2 * len(self._operators) + 3
 
     def expected(self, volume: SameArray, out: DeviceArray | None = None) -> SameArray:
         """Returns I(x), (F, rows, columns) float32, of a volume (nz, ny, nx) in 1/mm, and sets J to the derivative there."""
-        self._shares = []  # frees their memory
+        self._shares = []  # frees their memory before new ones are computed
         frames: Array
         if isinstance(volume, DeviceArray):
             p = [operator.forward(volume, self._device.place(self.frames_shape)) for operator in self._operators]
@@ -93,8 +93,8 @@ class IntensityOperator:
         return cast(SameArray, self._given(total, out))
 
     def subset(self, frames: Sequence[int]) -> "IntensityOperator":
-        """Returns the operator for some of the frames, in the order given. Its J is that of x = 0 until its own
-        ``expected``."""
+        """Returns the operator to some of the frames, in the order given. Its J is at x = 0 until its own ``expected`` is
+        called."""
         chosen = list(frames)
         part = copy(self)
         part.frames_shape = (len(chosen), *self.frames_shape[1:])
@@ -103,7 +103,7 @@ class IntensityOperator:
         return part
 
     def _set(self, weights: list[np.ndarray]) -> None:
-        """Sets the weights (F, lines, 1) or (F, 1, lines) of each layer, and J to that of a volume of zeros."""
+        """Sets the weights of each layer, (F, lines, 1) or (F, 1, lines), and J to that at x = 0."""
         self._weights = weights
         self._line_weights: list[DeviceArray] = []
         self._shares = []
@@ -117,9 +117,9 @@ class IntensityOperator:
         return result if out is None else out
 
     def _shares_for(self, like: Array) -> list[Any]:
-        """Returns the softmax weights of each layer where ``like`` lies: device or host."""
+        """Returns the softmax weights of each layer, on the device if ``like`` is there, else on the host."""
         is_there = isinstance(like, DeviceArray)
-        # they lie on the other side: host or device
+        # they are on the other side, host or device
         if self._shares and isinstance(self._shares[0], DeviceArray) != is_there:
             brought = self._device.array if is_there else self._device.numpy
             self._shares = [brought(share) for share in self._shares]
@@ -131,8 +131,8 @@ class IntensityOperator:
         return self._shares or self._weights
 
     def _device_average(self, p: list[DeviceArray]) -> tuple[DeviceArray, list[DeviceArray]]:
-        """Returns frames (F, rows, columns) and the softmax weights of each layer, as ``intensity_average`` does on the
-        host. The weights overwrite the line integrals p."""
+        """Does on the device what ``intensity_average`` does on the host: returns frames (F, rows, columns) and the softmax
+        weights of each layer. Overwrites the line integrals p."""
         least, total = self._device.full(self.frames_shape, np.inf), self._device.full(self.frames_shape, 0.0)
         for q, weights in zip(p, self._uploaded(), strict=True):
             self._launch("layer_least", q, weights, least)
@@ -145,16 +145,14 @@ class IntensityOperator:
         return least, [self._device.multiply(q, total) for q in p]
 
     def _launch(self, name: str, *arrays: DeviceArray) -> None:
-        """Launches a kernel of cl/cell_layers.cl over all pixels of the frames."""
         frames, rows, columns = self.frames_shape
         rt = self._device.rt
         sides = (np.int32(n) for n in (rows, columns, self._by_row))
         rt.launch(rt.kernel("cell_layers", name), (columns, rows, frames), *arrays, *sides, group=rt.group(on_cpu=16))
 
     def _uploaded(self) -> list[DeviceArray]:
-        """Returns the weights (F, lines) of each layer on the device, uploaded once."""
         if not self._line_weights:
             shape = (self.frames_shape[0], -1)
-            # In place: copies of this operator share the list.
+            # Extends the list in place, because copies of this operator share it.
             self._line_weights.extend(self._device.rt.upload(w.reshape(shape), np.float32) for w in self._weights)
         return self._line_weights

@@ -1,7 +1,7 @@
 """Layout of volumes, frames and time cells in device memory for the ray-driven projector (cl/common/ray.h).
 
-``layered`` splits the cells of frames into layers in which no line has more than one cell. A detector averages intensities
-over the cells of a line, which needs separate line integrals for each cell."""
+A detector that averages intensities needs separate line integrals for each time cell of a line. ``layered`` divides the
+cells into layers, in which every line has at most one cell."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,18 +17,17 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
 _RAY_CELL_FLOATS = 16  # number of floats of a time cell in ``ray_constants``
-BORDER = 1  # width of the zeros around a volume in y and z, in voxels: samples need no test at its faces
-_WIDEST = 16  # number of elements of the widest vector, which may reach beyond the last cell or line
+BORDER = 1  # width of the zeros around a volume in y and z, in voxels: samples at its faces need no test
+_WIDEST = 16  # width of the widest vector, which may read beyond the last cell or line
 
 
 @dataclass(frozen=True)
 class RayLayout:
     """Layout of volumes (nz, ny, nx) and of stacks of frames with ``lines`` × ``width`` pixels in device memory.
 
-    ``brick``: the voxels of the grid that the volume holds, inside a border of zeros, so that the frames of all bricks
-    add up to the frames of the grid. ``subrays``: rays of a pixel along (v, u); lines and width count rays. ``axis``:
-    whether lines are rows or columns of the detector. ``is_across``: lines are rows although the readout goes along
-    columns."""
+    brick: the part of the grid that the volume holds. It has a border of zeros, so that the frames of all bricks add up to
+    the frames of the grid. subrays: the rays of a pixel along (v, u); ``lines`` and ``width`` count rays. axis: whether
+    lines are "rows" or "columns" of the detector. is_across: lines are rows although the panel is read column by column."""
 
     grid: Grid
     lines: int
@@ -42,11 +41,10 @@ class RayLayout:
     def of_scan(
         cls, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], axis: str, subrays: tuple[int, int] = (1, 1)
     ) -> "RayLayout":
-        """Returns the layout of the complete grid, with the readout's lines as rows of the frames.
+        """Returns the layout of the complete grid. Frames are stored line by line, as the panel is read along ``axis``.
 
-        detector_shape: (rows, columns). axis: the readout's. A CPU's vectors run along rows of the frames, which a panel
-        with fewer rows than lanes would leave mostly empty: where such a panel is read along columns, its rows stay the
-        lines."""
+        detector_shape: (rows, columns). A CPU's vectors run along a line. In a panel with very few rows, vectors along
+        columns would be mostly empty. So its lines are always rows, even if it is read column by column."""
         (rows, columns), (along_v, along_u) = detector_shape, subrays
         shape = rows * along_v, columns * along_u
         is_across = axis == "columns" and not rt.pixel_items and shape[0] < rt.lanes
@@ -54,7 +52,7 @@ class RayLayout:
         return cls(grid, *Readout(own).shape(shape), whole(grid.shape), subrays, own, is_across)
 
     def of(self, brick: Brick) -> "RayLayout":
-        """Returns the layout of the same frames with another brick of the grid."""
+        """Returns the layout for the same frames and another brick of the grid."""
         return replace(self, brick=brick)
 
     @property
@@ -67,7 +65,7 @@ class RayLayout:
 
     @property
     def turned(self) -> "RayLayout":
-        """The layout of frames stored transposed (F, width, lines)."""
+        """The layout for frames stored transposed, (F, width, lines)."""
         return replace(self, lines=self.width, width=self.lines)
 
     def frames_shape(self, count: int) -> tuple[int, int, int]:
@@ -75,37 +73,38 @@ class RayLayout:
 
     @property
     def volume_strides(self) -> Strides:
-        """Strides in floats of the padded volume, from its first voxel inside the border."""
+        """The strides in floats of the padded volume. They start at its first voxel inside the border."""
         _, ny, nx = self.brick.shape
         row, slice_ = pitch_of(nx), pitch_of(nx) * (ny + 2 * BORDER)
         return Strides(GUARD + BORDER * (slice_ + row), slice_, row)
 
     @property
     def frames_strides(self) -> Strides:
-        """Strides in floats of a stack of frames (F, lines, width) whose rows are padded to their pitch."""
+        """The strides in floats of a stack of padded frames (F, lines, width)."""
         row = pitch_of(self.width)
         return Strides(GUARD, self.lines * row, row)
 
     def pixel_strides(self, axis: str, *, turned: bool = False) -> tuple[int, int, int, int]:
-        """Returns, in floats, the start of padded frames and the steps from column to column, row to row and frame to
-        frame of the detector. axis: the readout's. turned: the frames are stored transposed, (F, width, lines)."""
+        """Returns in floats where padded frames start, and the steps to the next column, row and frame of the detector.
+
+        axis: along which the panel is read. turned: the frames are stored transposed, (F, width, lines)."""
         strides = self.turned.frames_strides if turned else self.frames_strides
         steps = (1, strides.row) if (axis == "rows") != turned else (strides.row, 1)
         return (strides.start, *steps, strides.slice)
 
     def column_floats(self, axis: str) -> int:
-        """Returns the floats of one padded frame stored by detector columns, for a readout along ``axis``."""
+        """Returns the floats of a padded frame stored column by column, for a panel that is read along ``axis``."""
         return (self.turned if axis == "rows" else self).frames_strides.slice
 
     def inside(self, flat: np.ndarray) -> np.ndarray:
-        """Returns the volume (nz, ny, nx) as a view into its padded floats, without the border."""
+        """Returns a view (nz, ny, nx) of a padded volume, without the padding."""
         nz, ny, nx = self.brick.shape
         padded = flat[GUARD:-GUARD].reshape(nz + 2 * BORDER, ny + 2 * BORDER, pitch_of(nx))
         return padded[BORDER:-BORDER, BORDER:-BORDER, :nx]
 
     def constants(self) -> tuple[np.ndarray | np.int32, ...]:
-        """The kernels' arguments: the brick's voxels (x, y, z), its first voxel, pitch of its rows in floats, voxel size in
-        mm, lines and width of a frame, and pitch of its lines."""
+        """Returns arguments of kernels. Of the brick: shape (x, y, z), first voxel, pitch of rows in floats, voxel size in
+        mm. Of a frame: lines, width, pitch of lines."""
         nz, ny, nx = self.brick.shape
         dz, dy, dx = self.grid.voxel_size_mm
         return (
@@ -133,14 +132,14 @@ class RayCells:
     weight_at: DeviceArray
     is_parallel: bool
     is_across: bool
-    most_per_line: int  # most cells that serve one line of a frame
+    most_per_line: int  # largest number of cells that serve the same line of a frame
 
     @classmethod
     def upload(
         cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells], rows_across: int | None = None
     ) -> "RayCells":
-        """Uploads the tables of all frames. rows_across: the panel's number of rows where they are the kernels' lines
-        although columns are read (``RayLayout.is_across``), else None."""
+        """Uploads the tables of all frames. rows_across: the panel's number of rows with ``RayLayout.is_across``, else
+        None."""
         starts = np.concatenate([[0], np.cumsum([table.count for table in tables])])
         pose = np.concatenate([table.readout.poses(table.pose) for table in tables])
         weights = [table.weights_of(cell) for table in tables for cell in range(table.count)]
@@ -148,7 +147,7 @@ class RayCells:
         served = [table.line_cells() + start for table, start in zip(tables, starts[:-1], strict=True)]
         if rows_across is not None:
             pose = np.concatenate([table.pose for table in tables])
-            # vectors may begin at every column and reach beyond a cell's lines: there its weight is 0
+            # Vectors may begin at any column and reach beyond the columns of a cell, where its weight must be 0.
             weights = [np.pad(weight, _WIDEST) for weight in weights]
             served = [np.tile(ends, (rows_across, 1)) for ends in zip(starts[:-1], starts[1:], strict=True)]
         weight_at = np.concatenate([[0], np.cumsum([len(weight) for weight in weights])])
@@ -171,8 +170,8 @@ class RayCells:
 
 
 def matrix_table(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> tuple[np.ndarray, int]:
-    """Returns ``voxel_matrices`` of poses (C, 12) transposed to (12, stride), and the stride: more than C, because
-    vectors read past the last pose."""
+    """Returns ``voxel_matrices`` of poses (C, 12), transposed to (12, stride), and the stride. It is larger than C, because
+    vectors read beyond the last pose."""
     stride = len(pose) + _WIDEST
     matrices = np.zeros((12, stride))
     matrices[:, : len(pose)] = voxel_matrices(pose, grid, is_parallel).T
@@ -180,7 +179,7 @@ def matrix_table(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> tup
 
 
 def ray_constants(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> np.ndarray:
-    """Returns poses (C, 12) in voxel indices: the (C, 16) float32 table of cl/common/ray.h."""
+    """Returns poses (C, 12) in units of voxels, as the table (C, 16) float32 that cl/common/ray.h describes."""
     if is_parallel:
         return _parallel_constants(pose, grid)
     first = np.array(grid.first_centre_mm[::-1])
@@ -194,14 +193,14 @@ def ray_constants(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> np
 
 
 def _parallel_constants(pose: np.ndarray, grid: Grid) -> np.ndarray:
-    """Returns ``ray_constants`` for parallel beams: the ray's direction over its main component, and where rays cut plane
-    0 of the main axis."""
+    """Returns ``ray_constants`` for parallel beams: the direction divided by its largest component (of the main axis), and
+    where rays meet the first plane of voxels along that axis."""
     first = np.array(grid.first_centre_mm[::-1])
     pitch = np.array(grid.voxel_size_mm[::-1])
     direction, panel = pose[:, 0:3] / pitch, pose[:, 3:].reshape(-1, 3, 3) / pitch
     panel[:, 0] -= first / pitch
     size = np.abs(direction)
-    # among components that float32 cannot tell apart, the first, as in the kernels: at 135° two differ in the last bit
+    # As in the kernels, of components that are equal in float32 the first is the main one. At 135°, two differ in float64.
     main = np.argmax((size / size.max(axis=1, keepdims=True)).astype(np.float32), axis=1)
     cell = np.arange(len(pose))
     direction /= direction[cell, main][:, None]
@@ -213,7 +212,8 @@ def _parallel_constants(pose: np.ndarray, grid: Grid) -> np.ndarray:
 
 
 def voxel_matrices(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> np.ndarray:
-    """Returns the matrices (C, 3 · 4) that map a voxel index (x, y, z) to (u·z, v·z, z); z is 1 in a parallel beam."""
+    """Returns matrices (C, 3 · 4) that map voxel indices (x, y, z) to (u·depth, v·depth, depth) on the detector, where the
+    depth is 1 in a parallel beam."""
     matrix = projection_matrices(pose, is_parallel).reshape(-1, 3, 4)
     first = np.array(grid.first_centre_mm[::-1])
     pitch = np.array(grid.voxel_size_mm[::-1])
@@ -222,16 +222,16 @@ def voxel_matrices(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> n
 
 
 def layers(table: TimeCells) -> list[TimeCells]:
-    """Splits the cells of a frame into tables in which no line has more than one cell. Keeps their order."""
+    """Divides the cells of a frame into tables in which every line has at most one cell. Keeps their order."""
     numbers = table.layer_numbers
     return [some_cells(table, np.flatnonzero(numbers == k)) for k in range(int(numbers.max()) + 1)]
 
 
 def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np.ndarray]]:
-    """Splits the cells of F frames into layers. Returns each layer's tables, with weights of 1, and each layer's original
-    weights.
+    """Divides the cells of F frames into layers. Returns the tables of each layer with weights of 1, and the weights.
 
-    Weights are float32, (F, lines, 1) or (F, 1, lines) by the readout's axis; 0 where a layer has no cell for a line."""
+    The weights of a layer are float32, (F, lines, 1) or (F, 1, lines) by the axis of readout, and 0 for lines without a
+    cell in it."""
     split = [layers(table) for table in tables]
     ones, weights = [], []
     for k in range(max(len(parts) for parts in split)):
@@ -243,13 +243,13 @@ def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np
 
 
 def some_cells(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
-    """Returns the table of the cells with the numbers ``cells``. They must have fixed poses, without ends of a motion."""
+    """Returns a table with only the cells of the numbers ``cells``. They must be still cells."""
     names = ["pose", "time_s", "line_start", "line_stop", "weight"]
     names += [] if table.line_share is None else ["line_share"]
     return replace(table, **{name: getattr(table, name)[cells] for name in names})
 
 
 def _empty(table: TimeCells) -> TimeCells:
-    """Returns the table with one cell that serves no line, because a table must not be empty."""
+    """Returns a table whose only cell serves no line, for frames without a cell: a table must not be empty."""
     one = some_cells(table, [0])
     return replace(one, line_stop=one.line_start.copy(), weight=np.zeros(1))

@@ -1,5 +1,5 @@
-"""The device memory of ray-driven operators: buffers for a volume or a brick of it, a batch of frames, and slots
-(``slots.py``)."""
+"""Device memory of ray-driven operators: buffers for a volume or a part of it (brick), for some frames (batch), and for the
+line integrals of single poses (slots, see ``slots.py``)."""
 
 from collections.abc import Iterator
 
@@ -15,17 +15,17 @@ from phyradgs_cl.operators.rays.upright import columns_floats, turn_volume
 from phyradgs_cl.runtime import Array, DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pad_rows, unpad_rows
 
-_FRAMES_SHARE = 0.25  # largest fraction of the free device memory for a batch of frames, where a volume is cut into bricks
-_SLOTS_SHARE = 0.125  # largest fraction of the free device memory for slots (``slots.py``)
-_MOST_SLOT_FLOATS = 2**26  # most floats of all slots at a time: more is not faster
+_FRAMES_SHARE = 0.25  # fraction of the free device memory for a batch of frames if the volume does not fit as a whole
+_SLOTS_SHARE = 0.125  # fraction of the free device memory for slots
+_MOST_SLOT_FLOATS = 2**26  # most floats of all slots at a time: more was not faster
 
 
 class RayMemory:
-    """Buffers for a volume and for frames of ``layout``, planned at their first use.
+    """Buffers for a volume and frames of ``layout``. Their sizes are chosen at the first use, by the memory free then.
 
-    A volume that does not fit is cut into bricks, as large as fit together with some frames. slot_floats: floats of one
-    frame's slots (``slots.py``), 0 without slots. With slots the volume is also stored transposed, with z along rows, if
-    both fit. Several operators may share one memory, one at a time: each call writes the buffers that it reads."""
+    A volume that does not fit is cut into bricks, as large as fit together with some frames. slot_floats: the floats of
+    one frame's slots, 0 without slots. With slots the volume is also stored transposed, with z along rows, if both fit.
+    Several operators may share one memory if they run one after the other: no call needs an earlier one's values."""
 
     def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int, slot_floats: int = 0) -> None:
         self.rt, self.layout, self.most_frames = rt, layout, most_frames
@@ -37,13 +37,13 @@ class RayMemory:
         self._bricks: list[Brick] = []
         self._batch = 0
         self._volume: DeviceArray | None = None
-        self._bordered: tuple[int, int, int] | None = None  # the shape of the brick whose border is zero
+        self._bordered: tuple[int, int, int] | None = None  # shape of the brick for which the volume's border is zero
         self._frames: DeviceArray | None = None
         self._padded: dict[tuple[int, int, int], np.ndarray] = {}
 
     def plan(self, share: float = 1.0) -> list[Brick]:
-        """Returns the bricks of the volume. ``share`` below 1 plans again, with that fraction of the free memory. Raises
-        OutOfMemoryError where no brick fits."""
+        """Returns the bricks of the volume. A ``share`` below 1 makes new ones, for that fraction of the free memory. Raises
+        OutOfMemoryError if no brick fits."""
         if not self._bricks or share < 1:
             self.release()
             self._bricks, self._batch = self._planned(share)
@@ -51,14 +51,14 @@ class RayMemory:
 
     @property
     def planned_bytes(self) -> int:
-        """The bytes of all buffers, allocated or not; 0 before there is a plan."""
+        """The bytes of all buffers, even if not yet allocated; 0 before ``plan``."""
         if not self._bricks:
             return 0
         floats = self.layout.of(self._bricks[0]).volume_floats + self._frames_floats(self._batch) + self._slots_floats
         return 4 * floats + self._columns_bytes
 
     def release(self) -> None:
-        """Frees the buffers. The next use plans them for the memory that is then free."""
+        """Frees the buffers. The next use chooses their sizes by the memory that is free then."""
         self._volume = self._frames = self._columns = self._slots = None
         self._padded.clear()
         self._bricks = []
@@ -101,7 +101,7 @@ class RayMemory:
             yield slice(start, min(start + self._batch, count))
 
     def holds_all(self, frames: int) -> bool:
-        """Returns whether the complete volume and ``frames`` frames fit together; allocates their buffers if they do."""
+        """Returns whether the whole volume and ``frames`` frames fit together. If so, allocates their buffers."""
         if len(self.plan()) > 1 or self._batch < frames:
             return False
         self.volume(self._bricks[0])
@@ -113,20 +113,20 @@ class RayMemory:
         return True
 
     def volume(self, brick: Brick) -> tuple[RayLayout, DeviceArray]:
-        """Returns the layout of a brick, and memory for it with undefined content."""
+        """Returns the layout of a brick, and memory for it with undefined values."""
         if self._volume is None:
             largest = self._bricks[0]
             self._volume = self.rt.zeros(self.layout.of(largest).volume_floats)
             self._bordered = largest.shape
         layout = self.layout.of(brick)
-        if brick.shape != self._bordered:  # the border of the last brick lies among the voxels of this one
+        if brick.shape != self._bordered:  # in another shape, the border lies where the last brick had voxels
             self._bordered = None
         return layout, DeviceArray(self._volume.buffer, (layout.volume_floats,), self._volume.dtype)
 
     def write_volume(self, volume: Array, brick: Brick) -> tuple[RayLayout, DeviceArray]:
         """Copies a brick of a volume (nz, ny, nx) to the device. Returns its layout and the padded copy.
 
-        The padded host array is kept for the next call, because new pages cost more than the copy."""
+        The padded array on the host is kept for the next call: allocating it takes longer than the copy."""
         layout, on_device = self.volume(brick)
         if isinstance(volume, DeviceArray):
             if self._bordered != brick.shape:
@@ -144,7 +144,7 @@ class RayMemory:
         return layout, on_device
 
     def read_volume(self, layout: RayLayout, on_device: DeviceArray, result: Array) -> None:
-        """Copies a padded brick from the device to its place in the volume ``result`` (nz, ny, nx)."""
+        """Copies a padded brick from the device into the volume ``result`` (nz, ny, nx)."""
         brick = layout.brick
         if isinstance(result, DeviceArray):
             plain = Strides.plain(result.shape, brick.start)
@@ -154,11 +154,11 @@ class RayMemory:
 
     @property
     def has_columns(self) -> bool:
-        """Whether the transposed volume, with z along rows, fits besides the volume; known after ``plan``."""
+        """Whether the transposed volume fits in addition to the volume. Known after ``plan``."""
         return self._columns_bytes > 0
 
     def turned(self, volume: Array) -> DeviceArray:
-        """Returns the complete volume (nz, ny, nx) on the device, padded and transposed to (y, x, z)."""
+        """Returns the whole volume (nz, ny, nx) on the device, padded and transposed to (y, x, z)."""
         if self._columns is None:
             self._columns = self.rt.zeros(self._columns_bytes // 4)
         if isinstance(volume, DeviceArray):
@@ -169,7 +169,7 @@ class RayMemory:
         return self._columns
 
     def slots(self) -> DeviceArray:
-        """Returns memory for the slots of ``slot_frames`` frames, with undefined content."""
+        """Returns memory for the slots of ``slot_frames`` frames, with undefined values."""
         if self._slots is None:
             self._slots = self.rt.zeros(self._slots_floats)
         return self._slots
@@ -179,7 +179,7 @@ class RayMemory:
         return 2 * GUARD + self.slot_frames * self.slot_floats if self.slot_frames else 0
 
     def frames(self, count: int) -> DeviceArray:
-        """Returns memory for ``count`` frames of a batch, with undefined content."""
+        """Returns memory for ``count`` frames of a batch, with undefined values."""
         return self._some_frames(self.layout.frames_floats(count))
 
     def _some_frames(self, floats: int) -> DeviceArray:
@@ -188,13 +188,13 @@ class RayMemory:
         return DeviceArray(self._frames.buffer, (floats,), self._frames.dtype)
 
     def _frames_floats(self, count: int) -> int:
-        """Returns the floats of a buffer for ``count`` frames, which holds them by rows or, with slots, by columns."""
+        """Returns the floats of a buffer for ``count`` frames. With slots it must also hold the frames transposed."""
         turned = self.layout.turned.frames_floats(count) if self.slot_floats else 0
         return max(self.layout.frames_floats(count), turned)
 
     def write_frames(self, frames: Array, part: slice, axis: str, *, turned: bool = False) -> DeviceArray:
-        """Copies the frames ``part`` of (F, rows, columns) to the device, padded. Lines along ``axis`` become rows of the
-        copy, or its columns where ``turned``."""
+        """Copies the frames ``part`` of a stack (F, rows, columns) to the device, padded. Lines along ``axis`` become rows
+        of the copy, or its columns if ``turned``."""
         count, layout = part.stop - part.start, self.layout
         on_device = self._some_frames(layout.turned.frames_floats(count)) if turned else self.frames(count)
         if layout.subrays != SINGLE and isinstance(frames, DeviceArray):
@@ -211,7 +211,7 @@ class RayMemory:
         return on_device
 
     def read_frames(self, on_device: DeviceArray, result: Array, part: slice, axis: str) -> None:
-        """Copies padded frames to their place in ``result`` (F, rows, columns): the inverse of ``write_frames``."""
+        """Copies padded frames to the frames ``part`` of ``result`` (F, rows, columns). Inverts ``write_frames``."""
         shape, subrays = self.layout.frames_shape(part.stop - part.start), self.layout.subrays
         if subrays != SINGLE and isinstance(result, DeviceArray):
             launch_means(self.rt, on_device, self.layout.pixel_strides(axis), subrays, result, part)

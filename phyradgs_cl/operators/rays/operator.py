@@ -1,12 +1,12 @@
-"""The system matrix of a scan: line integrals of a volume for all frames, as one linear operator A and its transpose.
+"""The system matrix A of a scan, from a volume to the line integrals of all frames, and its exact transpose.
 
 Each frame has a table of time cells: poses, the detector lines that each pose serves, and weights. A pixel is the weighted
-average of the line integrals from the poses that serve its line. ``forward`` projects batches of frames (``RayMemory``),
-one brick of the volume after the other if the volume does not fit on the device; ``adjoint`` is its exact transpose.
+average of the line integrals from the poses that serve its line. Frames are projected in batches. A volume that does not fit
+on the device is projected in parts, called bricks (``RayMemory``).
 
-Two sets of kernels compute the same samples. The general ones follow each ray (``general.py``): on every GPU, and on CPUs
-where columns lean. The upright ones need a CPU and detector columns that run nearly along z: they project each pose once,
-into a slot, and average slots to frames (``upright.py``, ``slots.py``)."""
+Two sets of kernels compute the same samples. The general kernels follow each ray (``general.py``). They serve GPUs, and
+scans whose detector columns are not along z. Otherwise, CPUs use the upright kernels: they project each pose once, into its
+own buffer ("slot"), and average these buffers to frames (``upright.py``, ``slots.py``)."""
 
 from collections.abc import Iterator, Sequence
 from copy import copy
@@ -28,8 +28,7 @@ from phyradgs_cl.runtime.layout import Strides
 
 
 class LinearOperator(Protocol):
-    """The interface that iterative methods need: A, Aᵀ, and A restricted to some frames. ``out`` receives a result if
-    given."""
+    """The interface that iterative methods need: A, Aᵀ, and A for some of the frames. ``out``: receives the result."""
 
     @property
     def volume_shape(self) -> tuple[int, ...]: ...
@@ -44,19 +43,17 @@ class LinearOperator(Protocol):
         """Returns Aᵀ y, a volume (nz, ny, nx) float32, of frames y (F, rows, columns)."""
 
     def subset(self, frames: Sequence[int]) -> "LinearOperator":
-        """Returns the operator for the frames with the numbers ``frames``, in the order given."""
+        """Returns the operator to the frames with the numbers ``frames``, in that order."""
 
 
 class RayOperator:
-    """Projects volumes with Joseph's method over the time cells of many frames, and backprojects with its transpose; a
-    ``LinearOperator``.
+    """Projects volumes to frames with Joseph's method, and backprojects with its exact transpose: a ``LinearOperator``.
 
-    NumPy arrays give NumPy arrays; device arrays (plain, float32) give device arrays. ``out``, an array of the same kind,
-    receives the result. detector_shape: (rows, columns). tables: the time cells of each frame, all read out along one
-    axis. An operator shares its tables and buffers with its subsets, and with operators that were given the same
-    ``memory``: use them one at a time. A volume that does not fit is projected in bricks. fewest_lines: as in
-    ``upright_of``; ``FEWEST_LINES`` is fastest for panels of few lines, and rounds differently. subrays: rays of a pixel
-    along (v, u), see ``subrays_of``; a given ``memory`` brings its own.
+    NumPy arrays give NumPy arrays; device arrays (not padded, float32) give device arrays. ``out``, of the same kind,
+    receives the result. detector_shape: (rows, columns). tables: the time cells of each frame, all read along one axis.
+    memory: buffers to share with other operators. Operators that share them, and subsets of an operator, must be used one
+    at a time. fewest_lines: as in ``upright_of``; ``FEWEST_LINES`` is fastest for panels with few lines, and rounds
+    differently. subrays: the rays of a pixel along (v, u), see ``subrays_of``; a given ``memory`` has its own.
 
     Joseph, IEEE Trans. Med. Imaging 1 (1982) 192. Raises InputError for tables that do not fit the detector."""
 
@@ -74,8 +71,7 @@ class RayOperator:
         self._tables = list(tables)
         if subrays != SINGLE:
             tables = [table.finer(*subrays) for table in tables]
-        # Upright kernels and their slots (``upright.py``, ``slots.py``) are for CPUs: on a GPU neighbouring pixels of the
-        # general kernel read neighbouring addresses already.
+        # The upright kernels are for CPUs. The general one is fast on GPUs, where neighbouring pixels read side by side.
         may_use_slots = not rt.pixel_items and (memory is None or memory.slot_floats > 0)
         self._upright = upright_of(grid, tables, rays_shape, rt.lanes, fewest_lines) if may_use_slots else None
         self._poses: UprightPoses | None = None
@@ -84,7 +80,7 @@ class RayOperator:
             self._poses = UprightPoses.upload(rt, grid, tables)
             self.slot_floats = self._poses.floats_per_frame(rays_shape, self._upright.leans)
         self.memory = memory or RayMemory(rt, layout, len(tables), self.slot_floats)
-        if self.slot_floats > self.memory.slot_floats:  # the shared memory was planned without room for slots
+        if self.slot_floats > self.memory.slot_floats:  # the shared memory has no room for slots
             self._upright = None
         self._rays_shape = rays_shape
         self._cells = RayCells.upload(rt, grid, tables, rays_shape[0] if layout.is_across else None)
@@ -122,11 +118,10 @@ class RayOperator:
 
     @property
     def _is_upright(self) -> bool:
-        """Whether the upright kernels apply, and the planned memory has room for slots."""
         return self._upright is not None and self.memory.slot_frames > 0
 
     def _forward_upright(self, columns: DeviceArray, part: slice, frames: DeviceArray) -> None:
-        """Projects a volume with z along rows to the frames ``part``, in the padded layout."""
+        """Projects a volume transposed to ``columns`` (y, x, z) to the frames ``part``, in the padded layout."""
         assert self._upright is not None and self._poses is not None
         layout = self.memory.layout
         start, *steps = layout.pixel_strides(self._axis)
@@ -140,8 +135,8 @@ class RayOperator:
             merge_slots(self.rt, self._cells, slots, there, target, self._rays_shape, self._axis)
 
     def _slots_of(self, part: slice) -> Iterator[tuple[int, Slots]]:
-        """Yields the slots of as many frames at a time as fit into memory, after the number of their first frame within
-        ``part``."""
+        """Divides the frames ``part`` so that their slots fit into memory. Yields the slots of each group of frames, after
+        the number within ``part`` of its first frame."""
         assert self._upright is not None and self._poses is not None
         for first in range(part.start, part.stop, self.memory.slot_frames):
             key = first, min(first + self.memory.slot_frames, part.stop)
@@ -184,8 +179,8 @@ class RayOperator:
     def _adjoint_upright(
         self, layout: RayLayout, part: slice, frames: DeviceArray, target: tuple[DeviceArray, Strides], add: bool
     ) -> None:
-        """Backprojects the frames ``part``, stored column by column, into a volume with the strides of ``target``. add:
-        adds to that volume, else replaces it."""
+        """Backprojects the frames ``part``, stored column by column, to ``target``, a volume with its strides. add: adds to
+        the volume, else overwrites it."""
         assert self._upright is not None and self._poses is not None
         there, pitch_mm = self.memory.slots(), layout.constants()[3]
         each = layout.column_floats(self._axis)
@@ -197,8 +192,8 @@ class RayOperator:
             )
 
     def subset(self, frames: Sequence[int]) -> "RayOperator":
-        """Returns the operator for the frames with the numbers ``frames``, in the order given. Keep it to use it again,
-        because it uploads tables. Raises InputError for no frames."""
+        """Returns the operator to the frames with the numbers ``frames``, in that order. Keep it for further use, because
+        its tables take time to upload. Raises InputError for no frames."""
         chosen = self._chosen[np.asarray(frames, np.int64)]
         if chosen.size == 0:
             raise InputError("subset", "no frames", "at least one frame")
@@ -213,7 +208,7 @@ class RayOperator:
         self._slots: dict[tuple[int, int], Slots] = {}
 
     def _listed(self, part: slice) -> DeviceArray:
-        """Returns the indices, among the frames of the whole scan, of this operator's frames ``part``, on the device."""
+        """Returns on the device the numbers of this operator's frames ``part`` in the whole scan. Uploads them once."""
         key = part.start, part.stop
         if key not in self._lists:
             self._lists[key] = self.rt.upload(self._chosen[part], np.int32)
@@ -239,7 +234,7 @@ def _check_shape(name: str, values: Array, shape: tuple[int, ...]) -> None:
 
 
 def _room_for(rt: Runtime, shape: tuple[int, ...], like: Array, out: Array | None) -> Any:
-    """Returns ``out``, or a new float32 array on the side of ``like``: device or host."""
+    """Returns ``out`` if given, else a new float32 array: on the device if ``like`` is there, else on the host."""
     if out is not None:
         _check_shape("out", out, shape)
         if isinstance(out, DeviceArray) != isinstance(like, DeviceArray):

@@ -1,7 +1,7 @@
-"""Slots of the upright kernels. A slot holds one pose's line integrals on the part of the panel that this pose serves.
+"""Slots: buffers of the upright kernels, each with the line integrals of one pose on the lines that this pose serves.
 
-Frames are weighted averages of slots; each line of a frame has a weight in each of its slots. Neighbouring frames share
-poses where exposures follow each other without gaps: such a pose is projected once."""
+A frame is a weighted average of slots, with a weight for each of its lines. If exposures follow each other without gaps,
+neighbouring frames share poses. A shared pose is projected only once."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pitch_of
 
 _SLOT_INTS, _SHARE_INTS = 8, 4  # integers per slot and per share, as in cl/common/ray_column.h and cl/rays_slots.cl
-_SAME_POSE = 10  # poses that agree to this many decimals, divided by the largest entry of all, count as one
+_SAME_POSE = 10  # poses, divided by the largest number in any, are the same if they agree to this many decimals
 
 
 @dataclass(frozen=True, eq=False)
 class UprightPoses:
-    """The distinct poses of F frames on the device, and the pose of each of their E cells, frame after frame.
+    """The distinct poses of F frames on the device, and which of them each of the frames' E cells has.
 
-    pose_of (E,): number of a cell's pose; first, stop (E,): its lines [first, stop). frame_cells (F + 1,): cells of frame
-    f begin at frame_cells[f]."""
+    pose_of (E,): the number of a cell's pose. first, stop (E,): a cell's lines [first, stop). frame_cells (F + 1,): frame
+    f has the cells frame_cells[f] to frame_cells[f + 1] − 1."""
 
     cells: DeviceArray
     matrices: DeviceArray
@@ -56,7 +56,7 @@ class UprightPoses:
         )
 
     def floats_per_frame(self, detector_shape: tuple[int, int], leans: bool) -> int:
-        """Returns the most floats that the slots of one frame need: line integrals and, where columns lean, slopes."""
+        """Returns the most floats that the slots of one frame need: line integrals and, if columns lean, slopes."""
         rows, columns = detector_shape
         widest = int((self.stop - self.first).max())
         each = columns * pitch_of(widest) if self.axis == "rows" else widest * pitch_of(rows)
@@ -65,8 +65,8 @@ class UprightPoses:
     def slots(
         self, rt: Runtime, frames: np.ndarray, detector_shape: tuple[int, int], leans: bool, most_floats: int
     ) -> "Slots":
-        """Returns the slots of the frames with these numbers, in the order of their first use, in at most ``most_floats``
-        floats. ``most_floats`` must be at least ``floats_per_frame``."""
+        """Returns slots for the frames with these numbers, in the order of their first use. They take at most
+        ``most_floats``, which must be at least ``floats_per_frame`` times the number of frames."""
         cells = np.concatenate([np.arange(self.frame_cells[f], self.frame_cells[f + 1]) for f in frames])
         of_frame = np.repeat(np.arange(len(frames)), np.diff(self.frame_cells)[frames])
         _, appears, slot = np.unique(self.pose_of[cells], return_index=True, return_inverse=True)
@@ -75,8 +75,7 @@ class UprightPoses:
         table = self._table(cells, appears, slot, detector_shape)
         columns, rows = _largest(table)
         if (2 if leans else 1) * len(table) * columns * pitch_of(rows) > most_floats:
-            # the lines of cells that share a pose lie far apart, and a slot would have all between: each cell gets its own
-            # slot
+            # A slot for cells whose lines are far apart would also hold all lines in between. So each cell gets its own.
             appears = slot = np.arange(len(cells))
             table = self._table(cells, appears, slot, detector_shape)
             columns, rows = _largest(table)
@@ -99,8 +98,8 @@ class UprightPoses:
     def _table(
         self, cells: np.ndarray, appears: np.ndarray, slot: np.ndarray, detector_shape: tuple[int, int]
     ) -> np.ndarray:
-        """Returns the table (S, 8) int32 of S slots. appears (S,): index in ``cells`` of each slot's first cell; slot
-        (E,): the slot of each cell."""
+        """Returns the table (S, 8) int32 that describes S slots to kernels. appears (S,): the index in ``cells`` of the
+        first cell of each slot. slot (E,): the slot of each cell."""
         first, stop = np.full(len(appears), 2**31 - 1), np.zeros(len(appears), np.int64)
         np.minimum.at(first, slot, self.first[cells])
         np.maximum.at(stop, slot, self.stop[cells])
@@ -112,21 +111,20 @@ class UprightPoses:
         return table
 
     def _shares(self, cells: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Returns a row (E, 4) per cell: its slot or frame ``of``, its lines [first, stop), and the index of its first
-        weight in ``RayCells``."""
+        """Returns a row (E, 4) per cell: its slot or frame (``of``), its lines [first, stop), and where its weights begin
+        in ``RayCells``."""
         begins = np.concatenate([[0], np.cumsum(self.stop - self.first)])
         return np.stack([of, self.first[cells], self.stop[cells], begins[cells]], -1)
 
 
 def _largest(table: np.ndarray) -> tuple[int, int]:
-    """Returns the columns of the widest slot and the rows of the highest."""
     return int((table[:, 2] - table[:, 1]).max()), int((table[:, 4] - table[:, 3]).max())
 
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """Slots of some frames on the device, in the arrays of cl/rays_slots.cl. columns, rows: size of the largest slot in
-    pixels."""
+    """The slots of some frames on the device, as the arrays that cl/rays_slots.cl describes. columns, rows: the size in
+    pixels of every slot, as large as the largest needs."""
 
     slots: DeviceArray
     frame_shares: DeviceArray
@@ -143,17 +141,17 @@ class Slots:
 
     @property
     def pitch(self) -> int:
-        """Floats from one detector column of a slot to the next."""
+        """The floats from one detector column of a slot to the next."""
         return pitch_of(self.rows)
 
     @property
     def floats(self) -> int:
-        """Floats of all slots, with one line integral per pixel."""
+        """The floats of all slots."""
         return self.count * self.columns * self.pitch
 
     @property
     def strides(self) -> np.ndarray:
-        """Start of the line integrals, and steps from column to column, row to row and slot to slot, in floats (4,)."""
+        """Where line integrals start, and the steps to the next column, row and slot: (4,) in floats."""
         return np.array([GUARD, self.pitch, 1, self.columns * self.pitch], np.int64)
 
     @property
@@ -165,8 +163,8 @@ def merge_slots(
     rt: Runtime, cells: RayCells, slots: Slots, integrals: DeviceArray,
     target: tuple[DeviceArray, np.ndarray], detector_shape: tuple[int, int], axis: str,
 ) -> None:
-    """Writes frames as weighted averages of the slots' line integrals. target: an array and its strides in floats (start,
-    column, row, frame)."""
+    """Averages the line integrals in slots to frames. target: the frames, and where they start and the steps to the next
+    column, row and frame in them, in floats."""
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "merge_slots", **{**slots.defines, "LEAN": 0}),
@@ -180,11 +178,11 @@ def split_slots(
     rt: Runtime, cells: RayCells, poses: UprightPoses, slots: Slots, turned: DeviceArray,
     detector_shape: tuple[int, int], pitch_mm: np.ndarray | np.int32, start: int, values: DeviceArray,
 ) -> None:
-    """Writes the transpose of ``merge_slots``: to each slot weight × pixel, times the ray's length between neighbouring
-    planes of voxels in mm.
+    """Transpose of ``merge_slots``: writes weight × pixel to each slot, times the ray's length in mm from one plane of
+    voxels to the next.
 
-    turned: transposed frames (F, columns, rows), which begin at ``start`` floats. values: receives a float per pixel of a
-    slot."""
+    turned: frames stored transposed, (F, columns, rows), from float ``start`` on. values: receives a float per pixel of
+    each slot."""
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "split_slots", **slots.defines), (slots.columns, slots.count),

@@ -1,8 +1,8 @@
-"""Sub-rays: where voxels are finer than pixels, a pixel is the mean over the rays of a block of a finer panel.
+"""Sub-rays: several rays per pixel where voxels are finer than pixels. A pixel is the mean of its rays.
 
-Rays have no width. Where they lie further apart than voxels, some voxels lie between them in every view, and no data reach
-these. A = B A', with A' the projector of the finer panel, and B the mean over its blocks. Aᵀ = A'ᵀ Bᵀ, and Bᵀ gives every
-ray of a block the same share."""
+Rays have no width. If they are further apart than voxels, some voxels lie between the rays of every view, and no data reach
+them. The projector is A = B A', with the projector A' of a panel with finer pixels, and B the mean over blocks of these.
+Aᵀ = A'ᵀ Bᵀ, where Bᵀ gives every ray of a block an equal part of the pixel."""
 
 from collections.abc import Sequence
 
@@ -14,24 +14,22 @@ from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
 SINGLE = (1, 1)
-_WIDEST = 1.25  # largest distance of neighbouring sub-rays in the grid's middle, in voxels
-# Largest distance of neighbouring single rays, in voxels; beyond it pixels get sub-rays. A usual scanner with as many voxels
-# as pixels has 1.43. The minimum-norm volume that fits rays on a line loses 4 % of its density at 1.5, 16 % at 1.9, and a
-# half at 2, where rays may pass through every other voxel alone.
+_WIDEST = 1.25  # largest distance of sub-rays in the grid's middle, in voxels
 _FARTHEST = 1.45
-# Largest distance of neighbouring single rays for a method that begins with a volume of the object's density, which it keeps
+"""Largest distance of rays, in voxels, without sub-rays. A common scanner with as many voxels as pixels has 1.43. The volume
+of least norm that fits such rays loses 4 % of its density at 1.5, 16 % at 1.9, and half at 2, where rays may miss voxels."""
+# Largest distance of rays without sub-rays if a method begins with the object's density: voxels without a ray keep it.
 _FARTHEST_OF_DENSE = 2.0
-_ROUNDING = 1e-3  # relative tolerance by which a distance may exceed its limit before a pixel gets another ray
-_MOST = 8  # most sub-rays of a pixel along an axis, reached where single rays are 10 voxels apart
+_ROUNDING = 1e-3  # a distance may exceed its limit by this fraction, so that rounding does not add rays
+_MOST = 8  # most sub-rays of a pixel along an axis: enough where single rays are 10 voxels apart
 
 
 def subrays_of(grid: Grid, tables: Sequence[TimeCells], *, is_dense: bool = False) -> tuple[int, int]:
-    """Returns how many rays (along v, along u) a pixel needs in the middle of the grid, by the median over frames. (1, 1)
-    unless voxels would lie between rays; then so many that rays are at most ``_WIDEST`` voxels apart.
+    """Returns how many rays (along v, along u) a pixel needs. It is (1, 1) unless voxels would lie between rays; then so
+    many that rays in the grid's middle are at most ``_WIDEST`` voxels apart, in the median over frames.
 
-    is_dense: the method begins with a volume that has the object's density. Rays then need to touch every voxel only
-    where the grid is nearest to the source. Further from the source they pass at other heights in other views, which fill
-    the gaps."""
+    is_dense: the method begins with a volume of the object's density. Then rays must meet every voxel only where the grid
+    is nearest to the source. Further away they pass at other heights in other views, which fills the gaps."""
     pose = np.stack([table.pose[0] for table in tables])
     steps = pose[:, 6:].reshape(-1, 2, 3)[:, ::-1] / grid.voxel_size_mm[::-1]
     spacing = np.linalg.norm(steps, axis=-1)
@@ -44,8 +42,9 @@ def subrays_of(grid: Grid, tables: Sequence[TimeCells], *, is_dense: bool = Fals
 
 
 def _depth(grid: Grid, pose: np.ndarray, *, is_nearest: bool) -> np.ndarray:
-    """Returns the depth (F,) of the grid's middle from the source, over the panel's depth. With ``is_nearest`` the point
-    is the nearest of the ellipsoid in the grid's box. The depth is 0 for a point behind the source."""
+    """Returns the depth (F,) of the grid's middle seen from the source, over the panel's depth; 0 if behind the source.
+
+    is_nearest: takes the nearest point of the ellipsoid that the grid's box contains, in place of the middle."""
     normal = np.cross(pose[:, 6:9], pose[:, 9:12])
     to_panel = np.einsum("fi,fi->f", pose[:, 3:6] - pose[:, :3], normal)
     to_middle = np.einsum("fi,fi->f", np.array(grid.offset_mm[::-1]) - pose[:, :3], normal)
@@ -54,13 +53,13 @@ def _depth(grid: Grid, pose: np.ndarray, *, is_nearest: bool) -> np.ndarray:
 
 
 def means(fine: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
-    """Returns B y, frames (F, rows, columns), for frames y (F, rows · along_v, columns · along_u) of the finer panel."""
+    """Returns B y: frames (F, rows, columns) from frames y (F, rows · along_v, columns · along_u) of the finer panel."""
     along_v, along_u = subrays
     return block_means(fine, (1, along_v, along_u))
 
 
 def spread(frames: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
-    """Returns Bᵀ y, frames (F, rows · along_v, columns · along_u) of the finer panel, for frames y (F, rows, columns)."""
+    """Returns Bᵀ y: frames (F, rows · along_v, columns · along_u) of the finer panel from frames y (F, rows, columns)."""
     along_v, along_u = subrays
     shares = frames / np.float32(along_v * along_u)
     return np.asarray(shares.repeat(along_v, 1).repeat(along_u, 2))
@@ -69,7 +68,7 @@ def spread(frames: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
 def launch_means(
     rt: Runtime, fine: DeviceArray, strides: Sequence[int], subrays: tuple[int, int], frames: DeviceArray, part: slice
 ) -> None:
-    """Writes B y of the padded frames ``fine`` to the frames ``part`` of the plain stack ``frames`` (F, rows, columns)."""
+    """Writes B y for padded frames ``fine`` to the frames ``part`` of ``frames`` (F, rows, columns), not padded."""
     _, rows, columns = frames.shape
     rt.launch(
         rt.kernel("subrays", "subray_means"), (columns, rows, part.stop - part.start), fine, np.array(strides, np.int64),
@@ -81,7 +80,7 @@ def launch_means(
 def launch_spread(
     rt: Runtime, frames: DeviceArray, part: slice, subrays: tuple[int, int], fine: DeviceArray, strides: Sequence[int]
 ) -> None:
-    """Writes Bᵀ y of the frames ``part`` of a plain stack (F, rows, columns) to the padded frames ``fine``."""
+    """Writes Bᵀ y for the frames ``part`` of ``frames`` (F, rows, columns), not padded, to the padded frames ``fine``."""
     _, rows, columns = frames.shape
     rt.launch(
         rt.kernel("subrays", "spread_subrays"), (columns, rows, part.stop - part.start), frames, np.int32(part.start),

@@ -1,8 +1,8 @@
-"""The ray-driven projector for detector columns nearly parallel to the volume's z, and poses that serve many lines.
+"""A faster ray-driven projector for CPUs, for detector columns nearly along z and poses that serve many lines.
 
-The rays of such a column share most of their work. Each pose is projected once, into a slot for its part of the panel;
-frames are weighted averages of slots (``slots.py``). Samples are the same as those of ``general.py``. Kernels:
-``cl/rays_upright.cl``, ``rays_upright_adjoint.cl``."""
+The rays to a detector column share most of their work. Each pose is projected once, into a buffer called slot, and frames
+are weighted averages of slots (``slots.py``). The samples are those of ``general.py``. Kernels: ``cl/rays_upright.cl``,
+``rays_upright_adjoint.cl``."""
 
 import math
 from collections.abc import Sequence
@@ -19,22 +19,21 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
 _LINES = 128  # most pixels of a detector column per work-item
-# least number of lines that a pose has to serve on average: with fewer, slots (``slots.py``) cost more than they save
+# Least number of lines that a pose must serve on average: with fewer, slots cost more time than they save.
 FEWEST_LINES = 8
-_VOXELS = 512  # most voxels along z that the lines of a work-item may meet in one slice
-# Numbers of voxels (x, y, z) of a work-item of the adjoint, the preferred first: neighbouring columns share rays. The bits
-# of the result do not depend on them.
+_VOXELS = 512  # most voxels along z that the rays of a work-item may meet in one plane of voxels
+# Boxes of voxels (x, y, z) that a work-item of the adjoint may take: the largest is best, as neighbours share rays.
 _OWNED = ((16, 16, 128), (8, 8, 128), (8, 4, 128))
-_ITEMS_PER_UNIT = 4  # least number of work-items per compute unit that is aimed at, so that none waits long for the last
-_UPRIGHT = 1e-6  # columns are upright where they, and rows, lean by at most this many voxels over the whole detector
-_MOST_LEAN = 0.25  # largest lean of a column, in voxels across per voxel along z: beyond it the general kernel is faster
-_TURN = 16  # voxels along each side (x and z) of the tile that a work-item transposes; TURN in cl/rays_upright.cl
+_ITEMS_PER_UNIT = 4  # wanted work-items per compute unit: with fewer, some units would wait long for the last item
+_UPRIGHT = 1e-6  # a column of pixels does not lean if x and y change by at most this many voxels over the detector
+_MOST_LEAN = 0.25  # largest lean of a column, in voxels across per voxel along z: beyond, the general kernel is faster
+_TURN = 16  # side of the tile (x and z) that a work-item transposes, in voxels; TURN in cl/rays_upright.cl
 
 
 @dataclass(frozen=True)
 class Upright:
-    """How the upright kernels are built. block: lines of a detector column per work-item. leans: columns lean against z.
-    is_parallel: rays are parallel."""
+    """How the upright kernels are built. block: the pixels of a detector column per work-item. leans: detector columns are
+    not exactly along z. is_parallel: rays are parallel."""
 
     block: int
     leans: bool
@@ -44,12 +43,12 @@ class Upright:
 def upright_of(
     grid: Grid, tables: Sequence[TimeCells], detector_shape: tuple[int, int], lanes: int, fewest_lines: int | None = None
 ) -> Upright | None:
-    """Returns how the upright kernels project the cells of ``tables``; None where the general kernel is needed.
+    """Returns how the upright kernels project the cells of ``tables``, or None if the general kernel is needed.
 
-    The upright kernels need poses that serve several lines each, rays with main axis x or y, and columns nearly along z.
-    If columns lean, the volume must lie between source and panel, which holds in every parallel beam. fewest_lines:
-    consecutive lines that a pose must serve on average, by default as many as a vector has lanes; it has no effect where
-    columns are read."""
+    The upright kernels need poses that serve several lines each, rays whose main axis is x or y, and detector columns
+    nearly along z. If columns lean in a cone beam, the volume must lie between source and panel. fewest_lines: the number
+    of lines that a pose must serve on average, by default the width of a vector. It has no effect if the panel is read
+    column by column."""
     served = sum(int((table.line_stop - table.line_start).sum()) for table in tables)
     lines = tables[0].lines
     fewest = fewest_lines or max(lanes, FEWEST_LINES)
@@ -75,7 +74,7 @@ def upright_of(
 
 
 def _is_steep(cells: np.ndarray, rows: int, columns: int) -> bool:
-    """Returns whether some ray of the cells (C, 16) may have the main axis z."""
+    """Returns whether z may be the main axis of any ray of the cells (C, 16)."""
     d00, eu, ev = cells[:, 3:6], cells[:, 6:9], cells[:, 9:12]
     across = np.linalg.norm(ev[:, :2], axis=1)
     ends_z = [np.abs(d00 + u * eu + v * ev)[:, 2] for u in (0, columns - 1) for v in (0, rows - 1)]
@@ -84,14 +83,14 @@ def _is_steep(cells: np.ndarray, rows: int, columns: int) -> bool:
 
 
 def _least_horizontal(d00: np.ndarray, eu: np.ndarray, width: int) -> np.ndarray:
-    """Returns the smallest length (C,) of d00 + u eu for u in [0, width − 1]; vectors (C, 2)."""
+    """Returns the smallest length (C,) of d00 + u eu over u in [0, width − 1], for vectors d00 and eu (C, 2)."""
     nearest = -np.sum(d00 * eu, 1) / np.maximum(np.sum(eu * eu, 1), 1e-30)
     return np.asarray(np.linalg.norm(d00 + np.clip(nearest, 0, width - 1)[:, None] * eu, axis=1))
 
 
 def _lies_between(grid: Grid, source: np.ndarray, d00: np.ndarray, eu: np.ndarray, ev: np.ndarray) -> bool:
-    """Returns whether the grid and a voxel around it lie between source and panel in every pose; vectors (C, 3) in
-    voxels."""
+    """Returns whether the grid, with a voxel around it, lies between source and panel in every pose. The poses are given by
+    vectors (C, 3) in voxels."""
     nz, ny, nx = grid.shape
     corners = np.array([(x, y, z) for x in (-1, nx) for y in (-1, ny) for z in (-1, nz)])
     normal = np.cross(eu, ev)
@@ -100,7 +99,7 @@ def _lies_between(grid: Grid, source: np.ndarray, d00: np.ndarray, eu: np.ndarra
 
 
 def columns_floats(grid: Grid) -> int:
-    """Returns the floats of a padded volume stored transposed, with z along rows."""
+    """Returns the floats of a padded volume that is transposed to (y, x, z)."""
     nz, ny, nx = grid.shape
     return 2 * GUARD + (ny + 2 * BORDER) * (nx + 2 * BORDER) * pitch_of(nz)
 
@@ -109,7 +108,8 @@ def launch_upright(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, columns: DeviceArray,
     target: tuple[DeviceArray, np.ndarray],
 ) -> None:
-    """Projects a volume with z along rows to slots. target: an array and its strides in floats, as ``Slots.strides``."""
+    """Projects a volume, transposed to ``columns`` (y, x, z), to slots. target: an array with its strides in floats, as
+    ``Slots.strides``."""
     shape, origin, _, pitch_mm, *_ = layout.constants()
     array, strides = target
     rt.launch(
@@ -124,8 +124,8 @@ def launch_upright_adjoint(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, values: DeviceArray,
     target: tuple[DeviceArray, Strides], *, add: bool = False,
 ) -> None:
-    """Backprojects slots, as ``split_slots`` writes them, into a volume. target: the volume and its strides. add: adds to
-    that volume, else replaces it."""
+    """Backprojects slots, as ``split_slots`` writes them, to ``target``, a volume with its strides. add: adds to the volume,
+    else overwrites it."""
     shape, origin, *_ = layout.constants()
     (x, y, z), items = _owned(layout.brick.shape, rt.device.compute_units)
     rt.launch(
@@ -137,8 +137,8 @@ def launch_upright_adjoint(
 
 
 def _owned(shape: tuple[int, int, int], units: int) -> tuple[tuple[int, int, int], tuple[int, ...]]:
-    """Returns the voxels (x, y, z) of a work-item and the work-items along x, y, z. The voxels are as many as keep all
-    compute units busy."""
+    """Returns the box of voxels (x, y, z) of a work-item, and the number of work-items along x, y, z: the first box that
+    keeps all compute units busy."""
     for owned in _OWNED:
         items = tuple(ceil_div(n, own) for n, own in zip(shape[::-1], owned, strict=True))
         if math.prod(items) >= _ITEMS_PER_UNIT * units:
@@ -149,8 +149,8 @@ def _owned(shape: tuple[int, int, int], units: int) -> tuple[tuple[int, int, int
 def turn_volume(
     rt: Runtime, layout: RayLayout, volume: tuple[DeviceArray, Strides], columns: DeviceArray
 ) -> None:
-    """Transposes a volume (nz, ny, nx), given with its strides, to ``columns`` (y, x, z). Does not write the padding,
-    which is zero."""
+    """Transposes a volume (nz, ny, nx), given with its strides, to ``columns`` (y, x, z). Leaves the padding, which is
+    zero."""
     nz, ny, nx = layout.grid.shape
     shape, *_ = layout.constants()
     size = (ceil_div(nx, _TURN), ny, ceil_div(nz, _TURN))

@@ -1,1 +1,1 @@
-"""Gaussians to frames and to voxels, with their adjoints."""
+"""Projection of Gaussians to frames ("splats"), their evaluation on voxel grids, and the adjoints."""

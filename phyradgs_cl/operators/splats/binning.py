@@ -1,30 +1,29 @@
-"""Lists of splats per tile, by a stable counting sort on the device."""
+"""Lists of the splats (projected Gaussians) in each tile of an image, by a stable counting sort on the device."""
 
 import numpy as np
 
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime import DeviceArray, LaterItem, MemoryShortage, Runtime
 
-_CHUNK = 512  # splats per work-item on a CPU
-_GROUP = 64  # splats per work-group on a GPU
-_LARGEST_GROUP = 256  # most splats per work-group on a GPU, where _GROUP would give too many counts
-_MANY_COUNTS = 1 << 22  # groups take more splats where there would be more counts (tiles × groups) than this
-_SCANNED = 64  # counts per step of a work-group's prefix sum
-_SLACK = 1.5  # number of indices allocated over the number needed
-_NEAR = 1.25  # lists with room for less than this many times the indices needed are allocated anew before they overflow
-# most tests of a splat at a pixel for which a launch may risk lists that are too short: a second on a fast GPU
+_CHUNK = 512  # number of splats that a CPU's work-item counts
+_GROUP = 64  # number of splats that a GPU's work-group counts
+_LARGEST_GROUP = 256  # most splats per work-group on a GPU, taken where _GROUP would give more than _MANY_COUNTS
+_MANY_COUNTS = 1 << 22  # number of counts, tiles × work-groups, above which their memory and time matter
+_SCANNED = 64  # number of counts that a work-group adds at a time in its prefix sum
+_SLACK = 1.5  # lists are allocated this many times larger than needed, because clouds grow
+_NEAR = 1.25  # lists less than this many times larger than needed are replaced by larger ones before they overflow
+# If lists overflow, every splat is tested at every pixel. A second on a fast GPU is the most that this may take.
 _MOST_CHECKS = 2**38
-_MOST_ENTRIES = 2**31 - 1  # upper limit of the indices of splats in all lists: kernels address them by int
+_MOST_ENTRIES = 2**31 - 1  # most entries of all lists together: kernels use 32-bit indices
 
 
 class TileLists:
-    """Builds lists of the splats whose extent touches each tile of a 2D or 3D domain.
+    """Builds a list, for each tile of an image or volume, of the splats whose extent touches it.
 
-    tile: a tile's size in pixels or voxels along x, y, z. tiles: the number of tiles along x, y, z. Lists keep the order
-    of the splats, so that sums over them repeat bit for bit. Memory for the lists follows the entries that former builds
-    needed. The host waits for that number if the count of splats is new, ``waits`` is set, or a GPU would take long
-    without lists. Otherwise it reads the number later; until then kernels do not use lists that did not fit
-    (cl/common/tile.h)."""
+    tile: a tile's size in pixels or voxels along x, y, z. tiles: the number of tiles along x, y, z. Lists keep the order of
+    the splats, so that sums over them repeat bit for bit. The number of list entries is known only on the device. The host
+    waits for it if the number of splats is new, ``waits`` is set, or a GPU would take long without lists. Else it reads the
+    number later. Until then, kernels test all splats in a tile whose list did not fit (cl/common/tile.h)."""
 
     def __init__(self, rt: Runtime, tile: tuple[int, int, int], tiles: tuple[int, int, int]) -> None:
         self.rt = rt
@@ -44,20 +43,19 @@ class TileLists:
 
     @property
     def samples(self) -> int:
-        """Upper limit of a launch's samples (see ``Runtime.launch``): list entries with memory, times pixels or voxels of
-        a tile."""
+        """The largest work of a launch (``samples`` of ``Runtime.launch``): list entries × pixels or voxels of a tile."""
         return self.splat_ids.size * int(np.prod(self.tile[:3], dtype=np.int64))
 
     def build(self, extents: DeviceArray, count: int, stride: int, cells: int = 1) -> None:
-        """Fills ``tile_offsets`` (tiles + 1,) and ``splat_ids`` from extents (6, stride) of ``count`` splats. cells: time
-        cells in which each splat was projected.
+        """Fills ``tile_offsets`` (tiles + 1,) and ``splat_ids`` from extents (6, stride) of ``count`` splats. cells: the
+        number of time cells from which each splat was projected.
 
-        Raises MemoryShortage for 2^31 list entries or more; smaller bricks of a volume may have fewer."""
+        Raises MemoryShortage for 2^31 list entries or more, since a smaller part of a volume may have fewer."""
         rt = self.rt
         chunk = chunk_of(rt, self.total, count)
         chunks = max(ceil_div(count, chunk), 1)
         if self._counts.size < self.total * chunks:
-            self._counts = rt.empty(1, np.int32)  # frees the old memory before it allocates the new
+            self._counts = rt.empty(1, np.int32)  # frees the old memory now, so that the device need not hold both
             self._counts = rt.empty(self.total * chunks, np.int32)
         domain = extents, stride, count, chunk, chunks, self.tile, self.tiles
         group = chunk if rt.pixel_items else 1
@@ -92,7 +90,7 @@ class TileLists:
 
     def _make_room(self, needed: int, share: float) -> None:
         """Allocates memory for more than ``needed`` list entries, unless ``share`` times as many fit already. Raises
-        MemoryShortage where ints cannot count the entries."""
+        MemoryShortage for more entries than 32-bit indices can count."""
         if needed >= _MOST_ENTRIES:
             found, expected = f"{needed} entries or more", f"fewer than {_MOST_ENTRIES}"
             remedy = "use fewer or smaller Gaussians"
@@ -103,7 +101,7 @@ class TileLists:
 
 
 def chunk_of(rt: Runtime, tiles: int, count: int) -> int:
-    """Returns the splats per work-item on a CPU, or per work-group on a GPU, whose work-items take one splat each."""
+    """Returns the splats of a CPU's work-item, or of a GPU's work-group, in which each work-item takes one splat."""
     if not rt.pixel_items:
         return _CHUNK
     kernels = (rt.kernel("binning", f"bin_{step}_group") for step in ("count", "fill"))

@@ -1,7 +1,8 @@
 """Layout of Gaussians, time cells and layers of frames in device memory.
 
-A detector adds photons: the merged frame is −ln Σ w_k exp(−p_k) over the cells k of a line. The projector therefore draws
-w_k p_k into layer k. Merging also keeps d(frame)/d(layer), which the adjoint needs."""
+A detector that averages intensities records −ln Σ w_k exp(−p_k) over the time cells k of a line. So the projector draws
+w_k p_k into a separate image ("layer") for each k, and the layers are then merged. Merging also keeps d(frame)/d(layer),
+which the adjoint needs."""
 
 from dataclasses import dataclass
 
@@ -14,12 +15,12 @@ from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of
 
 STRIDE_OF = 16  # the number of Gaussians is padded to a multiple of this, the width of the widest vector
-CELL_FLOATS = 24  # number of floats of a time cell's constants, as in cl/common/splat.h
+CELL_FLOATS = 24  # number of floats in which cl/common/splat.h expects a time cell
 
 
 @dataclass(eq=False)
 class DeviceGaussians:
-    """Parameter rows (11, stride) float32 on the device. The first ``count`` columns are Gaussians, the rest is padding."""
+    """Parameters of Gaussians on the device, ``rows`` (11, stride) float32. Columns from ``count`` on are padding."""
 
     rows: DeviceArray
     count: int
@@ -27,7 +28,7 @@ class DeviceGaussians:
 
     @classmethod
     def upload(cls, rt: Runtime, rows: np.ndarray) -> "DeviceGaussians":
-        """Uploads parameter rows (11, G). Padding is a unit Gaussian, which is never drawn."""
+        """Uploads parameter rows (11, G), padded with unit Gaussians, which are never drawn."""
         return cls(rt.upload(pad_columns(rows)), rows.shape[1], stride_of(rows.shape[1]))
 
 
@@ -45,7 +46,7 @@ def pad_columns(rows: np.ndarray) -> np.ndarray:
 
 
 def split_coefficients(rt: Runtime, matrix: np.ndarray) -> DeviceArray:
-    """Uploads coefficients as float64, or as (high, low) pairs of floats where the device has no float64."""
+    """Uploads coefficients as float64, or as pairs of floats (high, low) if the device lacks float64."""
     matrix = np.ascontiguousarray(matrix, np.float64)
     if rt.fp64:
         return rt.upload(matrix)
@@ -55,15 +56,15 @@ def split_coefficients(rt: Runtime, matrix: np.ndarray) -> DeviceArray:
 
 @dataclass(eq=False)
 class DeviceCells:
-    """The time cells of one frame on the device; lines are always the slow axis of the image.
+    """The C time cells of one frame on the device. A frame that is read column by column is projected transposed, with the
+    steps of its poses exchanged, so lines are always rows of the image.
 
-    A frame read out along columns is projected as its transpose: its poses' pixel steps are exchanged. With motion,
-    ``matrices`` has three poses per cell (middle, both ends) and ``line_times`` (C, 3, time_pitch) the integration times
-    of the lines; without motion ``line_times`` has one element. The intensity model draws cells into ``layers`` images,
-    each with at most one cell per line; ``layer_weights`` (layers, lines) are the cells' fractions of a line's window.
-    With ``fixed_conic``, ``cells`` are those of the pose that gives a splat its shape, and ``matrices`` have that pose
-    and then the cell's own. For an object that moves, ``shares`` (S, R) are the weights of the fields in S states, and
-    ``cell_states`` (C, poses) the state of every pose; else both have one element."""
+    - matrices: one pose per cell. If ``moving``, three: the middle and both ends.
+    - line_times (C, 3, time_pitch): the integration times of the lines if ``moving``, else one element.
+    - layers, layer_weights (layers, lines): number of layers for averaging intensities, and the weights of their cells.
+    - fixed_conic: ``cells`` describe the pose that gives splats their shape; ``matrices`` have that pose, then the cell's.
+    - shares (S, R), cell_states (C, poses): for an object that moves, the weights of its R displacement fields in S
+      states, and the state at each pose; else one element each."""
 
     cells: DeviceArray
     matrices: DeviceArray
@@ -88,8 +89,8 @@ class DeviceCells:
     def upload(
         cls, rt: Runtime, table: TimeCells, states: tuple[np.ndarray, np.ndarray] | None = None
     ) -> "DeviceCells":
-        """Uploads a frame's cells. states: for an object that moves, as from ``states_of``. Raises InputError for cells
-        that have a separate weight for each line."""
+        """Uploads a frame's cells. states: for an object that moves, what ``states_of`` returns. Raises InputError for
+        cells that have another weight in each line."""
         shares, cell_states = (np.zeros(1), np.zeros(1)) if states is None else states
         if table.line_share is not None:
             raise InputError("--motion", "cells with a weight for each line", "cells with one weight", "take micro-views")
@@ -123,10 +124,10 @@ class DeviceCells:
 
 
 def projection_matrices(pose: np.ndarray, is_parallel: bool = False) -> np.ndarray:
-    """Returns the matrices (C, 3 · 4) that map a world point x to (u·z, v·z, z): pixel column, line and depth of its ray.
+    """Returns matrices (C, 3 · 4) that map a world point x to (u·z, v·z, z), with its pixel column u, line v and depth z.
 
-    x − source = z (d00 + u·eu + v·ev), with d00 from the source to pixel (0, 0). In a parallel beam x is on the ray
-    through (u, v): x − pixel (0, 0) = u·eu + v·ev + t·direction; z is 1."""
+    x − source = z (d00 + u·eu + v·ev), where d00 goes from the source to pixel (0, 0). In a parallel beam
+    x − pixel (0, 0) = u·eu + v·ev + t·direction, and z is 1."""
     if is_parallel:
         inverse = np.linalg.inv(np.stack([pose[:, 6:9], pose[:, 9:12], pose[:, 0:3]], -1))
         shift = -np.einsum("cij,cj->ci", inverse, pose[:, 3:6])
@@ -143,8 +144,9 @@ def projection_matrices(pose: np.ndarray, is_parallel: bool = False) -> np.ndarr
 def cell_constants(
     pose: np.ndarray, weight: np.ndarray, layer: np.ndarray, is_parallel: bool = False
 ) -> np.ndarray:
-    """Returns the (C, 24) float32 table of cl/common/splat.h for poses (C, 12), weights (C,) and layers (C,) of cells."""
-    if is_parallel:  # as rays from a source at minus the direction through the origin
+    """Returns the table (C, 24) float32 that cl/common/splat.h describes, for cells with a pose (C, 12), weight (C,) and
+    layer (C,)."""
+    if is_parallel:  # kernels compute the direction as origin minus source
         pose = np.concatenate([-pose[:, 0:3], np.zeros((len(pose), 3)), pose[:, 6:]], 1)
     source, d00 = pose[:, 0:3], pose[:, 3:6] - pose[:, 0:3]
     eu, ev = pose[:, 6:9], pose[:, 9:12]
@@ -161,8 +163,8 @@ def cell_constants(
 
 
 class Layers:
-    """Draws a frame's layers, of ``lines`` × ``width`` pixels, and merges them. unit: the line integral of a layer's
-    value 1."""
+    """Memory for a frame's layers of ``lines`` × ``width`` pixels, and the kernels that merge them. unit: the line integral
+    that the value 1 in a layer stands for."""
 
     def __init__(self, rt: Runtime, lines: int, width: int, unit: float) -> None:
         self.rt, self.lines, self.width, self.unit = rt, lines, width, unit
@@ -171,8 +173,7 @@ class Layers:
         self._split = rt.kernel("intensity", "intensity_split", IMAGE_GUARD=GUARD)
 
     def images(self, cells: DeviceCells) -> DeviceArray:
-        """Returns memory for the layers of ``cells``: each has GUARD floats and an image (lines, pitch); GUARD floats
-        follow the last layer."""
+        """Returns memory for the layers of ``cells``. Each is GUARD zeros and an image (lines, pitch), then GUARD zeros."""
         if cells.layers > self._count:
             self._count = cells.layers
             self._drawn, self._shares, self._by_layers = (
@@ -182,14 +183,14 @@ class Layers:
         return DeviceArray(self._drawn.buffer, (floats,), self._drawn.dtype)
 
     def merge(self, cells: DeviceCells, merged: DeviceArray) -> None:
-        """Writes −ln Σ w exp(−p) over the layers drawn last, in line integrals, into ``merged``."""
+        """Writes −ln Σ w exp(−p) over the layers that were drawn last into ``merged``."""
         self._launch(
             self._merge, (self._drawn, cells.layer_weights), cells,
             (np.float32(self.unit), self._shares, merged),
         )
 
     def split(self, cells: DeviceCells, by_merged: DeviceArray) -> DeviceArray:
-        """Returns dL/d(layers) of the last ``merge`` from dL/d(merged), valid until the next call."""
+        """Returns dL/d(layers) from dL/d(merged) for the last ``merge``. The memory is valid until the next call."""
         self._launch(self._split, (by_merged, self._shares), cells, (self._by_layers,))
         return self._by_layers
 

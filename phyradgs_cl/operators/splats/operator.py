@@ -1,10 +1,10 @@
-"""Splats as operators in mm and 1/mm: a cloud to the frames of a scan or to a grid, each with its transposed derivative.
+"""Operators from Gaussians in mm and 1/mm to the frames of a scan or to a grid, with their transposed derivatives.
 
-``rows.enter`` converts a cloud once; it can then be rendered and differentiated any number of times. ``back`` renders
-nothing: it projects the Gaussians again (``prepare``), unless ``forward`` has just done so.
+``rows.enter`` converts Gaussians to the kernels' layout. The result can be rendered and differentiated any number of times.
+``back`` does not render: it only computes the Gaussians' projections, unless ``forward`` has just done so.
 
-``by_pose`` converts dL/d(Gaussians) to dL/d(pose). A rotation of the gantry equals one of the object the other way. A shift
-of the panel equals a shift of the projected centres the other way, and changes the rays' lengths."""
+``by_pose`` converts dL/d(Gaussians) to dL/d(pose). Rotating the gantry has the effect of rotating the object the other way.
+Shifting the panel shifts the projected centres the other way, and changes the lengths of rays."""
 
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -31,18 +31,17 @@ _FRAMES, _VOLUME, _ROWS, _DENSITY = "frames", "volume", "rows", "density"
 
 @dataclass(eq=False)
 class SplatPoint:
-    """A cloud of Gaussians in the kernels' layout, and the norms (stride,) that its quaternions had before they were
-    normalised."""
+    """Gaussians in the kernels' layout. norms (stride,): the lengths of their quaternions before these were normalised."""
 
     gaussians: DeviceGaussians
     norms: DeviceArray
 
 
 class PlainRows:
-    """Converts parameter rows (11, G), in mm and 1/mm with quaternions of any length, to the kernels' rows in units of
-    ``length_mm``.
+    """Converts parameter rows (11, G), in mm and 1/mm with quaternions of any length, to the kernels' rows: lengths in units
+    of ``length_mm``, and unit quaternions.
 
-    The kernels' densities are in 1/``length_mm`` with ``line_integrals``, which then have no unit, else in 1/mm."""
+    line_integrals: densities become 1/``length_mm``, so that line integrals have no unit. Else they stay in 1/mm."""
 
     def __init__(self, rt: Runtime, length_mm: float, *, line_integrals: bool) -> None:
         self.rt = rt
@@ -53,7 +52,7 @@ class PlainRows:
         self._copy = rt.kernel("splat_plain", "row_copy")
 
     def enter(self, rows: DeviceArray) -> SplatPoint:
-        """Returns the cloud of parameter rows (11, G) float32. It is a copy: the rows may change afterwards."""
+        """Returns a copy of parameter rows (11, G) float32 in the kernels' layout."""
         rt, count = self.rt, rows.shape[1]
         stride = stride_of(count)
         inside, norms = rt.empty((ROWS, stride)), rt.empty(stride)
@@ -62,8 +61,8 @@ class PlainRows:
         return SplatPoint(DeviceGaussians(inside, count, stride), norms)
 
     def leave(self, gradients: DeviceArray, point: SplatPoint, rows: DeviceArray, *, add: bool = False) -> None:
-        """Writes dL/d(plain rows), (11, G), to ``rows`` from dL/d(kernels' rows), (13, stride). add: adds to ``rows``
-        instead."""
+        """Converts gradients by the kernels' rows, (13, stride), to gradients by parameter rows in mm, (11, G), in ``rows``.
+        add: adds to ``rows``, else overwrites it."""
         rt, cloud = self.rt, point.gaussians
         rt.launch(
             self._leave, cloud.count, gradients, point.norms, cloud.count, cloud.stride, *self._units, add,
@@ -71,7 +70,7 @@ class PlainRows:
         )  # fmt: skip
 
     def with_densities(self, point: SplatPoint, density: DeviceArray) -> SplatPoint:
-        """Returns a cloud like ``point`` with the densities ``density`` (G,) in 1/mm."""
+        """Returns the Gaussians of ``point`` with other densities, (G,) in 1/mm."""
         rt, cloud = self.rt, point.gaussians
         rows = rt.empty((ROWS, cloud.stride))
         rt.copy(cloud.rows, rows)
@@ -80,7 +79,7 @@ class PlainRows:
         return SplatPoint(DeviceGaussians(rows, cloud.count, cloud.stride), point.norms)
 
     def densities(self, rows: DeviceArray) -> DeviceArray:
-        """Returns a copy (G,) of the densities in plain rows (11, G)."""
+        """Returns a copy (G,) of the densities in parameter rows (11, G)."""
         count = rows.shape[1]
         density = self.rt.empty(count)
         self.rt.copy(rows, density, nbytes=4 * count, source_offset=4 * DENSITY * count)
@@ -88,9 +87,9 @@ class PlainRows:
 
 
 class PlainImages:
-    """Copies images (rows, columns) of a plain stack to one padded image of ``lines`` × ``width``, and back.
+    """Copies images of a stack (F, rows, columns) to a padded image of ``lines`` × ``width``, and back.
 
-    turned: transposes, so that columns become the lines. A volume (nz, ny, nx) counts as an image of nz · ny lines."""
+    turned: transposes, so that columns become lines. A volume (nz, ny, nx) counts as an image with nz · ny lines."""
 
     def __init__(self, rt: Runtime, lines: int, width: int, *, turned: bool = False) -> None:
         self.rt, self.turned = rt, turned
@@ -100,7 +99,7 @@ class PlainImages:
         self._image: DeviceArray | None = None
 
     def enter(self, images: DeviceArray, number: int = 0) -> DeviceArray:
-        """Returns image ``number`` of the stack ``images`` in the padded layout, valid until the next call."""
+        """Returns image ``number`` of the stack ``images`` in the padded layout. The memory is valid until the next call."""
         if self._image is None:
             self._image = padded_zeros(self.rt, *self._by_line[1:])
         source, target = (images, self._place(number)), (self._image, self._padded)
@@ -117,19 +116,19 @@ class PlainImages:
 
 
 class GaussianOperator(Operator):
-    """An ``Operator`` on Gaussians, or on their parameter rows (11, G). ``rows`` converts them to clouds; a derived class
-    has ``forward`` and ``back`` at a cloud, both on the device."""
+    """An ``Operator`` on ``Gaussians``, or on their parameter rows (11, G). ``rows`` converts them to the kernels' layout.
+    Derived classes define ``forward`` and ``back``, which work on the device."""
 
     def __init__(self, rows: PlainRows, range_: tuple[str, Shape], **parts: Any) -> None:
         self.rows = rows
         super().__init__(rows.rt, (_ROWS, (ROWS, None)), range_, self._at_rows, **parts)
 
     def forward(self, point: SplatPoint) -> DeviceArray:
-        """Returns y float32 of a cloud."""
+        """Returns y float32 for Gaussians in the kernels' layout."""
         raise NotImplementedError
 
     def back(self, point: SplatPoint, by_y: DeviceArray) -> DeviceArray:
-        """Returns dL/d(rows), (11, G) float32 at a cloud, from dL/dy."""
+        """Returns dL/d(rows), (11, G) float32, at ``point`` from dL/dy."""
         raise NotImplementedError
 
     def _at_rows(self, rows: Values) -> tuple[Values, Map]:
@@ -150,10 +149,10 @@ class GaussianOperator(Operator):
 class SplatProjection(GaussianOperator):
     """The ``Operator`` from Gaussians to frames (F, rows, columns) of line integrals.
 
-    tables: the time cells of each frame in mm, all read out along one axis. length_mm: the kernels' unit of length, in
-    which the scene should have a size of about 1. average: for an operator of line integrals, makes the one of frames with
-    given numbers that averages intensities over a line's cells; with None, this is that one. Parts share all memory: use
-    them one at a time."""
+    tables: the time cells of each frame in mm, all read along one axis. length_mm: the kernels' unit of length, in which
+    the scene should have a size of about 1. intensity: averages intensities over the cells of a line, else line integrals.
+    average: makes the operator that averages intensities, for the frames with given numbers. An operator and its parts
+    share all memory: use them one at a time."""
 
     _instead = f"of_densities(gaussians) is linear in densities; {Operator._instead}"
 
@@ -171,7 +170,7 @@ class SplatProjection(GaussianOperator):
         self._images = PlainImages(rt, self._projector.lines, self._projector.width, turned=readout.axis != "rows")
         self._tables = [DeviceCells.upload(rt, table.scaled(1 / length_mm)) for table in tables]
         self._poses = [table.pose[table.count // 2] for table in tables]
-        self._ready: list[object] = []  # cloud and cells for which the kernels' buffers are ready; parts share it
+        self._ready: list[object] = []  # Gaussians and cells that the kernels' buffers hold; parts share this list
         self._detector_shape = detector_shape
         self._choose(range(len(tables)), PlainRows(rt, length_mm, line_integrals=True))
 
@@ -185,21 +184,21 @@ class SplatProjection(GaussianOperator):
 
     def _part(self, few: Sequence[int]) -> "SplatProjection":
         part = copy(self)
-        part.__dict__.pop("intensity", None)  # that of all frames
+        part.__dict__.pop("intensity", None)  # the cached operator to all frames
         part._choose([self._chosen[f] for f in few], self.rows)
         return part
 
     def forward(self, point: SplatPoint) -> DeviceArray:
-        """Renders a cloud to frames (F, rows, columns) float32."""
+        """Renders Gaussians to frames (F, rows, columns) float32."""
         frames = self.rt.empty((len(self._cells), *self._detector_shape))
-        self._ready.clear()  # before the buffers change: a failure may leave them half written
+        self._ready.clear()  # now, because a failure below may leave the buffers half written
         for number, cells in enumerate(self._cells):
             self._images.leave(self._projector.forward(point.gaussians, cells), frames, number)
         self._ready[:] = point, self._cells[-1]
         return frames
 
     def back(self, point: SplatPoint, by_y: DeviceArray) -> DeviceArray:
-        """Returns dL/d(rows), (11, G) float32 at a cloud, from dL/d(frames), (F, rows, columns)."""
+        """Returns dL/d(rows), (11, G) float32, at ``point`` from dL/d(frames), (F, rows, columns)."""
         rt, gaussians = self.rt, point.gaussians
         by_rows, gradients = rt.empty((ROWS, gaussians.count)), rt.empty((ROWS + 2, gaussians.stride))
         for number, cells in enumerate(self._cells):
@@ -210,17 +209,17 @@ class SplatProjection(GaussianOperator):
     def _differentiate(
         self, point: SplatPoint, cells: DeviceCells, by_image: DeviceArray, gradients: DeviceArray
     ) -> None:
-        """Writes one frame's gradients dL/d(kernels' rows), (13, stride), from its padded dL/d(frame)."""
+        """Writes dL/d(kernels' rows), (13, stride), for one frame from its dL/d(frame), ``by_image``, in padded layout."""
         is_ready = self._ready == [point, cells]
         self._ready.clear()
         if not is_ready:
             see = self._projector.forward if self._is_layered else self._projector.prepare
-            see(point.gaussians, cells)  # the derivative of merged intensities depends on every layer
+            see(point.gaussians, cells)  # averaged intensities depend on all layers, which must be drawn
         self._projector.backward(point.gaussians, cells, by_image, gradients)
 
     def by_poses(self, gaussians: Any, by_frames: Any) -> np.ndarray:
-        """Returns dL/d(turn in rad, shifts along columns and rows in pixels), (F, 3), from dL/dframes (F, rows, columns).
-        Raises InputError for an operator that averages intensities."""
+        """Returns dL/d(gantry angle in rad, panel shifts along columns and rows in pixels), (F, 3), from dL/dframes (F,
+        rows, columns). Raises InputError for an operator that averages intensities."""
         if self._is_layered:
             raise InputError("by_poses", "averages of intensity", "averages of line integrals")
         point = self._entered(self._to_array(self._domain, gaussians))
@@ -234,12 +233,12 @@ class SplatProjection(GaussianOperator):
             turn, along, across = by_pose(rows[:, : cloud.count], by_rows)
             shifts = [across / (self._projector.lines / 2), along / (self._projector.width / 2)]
             found[number] = turn, *(shifts[::-1] if self._images.turned else shifts)
-            if not (self._affine or cells.is_parallel):  # there all rays have the length of the central ray
+            if not (self._affine or cells.is_parallel):  # in these models all rays are as long as the central one
                 found[number, 1:] += by_length(self._poses[self._chosen[number]], weighed[number])
         return found
 
     def of_densities(self, gaussians: Gaussians) -> LinearOperator:
-        """Returns the linear operator from densities (G,) in 1/mm to frames; centres and shapes are those of ``gaussians``.
+        """Returns the linear operator from densities (G,) in 1/mm to frames, for the centres and shapes of ``gaussians``.
         Raises InputError for an operator that averages intensities, which is not linear."""
         if self._is_layered:
             raise InputError("of_densities", "averages of intensity", "averages of line integrals, which are linear")
@@ -259,7 +258,7 @@ class SplatProjection(GaussianOperator):
 
 
 class VoxelOperator(GaussianOperator):
-    """The ``Operator`` from Gaussians to their volume (nz, ny, nx) in 1/mm at the centres of a grid's voxels."""
+    """The ``Operator`` from Gaussians to a volume (nz, ny, nx) in 1/mm: their sum at the centres of a grid's voxels."""
 
     def __init__(self, rt: Runtime, grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA) -> None:
         nz, ny, nx = grid.shape
@@ -268,10 +267,10 @@ class VoxelOperator(GaussianOperator):
         self._inside = grid.scaled(1 / length_mm)
         self._voxeliser = Voxeliser(rt, grid.shape, cutoff_sigma=cutoff_sigma)
         self._images = PlainImages(rt, nz * ny, nx)
-        self._ready: list[object] = []  # the cloud for which the kernels' buffers are ready
+        self._ready: list[object] = []  # the Gaussians that the kernels' buffers hold
 
     def forward(self, point: SplatPoint) -> DeviceArray:
-        """Returns the field (nz, ny, nx) float32 of a cloud."""
+        """Returns the volume (nz, ny, nx) float32 of Gaussians."""
         volume = self.rt.empty(self._inside.shape)
         self._ready.clear()
         self._images.leave(self._voxeliser.forward(point.gaussians, self._inside), volume)
@@ -279,7 +278,7 @@ class VoxelOperator(GaussianOperator):
         return volume
 
     def back(self, point: SplatPoint, by_y: DeviceArray) -> DeviceArray:
-        """Returns dL/d(rows), (11, G) float32 at a cloud, from dL/d(volume), (nz, ny, nx)."""
+        """Returns dL/d(rows), (11, G) float32, at ``point`` from dL/d(volume), (nz, ny, nx)."""
         rt, gaussians = self.rt, point.gaussians
         by_rows, gradients = rt.empty((ROWS, gaussians.count)), rt.empty((ROWS + 2, gaussians.stride))
         if self._ready != [point]:
@@ -292,7 +291,6 @@ class VoxelOperator(GaussianOperator):
 
 
 def _check_rows(rows: np.ndarray) -> None:
-    """Raises InputError for rows whose rendering would be NaN."""
     checks.finite(_ROWS, rows)
     if (rows[SCALE] <= 0).any() or not rows[QUATERNION].any(axis=0).all():
         raise InputError(_ROWS, "a scale or a quaternion's length of 0 or less", "scales and lengths above 0")
@@ -301,21 +299,20 @@ def _check_rows(rows: np.ndarray) -> None:
 def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, float]:
     """Returns dL/d(gantry angle about z) per rad, and dL/d(panel shift) along and across a line.
 
-    Shifts are in halves of the detector's width and of its lines. rows (11, G): the kernels' rows; gradients (13, G):
-    dL/d(rows), then two rows for shifts of the projected centres."""
+    The units of shifts are half of the detector's width and half of its lines. rows (11, G): parameters in the kernels'
+    layout. gradients (13, G): dL/d(rows), and two rows of dL/d(projected centre)."""
     values, by = rows.astype(np.float64), gradients.astype(np.float64)
     (x, y, _), (by_x, by_y, _) = values[MEAN], by[MEAN]
     w, i, j, k = values[QUATERNION]
-    turned = np.stack([-k, -j, i, w]) / 2  # dq/d(angle) of a quaternion for a rotation about z that follows its own
+    turned = np.stack([-k, -j, i, w]) / 2  # dq/d(angle) for a further rotation about z
     by_object = np.sum(x * by_y - y * by_x) + np.sum(turned * by[QUATERNION])
     return -float(by_object), -float(by[11].sum()), -float(by[12].sum())
 
 
 def by_length(pose: np.ndarray, weighed: np.ndarray) -> np.ndarray:
-    """Returns the part (2,) of dL/d(panel shift) per pixel, along columns and along rows, that comes from the rays'
-    lengths.
+    """Returns the part (2,) of dL/d(panel shift), per pixel along columns and rows, that comes from the lengths of rays.
 
-    Line integrals are proportional to the rays' lengths. pose (12,) mm; weighed (rows, columns): frame × dL/d(frame)."""
+    Line integrals are proportional to these lengths. pose (12,) mm; weighed (rows, columns): frame × dL/d(frame)."""
     source, first, column, row = pose.reshape(4, 3)
     v, u = (np.arange(n, dtype=np.float64) for n in weighed.shape)
     ray = first - source + v[:, None, None] * row + u[:, None] * column

@@ -1,10 +1,10 @@
-"""Splat projector: Gaussians to one merged frame over all its time cells, and its adjoint.
+"""Projector of Gaussians to a frame, merged over all its time cells, and its adjoint.
 
-This is the paper's *multi-pose batch rendering* (section 2.3): one launch per step handles all M×N micro-views of a frame.
-``splat_prepare`` projects every Gaussian from every pose. ``splat_forward`` accumulates micro-views and joins strips (Eq. 3)
-directly in the merged frame; no micro-view is stored. ``splat_backward`` and ``splat_chain`` are the adjoint.
+This is the paper's *multi-pose batch rendering* (section 2.3): each kernel handles all M×N micro-views of a frame in one
+launch. ``splat_prepare`` projects every Gaussian from every pose. ``splat_forward`` adds up micro-views and joins strips
+(Eq. 3) directly in the merged frame; no micro-view is stored. ``splat_backward`` and ``splat_chain`` are the adjoint.
 
-A detector that averages intensities needs the cells of a line separately: ``Layers`` merges a few layers of them."""
+To average intensities the time cells of a line are needed separately: see ``Layers``."""
 
 from dataclasses import dataclass
 
@@ -17,29 +17,28 @@ from phyradgs_cl.operators.splats.states import CloudStates
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
-RECORD_FLOATS = {False: 16, True: 20}  # number of floats per splat and time cell, by whether the cell has motion
-DEFAULT_TIME_ERROR = 0.005  # default of the largest relative RMS error of averages over time
-# default distance from a Gaussian's centre, in standard deviations, beyond which it is 0: it has fallen to 0.1 % of its peak
+RECORD_FLOATS = {False: 16, True: 20}  # floats of a splat in a time cell, by whether poses move within the cell
+DEFAULT_TIME_ERROR = 0.005  # relative RMS error that averages over time may have
+# Distance in standard deviations beyond which a Gaussian counts as 0: there it has fallen to 0.1 % of its peak.
 DEFAULT_CUTOFF_SIGMA = 3.7
 _BAND_LINES = 8  # number of detector lines of a tile on a CPU
 GROUP_DEFINES = {False: {"GROUP": 1, "ACROSS": 1}, True: {"GROUP": 32, "ACROSS": 8}}
-"""Build options of a Gaussian's adjoint by ``Runtime.pixel_items``: work-items per Gaussian, and how many lie along a
-line."""
+"""Build options of the adjoint, by ``Runtime.pixel_items``: the work-items per Gaussian, and how many lie along a line."""
 
 
 def items_by_gaussian(rt: Runtime, count: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Returns the work-items and the sides of a work-group, both (x, y), of kernels in which ``count`` Gaussians sum over
-    their pixels."""
+    """Returns work-items and work-group, both (x, y), of kernels that sum over the pixels of each of ``count`` Gaussians."""
     items, across = (GROUP_DEFINES[rt.pixel_items][name] for name in ("GROUP", "ACROSS"))
     return (count * across, items // across), ((across, items // across) if items > 1 else (16, 1))
 
 
 def path_limits(time_error: float) -> tuple[float, float, float]:
-    """Returns the longest path within a line's window, in widths of the splat, for 1, 2 and 3 Gauss–Legendre times.
+    """Returns how far a splat may move during a line's exposure, in widths of the splat, for 1, 2 and 3 sample times.
 
-    The rules' remainders for exp(−x²/2), whose 2nd, 4th and 6th derivatives are at most 1, 3 and 15, are path²/24,
-    path⁴/1440 and path⁶/134400 of the peak. An error of twice ``time_error`` in the worst pixel is a relative RMS error
-    of about ``time_error``. Longer paths use the closed form, whose moments lose digits below a path of 0.7."""
+    The exposure is integrated by Gauss–Legendre rules. For exp(−x²/2), whose 2nd, 4th and 6th derivatives are at most 1, 3
+    and 15, their errors are path²/24, path⁴/1440 and path⁶/134400 of the peak. An error of 2 ``time_error`` in the worst
+    pixel means a relative RMS error of about ``time_error``. Longer paths are integrated in closed form, which loses digits
+    for paths below 0.7."""
     worst = 2 * time_error
     one, two, three = (24 * worst) ** (1 / 2), (1440 * worst) ** (1 / 4), (134400 * worst) ** (1 / 6)
     return one, two, max(three, 0.7)
@@ -47,7 +46,7 @@ def path_limits(time_error: float) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class _Kernels:
-    """The kernels of the four passes, compiled for splats at rest, with motion, or with motion of the centres alone."""
+    """The four kernels, built for splats that rest in a cell, that move in it, or of which only the centres move."""
 
     prepare: Kernel
     forward: Kernel
@@ -71,13 +70,12 @@ class _Kernels:
 
 
 class SplatProjector:
-    """Renders Gaussians to frames of ``lines`` lines (along the readout axis) by ``width`` pixels, and differentiates the
-    frames.
+    """Renders Gaussians to frames with ``lines`` lines (along the readout axis) of ``width`` pixels; also the derivative.
 
-    affine: R2-Gaussian's approximation instead of the exact ray integral. cutoff_sigma: Mahalanobis radius beyond which a
-    Gaussian is not drawn; 0 draws all of it. time_error: limit of the error (relative, RMS) of averages over time in
-    cells with motion. intensity_unit: the line integral of an image's value 1, where a detector averages intensities over
-    a line's cells; None averages line integrals. states: moves the cloud to the states of cells uploaded with them."""
+    affine: R2-Gaussian's approximation instead of the exact ray integral. cutoff_sigma: the Mahalanobis radius beyond which
+    a Gaussian is not drawn; 0 draws all of it. time_error: the largest relative RMS error of averages over time in moving
+    cells. intensity_unit: None averages line integrals. A number averages intensities; it is the line integral that the
+    value 1 of a pixel stands for. states: moves the Gaussians of an object that moves."""
 
     def __init__(
         self, rt: Runtime, lines: int, width: int, *, affine: bool = False,
@@ -106,24 +104,23 @@ class SplatProjector:
         }
 
     def _cut(self, tile_w: int, tile_h: int) -> None:
-        """Cuts the frame into tiles of ``tile_w`` × ``tile_h`` pixels, each with a list of splats."""
         self.tile_w, self.tile_h = tile_w, tile_h
         tiles = (ceil_div(self.width, tile_w), ceil_div(self.lines, tile_h), 1)
         self.lists = TileLists(self.rt, (tile_w, tile_h, 1), tiles)
 
     @property
     def path_limits(self) -> np.ndarray:
-        """The function ``path_limits`` as the kernels' argument, (4,) float32 with an unused last element."""
+        """What the function ``path_limits`` returns, as a kernel argument: (4,) float32, the last element unused."""
         return np.array([*path_limits(self.time_error), 0], np.float32)
 
     def forward(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
-        """Renders the merged frame in the padded layout, valid until the next call."""
+        """Renders the merged frame in the padded layout. Its memory is valid until the next call."""
         self.draw(gaussians, cells)
         return self.merge(cells)
 
     def draw(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
-        """Renders the layers of a frame, padded; without layers, the frame itself. Layers of several clouds may be added
-        before ``merge``."""
+        """Renders the layers of a frame in the padded layout, or the frame itself if line integrals are averaged. The layers
+        of several clouds may be added before ``merge``."""
         rt, kernel = self.rt, self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel].forward
         if self.by_pixel and rt.tile(kernel) != (self.tile_w, self.tile_h):
             self._cut(*rt.tile(kernel))
@@ -141,7 +138,7 @@ class SplatProjector:
         return drawn
 
     def merge(self, cells: DeviceCells) -> DeviceArray:
-        """Returns the frame merged from the layers of the last ``draw``, valid until the next call."""
+        """Merges the layers of the last ``draw`` to a frame. Its memory is valid until the next call."""
         if self._layers is not None:
             self._layers.merge(cells, self.image)
         return self.image
@@ -149,11 +146,11 @@ class SplatProjector:
     def backward(
         self, gaussians: DeviceGaussians, cells: DeviceCells, by_image: DeviceArray, gradients: DeviceArray
     ) -> None:
-        """Writes dL/d(parameters) into ``gradients`` (13, stride), rows as in cl/common/gradient.h, from the padded
-        dL/d(frame).
+        """Writes dL/d(parameters) into ``gradients`` (13, stride), with rows as in cl/common/gradient.h, from dL/d(frame) in
+        the padded layout.
 
-        Call ``prepare`` or ``forward`` with the same Gaussians and cells before each call: it overwrites their
-        results."""
+        Call ``prepare`` or ``forward`` with the same Gaussians and cells before each call, because their results are
+        overwritten."""
         rt = self.rt
         items, group = items_by_gaussian(rt, gaussians.count)
         by_images = by_image if self._layers is None else self._layers.split(cells, by_image)
@@ -174,11 +171,11 @@ class SplatProjector:
             self.states.back(gaussians, cells, gradients)
 
     def prepare(self, gaussians: DeviceGaussians, cells: DeviceCells) -> None:
-        """Projects every Gaussian from every pose: the first step of ``draw``, whose results ``backward`` needs."""
+        """Projects every Gaussian from every pose. ``draw`` begins with this; ``backward`` needs its results."""
         rt = self.rt
         footprints = gaussians.stride * cells.count
         if self._records.size < footprints * RECORD_FLOATS[cells.moving]:
-            self._records = rt.empty(1)  # frees the old memory before it allocates the new
+            self._records = rt.empty(1)  # frees the old memory now, so that the device need not hold both
             self._records = rt.empty(footprints * RECORD_FLOATS[cells.moving])
         if self._is_visible.size < footprints:
             self._is_visible = rt.empty(1, np.uint8)
@@ -201,7 +198,7 @@ class SplatProjector:
         return unpad_rows(self.rt.download(image), (self.lines, self.width))
 
     def project_adjoint(self, rows: np.ndarray, cells: DeviceCells, by_image: np.ndarray) -> np.ndarray:
-        """Returns dL/d(rows), (11, G), for parameter rows (11, G) and dL/d(frame), (lines, width)."""
+        """Returns dL/d(rows), (11, G), at parameter rows (11, G) from dL/d(frame), (lines, width)."""
         gaussians = DeviceGaussians.upload(self.rt, rows)
         self.forward(gaussians, cells)
         gradients = self.rt.zeros((13, gaussians.stride))

@@ -1,7 +1,9 @@
-"""A cloud in the states of an object that moves, and its gradients back to the reference (cl/splat_states.cl).
+"""Gaussians of an object that moves: from the reference to the object's states at other times, and gradients back
+(cl/splat_states.cl).
 
-The object at y is the reference at y + w(y). A Gaussian of the reference at m lies at the y with y + w(y) = m. Its
-covariance is G⁻¹ Σ G⁻ᵀ with G = I + ∂w/∂y. Its density stays, because the field moves attenuation, not mass."""
+In a state the object has at point y the attenuation that the reference has at y + w(y). So a Gaussian at m in the reference
+is at the y with y + w(y) = m. Its covariance is G⁻¹ Σ G⁻ᵀ with G = I + ∂w/∂y. Its density stays: the field moves
+attenuation, not mass."""
 
 import numpy as np
 
@@ -11,16 +13,16 @@ from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians, stride_of
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 
-STATE_ROWS = 12  # rows of a Gaussian in a state: its centre x, y, z, and the rows of G
-_PROBED_SIDE = 9  # points along each axis of the grid at which the inverse of a field is checked
-_PROBED_STATES = 16  # states at even times in which it is checked, besides those in which a field moves most
-_WRONG = 0.01  # largest error of an inverse, in voxels; a larger one raises InputError
-_BEND = 0.25  # largest bend of a point's path in a segment, in voxels; the bend's blur is 0.3 of it
-_MOST_SEGMENTS = 32  # most segments of a frame: beyond it larger bends are accepted
+STATE_ROWS = 12  # rows of a Gaussian in a state: its centre x, y, z, and the 9 numbers of G
+_PROBED_SIDE = 9  # number of points along each axis of the grid at which the inverse of a field is checked
+_PROBED_STATES = 16  # number of evenly spaced times at which the inverse is checked, besides those of largest displacement
+_WRONG = 0.01  # largest accepted error of an inverse, in voxels
+_BEND = 0.25  # largest deviation of a point's path in a segment from a straight line, in voxels; the blur is 0.3 of it
+_MOST_SEGMENTS = 32  # most segments of a frame, even if paths then deviate more
 
 
 class CloudStates:
-    """Moves clouds to the states of a frame's cells, as ``deformation`` does in the clouds' unit of length."""
+    """Moves Gaussians as ``deformation`` does, to the states at a frame's times. Both have the same unit of length."""
 
     def __init__(self, rt: Runtime, deformation: Deformation) -> None:
         self.rt, self.deformation = rt, deformation
@@ -33,18 +35,18 @@ class CloudStates:
         self._states, self._by_states = rt.empty(1), rt.empty(1)
 
     def forward(self, gaussians: DeviceGaussians, shares: DeviceArray) -> DeviceArray:
-        """Returns the cloud in S states, (S, 12, stride), valid until the next call. shares (S, R): weights of the R
-        fields."""
+        """Returns the Gaussians in S states, (S, 12, stride). The memory is valid until the next call. shares (S, R): the
+        weights of the R displacement fields in each state."""
         rt, count, stride = self.rt, shares.shape[0], gaussians.stride
         if self._states.size < count * STATE_ROWS * stride:
-            self._states = rt.empty(1)  # frees the old memory before it allocates the new
+            self._states = rt.empty(1)  # frees the old memory now, so that the device need not hold both
             self._states = rt.empty((count, STATE_ROWS, stride))
         kernel, field = self._kernel("splat_states"), (*self._field, shares, np.int32(count))
         rt.launch(kernel, stride, gaussians.rows, stride, *field, self._states, group=rt.group(on_cpu=16))
         return self._states
 
     def zeros(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
-        """Returns memory (S, 12, stride) of zeros for dL/d(states), valid until the next call."""
+        """Returns zeros (S, 12, stride) for dL/d(states). The memory is valid until the next call."""
         floats = cells.shares.shape[0] * STATE_ROWS * gaussians.stride
         if self._by_states.size < floats:
             self._by_states = self.rt.empty(1)
@@ -53,8 +55,8 @@ class CloudStates:
         return self._by_states
 
     def back(self, gaussians: DeviceGaussians, cells: DeviceCells, gradients: DeviceArray) -> None:
-        """Replaces the rows of the mean in ``gradients`` (13, stride) by dL/d(mean of the reference), from the
-        dL/d(states) in the memory of ``zeros``. The last ``forward`` must be of the same cloud and cells."""
+        """Replaces dL/d(mean) in ``gradients`` (13, stride) by the gradient for the means in the reference. Reads
+        dL/d(states) from the memory of ``zeros``. The last ``forward`` must be for the same Gaussians and cells."""
         rt, count = self.rt, cells.shares.shape[0]
         kernel, field = self._kernel("splat_states_back"), (*self._field, cells.shares, np.int32(count))
         rt.launch(
@@ -63,13 +65,13 @@ class CloudStates:
         )  # fmt: skip
 
     def check_inverse(self, grid: Grid) -> None:
-        """Raises InputError where the field has no inverse: where points of ``grid`` do not return to themselves in some
-        probed states."""
+        """Raises InputError if the field has no inverse. Tests whether some points of ``grid``, moved to some states and
+        back, return to where they were."""
         rt, (z, y, x) = self.rt, (np.linspace(axis[0], axis[-1], _PROBED_SIDE) for axis in grid.axes_mm())
         mean = np.stack(np.meshgrid(x, y, z, indexing="ij")).reshape(3, -1)
         rows = np.ones((11, mean.shape[1]))
         rows[:3] = mean
-        # the states in which each field moves most, and some at even times
+        # States in which each field moves most, and some at even times.
         ends = np.concatenate([self.deformation.weights.argmax(0), self.deformation.weights.argmin(0)])
         chosen = np.linspace(0, len(self.deformation.times_s) - 1, _PROBED_STATES).astype(int)
         weights = self.deformation.weights[np.unique([*ends, *chosen])]
@@ -87,9 +89,10 @@ class CloudStates:
 
 
 def segments_for_object(deformation: Deformation, lit_s: np.ndarray, voxel_mm: float) -> int:
-    """Returns how many segments a frame needs that is lit from lit_s[0] to lit_s[1], up to ``_MOST_SEGMENTS``. Within a
-    segment the path of any point of the object is bent by at most a quarter of a voxel, because splats follow a straight
-    path."""
+    """Returns how many segments of time a frame needs that is exposed from lit_s[0] to lit_s[1], up to ``_MOST_SEGMENTS``.
+
+    Splats move straight in a segment. So no point of the object may deviate from a straight line by more than a quarter of
+    a voxel."""
     for count in range(1, _MOST_SEGMENTS):
         weights = deformation.weights_at(np.linspace(lit_s[0], lit_s[1], 2 * count + 1))
         bend_mm = np.abs(weights[1::2] - (weights[:-1:2] + weights[2::2]) / 2) @ deformation.reach_mm
@@ -99,8 +102,8 @@ def segments_for_object(deformation: Deformation, lit_s: np.ndarray, voxel_mm: f
 
 
 def states_of(table: TimeCells, deformation: Deformation) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the weights (S, R) of the states that the cells of a frame see, in the order of time, and the state (C,
-    poses) of every pose. Raises InputError for cells whose splats keep their shape (``conic_pose``), and for moving cells
+    """Returns the field weights (S, R) of the object's states at the times of a frame's cells, and which state each pose
+    has, (C, poses). Raises InputError for cells in which splats keep their shape (``conic_pose``), and for moving cells
     without the times of their ends."""
     if table.conic_pose is not None:
         expected = "one in which also the shapes of splats move"

@@ -1,4 +1,4 @@
-"""Voxeliser: Gaussians to a voxel grid, and its adjoint."""
+"""Evaluates Gaussians on a voxel grid, with the adjoint of this map."""
 
 import numpy as np
 
@@ -12,14 +12,13 @@ from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, attempts
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
 RECORD_FLOATS = 20  # number of floats that ``voxel_prepare`` writes for each Gaussian
-SUM_FLOATS = 16  # number of floats of a Gaussian's sums over voxels
-_TILE_ROWS = 8  # number of voxels along z of a tile
-_DEFAULT_BRICK_BYTES = 1 << 28  # default of the most bytes of voxels that the device holds at a time
+SUM_FLOATS = 16  # number of floats for the sums over voxels of a Gaussian
+_TILE_ROWS = 8  # height of a tile along z, in voxels
+_DEFAULT_BRICK_BYTES = 1 << 28  # bytes of voxels that are computed at a time
 
 
 class Voxeliser:
-    """Evaluates the field of Gaussians at the voxel centres of grids of one ``shape`` (nz, ny, nx), and differentiates
-    it."""
+    """Evaluates Gaussians at the voxel centres of grids with ``shape`` (nz, ny, nx), and differentiates the result."""
 
     def __init__(
         self, rt: Runtime, shape: tuple[int, int, int], *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA
@@ -46,11 +45,11 @@ class Voxeliser:
     def forward(
         self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int] = (0, 0, 0)
     ) -> DeviceArray:
-        """Returns the field on the voxels [start, start + shape) of ``grid``, in the padded layout, valid until the next
-        call.
+        """Evaluates the Gaussians on the voxels [start, start + shape) of ``grid``. Returns them in the padded layout, in
+        memory that is valid until the next call.
 
-        Lengths are in the Gaussians' unit; ``start`` is (z, y, x). A part of a grid has the same bits as in the complete
-        field."""
+        The grid has the Gaussians' unit of length; ``start`` is (z, y, x). A part of a grid gets the same bits as the whole
+        grid."""
         rt = self.rt
         self.prepare(gaussians, grid, start)
         self.lists.build(self._extents, gaussians.count, gaussians.stride)
@@ -67,8 +66,8 @@ class Voxeliser:
         self, gaussians: DeviceGaussians, grid: Grid, by_volume: DeviceArray, gradients: DeviceArray, *,
         add: bool, weight: float = 1.0,
     ) -> None:
-        """Writes ``weight`` × dL/d(parameters) to ``gradients`` (13, stride), or adds to them, from the padded
-        dL/d(volume). Call ``forward`` or ``prepare`` with the same Gaussians before."""
+        """Writes ``weight`` × dL/d(parameters) to ``gradients`` (13, stride), or adds it, from dL/d(volume) in the padded
+        layout. Call ``forward`` or ``prepare`` with the same Gaussians before."""
         rt = self.rt
         if self._sums.size < gaussians.stride * SUM_FLOATS:
             self._sums = rt.zeros(gaussians.stride * SUM_FLOATS)
@@ -83,7 +82,7 @@ class Voxeliser:
         )  # fmt: skip
 
     def prepare(self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int]) -> None:
-        """Finds the voxels that every Gaussian touches: the first step of ``forward``, whose results ``backward`` needs."""
+        """Finds the voxels that each Gaussian touches. ``forward`` begins with this; ``backward`` needs its results."""
         rt, stride = self.rt, gaussians.stride
         if self._records.size < stride * RECORD_FLOATS:
             self._records = rt.empty(stride * RECORD_FLOATS)
@@ -95,7 +94,6 @@ class Voxeliser:
         )  # fmt: skip
 
     def _index_of(self, grid: Grid) -> DeviceArray:
-        """Returns ``index_matrix`` on the device, uploaded once per grid."""
         if self._index is None or self._index[0] != grid:
             self._index = grid, split_coefficients(self.rt, index_matrix(grid))
         return self._index[1]
@@ -118,10 +116,10 @@ def voxelise(
     rt: Runtime, rows: np.ndarray, grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA,
     brick_bytes: int = _DEFAULT_BRICK_BYTES,
 ) -> np.ndarray:
-    """Returns the field (nz, ny, nx) float32 of parameter rows (11, G) on the complete grid, computed brick by brick with
-    the same bits.
+    """Evaluates parameter rows (11, G) on a grid of any size, one part (brick) after the other. Returns the volume (nz, ny,
+    nx) float32.
 
-    brick_bytes: bytes of voxels on the device at a time, or fewer if memory is short."""
+    brick_bytes: the bytes of voxels on the device at a time, or fewer if memory is short. The bits do not depend on it."""
     for attempt in attempts("voxeliser"):
         with attempt as share:
             volume = _in_bricks(rt, DeviceGaussians.upload(rt, rows), grid, cutoff_sigma, brick_bytes, share)
@@ -137,9 +135,9 @@ def _in_bricks(
         nz, ny, _ = shape
         voxels_bytes = 4 * (2 * GUARD + nz * ny * pitch_of(nx))
         if voxels_bytes > brick_bytes and nz * ny > 1:
-            return (room.free_bytes + 1,)  # too large: more than the free memory
+            return (room.free_bytes + 1,)  # rejects the shape: no buffer is larger than the free memory
         lists_bytes = TileLists.bytes(rt, int(np.prod(_tiles(rt, shape)[1])), gaussians.count)
-        entries_bytes = lists_bytes  # an estimate: the number of entries is known only after counting
+        entries_bytes = lists_bytes  # a guess: the number of list entries is known only after counting
         return voxels_bytes, lists_bytes, entries_bytes, records_bytes
 
     room = rt.room()
@@ -147,18 +145,18 @@ def _in_bricks(
     made: Voxeliser | None = None
     for brick in cut(grid.shape, (1, 1), needs, room, share):
         if made is None or made.shape != brick.shape:
-            made = None  # frees its memory for the next one
+            made = None  # frees its memory before the next one is made
             made = Voxeliser(rt, brick.shape, cutoff_sigma=cutoff_sigma)
-            made.lists.waits = True  # bricks differ, and the host waits for each anyway
+            made.lists.waits = True  # lists differ from brick to brick, and the host waits for each brick anyway
         part = made.forward(gaussians, grid, brick.start)
         volume[brick.box] = unpad_rows(rt.download(part), brick.shape)
     return volume
 
 
 def _tiles(rt: Runtime, shape: Shape) -> tuple[Shape, Shape]:
-    """Returns size and number of the tiles of a volume of ``shape`` (nz, ny, nx), both along x, y, z."""
+    """Returns the size and the number of the tiles of a volume with ``shape`` (nz, ny, nx), both along x, y, z."""
     nz, ny, nx = shape
-    # a GPU's work-group has one work-item for each column (x, y) of a tile
+    # A GPU's work-group has a work-item for each column (x, y) of a tile.
     tile_x = 16 if rt.pixel_items else pitch_of(nx)
     tile_y = rt.group(16 * _TILE_ROWS, 16 * _TILE_ROWS, _forward(rt)) // 16
     return (tile_x, tile_y, _TILE_ROWS), (ceil_div(nx, tile_x), ceil_div(ny, tile_y), ceil_div(nz, _TILE_ROWS))

@@ -1,1 +1,1 @@
-"""Plain float64 NumPy twins of the kernels: slow, short, and what the tests compare against."""
+"""Twins of the kernels: the same mathematics in float64 NumPy, short and slow, with which tests compare the kernels."""

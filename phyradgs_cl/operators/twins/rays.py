@@ -1,8 +1,8 @@
-"""Float64 twins in NumPy of the ray-driven projector, its transpose and the voxel-driven backprojections; and, for objects
-that move, of warps of volumes and of Gaussians in their states.
+"""Float64 twins in NumPy of the ray-driven projector, its transpose, and the voxel-driven backprojections. For objects that
+move, also of the warps of volumes and of the displacement of Gaussians.
 
-The projector sums Joseph's samples one ray at a time. The backprojections solve for the ray of every voxel; with one pose
-per line they search all lines for the one on which the voxel falls."""
+The projector sums Joseph's samples ray by ray. The backprojections compute the ray of every voxel. With one pose per line
+they search all lines for the one onto which the voxel is projected."""
 
 from collections.abc import Iterable, Iterator
 
@@ -17,8 +17,8 @@ from phyradgs_cl.fields.gaussians import MEAN
 from phyradgs_cl.operators.rays.layout import some_cells
 from phyradgs_cl.operators.twins.splat import moving_frame, precision_matrices, splat_frame
 
-_REACH = 2  # largest distance, in voxels, at which a spline coefficient counts; also of places outside the volume that do
-_BORDER = 4  # width of the border of spline coefficients beyond each face of the volume, in voxels
+_REACH = 2  # a spline coefficient acts up to this far, in voxels; points further outside the volume have the value 0
+_BORDER = 4  # width in voxels around the volume in which spline coefficients are kept
 Volume = np.ndarray
 
 
@@ -51,8 +51,8 @@ def joseph_adjoint(image: np.ndarray, grid: Grid, pose: np.ndarray, is_parallel:
 def ray_frame(
     volume: np.ndarray, grid: Grid, table: TimeCells, detector_shape: tuple[int, int], model: str = "log"
 ) -> np.ndarray:
-    """Returns the frame (rows, columns) of a volume (nz, ny, nx) in 1/mm, merged over the time cells of ``table``. model:
-    log averages line integrals, intensity averages intensities."""
+    """Returns the frame (rows, columns) of a volume (nz, ny, nx) in 1/mm, averaged over the time cells of ``table``. model:
+    "log" averages line integrals, "intensity" averages intensities."""
     frame = np.zeros(detector_shape)
     for cell in range(table.count):
         image = joseph_image(volume, grid, table.pose[cell], detector_shape, table.is_parallel)
@@ -63,7 +63,7 @@ def ray_frame(
 
 
 def ray_volume(frame: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
-    """Returns the transpose of ``ray_frame`` with the log model: a frame (rows, columns) to a volume (nz, ny, nx)."""
+    """Transpose of ``ray_frame`` with the model "log": returns a volume (nz, ny, nx) from a frame (rows, columns)."""
     volume = np.zeros(grid.shape)
     for cell in range(table.count):
         image = np.zeros(frame.shape)
@@ -74,8 +74,8 @@ def ray_volume(frame: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
 
 
 def intensity_volume(frame: np.ndarray, volume: np.ndarray, grid: Grid, table: TimeCells) -> np.ndarray:
-    """Returns the transpose of d(``ray_frame``)/d(volume) with the intensity model at ``volume``: a frame (rows, columns)
-    to a volume (nz, ny, nx)."""
+    """Transpose of the derivative of ``ray_frame`` at ``volume`` with the model "intensity": returns a volume (nz, ny, nx)
+    from a frame (rows, columns)."""
     result = np.zeros(grid.shape)
     for cell, share in _shares(volume, grid, table, frame.shape):
         result += joseph_adjoint(share * frame, grid, table.pose[cell], table.is_parallel)
@@ -85,7 +85,7 @@ def intensity_volume(frame: np.ndarray, volume: np.ndarray, grid: Grid, table: T
 def _shares(
     volume: np.ndarray, grid: Grid, table: TimeCells, detector_shape: tuple[int, ...]
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Yields each cell and its fraction (rows, columns) of a pixel's light, 0 on lines that the cell does not serve."""
+    """Yields each cell, and the fraction (rows, columns) of a pixel's light that falls in it; 0 on lines of other cells."""
     shape = (detector_shape[0], detector_shape[1])
     total = np.exp(-ray_frame(volume, grid, table, shape, "intensity"))
     for cell in range(table.count):
@@ -103,8 +103,8 @@ def _lines(table: TimeCells, cell: int) -> tuple[slice, slice]:
 def _rays(
     grid: Grid, pose: np.ndarray, wanted: np.ndarray, is_parallel: bool
 ) -> Iterator[tuple[tuple[int, ...], np.ndarray, float]]:
-    """Yields (pixel, sample points (n, 3) as voxel indices x y z, length of ray per sample in mm) for the pixels
-    ``wanted``."""
+    """Yields for each pixel in the mask ``wanted``: its index, sample points (n, 3) as voxel indices x y z, and the length
+    of ray per sample in mm."""
     pitch, first = np.array(grid.voxel_size_mm[::-1]), np.array(grid.first_centre_mm[::-1])
     pixels = (pixel_centres(pose, wanted.shape) - first) / pitch
     source = (pose[:3] - first) / pitch
@@ -127,7 +127,7 @@ def backprojection(
     """Returns the volume (nz, ny, nx) Σ_f weight_f / z^power · frame_f(u, v), for frames (F, rows, columns), pose (F, 12)
     mm and weight (F,), as ``backproject`` does.
 
-    push_mm: (F, nz, ny, nx, 3) displacement, components x, y, z, of the matter of each voxel at the time of a frame."""
+    push_mm: (F, nz, ny, nx, 3) how far each voxel's matter has moved at the time of each frame, x, y, z."""
     volume = np.zeros(grid.shape)
     pushes: Iterable[np.ndarray | float] = [0.0] * len(frames) if push_mm is None else push_mm
     for frame, one, share, moved in zip(frames.astype(np.float64), pose, weight, pushes, strict=True):
@@ -142,7 +142,7 @@ def lines_backprojection(
     frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows",
     is_parallel: bool = False, push_mm: np.ndarray | None = None, power: int = 2,
 ) -> np.ndarray:
-    """Returns the volume (nz, ny, nx) of ``backproject_lines`` by its definition. pose (F, lines, 12) in mm; other
+    """Returns what ``backproject_lines`` returns, (nz, ny, nx), by its definition. pose (F, lines, 12) in mm; other
     arguments as in ``backprojection``."""
     speed_power = 2 if axis == "columns" and power == 2 else 1
     if axis == "columns":
@@ -153,7 +153,7 @@ def lines_backprojection(
     for frame, poses, share, moved in zip(frames.astype(np.float64), pose, weight, pushes, strict=True):
         positions = [detector_position(p, grid, is_parallel, moved) for p in poses]
         u, v, depth = (np.stack(parts) for parts in zip(*positions, strict=True))
-        ahead = v - np.arange(lines)[:, None, None, None]  # falls through zero where the voxel is seen
+        ahead = v - np.arange(lines)[:, None, None, None]  # goes from above to below 0 at the line that sees the voxel
         for index in np.ndindex(*grid.shape):
             at = (slice(None), *index)
             volume[index] += share * _seen(frame, u[at], ahead[at], depth[at], power, speed_power)
@@ -163,11 +163,11 @@ def lines_backprojection(
 def detector_position(
     pose: np.ndarray, grid: Grid, is_parallel: bool = False, push_mm: np.ndarray | float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns pixel column, pixel row and depth, (nz, ny, nx) each, of voxel centres displaced by ``push_mm`` (nz, ny,
+    """Returns pixel column u, pixel row v and depth, (nz, ny, nx) each, of voxel centres displaced by ``push_mm`` (nz, ny,
     nx, 3).
 
-    Solves x − s = depth (d00 + u eu + v ev). In a parallel beam x − first pixel = u eu + v ev + t direction, and the
-    depth is 1."""
+    Solves x − source = depth (d00 + u eu + v ev), where d00 goes from the source to pixel (0, 0). In a parallel beam
+    x − pixel (0, 0) = u eu + v ev + t direction, and the depth is 1."""
     z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
     if isinstance(push_mm, np.ndarray):
         x, y, z = x + push_mm[..., 0], y + push_mm[..., 1], z + push_mm[..., 2]
@@ -178,15 +178,15 @@ def detector_position(
     offset = np.stack([x, y, z]).reshape(3, -1) - pose[0:3, None]
     basis = np.stack([pose[6:9], pose[9:12], pose[3:6] - pose[0:3]], -1)
     u, v, depth = np.linalg.solve(basis, offset).reshape(3, *grid.shape)
-    with np.errstate(divide="ignore", invalid="ignore"):  # a voxel in the plane of the source has no position on the panel
+    with np.errstate(divide="ignore", invalid="ignore"):  # depth may be 0: such a voxel has no image
         return u / depth, v / depth, depth
 
 
 def _seen(
     frame: np.ndarray, u: np.ndarray, ahead: np.ndarray, depth: np.ndarray, power: int, speed_power: int
 ) -> float:
-    """Returns what a frame adds to one voxel. For the pose of each line: u (lines,), pixel along the line; ahead
-    (lines,), lines from that line to the voxel; depth (lines,)."""
+    """Returns the contribution of a frame to one voxel. For the pose of each line: u (lines,) is the voxel's pixel along the
+    line, ahead (lines,) how many lines further it is, depth (lines,) its depth."""
     crossing = np.flatnonzero((ahead[:-1] >= 0) & (ahead[1:] <= 0))
     if crossing.size == 0 or depth.min() <= 0:
         return 0.0
@@ -205,8 +205,8 @@ def _on(position: np.ndarray, count: int) -> np.ndarray:
 
 
 def warp_forward(volume: Volume, displacement: np.ndarray) -> Volume:
-    """Returns v(y + w(y)), (nz, ny, nx), by cubic splines, for w (nz, ny, nx, 3) in voxels, components x, y, z. It is 0
-    further than ``_REACH`` voxels outside of the volume."""
+    """Returns v(y + w(y)), (nz, ny, nx), where v interpolates a volume by cubic splines and the displacement w (nz, ny, nx,
+    3) is in voxels, x, y, z. v is 0 further than ``_REACH`` voxels outside the volume."""
     padded = _coefficients(np.pad(np.asarray(volume, np.float64), _BORDER))
     result = np.zeros(volume.shape)
     for place, weight in _taps(displacement):
@@ -224,7 +224,8 @@ def warp_adjoint(values: Volume, displacement: np.ndarray) -> Volume:
 
 
 def _coefficients(values: Volume) -> Volume:
-    """Returns the coefficients of the cubic spline through values (nz, ny, nx) between zeros, by its impulse response."""
+    """Returns the coefficients of the cubic spline through values (nz, ny, nx), which are 0 outside, by convolution with
+    its impulse response."""
     for axis, side in enumerate(values.shape):
         distance = np.abs(np.subtract.outer(np.arange(side), np.arange(side)))
         response = np.sqrt(3) * (np.sqrt(3) - 2) ** distance
@@ -233,7 +234,7 @@ def _coefficients(values: Volume) -> Volume:
 
 
 def _taps(displacement: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, ...], np.ndarray]]:
-    """Yields indices into the volume with its border, and spline weights, of the neighbours of each displaced voxel."""
+    """Yields, for each of the 4³ coefficients that act on a displaced voxel, its indices in the padded volume and weight."""
     shape = displacement.shape[:3]
     places = np.indices(shape) + np.moveaxis(np.asarray(displacement, np.float64), -1, 0)[::-1]
     sides = np.reshape(shape, (3, 1, 1, 1))
@@ -247,10 +248,9 @@ def _taps(displacement: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, ...], np
 
 
 def moved_rows(rows: np.ndarray, deformation: Deformation, weights: np.ndarray) -> np.ndarray:
-    """Returns parameter rows (11, G) of a reference's Gaussians in the state with field weights (R,); densities keep
-    their peaks."""
+    """Returns parameter rows (11, G) of a reference's Gaussians in the state with field weights (R,). Densities stay."""
     mean = rows[MEAN].T + deformation.inverse_mm(rows[MEAN].T, weights)
-    for _ in range(2):  # Newton steps: differences of frames need more digits
+    for _ in range(2):  # Newton's method: central differences of frames need more digits
         off = mean + deformation.displacement_mm(mean, weights) - rows[MEAN].T
         pull = np.eye(3) + deformation.jacobian(mean, weights)
         mean = mean - np.linalg.solve(pull, off[..., None])[..., 0]
@@ -262,8 +262,8 @@ def moved_rows(rows: np.ndarray, deformation: Deformation, weights: np.ndarray) 
 def deformed_frame(
     rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], deformation: Deformation, affine: bool = False
 ) -> np.ndarray:
-    """Returns the merged frame (nv, nu) of a reference's parameter rows (11, G), which each cell sees in the state at its
-    time."""
+    """Returns the merged frame (nv, nu) of an object that moves, whose reference has parameter rows (11, G). Each cell sees
+    the object as it is at the cell's time."""
 
     def cloud_at(time_s: float) -> np.ndarray:
         return moved_rows(rows, deformation, deformation.weights_at(time_s)[0])

@@ -1,13 +1,13 @@
-"""Float64 twins of the splat projector: still splats, splats that move during a segment, and the voxel field.
+"""Float64 twins of the projector of Gaussians, at rest or moving during a segment of time, and of their voxelisation.
 
-A still splat follows the definition of the line integral. For each ray it is ρ √(2π/a) exp(−½ (c − b²/a)) with direction n,
-a = nᵀAn, b = nᵀA(μ−s), c = (μ−s)ᵀA(μ−s): the integral over the whole line, for Gaussians in front of the source. The
-kernel works in detector coordinates and shares no formula with it (docs/mathematics.md).
+At rest a Gaussian is integrated along each ray by the definition: ρ √(2π/a) exp(−½ (c − b²/a)) with the ray's direction n,
+the precision A = Σ⁻¹, a = nᵀAn, b = nᵀA(μ−s), c = (μ−s)ᵀA(μ−s). The integral is over the whole line, for Gaussians in front
+of the source. The kernel works in detector coordinates and shares no formula with this (docs/mathematics.md).
 
-A moving splat follows its definition by quadrature in time. Within a segment it keeps the conic, amplitude and perspective
-factor Q of the middle time, while its centre moves along a straight path at constant speed. The path's ends are the
-mean projected by the segment's two end poses; its middle is the mean of the parabola through both ends and the middle.
-Conic and Q come from the plain difference C − b bᵀ, which loses digits that float64 has to spare and float32 has not."""
+In motion, the definition is integrated over time numerically. In a segment a splat keeps the conic, amplitude and
+perspective factor Q of the middle time, while its centre moves on the panel along a straight line at constant speed. From
+end to end it moves as the mean μ projected by the two end poses. Its mid-time centre is the average of the parabola through
+both ends and the middle. Conic and Q come from the difference C − b bᵀ. It loses digits, of which float32 has too few."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -53,7 +53,7 @@ def _exact(
     if cutoff_sigma > 0:
         depth = centre @ normal
         reach = cutoff_sigma * np.sqrt(normal @ np.linalg.inv(precision) @ normal)
-        if abs(depth) <= reach:  # the ellipsoid crosses the plane of the source: it is not drawn
+        if abs(depth) <= reach:  # the ellipsoid crosses the plane through the source: kernels do not draw it
             return np.zeros_like(value)
         value = np.where(q <= cutoff_sigma**2, value, 0.0)
     return value
@@ -62,8 +62,8 @@ def _exact(
 def _in_parallel(
     row: np.ndarray, precision: np.ndarray, pose: np.ndarray, detector_shape: tuple[int, int], cutoff_sigma: float
 ) -> np.ndarray:
-    """Returns one Gaussian's line integrals (nv, nu) along parallel rays: density √(2π/a) exp(−q/2), with q the smallest
-    along the ray."""
+    """Returns one Gaussian's line integrals (nv, nu) along parallel rays: density √(2π/a) exp(−q/2), where q is the
+    smallest squared Mahalanobis distance along the ray."""
     offset = pixel_centres(pose, detector_shape) - row[:3]
     a = pose[:3] @ precision @ pose[:3]
     b = np.einsum("vui,ij,j->vu", offset, precision, pose[:3])
@@ -76,8 +76,8 @@ def _affine(
     row: np.ndarray, precision: np.ndarray, pose: np.ndarray, detector_shape: tuple[int, int],
     cutoff_sigma: float,
 ) -> np.ndarray:
-    """Returns one Gaussian's frame (nv, nu) by R2-Gaussian's approximation: covariance through the Jacobian at the
-    centre, amplitude of the central ray."""
+    """Returns one Gaussian's frame (nv, nu) by R2-Gaussian's approximation: its covariance is projected by the Jacobian at
+    the centre, and all rays have the amplitude of the ray through the centre."""
     source, eu, ev = pose[:3], pose[6:9], pose[9:12]
     centre = row[:3] - source
     inverse = np.linalg.inv(np.stack([eu, ev, pose[3:6] - source], -1))
@@ -99,8 +99,8 @@ def splat_frame(
     rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], cutoff_sigma: float = 0.0,
     affine: bool = False,
 ) -> np.ndarray:
-    """Returns the frame (rows, columns) of the paper's Eq. 3, one cell at a time: renders the cell's whole projection,
-    weighs it, cuts out the cell's lines and adds them up."""
+    """Returns the frame (rows, columns) by the paper's Eq. 3: adds up, over the cells, the cell's lines of a complete
+    projection from its pose, times its weight."""
     frame = np.zeros(detector_shape)
     for cell in range(table.count):
         lines = slice(int(table.line_start[cell]), int(table.line_stop[cell]))
@@ -113,8 +113,8 @@ def splat_frame(
 def voxel_field(
     rows: np.ndarray, z: np.ndarray, y: np.ndarray, x: np.ndarray, cutoff_sigma: float = 0.0
 ) -> np.ndarray:
-    """Returns the field (nz, ny, nx) of parameter rows (11, G) at the axes z, y, x, in the rows' unit of length, by
-    direct evaluation."""
+    """Evaluates parameter rows (11, G) at the coordinates z, y, x of voxel centres, in the rows' unit of length. Returns
+    (nz, ny, nx)."""
     points = np.stack(np.meshgrid(x, y, z, indexing="ij"), -1).transpose(2, 1, 0, 3)
     volume = np.zeros(points.shape[:3])
     for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
@@ -125,14 +125,14 @@ def voxel_field(
     return volume
 
 
-_PANELS = 6  # number of panels of the quadrature in time
-_NODES = 12  # number of Gauss–Legendre nodes of each panel
+_PANELS = 6  # number of intervals of the numerical integral over time
+_NODES = 12  # number of Gauss–Legendre nodes in each
 
 
 @dataclass(frozen=True)
 class _Segment:
-    """One Gaussian in one segment, in pixels (u, v): mean centre and path (2,), conic (2, 2), Q's coefficients b (2,) and c
-    (2, 2), and the peak value over the ray's length."""
+    """One Gaussian in one segment of time, in pixels (u, v): average centre and path (2,), conic (2, 2), coefficients b (2,)
+    and c (2, 2) of Q. amplitude: the peak value divided by the length of the ray."""
 
     centre: np.ndarray
     path: np.ndarray
@@ -146,11 +146,10 @@ def moving_frame(
     rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], cutoff_sigma: float = 0.0,
     affine: bool = False, cloud_at: Callable[[float], np.ndarray] | None = None,
 ) -> np.ndarray:
-    """Returns the merged frame (nv, nu) of parameter rows (11, G) over cells with motion, or over cells with a
-    ``conic_pose``.
+    """Returns the merged frame (nv, nu) of parameter rows (11, G) for moving cells, or for cells with a ``conic_pose``.
 
-    A cell with a ``conic_pose`` is a segment without a path: the splat keeps the shape of that pose, at the centre that
-    the cell's pose gives. cloud_at: returns the rows at a time in s, for an object that moves."""
+    With a ``conic_pose`` the splat rests in a cell: it has the shape that this pose gives, and the centre that the cell's
+    own pose gives. cloud_at: for an object that moves, returns the rows at a time in s."""
     moved = table.conic_pose is not None
     poses, end_poses, line_times = _centre_segments(table) if moved else (table.pose, table.end_poses, table.line_times)
     assert end_poses is not None and line_times is not None
@@ -171,8 +170,8 @@ def moving_frame(
 
 
 def _centre_segments(table: TimeCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the conic's pose for each cell (C, 12), each cell's own pose twice (C, 2, 12), and integration times (C, 3,
-    lines) of one instant."""
+    """Describes cells with a ``conic_pose`` as moving ones: that pose for each cell (C, 12), the cell's own pose at both
+    ends (C, 2, 12), and integration times (C, 3, lines) of length 0."""
     times = np.zeros((table.count, 3, table.lines))
     for cell, lines in enumerate(table.ranges):
         times[cell, 2, lines] = table.weight[cell]
@@ -180,7 +179,7 @@ def _centre_segments(table: TimeCells) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def seen_at(pose: np.ndarray, point: np.ndarray, is_parallel: bool = False) -> np.ndarray:
-    """Returns (u, v, depth) of a world point, u and v in pixels; the depth is 1 in a parallel beam."""
+    """Returns (u, v, depth) of a world point, with u and v in pixels. In a parallel beam the depth is 1."""
     if is_parallel:
         p = np.linalg.solve(np.stack([pose[6:9], pose[9:12], pose[:3]], -1), point - pose[3:6])
         return np.array([p[0], p[1], 1.0])
@@ -230,14 +229,14 @@ def _segment_image(
 
 
 def _exponent(s: _Segment, delta: np.ndarray, at: np.ndarray, big_q: np.ndarray) -> np.ndarray:
-    """Returns the exponent q (lines, width) of a segment whose centre has moved by its path times ``at`` (lines, 1 or
-    width)."""
+    """Returns the exponent q (lines, width) when the centre has moved from its average place by ``at`` (lines, 1 or width)
+    times the path."""
     moved = delta - at[..., None] * s.path
     return np.asarray(np.einsum("...i,ij,...j", moved, s.conic, moved) / big_q)
 
 
 def _nearest(s: _Segment, delta: np.ndarray, times: np.ndarray, big_q: np.ndarray) -> np.ndarray:
-    """Returns the smallest exponent q (lines, width) within each line's window."""
+    """Returns the smallest exponent q (lines, width) during each line's exposure."""
     fast = s.path @ s.conic @ s.path
     best = delta @ s.conic @ s.path / fast if fast > 0 else np.zeros(delta.shape[:2])
     first, last = (times[0] - times[1])[:, None], (times[0] + times[1])[:, None]
@@ -245,7 +244,7 @@ def _nearest(s: _Segment, delta: np.ndarray, times: np.ndarray, big_q: np.ndarra
 
 
 def _nodes() -> tuple[np.ndarray, np.ndarray]:
-    """Returns composite Gauss–Legendre nodes on [−1, 1] and weights that sum to 1."""
+    """Returns the nodes of a composite Gauss–Legendre rule on [−1, 1], and its weights, which sum to 1."""
     node, weight = np.polynomial.legendre.leggauss(_NODES)
     middle = (np.arange(_PANELS) + 0.5) / _PANELS * 2 - 1
     return (middle[:, None] + node / _PANELS).ravel(), np.tile(weight / 2 / _PANELS, _PANELS)

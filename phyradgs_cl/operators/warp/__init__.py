@@ -1,1 +1,1 @@
-"""Objects that move or deform during a scan: representative states, the warp of a volume to a state, warped projectors."""
+"""Objects that move or deform during a scan: their states at some times, volumes warped to a state, and projectors."""

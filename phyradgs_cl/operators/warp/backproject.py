@@ -1,6 +1,6 @@
-"""FDK's backprojection of an object that moves: every voxel is taken where its matter is at the time of a view.
+"""FDK's backprojection of an object that moves: a voxel reads each view where its matter was at the time of the view.
 
-The displacement of a view is interpolated between those of two states. S. Rit et al., Comparison of analytic and algebraic
+This displacement is interpolated between two states of the object. S. Rit et al., Comparison of analytic and algebraic
 methods for motion-compensated cone-beam CT reconstruction of the thorax, IEEE Trans. Med. Imaging 28 (2009) 1513."""
 
 from copy import copy
@@ -20,25 +20,25 @@ from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD
 
-_MOST_STEPS = 100  # most iterations of the fixed point that inverts a displacement
-_PROBED = 500  # most voxels at which an inverse is checked
-_WRONG = 0.1  # largest error of an inverse, in voxels; a larger one raises InputError
-_HELD_STATES = 3  # most states whose displacements stay on the device
+_MOST_STEPS = 100  # most iterations that invert a displacement field
+_PROBED = 500  # most voxels at which the inverse is checked
+_WRONG = 0.1  # largest accepted error of the inverse, in voxels
+_HELD_STATES = 3  # most states whose displacements are kept on the device; they take the memory of three volumes each
 
 
 class MovingBackprojector:
     """Backprojects the frames of an object that moves, as FDK does.
 
-    shares (F, K): the fraction of each of K states in a frame, at most two above 0. Holds up to nine volumes on the
-    device. Calls raise InputError where a field has no inverse."""
+    shares (F, K): the fraction of each of K states in a frame, at most two above 0. Keeps up to nine volumes on the device.
+    Calls raise InputError if a displacement field has no inverse."""
 
     def __init__(self, rt: Runtime, states: MotionStates, shares: np.ndarray) -> None:
         self.rt, self.states, self.shares = rt, states, shares
         self._push = lru_cache(_HELD_STATES)(self._push_of)
 
     def of_views(self, views: np.ndarray) -> "MovingBackprojector":
-        """Returns the backprojector of the views with the numbers ``views`` (n,)."""
-        some = copy(self)  # which shares the displacements on the device
+        """Returns the backprojector for the views with the numbers ``views`` (n,)."""
+        some = copy(self)  # both share the displacements on the device
         some.shares = self.shares[views]
         return some
 
@@ -46,8 +46,8 @@ class MovingBackprojector:
         self, frames: np.ndarray, pose: np.ndarray, weight: np.ndarray, grid: Grid, axis: str = "rows", *,
         is_parallel: bool = False,
     ) -> np.ndarray:  # fmt: skip
-        """Returns the backprojection (nz, ny, nx) float32: that of ``backproject``, or of ``backproject_lines`` with a
-        pose per line. frames (F, rows, columns), pose (F, 12) or (F, lines, 12) mm, weight (F,)."""
+        """Returns the backprojection (nz, ny, nx) float32, as ``backproject`` does, or ``backproject_lines`` with a pose per
+        line. frames (F, rows, columns), pose (F, 12) or (F, lines, 12) mm, weight (F,)."""
         volume, pairs = np.zeros(grid.shape, np.float32), _pairs(self.shares)
         for first, second in np.unique(pairs, axis=0).tolist():
             views = np.flatnonzero((pairs == (first, second)).all(1))
@@ -59,7 +59,8 @@ class MovingBackprojector:
         self, pair: tuple[int, int], frames: np.ndarray, pose: np.ndarray, weights: np.ndarray, grid: Grid, axis: str,
         is_parallel: bool,
     ) -> np.ndarray:  # fmt: skip
-        """Backprojects the frames between one pair of states. weights (F, 2): FDK's, and the second state's fraction."""
+        """Backprojects frames that lie between the same two states. weights (F, 2): FDK's weight, and the fraction of the
+        second state."""
         rt, fields = self.rt, [self._push(state) for state in pair]
         size, by_lines = np.array([*grid.shape[::-1], 0], np.int32), pose.ndim == 3
         turned = by_lines and axis == "columns"
@@ -80,8 +81,8 @@ class MovingBackprojector:
         return cast(np.ndarray, in_bricks(rt, Views(frames, turned, matrices, weights), grid, 1, launch))
 
     def _push_of(self, state: int) -> DeviceArray:
-        """Returns the displacement u of a state's matter from the reference, (3, nz, ny, nx) in voxels, components x, y,
-        z. Raises InputError where the field has no inverse."""
+        """Returns how far the matter of each voxel of the reference has moved in a state, (3, nz, ny, nx) in voxels, x, y,
+        z. Raises InputError if the field has no inverse."""
         rt, grid = self.rt, self.states.grid
         pull_mm, wide, margin = self._wide_pull_mm(state)
         spacing_mm = np.array(grid.voxel_size_mm[::-1])
@@ -96,8 +97,8 @@ class MovingBackprojector:
         return push
 
     def _wide_pull_mm(self, state: int) -> tuple[np.ndarray, Grid, tuple[int, int, int]]:
-        """Returns the field w (…, 3) in mm on a wider grid, which holds the grid's matter wherever it moves; that wider
-        grid; and its voxels (z, y, x) before the grid's first."""
+        """Returns the field w (…, 3) in mm on a wider grid, in which the grid's matter stays; this grid; and by how many
+        voxels (z, y, x) it begins earlier."""
         grid, weights = self.states.grid, self.states.weights[state]
         reach_mm = np.abs(np.tensordot(weights, self.states.fields_mm, 1)).max((0, 1, 2))[::-1]
         margin = np.ceil(1.5 * reach_mm / grid.voxel_size_mm).astype(int) + 1
@@ -107,7 +108,7 @@ class MovingBackprojector:
         return self.states.deformation.on_grid_mm(wide, weights), wide, (z, y, x)
 
     def _check_inverse(self, state: int, push_mm: np.ndarray) -> None:
-        """Raises InputError where u, push_mm (voxels, 3), does not invert the deformation at some probed voxels."""
+        """Raises InputError if the displacements push_mm (voxels, 3) do not invert the deformation at some voxels."""
         grid = self.states.grid
         probed = np.linspace(0, len(push_mm) - 1, min(_PROBED, len(push_mm))).astype(int)
         z, y, x = (axis[i] for axis, i in zip(grid.axes_mm(), np.unravel_index(probed, grid.shape), strict=True))
@@ -119,9 +120,9 @@ class MovingBackprojector:
 
 
 def _pairs(shares: np.ndarray) -> np.ndarray:
-    """Returns the two states (F, 2) of every frame from shares (F, K); a frame with one state has it twice."""
+    """Returns the two states (F, 2) whose fractions in a frame, shares (F, K), are above 0. A single one is given twice."""
     largest = np.argsort(-shares, axis=1, kind="stable")
     second = largest[:, min(1, shares.shape[1] - 1)]
     has_two = shares[np.arange(len(shares)), second] > 0
-    # sorted, so that all frames between the same two states are backprojected together
+    # Sorted, so that all frames between the same two states are found and backprojected together.
     return np.sort(np.stack([largest[:, 0], np.where(has_two, second, largest[:, 0])], -1), axis=1)

@@ -1,11 +1,11 @@
-"""The system matrix of a moving object: A x = Σ_k P_k W_k x over the states k, and its exact transpose.
+"""The system matrix of a moving object: A x = Σ_k P_k W_k x, summed over its states k, and its exact transpose.
 
-W_k warps the volume to a state; of an object that changes it takes the state from a stack. P_k projects it to the time cells
-that the state stands for (``states.py``). A cell may also be a blend of two states.
+W_k warps the volume x to state k. For an object that changes, x is a stack of volumes, and W_k takes volume k. P_k projects
+the result to the time cells for which the state stands (``states.py``). A cell may also be a blend of two states.
 
-``FieldDerivative`` differentiates the frames A v with respect to the displacement field w = Σ_r φ_r U_r: to the coefficients
-d_r of the fields U_r (J, with B from coefficients to voxels), and to the weights φ_r. w_k is the field in state k, and ∇v
-the gradient of the cubic spline through the volume:
+``FieldDerivative`` differentiates the frames A v by the displacement field w = Σ_r φ_r U_r. J is the derivative by the
+coefficients d_r of the fields U_r. B maps coefficients to voxels. w_k is the field in state k, and ∇v the gradient of the
+cubic spline through the volume:
 
     J d = Σ_k P_k (∇v(y + w_k) · Σ_r φ_r,k B d_r),    Jᵀ y = Bᵀ Σ_k φ_r,k ∇v(y + w_k) P_kᵀ y"""
 
@@ -30,20 +30,20 @@ from phyradgs_cl.operators.warp.states import MOST_STATES, MotionStates
 from phyradgs_cl.operators.warp.volume import StateStack, TimeStates, VolumeWarp
 from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 
-# number of frames that allows one state more than MOST_STATES: with more frames, warps take a smaller part of the time
+# For every 12 frames one state more than MOST_STATES is allowed: with many frames, warps take little of the time.
 _FRAMES_PER_STATE = 12
-_REACH = 2  # largest distance, in voxels, at which a spline coefficient counts, as in cl/warp.cl
-_BORDER = 4  # width of the border of spline coefficients beyond each face of the volume, in voxels, as in cl/warp.cl
-_SETTLES = 8  # width in voxels of further zeros around it, over which coefficients decay to 3e-5
+_REACH = 2  # a cubic spline's coefficient acts up to this far, in voxels, as in cl/warp.cl
+_BORDER = 4  # width in voxels around the volume in which coefficients are kept, as in cl/warp.cl
+_SETTLES = 8  # width in voxels of further zeros around, over which coefficients decay to 3e-5
 
 
 class WarpedOperator:
-    """Projects an object that moves as the states of ``warp`` do; a ``LinearOperator``.
+    """Projects an object that moves, with the states of ``warp``: a ``LinearOperator``.
 
-    Other arguments and arrays are those of ``RayOperator``; with a ``StateStack`` volumes are stacks (K, nz, ny, nx).
-    ``forward`` warps the volume once for each state that the operator's frames use. Operators of one ``warp`` or
-    ``memory`` share buffers: use them one at a time. Calls raise OutOfMemoryError where the whole volume does not fit on
-    the device."""
+    Other arguments and arrays are those of ``RayOperator``. If ``warp`` is a ``StateStack``, volumes are stacks (K, nz, ny,
+    nx). ``forward`` warps the volume once to each state that the operator's frames use. Operators with the same ``warp`` or
+    ``memory`` share buffers: use them one at a time. Calls raise OutOfMemoryError if the whole volume does not fit on the
+    device."""
 
     def __init__(
         self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells], *,
@@ -69,22 +69,22 @@ class WarpedOperator:
         self.project(lambda k: volume if self.warp.is_still(k) else self.warp.forward(k, source), frames)
 
     def project(self, volume_of: Callable[[int], DeviceArray], frames: DeviceArray) -> None:
-        """Writes Σ_k P_k v_k to frames (F, rows, columns), for volumes v_k (nz, ny, nx) of the states ``states``."""
+        """Writes Σ_k P_k v_k to frames (F, rows, columns). volume_of: returns the volume v_k (nz, ny, nx) of state k."""
         self.rt.fill(frames, 0)
         for part in self._parts:
             part.operator.forward(volume_of(part.state), out=self.warp.stack.of(len(part.frames), self.detector_shape))
             self.warp.stack.add(part.places, frames)
 
     def backprojections(self, frames: DeviceArray) -> Iterator[tuple[int, DeviceArray]]:
-        """Yields each state k that frames use, and P_kᵀ y (nz, ny, nx) of frames y (F, rows, columns), valid until the
-        next step."""
+        """Yields (k, P_kᵀ y) for frames y (F, rows, columns) and each state k that they use. P_kᵀ y (nz, ny, nx) is valid
+        until the next one."""
         for part in self._parts:
             taken = self.warp.stack.take(frames, part.frames)
             yield part.state, part.operator.adjoint(taken, out=self.warp.moved())
 
     @property
     def states(self) -> list[int]:
-        """The numbers of the states that this operator's frames use."""
+        """The numbers of the states that this operator's frames need."""
         return [part.state for part in self._parts]
 
     def adjoint(self, frames: SameArray, out: DeviceArray | None = None) -> SameArray:
@@ -101,8 +101,8 @@ class WarpedOperator:
         self, function: Callable[[DeviceArray, DeviceArray], None], values: SameArray, shape: tuple[int, ...],
         out: DeviceArray | None,
     ) -> SameArray:  # fmt: skip
-        """Calls ``function(values, result)`` on the device. Returns the result where ``values`` lie. Raises
-        OutOfMemoryError where the whole volume does not fit."""
+        """Calls ``function(values, result)`` with device arrays. Returns the result on the side where ``values`` are. Raises
+        OutOfMemoryError if the whole volume does not fit on the device."""
         if (bricks := len(self.memory.plan())) > 1:
             found = f"room for the volume in {bricks} bricks"
             expected = "room for the whole volume, which an object that moves needs"
@@ -113,8 +113,8 @@ class WarpedOperator:
         return cast(SameArray, result if is_there else self.rt.download(result))
 
     def subset(self, frames: Sequence[int]) -> "WarpedOperator":
-        """Returns the operator for the frames with the numbers ``frames``, in the order given. Keep it to use it again,
-        because it uploads tables."""
+        """Returns the operator to the frames with the numbers ``frames``, in that order. Keep it for further use, because
+        its tables take time to upload."""
         chosen = np.asarray(frames, np.int64)
         part = copy(self)
         part._parts = [piece for each in self._parts if (piece := each.subset(self.rt, chosen)) is not None]
@@ -123,19 +123,19 @@ class WarpedOperator:
 
     @property
     def holds(self) -> tuple[int, int]:
-        """Numbers of volumes and of stacks of frames on the device besides ``memory`` and the fields."""
+        """The numbers of volumes and of stacks of frames on the device besides ``memory`` and the displacement fields."""
         return self.warp.volumes, 1
 
 
 class _Part:
-    """The projector P_k of one state, and the numbers ``frames`` (n,) of the operator's frames that use the state."""
+    """The projector P_k of one state, and the numbers ``frames`` (n,) of the operator's frames that need it."""
 
     def __init__(self, rt: Runtime, state: int, frames: np.ndarray, operator: RayOperator) -> None:
         self.state, self.frames, self.operator = state, frames, operator
         self.places = rt.upload(frames, np.int32)
 
     def subset(self, rt: Runtime, chosen: np.ndarray) -> "_Part | None":
-        """Returns the part of the operator's frames ``chosen``; None where none of them uses the state."""
+        """Returns the same for the frames with the numbers ``chosen``, or None if none of them needs this state."""
         position = np.full(max(int(chosen.max()), int(self.frames.max())) + 1, -1)
         position[self.frames] = np.arange(len(self.frames))
         own = position[chosen]
@@ -147,12 +147,10 @@ def projector_of(
     rt: Runtime, grid: Grid, tables: Sequence[TimeCells], deformation: Deformation | None,
     state_times_s: np.ndarray | None = None,
 ) -> Callable[..., RayOperator | WarpedOperator]:
-    """Returns a constructor of projectors, with the arguments of ``RayOperator``; ``RayOperator`` itself for an object at
-    rest.
+    """Returns a function that makes projectors from the arguments of ``RayOperator``: for an object at rest ``RayOperator``.
 
-    deformation: how the object moves, at the times of ``tables``; or state_times_s (K,): times in s of the states of an
-    object that changes. Each cell takes the nearest state: a blend of two states would blur, and project every cell
-    twice."""
+    deformation: how the object moves. Or state_times_s (K,): times in s of the volumes of an object that changes. Each time
+    cell of ``tables`` takes the nearest state. A blend of two states would blur, and every cell would be projected twice."""
     if state_times_s is not None:
         return partial(WarpedOperator, warp=StateStack(rt, grid.shape, TimeStates(state_times_s)))
     if deformation is None:
@@ -166,8 +164,7 @@ def projector_of(
 def _tables_by_state(
     tables: Sequence[TimeCells], warp: VolumeWarp | StateStack
 ) -> list[tuple[np.ndarray, list[TimeCells]]]:
-    """Returns for each state the numbers of the frames that use it, and tables of their cells, weighted by the state's
-    fraction."""
+    """Returns for each state the numbers of the frames that need it, and their tables with the cells that it stands for."""
     ends = np.cumsum([table.count for table in tables])[:-1]
     shares = np.split(warp.states.shares(np.concatenate([table.time_s for table in tables])), ends)
     by_state = []
@@ -186,11 +183,10 @@ def _with_share(table: TimeCells, share: np.ndarray) -> TimeCells | None:
 
 
 class FieldDerivative:
-    """Derivative J of the frames at one volume (nz, ny, nx) in 1/mm and at the field of ``operator``. The states'
-    fractions of a time count as constants.
+    """The derivative J of the frames by the displacement field of ``operator``, at a volume (nz, ny, nx) in 1/mm. Which
+    state stands for which time is taken as fixed.
 
-    Coefficients (R, cz, cy, cx, 3) are in mm, as those of a ``Deformation``. Holds three volumes per state on the
-    host."""
+    Coefficients (R, cz, cy, cx, 3) are in mm, as in ``Deformation``. Keeps three volumes per state on the host."""
 
     def __init__(self, operator: WarpedOperator, volume: np.ndarray) -> None:
         assert isinstance(operator.warp, VolumeWarp)
@@ -223,7 +219,7 @@ class FieldDerivative:
         ]).astype(np.float64)  # fmt: skip
 
     def by_weights(self) -> np.ndarray:
-        """Returns d(frames)/d(weight φ_r), (R, F, rows, columns) float32, for a weight that changes alike at all times."""
+        """Returns d(frames)/d(φ_r), (R, F, rows, columns) float32, for a weight φ_r that changes equally at all times."""
         return np.stack([self._projected(dict.fromkeys(self.slopes, field).__getitem__) for field in self._fields_mm])
 
     def _projected(self, field_of: Callable[[int], np.ndarray]) -> np.ndarray:
@@ -243,8 +239,8 @@ class FieldDerivative:
 
 
 def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Returns ∇v(y + w(y)), (nz, ny, nx, 3) float32 per voxel, components x, y, z, of the cubic spline through v (nz, ny,
-    nx). The spline is 0 outside. w (nz, ny, nx, 3) is in voxels, components x, y, z."""
+    """Returns ∇v(y + w(y)), (nz, ny, nx, 3) float32 per voxel, x, y, z, at voxel centres y. v is the cubic spline through a
+    volume (nz, ny, nx), and 0 outside. displacement: w (nz, ny, nx, 3) in voxels, x, y, z."""
     wide = scipy.ndimage.spline_filter(np.pad(volume, _BORDER + _SETTLES), output=np.float32)
     padded = np.ascontiguousarray(wide[(slice(_SETTLES, -_SETTLES),) * 3])
     strides = (padded.shape[1] * padded.shape[2], padded.shape[2], 1)

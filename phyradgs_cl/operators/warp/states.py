@@ -1,5 +1,5 @@
-"""Representative states of a moving object. Operators warp a volume to each state once, and take for each time the nearest
-state or a blend of two."""
+"""Chooses a few representative states of a moving object. Operators warp a volume to each state only once, and use for each
+time the nearest state, or a blend of two."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,21 +9,19 @@ import numpy as np
 
 from phyradgs_cl.fields import Deformation, Grid
 
-MOST_STATES = 12  # most states of an object, unless ``most`` says otherwise
-# largest distance of a time from its nearest state where states are blended: displacement in voxels, RMS over moving voxels
-_SPACING = 0.6
-_SPACING_OF_NEAREST = 0.3  # largest distance, in voxels RMS, of a time from its nearest state where that state stands for it
+MOST_STATES = 12
+_SPACING = 0.6  # largest distance of a time from a state if states are blended: RMS displacement of moving voxels, in voxels
+_SPACING_OF_NEAREST = 0.3  # largest such distance if the nearest state stands for a time, without a blend
 _MOVES = 0.1  # a voxel counts as moving if its squared displacement is at least this fraction of the largest one
 
 
 @dataclass(frozen=True, eq=False)
 class MotionStates:
-    """Representative states of ``deformation``, and which of them stand for a time.
+    """K representative states of ``deformation``, and which of them stand for a time.
 
-    fields_mm: (R, nz, ny, nx, 3) displacements of unit weight on ``grid``, components x, y, z. weights: (K, R), the
-    fields' weights in each state. metric: (R, R); the distance of two states is √(dᵀ metric d), an RMS displacement in
-    voxels, for a difference d of weights. blends: whether a time between two states gets a blend of both, else the
-    nearest state."""
+    fields_mm: (R, nz, ny, nx, 3) displacements on ``grid`` by each field with weight 1, x, y, z. weights: (K, R) of the
+    fields in each state. metric: (R, R); two states whose weights differ by d are √(dᵀ metric d) apart, an RMS displacement
+    in voxels. blends: a time between two states gets a blend of both; else the nearest state."""
 
     deformation: Deformation
     grid: Grid
@@ -37,11 +35,11 @@ class MotionStates:
         cls, deformation: Deformation, grid: Grid, times_s: np.ndarray, least_voxels: float = 0.0, blends: bool = True,
         most: int = MOST_STATES,
     ) -> "MotionStates":  # fmt: skip
-        """Chooses at most ``most`` states for times (T,) in s: each next state is that of the time furthest from the
-        states so far.
+        """Chooses at most ``most`` states for times (T,) in s. The next state is always the object at the time at which it
+        differs most from all states so far.
 
-        least_voxels: displacement in voxels per unit of every weight, added in the distances, so that fields of zeros
-        have several states too."""
+        least_voxels: changing a weight by 1 counts as a displacement by at least this. So fields that are still zero get
+        several states too."""
         units, fields_mm = np.eye(deformation.rank), unit_fields_mm(deformation, grid)
         voxel_mm = min(grid.voxel_size_mm)
         seen = np.unique(deformation.weights_at(times_s), axis=0)
@@ -68,23 +66,22 @@ class MotionStates:
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether the object stays where the reference volume has it."""
+        """Whether the object is always as in the reference volume."""
         return self.count == 1 and self.is_still(0)
 
     def is_still(self, state: int) -> bool:
-        """Returns whether state ``state`` displaces nothing."""
+        """Returns whether no voxel is displaced in a state."""
         return not np.any(self._has_effect & (self.weights[state] != 0))
 
     @cached_property
     def _has_effect(self) -> np.ndarray:
-        """Whether each field displaces any voxel, (R,) bool."""
         return np.array([field.any() for field in self.fields_mm])
 
     def shares(self, times_s: np.ndarray | Sequence[float]) -> np.ndarray:
-        """Returns the fraction of each state (T, K) at times (T,) in s. A row sums to 1, with at most two states above 0.
+        """Returns the fractions of the states (T, K) at times (T,) in s. They sum to 1, with at most two above 0.
 
-        A blend takes the pair of states with the smallest error. This error, in voxels, adds two: the distance of the
-        time's weights from the line between both states, and the blur of two volumes displaced against each other."""
+        A blend takes the two states with the smallest error in voxels. This is a sum: the distance of the time's weights
+        from the line between the states, and the blur of adding two volumes that are displaced against each other."""
         wanted = self.deformation.weights_at(times_s)
         if not self.blends:
             distances = np.stack([_length(wanted - weights, self.metric) for weights in self.weights], -1)
@@ -106,11 +103,11 @@ class MotionStates:
 
 
 def unit_fields_mm(deformation: Deformation, grid: Grid) -> np.ndarray:
-    """Returns the displacements (R, nz, ny, nx, 3) of unit weight in mm, components x, y, z."""
+    """Returns the displacements (R, nz, ny, nx, 3) in mm by each field with weight 1, x, y, z."""
     return np.stack([deformation.on_grid_mm(grid, unit) for unit in np.eye(deformation.rank)])
 
 
 def _length(difference: np.ndarray, metric: np.ndarray) -> np.ndarray:
-    """Returns the lengths (T,) in voxels, RMS, of differences (T, R) of weights."""
+    """Returns the RMS displacements (T,) in voxels that differences (T, R) of weights make."""
     squared: np.ndarray = np.einsum("tr,rs,ts->t", difference, metric, difference)
     return np.asarray(np.sqrt(np.maximum(squared, 0)))

@@ -1,5 +1,5 @@
-"""Warps of a volume on the device, W_k of each state k, and their exact transposes (cl/warp.cl). Of an object that changes,
-W_k picks state k of a stack in place of a warp of one volume."""
+"""Warps W_k of a volume to the states k of a moving object, and their exact transposes (cl/warp.cl). For an object that
+changes, each state has its own volume, and W_k takes volume k from their stack."""
 
 from dataclasses import dataclass
 
@@ -10,23 +10,23 @@ from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
 
-_BORDER = 4  # spline coefficients beyond each face of the volume, as in cl/warp.cl: further ones are below 3e-3
-_MOST_OWNED = 8  # most slices of the result that a CPU's work-item owns; it repeats the voxels that reach another's too
-_ITEMS_PER_UNIT = 4  # least number of work-items per compute unit that is aimed at
-_HEADROOM = 64  # largest sum of the weights with which voxels add to one, as where the field contracts by 4 along each axis
-_TOGETHER = 8, 8, 4  # voxels (x, y, z) of a GPU's work-group, which add to a slab of local memory
-_SAMPLES = 16  # time to read the 4³ coefficients of a voxel, in samples of a ray
-_ADDED = 64  # time to add to the 4³ coefficients of a voxel, in samples of a ray
-_ROUNDING = 1e-3  # margin in voxels around the range of displacements along z, more than their rounding
+_BORDER = 4  # width in voxels around the volume in which coefficients are kept, as in cl/warp.cl: further ones are < 3e-3
+_MOST_OWNED = 8  # most slices for which a CPU's work-item sums; voxels near their ends are computed by two work-items
+_ITEMS_PER_UNIT = 4  # wanted work-items per compute unit, so that none waits long for the last
+_HEADROOM = 64  # weights with which voxels add to one may sum to this: the field then contracts by 4 along each axis
+_TOGETHER = 8, 8, 4  # box of voxels (x, y, z) of a GPU's work-group, which adds in local memory
+_SAMPLES = 16  # reading the 4³ coefficients of a voxel takes this many times longer than a ray's sample
+_ADDED = 64  # adding to the 4³ coefficients of a voxel takes this many times longer than a ray's sample
+_ROUNDING = 1e-3  # width in voxels by which the range of displacements along z is widened: more than they are rounded
 
 
 class VolumeWarp:
-    """Warps a volume v to each state k of ``states``: (W_k v)(y) = v(y + w_k(y)), 0 outside the volume.
+    """Warps a volume v to each state k of ``states``: (W_k v)(y) = v(y + w_k(y)), and 0 outside the volume.
 
-    Cubic splines through the voxels hardly blur: W_k = B_k F E puts the volume between zeros (E), solves for its spline's
-    coefficients (F) and samples the spline (B_k). F is its own transpose. Holds 3 R volumes on the device for the R
-    fields; a state's displacement is their weighted sum, made where it is used. Results have the same bits in every run:
-    no sum depends on the order of work-items."""
+    Interpolation by cubic splines hardly blurs. W_k = B_k F E pads the volume with zeros (E), solves for the spline's
+    coefficients (F) and samples the spline (B_k). F is symmetric. The R displacement fields take the memory of 3 R volumes
+    on the device; kernels sum them with a state's weights where needed. Results repeat bit for bit, because no sum depends
+    on the order of work-items."""
 
     def __init__(self, rt: Runtime, states: MotionStates) -> None:
         self.rt, self.states, self.shape = rt, states, states.grid.shape
@@ -45,11 +45,11 @@ class VolumeWarp:
     volumes = 4  # most volumes on the device, besides the displacement fields
 
     def is_still(self, state: int) -> bool:
-        """Returns whether W_k is the identity for state k."""
+        """Returns whether W_k is the identity for state k = ``state``."""
         return self.states.is_still(state)
 
     def source(self, volume: DeviceArray) -> DeviceArray:
-        """Returns F E v, the spline's coefficients of a volume v (nz, ny, nx), valid until the next call."""
+        """Returns F E v, the spline coefficients of a volume v (nz, ny, nx). The memory is valid until the next call."""
         if self._source is None:
             self._source = self.rt.empty(self._floats)
         self.rt.fill(self._source, 0)
@@ -58,8 +58,7 @@ class VolumeWarp:
         return self._source
 
     def _filter(self, values: DeviceArray) -> None:
-        """Applies F in place to padded coefficients. It filters whole rows of a plane: their padding is zeros, and stays
-        so."""
+        """Applies F to padded coefficients, in place. Filters padded rows as a whole, because their zeros stay zero."""
         nz, ny, nx = (n + 2 * _BORDER for n in self.shape)
         slice_, row = self._strides.slice, self._strides.row
         start = np.int64(self._strides.start - _BORDER * (slice_ + row + 1))
@@ -71,7 +70,7 @@ class VolumeWarp:
             self.rt.launch(across, (width // lanes, planes), values, start, *sides, group=group)
 
     def forward(self, state: int, source: DeviceArray) -> DeviceArray:
-        """Returns W_k v (nz, ny, nx) for the coefficients ``source`` of v, valid until the next call."""
+        """Returns W_k v (nz, ny, nx) from the coefficients ``source`` of v. The memory is valid until the next call."""
         nz, ny, nx = self.shape
         result, blocks = self.moved(), ceil_div(nx, self.rt.lanes)
         self.rt.launch(
@@ -82,20 +81,20 @@ class VolumeWarp:
         return result
 
     def moved(self) -> DeviceArray:
-        """Returns memory for a volume (nz, ny, nx) of one state; zeros follow its last voxel."""
+        """Returns memory for the volume (nz, ny, nx) of one state. Zeros follow, which vectors may read."""
         if self._moved is None:
             self._moved = self.rt.zeros(int(np.prod(self.shape)) + GUARD)
         return DeviceArray(self._moved.buffer, self.shape, self._moved.dtype)
 
     def zeros(self) -> DeviceArray:
-        """Returns zeros in the layout of the coefficients, valid until the next call."""
+        """Returns zeros in the layout of the coefficients. The memory is valid until the next call."""
         if self._total is None:
             self._total = self.rt.empty(self._floats)
         self.rt.fill(self._total, 0)
         return self._total
 
     def adjoint(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Adds B_kᵀ v to ``total`` for a volume v in the memory of ``moved``; ``read`` then applies Eᵀ F."""
+        """Adds B_kᵀ v to ``total``, for a volume v in the memory that ``moved`` returned. ``read`` then applies Eᵀ F."""
         if self.rt.pixel_items:
             self._adjoint_fixed(state, moved, total)
             return
@@ -109,13 +108,13 @@ class VolumeWarp:
         )  # fmt: skip
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:
-        """Writes the volume Eᵀ F ``total`` (nz, ny, nx) to ``result``. Overwrites ``total``."""
+        """Writes the volume Eᵀ F ``total`` (nz, ny, nx) to ``result``. Destroys ``total``."""
         self._filter(total)
         move(self.rt, (total, self._strides), (result, Strides.plain(self.shape)), self.shape)
 
     def _adjoint_fixed(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Adds B_kᵀ v in whole numbers, whose sums do not depend on their order. 2³¹ / ``_HEADROOM`` stands for the
-        largest voxel, so that rounding is that of float32."""
+        """Adds B_kᵀ v as integers, whose sums do not depend on the order. The largest voxel becomes 2³¹ / ``_HEADROOM``, so
+        rounding is as fine as float32's."""
         largest = self._space.largest(moved, absolute=True)
         if not largest > 0:
             return
@@ -137,7 +136,6 @@ class VolumeWarp:
         return self.rt.kernel("warp", name, RANK=len(self.states.fields_mm))
 
     def _layout(self) -> tuple[int, Strides]:
-        """Returns the floats and strides of the coefficients."""
         nz, ny, nx = self.shape
         slice_ = (ny + 2 * _BORDER) * pitch_of(nx)
         strides = Strides(GUARD + _BORDER * (slice_ + pitch_of(nx)), slice_, pitch_of(nx))
@@ -147,8 +145,7 @@ class VolumeWarp:
         return np.array([*self.shape[::-1], 0], np.int32)
 
     def _reach(self, state: int) -> tuple[DeviceArray, DeviceArray]:
-        """Returns the least and the largest displacement along z, in voxels, of every slice (nz, 2) and of every row (nz,
-        ny, 2)."""
+        """Returns the smallest and largest displacement along z in voxels, for each slice (nz, 2) and row (nz, ny, 2)."""
         fields = (self.states.fields_mm[..., 2] / self.states.grid.voxel_size_mm[0]).astype(np.float32)
         along_z = np.tensordot(self.states.weights[state].astype(np.float32), fields, 1)
         rows = np.stack([along_z.min(-1) - _ROUNDING, along_z.max(-1) + _ROUNDING], -1)
@@ -158,7 +155,7 @@ class VolumeWarp:
 
 @dataclass(frozen=True, eq=False)
 class TimeStates:
-    """States of an object at times (K,) in s, rising. The state nearest in time stands for any time."""
+    """States of an object at times_s (K,), rising. At any other time the object is as in the nearest state."""
 
     times_s: np.ndarray
 
@@ -168,13 +165,13 @@ class TimeStates:
         return len(self.times_s)
 
     def shares(self, times_s: np.ndarray) -> np.ndarray:
-        """Returns the fraction of each state (T, K) at times (T,): 1 for the nearest, else 0."""
+        """Returns the fractions of the states (T, K) at times (T,) in s: 1 for the nearest, else 0."""
         borders_s = (self.times_s[1:] + self.times_s[:-1]) / 2
         return np.asarray(np.eye(self.count)[np.searchsorted(borders_s, times_s, "right")])
 
 
 class StateStack:
-    """Picks states from a stack x (K, nz, ny, nx): W_k x = x_k, with the methods of a ``VolumeWarp``."""
+    """Takes states from a stack x (K, nz, ny, nx): W_k x = x_k. Has the methods of ``VolumeWarp``."""
 
     volumes = 2  # most stacks x on the device
 
@@ -186,30 +183,30 @@ class StateStack:
         self.stack = FrameStack(rt, rt.kernel("warp", "add_frames", RANK=1))
 
     def is_still(self, state: int) -> bool:
-        """Returns False: every state is copied from the stack."""
+        """Returns False, because every state is copied from the stack."""
         return False
 
     def source(self, stack: DeviceArray) -> DeviceArray:
         return stack
 
     def forward(self, state: int, source: DeviceArray) -> DeviceArray:
-        """Returns state k (nz, ny, nx) of the stack ``source``, valid until the next call."""
+        """Returns volume ``state`` (nz, ny, nx) of the stack ``source``. The memory is valid until the next call."""
         self.rt.copy(source, self._one, nbytes=4 * self._voxels, source_offset=4 * self._voxels * state)
         return self.moved()
 
     def moved(self) -> DeviceArray:
-        """Returns memory for a volume (nz, ny, nx) of one state; zeros follow its last voxel."""
+        """Returns memory for the volume (nz, ny, nx) of one state. Zeros follow, which vectors may read."""
         return DeviceArray(self._one.buffer, self._one_shape, self._one.dtype)
 
     def zeros(self) -> DeviceArray:
-        """Returns a stack (K, nz, ny, nx) of zeros, valid until the next call."""
+        """Returns a stack (K, nz, ny, nx) of zeros. The memory is valid until the next call."""
         if self._total is None:
             self._total = self.rt.empty(self.shape)
         self.rt.fill(self._total, 0)
         return self._total
 
     def adjoint(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Writes W_kᵀ v into state k of ``total``, which must be zero: no two parts of an operator have the same state."""
+        """Writes W_kᵀ v to volume k = ``state`` of ``total``. It need not add, because it is called once per state."""
         self.rt.copy(moved, total, nbytes=4 * self._voxels, target_offset=4 * self._voxels * state)
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:
@@ -218,7 +215,7 @@ class StateStack:
 
 
 class FrameStack:
-    """Device memory for the frames of one state at a time."""
+    """Device memory for a stack of frames, used for the frames of one state after the other."""
 
     def __init__(self, rt: Runtime, add: Kernel) -> None:
         self.rt, self._add = rt, add
@@ -226,7 +223,7 @@ class FrameStack:
         self._shape: tuple[int, ...] = ()
 
     def of(self, count: int, detector_shape: tuple[int, int]) -> DeviceArray:
-        """Returns memory for ``count`` frames of ``detector_shape``, valid until the next call."""
+        """Returns memory for ``count`` frames with ``detector_shape``, valid until the next call."""
         self._shape = (count, *detector_shape)
         if self._memory is None or self._memory.size < np.prod(self._shape):
             self._memory = self.rt.empty(self._shape)
@@ -241,7 +238,8 @@ class FrameStack:
         return taken
 
     def add(self, places: DeviceArray, frames: DeviceArray) -> None:
-        """Adds the frames of the last ``of`` or ``take`` to the frames with the numbers ``places`` (n,) of ``frames``."""
+        """Adds the frames in the memory that ``of`` or ``take`` returned last to frames number ``places`` (n,) of
+        ``frames``."""
         assert self._memory is not None
         count, pixels = self._shape[0], int(np.prod(self._shape[1:]))
         group = self.rt.group(on_cpu=min(pixels, 64))
