@@ -70,6 +70,7 @@ def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int
 class _Model(checks.Checked):
     """Base of this module's models, with words for help texts and reports."""
 
+    operators: ClassVar[tuple[str, ...]]  # of RAYS, SPLATS, LINE_POSES: which methods take the model
     poses: ClassVar[str] = ""  # a frame's poses in words, for the help of --motion; "" hides the model from the command line
     counts: ClassVar[str] = ""  # the model's numbers in words, appended to its name
     is_implied: ClassVar[bool] = True  # whether giving one of its numbers, such as --strips, chooses the model

@@ -90,7 +90,8 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
         return options.motion
     name = _implied_motion(options.motion.name, counts, models) if motion is None else motion
     if not isinstance(name, str) or name not in models:
-        raise InputError("--motion", checks.short_repr(name), f"one of {', '.join(models)} for --method {method}")
+        named = [one for one, model in models.items() if getattr(model, "poses", one)]  # the command line has no others
+        raise InputError("--motion", checks.short_repr(name), f"one of {', '.join(named)} for --method {method}")
     model = models[name]
     for key, value in counts.items():
         option = flag_of(key)

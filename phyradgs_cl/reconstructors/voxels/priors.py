@@ -165,7 +165,8 @@ class Prior:
     """Fraction, 0 to 1, of this pass's weight that is due to noise; the rest is due to the discretisation of edges."""
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
-        """Maps a volume (nz, ny, nx) of ``space``; ``weight`` in 1/mm."""
+        """Maps a volume (nz, ny, nx) of ``space``. weight: that of one short step, in 1/mm, about 1/50 of the noise that a
+        denoiser would be told."""
         return space.add(volume, volume, 0.0, nonnegative=nonnegative)
 
     def state(self) -> dict[str, np.ndarray]:
@@ -280,7 +281,7 @@ Denoiser = Callable[[np.ndarray, float], np.ndarray]
 
 class OwnPrior(Prior):
     """A user's denoiser on the host in place of a proximal map (plug-and-play: Venkatakrishnan, Bouman and Wohlberg
-    2013)."""
+    2013). Its change at such a weight must not vanish: two weights must give two volumes."""
 
     def __init__(self, denoiser: Denoiser) -> None:
         self.denoiser, self.subject = denoiser, f"--prior {function_name(denoiser)}"
