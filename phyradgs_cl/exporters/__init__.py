@@ -32,7 +32,7 @@ OWN = "h5"
 """This package's volume files. Their values stay in 1/mm; a scale of Hounsfield units is stored next to them."""
 ScaleOf = Callable[[Volume], Hounsfield | None]
 _SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": (), "zarr": (".ome.zarr", ".zarr")}
-_PLAIN = "values in 1/mm"  # written into files of other programs, which have no field for this unit
+_PLAIN = "values in 1/mm"  # a note for files of other programs, which have no field for this unit
 
 
 def export_volume(
@@ -199,8 +199,7 @@ def default_output(path: Path, to: str) -> Path:
 
 
 def format_of(output: str | Path | None, subject: str = "--to") -> str:
-    """Returns the format, one of ``EXPORTS`` or ``OWN``, to which an output's suffix belongs. Raises InputError for other
-    suffixes and for None."""
+    """Returns the format (``EXPORTS``, ``OWN``) of an output's suffix. Raises InputError for other suffixes and None."""
     for to in (*EXPORTS, OWN):
         if output is not None and _suffixes(to) and Path(output).name.lower().endswith(_suffixes(to)):
             return to

@@ -27,8 +27,8 @@ _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_di
 Length = float | Callable[[], float]
 Pitch = tuple[float, float] | Callable[[], tuple[float, float]]
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_VIEW_DIGITS = 5  # decimals to which two views' angles, or scaled poses, must agree to count as the same view
-_SLACK = 1e-6  # fraction of a frame's span by which pose tables are extended, so that rounding leaves no time outside
+_VIEW_DIGITS = 5  # views are equal if cosine and sine of their angles, or their scaled poses, agree to so many decimals
+_SLACK = 1e-6  # pose tables are extended by this fraction of a frame's duration, so that rounding leaves no time outside
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ def make_timing(
 
 def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> CircularOrbit:
     """Returns a circular orbit through gantry angles (F,) in rad. Central differences of the angles over time give the
-    gantry's speed within a frame; differences are one-sided at both ends. A frame at rest does not turn."""
+    gantry's speed within a frame; differences are one-sided at both ends. Frames taken at rest keep their angle."""
     angle_rad = np.asarray(angle_rad, np.float64)
     exposure_s = timing.shutter.exposure_s
     if not timing.is_fly:
@@ -144,7 +144,7 @@ class Turned:
         return array[..., ::-1] if self.columns else array
 
     def poses(self, pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-        """Converts poses (..., 12) of the stored images to those of the flipped ones. panel: (rows, columns)."""
+        """Converts poses (..., 12), see ``PoseTable``, of stored images to those of flipped ones. panel: (rows, columns)."""
         pose = np.array(pose, np.float64)
         sides = (self.rows, panel[0], slice(9, 12)), (self.columns, panel[1], slice(6, 9))
         for count, step in ((count, step) for is_flipped, count, step in sides if is_flipped):
@@ -154,7 +154,7 @@ class Turned:
 
 
 def turn_of(pose: np.ndarray) -> Turned:
-    """Finds, from a stored image's pose (12,), the flips that put row 0 at the bottom and column 0 on the left."""
+    """Finds the flips that put row 0 at the bottom and column 0 on the left, from an image's pose (see ``PoseTable``)."""
     source, step_u, step_v = pose[:3], pose[6:9], pose[9:12]
     right = np.array([-source[1], source[0], 0.0])
     return Turned(rows=bool(step_v[2] < 0), columns=bool(step_u @ right < 0))
@@ -274,11 +274,11 @@ class RotaryStage:
     shift_mm: np.ndarray | None = None
 
     def poses(self, angle_rad: np.ndarray, shift_mm: np.ndarray | float = 0.0) -> np.ndarray:
-        """Returns poses (T, 12) at gantry angles (T,), in the sample's frame. shift_mm (T, 2): the panel's shifts (v, u)."""
-        upright = self.geometry.pose(0.0).reshape(4, 3)  # x to the source, y to the right, z up
+        """Returns poses (T, 12), see ``PoseTable``, at gantry angles (T,). shift_mm (T, 2): the panel's shifts (v, u)."""
+        upright = self.geometry.pose(0.0).reshape(4, 3)  # in axes x to the source, y to the right, z up
         is_parallel = isinstance(self.geometry, ParallelGeometry)
         parts = np.repeat(upright[None], len(angle_rad), axis=0)
-        parts[:, int(is_parallel) : 2, 1] -= self.axis_u_mm  # the axis becomes the origin
+        parts[:, int(is_parallel) : 2, 1] -= self.axis_u_mm  # moves source and panel, so that the axis is at y = 0
         parts[:, 1, 2:0:-1] += shift_mm
         leaning = Rotation.from_euler("YX", [-self.tilt_rad, -self.roll_rad])  # rotates the z axis onto the stage's axis
         turned = (Rotation.from_euler("z", np.reshape(angle_rad, (-1, 1))) * leaning.inv()).as_matrix()

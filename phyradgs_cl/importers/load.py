@@ -37,7 +37,7 @@ _KINDS = {
     ("fit", "fits"): ("FITS", "convert them to TIFF: astropy.io.fits and tifffile.imwrite"),
     ("xrm", "txm"): ("single images or a volume of Xradia", "import the scan's .txrm, or export TIFFs"),
 }  # fmt: skip
-_MOST_FILES = 1000  # a folder's files that are looked at for an error about its format; more would take long
+_MOST_FILES = 1000  # files of a folder whose suffixes are read for an error about its format; more would take long
 
 
 def refuse_unread(path: Path, expected: str) -> None:
@@ -78,7 +78,7 @@ FORMATS = {
     "tigre": ("pickles:tigre", "TIGRE"),
 }
 _MOST_BODIES = 1000  # no calibration phantom has more beads and wires
-_LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5  # beyond these, coordinates in mm and attenuations in 1/mm are in wrong units
+_LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5  # larger coordinates and attenuations must be in wrong units
 _COMMON = "attenuation_per_mm"
 _KEYS = {"bead": ("centre_mm", "radius_mm", _COMMON), "wire": ("from_mm", "to_mm", "radius_mm", _COMMON)}
 

@@ -21,7 +21,7 @@ _COLUMNS = re.compile(r",\s+|[;:\s]+")
 _ANGLE, _RAD = re.compile(r"angle|theta|phi|rot|deg", re.I), re.compile(r"\brad", re.I)
 _BRIGHTER = 1.2  # a pixel above this many times the stated counts of air is too bright: noise does not reach so far
 _FEW = 0.01  # this fraction of the pixels may be too bright, because they are broken
-_HEAD_BYTES = 1 << 14  # bytes at a file's start in which words of its format are searched
+_HEAD_BYTES = 1 << 14  # words of a format are searched in so many bytes at a file's start
 TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
 
 
@@ -44,7 +44,7 @@ def number_at_start(text: str, comma_is_decimal: bool = False) -> tuple[float, s
 
 
 def commas_are_decimal(texts: list[str]) -> bool:
-    """Returns whether numbers in the texts have decimal commas: some comma cannot mean thousands, and there is no point."""
+    """Returns whether numbers in the texts have decimal commas: a comma that cannot mark thousands, and no point."""
     commas = any(_ONE_COMMA.fullmatch(text) and not _EITHER.fullmatch(text) for text in texts)
     return commas and not any(re.fullmatch(r"[-+]?\d*\.\d+", text) for text in texts)
 

@@ -26,7 +26,7 @@ _LONGEST = 50  # characters of the target's name kept in a temporary one: at 4 b
 _LONGEST_BYTES = 255  # longest file name that common file systems allow
 _SPARE_BYTES = 1 << 16  # room on the disk that is reserved for headers, besides the arrays
 _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part(\.[a-z.]+)?$")
-_FORMAT = 2  # version of checkpoints
+_FORMAT = 2  # version of the checkpoint format; other versions are refused
 _RESTART = "start without --resume"
 
 
@@ -79,7 +79,7 @@ def only_run(output: str | Path) -> Iterator[None]:
         yield
     finally:
         with suppress(OSError):
-            path.unlink()  # before the release: a process that waits then sees that the file is gone
+            path.unlink()  # before the release, so that a waiting process sees that the file is gone
         lock.release()
 
 
@@ -156,7 +156,7 @@ def temporary_name(target: Path, suffix: str = "") -> Path:
 
 @cache
 def _machine() -> str:
-    """Identifies this machine and, on it, the container: within it process numbers are unique."""
+    """Returns a hash of this machine and its container (PID namespace), within which process numbers are unique."""
     namespace = ""
     with suppress(OSError):
         namespace = os.readlink("/proc/self/ns/pid")
@@ -169,14 +169,14 @@ def _is_dead(process: int) -> bool:
     try:
         os.kill(process, 0)
     except OSError as error:
-        return isinstance(error, ProcessLookupError)  # any other error: a process of another user, alive
+        return isinstance(error, ProcessLookupError)  # any other error: another user's process, alive
     return False
 
 
 def _discard(path: Path) -> None:
     try:
         path.unlink()
-    except OSError:  # a folder, or removed by another process
+    except OSError:  # ``path`` is a folder, or another process has removed it
         shutil.rmtree(path, ignore_errors=True)
 
 

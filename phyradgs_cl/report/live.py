@@ -92,8 +92,7 @@ class Status:
     snapshot: Snapshot | None = None
 
     def after(self, progress: Progress, now: float) -> "Status":
-        """Returns the status after a report at ``now`` (s since 1970). A new curve begins where iterations start again, as
-        after a trial."""
+        """Returns the status after a report at ``now`` (s since 1970). If iterations start again, so does the curve."""
         last, points, first = self.progress, self.points, self.first
         is_same = last is not None and (last.quantity, last.iterations) == (progress.quantity, progress.iterations)
         if last is None or not is_same or progress.iteration < last.iteration:

@@ -22,12 +22,12 @@ from phyradgs_cl.io.scan import BEAMS
 from phyradgs_cl.io.tables import Fields
 
 META = "meta_data.json"
-META_WITH_TIMES = "meta_data_motion_blur_rolling_shutter_fps18.json"  # in folders of PhyRadGS
+META_WITH_TIMES = "meta_data_motion_blur_rolling_shutter_fps18.json"  # the description in folders of PhyRadGS
 ROW_0 = "top"
 OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 OPTIONS_WITH_TIMES = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
 _KEYS = ("first_line_start", "first_line_end", "last_line_end")
-_SAME = 1e-3  # readout over exposure may differ by this between frames, or by this fraction of a ratio above 1
+_SAME = 1e-3  # readout over exposure may differ by this much between frames; for ratios above 1, by this fraction
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,7 +44,7 @@ _MAKERS = (
 def _read_geometry(rtk: Any, reader_name: str, description: str, names: list[str]) -> Any:
     """Reads RTK's geometry from the description and, for makers that store angles there, from the projections' headers."""
     reader = getattr(rtk, reader_name).New()
-    if hasattr(reader, "SetFilename"):  # Elekta's description holds the geometry of all projections
+    if hasattr(reader, "SetFilename"):  # Elekta's reader: the description has the geometry of all projections
         reader.SetFilename(description)
         reader.GenerateOutputInformation()
         return reader.GetOutputObject()

@@ -75,8 +75,7 @@ def read_values(
     source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: str = "iuf", rows: slice | None = None
 ) -> np.ndarray:
     """Reads a dataset in its own type. kinds: the allowed letters of NumPy's ``dtype.kind``. rows: the only rows that are
-    read of a stack (..., v, u). Raises InputError for damage and other types, OutOfMemoryError for more data than this
-    machine's memory holds."""
+    read of a stack (..., v, u). Raises InputError for damage and other types, OutOfMemoryError for more than fits memory."""
     if dataset.dtype.kind not in kinds:
         expected = "numbers" if "f" in kinds else "whole numbers"
         raise source.error(address, f"type {dataset.dtype}", expected, "store them as plain HDF5 numbers")
@@ -153,8 +152,7 @@ def read_integers(source: Hdf5Source, address: str, shape: Sequence[int | None])
 def read_word(
     source: Hdf5Source, address: str, allowed: Collection[str] | None = None, default: str | None = None
 ) -> str:
-    """Reads a string, one of ``allowed`` if given. Raises InputError for others, and for a missing dataset that has no
-    ``default``."""
+    """Reads a string, one of ``allowed`` if given. Raises InputError for others, and for no dataset without ``default``."""
     if default is not None and source.optional(address) is None:
         return default
     dataset, word = source.dataset(address), None
