@@ -106,7 +106,7 @@ def _is_index(values: list[float]) -> bool:
 
 
 def _column(path: Path, names: list[str], table: list[list[float]], count: int, column: int | None) -> np.ndarray:
-    """Returns a table's angles in the stored unit: its only column or row, the column with such a name, or the one next to
+    """Returns a table's angles in the stored unit: its only column or row, the column named as an angle, or that next to
     an index, which gives the order. Raises InputError if several columns may be meant."""
     widths = {len(row) for row in table}
     if widths == {1} or (len(table) == 1 and column is None) or (len(table) < count == sum(map(len, table))):
@@ -175,7 +175,7 @@ def read_settings(
 ) -> Settings:
     """Reads the lines NAME ``separator`` VALUE for the given ``names``, in upper or lower case; ignores other lines.
 
-    sections: the only [sections] that are read; () reads all. If two sections have a name, the first counts. Raises
+    sections: the only [sections] that are read; () reads all. If a name is in two sections, the first counts. Raises
     InputError for a file with none of the names, and for a section that gives a name two values."""
     spelt, wanted = {name.lower(): name for name in names}, {section.lower() for section in sections}
     values: dict[tuple[str, str], str] = {}  # keys are (section, name)

@@ -112,7 +112,7 @@ def written_beside(path: str | Path, size_bytes: int = 0, suffix: str = "") -> I
 
 
 def _target(path: str | Path) -> Path:
-    """Returns the file to write, to which a symbolic link may point. Raises OutputError if it cannot be written."""
+    """Returns the file to write: ``path``, or where its symbolic link leads. Raises OutputError if it cannot be written."""
     shown = str(path)
     if not shown or shown.endswith(("/", os.sep)) or os.path.isdir(shown):
         raise OutputError(shown or "output path", "a folder", "a file name", "add a file name to the path")

@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Values (nz, ny, nx) float32 in 1/mm and their grid; None for a bare array. provenance: how they were made, with the
+    """Values (nz, ny, nx) float32 in 1/mm and their grid, None for a bare array. provenance: how they were made, in the
     types of ``tables.PROVENANCE``. gaussians: float32, in mm and 1/mm. metrics: by name. deformation: the object's motion
     from this volume. states: the object at several times, whose mean is this volume. doubt: σ (nz, ny, nx) in 1/mm."""
 

@@ -134,7 +134,7 @@ def panel_corners(pose: Points, detector_shape: tuple[int, int]) -> Points:
 
 
 def _first_arc(scan: Scan) -> Points:
-    """Returns poses (T, 12) of the first frame, from when its first line is exposed to when its last line ends."""
+    """Returns ``PoseTable``'s poses (T, 12) from when the first frame's first line opens to when its last line closes."""
     first_s, last_s = scan.shutter.lit_span_s if scan.is_fly else (scan.shutter.middle_s,) * 2
     times_s = scan.frame_start_s[0] + np.linspace(first_s, last_s, _ARC_SAMPLES)
     return with_sources(scan, scan.trajectory.pose(0, times_s))

@@ -132,7 +132,7 @@ class PlainUnpickler(pickle.Unpickler):
 
 
 class _Type:
-    """A NumPy type of plain numbers. Unpickling calls ``__setstate__`` with its byte order."""
+    """A NumPy type of plain numbers, by a code such as "f4". Unpickling then sets the byte order by ``__setstate__``."""
 
     __slots__ = ("dtype",)
 

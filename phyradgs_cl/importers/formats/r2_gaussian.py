@@ -49,7 +49,7 @@ class R2Folder:
         return cls(folder, meta, read_geometry(meta.table("scanner"), unit_mm), unit_mm)
 
     def frame(self, entry: Fields) -> np.ndarray:
-        """Reads one projection (v, u) as stored."""
+        """Reads the projection (v, u) of an entry, as stored."""
         name = entry.word("file_path")
         first_copy = name.replace("_sim1", "")  # _sim1 marks a repeated simulation; some folders have only the first one
         path = self.folder.file(first_copy if self.folder.exists(first_copy) else name, entry.name("file_path"))
@@ -141,7 +141,7 @@ def _offset(scanner: Fields, key: str, count: int) -> np.ndarray:
 
 
 def turned_volume(subject: str, volume: np.ndarray, grid: Grid, per_mm: float) -> np.ndarray:
-    """Converts a stored volume [x, y, z] to (nz, ny, nx) float32 in 1/mm; ``per_mm``: the factor of its values. Raises
+    """Converts a stored volume [x, y, z], times the factor ``per_mm``, to (nz, ny, nx) float32 in 1/mm. Raises
     InputError for a shape other than the grid's, and for values that are not finite in float32."""
     checks.shape(subject, volume, grid.shape[::-1])
     checks.finite(subject, volume)
@@ -190,7 +190,7 @@ def exposure_of_blurred_s(options: ImportOptions) -> float:
 
 
 def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarray) -> float:
-    """Returns readout time over exposure from the angles (F,) in rad through which the gantry turns in each. Raises
+    """Returns readout time over exposure time, from the gantry's arcs (F,) in rad during both. Raises
     InputError where the ratio differs between frames, and for exposures without a turn."""
     if np.any(exposure_arc == 0) or np.any(np.sign(exposure_arc) != np.sign(exposure_arc[0])):
         found = f"arcs from {exposure_arc.min():.6g} to {exposure_arc.max():.6g} rad"

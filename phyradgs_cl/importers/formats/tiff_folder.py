@@ -157,7 +157,7 @@ def _line_integrals(
 
 
 def _files(folder: SafeFolder, frames: Fields, name: str, default: str = "") -> list[Path]:
-    """Returns the files that match the patterns which ``frames`` has under ``name``, or ``default`` without that key."""
+    """Returns the files that match the patterns under the key ``name`` of [frames], or ``default`` without that key."""
     value = frames.values.get(name) or default
     paths: list[Path] = []
     for one in value if isinstance(value, list) else [value] if value else []:

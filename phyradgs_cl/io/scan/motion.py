@@ -153,7 +153,7 @@ def _sense(source: Hdf5Source, address: str, absent: float) -> float:
 
 
 def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, first_rad: np.ndarray) -> None:
-    """Warns if table and rotation_angle differ by more than 5°, as with a wrong sign. The table is still used."""
+    """Warns if encoder table and rotation_angle, both (P,), differ by over 5°, as with a wrong sign. The table is used."""
     apart_rad = np.abs((table_rad - first_rad + np.pi) % (2 * np.pi) - np.pi)
     if apart_rad.max() > _SUSPECT_RAD:
         text = "%s: up to %.3g° from rotation_angle; the table is used"
