@@ -274,7 +274,7 @@ class RotaryStage:
     shift_mm: np.ndarray | None = None
 
     def poses(self, angle_rad: np.ndarray, shift_mm: np.ndarray | float = 0.0) -> np.ndarray:
-        """Returns poses (T, 12) in the sample's frame (``PoseTable``) at angles (T,). shift_mm (T, 2): panel shifts (v, u)."""
+        """Returns poses (T, 12) in the sample's frame (``PoseTable``) at angles (T,). shift_mm (T, 2): panel's shifts."""
         upright = self.geometry.pose(0.0).reshape(4, 3)  # in axes x to the source, y to the right, z up
         is_parallel = isinstance(self.geometry, ParallelGeometry)
         parts = np.repeat(upright[None], len(angle_rad), axis=0)

@@ -51,7 +51,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
         reader.ReadImageInformation()
         yield sitk, reader
     except (RuntimeError, EOFError, gzip.BadGzipFile, zlib.error) as error:
-        text = str(error).rpartition("ERROR: ")[2].partition("Reason:")[0]  # an earlier error follows "Reason:"
+        text = str(error).rpartition("ERROR: ")[2].partition("Reason:")[0]  # "Reason:" begins an earlier error
         reason = re.sub(r"^\w+\(0x\w+\): ", "", text.strip()).replace(subject, "")[:100]
         raise InputError(subject, f"a damaged file ({reason})", "an image of three axes") from error
 

@@ -57,9 +57,9 @@ def _is_dicom(path: Path) -> bool:
         return file.read(132)[128:] == b"DICM"
 
 
-# Format: its module in formats/, loaded when it is needed, and whose scans it reads, for the help. The module has
-# recognises(path) -> bool and import_scan(path, options) -> Scan for a file or folder. For MODULE:END they are called
-# recognises_END and import_scan_END.
+# By format: its module in formats/, which is loaded when it is needed, and whose scans it reads, for the help.
+# A module has recognises(path) -> bool and import_scan(path, options) -> Scan, for a file or a folder.
+# For MODULE:END the module's functions are recognises_END and import_scan_END.
 FORMATS = {
     "r2": ("r2_gaussian", "R2-Gaussian"),
     "phyradgs": ("r2_gaussian:with_times", "PhyRadGS"),

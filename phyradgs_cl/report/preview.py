@@ -121,7 +121,7 @@ def add_volume(viewer: Any, stored: Volume, name: str) -> None:
     """Adds a volume to napari's ``viewer``, in mm at its position. Axes are z, y, x, y points up, and black is 0."""
     viewer.add_image(stored.values, **_look_of_volume(stored, name))
     viewer.dims.axis_labels = _AXES
-    if hasattr(viewer.camera, "orientation2d"):  # napari has this since 0.6; before, y points down
+    if hasattr(viewer.camera, "orientation2d"):  # napari 0.6 and later; in earlier ones y points down
         viewer.camera.orientation2d = ("up", "right")
     # napari 0.9 moved overlays to its canvas
     overlays = viewer.canvas.overlays if hasattr(viewer, "canvas") else viewer

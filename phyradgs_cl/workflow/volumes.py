@@ -76,7 +76,7 @@ def run_evaluation(
     if result.doubt is not None and grid is not None:
         facts, curve = provenance.get("doubt"), picture.with_name(f"{picture.stem}.doubt.png")
         stated = facts.get("multiple_95") if isinstance(facts, Mapping) else None
-        multiple_95 = stated if isinstance(stated, float) else 1.96  # 95 % of a normal distribution
+        multiple_95 = stated if isinstance(stated, float) else 1.96  # 95 % of a normal distribution lie within 1.96 σ
         bar = volume if (of_bars := aligned(result.doubt, grid, *truth)) is None else of_bars.volume
         with finish_despite_interrupt(), written_beside(curve) as temporary:
             reliability_png(temporary, bar, volume, reference, multiple_95)
