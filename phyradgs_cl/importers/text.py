@@ -58,7 +58,7 @@ def read_angles_rad(path: Path, count: int, unit: str | None = None, column: int
     lines = [(i, text) for i, line in numbered if (text := line.partition("#")[0].strip())]
     is_header = [not re.search(r"\d", line) or (_cells(line, True) or _cells(line, False)) is None for _, line in lines]
     head = is_header.index(False) if False in is_header else len(lines)
-    if column is not None:  # a scanner's file, in which lines above the table may look like the table's
+    if column is not None:  # a scanner's file: lines above the table may look like its lines
         head = max(head, len(lines) - count)
     names, rows = [line for _, line in lines[:head]], lines[head:]
     is_comma = _is_decimal_comma(path, [line for _, line in rows])

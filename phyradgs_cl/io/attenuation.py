@@ -72,7 +72,7 @@ def words_of_hu(volumes: Mapping[Path, Volume], mu_water_per_mm: float | None = 
 
 
 def attenuation_of(subject: str, volume: Volume) -> Volume:
-    """Returns the volume. Raises InputError about ``subject`` for values that cannot be 1/mm, such as Hounsfield units."""
+    """Returns ``volume``. Raises InputError about ``subject`` if its values cannot be 1/mm, such as HU."""
     lowest, highest = float(volume.values.min()), float(volume.values.max())
     if lowest < _LOWEST_PER_MM or highest > _HIGHEST_PER_MM:
         found = f"values from {lowest:g} to {highest:g}, as of Hounsfield units"

@@ -55,7 +55,7 @@ def make_folder(folder: Path, subject: Path) -> None:
 
 
 def lock_path(output: str | Path) -> Path:
-    """Returns the path of the lock file of ``output``. A file that a dead process has left does not lock."""
+    """Returns the path of the lock file of ``output``. A lock file that a dead process left locks nothing."""
     return beside(Path(os.path.realpath(output)), ".lock", ".")
 
 

@@ -59,7 +59,7 @@ class Snapshot:
 
     @cached_property
     def parts(self) -> list[Markup]:
-        """The page's sections with pictures."""
+        """The page's sections with pictures: slices and, if there are any, frames."""
         words = note(f"The middle slices after iteration {self.iteration}.")
         pictures = stills(middle_planes(self.slices, self.grid, (0.0, self.high)), "volume", self.high)
         parts = [section("slices", "Slices", words, pictures)]

@@ -27,7 +27,7 @@ from phyradgs_cl.io.tables import read_facts
 
 _log = logging.getLogger(__name__)
 _JITTER = 0.01  # measured times of frames may differ from their median by this fraction of it
-_DEEPEST_ENTRY = 3  # NXtomo entries, also subentries, are searched in so many levels of groups
+_DEEPEST_ENTRY = 3  # levels of groups in which NXtomo entries and subentries are searched
 
 
 @dataclass(frozen=True, eq=False)

@@ -163,7 +163,7 @@ def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, firs
 def read_gating(source: Hdf5Source, entry: str, used: np.ndarray, middle_s: np.ndarray) -> Gating | None:
     """Reads the gating signal or phase of the projections; None if the file has neither. used, bool (F,): which stored
     frames are projections. middle_s (P,): the middle of each projection's time. Raises InputError for a signal and a phase
-    together, and for equal times."""
+    together, and for frames at equal times."""
     if source.optional_group(f"{entry}/{schema.GATING}") is None:
         return None
     signal, phase = f"{entry}/{schema.SIGNAL}", f"{entry}/{schema.PHASE}"
