@@ -113,7 +113,7 @@ def _fitting(
     names: Mapping[str, Sequence[str]],
 ) -> np.ndarray:
     """Returns which frames, bool (k,), are like the others in median and pattern. group (k,): their indices in ``stack``.
-    All are kept if no majority shows which are right. light: the flats' median counts. Warns of each that is unlike."""
+    tolerance: of medians, as a fraction of ``light``, the flats' median. Keeps all without a majority; warns of others."""
     some, level = _levels(stack[group])
     usual = float(np.median(level))
     is_odd = np.abs(level - usual) > tolerance * light

@@ -123,7 +123,7 @@ def read_grid(scanner: Fields, unit_mm: float) -> Grid:
 
 
 def _pitches(scanner: Fields, what: str, counts: tuple[int, ...]) -> np.ndarray:
-    """Returns sizes of a pixel (dDetector) or voxel (dVoxel) along each axis, else the total size (s...) over the count."""
+    """Returns a pixel's or voxel's size along each axis: key dVoxel (or dDetector), else the total sVoxel over the count."""
     if scanner.has(f"d{what}"):
         return scanner.lengths(f"d{what}", len(counts))
     return scanner.lengths(f"s{what}", len(counts)) / np.array(counts)

@@ -236,7 +236,7 @@ def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, f
 
 def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bool) -> float:
     """Reads one time in s for all projections, stored once or for every frame. Measured times may differ by a percent; the
-    result is their median. Returns 0 if it is missing and not ``needed``."""
+    result is their median. Returns 0 if the dataset is missing and not ``needed``."""
     dataset = source.dataset(address) if needed else source.optional(address)
     if dataset is None:
         return 0.0
