@@ -112,7 +112,7 @@ def load_deformation(path: str | Path) -> Deformation:
 def save_deformation(path: str | Path, deformation: Deformation) -> None:
     """Writes ``deformation``, how an object moves, to a file, completely or not at all.
 
-    path: the HDF5 file, replaced if it exists. Raises InputError for other objects, OutputError if writing fails."""
+    path: an HDF5 file, new or replaced. Raises InputError for anything but a Deformation, OutputError if writing fails."""
     if not isinstance(deformation, Deformation):
         raise InputError("deformation", checks.short_repr(deformation), "a Deformation")
     write_deformation(_checked_path(path), deformation)

@@ -199,7 +199,8 @@ def default_output(path: Path, to: str) -> Path:
 
 
 def format_of(output: str | Path | None, subject: str = "--to") -> str:
-    """Returns the format (``EXPORTS``, ``OWN``) of an output's suffix. Raises InputError for other suffixes and None."""
+    """Returns the format, one of ``EXPORTS`` or ``OWN``, to which an output's suffix belongs. Raises InputError for other
+    suffixes and for None."""
     for to in (*EXPORTS, OWN):
         if output is not None and _suffixes(to) and Path(output).name.lower().endswith(_suffixes(to)):
             return to

@@ -230,7 +230,8 @@ def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
 def parallel(
     options: ImportOptions, panel: tuple[int, int], pitch_mm: Pitch, offset_mm: tuple[float, float]
 ) -> ParallelGeometry:
-    """Returns a parallel beam of the options' numbers, else the arguments, the file's. Raises InputError for a distance."""
+    """Returns a parallel beam from the options' numbers, else the arguments, which are the file's. Raises InputError for an
+    option that is a distance."""
     for name in options.given(_DISTANCES):
         expected, remedy = "no distance: this file has a parallel beam", "leave it out"
         raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
@@ -274,7 +275,8 @@ class RotaryStage:
     shift_mm: np.ndarray | None = None
 
     def poses(self, angle_rad: np.ndarray, shift_mm: np.ndarray | float = 0.0) -> np.ndarray:
-        """Returns poses (T, 12) in the sample's frame (``PoseTable``) at angles (T,). shift_mm (T, 2): panel's shifts."""
+        """Returns poses (T, 12), see ``PoseTable``, in the sample's frame at gantry angles (T,) in rad. shift_mm (T, 2): the
+        panel's shifts (v, u)."""
         upright = self.geometry.pose(0.0).reshape(4, 3)  # in axes x to the source, y to the right, z up
         is_parallel = isinstance(self.geometry, ParallelGeometry)
         parts = np.repeat(upright[None], len(angle_rad), axis=0)

@@ -113,7 +113,8 @@ def _fitting(
     names: Mapping[str, Sequence[str]],
 ) -> np.ndarray:
     """Returns which frames, bool (k,), are like the others in median and pattern. group (k,): their indices in ``stack``.
-    tolerance: of medians, as a fraction of ``light``, the flats' median. Keeps all without a majority; warns of others."""
+    tolerance: of the median, as a fraction of ``light``, the flats' median counts. All are kept if no majority shows which
+    are right. Warns of each that is unlike."""
     some, level = _levels(stack[group])
     usual = float(np.median(level))
     is_odd = np.abs(level - usual) > tolerance * light

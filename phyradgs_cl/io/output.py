@@ -212,7 +212,7 @@ def shortened(name: str, most_bytes: int) -> str:
 
 
 def beside(path: str | Path, ending: str, beginning: str = "") -> Path:
-    """Returns the path ``beginning`` + name + ``ending`` in the same folder, shortened to 255 bytes if need be."""
+    """Returns the path ``beginning`` + name + ``ending`` in the same folder. Shortens names of more than 255 bytes."""
     room = _LONGEST_BYTES - len(os.fsencode(beginning + ending))
     path = Path(path)
     return path.with_name(f"{beginning}{shortened(path.name, room)}{ending}")

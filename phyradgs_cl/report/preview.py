@@ -27,7 +27,7 @@ from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.report.images import bytes_of, grey_range, png_bytes, top_row_first
 
 _GAP = 4  # pixels between two slices
-_SMALLEST, _LARGEST = 128, 512  # the volume's longest side has from this to this many pixels
+_SMALLEST, _LARGEST = 128, 512  # least and most pixels along the volume's longest side
 log = logging.getLogger(__name__)
 
 

@@ -308,5 +308,5 @@ def resume_or_restart(
 
 
 def is_complete(result: methods.Reconstruction) -> bool:
-    """Returns whether the run was not interrupted."""
+    """Returns whether a result is of a run that was not interrupted."""
     return result.facts.get("interrupted_at") is None

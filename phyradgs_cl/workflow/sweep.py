@@ -52,7 +52,7 @@ _BUSY_S = 20.0  # wait before a new try, while another process still writes the 
 _LOCAL = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
 Line = dict[str, Any]
 
-runtime_of_process = functools.cache(Runtime)  # one per process and device, so that kernels are built only once
+runtime_of_process = functools.cache(Runtime)  # one Runtime per process and device, so that kernels are built only once
 
 
 @dataclass(frozen=True)

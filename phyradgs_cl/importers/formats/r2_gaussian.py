@@ -22,7 +22,7 @@ from phyradgs_cl.io.scan import BEAMS
 from phyradgs_cl.io.tables import Fields
 
 META = "meta_data.json"
-META_WITH_TIMES = "meta_data_motion_blur_rolling_shutter_fps18.json"  # the description in folders of PhyRadGS
+META_WITH_TIMES = "meta_data_motion_blur_rolling_shutter_fps18.json"  # the description's name in folders of PhyRadGS
 ROW_0 = "top"
 OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 OPTIONS_WITH_TIMES = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
@@ -123,7 +123,8 @@ def read_grid(scanner: Fields, unit_mm: float) -> Grid:
 
 
 def _pitches(scanner: Fields, what: str, counts: tuple[int, ...]) -> np.ndarray:
-    """Returns a pixel's or voxel's size along each axis: key dVoxel (or dDetector), else the total sVoxel over the count."""
+    """Returns a pixel's or voxel's size along each axis, from the key d + ``what``. Without it, takes the total size, key
+    s + ``what``, over the count. what: "Detector" or "Voxel"."""
     if scanner.has(f"d{what}"):
         return scanner.lengths(f"d{what}", len(counts))
     return scanner.lengths(f"s{what}", len(counts)) / np.array(counts)

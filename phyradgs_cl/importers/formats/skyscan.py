@@ -99,7 +99,8 @@ def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOp
 
 def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredTiming:
     """Returns the exposure in s, summed over averaged frames. Leaves it out where the log has none, and where the scanner
-    stopped for each frame and no option gives a frame time. Raises InputError for an unreadable Frame Averaging."""
+    stopped for each frame and no option gives a frame time. Raises InputError for a Frame Averaging other than OFF, or ON
+    with a count."""
     motion = next((scan.word(name) for name in ("Type of Detector Motion", "Type of Motion") if scan.has(name)), "")
     averaging = scan.word("Frame Averaging", default="OFF")
     averaged = re.fullmatch(r"ON *\(([1-9]\d{0,5})\)", averaging, re.I)

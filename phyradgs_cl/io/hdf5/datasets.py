@@ -75,7 +75,8 @@ def read_values(
     source: Hdf5Source, address: str, dataset: h5py.Dataset, kinds: str = "iuf", rows: slice | None = None
 ) -> np.ndarray:
     """Reads a dataset in its own type. kinds: the allowed letters of NumPy's ``dtype.kind``. rows: the only rows that are
-    read of a stack (..., v, u). Raises InputError for damage and other types, OutOfMemoryError for more than fits memory."""
+    read of a stack (..., v, u). Raises InputError for damage and other types, OutOfMemoryError for more data than this
+    machine's memory holds."""
     if dataset.dtype.kind not in kinds:
         expected = "numbers" if "f" in kinds else "whole numbers"
         raise source.error(address, f"type {dataset.dtype}", expected, "store them as plain HDF5 numbers")
