@@ -68,7 +68,7 @@ class StoredTiming:
 def make_timing(
     subject: str, frames: int | np.ndarray, options: ImportOptions, stored: StoredTiming | None = None
 ) -> Timing:
-    """Returns the timing of ``frames``: their count, or their numbers (F,). Options replace stored values. With start
+    """Returns the timing of frames, given by their count or their numbers (F,). Options replace stored values. With start
     times, or a time from frame to frame, the scan is a fly-scan. Without them, every frame was taken at rest.
 
     Raises InputError for a fly-scan without an exposure or without two rising start times. Raises it also for options
@@ -120,7 +120,7 @@ def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> Circul
 
 
 def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
-    """Raises InputError for options that only a fly-scan has. Warns that the file's exposure is not used."""
+    """Raises InputError for options that only a fly-scan has. Warns of an exposure, which frames at rest do not use."""
     turns = [name for name in options.given(_OF_A_TURN) if name != "exposure_s" or stored.exposure_s is None]
     frame_time = " or ".join(dict.fromkeys(map(options.named, ("frame_time_s", "fps"))))
     for name in (*map(options.called, turns), *stored.written):

@@ -40,7 +40,7 @@ _SAME = 1e-3  # flats up to this fraction above the saturation level are clipped
 @dataclass(frozen=True, eq=False)
 class Light:
     """Flats (G, v, u) at G times, and the dark (1, v, u) or None. place (P,): the time of each projection, counted in
-    flats: 0.5 is halfway from the first to the second. used: how many flats and darks are used. said: the same as text."""
+    flats: 0.5 is halfway from the first to the second. used: how many flats and darks are used. said: that as text."""
 
     flats: np.ndarray
     dark: np.ndarray | None

@@ -27,7 +27,7 @@ _FRAME_HELP = (
     "read is blue, and stays where the panel was in the middle of its exposure. Drag, or press arrow keys here, to turn."
 )
 MOST_VALUES = 150_000  # numbers in the page's control points, of 2 bytes each: about 0.4 MB of base64
-_MOST_TIMES = 2000  # times at which the page has the deformation's weights
+_MOST_TIMES = 2000  # limit of the times at which the page has the deformation's weights
 _STEPS = 200  # steps of the slider for the object's time
 _MOST_LENGTH = 10  # users may lengthen arrows by up to this factor
 _LARGEST = 32767  # largest signed number of 16 bits
