@@ -116,7 +116,7 @@ def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 def _angles(scan: Scan, frame: int, time_s: np.ndarray) -> np.ndarray:
     if isinstance(scan.trajectory, CircularOrbit):
         return scan.trajectory.angle_rad(frame, time_s)
-    source = towards_source(scan.trajectory.pose(frame, time_s), scan.is_parallel)  # other programs read its azimuth
+    source = towards_source(scan.trajectory.pose(frame, time_s), scan.is_parallel)  # its azimuth serves as the angle
     return np.unwrap(np.arctan2(source[:, 1], source[:, 0]))
 
 
