@@ -18,7 +18,7 @@ from phyradgs_cl.fields import Gaussians
 from phyradgs_cl.fields.gaussians import ROWS
 from phyradgs_cl.importers import load_beads
 
-_STEP_PX = 0.25  # central differences move the image's edge this far: less drowns in voxels' errors, more is nonlinear
+_STEP_PX = 0.25  # central differences move the image's edge so many pixels: less drowns in voxels' errors, more is nonlinear
 
 
 @naming_arguments()
@@ -80,8 +80,8 @@ def pose_gradient(
 ) -> np.ndarray:
     """Returns the derivative (F, 3) float64 of a loss by the ``views`` of ``move_views``, per rad and mm (Choi et al. 2026).
 
-    x: the object. For ``Gaussians`` it is the chain rule through the poses of every line. For a volume (nz, ny, nx) in 1/mm
-    on the scan's grid it is central differences of a quarter of a pixel. by_frames (F, rows, columns): the loss' derivative
+    x: the object. ``Gaussians`` are differentiated by the chain rule, through the poses of every line; a volume (nz, ny, nx)
+    in 1/mm on the scan's grid, by central differences of 1/4 pixel. by_frames (F, rows, columns): the loss' derivative
     by the frames; for half the squared misfit, frames of x minus frames of the scan. Exposures average line integrals,
     whatever the scan's detector model. motion: as in ``splat_operator`` or ``ray_operator``. device: what ``--device``
     takes, or a Runtime.

@@ -94,7 +94,7 @@ def splat_operator(
 
     Raises InputError for anything but a Scan, for an unknown motion, and for a cutoff out of range."""
     model = _checked(scan, motion, models.RAYS, models.SPLATS)
-    if type(model) is PerRow:  # rays share poses between lines with weights; splats cannot, so each line has its own
+    if type(model) is PerRow:  # splats cannot share poses between lines by weights, so each line gets its own
         model = OwnTimes(model.of(scan).sub_intervals)
     _check_cutoff(cutoff_sigma)
     rt = runtime_of(device)

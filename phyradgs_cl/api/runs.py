@@ -71,8 +71,7 @@ def save_scan(path: str | Path, scan: Scan) -> None:
     """Writes a scan file, completely or not at all: line integrals (F, rows, columns), lengths in mm, times in s.
 
     path: the HDF5 file; an existing one is replaced. scan: a trajectory of your own class is sampled into a table of poses.
-    Raises InputError for anything but a Scan, and for a scan that the format cannot express; OutputError if the file cannot
-    be written."""
+    Raises InputError for anything but a Scan, and a scan that the format cannot express; OutputError if writing fails."""
     check_scan(scan)
     write_scan(_checked_path(path), scan)
 
@@ -113,8 +112,7 @@ def load_deformation(path: str | Path) -> Deformation:
 def save_deformation(path: str | Path, deformation: Deformation) -> None:
     """Writes ``deformation``, how an object moves, to a file, completely or not at all.
 
-    path: the HDF5 file, replaced if it exists. Raises InputError for anything but a Deformation, OutputError if writing
-    fails."""
+    path: an HDF5 file, new or replaced. Raises InputError for anything but a Deformation, OutputError if writing fails."""
     if not isinstance(deformation, Deformation):
         raise InputError("deformation", checks.short_repr(deformation), "a Deformation")
     write_deformation(_checked_path(path), deformation)
@@ -200,8 +198,7 @@ def prepare(scan: Scan, steps: str = DEFAULT_STEPS, *, device: Device = None, **
 
     steps: names of steps in docs/prepare.md, with commas. device: what ``--device`` takes, or a Runtime. options: a step's
     options as a table (``rings={"window": 11}``), and other options of preprocessing. The scan's provenance lists under
-    ``prepared`` what each step did. Raises InputError for unknown steps and options, and for a scan that a step cannot
-    correct."""
+    ``prepared`` what each step did. Raises InputError for unknown steps or options and a scan that a step cannot correct."""
     check_scan(scan)
     before = preprocessing_of({"steps": steps, **options})
     before.check_written()

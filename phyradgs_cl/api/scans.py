@@ -30,7 +30,7 @@ _ARGUMENTS = {
     "source_to_axis_mm": "geometry.source_to_axis_mm", "source_to_detector_mm": "geometry.source_to_detector_mm",
 }  # fmt: skip
 _SLACK = 1e-3  # relative tolerance of steps and arcs, since users round angles
-_AIR_SLACK = 0.2  # noise may change a transmission of 1, in air, by this
+_AIR_SLACK = 0.2  # noise may move a transmission in air this far from 1
 _CLEAR_STEP_DEG = 90.0  # between views this far apart or more, the gantry may have turned either way
 
 
@@ -98,7 +98,7 @@ def _arcs_deg(angles_deg: np.ndarray, exposure_deg: float) -> np.ndarray:
 
     Unwrapped angles (F,) that rise and fall belong to a gantry that swings back and forth. In each frame it turns towards
     the next frame's angle, but at a reversal it may still turn the other way. With steps too large to show this, all frames
-    turn as stated."""
+    turn as ``exposure_deg`` states."""
     steps_deg = np.diff(angles_deg)
     arcs_deg = np.full(len(angles_deg), exposure_deg)
     is_clear = (np.abs(steps_deg) < _CLEAR_STEP_DEG).all() and (steps_deg > 0).any() and (steps_deg < 0).any()

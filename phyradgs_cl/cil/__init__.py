@@ -78,7 +78,7 @@ class FBP(DataProcessor):
         self._shape_out = self.image_geometry.shape
 
     def process(self, out: DataContainer | None = None) -> DataContainer:
-        """Returns the volume, in ``out`` if given."""
+        """Returns the volume reconstructed from the input, in ``out`` if given."""
         between = self.image_geometry, self.acquisition_geometry
         method = "fbp" if between[1].geom_type == "parallel" else "fdk"
 
@@ -98,7 +98,7 @@ class _Turning:
         self._middle_s = self.start_s + shutter.middle_s
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Returns poses (..., 12) of a frame at times (...) in s."""
+        """Returns poses (..., 12), see ``PoseTable``, of a frame at times (...) in s."""
         angles_rad = self._angles_rad[frame] + self._rad_per_s * (np.asarray(time_s) - self._middle_s[frame])
         return poses_of_astra(_turned(self._at_zero, angles_rad.ravel()), self._panel).reshape(*angles_rad.shape, 12)
 
@@ -157,7 +157,7 @@ def _panel(frames: AcquisitionGeometry, detector: Any) -> tuple[np.ndarray, np.n
 
 
 def _turned(at_zero: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
-    """Returns ASTRA's vectors (F, 12) for angles (F,) of the object; the gantry turns the other way."""
+    """Returns ASTRA's vectors (F, 12) at angles (F,) of the object: those of ``_at_zero``, turned the other way about z."""
     (x, y, z), cos, sin = at_zero.T, np.cos(angles_rad)[:, None], np.sin(angles_rad)[:, None]
     return np.stack([cos * x + sin * y, cos * y - sin * x, z + 0 * cos], -1).reshape(-1, 12)
 

@@ -171,7 +171,7 @@ def takes_part(arguments: Sequence[str]) -> bool:
     """Returns whether this process takes part in the command. Turns off the output of all ranks but 0."""
     if launched().rank == 0:
         return True
-    sys.stdout = sys.stderr = None  # as in programs without a console, so libraries check for it
+    sys.stdout = sys.stderr = None  # None as in programs without a console: libraries check for it
     return any(arguments[:1] == [name] for name in SHARED_BY_RANKS)
 
 

@@ -34,7 +34,7 @@ ObjectMotion = Annotated[Path | None, file_option(_OBJECT_MOTION, "--object-moti
 
 _CHECKPOINT = "Seconds from checkpoint to checkpoint of a run, which continues from its last; 0: on Ctrl-C only."
 CheckpointEvery = Annotated[float, option(_CHECKPOINT, metavar="SECONDS")]
-CHECKPOINT_EVERY_S = 600.0  # a killed run loses at most this much, and writing takes a small part of it
+CHECKPOINT_EVERY_S = 600.0  # a killed run loses at most this time, of which writing takes a small part
 
 
 def lengths(flag: str, help: str, default: str) -> Any:
@@ -117,7 +117,7 @@ def with_run_options(*without: str) -> Callable[[Callable[..., Any]], Callable[.
 
 
 def settings_of(options: dict[str, Any]) -> Settings:
-    """Returns a command's settings from its options, of which ``config`` and ``assignments`` give further ones."""
+    """Returns a command's settings from its options; the TOML file ``config`` and the texts ``assignments`` give more."""
     given = {name: None if value is False else value for name, value in options.items()}  # False: flag not given
     config, assignments = given.pop("config"), given.pop("assignments") or []
     return read_settings(config, given, assignments)
@@ -128,8 +128,7 @@ def with_options(
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Returns a decorator that replaces a command's parameter ``slot`` by ``options``, each (annotation, default).
 
-    The command is called with ``make(values by name)`` for ``slot``. Its signature lists the options, because Typer reads
-    them there."""
+    The command is called with ``make(values by name)`` for ``slot``. Its signature, which Typer reads, lists the options."""
 
     def decorated(command: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(command)

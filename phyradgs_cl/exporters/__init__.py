@@ -32,7 +32,7 @@ OWN = "h5"
 """This package's volume files. Their values stay in 1/mm; a scale of Hounsfield units is stored next to them."""
 ScaleOf = Callable[[Volume], Hounsfield | None]
 _SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": (), "zarr": (".ome.zarr", ".zarr")}
-_PLAIN = "values in 1/mm"  # written into files of other programs, which have no field for this unit
+_PLAIN = "values in 1/mm"  # a note for files of other programs, which have no field for this unit
 
 
 def export_volume(
@@ -76,7 +76,7 @@ def _checked(
     path: Path, to: str, output: str | Path | None, mu_water_per_mm: float | None, labels: DicomLabels | None,
     scale_of: ScaleOf | None,
 ) -> tuple[Path, ScaleOf | None]:  # fmt: skip
-    """Returns the path to write and the function that gives the scale. Raises InputError for options of other formats."""
+    """Returns the path to write and the function that gives the HU scale. Raises InputError for other formats' options."""
     checks.one_of("--to", to, (*EXPORTS, OWN))
     if mu_water_per_mm is not None and scale_of is not None:
         raise InputError("--mu-water-per-mm", "given with --hu", "one of the two", "leave one out")
@@ -160,7 +160,7 @@ def export_stored(
     volume: Volume, to: str, target: Path, subject: str, scale_of: ScaleOf | None = None,
     labels: DicomLabels | None = None, unit: str = _PLAIN,
 ) -> None:  # fmt: skip
-    """Writes a volume as ``export_volume`` does. subject: names it in messages. unit: the note of values without a scale."""
+    """Writes a volume as ``export_volume`` does. subject: names it in messages. unit: a note for values without HU scale."""
     if to in CLOUDS:
         CLOUDS[to](target, writers.gaussians_of(volume, subject))
         return

@@ -74,7 +74,7 @@ def write_dicom(path: Path, volume: Volume, note: str, labels: DicomLabels) -> N
     unit = "HU" if of_note(note)[0] else "1/mm"
     slope, grid = _rescale_slope(volume.values, unit), volume.required_grid
     content = volume.values.tobytes() + repr((grid.voxel_size_mm[::-1], grid.first_centre_mm[::-1])).encode()
-    content += repr(labels.given).encode() if labels.given else b""  # with other labels it must be another study
+    content += repr(labels.given).encode() if labels.given else b""  # other labels must give another study's UIDs
     seed, generate = hashlib.sha256(content).hexdigest(), pydicom.uid.generate_uid
     uid = {n: generate(entropy_srcs=[seed, unit, n]) for n in ("study", "series", "frame")}
     with folder_written_beside(path) as folder:
@@ -95,7 +95,7 @@ def _rescale_slope(values: np.ndarray, unit: str) -> str:
     peak = float(np.abs(values).max())
     if unit == "HU" and peak <= _LARGEST:
         return "1"
-    return f"{max(peak, 1e-30) / _LARGEST * (1 + 1e-8):.9e}"  # 1e-8 more, so that rounding cannot make it too small
+    return f"{max(peak, 1e-30) / _LARGEST * (1 + 1e-8):.9e}"  # 1e-8 more, so that rounding never makes the step too small
 
 
 def _common(pydicom: Any, shape: tuple[int, ...], unit: str, slope: str, uid: dict[str, str]) -> Any:

@@ -81,7 +81,7 @@ def write_npy(path: Path, volume: Volume, note: str) -> None:
     with written_beside(path.with_suffix(".json")) as temporary:
         temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     with written_beside(path) as temporary, open(temporary, "wb") as file:
-        np.save(file, volume.values)  # a file, since np.save would add a suffix to a name
+        np.save(file, volume.values)  # an open file, since np.save adds a suffix to names
 
 
 def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None, unit: str = "values in 1/mm") -> None:
@@ -99,7 +99,7 @@ def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None, unit: str =
             shape, name = tuple((np.array(before.shape) // step).tolist()), f"s{len(levels)}"
             level = group.create_array(
                 name, shape=shape, chunks=tuple(min(n, _CHUNK) for n in shape), dtype="float32",
-                dimension_names=list("zyx"), config={"write_empty_chunks": True},  # else readers cannot see a lost chunk
+                dimension_names=list("zyx"), config={"write_empty_chunks": True},  # else a lost chunk looks empty
             )  # fmt: skip
             for start in range(0, shape[0], _CHUNK):
                 stop = min(start + _CHUNK, shape[0])

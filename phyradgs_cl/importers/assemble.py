@@ -27,8 +27,8 @@ _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_di
 Length = float | Callable[[], float]
 Pitch = tuple[float, float] | Callable[[], tuple[float, float]]
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_VIEW_DIGITS = 5  # decimals to which two views' angles, or scaled poses, must agree to count as the same view
-_SLACK = 1e-6  # fraction of a frame's span by which pose tables are extended, so that rounding leaves no time outside
+_VIEW_DIGITS = 5  # views are equal if cosine and sine of their angles, or their scaled poses, agree to so many decimals
+_SLACK = 1e-6  # pose tables are extended by this fraction of a frame's duration, so that rounding leaves no time outside
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class StoredTiming:
 def make_timing(
     subject: str, frames: int | np.ndarray, options: ImportOptions, stored: StoredTiming | None = None
 ) -> Timing:
-    """Returns the timing of ``frames``: their count, or their numbers (F,). Options replace stored values. With start
+    """Returns the timing of frames, given by their count or their numbers (F,). Options replace stored values. With start
     times, or a time from frame to frame, the scan is a fly-scan. Without them, every frame was taken at rest.
 
     Raises InputError for a fly-scan without an exposure or without two rising start times. Raises it also for options
@@ -108,7 +108,7 @@ def make_timing(
 
 def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> CircularOrbit:
     """Returns a circular orbit through gantry angles (F,) in rad. Central differences of the angles over time give the
-    gantry's speed within a frame; differences are one-sided at both ends. A frame at rest does not turn."""
+    gantry's speed within a frame; differences are one-sided at both ends. Frames taken at rest keep their angle."""
     angle_rad = np.asarray(angle_rad, np.float64)
     exposure_s = timing.shutter.exposure_s
     if not timing.is_fly:
@@ -120,7 +120,7 @@ def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> Circul
 
 
 def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
-    """Raises InputError for options that only a fly-scan has. Warns that the file's exposure is not used."""
+    """Raises InputError for options that only a fly-scan has. Warns of an exposure, which frames at rest do not use."""
     turns = [name for name in options.given(_OF_A_TURN) if name != "exposure_s" or stored.exposure_s is None]
     frame_time = " or ".join(dict.fromkeys(map(options.named, ("frame_time_s", "fps"))))
     for name in (*map(options.called, turns), *stored.written):
@@ -133,7 +133,7 @@ def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: 
 
 @dataclass(frozen=True)
 class Turned:
-    """Which flips make a stored image's v point up and its u to the right, seen from the source."""
+    """Which flips, of rows and of columns, turn a stored image upright: v up and u to the right, seen from the source."""
 
     rows: bool
     columns: bool
@@ -144,7 +144,7 @@ class Turned:
         return array[..., ::-1] if self.columns else array
 
     def poses(self, pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-        """Converts poses (..., 12) of the stored images to those of the flipped ones. panel: (rows, columns)."""
+        """Converts poses (..., 12), see ``PoseTable``, of stored images to those of flipped ones. panel: (rows, columns)."""
         pose = np.array(pose, np.float64)
         sides = (self.rows, panel[0], slice(9, 12)), (self.columns, panel[1], slice(6, 9))
         for count, step in ((count, step) for is_flipped, count, step in sides if is_flipped):
@@ -154,7 +154,7 @@ class Turned:
 
 
 def turn_of(pose: np.ndarray) -> Turned:
-    """Finds, from a stored image's pose (12,), the flips that put row 0 at the bottom and column 0 on the left."""
+    """Finds the flips that put row 0 at the bottom and column 0 on the left, from an image's pose (see ``PoseTable``)."""
     source, step_u, step_v = pose[:3], pose[6:9], pose[9:12]
     right = np.array([-source[1], source[0], 0.0])
     return Turned(rows=bool(step_v[2] < 0), columns=bool(step_u @ right < 0))
@@ -230,7 +230,8 @@ def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
 def parallel(
     options: ImportOptions, panel: tuple[int, int], pitch_mm: Pitch, offset_mm: tuple[float, float]
 ) -> ParallelGeometry:
-    """Returns a parallel beam from the options' numbers, else the file's. Raises InputError for a distance as option."""
+    """Returns a parallel beam from the options' numbers, else the arguments, which are the file's. Raises InputError for an
+    option that is a distance."""
     for name in options.given(_DISTANCES):
         expected, remedy = "no distance: this file has a parallel beam", "leave it out"
         raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
@@ -241,7 +242,7 @@ def cone(
     options: ImportOptions, to_axis_mm: Length, to_detector_mm: Length, panel: tuple[int, int], pitch_mm: Pitch,
     offset_mm: tuple[float, float], names: Mapping[str, str] | None = None,
 ) -> ConeGeometry:
-    """Returns a cone beam from the options' numbers, else the file's. Where a number comes as a function, the function is
+    """Returns a cone beam from the options' numbers, else the arguments, the file's. An argument may be a function, which is
     called only if no option replaces it, so that a file may lack it. names: what the file calls the numbers, for messages.
     Raises InputError unless the panel stands behind the axis."""
     axis_mm, detector_mm = map(partial(_taken, options), _DISTANCES, (to_axis_mm, to_detector_mm))
@@ -274,11 +275,12 @@ class RotaryStage:
     shift_mm: np.ndarray | None = None
 
     def poses(self, angle_rad: np.ndarray, shift_mm: np.ndarray | float = 0.0) -> np.ndarray:
-        """Returns poses (T, 12) at gantry angles (T,), in the sample's frame. shift_mm (T, 2): the panel's shifts (v, u)."""
-        upright = self.geometry.pose(0.0).reshape(4, 3)  # x to the source, y to the right, z up
+        """Returns poses (T, 12), see ``PoseTable``, in the sample's frame at gantry angles (T,) in rad. shift_mm (T, 2): the
+        panel's shifts (v, u)."""
+        upright = self.geometry.pose(0.0).reshape(4, 3)  # in axes x to the source, y to the right, z up
         is_parallel = isinstance(self.geometry, ParallelGeometry)
         parts = np.repeat(upright[None], len(angle_rad), axis=0)
-        parts[:, int(is_parallel) : 2, 1] -= self.axis_u_mm  # the axis becomes the origin
+        parts[:, int(is_parallel) : 2, 1] -= self.axis_u_mm  # moves source and panel, so that the axis is at y = 0
         parts[:, 1, 2:0:-1] += shift_mm
         leaning = Rotation.from_euler("YX", [-self.tilt_rad, -self.roll_rad])  # rotates the z axis onto the stage's axis
         turned = (Rotation.from_euler("z", np.reshape(angle_rad, (-1, 1))) * leaning.inv()).as_matrix()

@@ -26,7 +26,7 @@ def check_room(subject: str, needed_bytes: int) -> None:
 
 @contextmanager
 def naming_damage(path: Path, found: str, expected: str, remedy: str = "") -> Iterator[None]:
-    """Turns every exception except MemoryError into InputError. Libraries may raise any kind for a damaged file."""
+    """Turns any exception but MemoryError into InputError about ``path``: for damaged files, libraries raise every kind."""
     try:
         yield
     except (InputError, MemoryError):
@@ -99,7 +99,7 @@ class SafeFolder:
         return [path for path in _files(self.root) if _is_one_of(path, suffixes)]
 
     def only(self, what: str, *suffixes: str) -> Path:
-        """Returns the only file with one of the suffixes. Raises InputError for none or several; ``what`` names its role."""
+        """Returns the only file with one of the suffixes. what: its role, as text. Raises InputError for none or several."""
         paths = self.matching(*suffixes)
         if len(paths) != 1:
             names = ", ".join(path.name for path in paths[:5]) or "none"
@@ -130,5 +130,5 @@ def checked_name(name: object, subject: str) -> str:
 
 def in_natural_order(paths: Sequence[Path]) -> list[Path]:
     """Returns the paths sorted by name, numbers by value: 2.tif before 10.tif."""
-    parts = {path: re.split(r"(\d+)", path.name) for path in paths}  # text and numbers alternate
+    parts = {path: re.split(r"(\d+)", path.name) for path in paths}  # text at even places, numbers at odd ones
     return sorted(paths, key=lambda path: [int(part) if i % 2 else part for i, part in enumerate(parts[path])])

@@ -19,7 +19,7 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
-_PIXELS = 1 << 16  # pixels of a frame that are compared with other frames; all would take long and tell little more
+_PIXELS = 1 << 16  # so many pixels of each frame are compared with other frames; all would take long and tell little more
 
 # A flat or dark is left out if its median differs from the others' by more than this fraction of the flats' median.
 _TOGETHER = 0.1  # largest difference among flats of one time, in which the tube hardly drifts
@@ -28,7 +28,7 @@ _DARK = 0.02  # largest difference among darks
 
 # A flat or dark is left out too if its pixels differ from the others', in the mean, by more than the sum of these two.
 _PATTERN = 0.02  # allowed difference, as a fraction of the flats' median
-_TIMES = 5.0  # allowed difference, in units of the frames' median deviation
+_TIMES = 5.0  # allowed difference, as a multiple of its median over the frames
 _BLOCK_BYTES = 1 << 26  # memory of a block of rows whose median is taken: a float64 copy of all frames would be large
 Mask = np.ndarray | None
 TAKEN = "taken"
@@ -40,7 +40,7 @@ _SAME = 1e-3  # flats up to this fraction above the saturation level are clipped
 @dataclass(frozen=True, eq=False)
 class Light:
     """Flats (G, v, u) at G times, and the dark (1, v, u) or None. place (P,): the time of each projection, counted in
-    flats: 0.5 is halfway from the first to the second. used: how many flats and darks are used. said: the same as text."""
+    flats: 0.5 is halfway from the first to the second. used: how many flats and darks are used. said: that as text."""
 
     flats: np.ndarray
     dark: np.ndarray | None
@@ -102,7 +102,7 @@ def _times(
 
 
 def _levels(stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns every m-th pixel (n, k) float64 of n frames and the medians (n,). Pixels that are not finite become 0."""
+    """Returns evenly chosen pixels (n, k) float64 of n frames, and the frames' medians (n,). NaN and infinity become 0."""
     pixels = stack.reshape(len(stack), -1)
     some = np.nan_to_num(pixels[:, :: -(-pixels.shape[1] // _PIXELS)].astype(np.float64), posinf=0.0, neginf=0.0)
     return some, np.median(some, axis=1)
@@ -113,11 +113,12 @@ def _fitting(
     names: Mapping[str, Sequence[str]],
 ) -> np.ndarray:
     """Returns which frames, bool (k,), are like the others in median and pattern. group (k,): their indices in ``stack``.
-    All are kept if no majority shows which are right. light: the flats' median counts. Warns of each that is unlike."""
+    tolerance: of the median, as a fraction of ``light``, the flats' median counts. All are kept if no majority shows which
+    are right. Warns of each that is unlike."""
     some, level = _levels(stack[group])
     usual = float(np.median(level))
     is_odd = np.abs(level - usual) > tolerance * light
-    if tolerance != _APART:  # the beam's pattern may change from one time to another
+    if tolerance != _APART:  # not for flats of several times, in which the beam's pattern may change
         if kind == "flats":
             some *= np.divide(usual, level, out=np.ones_like(level), where=level > 0)[:, None]
         pattern = np.abs(some - np.median(some, axis=0)).mean(axis=1)

@@ -113,7 +113,7 @@ class Places:
         types of frames (projection, flat, dark, invalid). Separate flats and darks replace those among the projections.
         Raises InputError without projections, and for arrays that do not fit them."""
         if self.source is not None and "projections" not in self.stated:
-            self.source.dataset(projections)  # if it is missing, the error says what the file has instead
+            self.source.dataset(projections)  # raises an error if the dataset is missing, and names a similar one
         if (stored := self.stack("projections", [projections])) is None:
             raise InputError(self.subject, "no place of the projections", "one of them")
         frames, panel = stored[0], (stored[0].shape[1], stored[0].shape[2])
@@ -124,7 +124,7 @@ class Places:
         for name, addresses in (("flats", flats), ("darks", darks), ("mask", mask)):
             if parts := self.stack(name, addresses, panel):
                 stacks[name] = parts[0]
-                at = {"pre": -0.5, "post": int(used.sum()) - 0.5}  # time of flats, by how their address ends
+                at = {"pre": -0.5, "post": int(used.sum()) - 0.5}  # time of flats, by the end of their address
                 ends = [text.rpartition("_")[2] for text in parts[1]]
                 if name == "flats":
                     flats_at = np.repeat([at.get(end, np.nan) for end in ends], list(parts[1].values()))
@@ -138,7 +138,7 @@ class Places:
         return Stacks(frames if used.all() else frames[used], stacks["flats"], stacks["darks"], bad, used, flats_at)
 
     def _key(self, usual: Sequence[str], frames: int) -> np.ndarray:
-        """Reads the types (F,) of frames, with the numbers of ``io.scan``. Without a key all are projections. Raises
+        """Reads the types (F,) of frames: 0 projection, 1 flat, 2 dark, 3 invalid. Without a key all are projections. Raises
         InputError for other numbers, and where no frame is a projection."""
         for text in self._at("image_key", usual)[:1]:
             with self.opened("image_key", text) as (source, address):
@@ -226,7 +226,7 @@ def beam(
     source: Hdf5Source, lengths: Lengths, options: ImportOptions, panel: tuple[int, int], axis_columns: float = 0.0
 ) -> Geometry:
     """Returns the geometry from the options' numbers, else the file's. If neither states the source's distance, it is a
-    parallel beam, with a warning. axis_columns: from the axis to the panel's middle. Raises InputError for wrong lengths."""
+    parallel beam, with a warning. axis_columns: columns from axis to panel's middle. Raises InputError for wrong lengths."""
     quantity = LENGTH
     for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):
         if source.find(address) is not None and not h5.read_attribute(source, address, "units"):
@@ -262,7 +262,7 @@ def beam(
         _log.warning("%s: no source distance: a parallel beam", source.name(lengths.source))
         sides = options.taken("pixel_size_mm", pitch_mm)
         return parallel(options, panel, sides, (0.0, axis_columns * sides[1]))
-    # abs: NeXus counts the source's distance negative
+    # abs, since NeXus files have the source's distance below 0
     to_axis_mm = options.taken("source_to_axis_mm", lambda: abs(h5.read_number(source, lengths.source, quantity)))
     if to_axis_mm == 0:
         raise source.error(lengths.source, "0", "a length other than 0", "remove it: without one the beam is parallel")

@@ -1,8 +1,7 @@
 """Reads NIfTI, NRRD and MetaImage files by SimpleITK, and OME-Zarr 0.4 and 0.5 by zarr: one volume at full resolution, with
 its voxel sizes and position.
 
-SimpleITK passes over missing voxels, data in another folder, a note of Hounsfield units, and NRRD's units; these are checked
-and read here."""
+SimpleITK passes over missing voxels, data in another folder, notes of Hounsfield units, and NRRD's units: checked here."""
 
 import gzip
 import logging
@@ -30,7 +29,7 @@ from phyradgs_cl.io.volume import Volume, finite_float32, shares_of_maximum
 _log = logging.getLogger(__name__)
 STACKS = (".mha", ".mhd")
 _SPACES = ("left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las", "")
-_HEAD_BYTES = 1 << 16  # bytes at a file's start in which its header ends
+_HEAD_BYTES = 1 << 16  # a header is read from so many bytes at the file's start
 _VOXEL_BYTES = 8  # bytes of memory per voxel while a file is read
 _NOTE = "ITK_FileNotes"  # SimpleITK's name for a file's comment, which is NIfTI's field descrip
 _READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", ".nrrd": "Nrrd"}
@@ -52,7 +51,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
         reader.ReadImageInformation()
         yield sitk, reader
     except (RuntimeError, EOFError, gzip.BadGzipFile, zlib.error) as error:
-        text = str(error).rpartition("ERROR: ")[2].partition("Reason:")[0]  # an earlier error follows "Reason:"
+        text = str(error).rpartition("ERROR: ")[2].partition("Reason:")[0]  # "Reason:" begins an earlier error
         reason = re.sub(r"^\w+\(0x\w+\): ", "", text.strip()).replace(subject, "")[:100]
         raise InputError(subject, f"a damaged file ({reason})", "an image of three axes") from error
 
@@ -100,13 +99,13 @@ def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
     is_nrrd = path.suffix.lower() == ".nrrd"
     found = _DATA_FILE.search(head)
     name, start = (found[1].decode("latin-1"), head.find(b"\n", found.end(1)) + 1) if found else ("LOCAL", 0)
-    if name.startswith("LIST") or "%" in name:  # SimpleITK returns undefined voxels where one file is missing
+    if name.startswith("LIST") or "%" in name:  # several files: SimpleITK returns undefined voxels if one is missing
         raise InputError(f"{path} data file", name[:60], "LOCAL or one file name", "write it as one file")
     if name != "LOCAL":
         path, start = SafeFolder(path.parent).file(name, f"{path} data file"), 0
     if not re.search(rb"^CompressedData *= *True", head, re.I | re.M):
         return None if is_nrrd else path.stat().st_size - start
-    if not re.search(rb"^CompressedDataSize *= *\d", head, re.M):  # without it SimpleITK returns undefined voxels
+    if not re.search(rb"^CompressedDataSize *= *\d", head, re.M):  # without the size SimpleITK returns undefined voxels
         raise InputError(f"{path} CompressedDataSize", "nothing", "the bytes of packed voxels", "write it unpacked")
     return len(zlib.decompress(path.read_bytes()[start:]))
 
@@ -179,7 +178,7 @@ def read_zarr(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | N
     except Exception as error:  # zarr and its stores raise errors of every kind
         found = f"{type(error).__name__}: {str(error)[:150]}"
         raise InputError(subject, found, "an OME-Zarr with real numbers of one volume along z, y and x") from error
-    in_mm = np.array([units[name] for name in "zyx"], np.float64)  # None becomes NaN
+    in_mm = np.array([units[name] for name in "zyx"], np.float64)  # units that are None become NaN
     size_mm, first_mm = sizes[order] * in_mm, first[order] * in_mm
     if not (np.isfinite([size_mm, first_mm]).all() and size_mm.min() > 0):
         _log.warning("%s: its axes have no sizes in a unit of length: the scale is left out", path)

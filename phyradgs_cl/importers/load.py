@@ -37,7 +37,7 @@ _KINDS = {
     ("fit", "fits"): ("FITS", "convert them to TIFF: astropy.io.fits and tifffile.imwrite"),
     ("xrm", "txm"): ("single images or a volume of Xradia", "import the scan's .txrm, or export TIFFs"),
 }  # fmt: skip
-_MOST_FILES = 1000  # a folder's files that are looked at for an error about its format; more would take long
+_MOST_FILES = 1000  # files of a folder whose suffixes are read for an error about its format; more would take long
 
 
 def refuse_unread(path: Path, expected: str) -> None:
@@ -57,9 +57,9 @@ def _is_dicom(path: Path) -> bool:
         return file.read(132)[128:] == b"DICM"
 
 
-# Format: its module in formats/, loaded when it is needed, and whose scans it reads, for the help. The module has
-# recognises(path) -> bool and import_scan(path, options) -> Scan for a file or folder. For MODULE:END they are called
-# recognises_END and import_scan_END.
+# By format: its module in formats/, which is loaded when it is needed, and whose scans it reads, for the help.
+# A module has recognises(path) -> bool and import_scan(path, options) -> Scan, for a file or a folder.
+# For MODULE:END the module's functions are recognises_END and import_scan_END.
 FORMATS = {
     "r2": ("r2_gaussian", "R2-Gaussian"),
     "phyradgs": ("r2_gaussian:with_times", "PhyRadGS"),
@@ -78,7 +78,7 @@ FORMATS = {
     "tigre": ("pickles:tigre", "TIGRE"),
 }
 _MOST_BODIES = 1000  # no calibration phantom has more beads and wires
-_LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5  # beyond these, coordinates in mm and attenuations in 1/mm are in wrong units
+_LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5  # larger coordinates and attenuations must be in wrong units
 _COMMON = "attenuation_per_mm"
 _KEYS = {"bead": ("centre_mm", "radius_mm", _COMMON), "wire": ("from_mm", "to_mm", "radius_mm", _COMMON)}
 

@@ -81,7 +81,7 @@ class ImportOptions:
     def __post_init__(self) -> None:
         checks.fields_within(self.named, self)
         axis, direction = readout_order(self.first, self.readout_axis, self.readout_direction, self.named)
-        stated = {  # converted to the fields that every format reads
+        stated = {  # values for the fields that every format reads
             "readout_axis": axis, "readout_direction": direction,
             "frame_time_s": frame_time_of(self.fps, self.frame_time_s, self.named),
             "exposure_s": seconds_of("exposure", self.exposure_ms, self.exposure_s, self.named),
@@ -137,7 +137,7 @@ _WORD_OF = {
 }  # fmt: skip
 _DEFAULTS = {item.name: item.default for item in fields(ImportOptions) if item.name != "named"}
 WORDS = {item.name: item.metadata["words"] for item in fields(ImportOptions) if "words" in item.metadata}
-"""By field: the words that an option may be."""
+"""The words that an option accepts, by its name."""
 FIELDS = tuple(_DEFAULTS)
 """The names of all options."""
 

@@ -25,15 +25,15 @@ _STEADY = 0.25  # largest difference from the usual step, as a fraction of it
 _GAP = 1.5  # a step between angles or times of this many usual steps shows a missing frame
 _USUAL = 0.5  # a series is regular if at least this fraction of its steps is
 _STEADY_ANGLES = 0.75  # angles or times with fewer regular steps are uneven: no gap shows a missing frame
-_SMALL = 0.25  # groups of files with the same words below this fraction of the largest group are no frames
+_SMALL = 0.25  # a group of files with the same words holds no frames if it is smaller than this fraction of the largest
 _BEFORE, _AFTER = (re.compile(rf"(?<![a-z])({words})(?![a-z])", re.I) for words in ("before|pre|start", "after|post|end"))
 _STAMP = 10**7  # numbers from here on are times in milliseconds, not indices
-_MOST_NAMES = 8  # of files, in a message
+_MOST_NAMES = 8  # file names that a message lists at most
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Files in the order of the scan. numbers (F,): in their names, or None. said: a text about which files were taken."""
+    """Files in the scan's order. numbers (F,): those in their names, or None. said: which files were taken, as text."""
 
     paths: list[Path]
     numbers: np.ndarray | None

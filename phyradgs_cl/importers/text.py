@@ -21,7 +21,7 @@ _COLUMNS = re.compile(r",\s+|[;:\s]+")
 _ANGLE, _RAD = re.compile(r"angle|theta|phi|rot|deg", re.I), re.compile(r"\brad", re.I)
 _BRIGHTER = 1.2  # a pixel above this many times the stated counts of air is too bright: noise does not reach so far
 _FEW = 0.01  # this fraction of the pixels may be too bright, because they are broken
-_HEAD_BYTES = 1 << 14  # bytes at a file's start in which words of its format are searched
+_HEAD_BYTES = 1 << 14  # words of a format are searched in so many bytes at a file's start
 TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
 
 
@@ -44,7 +44,7 @@ def number_at_start(text: str, comma_is_decimal: bool = False) -> tuple[float, s
 
 
 def commas_are_decimal(texts: list[str]) -> bool:
-    """Returns whether numbers in the texts have decimal commas: some comma cannot mean thousands, and there is no point."""
+    """Returns whether numbers in the texts have decimal commas: a comma that cannot mark thousands, and no point."""
     commas = any(_ONE_COMMA.fullmatch(text) and not _EITHER.fullmatch(text) for text in texts)
     return commas and not any(re.fullmatch(r"[-+]?\d*\.\d+", text) for text in texts)
 
@@ -58,7 +58,7 @@ def read_angles_rad(path: Path, count: int, unit: str | None = None, column: int
     lines = [(i, text) for i, line in numbered if (text := line.partition("#")[0].strip())]
     is_header = [not re.search(r"\d", line) or (_cells(line, True) or _cells(line, False)) is None for _, line in lines]
     head = is_header.index(False) if False in is_header else len(lines)
-    if column is not None:  # a scanner's file, in which lines above the table may look like the table's
+    if column is not None:  # a scanner's file: lines above the table may look like its lines
         head = max(head, len(lines) - count)
     names, rows = [line for _, line in lines[:head]], lines[head:]
     is_comma = _is_decimal_comma(path, [line for _, line in rows])
@@ -106,7 +106,7 @@ def _is_index(values: list[float]) -> bool:
 
 
 def _column(path: Path, names: list[str], table: list[list[float]], count: int, column: int | None) -> np.ndarray:
-    """Returns a table's angles in the stored unit: its only column or row, the column with such a name, or the one next to
+    """Returns a table's angles in the stored unit: its only column or row, the column named as an angle, or that next to
     an index, which gives the order. Raises InputError if several columns may be meant."""
     widths = {len(row) for row in table}
     if widths == {1} or (len(table) == 1 and column is None) or (len(table) < count == sum(map(len, table))):
@@ -175,7 +175,7 @@ def read_settings(
 ) -> Settings:
     """Reads the lines NAME ``separator`` VALUE for the given ``names``, in upper or lower case; ignores other lines.
 
-    sections: the only [sections] that are read; () reads all. If two sections have a name, the first counts. Raises
+    sections: the only [sections] that are read; () reads all. If a name is in two sections, the first counts. Raises
     InputError for a file with none of the names, and for a section that gives a name two values."""
     spelt, wanted = {name.lower(): name for name in names}, {section.lower() for section in sections}
     values: dict[tuple[str, str], str] = {}  # keys are (section, name)

@@ -42,7 +42,7 @@ def read_tiffs(paths: list[Path]) -> np.ndarray:
     for path, (count, _) in zip(paths, headers, strict=True):
         with _opened(path) as tiff:
             try:
-                for page in tiff.pages:  # a page may hold a stack of images
+                for page in tiff.pages:  # a page may hold a stack (n, v, u)
                     images = math.prod(page.shape[:-2])
                     page.asarray(maxworkers=1, out=stack[at : at + images].reshape(page.shape))
                     at += images
@@ -115,7 +115,7 @@ def _header(path: Path) -> tuple[int, tuple[tuple[int, int], np.dtype]]:
         raise InputError(str(path), "no page", "at least one image")
     if any(kind != kinds[0] for kind in kinds):
         raise InputError(str(path), "pages of several sizes or types", "one for all frames")
-    if stated_images > images:  # as in ImageJ's files of more than 4 GB
+    if stated_images > images:  # ImageJ's files of more than 4 GB list fewer than they have
         found, expected = f"{stated_images} images and {images} of them in its directory", "a directory of all images"
         raise InputError(str(path), found, expected, "save it as BigTIFF, or as one file per image")
     return images, kinds[0]

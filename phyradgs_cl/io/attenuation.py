@@ -14,7 +14,7 @@ from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.volume import Volume
 from phyradgs_cl.text import plain_text
 
-_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # no noise goes lower, no metal higher
+_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # values beyond are HU: no noise goes lower, no metal higher
 _USUAL_PER_MM = 10.0  # where the user states water's attenuation, values beyond this are HU, not 1/mm
 VALUES = "values"
 """The provenance's key for the note that another program's file has about its values."""
@@ -24,9 +24,9 @@ log = logging.getLogger(__name__)
 
 
 def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Volume:
-    """Returns ``volume`` after a check that it can be projected. Raises InputError about ``subject`` for values beyond 1e9.
+    """Returns ``volume`` if it can be projected. Raises InputError about ``subject`` for values beyond 1e9 1/mm.
     Raises it also if negative values sum to at least as much as positive ones, as in Hounsfield units. Warns if they sum to
-    more than a tenth, unless ``warn`` is False."""
+    more than a tenth of these, unless ``warn`` is False."""
     values = volume.values
     if (size := float(np.abs(values).max())) > h5.ATTENUATION.largest:
         expected = f"attenuation of at most {h5.ATTENUATION.largest:g} 1/mm"
@@ -47,7 +47,7 @@ def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Vol
 def in_per_mm(subject: str, volume: Volume, mu_water_per_mm: float | None = None) -> Volume:
     """Returns a volume in 1/mm; if it was in Hounsfield units, with their scale. A file's note may say that values are in
     Hounsfield units, and give their scale; else ``mu_water_per_mm`` gives it. Without a note, ``mu_water_per_mm`` converts
-    volumes with values beyond 10. Raises InputError about ``subject`` for noted Hounsfield units without a scale."""
+    volumes with values beyond 10 1/mm. Raises InputError about ``subject`` for noted Hounsfield units without a scale."""
     stated = None if mu_water_per_mm is None else Hounsfield(mu_water_per_mm)
     is_hu, scale = of_note(str(volume.provenance.get(VALUES, "")))
     if scale is None and (is_hu or float(np.abs(volume.values).max()) > _USUAL_PER_MM):
@@ -72,7 +72,7 @@ def words_of_hu(volumes: Mapping[Path, Volume], mu_water_per_mm: float | None = 
 
 
 def attenuation_of(subject: str, volume: Volume) -> Volume:
-    """Returns the volume. Raises InputError about ``subject`` for values that cannot be 1/mm, such as Hounsfield units."""
+    """Returns ``volume``. Raises InputError about ``subject`` if its values cannot be 1/mm, such as HU."""
     lowest, highest = float(volume.values.min()), float(volume.values.max())
     if lowest < _LOWEST_PER_MM or highest > _HIGHEST_PER_MM:
         found = f"values from {lowest:g} to {highest:g}, as of Hounsfield units"

@@ -120,7 +120,7 @@ def check_truth(source: Hdf5Source, entry: str, grid: Grid) -> tuple[bool, int]:
 
 
 def read_reference(source: Hdf5Source, entry: str) -> np.ndarray:
-    """Reads the true volume (nz, ny, nx) float32 in 1/mm. Raises InputError for NaN or infinity, or if none is above 0."""
+    """Reads the true volume (nz, ny, nx) float32 in 1/mm. Raises InputError for NaN, infinity, or no value above 0."""
     return _read_volumes(source, f"{entry}/{schema.TRUTH}")
 
 

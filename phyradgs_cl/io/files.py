@@ -13,7 +13,7 @@ from phyradgs_cl.errors import InputError
 
 try:
     import resource
-except ImportError:  # not POSIX
+except ImportError:  # Windows has no such module
     resource = None  # type: ignore[assignment]
 
 HOST_SHARE = 0.8

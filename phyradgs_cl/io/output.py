@@ -26,7 +26,7 @@ _LONGEST = 50  # characters of the target's name kept in a temporary one: at 4 b
 _LONGEST_BYTES = 255  # longest file name that common file systems allow
 _SPARE_BYTES = 1 << 16  # room on the disk that is reserved for headers, besides the arrays
 _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part(\.[a-z.]+)?$")
-_FORMAT = 2  # version of checkpoints
+_FORMAT = 2  # version of the checkpoint format; other versions are refused
 _RESTART = "start without --resume"
 
 
@@ -55,7 +55,7 @@ def make_folder(folder: Path, subject: Path) -> None:
 
 
 def lock_path(output: str | Path) -> Path:
-    """Returns the path of the lock file of ``output``. A file that a dead process has left does not lock."""
+    """Returns the path of the lock file of ``output``. A lock file that a dead process left locks nothing."""
     return beside(Path(os.path.realpath(output)), ".lock", ".")
 
 
@@ -79,7 +79,7 @@ def only_run(output: str | Path) -> Iterator[None]:
         yield
     finally:
         with suppress(OSError):
-            path.unlink()  # before the release: a process that waits then sees that the file is gone
+            path.unlink()  # before the release, so that a waiting process sees that the file is gone
         lock.release()
 
 
@@ -112,7 +112,7 @@ def written_beside(path: str | Path, size_bytes: int = 0, suffix: str = "") -> I
 
 
 def _target(path: str | Path) -> Path:
-    """Returns the file to write, to which a symbolic link may point. Raises OutputError if it cannot be written."""
+    """Returns the file to write: ``path``, or where its symbolic link leads. Raises OutputError if it cannot be written."""
     shown = str(path)
     if not shown or shown.endswith(("/", os.sep)) or os.path.isdir(shown):
         raise OutputError(shown or "output path", "a folder", "a file name", "add a file name to the path")
@@ -156,7 +156,7 @@ def temporary_name(target: Path, suffix: str = "") -> Path:
 
 @cache
 def _machine() -> str:
-    """Identifies this machine and, on it, the container: within it process numbers are unique."""
+    """Returns a hash of this machine and its container (PID namespace), within which process numbers are unique."""
     namespace = ""
     with suppress(OSError):
         namespace = os.readlink("/proc/self/ns/pid")
@@ -169,14 +169,14 @@ def _is_dead(process: int) -> bool:
     try:
         os.kill(process, 0)
     except OSError as error:
-        return isinstance(error, ProcessLookupError)  # any other error: a process of another user, alive
+        return isinstance(error, ProcessLookupError)  # any other error: another user's process, alive
     return False
 
 
 def _discard(path: Path) -> None:
     try:
         path.unlink()
-    except OSError:  # a folder, or removed by another process
+    except OSError:  # ``path`` is a folder, or another process has removed it
         shutil.rmtree(path, ignore_errors=True)
 
 
@@ -212,7 +212,7 @@ def shortened(name: str, most_bytes: int) -> str:
 
 
 def beside(path: str | Path, ending: str, beginning: str = "") -> Path:
-    """Returns the path ``beginning`` + name + ``ending`` in the same folder, shortened to 255 bytes if need be."""
+    """Returns the path ``beginning`` + name + ``ending`` in the same folder. Shortens names of more than 255 bytes."""
     room = _LONGEST_BYTES - len(os.fsencode(beginning + ending))
     path = Path(path)
     return path.with_name(f"{beginning}{shortened(path.name, room)}{ending}")

@@ -21,7 +21,7 @@ else:
 
 LARGEST = 1e12  # no angle, time or count is larger, and sums of such numbers stay finite
 LARGEST_LENGTH = 1e9  # no length is larger in mm, and none smaller than its inverse except 0
-_MOST_TOML_BYTES = 16 << 20  # larger files are no descriptions, and would take long to parse
+_MOST_TOML_BYTES = 16 << 20  # a larger file is no description, and would take long to parse
 _COUNTS = {2: "two", 3: "three"}
 _log = logging.getLogger(__name__)
 PROVENANCE: dict[str, tuple[type, ...]] = {
@@ -120,14 +120,14 @@ class Fields:
         return value
 
     def length(self, key: str) -> float:
-        """Returns a number from 1e-9 to 1e9: no scanner has lengths outside."""
+        """Returns a number from 1e-9 to 1e9, in the file's unit: no scanner has lengths outside."""
         value = self.number(key, highest=LARGEST_LENGTH)
         if value < 1 / LARGEST_LENGTH:
             raise self.error(key, f"{value:g}", "a number above 0")
         return value
 
     def position(self, key: str) -> float:
-        """Returns a number from -1e9 to 1e9; 0 if the key is missing."""
+        """Returns a coordinate from -1e9 to 1e9, in the file's unit; 0 if the key is missing."""
         return self.number(key, 0.0, -LARGEST_LENGTH, LARGEST_LENGTH)
 
     def numbers(self, key: str, count: int | None = None, largest: float = LARGEST) -> np.ndarray:

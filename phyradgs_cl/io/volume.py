@@ -27,13 +27,13 @@ _VOLUME, _DOUBT, _BARE = f"{_DATA}/volume", f"{_DATA}/doubt", "/volume"
 _AXES = ("z", "y", "x")
 _GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/time_series"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
-_AXIS_TOLERANCE = 1e-3  # uneven spacing, in voxels, that rounding to float32 may cause in a stored axis
+_AXIS_TOLERANCE = 1e-3  # stored voxel centres may miss even steps by this fraction of a step, as rounding to float32 causes
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """Values (nz, ny, nx) float32 in 1/mm and their grid; None for a bare array. provenance: how they were made, with the
+    """Values (nz, ny, nx) float32 in 1/mm and their grid, None for a bare array. provenance: how they were made, in the
     types of ``tables.PROVENANCE``. gaussians: float32, in mm and 1/mm. metrics: by name. deformation: the object's motion
     from this volume. states: the object at several times, whose mean is this volume. doubt: σ (nz, ny, nx) in 1/mm."""
 

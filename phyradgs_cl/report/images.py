@@ -102,7 +102,7 @@ class Window:
 
 @dataclass(frozen=True)
 class Plane:
-    """The slices of one orientation. indices: of the slices in the page, among all ``count``.
+    """The slices of one orientation. indices: which of all ``count`` slices the page has.
 
     layers: PNGs in base64 for each of result, truth, difference and error bar. first_mm, step_mm: the centre of slice 0 and
     the distance to the next. size_mm: (width, height). right, up: the world axes in the picture. still: a PNG of the

@@ -59,7 +59,7 @@ class Snapshot:
 
     @cached_property
     def parts(self) -> list[Markup]:
-        """The page's sections with pictures."""
+        """The page's sections with pictures: slices and, if there are any, frames."""
         words = note(f"The middle slices after iteration {self.iteration}.")
         pictures = stills(middle_planes(self.slices, self.grid, (0.0, self.high)), "volume", self.high)
         parts = [section("slices", "Slices", words, pictures)]
@@ -92,8 +92,7 @@ class Status:
     snapshot: Snapshot | None = None
 
     def after(self, progress: Progress, now: float) -> "Status":
-        """Returns the status after a report at ``now`` (s since 1970). A new curve begins where iterations start again, as
-        after a trial."""
+        """Returns the status after a report at ``now`` (s since 1970). If iterations start again, so does the curve."""
         last, points, first = self.progress, self.points, self.first
         is_same = last is not None and (last.quantity, last.iterations) == (progress.quantity, progress.iterations)
         if last is None or not is_same or progress.iteration < last.iteration:

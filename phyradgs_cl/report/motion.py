@@ -2,7 +2,7 @@
 other shows slices of a moving object at any time of the scan, with arrows of its displacement.
 
 The page has the object's voxels once, at the resolution of the 3D picture, and the deformation as control points. The
-script computes the object at a time t as v(y + w(y, t)), trilinearly."""
+script computes the object at time t and point y as v(y + w(y, t)), from the voxels v and the displacement w, trilinearly."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ _FRAME_HELP = (
     "read is blue, and stays where the panel was in the middle of its exposure. Drag, or press arrow keys here, to turn."
 )
 MOST_VALUES = 150_000  # numbers in the page's control points, of 2 bytes each: about 0.4 MB of base64
-_MOST_TIMES = 2000  # times at which the page has the deformation's weights
+_MOST_TIMES = 2000  # limit of the times at which the page has the deformation's weights
 _STEPS = 200  # steps of the slider for the object's time
 _MOST_LENGTH = 10  # users may lengthen arrows by up to this factor
 _LARGEST = 32767  # largest signed number of 16 bits
@@ -70,7 +70,7 @@ def frame_in_motion(scan: Scan) -> Markup:
 
 
 def _angles_deg(scan: Scan, times_s: np.ndarray) -> list[list[float]] | None:
-    """Returns the gantry's angle (T, 1) at times (T,) within the first frame; None for a gantry not on a circle."""
+    """Returns gantry angles (T, 1) in degrees at times (T,) in s of the first frame; None for a gantry not on a circle."""
     if not isinstance(scan.trajectory, CircularOrbit):
         return None
     return np.rad2deg(scan.trajectory.angle_rad(0, scan.frame_start_s[0] + times_s))[:, None].tolist()
@@ -111,7 +111,7 @@ def fitting(deformation: Deformation, grid: Grid) -> Deformation:
         spacing_mm *= 1.25
         origin_mm, counts = control_points(grid, spacing_mm)
         axes_mm = [
-            np.clip(first_mm + spacing_mm * np.arange(n), centres_mm[0], centres_mm[-1])  # a field may end at the edge
+            np.clip(first_mm + spacing_mm * np.arange(n), centres_mm[0], centres_mm[-1])  # the field may end there
             for first_mm, n, centres_mm in zip(origin_mm[::-1], counts, grid.axes_mm(), strict=True)
         ]
         points_mm = np.stack(np.meshgrid(*axes_mm, indexing="ij")[::-1], -1).reshape(-1, 3)

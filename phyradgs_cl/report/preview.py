@@ -27,7 +27,7 @@ from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.report.images import bytes_of, grey_range, png_bytes, top_row_first
 
 _GAP = 4  # pixels between two slices
-_SMALLEST, _LARGEST = 128, 512  # limits of the pixels along the volume's longest side
+_SMALLEST, _LARGEST = 128, 512  # least and most pixels along the volume's longest side
 log = logging.getLogger(__name__)
 
 
@@ -84,7 +84,7 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
         image = bytes_of(np.take(volume, volume.shape[axis] // 2, axis=axis), low, high)
         size_mm = [side for a, side in enumerate(grid.size_mm) if a != axis]
         shape = [max(1, round(side * per_mm)) for side in size_mm]
-        ends = zip(shape, image.shape, strict=True)  # the nearest voxel, so that single voxels stay visible
+        ends = zip(shape, image.shape, strict=True)  # takes the nearest voxel, so that single ones stay visible
         rows, columns = (((np.arange(n) + 0.5) * m / n).astype(int) for n, m in ends)
         slices.append(top_row_first(image[rows[:, None], columns]))
     height, width = max(s.shape[0] for s in slices), sum(s.shape[1] + _GAP for s in slices) - _GAP
@@ -121,7 +121,7 @@ def add_volume(viewer: Any, stored: Volume, name: str) -> None:
     """Adds a volume to napari's ``viewer``, in mm at its position. Axes are z, y, x, y points up, and black is 0."""
     viewer.add_image(stored.values, **_look_of_volume(stored, name))
     viewer.dims.axis_labels = _AXES
-    if hasattr(viewer.camera, "orientation2d"):  # napari has this since 0.6; before, y points down
+    if hasattr(viewer.camera, "orientation2d"):  # napari 0.6 and later; in earlier ones y points down
         viewer.camera.orientation2d = ("up", "right")
     # napari 0.9 moved overlays to its canvas
     overlays = viewer.canvas.overlays if hasattr(viewer, "canvas") else viewer
@@ -129,8 +129,7 @@ def add_volume(viewer: Any, stored: Volume, name: str) -> None:
 
 
 def napari_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Layer]] | None:
-    """Returns the function with which napari reads volumes and scans of phyradgs-cl; None for other files. napari calls
-    this for every .h5 file."""
+    """Returns the function with which napari reads this package's volumes and scans; None for other .h5 files."""
     paths = [path] if isinstance(path, str) else path
     with suppress(PhyradgsError):
         if all(file_kind(one) in ("volume", "scan") for one in paths):

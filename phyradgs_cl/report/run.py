@@ -169,7 +169,7 @@ def _same_file(path: Path, name: str, sha256: object) -> Path | None:
 
 
 def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
-    """Returns ``count`` frames of the scan after the run's preprocessing, with the frames computed from the volume."""
+    """Returns ``count`` preprocessed frames and those computed from the volume; [] if scan or object motion is missing."""
     if run.scan is None or count < 1:
         return []
     if run.deformation is None and "object_motion" in run.stored.provenance:

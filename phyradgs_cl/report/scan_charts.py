@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 _MOST_FRAMES = 180  # of more source positions, about this many are marked
 _ARC_SAMPLES = 24  # poses along the first frame's arc
 _FIRST_FRAMES = 4  # frames in the chart of successive frames
-_MOST_DOTS = 600  # dots, in all, for the poses at which a motion model projects lines
-_LINES_WITH_DOTS = 12  # detector lines that have such dots; more would merge
+_MOST_DOTS = 600  # limit of the dots that mark the times and lines of a motion model's poses
+_LINES_WITH_DOTS = 12  # detector lines that have such dots; dots of more lines would merge
 _BESIDE = 0.75  # a parallel beam's source and panel are drawn this many diagonals of the volume from its middle
 _ROOM = 0.06  # margin around the data, as a fraction of their range
 Points = NDArray[np.float64]
@@ -134,7 +134,7 @@ def panel_corners(pose: Points, detector_shape: tuple[int, int]) -> Points:
 
 
 def _first_arc(scan: Scan) -> Points:
-    """Returns poses (T, 12) of the first frame, from when its first line is exposed to when its last line ends."""
+    """Returns ``PoseTable``'s poses (T, 12) from when the first frame's first line opens to when its last line closes."""
     first_s, last_s = scan.shutter.lit_span_s if scan.is_fly else (scan.shutter.middle_s,) * 2
     times_s = scan.frame_start_s[0] + np.linspace(first_s, last_s, _ARC_SAMPLES)
     return with_sources(scan, scan.trajectory.pose(0, times_s))
@@ -153,8 +153,7 @@ def shutter_chart(scan: Scan, motion: Motion | None) -> Markup:
 
 
 def draw_shutter(axes: "Axes", scan: Scan, motion: Motion | None) -> None:
-    """Draws when each line is exposed, the times of the run's poses, the durations of exposure and readout, and above them
-    the gantry's angle."""
+    """Draws when each line is exposed, the run's poses, the durations of exposure and readout, and the gantry's angle."""
     shutter, last = scan.shutter, max(scan.lines - 1, 1)
     draw_windows(axes, shutter, scan.lines)
     if motion is not None:

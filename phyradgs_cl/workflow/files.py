@@ -31,7 +31,7 @@ _KINDS = {
     "plain-volume": "a bare volume (dataset /volume)",
     "deformation": "how an object moves (/entry/deformation)",
 }
-_OF_MOTION = ("fields", "control_points", "displacements_below_mm", "smallest_determinant")  # facts shown of a motion
+_OF_MOTION = ("fields", "control_points", "displacements_below_mm", "smallest_determinant")  # facts shown of a deformation
 
 
 def load_scan(path: str | Path, flats: str = "mean", rows: tuple[int, int] | None = None) -> Scan:

@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 _SETTLED = 5  # fewer recorded residuals say nothing about convergence: the first is always 1
 _UNLIKELY = 0.15  # smaller residuals give no warning: correct scans had at most 0.13, besides noise
 _AT_REST = 1.05  # converged: the residual after 3/4 of the iterations is at most this many times the last one
-_BEYOND_NOISE = 1.5  # in units of the noise; correct scans, even of 100 photons with residual 0.7, had at most 1.1
+_BEYOND_NOISE = 1.5  # no warning up to this many times the noise; correct scans, even of 100 photons, had at most 1.1
 _ALL_ROWS = Slabs()
 
 
@@ -284,7 +284,7 @@ def _keep_checkpoint(output: Path, result: methods.Reconstruction) -> None:
     path = checkpoint_path(output)
     if result.state is None:
         for outdated in (path, partial_path(output)):
-            with suppress(OSError):  # harmless, since the volume is complete
+            with suppress(OSError):  # a file that stays is harmless: the volume is complete
                 outdated.unlink()
     else:
         write_checkpoint(path, result.state)
@@ -294,8 +294,7 @@ def resume_or_restart(
     plan: methods.RunPlan, scan: Path, output: Path, make_runtime: Callable[[], Runtime],
     report: methods.ProgressReport = methods.ignore_progress, checkpoint_every_s: float = 600.0,
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
-    """Continues ``run_reconstruction`` from the output's checkpoint. Starts again if there is none, or if it is damaged or
-    of another run."""
+    """Continues ``run_reconstruction`` from its checkpoint; starts again if that is missing, damaged or of another run."""
     run = partial(run_reconstruction, plan, scan, output, make_runtime, report, checkpoint_every_s=checkpoint_every_s)
     checkpoint = checkpoint_path(output)
     if checkpoint.is_file() and methods.method_of(plan.method).is_resumable:
@@ -309,5 +308,5 @@ def resume_or_restart(
 
 
 def is_complete(result: methods.Reconstruction) -> bool:
-    """Returns whether the run was not interrupted."""
+    """Returns whether a result is of a run that was not interrupted."""
     return result.facts.get("interrupted_at") is None

@@ -46,13 +46,13 @@ from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
 log = logging.getLogger(__name__)
 RESULTS, TABLE = "results.jsonl", "results.md"
 _RETRIES = 3  # times that Dask repeats a run after an error
-_CONNECT_S = 10.0  # time to connect to Dask's scheduler
+_CONNECT_S = 10.0  # time limit for connecting to Dask's scheduler
 _BUSY_S = 20.0  # wait before a new try, while another process still writes the run's output
 # Dask listens on this machine only, so that nobody else can send work to it
 _LOCAL = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
 Line = dict[str, Any]
 
-runtime_of_process = functools.cache(Runtime)  # kept for a process and device, so that kernels are built only once
+runtime_of_process = functools.cache(Runtime)  # one Runtime per process and device, so that kernels are built only once
 
 
 @dataclass(frozen=True)
@@ -174,10 +174,10 @@ def _made_here(runs: Sequence[SweepRun], device: str | None, report: ProgressRep
 
 
 def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None, page: Path) -> Iterator[Line]:
-    """Yields the runs' lines as they finish, and writes Dask's report to ``page``. Raises InputError without a scheduler."""
-    os.environ.setdefault("DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION", "1.0")  # else a dead worker fails queued runs
+    """Yields lines of runs as they finish; writes Dask's report to ``page``. Raises InputError if no scheduler answers."""
+    os.environ.setdefault("DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION", "1.0")  # else a dead worker fails its queue
     dask = checks.package("distributed", "the package that --workers needs", "phyradgs-cl[cluster]")
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # the InputError below says it already
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # the InputError below reports the same
     count, where = int(workers) if workers.isdigit() else None, {"address": workers, "timeout": _CONNECT_S}
     if count is not None:
         checks.within("--workers", count, 1, 1024)
@@ -215,7 +215,7 @@ def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: st
         return _failed(run, error)
     except Exception as error:
         runtime_of_process.cache_clear()  # the device may have failed: the next run opens it again
-        time.sleep(_BUSY_S if isinstance(error, BusyError) else 0)  # a worker that lost contact may be writing it
+        time.sleep(_BUSY_S if isinstance(error, BusyError) else 0)  # a worker that lost contact may be writing the output
         raise
     if not is_complete(result):
         raise KeyboardInterrupt

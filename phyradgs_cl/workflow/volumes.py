@@ -33,7 +33,7 @@ from phyradgs_cl.workflow.files import check_picture, load_reference, load_resul
 
 log = logging.getLogger(__name__)
 _LITTLE = 0.5 - 1e-6  # boxes that share less than this fraction of either often have a wrong size or offset
-_ALIKE = 0.65  # least correlation in the shared part that clears the doubt: wrong ones had at most 0.6, right 0.55 to 0.9
+_ALIKE = 0.65  # little overlap warns below this correlation: wrong sizes had at most 0.6, right ones 0.55 to 0.9
 
 
 @np.errstate(all="ignore")
@@ -76,7 +76,7 @@ def run_evaluation(
     if result.doubt is not None and grid is not None:
         facts, curve = provenance.get("doubt"), picture.with_name(f"{picture.stem}.doubt.png")
         stated = facts.get("multiple_95") if isinstance(facts, Mapping) else None
-        multiple_95 = stated if isinstance(stated, float) else 1.96  # 95 % of a normal distribution
+        multiple_95 = stated if isinstance(stated, float) else 1.96  # 95 % of a normal distribution lie within 1.96 σ
         bar = volume if (of_bars := aligned(result.doubt, grid, *truth)) is None else of_bars.volume
         with finish_despite_interrupt(), written_beside(curve) as temporary:
             reliability_png(temporary, bar, volume, reference, multiple_95)
@@ -91,7 +91,7 @@ def run_evaluation(
     with finish_despite_interrupt(), written_beside(picture) as temporary:
         try:
             slices_png(temporary, volume, reference, title)
-        except OutputError as error:  # it names the temporary file; its cause is reported under the picture's name
+        except OutputError as error:  # the error names the temporary file; raises its cause under the picture's name
             raise error.__cause__ or error from None
     known: dict[str, object] = {key: provenance[key] for key in ("method", "seconds", "gaussians") if key in provenance}
     files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
@@ -116,7 +116,7 @@ def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dic
     points_mm = edge_points_mm(truth.volumes[0], truth_grid)
     try:
         mean_mm, high_mm = motion_error_mm(field, truth.deformation, points_mm, truth.times_s)
-    except InputError as error:  # a deformation without an inverse, which the other metrics do not need
+    except InputError as error:  # the deformation has no inverse; other metrics need none
         log.warning("no error of the motion: %s", error)
         return {"states": rows, **means}
     return {"states": rows, **means, "mean_motion_error_mm": mean_mm, "p95_motion_error_mm": high_mm}

@@ -64,7 +64,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     with open_hdf5(path, options.linked_folder) as source:
         places = hdf5.places_of(options, source)
         entry = find_entry(source, options.entry) if "projections" not in places.stated or options.entry else _NOWHERE
-        if source.find(extra := f"{entry}/{schema.EXTRA}") is not None:  # an import would lose what NXtomo cannot hold
+        if source.find(extra := f"{entry}/{schema.EXTRA}") is not None:  # a scan of this package, which needs no import
             raise source.error(extra, "a scan file of this package", "a file of another program", "use it as it is")
         detector = f"{entry}/{schema.DETECTOR}"
         keys = [f"{detector}/{name}" for name in ("image_key_control", "image_key")]

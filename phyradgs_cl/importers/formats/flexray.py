@@ -67,7 +67,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:
-    """Returns the stage that the settings describe. Heights count from the source's, which makes z = 0 its plane."""
+    """Returns the stage that the settings describe. Heights count from the source, which is thus at z = 0."""
     to_axis_mm = options.taken("source_to_axis_mm", partial(scan.length, "SOD"))
     to_detector_mm = options.taken("source_to_detector_mm", partial(scan.length, "SDD"))
 

@@ -2,8 +2,7 @@
 
 LEAP's angle φ is our φ − 90°: at φ = 0° its source stands at −y. Columns count in the direction of the turn, row 0 is
 the lowest. The ray through the origin falls on centerRow and centerCol. ``tau`` shifts source and panel against the columns'
-direction. A modular beam is a table of sources, panel centres, and directions of rows and columns. Lengths are in mm, angles
-in degrees."""
+direction. A modular beam is a table of sources, panel centres, and directions of rows and columns. Units: mm, degrees."""
 
 from functools import partial
 from pathlib import Path

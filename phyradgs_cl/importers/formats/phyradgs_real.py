@@ -56,8 +56,8 @@ class Circle:
         return cls(centre[:2], circle.length("radius"), z, angles)
 
     def at(self, view: int, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns a view's angles (T,) in rad and points (T, 3) in mm at times ``share`` (T,), which count exposures from
-        its start: 1 is one exposure later."""
+        """Returns a view's angles (T,) in rad and points (T, 3) in mm at times ``share`` (T,), in exposures after the
+        opening of its first line."""
         start, closed, _ = self.angle_rad[view]
         angle = start + (closed - start) * share
         x, y = (self.centre[:, None] + self.radius * np.stack([np.cos(angle), np.sin(angle)])).tolist()
@@ -90,7 +90,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         expected, remedy = "a length in mm along v and along u", f"say {options.named('pixel_size_mm')}"
         raise InputError(f"{description} pixel size", "nothing", expected, remedy)
     share = np.linspace(0, shutter.span_s / shutter.exposure_s, _TIMES_A_FRAME)
-    poses = np.stack([  # (F, T, 12), of the images as stored, at T times of every frame
+    poses = np.stack([  # (F, T, 12), see PoseTable: stored images, at T times of every frame
         _view_poses(view, source.at(i, share)[1], detector.at(i, share), detector.centre, panel, pitch)
         for i, view in enumerate(views)
     ])  # fmt: skip
@@ -129,7 +129,7 @@ def _frames_and_views(
 
 
 def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> ImportOptions:
-    """Returns options with a flat value. Unless given, it is the brightest pixel, as in the published code; warns of it."""
+    """Returns options with a flat value: that given, else the brightest pixel, as in the published code, with a warning."""
     if options.flat_value is not None or options.quantity not in (None, "counts"):
         return options
     brightest = float(frames.max())
@@ -155,7 +155,8 @@ def _view_poses(
     view: Fields, source_mm: np.ndarray, detector: tuple[np.ndarray, np.ndarray], centre: np.ndarray,
     panel: tuple[int, int], pitch: tuple[float, float],
 ) -> np.ndarray:
-    """Returns poses (T, 12) of one view. The panel is rotated about +z from the angle at which its matrix holds."""
+    """Returns a view's poses (T, 12), see ``PoseTable``. detector: the panel's angles (T,) in rad and centres (T, 3) in mm.
+    The panel is rotated about +z from the angle at which its matrix holds. centre: (x, y) of its circle."""
     rotation, stands_at = _matrix(view)
     angle_rad, centre_mm = detector
     turned_rad = angle_rad - np.arctan2(stands_at[1] - centre[1], stands_at[0] - centre[0])

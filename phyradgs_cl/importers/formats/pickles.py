@@ -112,11 +112,11 @@ def read_pickle(path: Path, unpickler: "type[PlainUnpickler] | None" = None) -> 
 
 
 class PlainUnpickler(pickle.Unpickler):
-    """Python's unpickler, which here calls only a few functions of our own."""
+    """An unpickler that calls no function which a file names, but only a few of our own."""
 
     def find_class(self, module: str, name: str) -> Any:
         """Returns our function for an allowed name. Raises InputError for any other name."""
-        functions: dict[str, Any] = {  # made again at each call, since a pickle can set attributes of a function
+        functions: dict[str, Any] = {  # made anew at each call, since a pickle can change a function's attributes
             "numpy.ndarray": object,  # only passed to _reconstruct, which ignores it
             "numpy.dtype": lambda code, *_: _Type(code),
             "numpy.core.multiarray._reconstruct": lambda *_: _Array((0,)),
@@ -132,7 +132,7 @@ class PlainUnpickler(pickle.Unpickler):
 
 
 class _Type:
-    """A NumPy type of plain numbers. Unpickling calls ``__setstate__`` with its byte order."""
+    """A NumPy type of plain numbers, by a code such as "f4". Unpickling then sets the byte order by ``__setstate__``."""
 
     __slots__ = ("dtype",)
 
@@ -167,7 +167,7 @@ def _plain_array(raw: object, dtype: object, shape: object, order: object = "C")
 
 
 class _Geometry(SimpleNamespace):
-    """The attributes of a ``tigre.geometry``."""
+    """Stands in for a ``tigre.geometry``: has its attributes, and runs none of TIGRE's code."""
 
 
 class TigreUnpickler(PlainUnpickler):

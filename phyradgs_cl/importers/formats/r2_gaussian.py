@@ -22,12 +22,12 @@ from phyradgs_cl.io.scan import BEAMS
 from phyradgs_cl.io.tables import Fields
 
 META = "meta_data.json"
-META_WITH_TIMES = "meta_data_motion_blur_rolling_shutter_fps18.json"  # in folders of PhyRadGS
+META_WITH_TIMES = "meta_data_motion_blur_rolling_shutter_fps18.json"  # the description's name in folders of PhyRadGS
 ROW_0 = "top"
 OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 OPTIONS_WITH_TIMES = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
 _KEYS = ("first_line_start", "first_line_end", "last_line_end")
-_SAME = 1e-3  # readout over exposure may differ by this between frames, or by this fraction of a ratio above 1
+_SAME = 1e-3  # readout over exposure may differ by this much between frames; for ratios above 1, by this fraction
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class R2Folder:
         return cls(folder, meta, read_geometry(meta.table("scanner"), unit_mm), unit_mm)
 
     def frame(self, entry: Fields) -> np.ndarray:
-        """Reads one projection (v, u) as stored."""
+        """Reads the projection (v, u) of an entry, as stored."""
         name = entry.word("file_path")
         first_copy = name.replace("_sim1", "")  # _sim1 marks a repeated simulation; some folders have only the first one
         path = self.folder.file(first_copy if self.folder.exists(first_copy) else name, entry.name("file_path"))
@@ -123,7 +123,8 @@ def read_grid(scanner: Fields, unit_mm: float) -> Grid:
 
 
 def _pitches(scanner: Fields, what: str, counts: tuple[int, ...]) -> np.ndarray:
-    """Returns a pixel's or voxel's size along each axis: d<what>, else the total size s<what> over the count."""
+    """Returns a pixel's or voxel's size along each axis, from the key d + ``what``. Without it, takes the total size, key
+    s + ``what``, over the count. what: "Detector" or "Voxel"."""
     if scanner.has(f"d{what}"):
         return scanner.lengths(f"d{what}", len(counts))
     return scanner.lengths(f"s{what}", len(counts)) / np.array(counts)
@@ -141,7 +142,7 @@ def _offset(scanner: Fields, key: str, count: int) -> np.ndarray:
 
 
 def turned_volume(subject: str, volume: np.ndarray, grid: Grid, per_mm: float) -> np.ndarray:
-    """Converts a stored volume [x, y, z] to (nz, ny, nx) float32 in 1/mm; ``per_mm``: the factor of its values. Raises
+    """Converts a stored volume [x, y, z], times the factor ``per_mm``, to (nz, ny, nx) float32 in 1/mm. Raises
     InputError for a shape other than the grid's, and for values that are not finite in float32."""
     checks.shape(subject, volume, grid.shape[::-1])
     checks.finite(subject, volume)
@@ -190,7 +191,7 @@ def exposure_of_blurred_s(options: ImportOptions) -> float:
 
 
 def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarray) -> float:
-    """Returns readout time over exposure from the angles (F,) in rad through which the gantry turns in each. Raises
+    """Returns readout time over exposure time, from the gantry's arcs (F,) in rad during both. Raises
     InputError where the ratio differs between frames, and for exposures without a turn."""
     if np.any(exposure_arc == 0) or np.any(np.sign(exposure_arc) != np.sign(exposure_arc[0])):
         found = f"arcs from {exposure_arc.min():.6g} to {exposure_arc.max():.6g} rad"

@@ -35,7 +35,7 @@ NAMES = (
 _TO_AXIS, _TO_DETECTOR, _ANGLE = NAMES[:3]
 _ANGLES = ("GantryAngle", "InPlaneAngle", "OutOfPlaneAngle")
 _RADIUS = "RadiusCylindricalDetector"
-_RAW, _ORA = (".his", ".hnd", ".hnc", ".xim"), ".ora.xml"  # files for rtk_projections.py, not for this module
+_RAW, _ORA = (".his", ".hnd", ".hnc", ".xim"), ".ora.xml"  # endings of files that rtk_projections.py reads
 XIM_BELOW = "Acquisitions/*/*.xim"
 """Pattern of the projections of Varian's TrueBeam, from the folder of its Scan.xml."""
 # RTK's X, Y, Z are our y, z, x: the same right-handed frame with other names of its axes.
@@ -155,10 +155,10 @@ class RtkGeometry:
     def poses(
         self, position: np.ndarray, origin_mm: np.ndarray, step_u: np.ndarray, step_v: np.ndarray
     ) -> np.ndarray:
-        """Returns poses (T, 12) at frame positions (T,), linear between and beyond frames. origin_mm (2,): where pixel
-        (0, 0) lies on the panel. step_u, step_v (2,): steps in mm to the next column and row."""
+        """Returns poses (T, 12), see ``PoseTable``, at frame positions (T,), linear between and beyond frames. origin_mm
+        (2,): where pixel (0, 0) lies on the panel. step_u, step_v (2,): steps in mm to the next column and row."""
         at = {name: along(np.unwrap(v) if name in _ANGLES else v, position) for name, v in self.values.items()}
-        # from the gantry's to RTK's fixed frame: the inverse of Rz(−in plane) Rx(−out of plane) Ry(−gantry)
+        # rotates from the gantry's to RTK's fixed frame: the inverse of Rz(−in plane) Rx(−out of plane) Ry(−gantry)
         angles_rad = np.stack([at[name] for name in ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle")], -1)
         turn = Rotation.from_euler("YXZ", angles_rad).as_matrix()
         zero = np.zeros(position.shape)

@@ -23,8 +23,8 @@ _COPIES = 12  # bytes of memory for every byte of the files: some makers pack im
 
 @dataclass(frozen=True)
 class _Maker:
-    """A maker's files: how names of the description and of projections end, RTK's class that reads the geometry, and the
-    options that apply. below: pattern of projections that are in folders below the description's."""
+    """A maker's files. description, suffixes: how names of the description and of projections end. reader: RTK's class for
+    the geometry. below: pattern of projections in folders below the description's. options: those that apply."""
 
     description: str
     suffixes: tuple[str, ...]
@@ -44,7 +44,7 @@ _MAKERS = (
 def _read_geometry(rtk: Any, reader_name: str, description: str, names: list[str]) -> Any:
     """Reads RTK's geometry from the description and, for makers that store angles there, from the projections' headers."""
     reader = getattr(rtk, reader_name).New()
-    if hasattr(reader, "SetFilename"):  # Elekta's description holds the geometry of all projections
+    if hasattr(reader, "SetFilename"):  # Elekta's reader: the description has the geometry of all projections
         reader.SetFilename(description)
         reader.GenerateOutputInformation()
         return reader.GetOutputObject()

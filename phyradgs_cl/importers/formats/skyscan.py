@@ -36,7 +36,7 @@ _FIELDS = {
     "source_to_axis_mm": "Object to Source (mm)", "source_to_detector_mm": "Camera to Source (mm)",
     "exposure_s": "Exposure (ms)", "angles": "Rotation Step (deg)", "pixel_size_mm": "Image Pixel Size (um)",
 }  # fmt: skip
-_OFF = re.compile(r"OFF( *\(.*\))?", re.I)  # the log writes OFF (n) too, where n would count if it were ON
+_OFF = re.compile(r"OFF( *\(.*\))?", re.I)  # the log also writes OFF (n), where n would count if it were ON
 _SENSES = {"CC": 1, "CCW": 1, "CW": -1, "C": -1}
 _ASSUMED = {
     "Rotation Direction": "CC", "Optical Axis (line)": "the middle", "Scanning Start Angle": "0",
@@ -90,7 +90,7 @@ def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOp
         return width_mm / next((scan.length(name) for name in _RATIOS if scan.has(name)), 1.0), width_mm
 
     pitch_mm = options.taken("pixel_size_mm", stored_mm)
-    # a cropped image may not contain the central ray, but more than its own height away must be an error
+    # the central ray may lie outside a cropped image; if it is more than the image's height away, the log is wrong
     up_mm = (panel[0] / 2 - scan.number("Optical Axis (line)", panel[0] / 2, -panel[0], 2 * panel[0])) * pitch_mm[0]
     if options.detector_offset_mm is None:
         settings.say_missing(scan, {"place of the axis": "the middle of the panel; check --fix-offset or calibrate find it"})
@@ -99,8 +99,8 @@ def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOp
 
 def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredTiming:
     """Returns the exposure in s, summed over averaged frames. Leaves it out where the log has none, and where the scanner
-    stopped for each frame and the options give no frame time. Raises InputError for a Frame Averaging that is neither OFF
-    nor ON with a count."""
+    stopped for each frame and no option gives a frame time. Raises InputError for a Frame Averaging other than OFF, or ON
+    with a count."""
     motion = next((scan.word(name) for name in ("Type of Detector Motion", "Type of Motion") if scan.has(name)), "")
     averaging = scan.word("Frame Averaging", default="OFF")
     averaged = re.fullmatch(r"ON *\(([1-9]\d{0,5})\)", averaging, re.I)

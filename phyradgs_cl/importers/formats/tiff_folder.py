@@ -85,7 +85,7 @@ def _tables(path: Path) -> dict[str, Fields]:
     """Returns the tables [frames], [angles], [timing] and [readout] by name, and under "" all tables that a scanner file
     has too. Raises InputError for unknown names."""
     content = read_toml(path)
-    for place in (content, content.get("frames")):  # angles = "FILE" is short for [angles] file
+    for place in (content, content.get("frames")):  # angles = "FILE" is short for file = "FILE" in [angles]
         if isinstance(place, dict) and isinstance(place.get("angles"), str):
             text = place.pop("angles")
             content["angles"] = {**content.get("angles", {}), "file": text}
@@ -157,7 +157,7 @@ def _line_integrals(
 
 
 def _files(folder: SafeFolder, frames: Fields, name: str, default: str = "") -> list[Path]:
-    """Returns the files that match the patterns which ``frames`` has under ``name``, or ``default`` without that key."""
+    """Returns the files that match the patterns under the key ``name`` of [frames], or ``default`` without that key."""
     value = frames.values.get(name) or default
     paths: list[Path] = []
     for one in value if isinstance(value, list) else [value] if value else []:
@@ -182,7 +182,7 @@ def _scanner(path: Path, scanner: Fields, panel: tuple[int, int], options: Impor
         "detector": dict(zip(("pixel_size_v_mm", "pixel_size_u_mm"), options.pixel_size_mm or (), strict=False)),
     }
     for table, values in ((source, given["source"]), (detector, given["detector"])):
-        if isinstance(table, dict) and table.get("beam") != "parallel":  # with a parallel beam distances are an error
+        if isinstance(table, dict) and table.get("beam") != "parallel":  # distances of a parallel beam are an error
             table.update({key: value for key, value in values.items() if value is not None})
     if isinstance(detector, dict):
         content["detector"] = {"rows": panel[0], "columns": panel[1], **detector}

@@ -48,7 +48,7 @@ def open_hdf5(path: str | Path, linked_folder: Path | None = None) -> "Iterator[
         unknown = f"a file that HDF5 cannot open ({error})", ""
         found, remedy = next((known for words, known in _REASONS.items() if words in str(error)), unknown)
         raise InputError(subject, found, "a readable HDF5 file", remedy) from error
-    folders = filter(None, (path.parent, path.resolve().parent, linked_folder))  # of a symbolic link, both folders
+    folders = filter(None, (path.parent, path.resolve().parent, linked_folder))  # a link's own folder, and its target's
     places = tuple(Path(place) for one in folders for place in (os.path.abspath(one), one.resolve()))
     with file:
         try:
@@ -86,7 +86,7 @@ class Hdf5Source:
         return thing
 
     def groups(self, depth: int = 1, below: str = "/") -> Iterator[str]:
-        """Yields addresses of groups, at most ``depth`` levels below a group; leaves out broken links."""
+        """Yields addresses of groups, at most ``depth`` levels below the group ``below``; leaves out broken links."""
         for name in self.file[below] if depth else ():
             with suppress(InputError):
                 if isinstance(self.find(inside := posixpath.join(below, name)), h5py.Group):
@@ -168,7 +168,7 @@ class Hdf5Source:
         """Raises InputError if a linked file has no data at ``inside``; HDF5 itself would return nothing, or zeros."""
         own = Path(file.filename)
         place = own if name == "." else own.parent / name
-        if os.path.isabs(name) and not place.exists():  # HDF5 then looks for its name in the first file's folder
+        if os.path.isabs(name) and not place.exists():  # HDF5 then looks for the name beside the linking file
             place = own.parent / place.name
         self._check_place(address, place)
         if "%" in name:  # a pattern of numbered files, of which HDF5 reads all that exist

@@ -27,7 +27,7 @@ from phyradgs_cl.io.tables import read_facts
 
 _log = logging.getLogger(__name__)
 _JITTER = 0.01  # measured times of frames may differ from their median by this fraction of it
-_DEEPEST_ENTRY = 3  # levels of groups that are searched for NXtomo entries, which may be subentries
+_DEEPEST_ENTRY = 3  # levels of groups in which NXtomo entries and subentries are searched
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +213,7 @@ def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool)
     needed = moving and exposure_s > 0
     readout_s = read_duration(source, f"{entry}/{schema.DETECTOR}/detector_readout_time", used, needed)
     axis, direction = f"{entry}/{schema.EXTRA}/readout_axis", f"{entry}/{schema.EXTRA}/readout_direction"
-    rolling = needed and readout_s > 0  # else the order of lines has no effect
+    rolling = needed and readout_s > 0  # if not, the order of lines has no effect
     word = h5.read_word(source, axis, AXES, default=None if rolling else "rows")
     number = h5.read_number(source, direction, default=None if rolling else 1.0)
     checks.one_of(source.name(direction), number, (1, -1))
@@ -236,7 +236,7 @@ def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, f
 
 def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bool) -> float:
     """Reads one time in s for all projections, stored once or for every frame. Measured times may differ by a percent; the
-    result is their median. Returns 0 if it is missing and not ``needed``."""
+    result is their median. Returns 0 if the dataset is missing and not ``needed``."""
     dataset = source.dataset(address) if needed else source.optional(address)
     if dataset is None:
         return 0.0

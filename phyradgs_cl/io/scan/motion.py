@@ -19,8 +19,8 @@ from phyradgs_cl.io.hdf5 import datasets as h5
 _log = logging.getLogger(__name__)
 _KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # motions of a circular orbit that files can hold
 _RAMP_ERROR_RAD = 1e-9  # a speed ramp is stored as a table of angles, whose interpolation errs by at most this
-_MOST_RAMP_SAMPLES = 500_000  # longest such table, about 8 MB; a long, fast ramp is then stored less exactly
-_SUSPECT_RAD = math.radians(5.0)  # table and rotation_angle differ by more only if one has a wrong sign or zero
+_MOST_RAMP_SAMPLES = 500_000  # rows of the longest such table, about 8 MB; a longer ramp is stored less exactly
+_SUSPECT_RAD = math.radians(5.0)  # encoder table and rotation_angle differ by more only if one has a wrong sign or zero
 
 
 def has_motion(source: Hdf5Source, entry: str) -> bool:
@@ -106,7 +106,7 @@ def _table_group(entry: h5py.Group, name: str, time_s: np.ndarray) -> h5py.Group
 
 
 def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-    """Returns gantry angles (F,) in rad at start and end of each first line's exposure. At rest both are the frame's."""
+    """Returns gantry angles (F,) in rad at start and end of each first line's exposure; at rest, twice the frame's angle."""
     shutter = scan.shutter
     offsets_s = np.array([0.0, shutter.exposure_s] if scan.is_fly else [shutter.middle_s] * 2)
     pairs = np.array([_angles(scan, f, start_s + offsets_s) for f, start_s in enumerate(scan.frame_start_s)])
@@ -116,7 +116,7 @@ def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 def _angles(scan: Scan, frame: int, time_s: np.ndarray) -> np.ndarray:
     if isinstance(scan.trajectory, CircularOrbit):
         return scan.trajectory.angle_rad(frame, time_s)
-    source = towards_source(scan.trajectory.pose(frame, time_s), scan.is_parallel)  # its azimuth is for other programs
+    source = towards_source(scan.trajectory.pose(frame, time_s), scan.is_parallel)  # its azimuth serves as the angle
     return np.unwrap(np.arctan2(source[:, 1], source[:, 0]))
 
 
@@ -153,7 +153,7 @@ def _sense(source: Hdf5Source, address: str, absent: float) -> float:
 
 
 def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, first_rad: np.ndarray) -> None:
-    """Warns if table and rotation_angle differ by more than 5°, as with a wrong sign. The table is still used."""
+    """Warns if encoder table and rotation_angle, both (P,), differ by over 5°, as with a wrong sign. The table is used."""
     apart_rad = np.abs((table_rad - first_rad + np.pi) % (2 * np.pi) - np.pi)
     if apart_rad.max() > _SUSPECT_RAD:
         text = "%s: up to %.3g° from rotation_angle; the table is used"
@@ -163,7 +163,7 @@ def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, firs
 def read_gating(source: Hdf5Source, entry: str, used: np.ndarray, middle_s: np.ndarray) -> Gating | None:
     """Reads the gating signal or phase of the projections; None if the file has neither. used, bool (F,): which stored
     frames are projections. middle_s (P,): the middle of each projection's time. Raises InputError for a signal and a phase
-    together, and for equal times."""
+    together, and for frames at equal times."""
     if source.optional_group(f"{entry}/{schema.GATING}") is None:
         return None
     signal, phase = f"{entry}/{schema.SIGNAL}", f"{entry}/{schema.PHASE}"

@@ -21,7 +21,7 @@ from phyradgs_cl.io.hdf5.datasets import ATTENUATION, read_array, read_grid, rea
 from phyradgs_cl.io.scan.header import ScanHeader, read_header
 
 LARGEST_LINE_INTEGRAL = 1e6  # a larger one cannot be measured, so it raises an error
-# (data (F, v, u), image_key (F,), quantity) -> line integrals (P, v, u) of the projections, mask of bad pixels or None.
+# Takes data (F, v, u), image_key (F,) and quantity; returns line integrals (P, v, u) and a mask of bad pixels or None.
 ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.ndarray | None]]
 
 
@@ -79,7 +79,7 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
     scan, key = header.scan, header.image_key
     kinds = ("projections", "flats", "darks", "invalid")
     counts = {name: int(np.count_nonzero(key == number)) for number, name in enumerate(kinds)}
-    if header.quantity == "attenuation":  # flats and darks have been applied; only their numbers are in the file
+    if header.quantity == "attenuation":  # flats and darks have been applied, and the file has only their numbers
         applied = {name: scan.provenance.get(name) for name in APPLIED}
         counts |= {name: count for name, count in applied.items() if isinstance(count, int)}
     return {

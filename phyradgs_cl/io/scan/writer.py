@@ -35,7 +35,7 @@ def write_scan(
     frames. A user's own class of trajectory becomes a table of poses. Raises InputError for arguments that contradict each
     other, and for a scan that the format cannot express; OutputError if the file cannot be written."""
     frames, key = _checked_frames(scan, data, image_key, quantity)
-    if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:  # a reader would take it as at rest
+    if scan.is_fly and scan.shutter.exposure_s == 0 and scan.shutter.readout_s > 0:  # readers would take the scan as at rest
         remedy = "give the exposure its real length"
         raise InputError("exposure_s", "0 in a fly-scan with a readout", "a time above 0 s", remedy)
     scan = storable(scan)
@@ -184,7 +184,7 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
             write_motion(entry, scan, frame_of)
         elif isinstance(scan.trajectory, PoseTable):
             _remove(entry, schema.POSES)
-            if not scan.is_fly:  # see _stored_durations; poses belong to times, so frames need their times too
+            if not scan.is_fly:  # stored without exposure (_stored_durations), with the times of the poses
                 detector = entry[schema.DETECTOR]
                 _replace(detector, "count_time", 0.0, "s")
                 _replace(detector, "detector_readout_time", 0.0, "s")
@@ -196,7 +196,7 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
 
 @contextmanager
 def _copied(source: str | Path, target: str | Path, entry: str) -> Iterator[h5py.Group]:
-    """Yields the entry of a copy of ``source``, which has the group ``EXTRA``. On success the copy replaces ``target``."""
+    """Yields the group ``entry``, with the group ``EXTRA``, of a copy of ``source``. On success it replaces ``target``."""
     with written_beside(target) as temporary:
         shutil.copyfile(source, temporary)
         with h5py.File(temporary, "r+") as file:

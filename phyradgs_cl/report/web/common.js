@@ -62,7 +62,7 @@ function makePlayer(button, slider, lasts_ms, show) {
   return { start, stop, isPlaying: () => playing !== 0 };
 }
 
-// The largest of 1, 2, 5, 10, ... that is at most this.
+// Returns the largest of 1, 2, 5, 10, ... that is at most ``most``.
 function roundLength(most) {
   const power = 10 ** Math.floor(Math.log10(most));
   return power * ([5, 2].find((factor) => factor * power <= most * (1 + 1e-9)) || 1);

@@ -10,7 +10,7 @@
   let kept = {};
   try {
     kept = JSON.parse(sessionStorage.getItem("live") || "{}");
-  } catch {} // no storage for files
+  } catch {} // a page opened as a file may have no storage
   const keep = (more) => {
     kept = { ...kept, ...more };
     try {

@@ -1,4 +1,4 @@
-// The object at any time of the scan: the page's voxels at v(y + w(y, t)), and arrows from where matter is in the reference.
+// The object at point y and time t: v(y + w(y, t)), from the reference volume v and the displacement w, which arrows show.
 (() => {
   const data = dataOf("motion-data"), volume = dataOf("volume-data");
   if (!data || !volume) return;

@@ -34,7 +34,7 @@
     return [pose[0], ...ends(pose, 0), ...ends(pose, count - 1)];
   }));
   const middle = [0, 1, 2].map((k) => (Math.min(...all.map((at) => at[k])) + Math.max(...all.map((at) => at[k]))) / 2);
-  const reach = Math.max(...all.map((at) => Math.hypot(at[0] - middle[0], at[1] - middle[1]))); // about the axis
+  const reach = Math.max(...all.map((at) => Math.hypot(at[0] - middle[0], at[1] - middle[1]))); // across the axis
   const height = Math.max(...all.map((at) => Math.abs(at[2] - middle[2])));
 
   function draw() {
