@@ -16,8 +16,11 @@ from phyradgs_cl.io.output import lock_path
 TINY = ["--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4", "--time-samples", "2"]
 # every other method goes on from its state in tests/reconstructors (test_iterative, test_changing, test_object_motion)
 RUNS = {
-    "phyradgs": ["--method", "phyradgs", "--iterations", "150", "--gaussians", "60", "--set", "control.start_iteration=50"],
-    "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "100"],
+    "phyradgs": [
+        *("--method", "phyradgs", "--iterations", "60", "--gaussians", "60"),
+        *("--set", "control.start_iteration=20", "--set", "control.every=30"),
+    ],
+    "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "40"],
 }
 # STRESS=50 is what `make stress` sets
 KILLS = int(os.environ.get("STRESS", "1"))
