@@ -26,7 +26,7 @@ TORCH  ?= torch==2.13.0
 BIN      := $(VENV)/bin
 PHYRADGS := $(BIN)/phyradgs
 
-.PHONY: demo test test-all docs stress coverage types test-quick test-browser test-cluster test-drivers test-gpu-build gpu test-intel test-mpi test-neural test-oclgrind test-pocl-package test-spectrum clean
+.PHONY: demo test test-all docs stress coverage types test-every test-quick test-browser test-cluster test-drivers test-gpu-build gpu test-intel test-mpi test-neural test-oclgrind test-pocl-package test-spectrum clean
 .DELETE_ON_ERROR:
 
 $(BIN)/python:
@@ -68,6 +68,11 @@ test: $(VENV)/.installed-test
 	$(BIN)/ruff check .
 	@$(MAKE) --no-print-directory --jobs=2 types test-quick
 
+# One run of pytest: another would import, collect and make what tests share once more.
+test-all: $(VENV)/.installed-test-all
+	$(BIN)/ruff check .
+	@$(MAKE) --no-print-directory --jobs=2 types test-every
+
 types: $(VENV)/.installed-test
 	@if $(BIN)/python -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then \
 		echo $(BIN)/mypy phyradgs_cl cli.py; $(BIN)/mypy phyradgs_cl cli.py; \
@@ -76,8 +81,8 @@ types: $(VENV)/.installed-test
 test-quick: $(VENV)/.installed-test
 	$(call tested,$(VENV),-m "not slow" $(PARALLEL))
 
-test-all: test $(VENV)/.installed-test-all
-	$(call tested,$(VENV),-m slow $(PARALLEL))
+test-every: $(VENV)/.installed-test-all
+	$(call tested,$(VENV),$(PARALLEL))
 
 docs: $(VENV)/.installed-test-all
 	$(BIN)/python docs/make_reference.py
