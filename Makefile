@@ -1,6 +1,6 @@
 # make demo    simulate a fly-scan, reconstruct it four ways, print a table (two to four minutes of processor time)
 # make test    style, types, every kernel, a bit of everything else: minutes; a skipped kernel test is a failure
-# make test-all   the same and then all other tests: a quarter of an hour
+# make test-all   the same and all other tests: a quarter of an hour
 # make docs     the documentation as a site, in site/
 # make stress     runs killed fifty times each, injected faults, damaged files, laws on random scanners (hours)
 # make coverage   which lines the tests run, with PyTorch, Dask and MPI in one environment; fails below 95 %
