@@ -1,16 +1,14 @@
 """Whether a device can be trusted: every kernel is asked, and one that is wrong is named."""
 
 import math
-import pickle
 import re
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 from kernel_kit import CPU_ONLY, launches
+from remembered import remembered
 
 from phyradgs_cl import device_check, device_probes
 from phyradgs_cl.device_check import check_device
@@ -44,17 +42,9 @@ LONG = {  # kernels that may take long
 @pytest.fixture(scope="module")
 def twins_once() -> Iterator[None]:
     """Central differences of the twins are most of a check's time, and the same whatever shape launches have."""
-    kept: dict[bytes, np.ndarray] = {}
-
-    def remembered(twin, *given, **named):
-        key = pickle.dumps((twin.__name__, given, named))
-        if key not in kept:
-            kept[key] = twin(*given, **named)
-        return kept[key]
-
     with pytest.MonkeyPatch.context() as patch:
         for name in TWINS:
-            patch.setattr(device_check, name, partial(remembered, getattr(device_check, name)))
+            patch.setattr(device_check, name, remembered(getattr(device_check, name)))
         yield
 
 
