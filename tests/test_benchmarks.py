@@ -1,9 +1,7 @@
 """Benchmarks run, at their smallest; no figure of theirs is looked at but for being there."""
 
 import json
-import os
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 
@@ -36,12 +34,10 @@ def run(monkeypatch, capsys):
     return run
 
 
-def test_the_demo(tmp_path) -> None:
+def test_the_demo(tmp_path, run, monkeypatch) -> None:
     """Its table has every run with its motion, and its processor seconds are counted in the sum."""
-    command = [sys.executable, str(FOLDER / "demo.py"), str(tmp_path), "--quick"]
-    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(FOLDER.parent)}, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
-    lines = done.stdout.splitlines()
+    monkeypatch.setenv("PYTHONPATH", str(FOLDER.parent))
+    lines = run("demo.py", str(tmp_path), "--quick").splitlines()
     start = next(n for n, line in enumerate(lines) if line.startswith("method "))
     *rows, total = (line.split() for line in lines[start + 1 : start + 6])
     assert [row[:2] for row in rows] == [["fdk", "ignored"], ["fista", "ignored"], ["fista", "known"], ["phyradgs", "known"]]
