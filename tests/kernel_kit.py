@@ -16,7 +16,7 @@ from phyradgs_cl.acquisition.cells import (
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, QUATERNION, SCALE
 from phyradgs_cl.operators import DeviceCells, SplatProjector
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime import Runtime, context
 
 CLASSES = {"mean": MEAN, "scale": SCALE, "quaternion": QUATERNION, "density": DENSITY}
 MODELS = pytest.mark.parametrize("affine", [False, True], ids=["exact", "affine"])
@@ -103,3 +103,15 @@ def assert_classes(found: np.ndarray, expected: np.ndarray, tolerance: float) ->
     for name, part in CLASSES.items():
         error = np.linalg.norm(found[part] - expected[part]) / np.linalg.norm(expected[part])
         assert error <= tolerance, (name, error)
+
+
+def launches(monkeypatch) -> list[tuple[str, tuple, tuple, tuple | None]]:
+    """(kernel, work-items, group, first item) of every launch from now on."""
+    seen, launch = [], context.cl.enqueue_nd_range_kernel
+
+    def noted(queue, kernel, items, group, first=None):
+        seen.append((kernel.function_name, items, group, first))
+        return launch(queue, kernel, items, group, first)
+
+    monkeypatch.setattr(context.cl, "enqueue_nd_range_kernel", noted)
+    return seen

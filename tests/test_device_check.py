@@ -1,11 +1,14 @@
 """Whether a device can be trusted: every kernel is asked, and one that is wrong is named."""
 
+import math
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from kernel_kit import CPU_ONLY
+from kernel_kit import CPU_ONLY, launches
+from remembered import remembered
 
 from phyradgs_cl import device_check, device_probes
 from phyradgs_cl.device_check import check_device
@@ -28,13 +31,41 @@ SHAPES = {
 }  # fmt: skip
 
 
+TWINS = ("splat_frame", "moving_frame", "splat_image", "deformed_frame", "voxel_field")
+LONG = {  # kernels that may take long
+    "rays_forward", "rays_adjoint", "backproject", "backproject_lines", "backproject_moving", "backproject_lines_moving",
+    "push_displacement", "splat_forward_pixels", "splat_backward_group", "voxel_forward", "voxel_backward", "warp_forward",
+    "warp_adjoint_fixed", "dct_excess", "ridge_responses",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def twins_once() -> Iterator[None]:
+    """Central differences of the twins are most of a check's time, and the same whatever shape launches have."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in TWINS:
+            patch.setattr(device_check, name, remembered(getattr(device_check, name)))
+        yield
+
+
 @pytest.mark.parametrize(("launch_shape", "others"), SHAPES.values(), ids=SHAPES)
-def test_every_kernel_is_asked(launch_shape, others) -> None:
+def test_every_kernel_is_asked(twins_once, launch_shape, others) -> None:
     sources = (path.read_text(encoding="utf-8") for path in KERNELS.glob("*.cl"))
     known = {name for text in sources for name in re.findall(r"__kernel\s+void\s+(\w+)", text)}
     verdict = check_device(**launch_shape)
     assert verdict.failures == () and known - verdict.agreeing == others
     assert str(verdict).endswith(f"can be trusted: all {len(verdict.agreeing)} kernels agree with float64")
+
+
+def test_groups_and_launches_keep_to_small_limits(twins_once, monkeypatch) -> None:
+    """A kernel with many registers may allow fewer items than its device. Here all do, and no launch may be long."""
+    parts = launches(monkeypatch)
+    monkeypatch.setattr(Runtime, "_asked", lambda *_: 32)
+    monkeypatch.setattr(Runtime, "most_samples", 50)
+    verdict = check_device(**SHAPES["GPU"][0])
+    assert verdict.failures == () and len(verdict.agreeing) > 60
+    assert max(math.prod(group) for _, _, group, _ in parts) == 32
+    assert {name for name, _, _, first in parts if first is not None} >= LONG
 
 
 # a check, a program, what is changed in it, and what the line says

@@ -2,7 +2,7 @@
 is masked by one condition for all lanes. PoCL may undo either silently, and the kernel then takes 3 to 20 times as long."""
 
 import pytest
-from machine_code import HERE, built, code_of
+from machine_code import HERE, STRESSED, built, code_of
 
 CHECKS = ("_algebra", "_image_terms", "_variation", "_optimiser")
 """The checks of a device whose kernels stream; their programs build quickly."""
@@ -16,7 +16,8 @@ MAY_BE_SCALAR = {
 }
 
 
-TARGETS = [*HERE[:1], *(pytest.param(*row, marks=pytest.mark.slow) for row in HERE[1:])]
+TARGETS = [*HERE[:1], *(pytest.param(*row, marks=pytest.mark.slow) for row in HERE[1 : 3 if STRESSED else 2])]
+"""`make test` has the widest, `make test-all` AVX2 too, whose masks are vectors; `make stress` has AVX as well."""
 
 
 @pytest.mark.parametrize("target, library, lanes", TARGETS)

@@ -143,7 +143,7 @@ def test_beads_are_told_from_spots_that_are_none_and_from_their_mirror_image(kno
 @pytest.mark.slow
 def test_a_scanner_is_found_by_what_it_shows_of_beads(cli, rt, file, known, tmp_path, capsys) -> None:
     """Rows read, from the other end than stated, one turn; another start of all frames is the phantom turned."""
-    scan = scanned(rt, lying(known), noise="tigre", views=10)
+    scan = scanned(rt, lying(known), noise="tigre", views=8)
     planted = {"readout": 0.09, "exposure": -0.17, "offset-u": 0.15, "detector-distance": -0.05, "direction": 2.0}
     off = GeometryCorrection(readout_s=0.09, exposure_s=-0.17, offset_u_mm=0.15, detector_distance_mm=-0.05)
     stated = perturb(scan, GeometryCorrection(**{name: -value for name, value in vars(off).items()}))

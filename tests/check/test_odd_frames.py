@@ -24,8 +24,8 @@ from phyradgs_cl.fields import Grid
 pytestmark = pytest.mark.slow
 
 PLANTED = {
-    "moved": lambda p, at: shift(p[at], (0, 2), order=1, mode="nearest"),
-    "mirrored": lambda p, at: p[at][:, ::-1],
+    "moved": lambda frame: shift(frame, (0, 2), order=1, mode="nearest"),
+    "mirrored": lambda frame: frame[:, ::-1],
 }
 
 
@@ -43,18 +43,18 @@ def answer(rt, scan: Scan) -> tuple[str, str]:
     return finding.verdict, finding.text.split(";")[0]
 
 
-PLACES = [("half a turn", "first"), ("its end too", "last"), ("cone, 216°", "middle"), ("cone, 216°", "last")]
-
-
-@pytest.mark.parametrize(("arc", "place"), [*PLACES, ("cone, full", "first")])
-def test_one_odd_frame_is_named_wherever_it_is(rt, arcs, arc, place) -> None:
-    scan = arcs[arc]
-    at = {"first": 0, "middle": scan.frames // 2, "last": scan.frames - 1}[place]
-    for change in PLANTED.values():
-        frames = scan.projections.copy()
-        frames[at] = change(frames, at)
-        said = answer(rt, replace(scan, projections=frames))
-        assert said == (SUSPICIOUS, f"frame {at} (from 0) does not fit the others")
+@pytest.mark.parametrize(
+    ("arc", "at", "change"),
+    [
+        ("half a turn", 0, "moved"), ("its end too", 30, "mirrored"), ("cone, 216°", 18, "moved"),
+        ("cone, 216°", 35, "mirrored"), ("cone, full", 0, "moved"),
+    ],
+)  # fmt: skip
+def test_one_odd_frame_is_named_wherever_it_is(rt, arcs, arc, at, change) -> None:
+    frames = arcs[arc].projections.copy()
+    frames[at] = PLANTED[change](frames[at])
+    said = answer(rt, replace(arcs[arc], projections=frames))
+    assert said == (SUSPICIOUS, f"frame {at} (from 0) does not fit the others")
 
 
 def test_the_first_and_the_last_frame_may_both_be_odd(rt, arcs) -> None:

@@ -13,11 +13,16 @@ import pytest
 from phyradgs_cl.io import checkpoint_path, read_volume
 from phyradgs_cl.io.output import lock_path
 
+pytestmark = pytest.mark.slow
+
 TINY = ["--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4", "--time-samples", "2"]
 # every other method goes on from its state in tests/reconstructors (test_iterative, test_changing, test_object_motion)
 RUNS = {
-    "phyradgs": ["--method", "phyradgs", "--iterations", "150", "--gaussians", "60", "--set", "control.start_iteration=50"],
-    "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "100"],
+    "phyradgs": [
+        *("--method", "phyradgs", "--iterations", "60", "--gaussians", "60"),
+        *("--set", "control.start_iteration=20", "--set", "control.every=30"),
+    ],
+    "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "40"],
 }
 # STRESS=50 is what `make stress` sets
 KILLS = int(os.environ.get("STRESS", "1"))
@@ -28,14 +33,13 @@ def scan(simulated) -> Path:
     return simulated(*TINY, "--noise", "tigre")
 
 
-def command(scan: Path, output: Path, options: list[str]) -> list[str]:
+def words_of(scan: Path, output: Path, options: list[str]) -> list[str]:
     """A run that keeps a checkpoint at every report."""
-    start = [sys.executable, "-m", "phyradgs_cl", "reconstruct", str(scan), "-o", str(output)]
-    return [*start, *options, "--checkpoint-every", "1e-6"]
+    return ["reconstruct", str(scan), "-o", str(output), *options, "--checkpoint-every", "1e-6"]
 
 
-def finished(scan: Path, output: Path, options: list[str]) -> subprocess.CompletedProcess:
-    return subprocess.run(command(scan, output, options), capture_output=True, text=True, check=False)
+def command(scan: Path, output: Path, options: list[str]) -> list[str]:
+    return [sys.executable, "-m", "phyradgs_cl", *words_of(scan, output, options)]
 
 
 def kill_in_the_middle(run: list[str], output: Path, after_s: float) -> None:
@@ -53,11 +57,10 @@ def kill_in_the_middle(run: list[str], output: Path, after_s: float) -> None:
     process.wait()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
-def test_killed_runs_end_with_the_bits_of_one_that_was_not(scan, tmp_path, name) -> None:
+def test_killed_runs_end_with_the_bits_of_one_that_was_not(cli, scan, tmp_path, name) -> None:
     whole, killed, options = tmp_path / "whole.h5", tmp_path / "killed.h5", RUNS[name]
-    subprocess.run(command(scan, whole, options), check=True, capture_output=True)
+    assert cli.run(words_of(scan, whole, options)) == 0
     assert list(tmp_path.iterdir()) == [whole]
     rng = np.random.default_rng(len(name))
     run = command(scan, killed, options)
@@ -69,7 +72,7 @@ def test_killed_runs_end_with_the_bits_of_one_that_was_not(scan, tmp_path, name)
             checkpoint_path(killed).unlink(missing_ok=True)
             kill_in_the_middle(run, killed, 0.0)
     resume = ["--resume"] if checkpoint_path(killed).exists() else []
-    subprocess.run([*run, *resume], check=True, capture_output=True)
+    assert cli.run(words_of(scan, killed, [*options, *resume])) == 0
     np.testing.assert_array_equal(read_volume(killed).values, read_volume(whole).values)
     told, expected = (
         [line["iteration"] for line in read_volume(path).provenance["record"]] for path in (killed, whole)
@@ -78,32 +81,28 @@ def test_killed_runs_end_with_the_bits_of_one_that_was_not(scan, tmp_path, name)
     assert not checkpoint_path(killed).exists() and not lock_path(killed).exists()
 
 
-@pytest.mark.slow
-def test_two_runs_on_one_output_refuse_each_other(scan, tmp_path) -> None:
+def test_two_runs_on_one_output_refuse_each_other(refused, scan, tmp_path) -> None:
     output, quiet = tmp_path / "volume.h5", {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     first = subprocess.Popen(command(scan, output, ["--iterations", "100000"]), **quiet)
     try:
         deadline = time.monotonic() + 60
         while not checkpoint_path(output).exists() and time.monotonic() < deadline:
             time.sleep(0.02)
-        second = finished(scan, output, ["--method", "fdk"])
+        refused(words_of(scan, output, ["--method", "fdk"]), "volume.h5: found another run at work on it", status=4)
     finally:
         first.kill()
         first.wait()
-    assert second.returncode == 4
-    assert second.stderr.count("\n") == 1 and "volume.h5: found another run at work on it" in second.stderr
 
 
-@pytest.mark.slow
-def test_a_checkpoint_is_neither_needed_nor_lost(scan, tmp_path) -> None:
+def test_a_checkpoint_is_neither_needed_nor_lost(cli, scan, tmp_path, caplog) -> None:
     """It is a warning that none can be written, and a run that forgets one sets it aside."""
     output, short = tmp_path / "volume.h5", ["--method", "sirt", "--iterations", "3"]
     checkpoint_path(output).mkdir()
-    done = finished(scan, output, short)
-    assert done.returncode == 0 and done.stderr.count("no checkpoint") == 1 and output.exists()
+    assert cli.run(words_of(scan, output, short)) == 0 and output.exists()
+    assert caplog.text.count("no checkpoint") == 1
     checkpoint_path(output).rmdir()
     kill_in_the_middle(command(scan, output, [*short, "--iterations", "100000"]), output, 0.01)
     kept = checkpoint_path(output).read_bytes()
-    done = finished(scan, output, short)
-    assert done.returncode == 0 and "kept as volume.h5.checkpoint.npz.bak" in done.stderr
+    assert cli.run(words_of(scan, output, short)) == 0
+    assert "kept as volume.h5.checkpoint.npz.bak" in caplog.text
     assert checkpoint_path(output).with_name("volume.h5.checkpoint.npz.bak").read_bytes() == kept

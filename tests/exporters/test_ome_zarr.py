@@ -7,9 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from ome_zarr.format import FormatV04
-from ome_zarr.writer import write_image
-from ome_zarr_models import open_ome_zarr
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import export_volume
@@ -29,7 +26,15 @@ def large() -> Volume:
     return Volume(np.random.default_rng(5).uniform(0, 0.03, grid.shape).astype(np.float32), grid)
 
 
+def write_image(*given, **named) -> None:
+    from ome_zarr import writer  # takes seconds, in every process that collects tests
+
+    writer.write_image(*given, **named)
+
+
 def test_every_level_has_the_means_and_places_of_the_one_before(large, tmp_path) -> None:
+    from ome_zarr_models import open_ome_zarr
+
     write_zarr(tmp_path / "v.ome.zarr", large, None)
     image = open_ome_zarr(zarr.open_group(str(tmp_path / "v.ome.zarr"), mode="r"))
     assert image.ome_attributes.version == "0.5"
@@ -62,6 +67,8 @@ def test_no_second_copy_of_the_volume_is_made(tmp_path, scale) -> None:
 
 
 def test_other_programs_versions_units_axes_and_types(tmp_path) -> None:
+    from ome_zarr.format import FormatV04
+
     counts = np.random.default_rng(1).integers(-1000, 3000, (1, 1, 6, 5, 4)).astype(np.int16)
     sides = {"t": 1.0, "c": 1.0, "z": 500.0, "y": 250.0, "x": 125.0}
     units = {axis: "micrometer" for axis in "zyx"}

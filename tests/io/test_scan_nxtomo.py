@@ -4,12 +4,18 @@ import h5py
 import numpy as np
 import pint
 import pytest
-from nxtomo.application import nxtomo
 
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.io import read_scan, write_scan
 
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def nxtomo():
+    from nxtomo.application import nxtomo  # takes seconds, in every process that collects tests
+
+    return nxtomo
 
 
 @pytest.fixture
@@ -23,7 +29,7 @@ def stored(tmp_path, make_scan):
     return tmp_path / "scan.nx", scan, key, data
 
 
-def test_nxtomo_reads_our_file(stored) -> None:
+def test_nxtomo_reads_our_file(nxtomo, stored) -> None:
     path, _, key, data = stored
     assert nxtomo.NXtomo.get_valid_entries(str(path)) == ("/entry",)
     tomo = nxtomo.NXtomo().load(str(path), "/entry", detector_data_as="as_numpy_array")
@@ -50,7 +56,7 @@ def test_default_plot_leads_to_the_frames(stored) -> None:
             assert name == "." or name in group
 
 
-def test_we_read_a_file_of_nxtomo(tmp_path) -> None:
+def test_we_read_a_file_of_nxtomo(nxtomo, tmp_path) -> None:
     """A static cone-beam file without our own group: angles are the sample's, distances in metres."""
     units, rng = pint.get_application_registry(), np.random.default_rng(3)
     tomo = nxtomo.NXtomo()

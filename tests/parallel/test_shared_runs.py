@@ -74,7 +74,7 @@ def test_classical_methods_come_to_the_same_volume(on_ranks, scan, method, model
     options = method_options(method, None, changes)
     one = reconstruct(scan, RunPlan(method, options), Runtime()).volume
     first: dict[int, np.ndarray] = {}
-    for size in (3, 2, 3):  # and once more
+    for size in (3, 2, 3) if method == "sirt" else (3,):  # and once more
         volumes = [found.volume for found in on_ranks(size, method, options)]
         assert np.linalg.norm(volumes[0] - one) <= RANK_VOLUME * np.linalg.norm(one)
         for volume in volumes:
@@ -82,7 +82,7 @@ def test_classical_methods_come_to_the_same_volume(on_ranks, scan, method, model
 
 
 def test_a_stopped_run_goes_on_with_another_number_of_ranks(on_ranks, scan) -> None:
-    options = replace(OPTIONS, iterations=80, control=replace(CONTROL, max_gaussians=400))
+    options = replace(OPTIONS, iterations=76, control=replace(CONTROL, max_gaussians=400))
     whole = reconstruct(scan, RunPlan("phyradgs", options, seed=1), Runtime())
 
     def stop(progress: Progress) -> None:
@@ -105,10 +105,10 @@ def test_rank_0_reports_alone_and_can_make_what_it_is_asked_for(on_ranks, scan, 
         seen.append((progress.iteration, volume.shape == grid.shape, progress.state()["raw"].shape[0]))
 
     monkeypatch.setattr(loop, "SILENT_S", 0.0)
-    options = replace(OPTIONS, iterations=60, batch=1, control=replace(CONTROL, max_gaussians=400))
-    for size, batch, expected in ((1, 1, list(range(1, 61))), (2, 2, [50, 60]), (3, 4, [52, 60])):
+    options = replace(OPTIONS, control=replace(CONTROL, max_gaussians=400))
+    for size, batch, expected in ((1, 1, [1, 2, 3, 4]), (2, 2, [50, 56]), (3, 4, [52, 56])):
         seen.clear()
-        on_ranks(size, "phyradgs", replace(options, batch=batch), report=report)
+        on_ranks(size, "phyradgs", replace(options, iterations=expected[-1], batch=batch), report=report)
         assert seen == [(iteration, True, 11) for iteration in expected]
 
 

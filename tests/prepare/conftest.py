@@ -39,17 +39,17 @@ def planted(rt) -> Planted:
 
 @pytest.fixture(scope="session")
 def closed_form() -> Planted:
-    """(body, distances, arc in degrees, spread of gains, panel, photons, noise) → a stop-and-shoot scan of 180 views."""
+    """(body, distances, arc in degrees, spread of gains, panel, photons, noise, views) → a stop-and-shoot scan."""
 
     @cache
     def make(
         name: str, distances: tuple[float, float] = CONE, arc_deg: float = 360.0, rings: float = 0.0,
-        panel: int = 48, dose: float = 28_000, noise: Noise = tigre_noise,
+        panel: int = 48, dose: float = 28_000, noise: Noise = tigre_noise, views: int = VIEWS,
     ) -> Scan:  # fmt: skip
         ellipsoids = [Ellipsoid((x, y, z), (a, b, c), per_mm) for per_mm, x, y, z, a, b, c in BODIES[name]]
         phantom = EllipsoidPhantom(tuple(ellipsoids), name)
         geometry = ConeGeometry(*distances, (panel, panel), 2.6 * distances[1] / distances[0] / panel)
-        protocol, angle_rad = Protocol(views=VIEWS), np.deg2rad(np.arange(VIEWS) * arc_deg / VIEWS)
+        protocol, angle_rad = Protocol(views=views), np.deg2rad(np.arange(views) * arc_deg / views)
         poses = geometry.pose(angle_rad)
         frames = phantom.line_integrals(poses[:, None, None, :3], pixel_centres(poses, (panel, panel))).astype(np.float32)
         rng, grid = np.random.default_rng(5), Grid.cube(32, 2.0)

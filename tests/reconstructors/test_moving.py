@@ -144,7 +144,7 @@ def test_an_unknown_motion_is_found_and_taken_out(rt, scan, result) -> None:
 
 def test_parallel_beams_show_an_unknown_motion_too(rt) -> None:
     scan = breathing_scan(rt, 0.3, is_parallel=True)
-    found = run(rt, scan).facts[MOTION_FOUND]
+    found = run(rt, scan, iterations=3).facts[MOTION_FOUND]
     assert found["moves"] and found["period_s"] == pytest.approx(2.3, rel=0.05) and found["gain"] > 0.2
 
 

@@ -1,14 +1,16 @@
-"""Launches on devices that allow less than PoCL does: groups by the kernel's own limit, and no launch that takes long."""
+"""Launches on devices that allow less than PoCL does: groups by the kernel's own limit, and no launch that takes long.
+
+tests/test_device_check.py asks every kernel so."""
 
 import math
 
 import numpy as np
 import pytest
+from kernel_kit import launches
 
 from phyradgs_cl import operators
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import per_line_cells
-from phyradgs_cl.device_check import check_device
 from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.splats import binning
@@ -16,35 +18,11 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime import context as runtime_context
 
 GPU = {"lanes": 1, "pixel_items": True}
-LONG = {  # kernels that may take long
-    "rays_forward", "rays_adjoint", "backproject", "backproject_lines", "backproject_moving", "backproject_lines_moving",
-    "push_displacement", "splat_forward_pixels", "splat_backward_group", "voxel_forward", "voxel_backward", "warp_forward",
-    "warp_adjoint_fixed", "dct_excess", "ridge_responses",
-}  # fmt: skip
 
 
 @pytest.fixture
 def parts(monkeypatch):
-    """(kernel, work-items, group, first item) of every launch from now on."""
-    seen, launch = [], runtime_context.cl.enqueue_nd_range_kernel
-
-    def noted(queue, kernel, items, group, first=None):
-        seen.append((kernel.function_name, items, group, first))
-        return launch(queue, kernel, items, group, first)
-
-    monkeypatch.setattr(runtime_context.cl, "enqueue_nd_range_kernel", noted)
-    return seen
-
-
-@pytest.mark.slow
-def test_groups_and_launches_keep_to_small_limits(monkeypatch, parts) -> None:
-    """A kernel with many registers may allow fewer items than its device. Here all do, and no launch may be long."""
-    monkeypatch.setattr(Runtime, "_asked", lambda *_: 32)
-    monkeypatch.setattr(Runtime, "most_samples", 50)
-    verdict = check_device(**GPU)
-    assert verdict.failures == () and len(verdict.agreeing) > 60
-    assert max(math.prod(group) for _, _, group, _ in parts) == 32
-    assert {name for name, _, _, first in parts if first is not None} >= LONG
+    return launches(monkeypatch)
 
 
 def test_a_kernel_that_allows_hardly_any_items_is_named(monkeypatch) -> None:
