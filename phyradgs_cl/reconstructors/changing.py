@@ -36,7 +36,7 @@ class ChangingOptions(IterativeOptions):
     - subsets: as in ``fista``, but at most two for each frame of a state. tv_iterations: as in ``fista``."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 8)
-    """Iterations of the two short runs that ``estimate`` times: the first passes, which touch new memory, are slower."""
+    """Iterations of the two short runs that ``estimate`` times. Both begin with the slower first pass."""
 
     motion: Motion = PerRow()
     iterations: int = 40

@@ -22,13 +22,13 @@ from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.text import flag_of, suggest_name
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
-"""Fields of motion models, such as the number of times per line, which are options of their names."""
+"""Fields of motion models, such as the number of times per line, which are also options, under the same names."""
 _ALL = motions_for(RAYS, SPLATS)  # a user's own method may take any motion model
 LARGEST_SEED = 2**63
 _DECIMALS = 6  # decimals of mm and s in a run's identity: a scan that was stored and read is still the same scan
 _SUBJECT = "--object-motion"
 _MOST_VOXELS = 24  # deformations are smooth, so a grid of this many voxels a side is enough to check one
-_LEAST_DETERMINANT = 0.05  # a deformation with a smaller det(I + ∂w/∂y) is refused: at 0 matter folds
+_LEAST_DETERMINANT = 0.05  # a deformation w(y) with a smaller det(I + ∂w/∂y) is refused: at 0 matter folds
 _LEAST_COVERED = 0.5  # a deformation that covers less than this fraction of the scan's time is refused
 _MOSTLY_COVERED = 0.98  # a deformation that covers less than this fraction causes a warning
 log = logging.getLogger(__name__)

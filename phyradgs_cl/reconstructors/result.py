@@ -118,9 +118,10 @@ class Reconstruction:
     ) -> "Reconstruction":
         """Returns the result, still in 1/mm, with a scale of Hounsfield units fitted to two points.
 
-        air, water: boxes (z0, z1, y0, y1, x0, x1) in mm, whose mean counts; None: the volume's own peak, the lowest and the
-        largest above it. insert_hu: the HU of the second point, if it is not water. ``result.scale.line`` says what was
-        fitted, ``result.scale.of(result.volume)`` is the volume (nz, ny, nx) in HU. ``save_volume`` keeps the scale.
+        air, water: boxes (z0, z1, y0, y1, x0, x1) in mm, whose mean counts; None: a peak of the volume's histogram, the
+        lowest for air, the largest above that for water. insert_hu: the HU of the second point, if it is not water.
+        ``result.scale.line`` says what was fitted, ``result.scale.of(result.volume)`` is the volume in HU. ``save_volume``
+        keeps it.
 
         Raises InputError for less than 100 voxels, air that is not below water, and peaks that are not theirs."""
         scale = fitted(self.volume, self.grid, air, water, insert_hu)
@@ -177,9 +178,9 @@ class Progress:
 
     loss: the dimensionless measure that ``quantity`` names. gaussians: their number, or 0. Three functions may be called
     during the report only. state returns the state from which the run can resume. volume returns the present volume (nz, ny,
-    nx) in 1/mm and its grid. frames returns so many measured frames, spread evenly, with those computed from the present
-    volume. deformation: how the object moves, once the method has found it. states: returns the object at some times, if the
-    method has them. A report that raises KeyboardInterrupt ends the run as Ctrl-C does."""
+    nx) in 1/mm and its grid. frames returns a given number of measured frames, spread evenly, with those computed from the
+    present volume. deformation: how the object moves, once the method has found it. states: returns the object at some
+    times, if the method has them. A report that raises KeyboardInterrupt ends the run as Ctrl-C does."""
 
     iteration: int
     iterations: int
@@ -196,7 +197,7 @@ class Progress:
     def mapped(
         self, state: "Callable[[State], State] | None" = None, volume: "VolumeMap | None" = None, **changes: Any
     ) -> "Progress":
-        """Returns the report with other fields. ``state`` and ``volume`` change what the run gives, if it gives any."""
+        """Returns the report with other fields. ``state``, ``volume`` map what its functions of these names return."""
         own_state, own_volume = self.state, self.volume
         if state is not None and own_state is not None:
             changes["state"] = lambda: state(own_state())

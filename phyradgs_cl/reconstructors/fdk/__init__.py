@@ -100,8 +100,8 @@ def fdk(
 
     ``seed`` is part of the common signature and not used.
 
-    Logs a warning for incomplete turns, and for an orbit that is not a circle about z. Raises InputError for the other beam,
-    for an orbit far from a circle, and for parallel rays that are not at right angles to the axis."""
+    Logs a warning for incomplete turns, and for an orbit that is not a circle about z. Raises InputError for the other
+    method's beam, for an orbit far from a circle, and for parallel rays that are not at right angles to the axis."""
     started, method = time.perf_counter(), "fbp" if isinstance(options, FbpOptions) else "fdk"
     if deformation is not None and options.extrapolate == "reprojected":
         expected, remedy = "another way of rows beyond the panel", "leave extrapolate out"
@@ -228,7 +228,7 @@ def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], w
 def ramp_spectrum(length: int, window: str = "ram-lak") -> np.ndarray:
     """Returns the filter's real spectrum (length // 2 + 1,) for a pixel pitch of 1 and a period of ``length`` samples.
 
-    It comes from the space-domain kernel: |frequency|, sampled, would add a wrong constant to every row."""
+    It comes from the space-domain kernel: sampling |frequency| instead would add a wrong constant to every row."""
     # distance from sample 0, counted around the period: its second half stands for negative distances
     n = np.minimum(np.arange(length), length - np.arange(length))
     kernel = np.where(n % 2 == 1, -1.0 / (np.pi * np.maximum(n, 1)) ** 2, 0.0)

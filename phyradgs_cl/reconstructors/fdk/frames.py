@@ -33,11 +33,11 @@ from phyradgs_cl.runtime import Runtime
 
 WAYS = ("none", "cosine", "cylinder", "reprojected")
 _SHARE = 0.5  # "cosine" and "cylinder" extend rows at each side by this fraction of the panel's columns
-_SLOPE_PIXELS = 5  # the slope at a row's end is taken over this many pixels, against noise
+_SLOPE_PIXELS = 5  # the slope at a row's end is taken over this many pixels, to lower its noise
 _NOISE = 0.01  # below this fraction of the line integrals' 99.9th percentile, the end of a row is air
 _UNEVEN = 0.02  # steps between views may differ by this fraction from the median step and still count as even
 _REACH = 8  # the first and last view of an arc are repeated over this many arcs of an exposure, so that no edge is filtered
-_FULL_TURN = 1.5  # a gap of more median steps between views means less than a full turn
+_FULL_TURN = 1.5  # if a gap between views is wider than this many median steps, they cover less than a full turn
 
 
 def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
@@ -145,7 +145,7 @@ def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: boo
 
 def deblurred(scan: Scan, frames: np.ndarray, angle_rad: np.ndarray, noise: float) -> np.ndarray:
     """Returns frames (F, rows, columns) float32 without motion blur along the angle, as if the gantry stopped for each view.
-    angle_rad (F,): gantry angles at the frames' middles. noise: λ above.
+    angle_rad (F,): gantry angles at the frames' middles. noise: the power of noise over that of the signal.
 
     Raises InputError where views are not evenly spaced in angle; their order does not matter."""
     arc_rad = exposure_arc_rad(scan)

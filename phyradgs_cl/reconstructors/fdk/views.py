@@ -13,8 +13,8 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import weights
 
 # A gap between views stands out if it is this many times as wide as another gap; one lost view makes a gap of 2 steps.
-# The widest gap is compared with the second widest. The median would make uneven views of a full turn a short scan.
-# Any gap wider than _WIDE_RAD is compared with both of its neighbours.
+# The widest gap is compared with the second widest. Compared with the median, uneven views of a full turn would count as a
+# short scan. Any gap wider than _WIDE_RAD is compared with both of its neighbours.
 SHORT_SCAN_GAP = 2.5
 _SAME_VIEW = 1e-3  # views nearer to each other than this fraction of the mean gap count as one, as those of a second turn
 # A warning names filled gaps from this width on: narrower ones changed the density of large balls by less than 1 %.
@@ -237,8 +237,8 @@ def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc, is_parallel:
     """Returns the fan angle (rows, columns) on which a ray's opposite depends. In a parallel beam's short scan it is 0, and
     in its full turn a distance from the axis.
 
-    If columns are read out one after the other, a short scan begins at another angle for each column, and a ray's opposite
-    lies on another column. So the angles of both columns, relative to the frame's, which is 0 here, add up."""
+    If columns are read out one after the other, each has its own gantry angle. A short scan then begins at another angle for
+    each column, and a ray's opposite lies on another column. So the column's angle, relative to the frame's, is added."""
     angle_rad = weights.fan_angle(pose, rays, is_parallel)
     if is_parallel and not arc.is_full:
         angle_rad = np.zeros_like(angle_rad)
@@ -308,7 +308,7 @@ def _check_orbit(pose: np.ndarray) -> None:
     usual = np.median(canonical, axis=0)
     length_mm = float(np.linalg.norm(usual[1] - usual[0]))
     off_mm = canonical[:, :2] - usual[:2]  # offsets of source and panel from their median positions
-    aside_mm = off_mm - np.eye(3)[2] * off_mm[:, :1, 2:]  # travel along z only makes voxels miss views
+    aside_mm = off_mm - np.eye(3)[2] * off_mm[:, :1, 2:]  # without travel along z, which only makes voxels miss views
     above_deg = float(np.rad2deg(np.arctan2(abs(usual[0, 2]), np.hypot(*usual[0, :2]))))
 
     def distances_beyond(most: float, most_deg: float, of_mm: np.ndarray) -> str:

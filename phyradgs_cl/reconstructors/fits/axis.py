@@ -37,7 +37,7 @@ _BIAS_PX = 0.02  # error (std) of a shift that comes from interpolating views
 @dataclass(frozen=True, eq=False)
 class AxisShift:
     """A shift of the panel along u, and the fit that found it. pixels, deviation: the shift and its standard deviation in
-    pixels of the recorded scan, both NaN if no shift fits best. squares (F,): squared residuals of the nearest trial."""
+    pixels of the recorded scan, both NaN if no shift fits best. squares (F,): frames' residuals in the nearest trial."""
 
     pixels: float
     deviation: float

@@ -14,7 +14,7 @@ from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-# Errors of flats affect frames this much, relative to the volume: as strong as the volume, they would explain motion.
+# Unknown errors of flats affect frames this much, relative to the volume. At 1 they would explain away motion.
 _FREEDOM = 0.3
 _ITERATIONS = 20  # iterations of CGLS in a fit, unless stated
 _MOST_TIMES = 12  # most times per exposure: each costs a projection
@@ -61,8 +61,9 @@ class FlatErrors:
 
 @dataclass(frozen=True, eq=False)
 class ViewParameters:
-    """Unknowns b: coefficients (n, K) of K kinds of parameters of views. View f has the values (basis @ b)[f], with
-    ``basis`` (F, n). Its frame changes by each value times its signal, from ``signals`` (F, K, rows, columns)."""
+    """Unknown parameters of views, of K kinds: coefficients b (n, K) of n functions of the view. View f has the values
+    (basis @ b)[f], with ``basis`` (F, n). Each changes its frame by the value times a signal of ``signals`` (F, K, rows,
+    columns)."""
 
     signals: np.ndarray
     basis: np.ndarray

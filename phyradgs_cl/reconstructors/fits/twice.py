@@ -1,7 +1,7 @@
 """Finds the axis of rotation near the edge of a displaced panel, from the rays that a full turn measures twice.
 
-The residual of a fit is no help there: a shift that leaves fewer rays measured twice always leaves less of it. Here each ray
-is compared with its opposite, half a turn and twice its fan angle away, by the mean of squares, whatever their number."""
+The residual of a fit is no help there: it is always smaller for a shift with fewer rays measured twice. Here each ray is
+compared with its opposite, half a turn and twice its fan angle away, by the mean of squares, whatever their number."""
 
 import math
 

@@ -43,7 +43,7 @@ _MOST_COLUMNS = 64  # blocks of pixels along the longer side of the panel in the
 _MOST_VOXELS = 32  # voxels along the longest side of the coarse scan's grid, at most
 _MOST_FRAMES = 600  # frames of the coarse scan, at most, unless the signal has more knots
 _TIMES_PER_PERIOD = 12  # times per period of a motion at which exposures sample it
-_MOST_TIMES = 6  # most times per exposure for this: each costs a projection
+_MOST_TIMES = 6  # most times per exposure that a period may ask for: each costs a projection
 _FIRST_PASSES = 8  # passes of fista before the first round, for an object at rest: the field needs a volume to start from
 _PASSES = 3  # passes of fista in each round, which let the volume follow the field
 _WEIGHT = 0.42  # prior weight of fista in the search
@@ -153,8 +153,8 @@ class FieldSearch:
 
     def finding(self) -> tuple[Deformation, float]:
         """Returns the field, and its gain: by which fraction its squared residual is below that of an object at rest after
-        as many passes. The field is zeros if the gain is within ``LEAST_GAIN``, or within what as many free numbers explain
-        of noise."""
+        as many passes. The field is zeros if the gain is within ``LEAST_GAIN``, or not above what so many free numbers would
+        explain of noise alone."""
         if not self.field.control_mm.any():
             return self.field.deformation(), 0.0
         moving = self._reconstructed(self.field, self.volume, _PASSES)

@@ -14,7 +14,7 @@ from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 from phyradgs_cl.text import repr_of_changes
 
 # Iterations before ``exact_from`` model motion coarsely, which loses nothing (docs/results/motion_models.md).
-_STATIC_SHARE = 0.4  # the first of the coarse iterations, this fraction, have one pose per frame
+_STATIC_SHARE = 0.4  # this fraction of the coarse iterations, the first ones, have one pose per frame
 _COARSE_ERROR = 0.1  # the other coarse iterations have at least this ``time_error``
 
 
@@ -22,8 +22,8 @@ _COARSE_ERROR = 0.1  # the other coarse iterations have at least this ``time_err
 class SplatOptions(MotionOptions):
     """Options of a splatting run; lengths in half-sides of the volume, densities relative to FDK's 99.9th percentile.
 
-    - gaussians: size of the first cloud; 0 chooses it from the grid. The weights are Eq. 4's λ. tv_edge: edge in voxels of
-      the random sub-volume for total variation. scale_min_voxels: least scale as a fraction of a voxel.
+    - gaussians: size of the first cloud; 0 chooses it from the grid. The weights are λ of the paper's Eq. 4. tv_edge: edge
+      in voxels of the random sub-volume for total variation. scale_min_voxels: least scale as a fraction of a voxel.
     - detector_model: what the detector averages over a line's times: line integrals (log), intensity, or what the scan
       states (scan).
     - exact_from: in iterations before this fraction of the run, the motion ``exact`` is coarse: first one pose for each

@@ -39,11 +39,12 @@ _DCT_AT_REST = 1.35  # threshold of the block cosine transforms before ridge ste
 _RIDGE_NOISE = 17.0  # noise that a ridge step assumes, relative to the prior's weight, for fly-scans
 _RIDGE_NOISE_AT_REST = 20.0  # noise that a ridge step assumes, relative to the prior's weight, for scans that stop
 _RIDGE_LENGTH = 0.5  # length of a ridge step: factor on the regulariser's gradient
-_RIDGE_EVERY = 4  # a ridge step follows each of this many maps of the other prior
-# The two factors for scans that stop hold for this noise of line integrals, and follow the sixth root of the scan's noise.
+_RIDGE_EVERY = 4  # after this many maps of the other prior comes one ridge step
+# _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals. With the sixth root of the scan's noise, the
+# first grows and the second falls.
 _USUAL_NOISE = 0.01
 _LEAST_NOISE = 0.001  # some scans have no noise: it counts as at least this
-_LEAST_NOISE_SHARE = 0.1  # least noise_share (``Prior``) of a ridge step, because some scans have no noise
+_LEAST_NOISE_SHARE = 0.1  # a ridge step counts at least this fraction of the weight as noise, because some scans have none
 _SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result; the larger voxels of the passes before have the rest
 _SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels with the prior ``ridge``, which leaves less noise
 
@@ -60,7 +61,7 @@ class FrameError:
 
 
 def frame_error(scan: Scan, motion: Motion) -> FrameError:
-    """Estimates the error of a scan's pixels on its grid. The motion blur of ``motion`` averages the error at edges."""
+    """Estimates the error of a scan's pixels on its grid. Blur by ``motion`` averages out part of that at edges."""
     voxel_mm = max(scan.grid.voxel_size_mm[1:])
     edges_mm = _EDGES * voxel_mm / math.sqrt(1 + _blur_mm(scan, motion) / voxel_mm)
     return FrameError(noise_behind(np.asarray(scan.projections, np.float32), scan.valid), edges_mm)
@@ -114,7 +115,7 @@ class PriorWeight:
 
 
 def _density(space: Space[Any], volume: Any) -> float:
-    """Returns the mean of a volume's values weighted by their squares, in 1/mm: Σ x³ / Σ x², which air does not change."""
+    """Returns the mean of a volume's values weighted by their squares, in 1/mm: Σ x³ / Σ x², to which air adds nothing."""
     squares = space.inner(volume, volume)
     return max(space.inner(space.multiply(volume, volume), volume) / squares, 0.0) if squares > 0 else 0.0
 
@@ -141,8 +142,8 @@ class PriorInputs:
         return TvAndDct(self.tv(tv_share), DctProx(self.rt, self.grid.shape), dct_share)
 
     def dct_then_ridge(self) -> "Prior":
-        """Returns ``dct`` with ridge steps, or ``dct`` alone on small grids. For scans that stop, the ridge step does more
-        of the work, most of it where noise is low. Fly-scans of flat bodies would lose by that."""
+        """Returns ``dct`` with ridge steps, or ``dct`` alone on grids smaller than a ridge step needs. For scans that stop,
+        ridge steps are stronger, the more so the lower the noise. Fly-scans of flat bodies would lose quality by that."""
         if min(self.grid.shape) < RIDGE_EDGE:
             return self.tv_and_dct()
         ridge = RidgeStep(self.rt, self.grid.shape, learned_ridge())

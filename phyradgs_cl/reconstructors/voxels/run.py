@@ -144,8 +144,8 @@ def voxel_method(
     name: str, default: IterativeOptions, make: Callable[[System, Any, MethodRun], Algorithm], *,
     volumes: int | Callable[[Scan, Any], int], frames: int,
 ) -> Method:
-    """Returns the algorithm that ``make`` builds as a method. volumes, frames: as in ``MethodRun.system``; volumes may be a
-    function of scan and options."""
+    """Returns a method that runs the algorithm that ``make`` builds. volumes, frames: as in ``MethodRun.system``; volumes
+    may be a function of scan and options."""
 
     def reconstruct(scan: Scan, options: Any, rt: Runtime, **arguments: Any) -> Reconstruction:
         run = MethodRun(scan, options, rt, **arguments)

@@ -96,7 +96,7 @@ METHOD, OS_METHOD = _method("sart", SartOptions()), _method("os-sart", OS_SART)
 
 @dataclass(frozen=True)
 class SirtOptions(IterativeOptions):
-    """Options of SIRT. relaxation: λ, between 0 and 2."""
+    """Options of SIRT. relaxation: λ, which fraction of each correction is applied, up to 2."""
 
     iterations: int = 100
     relaxation: float = ranged(1.0, 1e-6, 2)

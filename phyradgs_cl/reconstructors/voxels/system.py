@@ -59,7 +59,7 @@ class System:
         (K,): times in s of an object that changes; volumes are then stacks (K, nz, ny, nx).
 
         detector_model: log, intensity, or scan for the scan's own. fewest_lines: as in ``RayOperator``, for an object at
-        rest. is_dense: as in ``subrays_of``."""
+        rest. is_dense: volumes have the object's density from the start, which ``subrays_of`` uses."""
         tables = [motion.cells(scan, f).still() for f in range(scan.frames)]
         shape = scan.geometry.detector_shape
         projector = projector_of(rt, scan.grid, tables, deformation, state_times_s)
@@ -159,7 +159,7 @@ class System:
 
     def residual(self, volume: Any) -> Any:
         """Returns p − A x or, in the intensity model, p − I(x), dimensionless; 0 at invalid pixels."""
-        # frames before the mask get no name, which would keep their memory
+        # the frames before masking get no name, because a name would keep their memory
         expected = self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
         return self.space.add(self.measured, expected, -1.0)
 
