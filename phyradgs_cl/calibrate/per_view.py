@@ -25,9 +25,10 @@ from phyradgs_cl.runtime import Runtime
 SPLINES = 7  # default number of splines; each is about a seventh of the scan wide
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
 _STEP_PX = 0.25  # signals are central differences, for which a frame moves by this much to each side
-_LEAST_NORM = 0.1  # parameters with weak signals are scaled as if they had this fraction of their kind's largest norm
+_LEAST_NORM = 0.1  # a signal's norm counts as at least this fraction of its kind's largest, which limits how it is scaled
 _DEG = float(np.rad2deg(1.0))
-# Discretisation errors fall in proportion to the voxel, so half of the change since a grid half as fine is still an error.
+# This fraction of the change since a grid half as fine counts as error: 1 suits errors ∝ voxel side, 1/3 errors ∝ its
+# square.
 DISCRETISATION = 0.5
 _STEPS = 3  # Gauss–Newton steps on each grid; the next grid continues from there
 _ITERATIONS = 20  # iterations of CGLS for each step and each standard deviation
@@ -51,7 +52,7 @@ class PerViewParameters(ABC):
 
     - units (K,): how much of each kind moves a frame by a pixel at its edge.
     - circle (n, 2): values that vary as cosine and sine of the angle, as far as the basis can.
-    - MISMATCH: measured errors (docs/calibrate.md) over those that noise causes: voxels do not represent the object exactly.
+    - MISMATCH: measured errors (docs/calibrate.md) over those from noise alone; voxels do not represent the object exactly.
     - RESTARTED: kinds that start from 0 on each grid."""
 
     values: np.ndarray
@@ -186,7 +187,7 @@ def view_step(
     norms = _norms(parameters.basis, signals)
     scale = _strength(operator) / np.maximum(norms, _LEAST_NORM * norms.max(0))
     if not np.array_equal(parameters.basis, np.eye(len(signals))):
-        # a spline reaches over many views, so all splines have one scale
+        # several splines act on a view, but its signal can be scaled only once: so all splines share one scale
         scale = np.broadcast_to(scale.mean(0), scale.shape)
     per_view = parameters.basis @ scale / parameters.basis.sum(1, keepdims=True)
     scaled = (signals * per_view[:, :, None, None]).astype(np.float32)

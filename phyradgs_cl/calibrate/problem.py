@@ -29,7 +29,7 @@ _VOXELS_PER_TIME = 2.0  # an exposure is sampled so often that the volume's rim 
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
-_LEAST_SHARE = 0.1  # in progress, a phase with passes left counts at least this fraction of their cost
+_LEAST_SHARE = 0.1  # in progress reports, passes that remain in a phase count at least this fraction of their cost
 Passes = tuple[int, float]
 """How many passes may still come at most, and their expected total cost."""
 

@@ -65,7 +65,7 @@ _FEWEST_SPLINES = 4  # a cubic spline of a wobble needs four
 _LEAST_EXPLAINED = 0.3
 _ORDER_ERRORS = 4.0  # a direction of readout must be better by this many standard errors, as in ``check``
 _ORDER_RATIO = 1.04  # the squared residuals of both directions must differ by this factor, as in ``check``
-_BEYOND = 1e6  # an encoder table is continued by this many frame times: first steps of the search may be very wrong
+_BEYOND = 1e6  # an encoder table is continued by this many frame times: first steps of the search may reach far beyond it
 # Progress expects a stage to cost this fraction of its most: few parameters are determined, and steps soon become small.
 _EXPECTED_SHARE = 0.25
 
@@ -111,7 +111,7 @@ class _Calibrator:
         self.placement = np.zeros(0)
         self.stated = self.ready  # ``ready`` may later get the other readout direction
         stages = {one.block(self.scan): one for one in reversed(STAGES if self.phantom is None else BEAD_STAGES)}
-        self.stages = list(stages.values())[::-1]  # on a small panel several stages have the same blocks
+        self.stages = list(stages.values())[::-1]  # on a small panel, of stages with the same blocks the first is kept
         self.per_view: PerViewParameters | None = None
         if self.request.per_view == WOBBLE:
             self.per_view = WobbleParameters.of(self.ready[0], self.splines)

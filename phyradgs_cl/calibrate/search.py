@@ -31,7 +31,7 @@ LEAST_SHARE = 0.2
 LEAST_SHARE_OF_BEADS = 0.02
 _TINY = 1e-9  # added to the diagonal of a matrix before its inverse, because signals may be linearly dependent
 _GAUGE_FACTOR = 2.0  # voxels leave some signal of a gauge (``GAUGES``) by error: a parameter must leave twice as much
-_MOST_GAUGE = 0.2  # in a wrong geometry more of a gauge's signal is left, which must not refuse every parameter
+_MOST_GAUGE = 0.2  # a gauge's share counts as this at most: in a wrong geometry it grows, and would refuse every parameter
 DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
 _MOST_PX = 2.0  # a step moves the image by at most this many coarse pixels at its edge: signals are not linear beyond
 _SETTLED = 0.1  # the steps on a grid end when all are smaller than this many standard deviations
@@ -93,7 +93,7 @@ class Reduced:
         return np.sqrt(np.minimum(np.minimum(certainty, np.diag(self.gram)), 1.0))
 
     def step(self) -> np.ndarray:
-        """Returns the Gauss–Newton step (K,) in the fields' units."""
+        """Returns the Gauss–Newton step (K,) of the parameters, in the units of their fields."""
         return np.linalg.solve(self.gram, self.unit @ self.residual) / self.sizes
 
     def deviations(self) -> np.ndarray:
@@ -288,7 +288,8 @@ class Search:
         return significant | dict(zip(names, map(float, values), strict=True))
 
     def table(self, scan: Scan, corrections: Mapping[str, float]) -> list[ParameterEstimate]:
-        """Returns an estimate per parameter in displayed units. corrections: values by name, which replace those found."""
+        """Returns an estimate per parameter in displayed units. corrections: values by name, in the fields' units, which
+        replace those found."""
         values, deviations = self.estimates()
         estimates = {name: (estimate.value, estimate.deviation) for name, estimate in self.fixed.items()}
         estimates |= dict(zip(self.determined or (), zip(values.tolist(), deviations.tolist(), strict=True), strict=True))

@@ -38,7 +38,7 @@ _ERRORS = 4.0  # a hypothesis must be better than the stated scan by this many s
 _SAME = 0.03  # residual over the standard deviation of the line integrals
 _NOISY = 1.6  # residual over the noise: round objects had up to 1.3, others 2.3 or more
 _MOST_REFINED = 2  # only the best hypotheses get a refined shift of the panel, which takes time
-_SHIFT_PENALTY = 1.5  # a hypothesis pays this factor for each coarse pixel of shift: stated offsets are mostly right
+_SHIFT_PENALTY = 1.5  # each coarse pixel of shift multiplies a hypothesis's squares by this: stated offsets are mostly right
 # A frame is odd if its mean line integral differs from its neighbours' by more than _DEVIATIONS and _LEAST_CHANGE.
 _DEVIATIONS = 12.0  # difference in robust standard deviations of all frames' differences
 _LEAST_CHANGE = 0.75  # difference over the frames' median mean line integral
@@ -129,9 +129,8 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
 
 
 def _unseen(scan: Scan, as_stated: Scan) -> float:
-    """Returns how small a residual in a random order shows that frames of a coarse ``scan`` tell nothing about their
-    angles."""
-    # The smaller one counts: edges raise the estimate from coarse pixels, noise that differs between rays the other one.
+    """Returns the residual in a random order below which the frames of a coarse ``scan`` tell nothing about their angles."""
+    # The smaller noise counts: edges raise that of coarse pixels, noise that differs between rays raises that of full ones.
     levels = [noise_level(one.projections, np.broadcast_to(one.valid, one.projections.shape)) for one in (scan, as_stated)]
     noise = min(levels[0], levels[1] / float(np.prod(altered_trajectory(scan).blocks)) ** 0.5)
     return max(_SAME * float(np.asarray(scan.projections, np.float64).std()), _NOISY * noise)
@@ -150,7 +149,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     turned = best = scan
     least = _CLEAR * fit_squares(rt, scan).sum()
     for sense, rough, limits in zip(senses, roughs, limits_px, strict=True):
-        if rough.squares.mean() > _NEARLY * least_rough:  # rough fits of a narrow fan are too close to decide
+        if rough.squares.mean() > _NEARLY * least_rough:  # if both fit alike, as in a narrow fan, both are refined
             continue
         shift = axis.refined_shift(rt, sense, rough, limits)
         if not shift.is_found:

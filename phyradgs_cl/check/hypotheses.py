@@ -106,8 +106,8 @@ def _times(name: str, factor: float) -> str:
 
 
 def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Scan:
-    """Returns the coarse scan with pixels ``factor`` times as large, and a grid that fits them. keeps_axis: as in
-    ``resized``."""
+    """Returns the coarse scan with pixels ``factor`` times as large, and a grid that fits them. keeps_axis: the axis stays
+    in its column."""
     v_mm, u_mm = stated.geometry.pixel_size_mm
     off_v_mm, off_u_mm = (offset * (factor if keeps_axis else 1) for offset in stated.geometry.detector_offset_mm)
     pixel_size_mm = (factor * v_mm, factor * u_mm)

@@ -93,7 +93,7 @@ def mean_dark(darks: NDArray[np.generic] | None, panel: tuple[int, ...]) -> NDAr
 def minus_log(signal: NDArray[np.float64], gain: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Returns −ln(signal / gain) for arrays of one shape, and where the result must not be used.
 
-    Where the gain is 0 or less the pixel tells nothing, and the result is 0. A dark one becomes −ln
+    Where the gain is 0 or less the pixel tells nothing, and the result is 0. A pixel without signal becomes −ln
     ``TRANSMISSION_FLOOR``."""
     live = np.isfinite(signal) & np.isfinite(gain) & (gain > 0)
     transmission = np.divide(signal, gain, out=np.zeros_like(signal), where=live)

@@ -343,7 +343,8 @@ def line_integrals(
 
 
 def intensity_average(integrals: torch.Tensor, unit: float) -> torch.Tensor:
-    """Returns −ln(mean over K of exp(−unit · p)) / unit (R,) of the integrals p (R, K) at a pixel's times."""
+    """Returns what a detector that averages intensity measures (R,), from the line integrals (R, K) at a pixel's K times.
+    Both are in multiples of ``unit``."""
     return (math.log(integrals.shape[1]) - torch.logsumexp(-unit * integrals, 1)) / unit
 
 

@@ -4,7 +4,8 @@ anatomy.
 Goujon, Neumayer and Unser, "Learning weakly convex regularizers for convergent image-reconstruction algorithms", SIAM J.
 Imaging Sci. 17 (2024) 91, in 3D. The sums run over filters i and voxels p. A filter W_i of 5³ voxels is a chain: 4
 correlations with 3³ voxels, then 16 with their results. Only windows inside the volume count. ψ_i' is a difference of two
-clamps, with knots in units of the noise σ; it may fall again. ½‖x − v‖² + step R(x) is convex for step ≤ 1."""
+clamps, with knots in units of the noise σ. It may fall beyond a knot, so R is only weakly convex: ½‖x − v‖² + step R(x) is
+convex for step ≤ 1."""
 
 import json
 from dataclasses import dataclass
@@ -69,7 +70,7 @@ class RidgeStep:
     the same."""
 
     VOLUMES = 4
-    """Memory of a step, in volumes of floats, at most; for volumes of 50 slices and 64 voxels a row, or more."""
+    """Most memory of a step, in volumes of floats, if a volume has at least 50 slices and 64 voxels a row."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], ridge: Ridge) -> None:
         self.rt, self.shape = rt, shape

@@ -5,7 +5,8 @@ Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weights scale the dif
 object that changes, the sum of |differences| between successive states is added.
 
 ``TvDescent`` takes steps of a fixed length, as ASD-POCS does (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777), with TIGRE's
-backward differences. A number that is small relative to the volume's values is added to their lengths: none is 0."""
+backward differences. A number that is small relative to the volume's values is added to lengths of differences: none is then
+0."""
 
 import math
 from collections.abc import Callable

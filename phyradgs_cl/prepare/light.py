@@ -29,7 +29,7 @@ _MOST_COMPONENTS, _CLEAR = 4, 4.0  # most principal components; one that varies 
 _REWEIGHTINGS = 12
 _LEAST_PIXELS = 20  # with fewer pixels of air in a frame, their median is too noisy
 _AROUND = np.ones((3, 3), bool)
-_MARGIN = 2  # this near to the object, in pixels, its blurred edge is no air
+_MARGIN = 2  # pixels this near to the object are no air, because its edge is blurred
 _PASSES = 3  # bright or dim light shifts the air, so the threshold follows its median, in this many rounds
 Counts = np.ndarray
 

@@ -25,7 +25,7 @@ from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 _LEAST_FRAMES = 8  # fewer views do not average the object enough to show rings: such scans stay as they are
 _LEAST_PAIRS = 0.25  # columns are compared with their mirror images if at least this fraction of them has one on the panel
-_LEAST_SHARE = 0.25  # a pattern that varies less, relative to the noise of the mean, is not worth a correction
+_LEAST_SHARE = 0.25  # a pattern with less than this fraction of the variance of the mean's noise is not worth a correction
 _NEGLIGIBLE = 1e-4  # nobody sees a pattern with a smaller standard deviation in line integrals: gains off by 0.01 %
 _SURE = 12.0  # a pattern is certain if its variance over the noise's exceeds this many standard errors, about 1/√pixels
 _THRESHOLD = 3.5  # coefficients above this many standard deviations of the pattern belong to the object
@@ -131,7 +131,7 @@ def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: f
     parts = [(mean + mean[:, mirrored]) / 2, (mean - mean[:, mirrored]) / 2] if whole else [mean]
     variances = np.array([strength.pattern - strength.column, strength.column]) / len(parts)
     rough = sum(part - _denoised(part, variances, window) for part in parts)
-    # Denoising removes the pattern together with the noise of the mean: this fraction of both is the pattern.
+    # Denoising removes the pattern together with the noise of the mean: only this fraction of the sum is the pattern.
     return np.asarray(rough * strength.pattern / (strength.pattern + strength.noise), np.float32)
 
 

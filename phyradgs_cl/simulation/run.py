@@ -121,7 +121,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
     order = readout_order(given.get("first"), given.get("readout_axis"), given.get("readout_direction"), _flag)
     keys = ("readout_axis", "readout_direction", "lag", "readout_ratio", "pulse", "fps", "readout_ms")
     of_scanner = {key: getattr(scanner, key) for key in keys}
-    if "readout_ratio" in given or "readout_ms" in given:  # both state the readout time: the scanner's is then void
+    if "readout_ratio" in given or "readout_ms" in given:  # each states the readout time, in place of the scanner's
         del of_scanner["readout_ratio"], of_scanner["readout_ms"]
     values = {**of_scanner, **given}
     values.update({key: value for key, value in zip(keys, order, strict=False) if value is not None})
