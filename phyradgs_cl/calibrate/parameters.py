@@ -57,8 +57,7 @@ class Parameter:
         return self.unit != "deg" or deviation < _LEAST_KNOWN_RAD
 
     def lowest(self, scan: Scan) -> float:
-        """Returns the lowest correction of the field that the search may try: times stay above 0; others have no limit
-        (−∞)."""
+        """Returns the lowest correction that the search may try: times stay above 0, other fields have no limit (−∞)."""
         stated = self.stated(scan) if self.is_timing else 0.0
         return -_LARGEST_CUT * stated if stated > 0 else -math.inf
 
@@ -216,8 +215,7 @@ def correction_of(values: Mapping[str, float]) -> GeometryCorrection:
 
 
 def in_words(weights: Mapping[str, float]) -> str:
-    """Returns a combination of parameters (weights by name) in words: the largest weight first, and no weight below 0.3 of
-    it."""
+    """Returns a combination of parameters (weights by name) in words: the largest weight first, none below 0.3 of it."""
     order = sorted(weights, key=lambda name: -abs(weights[name]))
     largest = abs(weights[order[0]])
     main, *others = [name for name in order if abs(weights[name]) > 0.3 * largest]

@@ -37,8 +37,7 @@ _DEVIATIONS = 3.0  # a kind is corrected only if its RMS over the views exceeds 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of parameter: its name and unit in the table. scale: how many of that unit make an internal unit (rad or
-    mm)."""
+    """A kind of parameter: its name and unit in the table. scale: how many of these make an internal unit (rad or mm)."""
 
     name: str
     unit: str
@@ -159,8 +158,7 @@ def _turn_unit_rad(scan: Scan) -> float:
 
 
 def units_of_views(scan: Scan) -> np.ndarray:
-    """Returns (3,) the turn in rad, and the shifts along v and u in mm, that each move a view's frame by a pixel at its
-    edge."""
+    """Returns (3,) the turn in rad and the shifts along v and u in mm that each move a frame's edge by a pixel."""
     return np.array([_turn_unit_rad(scan), *scan.geometry.pixel_size_mm])
 
 
@@ -179,8 +177,7 @@ def view_step(
     kinds: Sequence[int], iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns a Gauss–Newton step (n, K) of the parameters, at the object ``volume``; it is 0 for kinds outside of
-    ``kinds``. Also returns the signals (F, kinds, rows, columns): the change of the frames when each kind moves them by one
-    pixel."""
+    ``kinds``. Also returns the signals (F, kinds, rows, columns): the frames' change when a kind moves them by a pixel."""
     operator = parameters.operator(problem, correction)
     residual = problem.residual(operator, volume)
     signals = np.stack([_signal(problem, correction, parameters, volume, kind) for kind in kinds], 1)

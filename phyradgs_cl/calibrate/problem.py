@@ -57,8 +57,7 @@ class Stage:
 
 
 def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:
-    """Returns the cost of a pass through the scans with at most ``columns`` blocks: it grows as rays × voxels along a
-    ray."""
+    """Returns the cost of a pass through the scans with at most ``columns`` blocks: about rays × voxels along each."""
     shape = scans[0].geometry.detector_shape
     rows, across = (ceil_div(n, ceil_div(max(shape), columns)) for n in shape)
     return float(sum(min(scan.frames, most_frames) for scan in scans) * rows * across * max(rows, across))
@@ -157,8 +156,8 @@ class CoarseProblem(CoarseFrames):
         """Returns the operator A of the coarse frames of all scans, in the geometry that ``correction`` and ``views``
         change.
 
-        Each line integrates over 2 to 8 times of its exposure. views: changes of single views or of the object's pose; None:
-        none."""
+        Each line integrates over 2 to 8 times of its exposure. views: changes of single views or of the object's pose, if
+        any."""
         tables = []
         for scan in self.scans:
             small = coarse.binned(perturb(scan, correction, views), self.block)
@@ -181,7 +180,7 @@ class CoarseProblem(CoarseFrames):
         return IntensityOperator(self.rt, self.grid, operator.detector_shape, operator.tables).expected(volume)
 
     def reconstruct(self, operator: RayOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
-        """Returns a nonnegative volume (nz, ny, nx) of little total variation, after ``iterations`` from ``start`` (None:
+        """Returns a nonnegative volume (nz, ny, nx) of little total variation, ``iterations`` after ``start`` (None:
         zeros)."""
         volume = np.zeros(self.grid.shape, np.float32) if start is None else start
         system = System(operator, self.line_integrals(operator, volume), self.valid)
@@ -201,8 +200,7 @@ class CoarseProblem(CoarseFrames):
         return self.measured - self.masked(self._expected(operator, volume))
 
     def noise(self, residual: np.ndarray) -> float:
-        """Returns the standard deviation of a pixel's noise, from the measurement: a volume fits some of the noise in
-        ``residual``."""
+        """Returns a pixel's noise (std) in the measurement: from ``residual``, the volume has taken some of it."""
         return noise_level(self.measured, self.valid)
 
     def beyond_object(

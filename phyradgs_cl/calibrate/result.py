@@ -1,5 +1,4 @@
-"""The result of a calibration: an estimate per parameter, combinations that no frame distinguishes, and the corrected
-scan."""
+"""The result of a calibration: an estimate per parameter, combinations that no frame distinguishes, the corrected scan."""
 
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
@@ -91,8 +90,8 @@ class Calibration:
         """Returns the corrections of every view, (F,) by name and unit; {} without corrections of views.
 
         A wobble is added to the stated poses: source and panel turn counterclockwise as seen from above, and the panel moves
-        along its own v and u. A motion is the object's pose in the middle of each view: rotated about x, y and z, then
-        shifted along them."""
+        along its own v and u. A motion is the object's pose in the middle of each view: rotated about, then shifted along x,
+        y and z."""
         if self.views is None:
             return {}
         if isinstance(self.views, Views):

@@ -177,8 +177,8 @@ class _Calibrator:
             self.search.fallback = {OFFSET_U: Fallback(shift.pixels * pitch_mm, shift.deviation * pitch_mm, is_significant)}
 
     def _search_common(self) -> None:
-        """Searches the parameters that all views share. Single views are corrected first, because their errors would look
-        like a roll."""
+        """Searches the parameters that all views share. Single views are corrected first: their errors would look like a
+        roll."""
         steady = self.ready
         if self.per_view is not None:
             self.passes.begin("views before", "views, before the rest")
@@ -221,8 +221,8 @@ class _Calibrator:
         return replace(problem, count_pass=self.passes.counter(pass_cost(scans, stage.columns, most_frames)))
 
     def _place(self, phantom: EllipsoidPhantom) -> np.ndarray:
-        """Returns a first placement (7,) of the phantom: of those at which its beads are seen, the one that explains the
-        frames best."""
+        """Returns a first placement (7,) of the phantom: of those where its beads are seen, the one that fits the frames
+        best."""
         bead_centres_mm(phantom)
         correction = correction_of(self.search.at)
         voxels = CoarseProblem.of(self.rt, self.ready, STAGES[-1])
@@ -243,8 +243,8 @@ class _Calibrator:
         """Compares the residuals with lines read from either end, and corrects the scans' direction. Returns its line of the
         table.
 
-        A correction needs four standard errors and 4 % of the squared residual. The direction is 1 or −1; its deviation is
-        on that scale."""
+        A correction needs four standard errors and 4 % of the squared residual. The deviation is that of a direction of 1 or
+        −1."""
         self.passes.begin("order", "which line is read first")
         stage = self.stages[min(1, len(self.stages) - 1)]
         reverse = [reversed_readout(scan) for scan in self.ready]

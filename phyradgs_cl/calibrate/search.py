@@ -65,8 +65,7 @@ class Reduced:
         )
 
     def relative_to_stated(self, at: Mapping[str, float]) -> "Reduced":
-        """Returns the problem with steps that count from the stated values. It was linearised at the values ``at``, by
-        name."""
+        """Returns the problem with steps that count from the stated values; it was linearised at values ``at``, by name."""
         back = np.array([at.get(name, 0.0) for name in self.names]) @ self.jacobian
         return replace(self, residual=self.residual + back)
 
@@ -137,8 +136,7 @@ def reduced(
 def _signal(
     problem: CoarseProblem | BeadProblem, one: Parameter, at: Mapping[str, float], volume: np.ndarray
 ) -> np.ndarray:
-    """Returns the parameter's signal (F, rows, columns): d(expected frames)/d(parameter), per unit of its field, 0 at
-    invalid pixels."""
+    """Returns the signal (F, rows, columns): d(expected frames)/d(parameter), per unit of its field, 0 at invalid pixels."""
     step = one.step(problem.scans[0]) * (1 if one.is_timing else problem.block)
     ends = []
     for sign in (1, -1):
@@ -241,8 +239,7 @@ class Search:
             self.at[name] = estimate.correction
 
     def _step(self, problem: Problem) -> bool:
-        """Moves the determined parameters, each no further than its signal is linear. Returns whether all steps were
-        small."""
+        """Moves the determined parameters, each as far as its signal is linear. Returns whether all steps were small."""
         assert self.reduced is not None and self.determined is not None
         current = np.array([self.at.get(name, 0.0) for name in self.determined])
         change = self.reduced.step() - current
@@ -273,8 +270,7 @@ class Search:
     def corrections(self) -> dict[str, float]:
         """Returns the values, by name, of the parameters that differ from their stated values by three deviations.
 
-        All other parameters go back to their stated values. That changes the remaining values, so the test repeats until all
-        differ."""
+        All other parameters go back to their stated values. That changes the rest, so the test repeats until all differ."""
         values, deviations = self.estimates()
         deviation = dict(zip(self.determined or (), deviations, strict=True))
         names = self.determined or ()

@@ -91,8 +91,8 @@ class LineAttention(nn.Module):
 
 
 class LineAttentionBlocks(nn.Module):
-    """Alternates attention and feed-forward layers on values (P, width). A layer norm precedes each, a skip connection
-    bypasses it."""
+    """Alternates attention and feed-forward layers on values (P, width), each after a layer norm and with a skip
+    connection."""
 
     def __init__(self, width: int, segment: int, heads: int, head_width: int, blocks: int) -> None:
         super().__init__()
@@ -216,15 +216,13 @@ def _corner_shape(axis: int) -> tuple[int, int, int, int]:
 
 
 def weighted_rows(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Returns Σ weight · table[index] over the last axis of index (B, 8), without ``embedding_bag``: some devices lack
-    it."""
+    """Returns Σ weight · table[index] over the last axis of index (B, 8), for devices that lack ``embedding_bag``."""
     rows = table.index_select(0, index.reshape(-1)).reshape(*index.shape, table.shape[1])
     return torch.einsum("bkf,bk->bf", rows, weight)
 
 
 class _Interpolate(torch.autograd.Function):
-    """Returns Σ weight · table[index] over 8 corners, (B, 8). Its gradient is summed in a fixed order, so that runs
-    repeat."""
+    """Returns Σ weight · table[index] over 8 corners, (B, 8). Its gradient is summed in a fixed order: runs repeat."""
 
     @staticmethod
     def forward(ctx: Any, table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:

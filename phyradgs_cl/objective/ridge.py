@@ -28,8 +28,8 @@ _RING = _SLICES + 2  # slices in memory: correlating two slices needs one more o
 class Ridge:
     """A regulariser's numbers, float32. first (4, 3, 3, 3), second (16, 4, 3, 3, 3): its filters, with axes z, y, x.
 
-    ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i] clip(t, ±σ knot_down[i]). Slopes and knots are (16,) each,
-    and not below 0."""
+    ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i] clip(t, ±σ knot_down[i]). Slopes and knots (16,) are not
+    below 0."""
 
     first: np.ndarray
     second: np.ndarray
@@ -66,8 +66,8 @@ def learned_ridge() -> Ridge:
 
 
 class RidgeStep:
-    """Steps down the ridge regulariser for volumes of a fixed ``shape`` (nz, ny, nx). A volume thinner than a filter stays
-    the same."""
+    """Steps down the ridge regulariser for volumes of a fixed ``shape`` (nz, ny, nx). One thinner than a filter stays as it
+    is."""
 
     VOLUMES = 4
     """Most memory of a step, in volumes of floats, if a volume has at least 50 slices and 64 voxels a row."""
@@ -107,8 +107,7 @@ class RidgeStep:
         return brought_to(self.rt, volume, result)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
-        """Runs a kernel on slices from ``first`` on. Its result has ``less`` voxels fewer along each axis than the
-        volume."""
+        """Runs a kernel on slices from ``first`` on. Its result is ``less`` voxels shorter along each axis than a volume."""
         nz, ny, nx = (count - less for count in self.shape)
         start, stop = max(first, 0), min(first + _SLICES, nz)
         if start < stop:

@@ -132,8 +132,8 @@ def find_dead(
     A pixel is dead if it never changes while its neighbours do. It is also dead if it is above all its neighbours, or below
     all, in 70 % of the frames. It must then differ from the median of 3 × 3 pixels by more than ``deviations`` standard
     deviations of the panel's pixels. Near ``axis_column`` small parts of the object stay on one pixel: there a dead pixel
-    must also be sharper than the optics. A row or column that differs from both neighbours over 90 % of its length is dead
-    as a whole."""
+    must also be sharper than the optics. A whole row or column is dead if it differs from both neighbours over 90 % of its
+    length."""
     if len(frames) < LEAST_FRAMES:
         return np.zeros(frames.shape[1:], bool)
     numbers = np.unique(np.linspace(0, len(frames) - 1, _MOST_FRAMES).round().astype(int))

@@ -129,8 +129,7 @@ def _straighten_two(
     frames: np.ndarray, spectrum: Spectrum, model: Model, blur: float, water: Polynomial, bone_in: BoneIn
 ) -> tuple[np.ndarray, float]:
     """Returns line integrals (F, v, u) corrected for soft tissue and bone, and bone's fraction of the volume's attenuation.
-    Without bone they are corrected for water. blur: standard deviation in pixels by which frames are blurred for a coarse
-    model."""
+    Without bone they are corrected for water. blur: standard deviation in pixels of the frames' blur for a coarse model."""
     clean, share = straighten(frames, water), 0.0
     for _ in range(_PASSES):
         volume = model.regularised(step.smooth(clean, blur))
@@ -178,8 +177,7 @@ def _with_bone(bone: np.ndarray, frames: np.ndarray, spectrum: Spectrum, model: 
 
 
 def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> np.ndarray:
-    """Returns the soft tissue's line integrals that, behind bone of line integrals ``dense``, give the measured
-    ``frames``."""
+    """Returns the soft tissue's line integrals that, with those of bone (``dense``), give the measured ``frames``."""
     soft, small = np.asarray(frames - dense, np.float64), 1e-3
     for _ in range(_NEWTON):
         now = spectrum.hardened(soft, dense)

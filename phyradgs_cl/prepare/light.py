@@ -5,8 +5,7 @@
 - pca: each frame gets the combination of the flats' principal components that leaves the least total variation, in
   logarithms (Van Nieuwenhove et al., Opt. Express 23 (2015) 27975).
 
-The step ``air`` corrects each frame's amount of light by the pixels that no object covers, as nabu and algotom's ROI
-normalisation do."""
+The step ``air`` corrects each frame's amount of light by the pixels that no object covers, as nabu and algotom do."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -70,8 +69,7 @@ def _with_changing_flats(
 
 
 def _in_time(signal: np.ndarray, flats: np.ndarray, numbers: np.ndarray) -> Iterator[np.ndarray]:
-    """Yields each projection's flat (v, u), interpolated by frame number between the means of flats taken one after
-    another."""
+    """Yields each projection's flat (v, u): means of flats taken one after another, interpolated by frame number."""
     groups = np.split(np.arange(len(flats)), np.flatnonzero(np.diff(flats) > 1) + 1)
     time = np.array([flats[group].mean() for group in groups])
     means = np.stack([signal[group].mean(axis=0) for group in groups])
@@ -169,7 +167,6 @@ def enough_air(frames: np.ndarray, below: float, least: float, step: str, remedy
 
 
 def with_air_at_0(frames: np.ndarray, air: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shifts each frame of line integrals (F, v, u) so that its median over ``air`` is 0. Returns them, and the medians
-    (F,)."""
+    """Shifts each frame of line integrals (F, v, u) so that its median over ``air`` is 0. Also returns the medians (F,)."""
     value = np.array([np.median(frame[where]) for frame, where in zip(frames, air, strict=True)])
     return frames - value[:, None, None].astype(np.float32), value

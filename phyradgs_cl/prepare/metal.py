@@ -22,8 +22,7 @@ _MOST, _OBJECT = 0.5, 0.02  # most of the object that the shadow may cover; the 
 
 @dataclass(frozen=True)
 class MetalOptions(checks.Checked):
-    """above_per_mm: attenuation in 1/mm, in a first volume, from which a voxel is metal. 0: six times the main
-    material's."""
+    """above_per_mm: attenuation in 1/mm in a first volume from which voxels are metal. 0: six times the main material's."""
 
     PREFIX = "metal."
 

@@ -68,8 +68,7 @@ def retrieve_phase(
 
     pixel_mm (v, u), distance_mm: for a parallel beam. A cone beam with the magnification M has pixels of pitch/M and the
     distance R₁R₂/(R₁ + R₂), from source to object R₁ and from object to panel R₂. delta_beta: δ/β of the material. If it or
-    the distance is 0, the frames themselves are returned. Beyond the panel, frames continue with the values at their
-    edges."""
+    the distance is 0, the frames themselves are returned. Beyond the panel, frames continue with their edges' values."""
     reach_mm = filter_reach_mm(distance_mm, energy_kev, delta_beta)
     if reach_mm == 0:
         return frames

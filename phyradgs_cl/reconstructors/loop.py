@@ -59,8 +59,8 @@ class Loop:
     """Runs a method to its end, an interruption, or its own reason to stop, and records its convergence.
 
     stopped_by: ``iterations``, ``interrupt``, or the method's reason. record_every, report_every: iterations between lines
-    of the record, and between reports, which come sooner for slow iterations. started: the ``time.perf_counter`` from which
-    seconds count."""
+    of the record, and between reports, which come sooner if iterations are slow. started: the ``time.perf_counter`` of
+    second 0."""
 
     def __init__(
         self, method: Stepwise, ranks: Communicator, report: ProgressReport, started: float,
@@ -136,7 +136,6 @@ class Loop:
         return False
 
     def _reaches(self, every: int, before: int) -> bool:
-        """Returns whether a step that began at iteration ``before`` reached a multiple of ``every``, or the last
-        iteration."""
+        """Returns whether a step from iteration ``before`` on reached a multiple of ``every``, or the last iteration."""
         now = self.method.iteration
         return now // every > before // every or now == self.method.iterations

@@ -70,8 +70,8 @@ def preprocessing_of(changes: Mapping[str, Any]) -> Preprocessing:
 
 
 def _models(options: Any) -> dict[str, Any]:
-    """Returns the motion models that a method's options allow, by name. The preset's own model keeps its numbers of strips
-    and times."""
+    """Returns by name the motion models that a method's options allow. The preset's own keeps its numbers of strips and
+    times."""
     own = [options.motion] if hasattr(options.motion, "name") else []
     return {model.name: model for model in (*getattr(options, "MOTIONS", _ALL), *own)}
 
@@ -146,8 +146,7 @@ def _having(option: str) -> str:
 
 
 def _converted(current: Any, value: Any, subject: str) -> Any:
-    """Returns ``value`` in the type of ``current``: number, word, tuple or nested table; unchanged if ``current`` is
-    None."""
+    """Returns ``value`` in the type of ``current``: number, word, tuple or nested table. None leaves it unchanged."""
     if current is None:  # the options check it themselves
         return value.item() if isinstance(value, np.generic) else value
     if isinstance(value, np.generic | np.ndarray):

@@ -91,15 +91,13 @@ class Reconstruction:
         return f", stopped after {done} of {asked} iterations ({reason})"
 
     def complete(self) -> "Reconstruction":
-        """Returns the result. Raises KeyboardInterrupt if the run was interrupted: nobody shall take a part for the
-        whole."""
+        """Returns the result. Raises KeyboardInterrupt if the run was interrupted, so that no part passes for the whole."""
         if self.facts.get("interrupted_at") is not None:
             raise KeyboardInterrupt
         return self
 
     def within(self, grid: Grid) -> "Reconstruction":
-        """Returns the part of the result on ``grid``, with all Gaussians, or the result itself if ``grid`` reaches beyond
-        it."""
+        """Returns the part of the result on ``grid``, with all Gaussians; the result itself if ``grid`` reaches beyond."""
         if (part := grid.slices_in(self.grid)) is None:
             return self
         of_all = slice(None), *part

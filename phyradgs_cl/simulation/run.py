@@ -206,8 +206,8 @@ def simulate(
 ) -> Scan:
     """Returns a scan of the object that ``source`` projects, with noise.
 
-    reference (nz, ny, nx): the truth in 1/mm, which ``peak`` scales too. bone: projects the object's bone alone, for a beam
-    of many energies."""
+    reference (nz, ny, nx): the truth in 1/mm, which ``peak`` scales too. bone: projects the bone alone, for a beam of many
+    energies."""
     if options.kvp and bone is None:
         expected = "an object of voxels, whose dense ones are bone: foot, jaw or a volume"
         raise InputError("--kvp", "a phantom in closed form", expected, "leave it out")
@@ -263,8 +263,7 @@ def simulate(
 
 
 def _gating(scan: Scan, scene: Scene) -> Gating:
-    """Returns the state of the motion in the middle of every frame: the first field's weight, or the phase without
-    fields."""
+    """Returns the motion's state in the middle of every frame: the first field's weight, or the phase without fields."""
     middle_s = np.asarray(scan.frame_start_s) + scan.shutter.span_s / 2
     if scene.deformation is not None:
         return Gating(middle_s, scene.deformation.weights_at(middle_s)[:, 0])

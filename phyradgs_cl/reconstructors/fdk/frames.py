@@ -41,8 +41,7 @@ _FULL_TURN = 1.5  # if a gap between views is wider than this many median steps,
 
 
 def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
-    """Continues line integrals ``frames`` (F, v, u) beyond both sides as ``way`` says. Returns (F, v, u + 2 n) float32, and
-    n."""
+    """Continues line integrals (F, v, u) beyond both sides by the ``way`` named. Returns (F, v, u + 2 n) float32, and n."""
     count = max(1, round(_SHARE * frames.shape[2]))
     beyond = np.arange(1, count + 1)
     least = _NOISE * float(np.percentile(frames, 99.9))
@@ -72,7 +71,7 @@ def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: 
 
 
 def _curvature(frames: np.ndarray) -> np.ndarray:
-    """Returns the curvature (F, v, 1), positive downwards, of the parabola through a row's squares: its median over
+    """Returns the curvature (F, v, 1), positive downwards, of the parabola through a row's squares; the median over
     frames."""
     u = np.linspace(-1, 1, frames.shape[2])
     basis = np.stack([np.ones_like(u), u, u**2], axis=1)

@@ -123,8 +123,7 @@ def _warn_if_few_views(views_a_turn: float, name: str) -> None:
 
 
 def _warn_if_unseen(covered: np.ndarray, name: str, turn: str) -> None:
-    """Logs how many voxels are seen from too few directions. covered: fraction (nz, ny, nx) of the directions that they
-    need."""
+    """Logs how many voxels too few directions see. covered: fraction (nz, ny, nx) of the directions that they need."""
     share = float((covered < 1 - 1e-3).mean())
     if share > _NAMED:
         text = "%s: %.0f %% of the voxels are seen from less than %s turn, the least from %.0f°: their densities are wrong"

@@ -73,8 +73,7 @@ class Arc:
 
 
 def filled_gap_rad(fan: weights.Fan) -> float:
-    """Returns the width in rad up to which gaps are filled by the views beside them, because no others see some of their
-    rays."""
+    """Returns the width in rad up to which gaps are filled by the views beside them: no others see some of their rays."""
     if fan.is_put_aside:
         return 2 * np.pi
     return _FILLED_RAD if fan.is_displaced else 0.0
@@ -211,8 +210,7 @@ def ray_weight(
 def opposite_weight(
     canonical: np.ndarray, shape: tuple[int, int], arc: Arc, is_parallel: bool
 ) -> Callable[[int], np.ndarray | float]:
-    """Returns a function from a view's index to redundancy weights (rows, columns): those of a ray and its opposite sum to
-    2."""
+    """Returns a function from a view's index to weights (rows, columns): those of a ray and its opposite sum to 2."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
 
     def weight(view: int) -> np.ndarray | float:

@@ -62,8 +62,7 @@ class FlatErrors:
 @dataclass(frozen=True, eq=False)
 class ViewParameters:
     """Unknown parameters of views, of K kinds: coefficients b (n, K) of n functions of the view. View f has the values
-    (basis @ b)[f], with ``basis`` (F, n). Each changes its frame by the value times a signal of ``signals`` (F, K, rows,
-    columns)."""
+    (basis @ b)[f], with ``basis`` (F, n). signals (F, K, rows, columns): how a frame changes per unit of each value."""
 
     signals: np.ndarray
     basis: np.ndarray

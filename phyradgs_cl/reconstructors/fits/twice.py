@@ -32,8 +32,8 @@ def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
     """Returns the panel's shift along u under which rays and their opposites agree best, its deviation by a jackknife over
     the views, and the mean squares (F,) of their differences.
 
-    NaN if views are more than 10° apart, if columns are read one after the other, and if no shift within an eighth of the
-    panel agrees best."""
+    NaN for views more than 10° apart, for columns read one after the other, and if no shift within an eighth of the panel is
+    best."""
     if scan.shutter.axis == "columns" and scan.shutter.readout_s > 0:
         return NOT_FOUND  # a ray and its opposite lie on different columns, read at different times
     poses = middle_poses(scan)

@@ -43,8 +43,8 @@ class MotionField:
 
     @classmethod
     def at_rest(cls, scan: Scan, spacing_mm: float, splines: TemporalSplines, temporal: np.ndarray) -> "MotionField":
-        """Returns a field of zeros over the scan's grid. Its weights, from ``temporal`` (count, R), have mean 0 and largest
-        size 1."""
+        """Returns a field of zeros over the scan's grid. Its weights, from ``temporal`` (count, R), get mean 0, largest size
+        1."""
         origin_mm, counts = control_points(scan.grid, spacing_mm)
         centred = temporal - splines.at(splines.node_times_s).mean(0) @ temporal  # splines sum to 1: the weights get mean 0
         control_mm = np.zeros((temporal.shape[1], *counts, 3))
@@ -136,8 +136,7 @@ class FieldProblem:
         return self._first_better(one, residual, candidates, volume, penalty)
 
     def time_step(self, one: MotionField, volume: np.ndarray) -> MotionField:
-        """Returns the field after a step of its weights' coefficients in time; itself if no step lowers misfit plus
-        penalty."""
+        """Returns the field after a step of its weights in time; the field itself if no step lowers misfit plus penalty."""
         operator = self.operator(one)
         residual = self._masked(self.scan.projections - operator.forward(volume))
         hessian, downhill = self._temporal_equations(one, operator, volume, residual)

@@ -83,7 +83,7 @@ def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: floa
 
 
 class FieldSearch:
-    """Searches the field on a coarse copy of the scan, as a ``Stepwise``. rounds: iterations of the search. bending: as in
+    """Searches the field on a coarse copy of the scan, as a ``Stepwise``. rounds: its iterations. bending: as in
     ``FieldProblem``."""
 
     quantity, remedy = "residual", "check the scan for extreme values"
@@ -104,8 +104,7 @@ class FieldSearch:
 
     @property
     def finished(self) -> str | None:
-        """Why the search ends early: the object is at rest, because in two rounds no step of the field lowered the residual.
-        Else None."""
+        """Why the search ends early: the object rests, because in two rounds no step lowered the residual. Else None."""
         return _AT_REST if self.iteration >= 2 and not self.field.control_mm.any() else None
 
     def step(self) -> None:
@@ -313,8 +312,7 @@ def _signal_of(scan: Scan, gating: str) -> MotionSignal:
 
 
 def _motion_facts(one: _Field, signal: MotionSignal, scan: Scan) -> dict[str, object]:
-    """Returns what the search found, for the result's facts. Displacements count from the mean position of matter in the
-    scan."""
+    """Returns what the search found, for the result's facts. Displacements count from matter's mean position."""
     moves = one.for_passes is not None
     follows = signal.knot_s is not None
     facts: dict[str, object] = {"moves": moves, "follows": follows, "period_s": signal.period_s, "gain": one.gain}

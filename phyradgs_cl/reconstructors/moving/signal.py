@@ -59,8 +59,7 @@ class TemporalSplines:
         return np.linspace(self.first_s, self.last_s, _NODES * self.intervals + 1)
 
     def at(self, times_s: np.ndarray) -> np.ndarray:
-        """Returns the values (n, count) of all splines at times (n,) in s. Before the first and after the last time they
-        stay constant."""
+        """Returns the values (n, count) of all splines at times (n,) in s, constant before first_s and after last_s."""
         knots_s = self.first_s + self.step_s * np.arange(-3, self.intervals + 4)
         return BSpline(knots_s, np.eye(self.count), 3)(np.clip(times_s, self.first_s, self.last_s))
 
@@ -71,8 +70,7 @@ class TemporalSplines:
         return np.asarray(np.linalg.lstsq(self.at(nodes_s), wanted, rcond=None)[0])
 
     def roughness(self) -> np.ndarray:
-        """Returns the matrix K (count, count) with which cᵀ K c is the sum of squared second differences of coefficients
-        c."""
+        """Returns the matrix K (count, count): cᵀ K c is the sum of squared second differences of coefficients c."""
         return _difference_squares(self.count, 2)
 
 

@@ -76,16 +76,16 @@ class SplatOptions(MotionOptions):
         return int(min(max(voxels / 16, 1000), 50_000))
 
     def motion_at(self, share: float) -> Motion:
-        """Returns the motion model after the fraction ``share`` of the run: coarse in early iterations, which gain nothing
-        from exact motion."""
+        """Returns the motion model after the fraction ``share`` of the run: a coarse one in early iterations, as it costs no
+        quality."""
         if not isinstance(self.motion, Exact) or share >= self.exact_from:
             return self.motion
         is_first = share < _STATIC_SHARE * self.exact_from
         return Static() if is_first else Exact(1, max(_COARSE_ERROR, self.motion.time_error))
 
     def batch_for(self, frames: int, ranks: int) -> int:
-        """Returns the frames per step: the option or, if it is 0, one for every rank. Raises InputError for more than the
-        scan has."""
+        """Returns the frames per step: the option or, if it is 0, one per rank. Raises InputError for more than the scan
+        has."""
         if self.batch > frames:
             raise InputError("batch", str(self.batch), f"no more than the scan's {frames} frames")
         return self.batch or min(ranks, frames)

@@ -1,8 +1,8 @@
 """One step of a splatting run on the device: its Gaussians and frames there, and the gradient, summed over ranks.
 
 Only ``FrameStep.gradient`` renders a frame, compares it, goes back, adds total variation and applies the chain rule. Each
-rank has all Gaussians, and some frames of the batch. Gradients are summed so that the bits depend on the batch, not on the
-number of ranks."""
+rank has all Gaussians, and some frames of the batch. The bits of summed gradients depend on the batch, not on the number of
+ranks."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -44,8 +44,7 @@ class Scale:
 
 
 class DeviceCloud:
-    """The Gaussians of a run on the device. Arrays have ``gaussians.stride`` columns, the first ``count`` of them
-    Gaussians."""
+    """The Gaussians of a run on the device: the first ``count`` of the ``gaussians.stride`` columns of each array."""
 
     def __init__(self, rt: Runtime, population: Population) -> None:
         self.rt, self.count = rt, population.count
@@ -135,8 +134,7 @@ def tables_of(
 
 
 def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[float]]:
-    """Uploads masks, 1 at valid pixels: one for all frames, or one per frame. Returns them and their numbers of valid
-    pixels."""
+    """Uploads masks, 1 at valid pixels: one for all frames, or one each. Returns them and their numbers of valid pixels."""
     masks = np.zeros((1, *scan.geometry.detector_shape)) if scan.pixel_mask is None else scan.pixel_mask
     stack = [(m == 0).astype(np.float32) for m in (masks if masks.ndim == 3 else masks[None])]
     arrays = [rt.upload(pad_rows(scan.shutter.readout.frames(m))) for m in stack]

@@ -70,8 +70,7 @@ class FistaOptions(IterativeOptions):
     """Options that may be a function."""
 
     TRIALS: ClassVar[tuple[int, int]] = (2, 7)
-    """Iterations of the two short runs that ``estimate`` times. Of their difference, 3 in 5 are coarse, as in a whole
-    run."""
+    """Iterations of the two short runs that ``estimate`` times. Of the five between, three are coarse, as in a whole run."""
 
     motion: Motion = PerRow()
     iterations: int = 35
@@ -234,8 +233,8 @@ def fista_passes(
     has_few_times: bool = False,
 ) -> Iterations:  # fmt: skip
     """Returns ``passes`` passes from ``volume`` (nz, ny, nx; None: the method's own start), with every voxel divided into
-    ``parts`` along each side. subsets: replaces the option, unless 0. has_few_times: takes a third of the times in an
-    exposure."""
+    ``parts`` along each side. subsets: replaces the option, unless 0. has_few_times: takes a third of an exposure's
+    times."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
     options, rt = replace(whole.options, iterations=passes), whole.rt

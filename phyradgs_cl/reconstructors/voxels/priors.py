@@ -53,8 +53,7 @@ _SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels with the prior ``ri
 class FrameError:
     """The error of a pixel that no volume on the grid explains.
 
-    noise: standard deviation of its line integral. edges_mm: discretisation error at edges, over the density there in
-    1/mm."""
+    noise: standard deviation of its line integral. edges_mm: discretisation error at edges, per density (1/mm) there."""
 
     noise: float
     edges_mm: float = 0.0
@@ -108,8 +107,7 @@ class PriorWeight:
         return max(self.strength * math.hypot(by_noise, by_edges), self.least)
 
     def noise_share(self, weight: float) -> float:
-        """Returns which part of ``weight`` is due to noise, 0 to 1. With many views or photons, edges make up most of a
-        weight."""
+        """Returns which part of ``weight`` is due to noise, 0 to 1. With many views or photons, edges make up most of it."""
         by_noise = self.strength * self.error.noise * self.noise_mm
         return min(by_noise / weight, 1.0) if weight > 0 else 1.0  # empty frames have no weight
 
@@ -223,8 +221,7 @@ class ThenRidge(Prior):
     VOLUMES = RidgeStep.VOLUMES
 
     def __init__(self, before: Prior, ridge: RidgeStep, noise_factor: float) -> None:
-        """Joins both maps. noise_factor: the noise that the ridge step assumes, over the part of the weight that is due to
-        noise."""
+        """Joins both maps. noise_factor: noise that the ridge step assumes, over the part of the weight due to noise."""
         self.before, self.ridge, self.noise_factor = before, ridge, noise_factor
         self.maps = 0  # maps since the last ridge step
 
@@ -280,8 +277,7 @@ Denoiser = Callable[[np.ndarray, float], np.ndarray]
 
 
 class OwnPrior(Prior):
-    """A user's denoiser on the host in place of a proximal map (plug-and-play: Venkatakrishnan, Bouman and Wohlberg
-    2013)."""
+    """A user's denoiser on the host in place of a proximal map (plug-and-play: Venkatakrishnan et al. 2013)."""
 
     def __init__(self, denoiser: Denoiser) -> None:
         self.denoiser, self.subject = denoiser, f"--prior {function_name(denoiser)}"

@@ -53,8 +53,7 @@ class IterativeOptions(MotionOptions):
 class Algorithm:
     """An iterative method on a system. ``volume`` (nz, ny, nx) in 1/mm is an array of the system's space.
 
-    A subclass writes ``step``, and names its running state: ``ARRAYS``, attributes that are arrays of the space, and
-    ``NUMBERS``."""
+    A subclass writes ``step``, and names the attributes of its running state: ``ARRAYS`` of the space, and ``NUMBERS``."""
 
     ARRAYS: ClassVar[tuple[str, ...]] = ("volume",)
     NUMBERS: ClassVar[tuple[str, ...]] = ()
@@ -127,8 +126,7 @@ class MethodRun:
     def result(self, name: str, method: WithFacts) -> Reconstruction:
         """Runs a method in a loop. Returns its volume, convergence record and facts.
 
-        The record has a line per iteration: the residual ‖p − A x‖/‖p‖, the change ‖x − x'‖/‖x‖, and the seconds since the
-        start."""
+        The record has, for each iteration, the residual ‖p − A x‖/‖p‖, the change ‖x − x'‖/‖x‖, and the seconds so far."""
         loop = Loop(method, self.rt.ranks, self.report, self.started)
         loop.run(self.resume)
         facts: dict[str, object] = {

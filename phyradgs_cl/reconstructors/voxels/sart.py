@@ -41,7 +41,7 @@ OS_SART = SartOptions(frames_per_subset=10)
 class Sart(Algorithm):
     """SART, x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i of the frames, with W = 1/(Aᵢ 1) and V = 1/(Aᵢᵀ 1).
 
-    The intensity model replaces Aᵢᵀ by Jᵢᵀ and Aᵢ x by Iᵢ(x). A pass's residual combines all subsets, each just before its
+    The intensity model replaces Aᵢᵀ by Jᵢᵀ and Aᵢ x by Iᵢ(x). The residual combines all subsets, each before its
     correction."""
 
     NUMBERS = ("relaxation",)

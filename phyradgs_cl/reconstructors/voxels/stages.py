@@ -23,8 +23,8 @@ class Stage:
     """One stage of a run. make: returns the stage's method, which starts from a volume (nz, ny, nx); None: from its own
     start.
 
-    merge: combines the stage's volume and the one before it to the result (nz, ny, nx) of the run. end: is called with the
-    finished method."""
+    merge: combines the stage's volume with the one before it to the run's (nz, ny, nx). end: called with the finished
+    method."""
 
     name: str
     iterations: int

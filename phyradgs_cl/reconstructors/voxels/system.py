@@ -83,8 +83,7 @@ class System:
         """Returns the system with its arrays on the device, if that has room for the operators, ``volumes`` volumes, and
         ``frames`` arrays of all frames. Otherwise they stay on the host.
 
-        They also stay there with several ranks, which sum on the host, and for a volume that is projected part after
-        part."""
+        They also stay there with several ranks, which sum on the host, and for a volume that is projected in parts."""
         kinds = RayOperator, WarpedOperator, IntensityOperator
         operators = [o for o in (self.operator, self.intensity) if isinstance(o, kinds)]
         if len(operators) < 1 + (self.intensity is not None):
@@ -147,8 +146,7 @@ class System:
         return self.operator.forward if self.intensity is None else self.intensity.expected
 
     def derivative(self, change: Any) -> Any:
-        """Returns A d or, in the intensity model, J d: how ``expected`` changes with a change d of the volume last
-        compared."""
+        """Returns A d or, with intensities, J d: how ``expected`` changes with a change d of the volume last compared."""
         operator = self.operator if self.intensity is None else self.intensity
         return self.masked(operator.forward(change, self.space.place(self.operator.frames_shape)))
 
@@ -269,8 +267,7 @@ class SharedOperator:
         return exact_sum(self.ranks, parts, shape, self.ranks.size).reshape(self.volume_shape)
 
     def subset(self: S, frames: Sequence[int]) -> S:
-        """Returns the operator of the frames with the numbers ``frames``, in the order given, divided among the ranks
-        again."""
+        """Returns the operator of the frames with the numbers ``frames``, in this order, divided among the ranks again."""
         return type(self)(self.ranks, self.whole.subset(frames))
 
     def _gathered(self, part: np.ndarray | None) -> np.ndarray:
