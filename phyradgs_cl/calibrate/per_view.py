@@ -27,8 +27,7 @@ TURN, SHIFT_V, SHIFT_U = 0, 1, 2
 _STEP_PX = 0.25  # signals are central differences, for which a frame moves by this much to each side
 _LEAST_NORM = 0.1  # a signal's norm counts as at least this fraction of its kind's largest, which limits how it is scaled
 _DEG = float(np.rad2deg(1.0))
-# This fraction of the change since a grid half as fine counts as error: 1 suits errors ∝ voxel side, 1/3 errors ∝ its
-# square.
+# This fraction of the change since a grid half as fine counts as error: 1 suits errors ∝ voxel, 1/3 errors ∝ voxel².
 DISCRETISATION = 0.5
 _STEPS = 3  # Gauss–Newton steps on each grid; the next grid continues from there
 _ITERATIONS = 20  # iterations of CGLS for each step and each standard deviation
@@ -65,7 +64,7 @@ class PerViewParameters(ABC):
 
     @abstractmethod
     def views_of(self, values: np.ndarray) -> Views | Sway:
-        """Returns values (n, K) as a change of a scan."""
+        """Returns the change of a scan's views, or of its object's pose, that values (n, K) stand for."""
 
     @abstractmethod
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
@@ -245,7 +244,7 @@ def _signal(
 def _share(
     problem: CoarseProblem, operator: RayOperator, basis: np.ndarray, signals: np.ndarray, iterations: int
 ) -> float:
-    """Returns the fraction of signals (F, rows, columns), with random signs, that no object explains, 0 to 1."""
+    """Returns which fraction, 0 to 1, of signals (F, rows, columns) no object explains, if each has a random sign."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], basis.shape[1]).astype(np.float32)
     probe = signals * (basis @ signs).astype(np.float32)[:, None, None]
     (rest,) = problem.beyond_object(operator, np.zeros(operator.volume_shape, np.float32), [probe], iterations)

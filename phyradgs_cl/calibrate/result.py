@@ -101,7 +101,7 @@ class Calibration:
             six = self.views.at(np.asarray(self.scan.frame_start_s) + self.scan.shutter.middle_s).T
             curves = {f"turn_{axis}_deg": np.rad2deg(values) for axis, values in zip("xyz", six[:3], strict=True)}
             curves |= {f"shift_{axis}_mm": values for axis, values in zip("xyz", six[3:], strict=True)}
-        return {name: values for name, values in curves.items() if values.any()}  # kinds that were not corrected are all 0
+        return {name: values for name, values in curves.items() if values.any()}  # only kinds that were corrected
 
     def plot(self) -> "Figure":
         """Returns a figure of the residuals of four frames, before on the left and after on the right, on one scale.

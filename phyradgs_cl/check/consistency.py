@@ -48,7 +48,7 @@ _UNLIKE = 2.0  # a repeated frame differs this much, relative to the median, fro
 _OUTLIER = 4.0  # the residual of an outlier is at least this many times the frames' median
 # Both ends of an arc may fit badly if their residuals differ by less than this factor: right frames had 1.4, odd ones 2.3.
 _ALIKE = 1.7
-# But they must leave less than this fraction of the residual in a random order: right frames had 0.2, odd ones mostly 0.3.
+# Both ends must also leave less than this fraction of the residual in a random order: right ones had 0.2, odd mostly 0.3.
 _AT_BOTH_ENDS = 0.25
 _MOST_OUTLIERS = 0.2  # this many outliers, as a fraction of the frames, have a common cause: then none counts as one
 _EXCHANGED = 0.5  # two frames were exchanged if the opposite order leaves less than this fraction of the squares

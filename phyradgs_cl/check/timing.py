@@ -54,7 +54,7 @@ def check_timing(scan: Scan) -> Finding:
         _share("readout", "a frame would be read while the last one is", scan.shutter.readout_s / period_s),
     ]
     if isinstance(scan.trajectory, CircularOrbit) and isinstance(scan.trajectory.kinematics, FrameSweeps):
-        findings.append(_speed(scan, starts_s))  # other trajectories are one function of time
+        findings.append(_speed(scan, starts_s))  # elsewhere one function of time gives both
     findings += _table(scan)
     suspicious = [finding for finding in findings if finding.verdict == SUSPICIOUS]
     return suspicious[0] if suspicious else max(findings, key=lambda finding: finding.value / finding.threshold)

@@ -76,7 +76,7 @@ def frames_to_attenuation(
                 part = slice(start, start + rows)
                 values = frames[frame, part].astype(np.float64)
                 if quantity == "attenuation":
-                    bad = ~(np.abs(values) <= largest)  # NaN compares false
+                    bad = ~(np.abs(values) <= largest)  # NaN is bad too: every comparison with it is false
                     result[i, part], unusable[i, part] = np.where(bad, 0.0, values), bad
                 else:
                     result[i, part], unusable[i, part] = minus_log(values - dark[part], gain[part])

@@ -197,7 +197,7 @@ def corners(positions: torch.Tensor, cells: int, size: int) -> tuple[torch.Tenso
     level has ``cells`` grid cells along a side and ``size`` entries."""
     scaled = positions.t() * cells
     low = scaled.floor().clamp_(0, cells - 1)
-    high_share = scaled - low  # (3, P)
+    high_share = scaled - low  # part of a cell's side, (3, P)
     low_share = 1 - high_share
     side, whole = cells + 1, low.to(torch.int64)
     is_dense = side**3 <= size

@@ -265,7 +265,7 @@ class ExposureRays:
             place = np.full(to_corner.shape, np.nan)
         scale, column, row = np.moveaxis(place, -1, 0)
         is_behind = not self.is_parallel and np.any(scale <= 0)
-        if is_behind or not np.all(np.isfinite(scale)):  # no ray of the panel meets this corner: take all pixels
+        if is_behind or not np.all(np.isfinite(scale)):  # a corner that no ray meets: take all pixels
             return slice(0, detector_shape[0]), slice(0, detector_shape[1])
         return _within(row, detector_shape[0]), _within(column, detector_shape[1])
 

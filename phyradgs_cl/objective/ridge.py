@@ -89,8 +89,8 @@ class RidgeStep:
     def __call__(
         self, volume: SameArray, sigma: float, step: float, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Returns v − ``step`` ∇R(v), float32, for a volume v (nz, ny, nx); sigma in v's unit. nonnegative: clips the
-        result at 0. out: as in ``DctProx``."""
+        """Returns v − ``step`` ∇R(v), float32, for a volume v (nz, ny, nx); sigma in v's unit. nonnegative: clips the result
+        at 0. out: a device array that takes the result."""
         nz, ny, nx = self.shape
         observed, result = beside(self.rt, volume, out)
         padded = self._padded, Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))

@@ -70,7 +70,8 @@ def _strength(means: np.ndarray, axis_column: float) -> Strength:
     Subtracting its mirror image from each column cancels the object, and second differences along rows remove what is left
     of it. The covariance of both sets is the pattern's variance."""
     one, other = (_rough(_antisymmetric(mean, axis_column)) for mean in means)
-    # the mean of half the views has twice the noise variance of the mean of all; the difference of two halves, four times
+    # a mean over half the views has twice the noise variance of that over all, and the difference of two such means four
+    # times
     noise, rows = robust_deviation(one - other) ** 2 / 4, len(one) // 2
     least = noise * max(_LEAST_SHARE, _SURE / np.sqrt(one.size))
     pattern = _covariance(one, other)
@@ -234,8 +235,8 @@ class SingleGains:
 def find_single_gains(
     means: np.ndarray, mirrored: np.ndarray, usable: np.ndarray, full_turn: bool
 ) -> SingleGains:
-    """Finds single wrong gains in the means (2, v, u) of two sets of views. mirrored: from ``mirror_columns``; columns
-    without a mirror image are left alone. usable: bool (v, u), False for masked pixels."""
+    """Finds single wrong gains in the means (2, v, u) of two sets of views. mirrored: the columns' mirror images, from
+    ``mirror_columns``; columns without a mirror image are left alone. usable: bool (v, u), False for masked pixels."""
     offset = np.zeros(usable.shape, np.float32)
     if len(mirrored) < _NEAR:
         return SingleGains(offset)

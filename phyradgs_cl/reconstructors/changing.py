@@ -31,9 +31,10 @@ class ChangingOptions(IterativeOptions):
     """Options of ``changing``.
 
     - states: number of the object's states, each with as many frames; fewer if the scan has fewer frames.
-    - prior_weight: weight of total variation in space, relative to the error of the gradient as in ``fista``.
+    - prior_weight: weight of total variation in space, relative to the error of the data term's gradient.
     - time_weight: weight of a voxel's change from one state to the next, relative to an equal step between two voxels.
-    - subsets: as in ``fista``, but at most two for each frame of a state. tv_iterations: as in ``fista``."""
+    - subsets: of the frames, with one step each; at most two for each frame of a state. tv_iterations: dual iterations per
+      proximal map."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 8)
     """Iterations of the two short runs that ``estimate`` times. Both begin with the slower first pass."""

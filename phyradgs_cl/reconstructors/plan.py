@@ -147,7 +147,7 @@ def _having(option: str) -> str:
 
 def _converted(current: Any, value: Any, subject: str) -> Any:
     """Returns ``value`` in the type of ``current``: number, word, tuple or nested table. None leaves it unchanged."""
-    if current is None:  # the options check it themselves
+    if current is None:  # its type is not known: the options check the value themselves
         return value.item() if isinstance(value, np.generic) else value
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()

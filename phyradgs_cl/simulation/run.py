@@ -134,7 +134,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
     timing = {key: values.pop(key) for key in _TIMING if key in values}
     sheet = {key: values.pop(key, None) for key in _DATA_SHEET}
     timed = make_protocol(protocol, **timing)
-    if given.get("jitter_deg") and not timed.is_fly:  # a gantry that stops rests at exact angles
+    if given.get("jitter_deg") and not timed.is_fly:  # a gantry that stops does not wander
         found, remedy = f"{given['jitter_deg']} with --protocol {protocol}", "leave it out, or choose a fly-scan"
         raise InputError("--jitter-deg", found, "0", remedy)
     unused = [name for name in ("dose", "electronic_noise") if name in given and given.get("noise", "none") == "none"]
@@ -191,7 +191,7 @@ def simulated_scan(
         scan.provenance["motion_of_object"] = asdict(motion)
         times_s = motion.state_times_s(*window_s)
     else:
-        # The times are eighths of the cycle in the middle of the scan.
+        # The true volumes are stored at eighths of the cycle in the middle of the scan.
         period_s = scene.period_s or 1.0
         times_s = (np.floor(sum(window_s) / 2 / period_s) + np.arange(_STATES) / _STATES) * period_s
     volumes = np.stack([scene.state(time_s) for time_s in times_s])

@@ -164,7 +164,7 @@ def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """Returns means, float32, of a volume (z, y, x) over the voxels of a coarser grid of ``shape`` in the same box."""
     if volume.shape == tuple(shape):
         return volume.astype(np.float32)
-    from skimage.transform import resize_local_mean  # imported here because it is slow
+    from skimage.transform import resize_local_mean  # imported here because the import is slow
 
     mean = resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True)
     return mean.astype(np.float32)

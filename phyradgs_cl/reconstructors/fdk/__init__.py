@@ -149,8 +149,9 @@ def fdk_volume(
 
     pose: (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns) and short
     scans are recognised and weighted. whole: reconstructs the complete object (nz, ny, nx) in 1/mm on ``grid``, for
-    extrapolate ``reprojected``. circle, for parallel beams: as in ``FbpOptions``. moving: backprojects an object that moves.
-    Logs a warning where data are missing. Raises InputError for a source on the rotation axis."""
+    extrapolate ``reprojected``. circle, for parallel beams: sets voxels outside of the circle that the panel reaches to 0.
+    moving: backprojects an object that moves. Logs a warning where data are missing. Raises InputError for a source on the
+    rotation axis."""
     by_pixel, canonical, fan, arc = _seen(pose, frames, axis, is_parallel)
     if extrapolate != "none" and fan.is_put_aside:
         log.warning("%s: the rows of a displaced detector are not extrapolated", "FBP" if is_parallel else "FDK")

@@ -16,8 +16,8 @@ from phyradgs_cl.reconstructors.fdk.views import pose_of_pixels, view_angles
 
 log = logging.getLogger(__name__)
 
-# An orbit travels along z if the origin's image moves by more than this fraction of the panel's height. Less travel matters
-# at the volume's ends only.
+# An orbit travels along z if the origin's image moves by more than this fraction of the panel's height.
+# Less travel matters at the volume's ends only.
 _TRAVEL = 0.05
 _CLASS_RAD = np.deg2rad(15)  # width of a class of ray directions about z, unless views are few
 _VIEWS_A_CLASS = 2.0  # each class needs this many views of one turn: with fewer views, classes are wider

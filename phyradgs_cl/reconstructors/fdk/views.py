@@ -13,8 +13,8 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import weights
 
 # A gap between views stands out if it is this many times as wide as another gap; one lost view makes a gap of 2 steps.
-# The widest gap is compared with the second widest. Compared with the median, uneven views of a full turn would count as a
-# short scan. Any gap wider than _WIDE_RAD is compared with both of its neighbours.
+# The widest gap is compared with the second widest: by the median, uneven views of a full turn would be a short scan.
+# Any gap wider than _WIDE_RAD is compared with both of its neighbours.
 SHORT_SCAN_GAP = 2.5
 _SAME_VIEW = 1e-3  # views nearer to each other than this fraction of the mean gap count as one, as those of a second turn
 # A warning names filled gaps from this width on: narrower ones changed the density of large balls by less than 1 %.
@@ -160,7 +160,7 @@ def _distinct(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     is_new = np.diff(turned[order], prepend=-np.inf) > tolerance
     index = np.cumsum(is_new) - 1
     centre = turned[order][is_new]
-    if centre.size > 1 and centre[0] + 2 * np.pi - turned[order[-1]] <= tolerance:  # 0° and 360° are one
+    if centre.size > 1 and centre[0] + 2 * np.pi - turned[order[-1]] <= tolerance:  # such angles are one, as 0° and 360° are
         index[index == centre.size - 1] = 0
         centre = centre[:-1]
     cell = np.empty(turned.size, np.int64)

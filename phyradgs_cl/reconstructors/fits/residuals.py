@@ -99,7 +99,8 @@ class AugmentedOperator:
         return self.operator.frames_shape
 
     def system(self, measured: np.ndarray, valid: np.ndarray | None) -> System:
-        """Returns the equations for measured frames (F, rows, columns), without subsets. valid: as in ``System``."""
+        """Returns the equations for measured frames (F, rows, columns), without subsets. valid: 1 at usable pixels, else 0;
+        None: all are usable."""
         return System(self, measured, valid)  # type: ignore[arg-type]
 
     def forward(self, vector: np.ndarray, out: None = None) -> np.ndarray:

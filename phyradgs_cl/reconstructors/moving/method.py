@@ -83,8 +83,8 @@ def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: floa
 
 
 class FieldSearch:
-    """Searches the field on a coarse copy of the scan, as a ``Stepwise``. rounds: its iterations. bending: as in
-    ``FieldProblem``."""
+    """Searches the field on a coarse copy of the scan, as a ``Stepwise``. rounds: its iterations. bending: stiffness of the
+    field."""
 
     quantity, remedy = "residual", "check the scan for extreme values"
 

@@ -195,7 +195,8 @@ class FrameStep:
         self, cloud: DeviceCloud, frame: int, corner: Corner | None, late: bool, statistics: DeviceArray
     ) -> None:
         """Writes one frame's dL/d(raw parameters) into the gradients of an activated cloud, and adds to the ``statistics``
-        (2, stride) of density control. corner, late: as in ``Batch``."""
+        (2, stride) of density control. corner: of the sub-volume for total variation, or None. late: whether the density
+        term applies."""
         options, gaussians, by_cloud = self.options, cloud.gaussians, cloud.gradients
         cells, measured, mask, pixels = self.frames.get(frame)
         rendered = self.projector.forward(gaussians, cells)

@@ -46,8 +46,8 @@ _COARSE_PASSES = 0.6  # fraction of all passes that are coarse
 _COARSE_SUBSETS = 1.6  # a coarse pass has this many times ``subsets`` subsets
 _COARSE_TIMES = 1 / 3  # a coarse pass has this fraction of the times per exposure, but two at least
 _FAINTEST = 1e-6  # smaller row sums of AᵀA count as this fraction of the largest: dividing by less would inflate the bound
-# Voxels are divided if a slice (y, x) has at most this many of them: dividing is worth its time at 64³, not at 128³. Slices
-# are not counted, so that thick and thin slabs of one scan are reconstructed in the same manner.
+# Voxels are divided if a slice (y, x) has at most this many of them: dividing is worth its time at 64³, not at 128³.
+# Slices are not counted, so that thick and thin slabs of one scan are reconstructed in the same manner.
 _MOST_DIVIDED = 90**2
 
 
@@ -104,7 +104,7 @@ class Accelerated(Algorithm):
         super().__init__(system)
         self.prior = prior
         self.previous = self.volume
-        self.momentum = 1.0  # tₖ
+        self.momentum = 1.0  # tₖ of Beck and Teboulle, 1 for the first step
         self.curvature = (_tight_curvature if has_long_steps else _curvature)(system) or 1.0  # L, which bounds ‖AᵀA‖
 
     def start_from(self, volume: Any) -> None:

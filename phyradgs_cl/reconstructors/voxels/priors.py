@@ -40,8 +40,8 @@ _RIDGE_NOISE = 17.0  # noise that a ridge step assumes, relative to the prior's 
 _RIDGE_NOISE_AT_REST = 20.0  # noise that a ridge step assumes, relative to the prior's weight, for scans that stop
 _RIDGE_LENGTH = 0.5  # length of a ridge step: factor on the regulariser's gradient
 _RIDGE_EVERY = 4  # after this many maps of the other prior comes one ridge step
-# _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals. With the sixth root of the scan's noise, the
-# first grows and the second falls.
+# _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals.
+# With the sixth root of the scan's noise, the first grows and the second falls.
 _USUAL_NOISE = 0.01
 _LEAST_NOISE = 0.001  # some scans have no noise: it counts as at least this
 _LEAST_NOISE_SHARE = 0.1  # a ridge step counts at least this fraction of the weight as noise, because some scans have none

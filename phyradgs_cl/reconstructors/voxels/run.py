@@ -84,7 +84,7 @@ class Algorithm:
             setattr(self, name, self.system.space.array(state[name]))
         for name in self.NUMBERS:
             setattr(self, name, state[name].item())
-        if self.system.intensity is not None:  # J depends on the volume, A does not
+        if self.system.intensity is not None:  # J, unlike A, depends on the volume: it is set again
             self.system.expected(self.volume)
 
 
@@ -142,8 +142,8 @@ def voxel_method(
     name: str, default: IterativeOptions, make: Callable[[System, Any, MethodRun], Algorithm], *,
     volumes: int | Callable[[Scan, Any], int], frames: int,
 ) -> Method:
-    """Returns a method that runs the algorithm that ``make`` builds. volumes, frames: as in ``MethodRun.system``; volumes
-    may be a function of scan and options."""
+    """Returns a method that runs the algorithm that ``make`` builds. volumes, frames: how many volumes and arrays of all
+    frames it holds at one time; volumes may be a function of scan and options."""
 
     def reconstruct(scan: Scan, options: Any, rt: Runtime, **arguments: Any) -> Reconstruction:
         run = MethodRun(scan, options, rt, **arguments)

@@ -58,8 +58,9 @@ class System:
         """Returns the system of a scan under the motion model ``motion``. deformation: how the object moves. state_times_s
         (K,): times in s of an object that changes; volumes are then stacks (K, nz, ny, nx).
 
-        detector_model: log, intensity, or scan for the scan's own. fewest_lines: as in ``RayOperator``, for an object at
-        rest. is_dense: volumes have the object's density from the start, which ``subrays_of`` uses."""
+        detector_model: log, intensity, or scan for the scan's own. fewest_lines: how many lines a pose must serve for the
+        fast kernels (``upright_of``), for an object at rest. is_dense: volumes have the object's density from the start,
+        which ``subrays_of`` uses."""
         tables = [motion.cells(scan, f).still() for f in range(scan.frames)]
         shape = scan.geometry.detector_shape
         projector = projector_of(rt, scan.grid, tables, deformation, state_times_s)
