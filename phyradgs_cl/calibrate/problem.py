@@ -74,7 +74,7 @@ class PassCounter:
         self._current: Passes = (0, 0.0)  # passes that remain in this phase
 
     def begin(self, phase: str, text: str) -> None:
-        """Begins a phase, which reports call ``text``. Earlier phases of the plan are over."""
+        """Begins a phase of the plan, which reports call ``text``, and drops the phases before it."""
         while phase in self.plan and next(iter(self.plan)) != phase:
             self.plan.pop(next(iter(self.plan)))
         self._text, self._current = text, self.plan.pop(phase, (0, 0.0))

@@ -45,7 +45,7 @@ class Ridge:
         return np.concatenate([part.ravel() for part in (*filters, *curves)]).astype(np.float32)
 
     def bend(self, responses: np.ndarray, sigma: float) -> np.ndarray:
-        """Returns ψ_i' of the filters' responses (16, z, y, x). sigma: the noise σ in the volume's unit."""
+        """Returns the slopes ψ_i' at the filters' responses (16, z, y, x). sigma: the noise σ in the volume's unit."""
         columns = (self.slope_up, self.knot_up, self.slope_down, self.knot_down)
         up, knot_up, down, knot_down = (values.astype(np.float64)[:, None, None, None] for values in columns)
         rising, falling = (np.clip(responses, -sigma * knot, sigma * knot) for knot in (knot_up, knot_down))
@@ -107,7 +107,8 @@ class RidgeStep:
         return brought_to(self.rt, volume, result)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
-        """Runs a kernel on slices from ``first`` on. Its result is ``less`` voxels shorter along each axis than a volume."""
+        """Runs a kernel on slices from ``first`` on. Its result has ``less`` fewer voxels along each axis than the
+        volume."""
         nz, ny, nx = (count - less for count in self.shape)
         start, stop = max(first, 0), min(first + _SLICES, nz)
         if start < stop:

@@ -1,8 +1,8 @@
 """Two ways to lower the isotropic total variation (TV) of a volume: a proximal map, and steepest descent.
 
-``TvProx`` solves argmin_x ½‖x − b‖² + weight · TV(x), with x ≥ 0 if asked, by fast gradient projection on the dual (Beck and
-Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weights scale the differences where voxels are not cubes. For an
-object that changes, the sum of |differences| between successive states is added.
+``TvProx`` maps a volume b to argmin_x ½‖x − b‖² + weight · TV(x), with x ≥ 0 if asked, by fast gradient projection on the
+dual (Beck and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weights scale the differences where voxels are not
+cubes. For an object that changes, the sum of |differences| between successive states is added.
 
 ``TvDescent`` takes steps of a fixed length, as ASD-POCS does (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777), with TIGRE's
 backward differences. A number far below the volume's values is added to lengths of differences: none is then 0."""

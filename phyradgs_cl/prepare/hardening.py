@@ -46,10 +46,13 @@ _NONE: Polynomial = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class HardeningOptions(checks.Checked):
-    """polynomial: coefficients of p², p³ and p⁴. kvp: tube voltage in kV, which gives the spectrum; 0: not stated. With
-    neither, a polynomial is fitted for one material. bone_per_mm: attenuation in 1/mm from which a voxel is bone; 0:
-    candidates are tried. filter_mm: thickness of aluminium. anode_deg: angle of a tungsten anode, for SpekPy's spectrum; 0:
-    Kramers' law. Raises InputError for values out of range or in contradiction."""
+    """Either polynomial or kvp may be stated. With neither, a polynomial is fitted for one material.
+
+    - polynomial: coefficients of p², p³ and p⁴. kvp: tube voltage in kV, which gives the spectrum; 0: not stated.
+    - bone_per_mm: attenuation in 1/mm from which a voxel is bone; 0: candidates are tried.
+    - filter_mm: thickness of aluminium. anode_deg: angle of a tungsten anode, for SpekPy's spectrum; 0: Kramers' law.
+
+    Raises InputError for values out of range or in contradiction."""
 
     PREFIX = "hardening."
 

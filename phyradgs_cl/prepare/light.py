@@ -24,7 +24,7 @@ from phyradgs_cl.io import ToAttenuation, read_scan
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 WAYS = ("mean", "time", "pca")
-_MOST_COMPONENTS, _CLEAR = 4, 4.0  # most principal components; one that varies 4 times as much as the median one is no noise
+_MOST_COMPONENTS, _CLEAR = 4, 4.0  # most components used; one must vary 4 times as much as the median one, or it is noise
 _REWEIGHTINGS = 12
 _LEAST_PIXELS = 20  # with fewer pixels of air in a frame, their median is too noisy
 _AROUND = np.ones((3, 3), bool)

@@ -17,7 +17,7 @@ _DENSER = 6.0  # metal attenuates 6 times as much as the main material: bone has
 _FEWEST = 4  # fewer touching voxels than this are noise, not metal
 _BLIND = 2  # only masked rays pass this near to metal, in voxels, so the fill knows nothing there
 _VOXELS = 128  # the volume that fills the shadow has at most this many voxels along its longest side, to save time
-_MOST, _OBJECT = 0.5, 0.02  # most of the object that the shadow may cover; the object exceeds 0.02 of the largest value
+_MOST, _OBJECT = 0.5, 0.02  # the shadow may cover half of the object, which exceeds 0.02 of the largest value in frames
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ Kernel = Mapping[tuple[float, int], float]
 _POWERS = (1, 2)  # powers of a ray's line integral to which scatter is fitted: the square tells thick rays from thin ones
 # Standard deviations of the fitted Gaussians over the panel's longer side. Narrower ones would fit columns of wrong gain.
 _REACHES = (0.12, 0.18, 0.27, 0.4)
-_PASSES = 6  # rounds of: scatter from the primary light, primary light from the scatter
+_PASSES = 6  # rounds that compute scatter from the primary light, then primary light from the scatter
 _LEAST_PRIMARY = 0.05  # an overestimate of scatter leaves at least this fraction of the light: the logarithm stays finite
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
 _FITTED_FRAMES = 24  # the fit uses at most this many frames, evenly spread, to save time

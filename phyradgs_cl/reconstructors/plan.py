@@ -30,7 +30,7 @@ _SUBJECT = "--object-motion"
 _MOST_VOXELS = 24  # deformations are smooth, so a grid of this many voxels a side is enough to check one
 _LEAST_DETERMINANT = 0.05  # a deformation w(y) with a smaller det(I + ∂w/∂y) is refused: at 0 matter folds
 _LEAST_COVERED = 0.5  # a deformation that covers less than this fraction of the scan's time is refused
-_MOSTLY_COVERED = 0.98  # a deformation that covers less than this fraction causes a warning
+_MOSTLY_COVERED = 0.98  # a deformation that covers less than this fraction of the scan's time causes a warning
 log = logging.getLogger(__name__)
 
 
@@ -200,8 +200,10 @@ class ObjectMotion:
 @dataclass(frozen=True, eq=False)
 class RunPlan:
     """What to run on a scan. method: a name as ``method_name`` returns it, or the user's own function. options: of the
-    method, checked. preprocessing: changes of the frames before the method. Raises InputError for a seed out of range, an
-    object that moves with a method for objects at rest, and error bars of runs that cannot differ."""
+    method, checked. preprocessing: changes of the frames before the method.
+
+    Raises InputError for a seed out of range, an object that moves with a method for objects at rest, and error bars of runs
+    that cannot differ."""
 
     method: "str | Callable[..., Any]"
     options: Any

@@ -41,10 +41,13 @@ DOUBT = "doubt"
 class Reconstruction:
     """A volume (nz, ny, nx) float32 in 1/mm on ``grid``, whose lengths are in mm.
 
-    gaussians: the cloud in mm, for methods that have one. record: the convergence record, one dict per line. facts: what is
-    needed to make it again (method, options, scales, seconds). state: from where an interrupted run resumes. deformation:
-    how the object moves, for ``moving``, whose volume is its reference state. states: the object at some times, for
-    ``changing``, whose volume is their mean. doubt: σ (nz, ny, nx) in 1/mm of its errors (docs/methods.md#error-bars).
+    - gaussians: the cloud in mm, for methods that have one. record: the convergence record, one dict per line.
+    - facts: what is needed to make it again (method, options, scales, seconds).
+    - state: from where an interrupted run resumes.
+    - deformation: how the object moves, for ``moving``, whose volume is its reference state.
+    - states: the object at some times, for ``changing``, whose volume is their mean.
+    - doubt: σ (nz, ny, nx) in 1/mm of the volume's errors (docs/methods.md#error-bars).
+
     Raises InputError for arrays that do not fit the grid."""
 
     volume: np.ndarray
@@ -174,11 +177,14 @@ def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
 class Progress:
     """One report of a running method: ``iteration`` of ``iterations`` is finished, after ``seconds`` in s.
 
-    loss: the dimensionless measure that ``quantity`` names. gaussians: their number, or 0. Three functions may be called
-    during the report only. state returns the state from which the run can resume. volume returns the present volume (nz, ny,
-    nx) in 1/mm and its grid. frames returns a given number of measured frames, spread evenly, with those computed from the
-    present volume. deformation: how the object moves, once the method has found it. states: returns the object at some
-    times, if the method has them. A report that raises KeyboardInterrupt ends the run as Ctrl-C does."""
+    - loss: the dimensionless measure that ``quantity`` names. gaussians: their number, or 0.
+    - state returns the state from which the run can resume. volume returns the present volume (nz, ny, nx) in 1/mm and its
+      grid. frames returns a given number of measured frames, spread evenly, with those computed from the present volume.
+      These three may be called during the report only.
+    - deformation: how the object moves, once the method has found it. states: returns the object at some times, if the
+      method has them.
+
+    A report that raises KeyboardInterrupt ends the run as Ctrl-C does."""
 
     iteration: int
     iterations: int

@@ -23,7 +23,7 @@ _FEWEST_VIEWS = 24  # fewer views cannot be interpolated to the opposite of each
 _MOST_VIEWS = 360  # views that are compared, at most, to save time
 _MOST_ROWS = 32  # rows that are compared, at most, to save time
 _MOST_PAIRS = 48  # pairs of opposite rays that are compared in a row, at most, to save time
-_LEAST_PX = 1.0  # the axis must lie this far inside the middle of the panel's outer column, or no ray has an opposite
+_LEAST_PX = 1.0  # the axis must lie this far inside the middle of the outer column, in pixels, or no ray has an opposite
 _BLOCKS = 12  # the jackknife leaves out one of this many blocks of views at a time
 _BIAS_PX = 0.05  # error (std) of the shift in pixels without noise, measured with half-fans and features of two pixels
 

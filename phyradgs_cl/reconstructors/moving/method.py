@@ -49,7 +49,7 @@ _PASSES = 3  # passes of fista in each round, which let the volume follow the fi
 _WEIGHT = 0.42  # prior weight of fista in the search
 _TV_ITERATIONS = 5  # TV iterations per pass of fista in the search
 _COARSE_SPACINGS = 2  # the first rounds find coarse motion, with this many spacings of control points along the longest side
-_FINE_SPACINGS = 4  # the last rounds refine it with closer control points, this many spacings
+_FINE_SPACINGS = 4  # the last rounds refine that motion with closer control points: this many spacings
 # Finer control points need a larger bending weight γ, by this factor, so that the field is as stiff in mm as before.
 _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4
 _COARSE_SHARE = 0.6  # fraction of the rounds that have coarse control points

@@ -39,10 +39,11 @@ OS_SART = SartOptions(frames_per_subset=10)
 
 
 class Sart(Algorithm):
-    """SART, x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i of the frames, with W = 1/(Aᵢ 1) and V = 1/(Aᵢᵀ 1).
+    """SART, x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i of the frames, with the rays' W = 1/(Aᵢ 1) and the voxels' V =
+    1/(Aᵢᵀ 1).
 
-    The intensity model replaces Aᵢᵀ by Jᵢᵀ and Aᵢ x by Iᵢ(x). The residual combines all subsets, each before its
-    correction."""
+    The intensity model replaces Aᵢ x by the expected Iᵢ(x), and Aᵢᵀ by its transposed derivative Jᵢᵀ. The residual combines
+    all subsets, each before its correction."""
 
     NUMBERS = ("relaxation",)
 
@@ -103,8 +104,8 @@ class SirtOptions(IterativeOptions):
 
 
 class Sirt(Algorithm):
-    """SIRT, x ← x + λ C Aᵀ R (p − A x), with R = 1/(A 1) and C = 1/(Aᵀ 1). The intensity model replaces Aᵀ by Jᵀ and A x by
-    I(x).
+    """SIRT, x ← x + λ C Aᵀ R (p − A x), with R = 1/(A 1) and C = 1/(Aᵀ 1). The intensity model replaces A x by the expected
+    I(x), and Aᵀ by its transposed derivative Jᵀ.
 
     An iteration's residual is the one before its correction. Weighted by √R, its norm falls in every step."""
 
