@@ -251,8 +251,8 @@ class BeadProblem(CoarseFrames):
         return list(beyond.reshape(len(images), *self.measured.shape))
 
     def compared(self, frames: np.ndarray) -> np.ndarray:
-        """Returns the values (F · pixels,) float64 by which frames are compared: blurred beyond single rays, no
-        background."""
+        """Returns the values (F · pixels,) float64 by which frames are compared: blurred until single rays do not show, and
+        without background."""
         blurred = gaussian_filter(self._without_background(frames), (0, _BLUR_PX, _BLUR_PX), output=np.float64)
         return blurred.ravel()
 

@@ -50,7 +50,7 @@ class PerViewParameters(ABC):
 
     - units (K,): how much of each kind moves a frame by a pixel at its edge.
     - circle (n, 2): values that vary as cosine and sine of the angle, as far as the basis can.
-    - MISMATCH: measured errors (docs/calibrate.md) over those from noise alone; voxels do not represent the object exactly.
+    - MISMATCH: measured errors (docs/calibrate.md) over those of noise alone, as voxels do not represent objects exactly.
     - RESTARTED: kinds that start from 0 on each grid."""
 
     values: np.ndarray

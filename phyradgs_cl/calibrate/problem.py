@@ -200,7 +200,7 @@ class CoarseProblem(CoarseFrames):
         return self.measured - self.masked(self._expected(operator, volume))
 
     def noise(self, residual: np.ndarray) -> float:
-        """Returns a pixel's noise (std) in the measurement: from ``residual``, the volume has taken some of it."""
+        """Returns a pixel's noise (std), from the measurement: the volume has fitted some of the noise of ``residual``."""
         return noise_level(self.measured, self.valid)
 
     def beyond_object(
@@ -221,8 +221,8 @@ class CoarseProblem(CoarseFrames):
 
 def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:
     """Returns the smoothing across (rows, columns), in pixels, before binning. Rows read one after the other are not
-    smoothed: they see the object at other angles, so smoothing would look like a shorter readout. Columns read so shear the
-    image, which smoothing does not change."""
+    smoothed: they see the object at other angles, so smoothing would look like a shorter readout. Columns read one after the
+    other shear the image, which smoothing does not change."""
     if block == 1:
         return 0.0
     is_rolling = scan.shutter.readout_s > 0 and scan.shutter.axis == "rows"

@@ -243,8 +243,8 @@ class _Calibrator:
         """Compares the residuals with lines read from either end, and corrects the scans' direction. Returns its line of the
         table.
 
-        A correction needs four standard errors and 4 % of the squared residual. The deviation is that of a direction of 1 or
-        −1."""
+        A correction needs four standard errors and 4 % of the squared residual. The direction is 1 or −1, and its deviation
+        is in the same unit."""
         self.passes.begin("order", "which line is read first")
         stage = self.stages[min(1, len(self.stages) - 1)]
         reverse = [reversed_readout(scan) for scan in self.ready]

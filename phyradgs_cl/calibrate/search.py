@@ -27,7 +27,7 @@ from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, Paramet
 
 # Frames determine a parameter if object and other parameters leave this fraction of its signal unexplained, or more.
 LEAST_SHARE = 0.2
-# For a known object (beads) less is enough: it has no voxels that explain signals by accident.
+# For a known object (beads) a smaller share is enough: there are no voxels that explain signals by accident.
 LEAST_SHARE_OF_BEADS = 0.02
 _TINY = 1e-9  # added to the diagonal of a matrix before its inverse, because signals may be linearly dependent
 _GAUGE_FACTOR = 2.0  # voxels leave some signal of a gauge (``GAUGES``) by error: a parameter must leave twice as much

@@ -37,7 +37,7 @@ _ERRORS = 4.0  # a hypothesis must be better than the stated scan by this many s
 # The frames look the same from every angle if a random order leaves a residual below _SAME or _NOISY.
 _SAME = 0.03  # residual over the standard deviation of the line integrals
 _NOISY = 1.6  # residual over the noise: round objects had up to 1.3, others 2.3 or more
-_MOST_REFINED = 2  # only the best hypotheses get a refined shift of the panel, which takes time
+_MOST_REFINED = 2  # only this many hypotheses, the best ones, get a refined shift of the panel, which takes time
 _SHIFT_PENALTY = 1.5  # each coarse pixel of shift multiplies a hypothesis's squares by this: stated offsets are mostly right
 # A frame is odd if its mean line integral differs from its neighbours' by more than _DEVIATIONS and _LEAST_CHANGE.
 _DEVIATIONS = 12.0  # difference in robust standard deviations of all frames' differences
@@ -187,7 +187,8 @@ def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -
     """Returns the best two hypotheses about the whole scan, with the panel shifted to fit best.
 
     most: a rough fit may leave 1.5 times this mean squared residual, because an offset between two coarse pixels hides other
-    differences. Large shifts count against a hypothesis. Of several hypotheses with one factor of sizes, the best counts."""
+    differences. Large shifts count against a hypothesis. Of several hypotheses with the same factor of sizes, the best
+    counts."""
     tried: list[tuple[Hypothesis, Scan, axis.AxisShift]] = []
     for hypothesis in hypotheses.of_scan(scan, as_stated):
         other = hypothesis.scan()

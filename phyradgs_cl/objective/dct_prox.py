@@ -23,8 +23,8 @@ TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 
 
 class DctProx:
-    """Shrinks the block cosine transforms of volumes of a fixed ``shape`` (nz, ny, nx). One thinner than a block stays the
-    same."""
+    """Shrinks the block cosine transforms of volumes of a fixed ``shape`` (nz, ny, nx). A volume thinner than a block stays
+    the same."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int]) -> None:
         self.rt, self.shape = rt, shape

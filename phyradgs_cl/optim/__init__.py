@@ -207,7 +207,7 @@ def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray
 
 
 def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:
-    """Draws one child (11, S) of each Gaussian (11, S): smaller, half as dense, its centre a draw from the parent."""
+    """Draws one child (11, S) of each Gaussian (11, S): smaller, half as dense, its centre drawn from the parent."""
     child: np.ndarray = rows.copy()
     child[g.MEAN] += rotate(rows[g.QUATERNION], rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE])
     child[g.SCALE] /= control.split_factor

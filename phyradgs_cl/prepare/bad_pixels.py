@@ -147,7 +147,7 @@ def find_dead(
 
 def _lines(frames: np.ndarray, deviations: float) -> np.ndarray:
     """Returns whole rows and columns, bool (v, u), that lie above or below both neighbours nearly everywhere, in the median
-    over frames. Air counts too: an object may be long and thin, but not as long as the panel."""
+    over frames. Pixels of air count too: an object may be long and thin, but not as long as the panel."""
     dead = np.zeros(frames.shape[1:], bool)
     floor = 1e-3 * max(float(np.percentile(frames, 99.9)), 1e-9)
     for axis in (0, 1):

@@ -70,8 +70,8 @@ def _completed(masked: Scan, shadow: np.ndarray, is_metal: np.ndarray, make_mode
 
 
 def _main_level(volume: np.ndarray) -> float:
-    """Returns the attenuation of the main material in a volume (z, y, x): half of the total attenuation lies in denser
-    voxels. Infinity for an empty volume."""
+    """Returns the attenuation of the main material in a volume (z, y, x): that above which half of the total attenuation
+    lies. Infinity for an empty volume."""
     rising = np.sort(volume[volume > 0])
     if rising.size == 0:
         return float("inf")

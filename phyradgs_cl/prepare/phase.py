@@ -1,7 +1,7 @@
 """Retrieves phase from one distance: removes the bright and dark edges that free propagation adds to line integrals.
 
-Paganin, Mayo, Gureyev, Miller and Wilkins, J. Microsc. 206 (2002) 33. The object has one material, of refractive index 1 − δ
-+ iβ, and thickness T. At the distance d and the wavelength λ, the transport-of-intensity equation gives the transmission
+Paganin, Mayo, Gureyev, Miller and Wilkins, J. Microsc. 206 (2002) 33. The object has one material (refractive index 1 − δ +
+iβ) of thickness T. At the distance d and the wavelength λ, the transport-of-intensity equation gives the transmission
 exp(−p) as (1 − d δ/μ ∇²) exp(−μT), with μ = 4πβ/λ. The inverse divides by 1 + π λ d (δ/β) f² at the frequency f, in 1/mm.
 
 The filter is linear in intensity, so it holds for the average over an exposure. A rolling shutter reads later rows when the

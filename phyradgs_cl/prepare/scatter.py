@@ -72,8 +72,8 @@ def remove_scatter(frames: np.ndarray, kernel: Kernel) -> np.ndarray:
 
 def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kernel:
     """Fits the kernel, by non-negative least squares, to the transmission above 1 in ``air``, bool (F, v, u), of line
-    integrals (F, v, u). A ``reach`` other than 0 fixes its width. The light may vary between frames; its mean is that of
-    flats."""
+    integrals (F, v, u). A ``reach`` other than 0 fixes its width. The light may vary between frames; on average it is that
+    of the flats."""
     numbers = _some(len(frames))
     recorded, where = np.exp(-frames[numbers].astype(np.float64)), air[numbers]
     terms = list(itertools.product((reach,) if reach > 0 else _REACHES, _POWERS))

@@ -59,8 +59,8 @@ class Loop:
     """Runs a method to its end, an interruption, or its own reason to stop, and records its convergence.
 
     stopped_by: ``iterations``, ``interrupt``, or the method's reason. record_every, report_every: iterations between lines
-    of the record, and between reports, which come sooner if iterations are slow. started: the ``time.perf_counter`` of
-    second 0."""
+    of the record, and between reports, which come sooner if iterations are slow. started: the ``time.perf_counter`` from
+    which seconds count."""
 
     def __init__(
         self, method: Stepwise, ranks: Communicator, report: ProgressReport, started: float,

@@ -124,7 +124,7 @@ class Reconstruction:
         ``result.scale.line`` says what was fitted, ``result.scale.of(result.volume)`` is the volume in HU. ``save_volume``
         keeps it.
 
-        Raises InputError for less than 100 voxels, air that is not below water, and peaks that are not theirs."""
+        Raises InputError for less than 100 voxels, air that is not below water, and peaks that cannot be air and water."""
         scale = fitted(self.volume, self.grid, air, water, insert_hu)
         return replace(self, facts={**self.facts, **scale.facts()})
 
@@ -201,7 +201,7 @@ class Progress:
     def mapped(
         self, state: "Callable[[State], State] | None" = None, volume: "VolumeMap | None" = None, **changes: Any
     ) -> "Progress":
-        """Returns the report with other fields. ``state``, ``volume`` map what its functions of these names return."""
+        """Returns the report with other fields. ``state`` and ``volume`` map what its functions of these names return."""
         own_state, own_volume = self.state, self.volume
         if state is not None and own_state is not None:
             changes["state"] = lambda: state(own_state())

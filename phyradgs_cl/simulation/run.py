@@ -54,8 +54,8 @@ class SimulationOptions:
     - time_samples: at how many times a line's exposure is sampled, in the middles of equal parts. 0: between two times, the
       volume's edge and a moving object move at most half a voxel of ``grid`` (docs/mathematics.md).
     - dose: photons of a pixel without object, on a line that sees the whole pulse.
-    - lag (λ), rings, sparks, drift, scatter: as in detector/effects.py; 0 is without.
-    - kvp: as in detector/attenuation.py; 0 is a beam of one energy.
+    - lag (λ), rings, sparks, drift, scatter: effects of panel and tube (detector/effects.py); 0 is without.
+    - kvp: tube voltage in kV, of a beam that hardens; 0 is a beam of one energy.
     - motion_of_object: how the object moves during the scan. None: it rests."""
 
     protocol: Protocol = Protocol()

@@ -46,10 +46,11 @@ RayWeight = Callable[[int], np.ndarray]
 class Arc:
     """The angles that the views cover, and how much of them each view stands for.
 
-    gap_rad (F,): each view's part of the arc. progress_rad (F,): its angle from the arc's start, which is half a step before
-    the first view; the end is half a step behind the last. In a full turn progress counts from the view of the least angle.
-    parts_rad (P, 2): progress at which each part between gaps begins and ends. filled_rad: total width of the gaps for which
-    neighbouring views stand."""
+    - gap_rad (F,): each view's part of the arc.
+    - progress_rad (F,): its angle from the arc's start, which is half a step before the first view; the end is half a step
+      behind the last. In a full turn it counts from the view of the least angle.
+    - parts_rad (P, 2): progress at which each part between gaps begins and ends.
+    - filled_rad: total width of the gaps for which neighbouring views stand."""
 
     gap_rad: np.ndarray
     progress_rad: np.ndarray

@@ -37,7 +37,8 @@ _BIAS_PX = 0.02  # error (std) of a shift that comes from interpolating views
 @dataclass(frozen=True, eq=False)
 class AxisShift:
     """A shift of the panel along u, and the fit that found it. pixels, deviation: the shift and its standard deviation in
-    pixels of the recorded scan, both NaN if no shift fits best. squares (F,): frames' residuals in the nearest trial."""
+    pixels of the recorded scan, both NaN if no shift fits best. squares (F,): squared residuals of the frames in the trial
+    nearest to the shift."""
 
     pixels: float
     deviation: float
@@ -137,7 +138,7 @@ def opposite_shift(scan: Scan) -> AxisShift:
     shifts, weight = shifts[is_found], information[is_found] / information[is_found].sum()
     shift = float(weight @ shifts)
     noise, scatter = 1 / information[is_found].sum(), float(weight**2 @ (shifts - shift) ** 2)
-    return AxisShift(shift, math.sqrt(2 * max(noise, scatter) + _BIAS_PX**2), np.empty(0))  # 2: each pair occurs twice
+    return AxisShift(shift, math.sqrt(2 * max(noise, scatter) + _BIAS_PX**2), np.empty(0))  # 2, as each pair counts twice
 
 
 def _pairs(scan: Scan) -> list[_Pair]:

@@ -182,7 +182,7 @@ class FieldSearch:
 
 
 def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:
-    """Returns the model with as many times per exposure as the gantry and the signal's period need. How fast the object
+    """Returns the model with as many times per exposure as the gantry and the signal's period need: how fast the object
     moves is not known yet."""
     timed = with_times(motion, scan)
     if motion != PerRow() or not isinstance(timed, PerRow) or period_s is None:

@@ -76,8 +76,8 @@ class SplatOptions(MotionOptions):
         return int(min(max(voxels / 16, 1000), 50_000))
 
     def motion_at(self, share: float) -> Motion:
-        """Returns the motion model after the fraction ``share`` of the run: a coarse one in early iterations, as it costs no
-        quality."""
+        """Returns the motion model after the fraction ``share`` of the run: a coarse one in early iterations, which gain
+        nothing from exact motion."""
         if not isinstance(self.motion, Exact) or share >= self.exact_from:
             return self.motion
         is_first = share < _STATIC_SHARE * self.exact_from

@@ -260,7 +260,7 @@ def fista_passes(
 
 def _gains_from_subvoxels(run: MethodRun, parts: int) -> bool:
     """Returns whether smaller voxels are worth their time on this grid, and fit on every rank's device. Logs a warning if
-    they only do not fit."""
+    only room is missing."""
     shape, rt = run.scan.grid.shape, run.rt
     if math.prod(shape[1:]) > _MOST_DIVIDED:
         return False

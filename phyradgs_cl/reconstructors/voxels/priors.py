@@ -60,7 +60,7 @@ class FrameError:
 
 
 def frame_error(scan: Scan, motion: Motion) -> FrameError:
-    """Estimates the error of a scan's pixels on its grid. Blur by ``motion`` averages out part of that at edges."""
+    """Estimates the error of a scan's pixels on its grid. Motion blur averages out part of the error at edges."""
     voxel_mm = max(scan.grid.voxel_size_mm[1:])
     edges_mm = _EDGES * voxel_mm / math.sqrt(1 + _blur_mm(scan, motion) / voxel_mm)
     return FrameError(noise_behind(np.asarray(scan.projections, np.float32), scan.valid), edges_mm)
@@ -120,10 +120,11 @@ def _density(space: Space[Any], volume: Any) -> float:
 
 @dataclass(frozen=True, eq=False)
 class PriorInputs:
-    """What a prior needs. tv_iterations: dual iterations per map. is_fly: frames expose over an arc. noise: standard
-    deviation of line integrals behind the object.
+    """What a prior needs.
 
-    image (nz, ny, nx) in 1/mm, share: for piccs, its prior image, and the weight of the change from it."""
+    - tv_iterations: dual iterations per map. is_fly: frames expose over an arc.
+    - noise: standard deviation of line integrals behind the object.
+    - image (nz, ny, nx) in 1/mm, share: of the prior piccs, its prior image and the weight of the change from it."""
 
     rt: Runtime
     grid: Grid

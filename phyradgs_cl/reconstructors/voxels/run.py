@@ -30,10 +30,11 @@ _SYSTEM_FRAMES = 6
 class IterativeOptions(MotionOptions):
     """Options of every iterative method.
 
-    motion: static, micro-views, or per-row (every line at its own times). iterations: passes over all frames. nonnegative:
-    clip the volume at 0 after every update. tolerance: stop when an iteration changes the volume by less than this fraction
-    of its norm; 0 runs all iterations. detector_model: what the detector averages over a line's times: line integrals (log),
-    intensity, or what the scan states (scan)."""
+    - motion: static, micro-views, or per-row (every line at its own times). iterations: passes over all frames.
+    - nonnegative: clip the volume at 0 after every update.
+    - tolerance: stop when an iteration changes the volume by less than this fraction of its norm; 0 runs all iterations.
+    - detector_model: what the detector averages over a line's times: line integrals (log), intensity, or what the scan
+      states (scan)."""
 
     transmission_weights: ClassVar[bool] = False
     """Whether pixels are weighted by their transmission. Some methods have an option of this name."""
