@@ -29,7 +29,7 @@ _VOXELS_PER_TIME = 2.0  # an exposure is sampled so often that the volume's rim 
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
-_LEAST_SHARE = 0.1  # in progress reports, passes that remain in a phase count at least this fraction of their cost
+_LEAST_SHARE = 0.1  # progress reports count a phase's remaining passes with at least this fraction of their full cost
 Passes = tuple[int, float]
 """How many passes may still come at most, and their expected total cost."""
 
@@ -174,7 +174,8 @@ class CoarseProblem(CoarseFrames):
         return self.measured + self.masked(operator.forward(volume) - self._expected(operator, volume))
 
     def _expected(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
-        """Returns the frames of a volume, averaged as the detector does."""
+        """Returns the frames (F, rows, columns) of a volume, with line integrals or intensities averaged, as the detector
+        does."""
         if self.scans[0].detector_model != "intensity":
             return operator.forward(volume)
         return IntensityOperator(self.rt, self.grid, operator.detector_shape, operator.tables).expected(volume)

@@ -48,7 +48,7 @@ class Trainer:
         self.rays = [ExposureRays.of_cells(table, scan.grid) for table in tables]
         times = self.rays[0].times
         stated = scan.detector_model if options.detector_model == "scan" else options.detector_model
-        self.model = stated if times > 1 else "log"  # for a single time both models agree
+        self.model = stated if times > 1 else "log"  # for a single time the log and the intensity model agree
         self.times = options.times_for(times, self.model)
         self.samples = options.samples_for(max(scan.grid.shape), times)
         self.points_at_once = _POINTS_ON_CPU if device.type == "cpu" else _POINTS_ELSEWHERE

@@ -138,7 +138,7 @@ def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: f
 
 def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarray:
     """Denoises an image (v, u): thresholds the coefficients of overlapping cosine blocks, then guides a Wiener filter by the
-    result. variances: of each pixel's own noise, and of the noise that a column shares."""
+    result. variances (2,): that of each pixel's own noise, and that of the noise that a whole column shares."""
     sigma = np.full((window, window), variances[0])
     # an error that a column shares is constant along it, so only the first row of coefficients has it
     sigma[0] += window * variances[1]

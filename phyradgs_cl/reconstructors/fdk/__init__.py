@@ -195,7 +195,7 @@ def fdk_volume(
 def _seen(
     pose: np.ndarray, frames: np.ndarray, axis: str, is_parallel: bool
 ) -> tuple[np.ndarray, np.ndarray, weights.Fan, Arc]:
-    """Returns the poses in a form that broadcasts to pixels, these rotated back to one angle, their fan, and the arc of all
+    """Returns the poses as ``pose_of_pixels`` does, the same poses rotated back to one angle, their fan, and the arc of all
     views. Raises InputError for a source on the rotation axis."""
     by_pixel = pose_of_pixels(pose, axis)
     if np.any(np.hypot(by_pixel[..., 0], by_pixel[..., 1]) <= 0):

@@ -34,7 +34,7 @@ _PLANE_DEG = 10.0  # elevation of the source above the plane z = 0, seen from th
 _NO_PLANE_DEG = 45.0
 _LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the plane of the rotation
 _NO_LEAN_DEG = 10.0
-_ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: densities are 0.1 % too low
+_ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: there densities are 0.1 % too low
 _NO_ROLL_DEG = 10.0  # angle at which densities are 1.5 % too low; at 90° they are 0
 _LEAST_OVERLAP = 2.0  # a displaced panel must reach this many columns beyond the axis, or a warning comes
 # A smaller missing angle causes no warning: nearly parallel rays have so narrow a fan that half a turn is enough.
@@ -106,8 +106,8 @@ def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
 
 
 def _stand_out(ahead: np.ndarray) -> np.ndarray:
-    """Returns which gaps (K,) to the next view are wider than a step, bool (K,): the widest if it stands out from all, and
-    others that stand out from their neighbours."""
+    """Returns which of the gaps (K,) from each view to the next are wide, bool (K,): the widest if it stands out from all
+    others, and any that stands out from its neighbours."""
     wide = np.zeros(ahead.size, bool)
     if ahead.size < 2:
         return wide
@@ -331,7 +331,7 @@ def _check_orbit(pose: np.ndarray) -> None:
 def warn_if_incomplete(
     arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: Grid, is_parallel: bool = False
 ) -> None:
-    """Logs what the views do not cover, in a line each."""
+    """Logs a warning for each thing that the views do not cover."""
     name = "FBP" if is_parallel else "FDK"
     if np.unique(arc.progress_rad).size == 1:
         log.warning("%s: all views are from one angle: the volume is a single backprojection", name)

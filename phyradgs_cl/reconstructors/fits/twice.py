@@ -1,7 +1,8 @@
 """Finds the axis of rotation near the edge of a displaced panel, from the rays that a full turn measures twice.
 
 The residual of a fit is no help there: it is always smaller for a shift with fewer rays measured twice. Here each ray is
-compared with its opposite, half a turn and twice its fan angle away, by the mean of squares, whatever their number."""
+compared with its opposite, half a turn and twice its fan angle away. The mean of the squared differences does not depend on
+the number of rays."""
 
 import math
 

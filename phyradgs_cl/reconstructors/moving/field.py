@@ -203,7 +203,7 @@ class FieldProblem:
         ``penalty`` than ``one``; else ``one``."""
         before = sum_squares(residual) + penalty(one)
         for candidate in candidates:
-            # a field that folds has no inverse, so it counts for nothing however well its frames fit
+            # a field that folds has no inverse, so it is passed over however well its frames fit
             if candidate.deformation().smallest_determinant() < _LEAST_DETERMINANT:
                 continue
             if sum_squares(self.residual(candidate, volume)) + penalty(candidate) < before:

@@ -155,7 +155,7 @@ def voxel_method(
 
 
 class Iterations:
-    """An algorithm with its residual and change; a ``Loop`` runs it as a ``Stepwise``."""
+    """An algorithm, with the residual and the change of its last iteration, as a ``Stepwise`` for ``Loop``."""
 
     quantity, remedy = "residual", "check the scan for extreme values, or lower the relaxation"
 

@@ -70,7 +70,7 @@ class System:
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
         intensity: IntensityOperator | SharedIntensity | None = None
-        if model == "intensity" and any(table.averages for table in tables):  # for single times both models agree
+        if model == "intensity" and any(table.averages for table in tables):  # for single times, log and intensity agree
             alone = IntensityOperator(rt, scan.grid, shape, tables, projector, subrays)
             intensity = SharedIntensity(rt.ranks, alone) if rt.ranks.size > 1 else alone
         if rt.ranks.size > 1:
