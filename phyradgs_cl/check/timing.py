@@ -53,8 +53,9 @@ def check_timing(scan: Scan) -> Finding:
         _share("exposure", "a line would open again while it is open", scan.shutter.exposure_s / period_s),
         _share("readout", "a frame would be read while the last one is", scan.shutter.readout_s / period_s),
     ]
+    # other trajectories compute the steps and the speed from one function of time: there they always agree
     if isinstance(scan.trajectory, CircularOrbit) and isinstance(scan.trajectory.kinematics, FrameSweeps):
-        findings.append(_speed(scan, starts_s))  # elsewhere one function of time gives both
+        findings.append(_speed(scan, starts_s))
     findings += _table(scan)
     suspicious = [finding for finding in findings if finding.verdict == SUSPICIOUS]
     return suspicious[0] if suspicious else max(findings, key=lambda finding: finding.value / finding.threshold)
