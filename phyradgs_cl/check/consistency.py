@@ -186,9 +186,9 @@ def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -
 def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:
     """Returns the best two hypotheses about the whole scan, with the panel shifted to fit best.
 
-    most: a rough fit may leave 1.5 times this mean squared residual, because an offset between two coarse pixels hides other
-    differences. Large shifts count against a hypothesis. Of several hypotheses with the same factor of sizes, the best
-    counts."""
+    most: rough fits with more than 1.5 times this mean squared residual are left out. They get that factor because an offset
+    between two coarse pixels hides other differences. Large shifts count against a hypothesis. Of several hypotheses with
+    the same factor of sizes, the best counts."""
     tried: list[tuple[Hypothesis, Scan, axis.AxisShift]] = []
     for hypothesis in hypotheses.of_scan(scan, as_stated):
         other = hypothesis.scan()

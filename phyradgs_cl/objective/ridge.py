@@ -19,7 +19,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, beside, brought_to, move,
 
 EDGE = 5
 """Voxels along each side of a filter."""
-_SAMPLES = 200  # longest time of one voxel, in samples of a ray: it decides the size of launches, as drivers kill long ones
+_SAMPLES = 200  # a voxel takes at most the time of this many ray samples: launches are divided, as drivers kill long ones
 _SLICES = 2  # slices computed at a time: channels and responses of a whole volume would need 24 times its memory
 _RING = _SLICES + 2  # slices in memory: correlating two slices needs one more on either side
 

@@ -16,7 +16,7 @@ from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport
 from phyradgs_cl.signals import stop_on_interrupt
 
-SILENT_S = 10.0  # a run of slow iterations reports at least this often
+SILENT_S = 10.0  # a run of slow iterations reports at least once in this many seconds
 
 
 class Stepwise(Protocol):
