@@ -32,7 +32,7 @@ _MOST_RAYS = 6  # rays along each side of a pixel, at most: the time grows with 
 _BLUR_PX = 0.8
 _LEAST_ZEROS = 0.2  # if at least this fraction of the pixels is 0, the noise of air was clipped at 0
 _ZEROS_PX = 5  # the noise of clipped air follows from means of blocks with this many pixels a side
-_BACKGROUND = 4  # cosines along each side of a frame: they describe holder, scatter and drift of the tube
+_BACKGROUND = 4  # cosines along each side of a frame: together they describe holder, scatter and drift of the tube
 _STEP_PX = 0.25  # signals are central differences, for which the frame's edge moves by this much to each side
 _MOST_PX = 1.5  # one step of the placement moves a frame by at most this much: signals are not linear beyond
 _SETTLED_PX = 0.01  # the search ends when a step moves the frame by less than this
@@ -43,8 +43,7 @@ _LINEAR_PX = 0.3  # signals are computed again after a step that moves the frame
 class BeadOperator:
     """Computes the frames (F, rows, columns) of a phantom along the lines of ``tables``, for a detector of ``model``.
 
-    samples: rays along each side of a pixel. clipped_noise: standard deviation of noise that was clipped at 0; 0:
-    unclipped."""
+    samples: rays along each side of a pixel. clipped_noise: standard deviation of noise clipped at 0; 0: unclipped."""
 
     phantom: EllipsoidPhantom
     tables: Sequence[TimeCells]
@@ -54,7 +53,7 @@ class BeadOperator:
     clipped_noise: float
 
     def forward(self, placement: np.ndarray) -> np.ndarray:
-        """Returns the frames of the phantom at a placement (7,): a turn (rotation vector, rad), a shift (mm), and a density
+        """Returns the phantom's frames at a placement (7,): a turn (rotation vector, rad), a shift (mm), and a density
         factor."""
         pose, weight = _poses_by_line(self.tables)
         frames, lines, samples = weight.shape
@@ -81,8 +80,7 @@ class BeadOperator:
 
 
 def _mean_of_clipped(p: np.ndarray, sigma: float) -> np.ndarray:
-    """Returns the mean of max(p + noise, 0) for normal noise of deviation ``sigma``. Clipping raises air more than faint
-    shadows."""
+    """Returns the mean of max(p + noise, 0) for normal noise of deviation ``sigma``. Clipping raises air most."""
     ratio = p / sigma
     return p * scipy.special.ndtr(ratio) + sigma * np.exp(-(ratio**2) / 2) / math.sqrt(2 * math.pi)
 
@@ -253,21 +251,20 @@ class BeadProblem(CoarseFrames):
         return list(beyond.reshape(len(images), *self.measured.shape))
 
     def compared(self, frames: np.ndarray) -> np.ndarray:
-        """Returns the values (F · pixels,) float64 by which frames are compared: blurred beyond single rays, without
-        background."""
+        """Returns the values (F · pixels,) float64 by which frames are compared: blurred until single rays do not show, and
+        without background."""
         blurred = gaussian_filter(self._without_background(frames), (0, _BLUR_PX, _BLUR_PX), output=np.float64)
         return blurred.ravel()
 
     def _units(self) -> np.ndarray:
-        """Returns for each number of a placement (7,) the step that moves a frame by a pixel at its edge, or doubles the
+        """Returns the step of each number of a placement (7,) that moves a frame's edge by a pixel, or doubles the
         density."""
         scan = self.scans[0]
         pixel_mm = self.block * min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
         return np.array([pixel_mm / (max(scan.grid.size_mm) / 2)] * 3 + [pixel_mm] * 3 + [1.0])
 
     def _signals(self, operator: BeadOperator, placement: np.ndarray) -> np.ndarray:
-        """Returns the change (7, F · pixels) of the compared values, per unit (``_units``) of each number of the
-        placement."""
+        """Returns how the compared values change, (7, F · pixels), per unit (``_units``) of each number of the placement."""
         signals = []
         for number, unit in enumerate(self._units()):
             step = np.eye(DENSITY + 1)[number] * _STEP_PX * unit

@@ -17,8 +17,8 @@ _STEP_PX = 0.25  # signals are central differences, for which the image's edge m
 _TIMING_STEP = 0.1  # a time is changed by at most this fraction of itself in a central difference
 _LARGEST_CUT = 0.7  # the search shortens a time by at most this fraction, so that it stays above 0
 _MOST_TILT_RAD = math.radians(2.0)  # an angle is changed by at most this in a central difference
-_SMALL_MISMATCH = 1.3  # errors of voxels do not change sign after half a turn, so they hardly disturb signals that do
-# An angle with a larger standard deviation counts as undetermined, because sines are not linear so far.
+_SMALL_MISMATCH = 1.3  # mismatch of signals that change sign after half a turn: voxels' errors do not, and disturb them less
+# An angle with a larger standard deviation counts as undetermined, because its sine is not linear over such a range.
 _LEAST_KNOWN_RAD = math.radians(10.0)
 _DEGREES = math.degrees(1.0)
 
@@ -30,7 +30,7 @@ class Parameter:
     - scale: displayed units per unit of the field.
     - object_instead: another object that explains the frames as well, if they do not determine the parameter.
     - pixels: how many pixels a unit of the field moves the image at its edge.
-    - mismatch: measured errors (docs/calibrate.md) over those that noise causes: voxels do not represent the object exactly.
+    - mismatch: measured errors (docs/calibrate.md) over those of noise alone, as voxels do not represent objects exactly.
     - is_axial: the parameter moves the image along the axis, like ``LIFT``. The others move it across, like ``TURN``."""
 
     name: str
@@ -57,8 +57,7 @@ class Parameter:
         return self.unit != "deg" or deviation < _LEAST_KNOWN_RAD
 
     def lowest(self, scan: Scan) -> float:
-        """Returns the lowest correction of the field that the search may try: times stay above 0; others have no limit
-        (−∞)."""
+        """Returns the lowest correction that the search may try: times stay above 0, other fields have no limit (−∞)."""
         stated = self.stated(scan) if self.is_timing else 0.0
         return -_LARGEST_CUT * stated if stated > 0 else -math.inf
 
@@ -216,8 +215,7 @@ def correction_of(values: Mapping[str, float]) -> GeometryCorrection:
 
 
 def in_words(weights: Mapping[str, float]) -> str:
-    """Returns a combination of parameters (weights by name) in words: the largest weight first, and no weight below 0.3 of
-    it."""
+    """Returns a combination of parameters (weights by name) in words: the largest weight first, none below 0.3 of it."""
     order = sorted(weights, key=lambda name: -abs(weights[name]))
     largest = abs(weights[order[0]])
     main, *others = [name for name in order if abs(weights[name]) > 0.3 * largest]

@@ -25,9 +25,9 @@ from phyradgs_cl.runtime import Runtime
 SPLINES = 7  # default number of splines; each is about a seventh of the scan wide
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
 _STEP_PX = 0.25  # signals are central differences, for which a frame moves by this much to each side
-_LEAST_NORM = 0.1  # parameters with weak signals are scaled as if they had this fraction of their kind's largest norm
+_LEAST_NORM = 0.1  # a signal's norm counts as at least this fraction of its kind's largest, which limits how it is scaled
 _DEG = float(np.rad2deg(1.0))
-# Discretisation errors fall in proportion to the voxel, so half of the change since a grid half as fine is still an error.
+# This fraction of the change since a grid half as fine counts as error: 1 suits errors ∝ voxel, 1/3 errors ∝ voxel².
 DISCRETISATION = 0.5
 _STEPS = 3  # Gauss–Newton steps on each grid; the next grid continues from there
 _ITERATIONS = 20  # iterations of CGLS for each step and each standard deviation
@@ -36,8 +36,7 @@ _DEVIATIONS = 3.0  # a kind is corrected only if its RMS over the views exceeds 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of parameter: its name and unit in the table. scale: how many of that unit make an internal unit (rad or
-    mm)."""
+    """A kind of parameter: its name and unit in the table. scale: how many of these make an internal unit (rad or mm)."""
 
     name: str
     unit: str
@@ -51,7 +50,7 @@ class PerViewParameters(ABC):
 
     - units (K,): how much of each kind moves a frame by a pixel at its edge.
     - circle (n, 2): values that vary as cosine and sine of the angle, as far as the basis can.
-    - MISMATCH: measured errors (docs/calibrate.md) over those that noise causes: voxels do not represent the object exactly.
+    - MISMATCH: measured errors (docs/calibrate.md) over those of noise alone, as voxels do not represent objects exactly.
     - RESTARTED: kinds that start from 0 on each grid."""
 
     values: np.ndarray
@@ -65,7 +64,7 @@ class PerViewParameters(ABC):
 
     @abstractmethod
     def views_of(self, values: np.ndarray) -> Views | Sway:
-        """Returns values (n, K) as a change of a scan."""
+        """Returns the change of a scan's views, or of its object's pose, that values (n, K) stand for."""
 
     @abstractmethod
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
@@ -158,8 +157,7 @@ def _turn_unit_rad(scan: Scan) -> float:
 
 
 def units_of_views(scan: Scan) -> np.ndarray:
-    """Returns (3,) the turn in rad, and the shifts along v and u in mm, that each move a view's frame by a pixel at its
-    edge."""
+    """Returns (3,) the turn in rad and the shifts along v and u in mm that each move a frame's edge by a pixel."""
     return np.array([_turn_unit_rad(scan), *scan.geometry.pixel_size_mm])
 
 
@@ -178,15 +176,14 @@ def view_step(
     kinds: Sequence[int], iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns a Gauss–Newton step (n, K) of the parameters, at the object ``volume``; it is 0 for kinds outside of
-    ``kinds``. Also returns the signals (F, kinds, rows, columns): the change of the frames when each kind moves them by one
-    pixel."""
+    ``kinds``. Also returns the signals (F, kinds, rows, columns): the frames' change when a kind moves them by a pixel."""
     operator = parameters.operator(problem, correction)
     residual = problem.residual(operator, volume)
     signals = np.stack([_signal(problem, correction, parameters, volume, kind) for kind in kinds], 1)
     norms = _norms(parameters.basis, signals)
     scale = _strength(operator) / np.maximum(norms, _LEAST_NORM * norms.max(0))
     if not np.array_equal(parameters.basis, np.eye(len(signals))):
-        # a spline reaches over many views, so all splines have one scale
+        # several splines act on a view, but its signal can be scaled only once: so all splines share one scale
         scale = np.broadcast_to(scale.mean(0), scale.shape)
     per_view = parameters.basis @ scale / parameters.basis.sum(1, keepdims=True)
     scaled = (signals * per_view[:, :, None, None]).astype(np.float32)
@@ -247,7 +244,7 @@ def _signal(
 def _share(
     problem: CoarseProblem, operator: RayOperator, basis: np.ndarray, signals: np.ndarray, iterations: int
 ) -> float:
-    """Returns the fraction of signals (F, rows, columns), with random signs, that no object explains, 0 to 1."""
+    """Returns which fraction, 0 to 1, of signals (F, rows, columns) no object explains, if each has a random sign."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], basis.shape[1]).astype(np.float32)
     probe = signals * (basis @ signs).astype(np.float32)[:, None, None]
     (rest,) = problem.beyond_object(operator, np.zeros(operator.volume_shape, np.float32), [probe], iterations)

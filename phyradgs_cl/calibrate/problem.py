@@ -29,7 +29,7 @@ _VOXELS_PER_TIME = 2.0  # an exposure is sampled so often that the volume's rim 
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
-_LEAST_SHARE = 0.1  # in progress, a phase with passes left counts at least this fraction of their cost
+_LEAST_SHARE = 0.1  # progress reports count a phase's remaining passes with at least this fraction of their full cost
 Passes = tuple[int, float]
 """How many passes may still come at most, and their expected total cost."""
 
@@ -57,8 +57,7 @@ class Stage:
 
 
 def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:
-    """Returns the cost of a pass through the scans with at most ``columns`` blocks: it grows as rays × voxels along a
-    ray."""
+    """Returns the cost of a pass through the scans with at most ``columns`` blocks: about rays × voxels along each."""
     shape = scans[0].geometry.detector_shape
     rows, across = (ceil_div(n, ceil_div(max(shape), columns)) for n in shape)
     return float(sum(min(scan.frames, most_frames) for scan in scans) * rows * across * max(rows, across))
@@ -75,7 +74,7 @@ class PassCounter:
         self._current: Passes = (0, 0.0)  # passes that remain in this phase
 
     def begin(self, phase: str, text: str) -> None:
-        """Begins a phase, which reports call ``text``. Earlier phases of the plan are over."""
+        """Begins a phase of the plan, which reports call ``text``, and drops the phases before it."""
         while phase in self.plan and next(iter(self.plan)) != phase:
             self.plan.pop(next(iter(self.plan)))
         self._text, self._current = text, self.plan.pop(phase, (0, 0.0))
@@ -157,8 +156,8 @@ class CoarseProblem(CoarseFrames):
         """Returns the operator A of the coarse frames of all scans, in the geometry that ``correction`` and ``views``
         change.
 
-        Each line integrates over 2 to 8 times of its exposure. views: changes of single views or of the object's pose; None:
-        none."""
+        Each line integrates over 2 to 8 times of its exposure. views: changes of single views or of the object's pose, if
+        any."""
         tables = []
         for scan in self.scans:
             small = coarse.binned(perturb(scan, correction, views), self.block)
@@ -175,13 +174,14 @@ class CoarseProblem(CoarseFrames):
         return self.measured + self.masked(operator.forward(volume) - self._expected(operator, volume))
 
     def _expected(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
-        """Returns the frames of a volume, averaged as the detector does."""
+        """Returns the frames (F, rows, columns) of a volume, with line integrals or intensities averaged, as the detector
+        does."""
         if self.scans[0].detector_model != "intensity":
             return operator.forward(volume)
         return IntensityOperator(self.rt, self.grid, operator.detector_shape, operator.tables).expected(volume)
 
     def reconstruct(self, operator: RayOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
-        """Returns a nonnegative volume (nz, ny, nx) of little total variation, after ``iterations`` from ``start`` (None:
+        """Returns a nonnegative volume (nz, ny, nx) of little total variation, ``iterations`` after ``start`` (None:
         zeros)."""
         volume = np.zeros(self.grid.shape, np.float32) if start is None else start
         system = System(operator, self.line_integrals(operator, volume), self.valid)
@@ -201,8 +201,7 @@ class CoarseProblem(CoarseFrames):
         return self.measured - self.masked(self._expected(operator, volume))
 
     def noise(self, residual: np.ndarray) -> float:
-        """Returns the standard deviation of a pixel's noise, from the measurement: a volume fits some of the noise in
-        ``residual``."""
+        """Returns a pixel's noise (std), from the measurement: the volume has fitted some of the noise of ``residual``."""
         return noise_level(self.measured, self.valid)
 
     def beyond_object(
@@ -223,8 +222,8 @@ class CoarseProblem(CoarseFrames):
 
 def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:
     """Returns the smoothing across (rows, columns), in pixels, before binning. Rows read one after the other are not
-    smoothed: they see the object at other angles, so smoothing would look like a shorter readout. Columns read so shear the
-    image, which smoothing does not change."""
+    smoothed: they see the object at other angles, so smoothing would look like a shorter readout. Columns read one after the
+    other shear the image, which smoothing does not change."""
     if block == 1:
         return 0.0
     is_rolling = scan.shutter.readout_s > 0 and scan.shutter.axis == "rows"

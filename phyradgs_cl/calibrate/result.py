@@ -1,5 +1,4 @@
-"""The result of a calibration: an estimate per parameter, combinations that no frame distinguishes, and the corrected
-scan."""
+"""The result of a calibration: an estimate per parameter, combinations that no frame distinguishes, the corrected scan."""
 
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
@@ -91,8 +90,8 @@ class Calibration:
         """Returns the corrections of every view, (F,) by name and unit; {} without corrections of views.
 
         A wobble is added to the stated poses: source and panel turn counterclockwise as seen from above, and the panel moves
-        along its own v and u. A motion is the object's pose in the middle of each view: rotated about x, y and z, then
-        shifted along them."""
+        along its own v and u. A motion is the object's pose in the middle of each view: rotated about, then shifted along x,
+        y and z."""
         if self.views is None:
             return {}
         if isinstance(self.views, Views):
@@ -102,7 +101,7 @@ class Calibration:
             six = self.views.at(np.asarray(self.scan.frame_start_s) + self.scan.shutter.middle_s).T
             curves = {f"turn_{axis}_deg": np.rad2deg(values) for axis, values in zip("xyz", six[:3], strict=True)}
             curves |= {f"shift_{axis}_mm": values for axis, values in zip("xyz", six[3:], strict=True)}
-        return {name: values for name, values in curves.items() if values.any()}  # kinds that were not corrected are all 0
+        return {name: values for name, values in curves.items() if values.any()}  # only kinds that were corrected
 
     def plot(self) -> "Figure":
         """Returns a figure of the residuals of four frames, before on the left and after on the right, on one scale.

@@ -65,7 +65,7 @@ _FEWEST_SPLINES = 4  # a cubic spline of a wobble needs four
 _LEAST_EXPLAINED = 0.3
 _ORDER_ERRORS = 4.0  # a direction of readout must be better by this many standard errors, as in ``check``
 _ORDER_RATIO = 1.04  # the squared residuals of both directions must differ by this factor, as in ``check``
-_BEYOND = 1e6  # an encoder table is continued by this many frame times: first steps of the search may be very wrong
+_BEYOND = 1e6  # an encoder table is continued by this many frame times: first steps of the search may reach far beyond it
 # Progress expects a stage to cost this fraction of its most: few parameters are determined, and steps soon become small.
 _EXPECTED_SHARE = 0.25
 
@@ -111,7 +111,7 @@ class _Calibrator:
         self.placement = np.zeros(0)
         self.stated = self.ready  # ``ready`` may later get the other readout direction
         stages = {one.block(self.scan): one for one in reversed(STAGES if self.phantom is None else BEAD_STAGES)}
-        self.stages = list(stages.values())[::-1]  # on a small panel several stages have the same blocks
+        self.stages = list(stages.values())[::-1]  # on a small panel, of stages with the same blocks the first is kept
         self.per_view: PerViewParameters | None = None
         if self.request.per_view == WOBBLE:
             self.per_view = WobbleParameters.of(self.ready[0], self.splines)
@@ -177,8 +177,8 @@ class _Calibrator:
             self.search.fallback = {OFFSET_U: Fallback(shift.pixels * pitch_mm, shift.deviation * pitch_mm, is_significant)}
 
     def _search_common(self) -> None:
-        """Searches the parameters that all views share. Single views are corrected first, because their errors would look
-        like a roll."""
+        """Searches the parameters that all views share. Single views are corrected first: their errors would look like a
+        roll."""
         steady = self.ready
         if self.per_view is not None:
             self.passes.begin("views before", "views, before the rest")
@@ -221,8 +221,8 @@ class _Calibrator:
         return replace(problem, count_pass=self.passes.counter(pass_cost(scans, stage.columns, most_frames)))
 
     def _place(self, phantom: EllipsoidPhantom) -> np.ndarray:
-        """Returns a first placement (7,) of the phantom: of those at which its beads are seen, the one that explains the
-        frames best."""
+        """Returns a first placement (7,) of the phantom: of those where its beads are seen, the one that fits the frames
+        best."""
         bead_centres_mm(phantom)
         correction = correction_of(self.search.at)
         voxels = CoarseProblem.of(self.rt, self.ready, STAGES[-1])
@@ -243,8 +243,8 @@ class _Calibrator:
         """Compares the residuals with lines read from either end, and corrects the scans' direction. Returns its line of the
         table.
 
-        A correction needs four standard errors and 4 % of the squared residual. The direction is 1 or −1; its deviation is
-        on that scale."""
+        A correction needs four standard errors and 4 % of the squared residual. The direction is 1 or −1, and its deviation
+        is in the same unit."""
         self.passes.begin("order", "which line is read first")
         stage = self.stages[min(1, len(self.stages) - 1)]
         reverse = [reversed_readout(scan) for scan in self.ready]

@@ -27,11 +27,11 @@ from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, Paramet
 
 # Frames determine a parameter if object and other parameters leave this fraction of its signal unexplained, or more.
 LEAST_SHARE = 0.2
-# For a known object (beads) less is enough: it has no voxels that explain signals by accident.
+# For a known object (beads) a smaller share is enough: there are no voxels that explain signals by accident.
 LEAST_SHARE_OF_BEADS = 0.02
 _TINY = 1e-9  # added to the diagonal of a matrix before its inverse, because signals may be linearly dependent
 _GAUGE_FACTOR = 2.0  # voxels leave some signal of a gauge (``GAUGES``) by error: a parameter must leave twice as much
-_MOST_GAUGE = 0.2  # in a wrong geometry more of a gauge's signal is left, which must not refuse every parameter
+_MOST_GAUGE = 0.2  # a gauge's share counts as this at most: in a wrong geometry it grows, and would refuse every parameter
 DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
 _MOST_PX = 2.0  # a step moves the image by at most this many coarse pixels at its edge: signals are not linear beyond
 _SETTLED = 0.1  # the steps on a grid end when all are smaller than this many standard deviations
@@ -65,8 +65,7 @@ class Reduced:
         )
 
     def relative_to_stated(self, at: Mapping[str, float]) -> "Reduced":
-        """Returns the problem with steps that count from the stated values. It was linearised at the values ``at``, by
-        name."""
+        """Returns the problem with steps that count from the stated values; it was linearised at values ``at``, by name."""
         back = np.array([at.get(name, 0.0) for name in self.names]) @ self.jacobian
         return replace(self, residual=self.residual + back)
 
@@ -93,7 +92,7 @@ class Reduced:
         return np.sqrt(np.minimum(np.minimum(certainty, np.diag(self.gram)), 1.0))
 
     def step(self) -> np.ndarray:
-        """Returns the Gauss–Newton step (K,) in the fields' units."""
+        """Returns the Gauss–Newton step (K,) of the parameters, in the units of their fields."""
         return np.linalg.solve(self.gram, self.unit @ self.residual) / self.sizes
 
     def deviations(self) -> np.ndarray:
@@ -137,14 +136,13 @@ def reduced(
 def _signal(
     problem: CoarseProblem | BeadProblem, one: Parameter, at: Mapping[str, float], volume: np.ndarray
 ) -> np.ndarray:
-    """Returns the parameter's signal (F, rows, columns): d(expected frames)/d(parameter), per unit of its field, 0 at
-    invalid pixels."""
+    """Returns the signal (F, rows, columns): d(expected frames)/d(parameter), per unit of its field, 0 at invalid pixels."""
     step = one.step(problem.scans[0]) * (1 if one.is_timing else problem.block)
     ends = []
     for sign in (1, -1):
         correction = correction_of({**at, one.name: at.get(one.name, 0.0) + sign * step})
         operator: Any = problem.operator(correction)
-        ends.append(operator.forward(volume) - problem.measured)  # residuals are small, so less is lost by rounding
+        ends.append(operator.forward(volume) - problem.measured)  # less is lost by rounding than with whole frames
     return problem.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 
@@ -241,8 +239,7 @@ class Search:
             self.at[name] = estimate.correction
 
     def _step(self, problem: Problem) -> bool:
-        """Moves the determined parameters, each no further than its signal is linear. Returns whether all steps were
-        small."""
+        """Moves the determined parameters, each as far as its signal is linear. Returns whether all steps were small."""
         assert self.reduced is not None and self.determined is not None
         current = np.array([self.at.get(name, 0.0) for name in self.determined])
         change = self.reduced.step() - current
@@ -273,8 +270,7 @@ class Search:
     def corrections(self) -> dict[str, float]:
         """Returns the values, by name, of the parameters that differ from their stated values by three deviations.
 
-        All other parameters go back to their stated values. That changes the remaining values, so the test repeats until all
-        differ."""
+        All other parameters go back to their stated values. That changes the rest, so the test repeats until all differ."""
         values, deviations = self.estimates()
         deviation = dict(zip(self.determined or (), deviations, strict=True))
         names = self.determined or ()
@@ -288,7 +284,8 @@ class Search:
         return significant | dict(zip(names, map(float, values), strict=True))
 
     def table(self, scan: Scan, corrections: Mapping[str, float]) -> list[ParameterEstimate]:
-        """Returns an estimate per parameter in displayed units. corrections: values by name, which replace those found."""
+        """Returns an estimate per parameter in displayed units. corrections: values by name, in the fields' units, which
+        replace those found."""
         values, deviations = self.estimates()
         estimates = {name: (estimate.value, estimate.deviation) for name, estimate in self.fixed.items()}
         estimates |= dict(zip(self.determined or (), zip(values.tolist(), deviations.tolist(), strict=True), strict=True))

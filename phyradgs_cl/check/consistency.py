@@ -27,7 +27,7 @@ from phyradgs_cl.runtime import Runtime
 CONSISTENCY = "consistency"
 # Consistent frames leave less than this fraction of their residual in a random order: correct scans have 0.02 to 0.23.
 _LARGEST = 0.35
-_DOUBTFUL = 0.1  # above this fraction, exchanged, missing and repeated frames are tried as explanations
+_DOUBTFUL = 0.1  # above this fraction of it, exchanged, missing and repeated frames are tried as explanations
 _RANDOM_ORDERS = 2  # the residual in a random order is averaged over this many orders
 _FEWEST_FRAMES = 5  # fewer frames cannot tell one order from another
 _FEWEST_PIXELS = 32  # fewer valid coarse pixels per frame cannot tell one order from another
@@ -37,8 +37,8 @@ _ERRORS = 4.0  # a hypothesis must be better than the stated scan by this many s
 # The frames look the same from every angle if a random order leaves a residual below _SAME or _NOISY.
 _SAME = 0.03  # residual over the standard deviation of the line integrals
 _NOISY = 1.6  # residual over the noise: round objects had up to 1.3, others 2.3 or more
-_MOST_REFINED = 2  # only the best hypotheses get a refined shift of the panel, which takes time
-_SHIFT_PENALTY = 1.5  # a hypothesis pays this factor for each coarse pixel of shift: stated offsets are mostly right
+_MOST_REFINED = 2  # only this many hypotheses, the best ones, get a refined shift of the panel, which takes time
+_SHIFT_PENALTY = 1.5  # each coarse pixel of shift multiplies a hypothesis's squares by this: stated offsets are mostly right
 # A frame is odd if its mean line integral differs from its neighbours' by more than _DEVIATIONS and _LEAST_CHANGE.
 _DEVIATIONS = 12.0  # difference in robust standard deviations of all frames' differences
 _LEAST_CHANGE = 0.75  # difference over the frames' median mean line integral
@@ -48,7 +48,7 @@ _UNLIKE = 2.0  # a repeated frame differs this much, relative to the median, fro
 _OUTLIER = 4.0  # the residual of an outlier is at least this many times the frames' median
 # Both ends of an arc may fit badly if their residuals differ by less than this factor: right frames had 1.4, odd ones 2.3.
 _ALIKE = 1.7
-# But they must leave less than this fraction of the residual in a random order: right frames had 0.2, odd ones mostly 0.3.
+# Both ends must also leave less than this fraction of the residual in a random order: right ones had 0.2, odd mostly 0.3.
 _AT_BOTH_ENDS = 0.25
 _MOST_OUTLIERS = 0.2  # this many outliers, as a fraction of the frames, have a common cause: then none counts as one
 _EXCHANGED = 0.5  # two frames were exchanged if the opposite order leaves less than this fraction of the squares
@@ -85,8 +85,7 @@ class _CoarseFit:
 def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
     """Finds frames and hypotheses that explain why the frames of a coarse ``scan`` do not fit together.
 
-    The finding's value is √(squared residual in the stated order / in a random order). as_stated: the scan before it was
-    made coarse."""
+    The finding's value is √(squared residual in the stated order / in a random order). as_stated: the scan of full size."""
     pixels = float(scan.valid.sum()) / scan.frames
     if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
@@ -129,9 +128,8 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
 
 
 def _unseen(scan: Scan, as_stated: Scan) -> float:
-    """Returns how small a residual in a random order shows that frames of a coarse ``scan`` tell nothing about their
-    angles."""
-    # The smaller one counts: edges raise the estimate from coarse pixels, noise that differs between rays the other one.
+    """Returns the residual in a random order below which the frames of a coarse ``scan`` tell nothing about their angles."""
+    # The smaller noise counts: edges raise that of coarse pixels, noise that differs between rays raises that of full ones.
     levels = [noise_level(one.projections, np.broadcast_to(one.valid, one.projections.shape)) for one in (scan, as_stated)]
     noise = min(levels[0], levels[1] / float(np.prod(altered_trajectory(scan).blocks)) ** 0.5)
     return max(_SAME * float(np.asarray(scan.projections, np.float64).std()), _NOISY * noise)
@@ -150,7 +148,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     turned = best = scan
     least = _CLEAR * fit_squares(rt, scan).sum()
     for sense, rough, limits in zip(senses, roughs, limits_px, strict=True):
-        if rough.squares.mean() > _NEARLY * least_rough:  # rough fits of a narrow fan are too close to decide
+        if rough.squares.mean() > _NEARLY * least_rough:  # if both fit alike, as in a narrow fan, both are refined
             continue
         shift = axis.refined_shift(rt, sense, rough, limits)
         if not shift.is_found:
@@ -188,8 +186,9 @@ def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -
 def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:
     """Returns the best two hypotheses about the whole scan, with the panel shifted to fit best.
 
-    most: a rough fit may leave 1.5 times this mean squared residual, because an offset between two coarse pixels hides other
-    differences. Large shifts count against a hypothesis. Of several hypotheses with one factor of sizes, the best counts."""
+    most: rough fits with more than 1.5 times this mean squared residual are left out. They get that factor because an offset
+    between two coarse pixels hides other differences. Large shifts count against a hypothesis. Of several hypotheses with
+    the same factor of sizes, the best counts."""
     tried: list[tuple[Hypothesis, Scan, axis.AxisShift]] = []
     for hypothesis in hypotheses.of_scan(scan, as_stated):
         other = hypothesis.scan()

@@ -17,7 +17,7 @@ _INVERTED = 0.9  # if the sides exceed this fraction of the largest value, brigh
 _BRIGHT = 0.05  # at most this fraction of the pixels may be brighter than the flats, by noise
 _FRAMES = 0.1  # the object may touch a side of the panel in this fraction of the frames
 _COVERED = 0.1  # a column shows the object if more than this fraction of its rows does
-# A unit is wrong if the grid is this many times wider than the panel's field of view, or the object than the grid.
+# A unit is wrong if the grid is this many times wider than the panel's view, or the object wider than the grid.
 _ANOTHER_SIZE = 5.0
 NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # findings with these units end the check
 CUT_OFF = "line integral at the border"  # a finding with this unit says that the object reaches beyond the panel
@@ -103,8 +103,8 @@ def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) ->
 
 
 def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
-    """Returns the level of the two columns ``columns``: the largest mean over an eighth of the rows, at the 90th percentile
-    of the frames."""
+    """Returns the level of two columns: the largest mean over an eighth of the rows, at the 90th percentile of the
+    frames."""
     edge = p[:, :, columns]
     weight = valid[:, :, columns].astype(float)
     rows = max(1, edge.shape[1] // 8)

@@ -66,7 +66,7 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
         advice = "did counts overflow (65,536 becomes 0)? Read the frames as unsigned, or lower the exposure"
         return Finding(_SATURATION, SUSPICIOUS, jumps, _MOST_JUMPS, OVERFLOW, text, advice)
     lowest, highest = float(p[~masked].min()), float(p[~masked].max())
-    is_inverted = float(np.median(p[:, :, [0, -1]])) == highest  # inverted images: ``check_coverage`` reports them
+    is_inverted = float(np.median(p[:, :, [0, -1]])) == highest  # ``check_coverage`` reports inverted images
     at_least = clustered_share((p == lowest) & ~masked & (abs(lowest) > _ZERO))
     at_largest = 0.0
     if not is_inverted:

@@ -29,8 +29,8 @@ _GAPS = 15  # a missing or repeated frame is looked for at this many frames, eve
 class Hypothesis:
     """What may be wrong in a scan: a description, advice, and a function that returns the scan corrected for it.
 
-    factor: by which pixels are larger than stated. Hypotheses that share a factor other than 1 differ only by the panel's
-    shift."""
+    factor: by which pixels are larger than stated. Hypotheses with the same factor, unless it is 1, differ only by the
+    panel's shift."""
 
     text: str
     advice: str
@@ -69,8 +69,8 @@ def frame_number(scan: Scan, frame: int) -> int:
 
 
 def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. stated: the scan before it
-    was made coarse."""
+    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. stated: the scan of full
+    size."""
     yield from _other_units(scan, stated)
     yield from _other_images(scan, stated)
 
@@ -106,8 +106,8 @@ def _times(name: str, factor: float) -> str:
 
 
 def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Scan:
-    """Returns the coarse scan with pixels ``factor`` times as large, and a grid that fits them. keeps_axis: as in
-    ``resized``."""
+    """Returns the coarse scan with pixels ``factor`` times as large, and a fitting grid. keeps_axis: the axis stays in its
+    column."""
     v_mm, u_mm = stated.geometry.pixel_size_mm
     off_v_mm, off_u_mm = (offset * (factor if keeps_axis else 1) for offset in stated.geometry.detector_offset_mm)
     pixel_size_mm = (factor * v_mm, factor * u_mm)
@@ -146,7 +146,7 @@ def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hy
 
 
 def _azimuths(scan: Scan) -> np.ndarray:
-    """Returns each frame's angle (F,) in rad relative to the first frame. Whole turns are kept if the trajectory states
+    """Returns each frame's angle (F,) in rad from the first frame's. Whole turns are kept if the trajectory states
     angles."""
     trajectory = variants.altered_trajectory(scan)
     angle_rad = getattr(trajectory.base, "angle_rad", None)
@@ -181,7 +181,7 @@ def _other_steps(scan: Scan) -> Iterator[Hypothesis]:
 
 def _exchanged_sizes(scan: Scan) -> Iterator[Hypothesis]:
     if scan.is_parallel:
-        return  # an object of another size would explain the frames as well
+        return  # in a parallel beam, an object of another size would explain the frames as well
     v, u = scan.geometry.pixel_size_mm
     if abs(v / u - 1) > 0.02:
         text, advice = "pixel sizes fit if v and u are exchanged", f"exchange {PIXEL_SIZES}"
@@ -195,7 +195,7 @@ def nearly_sized(scan: Scan, factor: float) -> Scan:
 
 
 def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses of a missing or a repeated frame, at up to 15 frames: all later frames are a step further on, or
+    """Yields hypotheses of a missing or a repeated frame, at up to 15 frames: all later ones are a step further on, or
     back."""
     sense = -1.0 if variants.altered_trajectory(scan).is_reversed else 1.0
     step = float(np.median(wrapped(np.diff(_azimuths(scan))))) * sense

@@ -118,7 +118,7 @@ def check(
     if not scan.is_parallel:
         ask(orbit.DISTANCES, orbit.check_distances, quick)
     gain = detector.check_gain(rt, quick)
-    if gain.verdict == SUSPICIOUS and covered.unit == coverage.CUT_OFF:  # an object cut off changes the levels too
+    if gain.verdict == SUSPICIOUS and covered.unit == coverage.CUT_OFF:  # an object that is cut off changes the levels too
         gain = replace(gain, verdict=CANNOT_TELL, text=f"{gain.text}, or the object does beyond the panel")
     answers.add(gain)
     if shutter.READOUT in questions:
@@ -126,7 +126,7 @@ def check(
         ask(shutter.READOUT, shutter.check_readout, around_object(turn.corrected(fine)))
     if shutter.EXPOSURE in questions:
         ask(shutter.EXPOSURE, shutter.check_exposure, quick)
-    if turn.is_reversed or turn.centre.unit == orbit.OTHER_CAUSE:  # the offset depends on another correction
+    if turn.is_reversed or turn.centre.unit == orbit.OTHER_CAUSE:  # the offset is right only after another correction
         return CheckResult(answers.findings, is_consistent=False)
     pitch_mm = scan.geometry.pixel_size_mm[1]
     return CheckResult(answers.findings, turn.shift.pixels * pitch_mm, turn.shift.deviation * pitch_mm)

@@ -15,7 +15,7 @@ from phyradgs_cl.runtime import Runtime
 
 READOUT, EXPOSURE = "sign of readout", "exposure"
 _ERRORS = 4.0  # two hypotheses must differ by this many standard errors
-# The wrong order of readout leaves this many times the squared residual: both orders are equally free to fit.
+# The wrong order of readout must leave this many times the squared residual. Little is enough: both are equally free to fit.
 _ORDER_RATIO = 1.04
 _OTHER_RATIO = 1.5  # another readout axis or time must fit better than the stated one by this factor in squares
 # A gantry at rest must fit better by this factor: a model without blur always fits better, above all with few views.

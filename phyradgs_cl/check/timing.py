@@ -30,7 +30,7 @@ _FEW_RAD = math.radians(5)  # if frames see a smaller arc of a long table of ang
 _MILLISECONDS = (900.0, 3000.0)  # if a table lasts this many times as long as the scan, it is in ms and the frames are in s
 _WIDE = 3.0  # a gap between views is wide above this multiple of the median gap
 _SAME_RAD = 1e-6  # views nearer to each other than this have the same angle
-_TOLERATED_DEG = 1.0  # so much coverage may be missing: nearly parallel rays need half a turn only
+_TOLERATED_DEG = 1.0  # coverage may be this much below half a turn and the fan: nearly parallel rays need half a turn only
 
 
 def check_timing(scan: Scan) -> Finding:
@@ -53,8 +53,9 @@ def check_timing(scan: Scan) -> Finding:
         _share("exposure", "a line would open again while it is open", scan.shutter.exposure_s / period_s),
         _share("readout", "a frame would be read while the last one is", scan.shutter.readout_s / period_s),
     ]
+    # other trajectories compute the steps and the speed from one function of time: there they always agree
     if isinstance(scan.trajectory, CircularOrbit) and isinstance(scan.trajectory.kinematics, FrameSweeps):
-        findings.append(_speed(scan, starts_s))  # other trajectories are one function of time
+        findings.append(_speed(scan, starts_s))
     findings += _table(scan)
     suspicious = [finding for finding in findings if finding.verdict == SUSPICIOUS]
     return suspicious[0] if suspicious else max(findings, key=lambda finding: finding.value / finding.threshold)

@@ -76,7 +76,7 @@ def frames_to_attenuation(
                 part = slice(start, start + rows)
                 values = frames[frame, part].astype(np.float64)
                 if quantity == "attenuation":
-                    bad = ~(np.abs(values) <= largest)  # NaN compares false
+                    bad = ~(np.abs(values) <= largest)  # NaN is bad too: every comparison with it is false
                     result[i, part], unusable[i, part] = np.where(bad, 0.0, values), bad
                 else:
                     result[i, part], unusable[i, part] = minus_log(values - dark[part], gain[part])
@@ -93,7 +93,7 @@ def mean_dark(darks: NDArray[np.generic] | None, panel: tuple[int, ...]) -> NDAr
 def minus_log(signal: NDArray[np.float64], gain: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Returns −ln(signal / gain) for arrays of one shape, and where the result must not be used.
 
-    Where the gain is 0 or less the pixel tells nothing, and the result is 0. A dark one becomes −ln
+    Where the gain is 0 or less the pixel tells nothing, and the result is 0. A pixel without signal becomes −ln
     ``TRANSMISSION_FLOOR``."""
     live = np.isfinite(signal) & np.isfinite(gain) & (gain > 0)
     transmission = np.divide(signal, gain, out=np.zeros_like(signal), where=live)
@@ -117,7 +117,7 @@ def intensity_average(p: Iterable[np.ndarray], weights: Iterable[np.ndarray]) ->
     p: S arrays of line integrals; the result has their precision and cannot overflow. weights: S numbers or arrays that
     broadcast, with sum 1. Where all weights are 0, both results are 0."""
     pairs = list(zip(p, weights, strict=True))
-    least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # p of the brightest moment
+    least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # the least p, that of the brightest moment
     least = np.where(np.isfinite(least), least, 0)
     intensities = [w * np.exp(np.where(w > 0, least - q, 0)) for q, w in pairs]
     total = np.sum(intensities, axis=0)
@@ -137,8 +137,8 @@ class Spectrum:
     bone: Array
 
     def hardened(self, soft: Array, bone: Array | float = 0.0) -> Array:
-        """Returns the line integrals that this beam measures, from those of soft tissue and bone without hardening (any
-        shape)."""
+        """Returns the line integrals (any shape) that this beam measures, from those of soft tissue and bone without
+        hardening."""
         soft, energies = np.asarray(soft, np.float64), zip(self.weight, self.soft, self.bone, strict=True)
         # One energy at a time: ``intensity_average`` would hold all of them in memory.
         return -np.log(sum(w * np.exp(-(s * soft + b * np.asarray(bone))) for w, s, b in energies))

@@ -75,8 +75,8 @@ def beer_lambert_noise(
     light: ArrayLike = 1.0, lag: float = 0.0
 ) -> NDArray[np.float32]:
     """Returns −ln(counts/dose), (F, v, u) float32; ``COUNT_FLOOR`` is the least count. Negative values stay: with 0 in their
-    place the mean of air would rise. Arguments as in ``tigre_noise``. Lag λ mixes photons of successive frames, before
-    electronic noise."""
+    place the mean of air would rise. Arguments as in ``tigre_noise``. Lag λ mixes successive frames, before electronic
+    noise."""
     expected = beer_lambert_counts(line_integrals, dose)
     share = np.asarray(light, dtype=np.float64)
     counts = add_lag(sample_counts(expected * share, 0.0, rng), lag)
@@ -130,8 +130,7 @@ def pixel_gains(shape: tuple[int, int], spread: float, rng: np.random.Generator)
 
 
 def add_sparks(line_integrals: Array, share: float, rng: np.random.Generator) -> tuple[Array, NDArray[np.bool_]]:
-    """Adds light to a fraction ``share`` of the pixels of line integrals (F, v, u). Returns them, and which were hit,
-    bool."""
+    """Adds light to a fraction ``share`` of the pixels of line integrals (F, v, u). Also returns which were hit, bool."""
     hit = rng.random(line_integrals.shape) < share
     height = rng.uniform(*_SPARK_HEIGHT, int(hit.sum()))
     sparked = np.array(line_integrals)

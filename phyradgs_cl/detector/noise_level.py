@@ -168,7 +168,8 @@ def _flat_differs(frames: NDArray[np.generic], flat: NDArray[np.floating], level
 
 
 def _shows_noise(frames: NDArray[np.generic], level: float) -> bool:
-    """Returns whether unclipped pixels are noisy, by second differences along both axes and along rows."""
+    """Returns whether unclipped pixels are noisy, by their second differences along both axes. These must exceed what
+    rounding causes, and half of those along rows alone: structure makes smaller ones."""
     along_rows, along_both = [], []
     top, left = (max(0, n - _LONGEST_EDGE) // 2 for n in frames.shape[1:])
     middle = np.s_[top : top + _LONGEST_EDGE, left : left + _LONGEST_EDGE]

@@ -57,8 +57,7 @@ def overlap(one: Grid, other: Grid) -> tuple[float, float]:
 
 
 def reference_on(grid: Grid, reference: Values, reference_grid: Grid) -> Values | None:
-    """Returns the reference (nz, ny, nx) on ``grid`` by the rule of ``aligned``; None if that resamples the volume
-    instead."""
+    """Returns the reference (nz, ny, nx) on ``grid`` by the rule of ``aligned``; None if it resamples the volume."""
     if grid.is_close(reference_grid):
         return reference
     blocks = _blocks(grid, reference_grid)

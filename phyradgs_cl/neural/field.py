@@ -91,8 +91,8 @@ class LineAttention(nn.Module):
 
 
 class LineAttentionBlocks(nn.Module):
-    """Alternates attention and feed-forward layers on values (P, width). A layer norm precedes each, a skip connection
-    bypasses it."""
+    """Alternates attention and feed-forward layers on values (P, width), each after a layer norm and with a skip
+    connection."""
 
     def __init__(self, width: int, segment: int, heads: int, head_width: int, blocks: int) -> None:
         super().__init__()
@@ -197,7 +197,7 @@ def corners(positions: torch.Tensor, cells: int, size: int) -> tuple[torch.Tenso
     level has ``cells`` grid cells along a side and ``size`` entries."""
     scaled = positions.t() * cells
     low = scaled.floor().clamp_(0, cells - 1)
-    high_share = scaled - low  # (3, P)
+    high_share = scaled - low  # part of a cell's side, (3, P)
     low_share = 1 - high_share
     side, whole = cells + 1, low.to(torch.int64)
     is_dense = side**3 <= size
@@ -216,15 +216,13 @@ def _corner_shape(axis: int) -> tuple[int, int, int, int]:
 
 
 def weighted_rows(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Returns Σ weight · table[index] over the last axis of index (B, 8), without ``embedding_bag``: some devices lack
-    it."""
+    """Returns Σ weight · table[index] over the last axis of index (B, 8), for devices that lack ``embedding_bag``."""
     rows = table.index_select(0, index.reshape(-1)).reshape(*index.shape, table.shape[1])
     return torch.einsum("bkf,bk->bf", rows, weight)
 
 
 class _Interpolate(torch.autograd.Function):
-    """Returns Σ weight · table[index] over 8 corners, (B, 8). Its gradient is summed in a fixed order, so that runs
-    repeat."""
+    """Returns Σ weight · table[index] over 8 corners, (B, 8). Its gradient is summed in a fixed order: runs repeat."""
 
     @staticmethod
     def forward(ctx: Any, table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:

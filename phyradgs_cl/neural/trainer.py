@@ -48,7 +48,7 @@ class Trainer:
         self.rays = [ExposureRays.of_cells(table, scan.grid) for table in tables]
         times = self.rays[0].times
         stated = scan.detector_model if options.detector_model == "scan" else options.detector_model
-        self.model = stated if times > 1 else "log"  # for a single time both models agree
+        self.model = stated if times > 1 else "log"  # for a single time the log and the intensity model agree
         self.times = options.times_for(times, self.model)
         self.samples = options.samples_for(max(scan.grid.shape), times)
         self.points_at_once = _POINTS_ON_CPU if device.type == "cpu" else _POINTS_ELSEWHERE
@@ -265,7 +265,7 @@ class ExposureRays:
             place = np.full(to_corner.shape, np.nan)
         scale, column, row = np.moveaxis(place, -1, 0)
         is_behind = not self.is_parallel and np.any(scale <= 0)
-        if is_behind or not np.all(np.isfinite(scale)):  # no ray of the panel meets this corner: take all pixels
+        if is_behind or not np.all(np.isfinite(scale)):  # a corner that no ray meets: take all pixels
             return slice(0, detector_shape[0]), slice(0, detector_shape[1])
         return _within(row, detector_shape[0]), _within(column, detector_shape[1])
 
@@ -343,7 +343,8 @@ def line_integrals(
 
 
 def intensity_average(integrals: torch.Tensor, unit: float) -> torch.Tensor:
-    """Returns −ln(mean over K of exp(−unit · p)) / unit (R,) of the integrals p (R, K) at a pixel's times."""
+    """Returns what a detector that averages intensity measures (R,), from the line integrals (R, K) at a pixel's K times.
+    Both are in multiples of ``unit``."""
     return (math.log(integrals.shape[1]) - torch.logsumexp(-unit * integrals, 1)) / unit
 
 

@@ -17,7 +17,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, beside, brought_to, padded_zeros, pitch_of
 
 EDGE = 4  # voxels along each side of a block
-_SAMPLES = 8  # time of one voxel, in samples of a ray, from which the size of a launch follows: drivers kill long ones
+_SAMPLES = 8  # a voxel takes the time of this many samples of a ray: launches are divided, as drivers kill long ones
 # In each turn, the blocks' shift along y for every shift along z: each shift occurs once, and in four turns each pair does.
 TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 

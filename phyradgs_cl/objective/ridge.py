@@ -4,7 +4,8 @@ anatomy.
 Goujon, Neumayer and Unser, "Learning weakly convex regularizers for convergent image-reconstruction algorithms", SIAM J.
 Imaging Sci. 17 (2024) 91, in 3D. The sums run over filters i and voxels p. A filter W_i of 5³ voxels is a chain: 4
 correlations with 3³ voxels, then 16 with their results. Only windows inside the volume count. ψ_i' is a difference of two
-clamps, with knots in units of the noise σ; it may fall again. ½‖x − v‖² + step R(x) is convex for step ≤ 1."""
+clamps, with knots in units of the noise σ. It may fall beyond a knot, so R is only weakly convex: ½‖x − v‖² + step R(x) is
+convex for step ≤ 1."""
 
 import json
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, beside, brought_to, move,
 
 EDGE = 5
 """Voxels along each side of a filter."""
-_SAMPLES = 200  # longest time of one voxel, in samples of a ray: it decides the size of launches, as drivers kill long ones
+_SAMPLES = 200  # a voxel takes at most the time of this many ray samples: launches are divided, as drivers kill long ones
 _SLICES = 2  # slices computed at a time: channels and responses of a whole volume would need 24 times its memory
 _RING = _SLICES + 2  # slices in memory: correlating two slices needs one more on either side
 
@@ -27,8 +28,8 @@ _RING = _SLICES + 2  # slices in memory: correlating two slices needs one more o
 class Ridge:
     """A regulariser's numbers, float32. first (4, 3, 3, 3), second (16, 4, 3, 3, 3): its filters, with axes z, y, x.
 
-    ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i] clip(t, ±σ knot_down[i]). Slopes and knots are (16,) each,
-    and not below 0."""
+    ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i] clip(t, ±σ knot_down[i]). Slopes and knots (16,) are not
+    below 0."""
 
     first: np.ndarray
     second: np.ndarray
@@ -44,7 +45,7 @@ class Ridge:
         return np.concatenate([part.ravel() for part in (*filters, *curves)]).astype(np.float32)
 
     def bend(self, responses: np.ndarray, sigma: float) -> np.ndarray:
-        """Returns ψ_i' of the filters' responses (16, z, y, x). sigma: the noise σ in the volume's unit."""
+        """Returns the slopes ψ_i' at the filters' responses (16, z, y, x). sigma: the noise σ in the volume's unit."""
         columns = (self.slope_up, self.knot_up, self.slope_down, self.knot_down)
         up, knot_up, down, knot_down = (values.astype(np.float64)[:, None, None, None] for values in columns)
         rising, falling = (np.clip(responses, -sigma * knot, sigma * knot) for knot in (knot_up, knot_down))
@@ -69,7 +70,7 @@ class RidgeStep:
     the same."""
 
     VOLUMES = 4
-    """Memory of a step, in volumes of floats, at most; for volumes of 50 slices and 64 voxels a row, or more."""
+    """Most memory of a step, in volumes of floats, if a volume has at least 50 slices and 64 voxels a row."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], ridge: Ridge) -> None:
         self.rt, self.shape = rt, shape
@@ -88,8 +89,8 @@ class RidgeStep:
     def __call__(
         self, volume: SameArray, sigma: float, step: float, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Returns v − ``step`` ∇R(v), float32, for a volume v (nz, ny, nx); sigma in v's unit. nonnegative: clips the
-        result at 0. out: as in ``DctProx``."""
+        """Returns v − ``step`` ∇R(v), float32, for a volume v (nz, ny, nx); sigma in v's unit. nonnegative: clips the result
+        at 0. out: a device array that takes the result."""
         nz, ny, nx = self.shape
         observed, result = beside(self.rt, volume, out)
         padded = self._padded, Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))
@@ -106,7 +107,7 @@ class RidgeStep:
         return brought_to(self.rt, volume, result)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
-        """Runs a kernel on slices from ``first`` on. Its result has ``less`` voxels fewer along each axis than the
+        """Runs a kernel on slices from ``first`` on. Its result has ``less`` fewer voxels along each axis than the
         volume."""
         nz, ny, nx = (count - less for count in self.shape)
         start, stop = max(first, 0), min(first + _SLICES, nz)

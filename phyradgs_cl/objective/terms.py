@@ -4,8 +4,8 @@ A frame's image loss is L1 + λ (1 − SSIM). Eq. 4 prints "+ SSIM", but the pap
 SSIM follows Wang et al. 2004 (IEEE Trans. Image Process. 13, 600), with an 11-tap Gaussian window of σ 1.5, zero padding,
 C1 = 0.01² and C2 = 0.03².
 
-Total variation is anisotropic, as in R2-Gaussian: the mean absolute difference between neighbouring voxels along z, plus the
-same along y and x."""
+Total variation is anisotropic, as in R2-Gaussian: the mean absolute difference between neighbouring voxels along z, plus
+those along y and x."""
 
 import math
 
@@ -44,8 +44,7 @@ class ImageLoss:
     def evaluate(
         self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float
     ) -> DeviceArray:
-        """Returns dL/d(rendered), valid until the next call. mask: 1 where a pixel counts, else 0. pixels: how many
-        count."""
+        """Returns dL/d(rendered), valid until the next call. mask: 1 where a pixel counts, else 0. pixels: their number."""
         rt = self.rt
         vectors = ceil_div(self.width, rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
@@ -99,7 +98,7 @@ def _blur(image: np.ndarray) -> np.ndarray:
 
 
 class TotalVariation:
-    """Computes the anisotropic total variation of volumes of a fixed ``shape`` (nz, ny, nx) with padded rows, and its
+    """Computes the anisotropic total variation of volumes of one ``shape`` (nz, ny, nx) with padded rows, and its
     gradient."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], pitch: int) -> None:
@@ -141,8 +140,7 @@ def total_variation(volume: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _axis_weights(shape: tuple[int, ...]) -> list[float]:
-    """Returns one over the number of differences along each axis (z, y, x), which turns sums into means; 0 if there are
-    none."""
+    """Returns one over the number of differences along each axis (z, y, x), to turn sums into means; 0 without any."""
     total = int(np.prod(shape))
     return [1.0 / (total // n * (n - 1)) if n > 1 else 0.0 for n in shape]
 

@@ -99,8 +99,7 @@ class DeviceAdam:
         self, raw: DeviceArray, gradients: DeviceArray, moments: DeviceArray, stride: int, rates: np.ndarray,
         step: int,
     ) -> None:
-        """Takes one step of Adam down ``gradients``, dL/d(raw). rates (11,): learning rates of the rows. step: counts from
-        1."""
+        """Takes one step of Adam down ``gradients``, dL/d(raw). rates (11,): learning rates. step: counts from 1."""
         rates16 = np.zeros(16, np.float32)
         rates16[:11] = folded_rates(rates, step)
         self.rt.launch(
@@ -163,7 +162,7 @@ def control_density(
 ) -> Population:
     """Returns the population after one round of density control: cloned, split and pruned.
 
-    statistic (G,): mean gradient norm. box (2, 3): lowest and highest corner x y z; Gaussians with centres outside are
+    statistic (G,): mean gradient norm. box (2, 3): lowest and highest corner x y z; Gaussians centred outside are
     removed."""
     rows = activation.apply(population.raw)
     room = max(control.max_gaussians - statistic.size, 0)
@@ -208,8 +207,7 @@ def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray
 
 
 def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:
-    """Draws one child (11, S) of each Gaussian (11, S): smaller, half as dense, its centre drawn from the parent's
-    distribution."""
+    """Draws one child (11, S) of each Gaussian (11, S): smaller, half as dense, its centre drawn from the parent."""
     child: np.ndarray = rows.copy()
     child[g.MEAN] += rotate(rows[g.QUATERNION], rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE])
     child[g.SCALE] /= control.split_factor

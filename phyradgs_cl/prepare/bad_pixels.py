@@ -26,7 +26,7 @@ LEAST_FRAMES = 5  # in fewer frames a sound pixel may look dead by chance
 _DEVIATIONS = 10.0
 _MOST_TIMES = 0.7  # a dead pixel is above, or below, all its neighbours in more than this fraction of the frames
 _MOST_FRAMES = 40  # dead pixels are sought in at most this many frames, evenly spread, to save time
-_STILL_SIDES = 0.5  # if more of the pixels in the two outermost columns never change, the scan has air without noise
+_STILL_SIDES = 0.5  # if more than this fraction of the two outermost columns never changes, it is air without noise
 _NEAR_AXIS = 1.5  # a small part of the object this close to the axis, in columns, stays on one pixel in all views
 _SHARED = 0.1  # a dead pixel differs alone: its neighbours show less than this fraction of the difference
 _LINE = 0.9  # a row or column with more than this fraction of dead pixels is dead as a whole
@@ -132,8 +132,8 @@ def find_dead(
     A pixel is dead if it never changes while its neighbours do. It is also dead if it is above all its neighbours, or below
     all, in 70 % of the frames. It must then differ from the median of 3 × 3 pixels by more than ``deviations`` standard
     deviations of the panel's pixels. Near ``axis_column`` small parts of the object stay on one pixel: there a dead pixel
-    must also be sharper than the optics. A row or column that differs from both neighbours over 90 % of its length is dead
-    as a whole."""
+    must also be sharper than the optics. A whole row or column is dead if it differs from both neighbours over 90 % of its
+    length."""
     if len(frames) < LEAST_FRAMES:
         return np.zeros(frames.shape[1:], bool)
     numbers = np.unique(np.linspace(0, len(frames) - 1, _MOST_FRAMES).round().astype(int))
@@ -147,7 +147,7 @@ def find_dead(
 
 def _lines(frames: np.ndarray, deviations: float) -> np.ndarray:
     """Returns whole rows and columns, bool (v, u), that lie above or below both neighbours nearly everywhere, in the median
-    over frames. Air counts too: an object may be long and thin, but not as long as the panel."""
+    over frames. Pixels of air count too: an object may be long and thin, but not as long as the panel."""
     dead = np.zeros(frames.shape[1:], bool)
     floor = 1e-3 * max(float(np.percentile(frames, 99.9)), 1e-9)
     for axis in (0, 1):
@@ -164,7 +164,7 @@ def _lines(frames: np.ndarray, deviations: float) -> np.ndarray:
 
 
 def _constant(frames: np.ndarray) -> np.ndarray:
-    """Returns the pixels, bool (v, u), that never change while their neighbours do. Air without noise is left out."""
+    """Returns the pixels, bool (v, u), that never change while their neighbours do. Air without noise does not count."""
     swing = np.ptp(frames, axis=0)
     constant = swing == 0
     sides = np.zeros_like(constant)
@@ -177,8 +177,8 @@ def _constant(frames: np.ndarray) -> np.ndarray:
 
 
 def _exceeding(frames: np.ndarray, deviations: float) -> np.ndarray:
-    """Returns the pixels, bool (v, u), far above or far below all neighbours in most frames. An object's edge moves, or
-    covers several pixels in a line."""
+    """Returns the pixels, bool (v, u), far above or far below all neighbours in most frames. An object's edge is not: it
+    moves, or covers several pixels in a line."""
     above = np.mean([f > scipy.ndimage.maximum_filter(f, footprint=_NEIGHBOURS) for f in frames], axis=0)
     below = np.mean([f < scipy.ndimage.minimum_filter(f, footprint=_NEIGHBOURS) for f in frames], axis=0)
     difference = np.median([f - scipy.ndimage.median_filter(f, size=3) for f in frames], axis=0)

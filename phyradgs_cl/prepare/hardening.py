@@ -36,7 +36,7 @@ _BONE_VOXELS = 128  # a coarse volume is enough to find bone, because its harden
 _BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in (0.4, 0.7, 1.0) if soft < bone]
 _BETWEEN += [(0.7, 1.0), (0.7, 1.5), (0.8, 1.5)]
 _AS_WELL = 0.1  # of candidates that explain at most this fraction less than the best one, the one with the least bone wins
-_NEARLY = 1.02  # bone may leave 2 % more unexplained than water, and is corrected: a stated voltage means a hardened scan
+_NEARLY = 1.02  # bone is corrected even if it leaves 2 % more unexplained than water: a stated voltage means a hardened scan
 _NEWTON = 3  # steps of Newton's method, enough for an error of 1e-12
 _UNIFORM = 0.08  # if the path leaves a larger relative RMS unexplained, the object has several materials
 _SHADOW = 0.1  # pixels whose path is longer than this fraction of the longest lie behind the object
@@ -46,10 +46,13 @@ _NONE: Polynomial = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class HardeningOptions(checks.Checked):
-    """polynomial: coefficients of p², p³ and p⁴. kvp: tube voltage in kV, which gives the spectrum; 0: not stated. With
-    neither, a polynomial is fitted for one material. bone_per_mm: attenuation in 1/mm from which a voxel is bone; 0:
-    candidates are tried. filter_mm: thickness of aluminium. anode_deg: angle of a tungsten anode, for SpekPy's spectrum; 0:
-    Kramers' law. Raises InputError for values out of range or in contradiction."""
+    """Either polynomial or kvp may be stated. With neither, a polynomial is fitted for one material.
+
+    - polynomial: coefficients of p², p³ and p⁴. kvp: tube voltage in kV, which gives the spectrum; 0: not stated.
+    - bone_per_mm: attenuation in 1/mm from which a voxel is bone; 0: candidates are tried.
+    - filter_mm: thickness of aluminium. anode_deg: angle of a tungsten anode, for SpekPy's spectrum; 0: Kramers' law.
+
+    Raises InputError for values out of range or in contradiction."""
 
     PREFIX = "hardening."
 
@@ -129,8 +132,7 @@ def _straighten_two(
     frames: np.ndarray, spectrum: Spectrum, model: Model, blur: float, water: Polynomial, bone_in: BoneIn
 ) -> tuple[np.ndarray, float]:
     """Returns line integrals (F, v, u) corrected for soft tissue and bone, and bone's fraction of the volume's attenuation.
-    Without bone they are corrected for water. blur: standard deviation in pixels by which frames are blurred for a coarse
-    model."""
+    Without bone they are corrected for water. blur: standard deviation in pixels of the frames' blur for a coarse model."""
     clean, share = straighten(frames, water), 0.0
     for _ in range(_PASSES):
         volume = model.regularised(step.smooth(clean, blur))
@@ -178,8 +180,7 @@ def _with_bone(bone: np.ndarray, frames: np.ndarray, spectrum: Spectrum, model: 
 
 
 def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> np.ndarray:
-    """Returns the soft tissue's line integrals that, behind bone of line integrals ``dense``, give the measured
-    ``frames``."""
+    """Returns the soft tissue's line integrals that, with those of bone (``dense``), give the measured ``frames``."""
     soft, small = np.asarray(frames - dense, np.float64), 1e-3
     for _ in range(_NEWTON):
         now = spectrum.hardened(soft, dense)

@@ -5,8 +5,7 @@
 - pca: each frame gets the combination of the flats' principal components that leaves the least total variation, in
   logarithms (Van Nieuwenhove et al., Opt. Express 23 (2015) 27975).
 
-The step ``air`` corrects each frame's amount of light by the pixels that no object covers, as nabu and algotom's ROI
-normalisation do."""
+The step ``air`` corrects each frame's amount of light by the pixels that no object covers, as nabu and algotom do."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -25,11 +24,11 @@ from phyradgs_cl.io import ToAttenuation, read_scan
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 WAYS = ("mean", "time", "pca")
-_MOST_COMPONENTS, _CLEAR = 4, 4.0  # most principal components; one that varies 4 times as much as the median one is no noise
+_MOST_COMPONENTS, _CLEAR = 4, 4.0  # most components used; one must vary 4 times as much as the median one, or it is noise
 _REWEIGHTINGS = 12
 _LEAST_PIXELS = 20  # with fewer pixels of air in a frame, their median is too noisy
 _AROUND = np.ones((3, 3), bool)
-_MARGIN = 2  # this near to the object, in pixels, its blurred edge is no air
+_MARGIN = 2  # pixels this near to the object are no air, because its edge is blurred
 _PASSES = 3  # bright or dim light shifts the air, so the threshold follows its median, in this many rounds
 Counts = np.ndarray
 
@@ -70,8 +69,7 @@ def _with_changing_flats(
 
 
 def _in_time(signal: np.ndarray, flats: np.ndarray, numbers: np.ndarray) -> Iterator[np.ndarray]:
-    """Yields each projection's flat (v, u), interpolated by frame number between the means of flats taken one after
-    another."""
+    """Yields each projection's flat (v, u): means of flats taken one after another, interpolated by frame number."""
     groups = np.split(np.arange(len(flats)), np.flatnonzero(np.diff(flats) > 1) + 1)
     time = np.array([flats[group].mean() for group in groups])
     means = np.stack([signal[group].mean(axis=0) for group in groups])
@@ -169,7 +167,6 @@ def enough_air(frames: np.ndarray, below: float, least: float, step: str, remedy
 
 
 def with_air_at_0(frames: np.ndarray, air: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shifts each frame of line integrals (F, v, u) so that its median over ``air`` is 0. Returns them, and the medians
-    (F,)."""
+    """Shifts each frame of line integrals (F, v, u) so that its median over ``air`` is 0. Also returns the medians (F,)."""
     value = np.array([np.median(frame[where]) for frame, where in zip(frames, air, strict=True)])
     return frames - value[:, None, None].astype(np.float32), value

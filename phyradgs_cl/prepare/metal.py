@@ -17,13 +17,12 @@ _DENSER = 6.0  # metal attenuates 6 times as much as the main material: bone has
 _FEWEST = 4  # fewer touching voxels than this are noise, not metal
 _BLIND = 2  # only masked rays pass this near to metal, in voxels, so the fill knows nothing there
 _VOXELS = 128  # the volume that fills the shadow has at most this many voxels along its longest side, to save time
-_MOST, _OBJECT = 0.5, 0.02  # most of the object that the shadow may cover; the object exceeds 0.02 of the largest value
+_MOST, _OBJECT = 0.5, 0.02  # the shadow may cover half of the object, which exceeds 0.02 of the largest value in frames
 
 
 @dataclass(frozen=True)
 class MetalOptions(checks.Checked):
-    """above_per_mm: attenuation in 1/mm, in a first volume, from which a voxel is metal. 0: six times the main
-    material's."""
+    """above_per_mm: attenuation in 1/mm in a first volume from which voxels are metal. 0: six times the main material's."""
 
     PREFIX = "metal."
 
@@ -71,8 +70,8 @@ def _completed(masked: Scan, shadow: np.ndarray, is_metal: np.ndarray, make_mode
 
 
 def _main_level(volume: np.ndarray) -> float:
-    """Returns the attenuation of the main material in a volume (z, y, x): half of the total attenuation lies in denser
-    voxels. Infinity for an empty volume."""
+    """Returns the attenuation of the main material in a volume (z, y, x): that above which half of the total attenuation
+    lies. Infinity for an empty volume."""
     rising = np.sort(volume[volume > 0])
     if rising.size == 0:
         return float("inf")

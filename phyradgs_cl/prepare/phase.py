@@ -1,8 +1,8 @@
 """Retrieves phase from one distance: removes the bright and dark edges that free propagation adds to line integrals.
 
-Paganin, Mayo, Gureyev, Miller and Wilkins, J. Microsc. 206 (2002) 33. The object has one material, of refractive index
-1 − δ + iβ, and thickness T. The transport-of-intensity equation gives the transmission exp(−p) at the panel as
-(1 − d δ/μ ∇²) exp(−μT), with μ = 4πβ/λ. The inverse divides by 1 + π λ d (δ/β) f² at the frequency f, in 1/mm.
+Paganin, Mayo, Gureyev, Miller and Wilkins, J. Microsc. 206 (2002) 33. The object has one material (refractive index 1 − δ +
+iβ) of thickness T. At the distance d and the wavelength λ, the transport-of-intensity equation gives the transmission
+exp(−p) as (1 − d δ/μ ∇²) exp(−μT), with μ = 4πβ/λ. The inverse divides by 1 + π λ d (δ/β) f² at the frequency f, in 1/mm.
 
 The filter is linear in intensity, so it holds for the average over an exposure. A rolling shutter reads later rows when the
 object has turned further. This is ignored: the filter mixes rows only a few pixels apart."""
@@ -68,8 +68,7 @@ def retrieve_phase(
 
     pixel_mm (v, u), distance_mm: for a parallel beam. A cone beam with the magnification M has pixels of pitch/M and the
     distance R₁R₂/(R₁ + R₂), from source to object R₁ and from object to panel R₂. delta_beta: δ/β of the material. If it or
-    the distance is 0, the frames themselves are returned. Beyond the panel, frames continue with the values at their
-    edges."""
+    the distance is 0, the frames themselves are returned. Beyond the panel, frames continue with their edges' values."""
     reach_mm = filter_reach_mm(distance_mm, energy_kev, delta_beta)
     if reach_mm == 0:
         return frames
@@ -89,7 +88,8 @@ def retrieve_phase(
 
 
 def filter_reach_mm(distance_mm: float, energy_kev: float, delta_beta: float) -> float:
-    """Returns the length in mm, in the object's plane, over which the filter's kernel falls to 1/e: √(λ d (δ/β) / 4π)."""
+    """Returns the length in mm, in the object's plane, over which the filter's kernel falls to 1/e: √(λ d (δ/β) / 4π), with
+    the wavelength λ and the distance d."""
     return math.sqrt(WAVELENGTH_MM_KEV / energy_kev * distance_mm * delta_beta / (4 * math.pi))
 
 

@@ -25,7 +25,7 @@ from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 _LEAST_FRAMES = 8  # fewer views do not average the object enough to show rings: such scans stay as they are
 _LEAST_PAIRS = 0.25  # columns are compared with their mirror images if at least this fraction of them has one on the panel
-_LEAST_SHARE = 0.25  # a pattern that varies less, relative to the noise of the mean, is not worth a correction
+_LEAST_SHARE = 0.25  # a pattern with less than this fraction of the variance of the mean's noise is not worth a correction
 _NEGLIGIBLE = 1e-4  # nobody sees a pattern with a smaller standard deviation in line integrals: gains off by 0.01 %
 _SURE = 12.0  # a pattern is certain if its variance over the noise's exceeds this many standard errors, about 1/√pixels
 _THRESHOLD = 3.5  # coefficients above this many standard deviations of the pattern belong to the object
@@ -70,7 +70,8 @@ def _strength(means: np.ndarray, axis_column: float) -> Strength:
     Subtracting its mirror image from each column cancels the object, and second differences along rows remove what is left
     of it. The covariance of both sets is the pattern's variance."""
     one, other = (_rough(_antisymmetric(mean, axis_column)) for mean in means)
-    # the mean of half the views has twice the noise variance of the mean of all; the difference of two halves, four times
+    # a mean over half the views has twice the noise variance of that over all, and the difference of two such means four
+    # times
     noise, rows = robust_deviation(one - other) ** 2 / 4, len(one) // 2
     least = noise * max(_LEAST_SHARE, _SURE / np.sqrt(one.size))
     pattern = _covariance(one, other)
@@ -131,13 +132,13 @@ def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: f
     parts = [(mean + mean[:, mirrored]) / 2, (mean - mean[:, mirrored]) / 2] if whole else [mean]
     variances = np.array([strength.pattern - strength.column, strength.column]) / len(parts)
     rough = sum(part - _denoised(part, variances, window) for part in parts)
-    # Denoising removes the pattern together with the noise of the mean: this fraction of both is the pattern.
+    # Denoising removes the pattern together with the noise of the mean: only this fraction of the sum is the pattern.
     return np.asarray(rough * strength.pattern / (strength.pattern + strength.noise), np.float32)
 
 
 def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarray:
     """Denoises an image (v, u): thresholds the coefficients of overlapping cosine blocks, then guides a Wiener filter by the
-    result. variances: of each pixel's own noise, and of the noise that a column shares."""
+    result. variances (2,): that of each pixel's own noise, and that of the noise that a whole column shares."""
     sigma = np.full((window, window), variances[0])
     # an error that a column shares is constant along it, so only the first row of coefficients has it
     sigma[0] += window * variances[1]
@@ -234,8 +235,8 @@ class SingleGains:
 def find_single_gains(
     means: np.ndarray, mirrored: np.ndarray, usable: np.ndarray, full_turn: bool
 ) -> SingleGains:
-    """Finds single wrong gains in the means (2, v, u) of two sets of views. mirrored: from ``mirror_columns``; columns
-    without a mirror image are left alone. usable: bool (v, u), False for masked pixels."""
+    """Finds single wrong gains in the means (2, v, u) of two sets of views. mirrored: the columns' mirror images, from
+    ``mirror_columns``; columns without a mirror image are left alone. usable: bool (v, u), False for masked pixels."""
     offset = np.zeros(usable.shape, np.float32)
     if len(mirrored) < _NEAR:
         return SingleGains(offset)

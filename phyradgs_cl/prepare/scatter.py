@@ -3,8 +3,8 @@
 Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563. The square lets thick rays scatter differently from thin
 ones, for which Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) take several kernels. The user states the width and the
 ratio of scatter to primary light. Otherwise a non-negative sum of Gaussians is fitted to the light in air beyond that of the
-flats, while each frame's light may vary. This may underestimate scatter behind the object. So the kernel is made stronger as
-long as the corrected frames agree about as well with their own reprojection."""
+flats, while each frame's light may vary. This may underestimate scatter behind the object. So stronger kernels are tried
+too. One is taken if the frames that it corrects agree far better with their own reprojection."""
 
 import itertools
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ Kernel = Mapping[tuple[float, int], float]
 _POWERS = (1, 2)  # powers of a ray's line integral to which scatter is fitted: the square tells thick rays from thin ones
 # Standard deviations of the fitted Gaussians over the panel's longer side. Narrower ones would fit columns of wrong gain.
 _REACHES = (0.12, 0.18, 0.27, 0.4)
-_PASSES = 6  # rounds of: scatter from the primary light, primary light from the scatter
+_PASSES = 6  # rounds that compute scatter from the primary light, then primary light from the scatter
 _LEAST_PRIMARY = 0.05  # an overestimate of scatter leaves at least this fraction of the light: the logarithm stays finite
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
 _FITTED_FRAMES = 24  # the fit uses at most this many frames, evenly spread, to save time
@@ -123,8 +123,7 @@ def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, bl
 
 
 def _height_for(frames: np.ndarray, to_primary: float, reach: float) -> float:
-    """Returns the kernel's strength that gives the ratio ``to_primary``. The ratio grows with the strength: bisection finds
-    it."""
+    """Returns the kernel's strength that gives the ratio ``to_primary``, by bisection: the ratio grows with the strength."""
     some = frames[_some(len(frames))]
     low, high = 0.0, _LARGEST_HEIGHT
     for _ in range(_BISECTIONS):

@@ -1,5 +1,4 @@
-"""What preparation steps share: their type, interpolation of masked pixels, and whether a scan agrees with its
-reprojection."""
+"""What preparation steps share: their type, interpolation of masked pixels, comparison of a scan with its reprojection."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -93,8 +92,7 @@ def object_in(volume: np.ndarray) -> np.ndarray:
 
 
 def densest(volume: np.ndarray) -> float:
-    """Returns the 99.9th percentile of a volume (z, y, x) in its middle: near the ends a cone beam does not see all of
-    it."""
+    """Returns the 99.9th percentile of a volume (z, y, x) in its middle: a cone beam does not see all of its ends."""
     z, y, x = (np.abs(np.arange(n) - (n - 1) / 2) / max(n / 2, 1) for n in volume.shape)
     middle = (z[:, None, None] <= 0.6) & (y[None, :, None] ** 2 + x[None, None, :] ** 2 <= 0.9)
     return float(np.percentile(volume[middle], 99.9))

@@ -26,7 +26,7 @@ _LEAST = 2e-3  # a stripe that deviates less, by a gain that is 0.2 % off, is le
 _NEAR = 5  # each side of a column is represented by the median of this many columns
 _FLUCTUATING = 3.0  # a column fluctuates if it changes this many times as much between views as the columns at both sides
 _UNRESPONSIVE = 10.0  # a column does not respond if it varies this many times less than the columns at both sides
-_MIRRORED = 2.0  # an edge shows in the mirror image too: a stripe deviates this many times as much as that
+_MIRRORED = 2.0  # an edge shows in the mirror image too: a stripe deviates this many times as much as its image
 _SMALLEST = 1e-6  # least spread in line integrals, to divide by: that of a stuck pixel is 0
 
 

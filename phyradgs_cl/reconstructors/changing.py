@@ -31,12 +31,13 @@ class ChangingOptions(IterativeOptions):
     """Options of ``changing``.
 
     - states: number of the object's states, each with as many frames; fewer if the scan has fewer frames.
-    - prior_weight: weight of total variation in space, relative to the error of the gradient as in ``fista``.
+    - prior_weight: weight of total variation in space, relative to the error of the data term's gradient.
     - time_weight: weight of a voxel's change from one state to the next, relative to an equal step between two voxels.
-    - subsets: as in ``fista``, but at most two for each frame of a state. tv_iterations: as in ``fista``."""
+    - subsets: of the frames, with one step each; at most two for each frame of a state. tv_iterations: dual iterations per
+      proximal map."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 8)
-    """Iterations of the two short runs that ``estimate`` times: the first passes, which touch new memory, are slower."""
+    """Iterations of the two short runs that ``estimate`` times. Both begin with the slower first pass."""
 
     motion: Motion = PerRow()
     iterations: int = 40
@@ -48,7 +49,7 @@ class ChangingOptions(IterativeOptions):
 
 
 def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the states of the object in 1/mm, and their mean as the volume. ``arguments``: as in ``MethodRun``; no seed is
+    """Returns the object's states in 1/mm, and as the volume their mean. ``arguments``: as in ``MethodRun``; no seed is
     used."""
     times_s = state_times_s(scan, options.states)
     shape = (len(times_s), *scan.grid.shape)

@@ -44,7 +44,7 @@ def without_identity(
 
 
 def _checksum(arrays: State) -> int:
-    """Returns the CRC-32 of all arrays with their names, types and shapes, which say what a device would read."""
+    """Returns the CRC-32 of all arrays with their names, types and shapes, which decide how the bytes are read."""
     total = 0
     for name in sorted(arrays):
         array = arrays[name]

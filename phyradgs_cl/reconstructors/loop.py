@@ -16,7 +16,7 @@ from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport
 from phyradgs_cl.signals import stop_on_interrupt
 
-SILENT_S = 10.0  # a run of slow iterations reports at least this often
+SILENT_S = 10.0  # a run of slow iterations reports at least once in this many seconds
 
 
 class Stepwise(Protocol):
@@ -59,8 +59,8 @@ class Loop:
     """Runs a method to its end, an interruption, or its own reason to stop, and records its convergence.
 
     stopped_by: ``iterations``, ``interrupt``, or the method's reason. record_every, report_every: iterations between lines
-    of the record, and between reports, which come sooner for slow iterations. started: the ``time.perf_counter`` from which
-    seconds count."""
+    of the record, and between reports, which come sooner if iterations are slow. started: the ``time.perf_counter`` from
+    which seconds count."""
 
     def __init__(
         self, method: Stepwise, ranks: Communicator, report: ProgressReport, started: float,
@@ -111,7 +111,7 @@ class Loop:
     def _tell(self, before: int) -> bool:
         """Records and reports the step that began at iteration ``before``. Returns True if the report asks to stop."""
         is_recorded = self._reaches(self.record_every, before)
-        is_slow = time.perf_counter() - self._reported > SILENT_S and self.ranks.size == 1  # clocks of ranks differ
+        is_slow = time.perf_counter() - self._reported > SILENT_S and self.ranks.size == 1  # ranks have different clocks
         is_reported = self._reaches(self.report_every, before) or (is_slow and self.method.iteration > before)
         if not (is_recorded or is_reported):
             return False
@@ -136,7 +136,6 @@ class Loop:
         return False
 
     def _reaches(self, every: int, before: int) -> bool:
-        """Returns whether a step that began at iteration ``before`` reached a multiple of ``every``, or the last
-        iteration."""
+        """Returns whether a step from iteration ``before`` on reached a multiple of ``every``, or the last iteration."""
         now = self.method.iteration
         return now // every > before // every or now == self.method.iterations

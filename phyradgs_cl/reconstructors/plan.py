@@ -22,15 +22,15 @@ from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.text import flag_of, suggest_name
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
-"""Fields of motion models, such as the number of times per line, which are options of their names."""
+"""Fields of motion models, such as the number of times per line, which are also options, under the same names."""
 _ALL = motions_for(RAYS, SPLATS)  # a user's own method may take any motion model
 LARGEST_SEED = 2**63
 _DECIMALS = 6  # decimals of mm and s in a run's identity: a scan that was stored and read is still the same scan
 _SUBJECT = "--object-motion"
 _MOST_VOXELS = 24  # deformations are smooth, so a grid of this many voxels a side is enough to check one
-_LEAST_DETERMINANT = 0.05  # a deformation with a smaller det(I + ∂w/∂y) is refused: at 0 matter folds
+_LEAST_DETERMINANT = 0.05  # a deformation w(y) with a smaller det(I + ∂w/∂y) is refused: at 0 matter folds
 _LEAST_COVERED = 0.5  # a deformation that covers less than this fraction of the scan's time is refused
-_MOSTLY_COVERED = 0.98  # a deformation that covers less than this fraction causes a warning
+_MOSTLY_COVERED = 0.98  # a deformation that covers less than this fraction of the scan's time causes a warning
 log = logging.getLogger(__name__)
 
 
@@ -70,8 +70,8 @@ def preprocessing_of(changes: Mapping[str, Any]) -> Preprocessing:
 
 
 def _models(options: Any) -> dict[str, Any]:
-    """Returns the motion models that a method's options allow, by name. The preset's own model keeps its numbers of strips
-    and times."""
+    """Returns by name the motion models that a method's options allow. The preset's own keeps its numbers of strips and
+    times."""
     own = [options.motion] if hasattr(options.motion, "name") else []
     return {model.name: model for model in (*getattr(options, "MOTIONS", _ALL), *own)}
 
@@ -147,9 +147,8 @@ def _having(option: str) -> str:
 
 
 def _converted(current: Any, value: Any, subject: str) -> Any:
-    """Returns ``value`` in the type of ``current``: number, word, tuple or nested table; unchanged if ``current`` is
-    None."""
-    if current is None:  # the options check it themselves
+    """Returns ``value`` in the type of ``current``: number, word, tuple or nested table. None leaves it unchanged."""
+    if current is None:  # its type is not known: the options check the value themselves
         return value.item() if isinstance(value, np.generic) else value
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
@@ -202,8 +201,10 @@ class ObjectMotion:
 @dataclass(frozen=True, eq=False)
 class RunPlan:
     """What to run on a scan. method: a name as ``method_name`` returns it, or the user's own function. options: of the
-    method, checked. preprocessing: changes of the frames before the method. Raises InputError for a seed out of range, an
-    object that moves with a method for objects at rest, and error bars of runs that cannot differ."""
+    method, checked. preprocessing: changes of the frames before the method.
+
+    Raises InputError for a seed out of range, an object that moves with a method for objects at rest, and error bars of runs
+    that cannot differ."""
 
     method: "str | Callable[..., Any]"
     options: Any

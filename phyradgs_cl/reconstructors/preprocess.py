@@ -26,9 +26,12 @@ _DOUBT = "Run twice more, for an error bar of every voxel: dataset doubt of the 
 
 @dataclass(frozen=True)
 class Preprocessing(PrepareOptions, GridChoice):
-    """size, voxel_mm, roi_mm, margin_mm: the grid, as in ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
-    holdout: percentage of the pixels that the method does not use, to measure its error on them. doubt: run the method on
-    two synthesised scans too, for error bars of voxels. steps, and a table for each: as in ``PrepareOptions``."""
+    """What happens to a scan before the method.
+
+    - size, voxel_mm, roi_mm, margin_mm: the grid, as in ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
+    - holdout: percentage of the pixels that the method does not use, to measure its error on them.
+    - doubt: run the method on two synthesised scans too, for error bars of voxels.
+    - steps, and a table for each: as in ``PrepareOptions``."""
 
     ignore_lag: bool = False
     holdout: float = checks.option(0.0, _HOLDOUT, "0", metavar="PERCENT", range=(0, MOST_HELD_OUT), of_method=True)
@@ -95,7 +98,7 @@ def reprojection(rt: Runtime | None, scan: Scan) -> Model:
         moving = with_times(PerRow(), scan)
         cells = [moving.cells(scan, frame) for frame in range(scan.frames)]
         whole = RayOperator(rt, scan.grid, scan.geometry.detector_shape, cells, subrays=subrays_of(scan.grid, cells))
-        near = scipy.ndimage.binary_dilation(inside)  # for rays that meet a voxel's edge, or meet it between two times
+        near = scipy.ndimage.binary_dilation(inside)  # adds rays that meet a voxel's edge, or meet it between two times
         return whole.forward(near.astype(np.float32)) > 0
 
     return Model(

@@ -26,8 +26,7 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """A measured frame and the same frame computed from a volume, in line integrals (rows, columns), 0 where ``valid`` is
-    False."""
+    """A measured frame and the same frame computed from a volume: line integrals (rows, columns), 0 where not ``valid``."""
 
     frame: int
     measured: Image

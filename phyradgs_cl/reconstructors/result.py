@@ -41,10 +41,13 @@ DOUBT = "doubt"
 class Reconstruction:
     """A volume (nz, ny, nx) float32 in 1/mm on ``grid``, whose lengths are in mm.
 
-    gaussians: the cloud in mm, for methods that have one. record: the convergence record, one dict per line. facts: what is
-    needed to make it again (method, options, scales, seconds). state: from where an interrupted run resumes. deformation:
-    how the object moves, for ``moving``, whose volume is its reference state. states: the object at some times, for
-    ``changing``, whose volume is their mean. doubt: σ (nz, ny, nx) in 1/mm of its errors (docs/methods.md#error-bars).
+    - gaussians: the cloud in mm, for methods that have one. record: the convergence record, one dict per line.
+    - facts: what is needed to make it again (method, options, scales, seconds).
+    - state: from where an interrupted run resumes.
+    - deformation: how the object moves, for ``moving``, whose volume is its reference state.
+    - states: the object at some times, for ``changing``, whose volume is their mean.
+    - doubt: σ (nz, ny, nx) in 1/mm of the volume's errors (docs/methods.md#error-bars).
+
     Raises InputError for arrays that do not fit the grid."""
 
     volume: np.ndarray
@@ -91,15 +94,13 @@ class Reconstruction:
         return f", stopped after {done} of {asked} iterations ({reason})"
 
     def complete(self) -> "Reconstruction":
-        """Returns the result. Raises KeyboardInterrupt if the run was interrupted: nobody shall take a part for the
-        whole."""
+        """Returns the result. Raises KeyboardInterrupt if the run was interrupted, so that no part passes for the whole."""
         if self.facts.get("interrupted_at") is not None:
             raise KeyboardInterrupt
         return self
 
     def within(self, grid: Grid) -> "Reconstruction":
-        """Returns the part of the result on ``grid``, with all Gaussians, or the result itself if ``grid`` reaches beyond
-        it."""
+        """Returns the part of the result on ``grid``, with all Gaussians; the result itself if ``grid`` reaches beyond."""
         if (part := grid.slices_in(self.grid)) is None:
             return self
         of_all = slice(None), *part
@@ -118,11 +119,12 @@ class Reconstruction:
     ) -> "Reconstruction":
         """Returns the result, still in 1/mm, with a scale of Hounsfield units fitted to two points.
 
-        air, water: boxes (z0, z1, y0, y1, x0, x1) in mm, whose mean counts; None: the volume's own peak, the lowest and the
-        largest above it. insert_hu: the HU of the second point, if it is not water. ``result.scale.line`` says what was
-        fitted, ``result.scale.of(result.volume)`` is the volume (nz, ny, nx) in HU. ``save_volume`` keeps the scale.
+        air, water: boxes (z0, z1, y0, y1, x0, x1) in mm, whose mean counts; None: a peak of the volume's histogram, the
+        lowest for air, the largest above that for water. insert_hu: the HU of the second point, if it is not water.
+        ``result.scale.line`` says what was fitted, ``result.scale.of(result.volume)`` is the volume in HU. ``save_volume``
+        keeps it.
 
-        Raises InputError for less than 100 voxels, air that is not below water, and peaks that are not theirs."""
+        Raises InputError for less than 100 voxels, air that is not below water, and peaks that cannot be air and water."""
         scale = fitted(self.volume, self.grid, air, water, insert_hu)
         return replace(self, facts={**self.facts, **scale.facts()})
 
@@ -175,11 +177,14 @@ def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
 class Progress:
     """One report of a running method: ``iteration`` of ``iterations`` is finished, after ``seconds`` in s.
 
-    loss: the dimensionless measure that ``quantity`` names. gaussians: their number, or 0. Three functions may be called
-    during the report only. state returns the state from which the run can resume. volume returns the present volume (nz, ny,
-    nx) in 1/mm and its grid. frames returns so many measured frames, spread evenly, with those computed from the present
-    volume. deformation: how the object moves, once the method has found it. states: returns the object at some times, if the
-    method has them. A report that raises KeyboardInterrupt ends the run as Ctrl-C does."""
+    - loss: the dimensionless measure that ``quantity`` names. gaussians: their number, or 0.
+    - state returns the state from which the run can resume. volume returns the present volume (nz, ny, nx) in 1/mm and its
+      grid. frames returns a given number of measured frames, spread evenly, with those computed from the present volume.
+      These three may be called during the report only.
+    - deformation: how the object moves, once the method has found it. states: returns the object at some times, if the
+      method has them.
+
+    A report that raises KeyboardInterrupt ends the run as Ctrl-C does."""
 
     iteration: int
     iterations: int
@@ -196,7 +201,7 @@ class Progress:
     def mapped(
         self, state: "Callable[[State], State] | None" = None, volume: "VolumeMap | None" = None, **changes: Any
     ) -> "Progress":
-        """Returns the report with other fields. ``state`` and ``volume`` change what the run gives, if it gives any."""
+        """Returns the report with other fields. ``state`` and ``volume`` map what its functions of these names return."""
         own_state, own_volume = self.state, self.volume
         if state is not None and own_state is not None:
             changes["state"] = lambda: state(own_state())

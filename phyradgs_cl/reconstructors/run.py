@@ -246,7 +246,7 @@ def _size_that_fits(rt: Runtime, scan: Scan, method: str, options: Any) -> int:
     if held is not None:
         free = min(free, _DEVICE_SHARE * rt.ledger.limit_bytes)
         if hasattr(options, "prior"):
-            from phyradgs_cl.reconstructors.voxels.priors import volumes_of  # loads SciPy
+            from phyradgs_cl.reconstructors.voxels.priors import volumes_of  # here, because it loads SciPy
 
             held += volumes_of(options.prior)
         voxels = (free - _STACKS * scan.projections.nbytes) / (4 * held)

@@ -54,8 +54,8 @@ class SimulationOptions:
     - time_samples: at how many times a line's exposure is sampled, in the middles of equal parts. 0: between two times, the
       volume's edge and a moving object move at most half a voxel of ``grid`` (docs/mathematics.md).
     - dose: photons of a pixel without object, on a line that sees the whole pulse.
-    - lag (λ), rings, sparks, drift, scatter: as in detector/effects.py; 0 is without.
-    - kvp: as in detector/attenuation.py; 0 is a beam of one energy.
+    - lag (λ), rings, sparks, drift, scatter: effects of panel and tube (detector/effects.py); 0 is without.
+    - kvp: tube voltage in kV, of a beam that hardens; 0 is a beam of one energy.
     - motion_of_object: how the object moves during the scan. None: it rests."""
 
     protocol: Protocol = Protocol()
@@ -121,7 +121,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
     order = readout_order(given.get("first"), given.get("readout_axis"), given.get("readout_direction"), _flag)
     keys = ("readout_axis", "readout_direction", "lag", "readout_ratio", "pulse", "fps", "readout_ms")
     of_scanner = {key: getattr(scanner, key) for key in keys}
-    if "readout_ratio" in given or "readout_ms" in given:  # both state the readout time: the scanner's is then void
+    if "readout_ratio" in given or "readout_ms" in given:  # each states the readout time, in place of the scanner's
         del of_scanner["readout_ratio"], of_scanner["readout_ms"]
     values = {**of_scanner, **given}
     values.update({key: value for key, value in zip(keys, order, strict=False) if value is not None})
@@ -134,7 +134,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
     timing = {key: values.pop(key) for key in _TIMING if key in values}
     sheet = {key: values.pop(key, None) for key in _DATA_SHEET}
     timed = make_protocol(protocol, **timing)
-    if given.get("jitter_deg") and not timed.is_fly:  # a gantry that stops rests at exact angles
+    if given.get("jitter_deg") and not timed.is_fly:  # a gantry that stops does not wander
         found, remedy = f"{given['jitter_deg']} with --protocol {protocol}", "leave it out, or choose a fly-scan"
         raise InputError("--jitter-deg", found, "0", remedy)
     unused = [name for name in ("dose", "electronic_noise") if name in given and given.get("noise", "none") == "none"]
@@ -191,7 +191,7 @@ def simulated_scan(
         scan.provenance["motion_of_object"] = asdict(motion)
         times_s = motion.state_times_s(*window_s)
     else:
-        # The times are eighths of the cycle in the middle of the scan.
+        # The true volumes are stored at eighths of the cycle in the middle of the scan.
         period_s = scene.period_s or 1.0
         times_s = (np.floor(sum(window_s) / 2 / period_s) + np.arange(_STATES) / _STATES) * period_s
     volumes = np.stack([scene.state(time_s) for time_s in times_s])
@@ -206,8 +206,8 @@ def simulate(
 ) -> Scan:
     """Returns a scan of the object that ``source`` projects, with noise.
 
-    reference (nz, ny, nx): the truth in 1/mm, which ``peak`` scales too. bone: projects the object's bone alone, for a beam
-    of many energies."""
+    reference (nz, ny, nx): the truth in 1/mm, which ``peak`` scales too. bone: projects the bone alone, for a beam of many
+    energies."""
     if options.kvp and bone is None:
         expected = "an object of voxels, whose dense ones are bone: foot, jaw or a volume"
         raise InputError("--kvp", "a phantom in closed form", expected, "leave it out")
@@ -263,8 +263,7 @@ def simulate(
 
 
 def _gating(scan: Scan, scene: Scene) -> Gating:
-    """Returns the state of the motion in the middle of every frame: the first field's weight, or the phase without
-    fields."""
+    """Returns the motion's state in the middle of every frame: the first field's weight, or the phase without fields."""
     middle_s = np.asarray(scan.frame_start_s) + scan.shutter.span_s / 2
     if scene.deformation is not None:
         return Gating(middle_s, scene.deformation.weights_at(middle_s)[:, 0])

@@ -17,7 +17,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.sources import AnalyticSource, DeformedSource, FrameSource, VolumeSource, on_panel
 
 _DENSE = 0.5  # in a beam of many energies, voxels above this fraction of the largest attenuation may be bone
-# Bone begins at an attenuation that few voxels have, relative to the commonest one: a threshold must not cut a material.
+# Bone begins at an attenuation with fewer voxels than this fraction of the commonest one's: there no material is cut.
 _RARE = 0.2
 log = logging.getLogger(__name__)
 Moves = Callable[[Grid], Deformation]
@@ -164,7 +164,7 @@ def block_mean(volume: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """Returns means, float32, of a volume (z, y, x) over the voxels of a coarser grid of ``shape`` in the same box."""
     if volume.shape == tuple(shape):
         return volume.astype(np.float32)
-    from skimage.transform import resize_local_mean  # imported here because it is slow
+    from skimage.transform import resize_local_mean  # imported here because the import is slow
 
     mean = resize_local_mean(volume.astype(np.float32), shape, grid_mode=True, preserve_range=True)
     return mean.astype(np.float32)

@@ -200,7 +200,7 @@ class _Average:
         if self._is_log:
             self._sum = weight * frame + (0.0 if self._sum is None else self._sum)
             return
-        with np.errstate(divide="ignore"):  # a line that these cells do not serve has the weight 0
+        with np.errstate(divide="ignore"):  # lines that these cells do not serve have the weight 0, and its logarithm is −∞
             log_part = np.log(weight) - frame
         self._sum = log_part if self._sum is None else np.logaddexp(self._sum, log_part)
 

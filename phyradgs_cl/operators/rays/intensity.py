@@ -119,7 +119,7 @@ class IntensityOperator:
     def _shares_for(self, like: Array) -> list[Any]:
         """Returns the softmax weights of each layer, on the device if ``like`` is there, else on the host."""
         is_there = isinstance(like, DeviceArray)
-        # they are on the other side, host or device
+        # if they lie on the host and the device asks for them, or the reverse, they are copied
         if self._shares and isinstance(self._shares[0], DeviceArray) != is_there:
             brought = self._device.array if is_there else self._device.numpy
             self._shares = [brought(share) for share in self._shares]

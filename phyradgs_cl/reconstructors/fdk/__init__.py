@@ -100,8 +100,8 @@ def fdk(
 
     ``seed`` is part of the common signature and not used.
 
-    Logs a warning for incomplete turns, and for an orbit that is not a circle about z. Raises InputError for the other beam,
-    for an orbit far from a circle, and for parallel rays that are not at right angles to the axis."""
+    Logs a warning for incomplete turns, and for an orbit that is not a circle about z. Raises InputError for the other
+    method's beam, for an orbit far from a circle, and for parallel rays that are not at right angles to the axis."""
     started, method = time.perf_counter(), "fbp" if isinstance(options, FbpOptions) else "fdk"
     if deformation is not None and options.extrapolate == "reprojected":
         expected, remedy = "another way of rows beyond the panel", "leave extrapolate out"
@@ -149,8 +149,9 @@ def fdk_volume(
 
     pose: (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns) and short
     scans are recognised and weighted. whole: reconstructs the complete object (nz, ny, nx) in 1/mm on ``grid``, for
-    extrapolate ``reprojected``. circle, for parallel beams: as in ``FbpOptions``. moving: backprojects an object that moves.
-    Logs a warning where data are missing. Raises InputError for a source on the rotation axis."""
+    extrapolate ``reprojected``. circle, for parallel beams: sets voxels outside of the circle that the panel reaches to 0.
+    moving: backprojects an object that moves. Logs a warning where data are missing. Raises InputError for a source on the
+    rotation axis."""
     by_pixel, canonical, fan, arc = _seen(pose, frames, axis, is_parallel)
     if extrapolate != "none" and fan.is_put_aside:
         log.warning("%s: the rows of a displaced detector are not extrapolated", "FBP" if is_parallel else "FDK")
@@ -194,7 +195,7 @@ def fdk_volume(
 def _seen(
     pose: np.ndarray, frames: np.ndarray, axis: str, is_parallel: bool
 ) -> tuple[np.ndarray, np.ndarray, weights.Fan, Arc]:
-    """Returns the poses in a form that broadcasts to pixels, these rotated back to one angle, their fan, and the arc of all
+    """Returns the poses as ``pose_of_pixels`` does, the same poses rotated back to one angle, their fan, and the arc of all
     views. Raises InputError for a source on the rotation axis."""
     by_pixel = pose_of_pixels(pose, axis)
     if np.any(np.hypot(by_pixel[..., 0], by_pixel[..., 1]) <= 0):
@@ -228,7 +229,7 @@ def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], w
 def ramp_spectrum(length: int, window: str = "ram-lak") -> np.ndarray:
     """Returns the filter's real spectrum (length // 2 + 1,) for a pixel pitch of 1 and a period of ``length`` samples.
 
-    It comes from the space-domain kernel: |frequency|, sampled, would add a wrong constant to every row."""
+    It comes from the space-domain kernel: sampling |frequency| instead would add a wrong constant to every row."""
     # distance from sample 0, counted around the period: its second half stands for negative distances
     n = np.minimum(np.arange(length), length - np.arange(length))
     kernel = np.where(n % 2 == 1, -1.0 / (np.pi * np.maximum(n, 1)) ** 2, 0.0)

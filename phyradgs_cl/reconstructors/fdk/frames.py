@@ -33,16 +33,15 @@ from phyradgs_cl.runtime import Runtime
 
 WAYS = ("none", "cosine", "cylinder", "reprojected")
 _SHARE = 0.5  # "cosine" and "cylinder" extend rows at each side by this fraction of the panel's columns
-_SLOPE_PIXELS = 5  # the slope at a row's end is taken over this many pixels, against noise
+_SLOPE_PIXELS = 5  # the slope at a row's end is taken over this many pixels, to lower its noise
 _NOISE = 0.01  # below this fraction of the line integrals' 99.9th percentile, the end of a row is air
 _UNEVEN = 0.02  # steps between views may differ by this fraction from the median step and still count as even
 _REACH = 8  # the first and last view of an arc are repeated over this many arcs of an exposure, so that no edge is filtered
-_FULL_TURN = 1.5  # a gap of more median steps between views means less than a full turn
+_FULL_TURN = 1.5  # if a gap between views is wider than this many median steps, they cover less than a full turn
 
 
 def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
-    """Continues line integrals ``frames`` (F, v, u) beyond both sides as ``way`` says. Returns (F, v, u + 2 n) float32, and
-    n."""
+    """Continues line integrals (F, v, u) beyond both sides by the ``way`` named. Returns (F, v, u + 2 n) float32, and n."""
     count = max(1, round(_SHARE * frames.shape[2]))
     beyond = np.arange(1, count + 1)
     least = _NOISE * float(np.percentile(frames, 99.9))
@@ -72,7 +71,7 @@ def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: 
 
 
 def _curvature(frames: np.ndarray) -> np.ndarray:
-    """Returns the curvature (F, v, 1), positive downwards, of the parabola through a row's squares: its median over
+    """Returns the curvature (F, v, 1), positive downwards, of the parabola through a row's squares; the median over
     frames."""
     u = np.linspace(-1, 1, frames.shape[2])
     basis = np.stack([np.ones_like(u), u, u**2], axis=1)
@@ -135,7 +134,7 @@ def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: boo
         ahead = ((first - corners) * normal).sum(-1) / (source * normal).sum(-1)
         hit = corners + ahead[..., None] * source - first
     else:
-        depth = ((corners - source) * normal).sum(-1) / ((first - source) * normal).sum(-1)  # 1 on the panel
+        depth = ((corners - source) * normal).sum(-1) / ((first - source) * normal).sum(-1)  # the panel has a depth of 1
         hit = (corners - source) / np.maximum(depth, 1e-6)[..., None] - (first - source)
     across = np.cross(step_v, normal)
     column = (hit * across).sum(-1) / (step_u * across).sum(-1)
@@ -145,7 +144,7 @@ def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: boo
 
 def deblurred(scan: Scan, frames: np.ndarray, angle_rad: np.ndarray, noise: float) -> np.ndarray:
     """Returns frames (F, rows, columns) float32 without motion blur along the angle, as if the gantry stopped for each view.
-    angle_rad (F,): gantry angles at the frames' middles. noise: λ above.
+    angle_rad (F,): gantry angles at the frames' middles. noise: the power of noise over that of the signal.
 
     Raises InputError where views are not evenly spaced in angle; their order does not matter."""
     arc_rad = exposure_arc_rad(scan)

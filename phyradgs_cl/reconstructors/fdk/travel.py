@@ -16,7 +16,8 @@ from phyradgs_cl.reconstructors.fdk.views import pose_of_pixels, view_angles
 
 log = logging.getLogger(__name__)
 
-# An orbit travels along z if it moves by more than this fraction of the panel's height: less matters at the ends only.
+# An orbit travels along z if the origin's image moves by more than this fraction of the panel's height.
+# Less travel matters at the volume's ends only.
 _TRAVEL = 0.05
 _CLASS_RAD = np.deg2rad(15)  # width of a class of ray directions about z, unless views are few
 _VIEWS_A_CLASS = 2.0  # each class needs this many views of one turn: with fewer views, classes are wider
@@ -122,8 +123,7 @@ def _warn_if_few_views(views_a_turn: float, name: str) -> None:
 
 
 def _warn_if_unseen(covered: np.ndarray, name: str, turn: str) -> None:
-    """Logs how many voxels are seen from too few directions. covered: fraction (nz, ny, nx) of the directions that they
-    need."""
+    """Logs how many voxels too few directions see. covered: fraction (nz, ny, nx) of the directions that they need."""
     share = float((covered < 1 - 1e-3).mean())
     if share > _NAMED:
         text = "%s: %.0f %% of the voxels are seen from less than %s turn, the least from %.0f°: their densities are wrong"

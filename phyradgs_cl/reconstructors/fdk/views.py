@@ -13,7 +13,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import weights
 
 # A gap between views stands out if it is this many times as wide as another gap; one lost view makes a gap of 2 steps.
-# The widest gap is compared with the second widest. The median would make uneven views of a full turn a short scan.
+# The widest gap is compared with the second widest: by the median, uneven views of a full turn would be a short scan.
 # Any gap wider than _WIDE_RAD is compared with both of its neighbours.
 SHORT_SCAN_GAP = 2.5
 _SAME_VIEW = 1e-3  # views nearer to each other than this fraction of the mean gap count as one, as those of a second turn
@@ -34,7 +34,7 @@ _PLANE_DEG = 10.0  # elevation of the source above the plane z = 0, seen from th
 _NO_PLANE_DEG = 45.0
 _LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the plane of the rotation
 _NO_LEAN_DEG = 10.0
-_ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: densities are 0.1 % too low
+_ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: there densities are 0.1 % too low
 _NO_ROLL_DEG = 10.0  # angle at which densities are 1.5 % too low; at 90° they are 0
 _LEAST_OVERLAP = 2.0  # a displaced panel must reach this many columns beyond the axis, or a warning comes
 # A smaller missing angle causes no warning: nearly parallel rays have so narrow a fan that half a turn is enough.
@@ -46,10 +46,11 @@ RayWeight = Callable[[int], np.ndarray]
 class Arc:
     """The angles that the views cover, and how much of them each view stands for.
 
-    gap_rad (F,): each view's part of the arc. progress_rad (F,): its angle from the arc's start, which is half a step before
-    the first view; the end is half a step behind the last. In a full turn progress counts from the view of the least angle.
-    parts_rad (P, 2): progress at which each part between gaps begins and ends. filled_rad: total width of the gaps for which
-    neighbouring views stand."""
+    - gap_rad (F,): each view's part of the arc.
+    - progress_rad (F,): its angle from the arc's start, which is half a step before the first view; the end is half a step
+      behind the last. In a full turn it counts from the view of the least angle.
+    - parts_rad (P, 2): progress at which each part between gaps begins and ends.
+    - filled_rad: total width of the gaps for which neighbouring views stand."""
 
     gap_rad: np.ndarray
     progress_rad: np.ndarray
@@ -73,8 +74,7 @@ class Arc:
 
 
 def filled_gap_rad(fan: weights.Fan) -> float:
-    """Returns the width in rad up to which gaps are filled by the views beside them, because no others see some of their
-    rays."""
+    """Returns the width in rad up to which gaps are filled by the views beside them: no others see some of their rays."""
     if fan.is_put_aside:
         return 2 * np.pi
     return _FILLED_RAD if fan.is_displaced else 0.0
@@ -106,8 +106,8 @@ def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
 
 
 def _stand_out(ahead: np.ndarray) -> np.ndarray:
-    """Returns which gaps (K,) to the next view are wider than a step, bool (K,): the widest if it stands out from all, and
-    others that stand out from their neighbours."""
+    """Returns which of the gaps (K,) from each view to the next are wide, bool (K,): the widest if it stands out from all
+    others, and any that stands out from its neighbours."""
     wide = np.zeros(ahead.size, bool)
     if ahead.size < 2:
         return wide
@@ -161,7 +161,7 @@ def _distinct(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     is_new = np.diff(turned[order], prepend=-np.inf) > tolerance
     index = np.cumsum(is_new) - 1
     centre = turned[order][is_new]
-    if centre.size > 1 and centre[0] + 2 * np.pi - turned[order[-1]] <= tolerance:  # 0° and 360° are one
+    if centre.size > 1 and centre[0] + 2 * np.pi - turned[order[-1]] <= tolerance:  # such angles are one, as 0° and 360° are
         index[index == centre.size - 1] = 0
         centre = centre[:-1]
     cell = np.empty(turned.size, np.int64)
@@ -211,8 +211,7 @@ def ray_weight(
 def opposite_weight(
     canonical: np.ndarray, shape: tuple[int, int], arc: Arc, is_parallel: bool
 ) -> Callable[[int], np.ndarray | float]:
-    """Returns a function from a view's index to redundancy weights (rows, columns): those of a ray and its opposite sum to
-    2."""
+    """Returns a function from a view's index to weights (rows, columns): those of a ray and its opposite sum to 2."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
 
     def weight(view: int) -> np.ndarray | float:
@@ -237,8 +236,8 @@ def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc, is_parallel:
     """Returns the fan angle (rows, columns) on which a ray's opposite depends. In a parallel beam's short scan it is 0, and
     in its full turn a distance from the axis.
 
-    If columns are read out one after the other, a short scan begins at another angle for each column, and a ray's opposite
-    lies on another column. So the angles of both columns, relative to the frame's, which is 0 here, add up."""
+    If columns are read out one after the other, each has its own gantry angle. A short scan then begins at another angle for
+    each column, and a ray's opposite lies on another column. So the column's angle, relative to the frame's, is added."""
     angle_rad = weights.fan_angle(pose, rays, is_parallel)
     if is_parallel and not arc.is_full:
         angle_rad = np.zeros_like(angle_rad)
@@ -308,7 +307,7 @@ def _check_orbit(pose: np.ndarray) -> None:
     usual = np.median(canonical, axis=0)
     length_mm = float(np.linalg.norm(usual[1] - usual[0]))
     off_mm = canonical[:, :2] - usual[:2]  # offsets of source and panel from their median positions
-    aside_mm = off_mm - np.eye(3)[2] * off_mm[:, :1, 2:]  # travel along z only makes voxels miss views
+    aside_mm = off_mm - np.eye(3)[2] * off_mm[:, :1, 2:]  # without travel along z, which only makes voxels miss views
     above_deg = float(np.rad2deg(np.arctan2(abs(usual[0, 2]), np.hypot(*usual[0, :2]))))
 
     def distances_beyond(most: float, most_deg: float, of_mm: np.ndarray) -> str:
@@ -332,7 +331,7 @@ def _check_orbit(pose: np.ndarray) -> None:
 def warn_if_incomplete(
     arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: Grid, is_parallel: bool = False
 ) -> None:
-    """Logs what the views do not cover, in a line each."""
+    """Logs a warning for each thing that the views do not cover."""
     name = "FBP" if is_parallel else "FDK"
     if np.unique(arc.progress_rad).size == 1:
         log.warning("%s: all views are from one angle: the volume is a single backprojection", name)

@@ -102,7 +102,7 @@ class Fan:
 
 
 def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = False) -> Fan:
-    """Returns the fan that all views see on a detector of ``shape`` (rows, columns), with poses (F, ..., 12) as in
+    """Returns the fan that all views see on a detector of ``shape`` (rows, columns). pose (F, ..., 12): as in
     ``pixel_rays``."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
     outer = pose[:, :, [0, -1]] if pose.shape[2] > 1 else pose
@@ -124,8 +124,7 @@ def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
     """Returns the weights of rays at fan angles of any shape: 1 ± sin where both sides of the axis are seen, 0 and 2 beyond.
 
     If the panel does not see the axis, every ray is measured once and counts 2. If the axis meets the panel's outermost
-    pixel, there is no room for a transition. A pixel then counts by how much of its width lies on the long side of the
-    axis."""
+    pixel, there is no room for a transition. A pixel then counts by which part of it lies on the long side."""
     if not fan.sees_axis:
         return np.full(angle_rad.shape, 2.0)
     short = min(fan.high_rad, -fan.low_rad)

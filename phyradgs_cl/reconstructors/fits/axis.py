@@ -37,7 +37,8 @@ _BIAS_PX = 0.02  # error (std) of a shift that comes from interpolating views
 @dataclass(frozen=True, eq=False)
 class AxisShift:
     """A shift of the panel along u, and the fit that found it. pixels, deviation: the shift and its standard deviation in
-    pixels of the recorded scan, both NaN if no shift fits best. squares (F,): squared residuals of the nearest trial."""
+    pixels of the recorded scan, both NaN if no shift fits best. squares (F,): squared residuals of the frames in the trial
+    nearest to the shift."""
 
     pixels: float
     deviation: float
@@ -52,7 +53,7 @@ NOT_FOUND = AxisShift(math.nan, math.nan, np.empty(0))
 
 
 def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHERE) -> AxisShift:
-    """Returns the best of five shifts within ``limits_px``, one coarse pixel apart, after a few iterations. Its deviation is
+    """Returns the best of five shifts within ``limits_px``, one coarse pixel apart, after few iterations; its deviation is
     NaN."""
     block = columns_per_block(scan)
     shifts_px = [block * shift for shift in _ROUGH_SHIFTS if limits_px[0] <= block * shift <= limits_px[1]]
@@ -137,7 +138,7 @@ def opposite_shift(scan: Scan) -> AxisShift:
     shifts, weight = shifts[is_found], information[is_found] / information[is_found].sum()
     shift = float(weight @ shifts)
     noise, scatter = 1 / information[is_found].sum(), float(weight**2 @ (shifts - shift) ** 2)
-    return AxisShift(shift, math.sqrt(2 * max(noise, scatter) + _BIAS_PX**2), np.empty(0))  # 2: each pair occurs twice
+    return AxisShift(shift, math.sqrt(2 * max(noise, scatter) + _BIAS_PX**2), np.empty(0))  # 2, as each pair counts twice
 
 
 def _pairs(scan: Scan) -> list[_Pair]:
@@ -183,8 +184,8 @@ def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _few_rows(scan: Scan, frame: int) -> np.ndarray:
-    """Returns a frame as means over blocks of rows, (few rows, columns) float64, smoothed along rows. Masked pixels are
-    interpolated."""
+    """Returns a frame as means over blocks of rows, (few rows, columns) float64, smoothed along rows; masked pixels are
+    filled in."""
     image = np.asarray(scan.projections[frame], np.float64)
     if scan.pixel_mask is not None:
         columns = np.arange(image.shape[1])
@@ -198,8 +199,7 @@ def _few_rows(scan: Scan, frame: int) -> np.ndarray:
 
 
 def _rough_shift(pairs: list[_Pair]) -> float:
-    """Returns the shift in pixels, a multiple of half a column, at which overlapping images differ least, relative to their
-    energy."""
+    """Returns the shift in pixels, in steps of 1/2, at which overlapping images differ least, relative to their energy."""
     columns = pairs[0].view.shape[1]
     # a shift moves the view and the mirror image against each other, by twice its size
     lags = np.arange(1 - columns, columns)  # column of the mirror image minus column of the view

@@ -14,7 +14,7 @@ from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-# Errors of flats affect frames this much, relative to the volume: as strong as the volume, they would explain motion.
+# Unknown errors of flats affect frames this much, relative to the volume. At 1 they would explain away motion.
 _FREEDOM = 0.3
 _ITERATIONS = 20  # iterations of CGLS in a fit, unless stated
 _MOST_TIMES = 12  # most times per exposure: each costs a projection
@@ -61,8 +61,8 @@ class FlatErrors:
 
 @dataclass(frozen=True, eq=False)
 class ViewParameters:
-    """Unknowns b: coefficients (n, K) of K kinds of parameters of views. View f has the values (basis @ b)[f], with
-    ``basis`` (F, n). Its frame changes by each value times its signal, from ``signals`` (F, K, rows, columns)."""
+    """Unknown parameters of views, of K kinds: coefficients b (n, K) of n functions of the view. View f has the values
+    (basis @ b)[f], with ``basis`` (F, n). signals (F, K, rows, columns): how a frame changes per unit of each value."""
 
     signals: np.ndarray
     basis: np.ndarray
@@ -99,7 +99,8 @@ class AugmentedOperator:
         return self.operator.frames_shape
 
     def system(self, measured: np.ndarray, valid: np.ndarray | None) -> System:
-        """Returns the equations for measured frames (F, rows, columns), without subsets. valid: as in ``System``."""
+        """Returns the equations for measured frames (F, rows, columns), without subsets. valid: 1 at usable pixels, else 0;
+        None: all are usable."""
         return System(self, measured, valid)  # type: ignore[arg-type]
 
     def forward(self, vector: np.ndarray, out: None = None) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Finds the axis of rotation near the edge of a displaced panel, from the rays that a full turn measures twice.
 
-The residual of a fit is no help there: a shift that leaves fewer rays measured twice always leaves less of it. Here each ray
-is compared with its opposite, half a turn and twice its fan angle away, by the mean of squares, whatever their number."""
+The residual of a fit is no help there: it is always smaller for a shift with fewer rays measured twice. Here each ray is
+compared with its opposite, half a turn and twice its fan angle away. The mean of the squared differences does not depend on
+the number of rays."""
 
 import math
 
@@ -23,7 +24,7 @@ _FEWEST_VIEWS = 24  # fewer views cannot be interpolated to the opposite of each
 _MOST_VIEWS = 360  # views that are compared, at most, to save time
 _MOST_ROWS = 32  # rows that are compared, at most, to save time
 _MOST_PAIRS = 48  # pairs of opposite rays that are compared in a row, at most, to save time
-_LEAST_PX = 1.0  # the axis must lie this far inside the middle of the panel's outer column, or no ray has an opposite
+_LEAST_PX = 1.0  # the axis must lie this far inside the middle of the outer column, in pixels, or no ray has an opposite
 _BLOCKS = 12  # the jackknife leaves out one of this many blocks of views at a time
 _BIAS_PX = 0.05  # error (std) of the shift in pixels without noise, measured with half-fans and features of two pixels
 
@@ -32,8 +33,8 @@ def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
     """Returns the panel's shift along u under which rays and their opposites agree best, its deviation by a jackknife over
     the views, and the mean squares (F,) of their differences.
 
-    NaN if views are more than 10° apart, if columns are read one after the other, and if no shift within an eighth of the
-    panel agrees best."""
+    NaN for views more than 10° apart, for columns read one after the other, and if no shift within an eighth of the panel is
+    best."""
     if scan.shutter.axis == "columns" and scan.shutter.readout_s > 0:
         return NOT_FOUND  # a ray and its opposite lie on different columns, read at different times
     poses = middle_poses(scan)

@@ -2,8 +2,8 @@
 
     min over U, φ of ‖p − Σ_k P_k W_k v‖² + γ bending(U) + β roughness(φ)
 
-The control vectors U and the weights' coefficients in time φ are improved in turn. A step is taken only if it lowers the sum
-and matter does not fold."""
+W_k deforms the volume v to state k, and P_k projects that. The control vectors U and the weights' coefficients in time φ are
+improved in turn. A step is taken only if it lowers the sum and matter does not fold."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
@@ -25,15 +25,15 @@ _CG_STEPS = 8  # iterations of conjugate gradients for one step of the control v
 _DAMPING = 1e-3  # Levenberg damping over the mean diagonal of JᵀJ: control vectors that no ray sees stay where they are
 _ROUGHNESS = 1e-2  # β, the penalty on the weights' roughness in time, relative to the mean diagonal of JᵀJ
 _SHORTER = (1.0, 0.5, 0.25)  # fractions of a step, tried in turn until one lowers the misfit
-_LEAST_DETERMINANT = 0.1  # a step may lower det(I + ∂w/∂y) to this: at 0 matter folds
-_LEAST_VOXELS = 1.0  # added to distances between states, so that even a field of zeros has several states
+_LEAST_DETERMINANT = 0.1  # a step may lower det(I + ∂w/∂y) of the displacement w(y) to this: at 0 matter folds
+_LEAST_VOXELS = 1.0  # voxels per unit weight, added to distances between states: fields of zeros then have several too
 _SUPPORT = 4  # a cubic spline in time extends over this many intervals between knots
 
 
 @dataclass(frozen=True, eq=False)
 class MotionField:
-    """A displacement field during its search. control_mm: (R, cz, cy, cx, 3) as in ``Deformation``. temporal (count, R):
-    spline coefficients, in time, of the weights of the R fields."""
+    """A displacement field during its search. control_mm: control vectors (R, cz, cy, cx, 3) of R fields, as in
+    ``Deformation``. temporal (count, R): spline coefficients, in time, of the fields' weights."""
 
     control_mm: np.ndarray
     origin_mm: tuple[float, float, float]
@@ -43,10 +43,10 @@ class MotionField:
 
     @classmethod
     def at_rest(cls, scan: Scan, spacing_mm: float, splines: TemporalSplines, temporal: np.ndarray) -> "MotionField":
-        """Returns a field of zeros over the scan's grid. Its weights, from ``temporal`` (count, R), have mean 0 and largest
-        size 1."""
+        """Returns a field of zeros over the scan's grid. Its weights, from ``temporal`` (count, R), get mean 0, largest size
+        1."""
         origin_mm, counts = control_points(scan.grid, spacing_mm)
-        centred = temporal - splines.at(splines.node_times_s).mean(0) @ temporal  # splines sum to 1
+        centred = temporal - splines.at(splines.node_times_s).mean(0) @ temporal  # splines sum to 1: the weights get mean 0
         control_mm = np.zeros((temporal.shape[1], *counts, 3))
         return cls(control_mm, origin_mm, spacing_mm, splines, centred).scaled()
 
@@ -72,8 +72,8 @@ class MotionField:
 
 @dataclass(eq=False)
 class FieldProblem:
-    """The misfit of a scan under a motion model, as a function of the field. bending: γ, relative to how strongly frames
-    respond to a control vector."""
+    """The misfit of a scan under a motion model, as a function of the field. bending: weight γ of the field's bending,
+    relative to how strongly frames respond to a control vector."""
 
     rt: Runtime
     scan: Scan
@@ -109,7 +109,7 @@ class FieldProblem:
         return self._masked(self.scan.projections - self.operator(one).forward(volume))
 
     def space_step(self, one: MotionField, volume: np.ndarray) -> MotionField:
-        """Returns the field after a step of its control vectors; the field itself if no step lowers the sum."""
+        """Returns the field after a step of its control vectors; the field itself if no step lowers misfit plus penalty."""
         operator = self.operator(one)
         residual = self._masked(self.scan.projections - operator.forward(volume))
         derivative = FieldDerivative(operator, volume)
@@ -117,7 +117,7 @@ class FieldProblem:
         def normal(change: np.ndarray) -> np.ndarray:
             return derivative.adjoint(self._masked(derivative.forward(change)))
 
-        # the weights are relative to the mean diagonal of JᵀJ, which a vector of random signs estimates (Hutchinson)
+        # penalties are relative to the mean diagonal of JᵀJ, which a vector of random signs estimates (Hutchinson)
         probe = np.random.default_rng(0).choice([-1.0, 1.0], one.control_mm.shape)
         response = float(np.vdot(probe, normal(probe))) / probe.size
         if not response > 0:
@@ -136,8 +136,7 @@ class FieldProblem:
         return self._first_better(one, residual, candidates, volume, penalty)
 
     def time_step(self, one: MotionField, volume: np.ndarray) -> MotionField:
-        """Returns the field after a step of its weights' coefficients in time; the field itself if no step lowers the
-        sum."""
+        """Returns the field after a step of its weights in time; the field itself if no step lowers misfit plus penalty."""
         operator = self.operator(one)
         residual = self._masked(self.scan.projections - operator.forward(volume))
         hessian, downhill = self._temporal_equations(one, operator, volume, residual)
@@ -204,7 +203,7 @@ class FieldProblem:
         ``penalty`` than ``one``; else ``one``."""
         before = sum_squares(residual) + penalty(one)
         for candidate in candidates:
-            # a field that folds has no inverse, so it counts for nothing however well its frames fit
+            # a field that folds has no inverse, so it is passed over however well its frames fit
             if candidate.deformation().smallest_determinant() < _LEAST_DETERMINANT:
                 continue
             if sum_squares(self.residual(candidate, volume)) + penalty(candidate) < before:
@@ -220,7 +219,7 @@ def sum_squares(values: np.ndarray) -> float:
 
 
 def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], right: np.ndarray, steps: int) -> np.ndarray:
-    """Solves A x = b approximately, in ``steps`` steps from 0, or fewer if the residual's norm falls to 1 %."""
+    """Solves ``apply``(x) = ``right`` approximately, in ``steps`` steps from 0, or until the residual is 1 % as large."""
     solution, residual = np.zeros_like(right), right.copy()
     direction, squares = residual.copy(), sum_squares(residual)
     least = 1e-4 * squares

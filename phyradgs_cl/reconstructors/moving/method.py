@@ -43,13 +43,13 @@ _MOST_COLUMNS = 64  # blocks of pixels along the longer side of the panel in the
 _MOST_VOXELS = 32  # voxels along the longest side of the coarse scan's grid, at most
 _MOST_FRAMES = 600  # frames of the coarse scan, at most, unless the signal has more knots
 _TIMES_PER_PERIOD = 12  # times per period of a motion at which exposures sample it
-_MOST_TIMES = 6  # most times per exposure for this: each costs a projection
+_MOST_TIMES = 6  # most times per exposure that a period may ask for: each costs a projection
 _FIRST_PASSES = 8  # passes of fista before the first round, for an object at rest: the field needs a volume to start from
 _PASSES = 3  # passes of fista in each round, which let the volume follow the field
 _WEIGHT = 0.42  # prior weight of fista in the search
 _TV_ITERATIONS = 5  # TV iterations per pass of fista in the search
 _COARSE_SPACINGS = 2  # the first rounds find coarse motion, with this many spacings of control points along the longest side
-_FINE_SPACINGS = 4  # the last rounds refine it with closer control points, this many spacings
+_FINE_SPACINGS = 4  # the last rounds refine that motion with closer control points: this many spacings
 # Finer control points need a larger bending weight γ, by this factor, so that the field is as stiff in mm as before.
 _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4
 _COARSE_SHARE = 0.6  # fraction of the rounds that have coarse control points
@@ -83,8 +83,8 @@ def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: floa
 
 
 class FieldSearch:
-    """Searches the field on a coarse copy of the scan, as a ``Stepwise``. rounds: iterations of the search. bending: as in
-    ``FieldProblem``."""
+    """Searches the field on a coarse copy of the scan, as a ``Stepwise``. rounds: its iterations. bending: stiffness of the
+    field."""
 
     quantity, remedy = "residual", "check the scan for extreme values"
 
@@ -104,8 +104,7 @@ class FieldSearch:
 
     @property
     def finished(self) -> str | None:
-        """Why the search ends early: the object is at rest, because in two rounds no step of the field lowered the residual.
-        Else None."""
+        """Why the search ends early: the object rests, because in two rounds no step lowered the residual. Else None."""
         return _AT_REST if self.iteration >= 2 and not self.field.control_mm.any() else None
 
     def step(self) -> None:
@@ -153,8 +152,8 @@ class FieldSearch:
 
     def finding(self) -> tuple[Deformation, float]:
         """Returns the field, and its gain: by which fraction its squared residual is below that of an object at rest after
-        as many passes. The field is zeros if the gain is within ``LEAST_GAIN``, or within what as many free numbers explain
-        of noise."""
+        as many passes. The field is zeros if the gain is within ``LEAST_GAIN``, or not above what so many free numbers would
+        explain of noise alone."""
         if not self.field.control_mm.any():
             return self.field.deformation(), 0.0
         moving = self._reconstructed(self.field, self.volume, _PASSES)
@@ -183,7 +182,7 @@ class FieldSearch:
 
 
 def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:
-    """Returns the model with as many times per exposure as the gantry and the signal's period need. How fast the object
+    """Returns the model with as many times per exposure as the gantry and the signal's period need: how fast the object
     moves is not known yet."""
     timed = with_times(motion, scan)
     if motion != PerRow() or not isinstance(timed, PerRow) or period_s is None:
@@ -313,8 +312,7 @@ def _signal_of(scan: Scan, gating: str) -> MotionSignal:
 
 
 def _motion_facts(one: _Field, signal: MotionSignal, scan: Scan) -> dict[str, object]:
-    """Returns what the search found, for the result's facts. Displacements count from the mean position of matter in the
-    scan."""
+    """Returns what the search found, for the result's facts. Displacements count from matter's mean position."""
     moves = one.for_passes is not None
     follows = signal.knot_s is not None
     facts: dict[str, object] = {"moves": moves, "follows": follows, "period_s": signal.period_s, "gain": one.gain}

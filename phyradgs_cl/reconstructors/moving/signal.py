@@ -20,7 +20,7 @@ _NODES = 4  # weights are stored at this many times per interval between knots, 
 _STRETCH = 0.02  # weight of first differences in the bending energy: without it, a field could grow linearly in air
 _HARMONICS = 6  # an object at rest changes the signal with these harmonics of the gantry's angle: they are removed
 _FEWEST_CYCLES = 5  # a motion with fewer cycles in the scan is modelled freely in time
-_BAND = 0.25  # breaths differ in length: the dominant rate and rates that differ by this fraction count as one
+_BAND = 0.25  # breaths differ in length: rates that differ from the dominant one by up to this fraction count as it
 # A signal repeats if at least this fraction of its power lies in the band, not counting what white noise has there.
 _PERIODIC_SHARE = 0.5
 _FEWEST_FRAMES = 16  # fewer frames show no period
@@ -59,8 +59,7 @@ class TemporalSplines:
         return np.linspace(self.first_s, self.last_s, _NODES * self.intervals + 1)
 
     def at(self, times_s: np.ndarray) -> np.ndarray:
-        """Returns the values (n, count) of all splines at times (n,) in s. Before the first and after the last time they
-        stay constant."""
+        """Returns the values (n, count) of all splines at times (n,) in s, constant before first_s and after last_s."""
         knots_s = self.first_s + self.step_s * np.arange(-3, self.intervals + 4)
         return BSpline(knots_s, np.eye(self.count), 3)(np.clip(times_s, self.first_s, self.last_s))
 
@@ -71,8 +70,7 @@ class TemporalSplines:
         return np.asarray(np.linalg.lstsq(self.at(nodes_s), wanted, rcond=None)[0])
 
     def roughness(self) -> np.ndarray:
-        """Returns the matrix K (count, count) with which cᵀ K c is the sum of squared second differences of coefficients
-        c."""
+        """Returns the matrix K (count, count): cᵀ K c is the sum of squared second differences of coefficients c."""
         return _difference_squares(self.count, 2)
 
 
@@ -195,7 +193,7 @@ def _gantry(scan: Scan, times_s: np.ndarray, order: np.ndarray) -> np.ndarray:
     angle_rad = np.arctan2(towards[:, 1], towards[:, 0])
     harmonics = [wave(k * angle_rad) for k in range(1, _HARMONICS + 1) for wave in (np.cos, np.sin)]
     drift = (times_s - times_s[0]) / max(times_s[-1] - times_s[0], 1e-300)
-    most = max(1, len(times_s) // 4)  # more terms would explain everything in few frames
+    most = max(1, len(times_s) // 4)  # with more terms than this, few frames would be explained completely
     return np.stack([np.ones(len(times_s)), drift, *harmonics][:most], -1)
 
 

@@ -174,7 +174,7 @@ def reconstruct_splats(
         "ranks": rt.ranks.size,
     }  # fmt: skip
     if isinstance(options.motion, Exact):
-        # frames may differ in segments: the most counts
+        # frames may differ in their number of segments: the largest is stated
         facts |= {"segments": run.frames.most_cells, "motion_phases": run.phases()}
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
     return Reconstruction(volume, scan.grid, cloud, loop.record, facts, loop.state_if_interrupted())

@@ -14,7 +14,7 @@ from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 from phyradgs_cl.text import repr_of_changes
 
 # Iterations before ``exact_from`` model motion coarsely, which loses nothing (docs/results/motion_models.md).
-_STATIC_SHARE = 0.4  # the first of the coarse iterations, this fraction, have one pose per frame
+_STATIC_SHARE = 0.4  # this fraction of the coarse iterations, the first ones, have one pose per frame
 _COARSE_ERROR = 0.1  # the other coarse iterations have at least this ``time_error``
 
 
@@ -22,8 +22,8 @@ _COARSE_ERROR = 0.1  # the other coarse iterations have at least this ``time_err
 class SplatOptions(MotionOptions):
     """Options of a splatting run; lengths in half-sides of the volume, densities relative to FDK's 99.9th percentile.
 
-    - gaussians: size of the first cloud; 0 chooses it from the grid. The weights are Eq. 4's λ. tv_edge: edge in voxels of
-      the random sub-volume for total variation. scale_min_voxels: least scale as a fraction of a voxel.
+    - gaussians: size of the first cloud; 0 chooses it from the grid. The weights are λ of the paper's Eq. 4. tv_edge: edge
+      in voxels of the random sub-volume for total variation. scale_min_voxels: least scale as a fraction of a voxel.
     - detector_model: what the detector averages over a line's times: line integrals (log), intensity, or what the scan
       states (scan).
     - exact_from: in iterations before this fraction of the run, the motion ``exact`` is coarse: first one pose for each
@@ -76,16 +76,16 @@ class SplatOptions(MotionOptions):
         return int(min(max(voxels / 16, 1000), 50_000))
 
     def motion_at(self, share: float) -> Motion:
-        """Returns the motion model after the fraction ``share`` of the run: coarse in early iterations, which gain nothing
-        from exact motion."""
+        """Returns the motion model after the fraction ``share`` of the run: a coarse one in early iterations, which gain
+        nothing from exact motion."""
         if not isinstance(self.motion, Exact) or share >= self.exact_from:
             return self.motion
         is_first = share < _STATIC_SHARE * self.exact_from
         return Static() if is_first else Exact(1, max(_COARSE_ERROR, self.motion.time_error))
 
     def batch_for(self, frames: int, ranks: int) -> int:
-        """Returns the frames per step: the option or, if it is 0, one for every rank. Raises InputError for more than the
-        scan has."""
+        """Returns the frames per step: the option or, if it is 0, one per rank. Raises InputError for more than the scan
+        has."""
         if self.batch > frames:
             raise InputError("batch", str(self.batch), f"no more than the scan's {frames} frames")
         return self.batch or min(ranks, frames)

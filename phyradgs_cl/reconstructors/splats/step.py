@@ -1,8 +1,8 @@
 """One step of a splatting run on the device: its Gaussians and frames there, and the gradient, summed over ranks.
 
 Only ``FrameStep.gradient`` renders a frame, compares it, goes back, adds total variation and applies the chain rule. Each
-rank has all Gaussians, and some frames of the batch. Gradients are summed so that the bits depend on the batch, not on the
-number of ranks."""
+rank has all Gaussians, and some frames of the batch. The bits of summed gradients depend on the batch, not on the number of
+ranks."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -44,8 +44,7 @@ class Scale:
 
 
 class DeviceCloud:
-    """The Gaussians of a run on the device. Arrays have ``gaussians.stride`` columns, the first ``count`` of them
-    Gaussians."""
+    """The Gaussians of a run on the device: the first ``count`` of the ``gaussians.stride`` columns of each array."""
 
     def __init__(self, rt: Runtime, population: Population) -> None:
         self.rt, self.count = rt, population.count
@@ -197,7 +196,8 @@ class FrameStep:
         self, cloud: DeviceCloud, frame: int, corner: Corner | None, late: bool, statistics: DeviceArray
     ) -> None:
         """Writes one frame's dL/d(raw parameters) into the gradients of an activated cloud, and adds to the ``statistics``
-        (2, stride) of density control. corner, late: as in ``Batch``."""
+        (2, stride) of density control. corner: of the sub-volume for total variation, or None. late: whether the density
+        term applies."""
         options, gaussians, by_cloud = self.options, cloud.gaussians, cloud.gradients
         cells, measured, mask, pixels = self.frames.get(frame)
         rendered = self.projector.forward(gaussians, cells)

@@ -21,7 +21,7 @@ class AsdPocsOptions(SartOptions):
     SART pass.
 
     tv_reduction: factor on that length when TV moves the volume by more than ``tv_ratio`` (r_max) times the SART pass's
-    change and the residual is above ε. residual_share: ε over the residual of the FDK volume."""
+    change and the residual is above ε. residual_share: ε, the residual to aim at, over that of the FDK volume."""
 
     iterations: int = 10
     relaxation_reduction: float = 0.9999
@@ -56,7 +56,7 @@ class AsdPocs(Algorithm):
         if tv_length > options.tv_ratio * data_length and residual > self.epsilon:
             self.tv_step *= options.tv_reduction
         cosine = space.inner(by_tv, by_data) / max(tv_length * data_length, 1e-30)
-        # data and TV steps point in opposite directions and undo each other: more of them would only alternate
+        # if data and TV steps undo each other, more iterations would only alternate between the two
         if cosine < -0.99 and residual <= self.epsilon:
             self.finished = "data and TV in balance"
         return residual
@@ -79,5 +79,5 @@ def _started(system: System, options: AsdPocsOptions, run: MethodRun) -> AsdPocs
 
 METHOD = voxel_method(
     "asd-pocs", AsdPocsOptions(), _started, frames=2,
-    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # 4 more for comparing the lengths of steps
+    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # 4 more volumes, to compare the lengths of steps
 )

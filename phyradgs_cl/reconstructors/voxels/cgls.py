@@ -11,7 +11,8 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 @dataclass(frozen=True)
 class CglsOptions(IterativeOptions):
-    """Options of CGLS. noise_stop: as in ``sart``. nonnegative must stay False, because CGLS does not clip."""
+    """Options of CGLS. noise_stop: ends the run at this many times the noise. nonnegative must stay False: CGLS does not
+    clip."""
 
     iterations: int = 60
     nonnegative: bool = False
@@ -26,8 +27,9 @@ class CglsOptions(IterativeOptions):
 class Cgls(Algorithm):
     """Minimises ‖p − A x‖ over the Krylov spaces of AᵀA from x = 0. An iteration's residual is the one after its step.
 
-    In the intensity model the residual is p − I(x), and J replaces A. Directions then combine as in nonlinear conjugate
-    gradients (Polak and Ribière 1969), which is the same iteration where I is linear."""
+    In the intensity model the residual is p − I(x), with I(x) the expected measurement, and its derivative J replaces A.
+    Directions then combine as in nonlinear conjugate gradients (Polak and Ribière 1969), which is the same iteration where I
+    is linear."""
 
     ARRAYS = ("volume", "residual", "direction", "gradient")
     NUMBERS = ("gamma",)

@@ -1,12 +1,12 @@
 """FISTA with a prior over ordered subsets of the frames: min ½‖p − A x‖² + R(x), x ≥ 0.
 
-Each subset S of M makes one step: xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁).
-The step and its momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The gradient
-of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
-34 (2015) 167). L bounds the norm of AᵀA.
+Each subset S, one of M, makes one step: xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁). The step
+and its momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The gradient of a
+subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34
+(2015) 167). L bounds the norm of AᵀA.
 
 The last 2/5 of the passes run on smaller voxels, whose means make up most of the result (``stages.py``). The passes before
-them only provide their first volume: they have more subsets, and few times in an exposure.
+them only provide their first volume, so they may be coarser: with more subsets, and fewer times in an exposure.
 
 The calls of a run: ``MethodRun``, ``Stages``, ``Loop``, ``Iterations.step``, ``Fista.step``, ``System``, ``RayOperator``, a
 kernel. ``fista_passes`` already projects before its loop, for the step sizes and the ``PriorWeight``."""
@@ -45,8 +45,8 @@ _COPIES = 2  # if volumes are on the host, the device holds two copies while a p
 _COARSE_PASSES = 0.6  # fraction of all passes that are coarse
 _COARSE_SUBSETS = 1.6  # a coarse pass has this many times ``subsets`` subsets
 _COARSE_TIMES = 1 / 3  # a coarse pass has this fraction of the times per exposure, but two at least
-_FAINTEST = 1e-6  # row sums of AᵀA below this fraction of the largest count as this fraction, so that the bound stays useful
-# Voxels are divided if a slice (y, x) has at most this many: it is worth its time at 64³, not at 128³.
+_FAINTEST = 1e-6  # smaller row sums of AᵀA count as this fraction of the largest: dividing by less would inflate the bound
+# Voxels are divided if a slice (y, x) has at most this many of them: dividing is worth its time at 64³, not at 128³.
 # Slices are not counted, so that thick and thin slabs of one scan are reconstructed in the same manner.
 _MOST_DIVIDED = 90**2
 
@@ -58,19 +58,19 @@ class FistaOptions(IterativeOptions):
     - prior: one of ``PRIORS``, a user's function, or its ``package.module:function``. A function takes (volume (nz, ny, nx)
       in 1/mm, weight in 1/mm) and returns a volume; docs/methods.md says how to scale a denoiser.
     - prior_share: s in the prior piccs, (1 − s) TV(x) + s TV(x − first volume).
-    - prior_weight: threshold relative to the error of the gradient. Two errors are added in squares: noise of the frames,
-      and edges inside large voxels.
-    - subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0: 2 for slices of up to 90² voxels where memory
+    - prior_weight: strength of the prior, relative to the error of the data term's gradient. That error comes from noise of
+      the frames and from edges inside large voxels.
+    - subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0 takes 2 for slices of up to 90² voxels where memory
       allows, else 1.
-    - subsets: of the frames, with one step each, 1.6 times as many before smaller voxels. If their steps diverge, they are
-      joined two by two. tv_iterations: dual iterations per proximal map of TV.
-    - transmission_weights: as in ``fista-tv``."""
+    - subsets: of the frames, with one step each; the passes before smaller voxels have 1.6 times as many. If their steps
+      diverge, they are joined two by two. tv_iterations: dual iterations per proximal map of TV.
+    - transmission_weights: weights pixels by their transmission, as in ``fista-tv``."""
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
     """Options that may be a function."""
 
     TRIALS: ClassVar[tuple[int, int]] = (2, 7)
-    """Iterations of the two short runs that ``estimate`` times: three of the five more are coarse, as in a whole run."""
+    """Iterations of the two short runs that ``estimate`` times. Of the five between, three are coarse, as in a whole run."""
 
     motion: Motion = PerRow()
     iterations: int = 35
@@ -104,7 +104,7 @@ class Accelerated(Algorithm):
         super().__init__(system)
         self.prior = prior
         self.previous = self.volume
-        self.momentum = 1.0  # tₖ
+        self.momentum = 1.0  # tₖ of Beck and Teboulle, 1 for the first step
         self.curvature = (_tight_curvature if has_long_steps else _curvature)(system) or 1.0  # L, which bounds ‖AᵀA‖
 
     def start_from(self, volume: Any) -> None:
@@ -112,12 +112,12 @@ class Accelerated(Algorithm):
 
     @property
     def next_momentum(self) -> float:
-        """The number tₖ₊₁ of Eq. 4.2, from which the momentum follows."""
+        """The number tₖ₊₁ of Beck and Teboulle's Eq. 4.2, from which ``extrapolation`` follows."""
         return float((1 + np.sqrt(1 + 4 * self.momentum**2)) / 2)
 
     @property
     def extrapolation(self) -> float:
-        """The factor βₖ of Eq. 4.3, by which the last change is continued."""
+        """The factor of Beck and Teboulle's Eq. 4.3: the next step starts this fraction of the last change further on."""
         return (self.momentum - 1) / self.next_momentum
 
     def accept(self, point: Any, volume: Any) -> None:
@@ -145,8 +145,8 @@ def _curvature(system: System) -> float:
 
 
 def _tight_curvature(system: System) -> float:
-    """Returns a bound in mm² of the norm of AᵀA, for one more pass: the largest (AᵀA x)/x of an x > 0 (Collatz and
-    Wielandt). With row sums as x the bound is a sixth smaller than the largest row sum."""
+    """Returns a bound in mm² of the norm of AᵀA, at the cost of one more pass: the largest (AᵀA x)/x of an x > 0 (Collatz
+    and Wielandt). With row sums as x the bound is a sixth smaller than the largest row sum."""
     sums, space = _row_sums(system), system.space
     again = system.adjoint(system.apply_weights(system.forward(sums)))
     bound = space.largest(space.multiply(again, space.reciprocal(sums, _FAINTEST)))
@@ -233,8 +233,8 @@ def fista_passes(
     has_few_times: bool = False,
 ) -> Iterations:  # fmt: skip
     """Returns ``passes`` passes from ``volume`` (nz, ny, nx; None: the method's own start), with every voxel divided into
-    ``parts`` along each side. subsets: replaces the option, unless 0. has_few_times: takes a third of the times in an
-    exposure."""
+    ``parts`` along each side. subsets: replaces the option, unless 0. has_few_times: takes a third of an exposure's
+    times."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
     options, rt = replace(whole.options, iterations=passes), whole.rt
@@ -259,8 +259,8 @@ def fista_passes(
 
 
 def _gains_from_subvoxels(run: MethodRun, parts: int) -> bool:
-    """Returns whether the grid is small enough for smaller voxels to be worth it, and every rank's device has room for the
-    method's volumes of them."""
+    """Returns whether smaller voxels are worth their time on this grid, and fit on every rank's device. Logs a warning if
+    only room is missing."""
     shape, rt = run.scan.grid.shape, run.rt
     if math.prod(shape[1:]) > _MOST_DIVIDED:
         return False

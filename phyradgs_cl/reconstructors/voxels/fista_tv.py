@@ -29,8 +29,9 @@ class FistaTvOptions(IterativeOptions):
 class FistaTv(Accelerated):
     """FISTA with TV on all frames at once. An iteration's residual belongs to its new volume.
 
-    A is linear, so A y at the extrapolated point y follows from A xₖ and A xₖ₋₁. The intensity model replaces A x by I(x)
-    and Aᵀ by Jᵀ at x. I is not linear between the two points; the error vanishes with the steps."""
+    A is linear, so A y at the extrapolated point y follows from A xₖ and A xₖ₋₁. The intensity model replaces A x by the
+    expected I(x), and Aᵀ by its transposed derivative Jᵀ at x. I is not linear between the two points; the error vanishes
+    with the steps."""
 
     ARRAYS = ("volume", "previous", "projected", "projected_previous")
 

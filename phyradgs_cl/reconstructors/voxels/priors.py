@@ -39,11 +39,12 @@ _DCT_AT_REST = 1.35  # threshold of the block cosine transforms before ridge ste
 _RIDGE_NOISE = 17.0  # noise that a ridge step assumes, relative to the prior's weight, for fly-scans
 _RIDGE_NOISE_AT_REST = 20.0  # noise that a ridge step assumes, relative to the prior's weight, for scans that stop
 _RIDGE_LENGTH = 0.5  # length of a ridge step: factor on the regulariser's gradient
-_RIDGE_EVERY = 4  # a ridge step follows each of this many maps of the other prior
-# The two factors for scans that stop hold for this noise of line integrals, and follow the sixth root of the scan's noise.
+_RIDGE_EVERY = 4  # after this many maps of the other prior comes one ridge step
+# _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals.
+# With the sixth root of the scan's noise, the first grows and the second falls.
 _USUAL_NOISE = 0.01
 _LEAST_NOISE = 0.001  # some scans have no noise: it counts as at least this
-_LEAST_NOISE_SHARE = 0.1  # least noise_share (``Prior``) of a ridge step, because some scans have no noise
+_LEAST_NOISE_SHARE = 0.1  # a ridge step counts at least this fraction of the weight as noise, because some scans have none
 _SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result; the larger voxels of the passes before have the rest
 _SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels with the prior ``ridge``, which leaves less noise
 
@@ -52,15 +53,14 @@ _SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels with the prior ``ri
 class FrameError:
     """The error of a pixel that no volume on the grid explains.
 
-    noise: standard deviation of its line integral. edges_mm: discretisation error at edges, over the density there in
-    1/mm."""
+    noise: standard deviation of its line integral. edges_mm: discretisation error at edges, per density (1/mm) there."""
 
     noise: float
     edges_mm: float = 0.0
 
 
 def frame_error(scan: Scan, motion: Motion) -> FrameError:
-    """Estimates the error of a scan's pixels on its grid. The motion blur of ``motion`` averages the error at edges."""
+    """Estimates the error of a scan's pixels on its grid. Motion blur averages out part of the error at edges."""
     voxel_mm = max(scan.grid.voxel_size_mm[1:])
     edges_mm = _EDGES * voxel_mm / math.sqrt(1 + _blur_mm(scan, motion) / voxel_mm)
     return FrameError(noise_behind(np.asarray(scan.projections, np.float32), scan.valid), edges_mm)
@@ -107,24 +107,24 @@ class PriorWeight:
         return max(self.strength * math.hypot(by_noise, by_edges), self.least)
 
     def noise_share(self, weight: float) -> float:
-        """Returns which part of ``weight`` is due to noise, 0 to 1. With many views or photons, edges make up most of a
-        weight."""
+        """Returns which part of ``weight`` is due to noise, 0 to 1. With many views or photons, edges make up most of it."""
         by_noise = self.strength * self.error.noise * self.noise_mm
         return min(by_noise / weight, 1.0) if weight > 0 else 1.0  # empty frames have no weight
 
 
 def _density(space: Space[Any], volume: Any) -> float:
-    """Returns the mean of a volume's values weighted by their squares, in 1/mm: Σ x³ / Σ x², which air does not change."""
+    """Returns the mean of a volume's values weighted by their squares, in 1/mm: Σ x³ / Σ x², to which air adds nothing."""
     squares = space.inner(volume, volume)
     return max(space.inner(space.multiply(volume, volume), volume) / squares, 0.0) if squares > 0 else 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class PriorInputs:
-    """What a prior needs. tv_iterations: dual iterations per map. is_fly: frames expose over an arc. noise: standard
-    deviation of line integrals behind the object.
+    """What a prior needs.
 
-    image (nz, ny, nx) in 1/mm, share: for piccs, its prior image, and the weight of the change from it."""
+    - tv_iterations: dual iterations per map. is_fly: frames expose over an arc.
+    - noise: standard deviation of line integrals behind the object.
+    - image (nz, ny, nx) in 1/mm, share: of the prior piccs, its prior image and the weight of the change from it."""
 
     rt: Runtime
     grid: Grid
@@ -141,8 +141,8 @@ class PriorInputs:
         return TvAndDct(self.tv(tv_share), DctProx(self.rt, self.grid.shape), dct_share)
 
     def dct_then_ridge(self) -> "Prior":
-        """Returns ``dct`` with ridge steps, or ``dct`` alone on small grids. For scans that stop, the ridge step does more
-        of the work, most of it where noise is low. Fly-scans of flat bodies would lose by that."""
+        """Returns ``dct`` with ridge steps, or ``dct`` alone on grids smaller than a ridge step needs. For scans that stop,
+        ridge steps are stronger, the more so the lower the noise. Fly-scans of flat bodies would lose quality by that."""
         if min(self.grid.shape) < RIDGE_EDGE:
             return self.tv_and_dct()
         ridge = RidgeStep(self.rt, self.grid.shape, learned_ridge())
@@ -223,8 +223,7 @@ class ThenRidge(Prior):
     VOLUMES = RidgeStep.VOLUMES
 
     def __init__(self, before: Prior, ridge: RidgeStep, noise_factor: float) -> None:
-        """Joins both maps. noise_factor: the noise that the ridge step assumes, over the part of the weight that is due to
-        noise."""
+        """Joins both maps. noise_factor: noise that the ridge step assumes, over the part of the weight due to noise."""
         self.before, self.ridge, self.noise_factor = before, ridge, noise_factor
         self.maps = 0  # maps since the last ridge step
 
@@ -280,8 +279,8 @@ Denoiser = Callable[[np.ndarray, float], np.ndarray]
 
 
 class OwnPrior(Prior):
-    """A user's denoiser on the host in place of a proximal map (plug-and-play: Venkatakrishnan, Bouman and Wohlberg
-    2013). Its change at such a weight must not vanish: two weights must give two volumes."""
+    """A user's denoiser on the host in place of a proximal map (plug-and-play: Venkatakrishnan et al. 2013). Its change at
+    such a small weight must not vanish: two weights must give two volumes."""
 
     def __init__(self, denoiser: Denoiser) -> None:
         self.denoiser, self.subject = denoiser, f"--prior {function_name(denoiser)}"

@@ -30,10 +30,11 @@ _SYSTEM_FRAMES = 6
 class IterativeOptions(MotionOptions):
     """Options of every iterative method.
 
-    motion: static, micro-views, or per-row (every line at its own times). iterations: passes over all frames. nonnegative:
-    clip the volume at 0 after every update. tolerance: stop when an iteration changes the volume by less than this fraction
-    of its norm; 0 runs all iterations. detector_model: what the detector averages over a line's times: line integrals (log),
-    intensity, or what the scan states (scan)."""
+    - motion: static, micro-views, or per-row (every line at its own times). iterations: passes over all frames.
+    - nonnegative: clip the volume at 0 after every update.
+    - tolerance: stop when an iteration changes the volume by less than this fraction of its norm; 0 runs all iterations.
+    - detector_model: what the detector averages over a line's times: line integrals (log), intensity, or what the scan
+      states (scan)."""
 
     transmission_weights: ClassVar[bool] = False
     """Whether pixels are weighted by their transmission. Some methods have an option of this name."""
@@ -53,8 +54,7 @@ class IterativeOptions(MotionOptions):
 class Algorithm:
     """An iterative method on a system. ``volume`` (nz, ny, nx) in 1/mm is an array of the system's space.
 
-    A subclass writes ``step``, and names its running state: ``ARRAYS``, attributes that are arrays of the space, and
-    ``NUMBERS``."""
+    A subclass writes ``step``, and names the attributes of its running state: ``ARRAYS`` of the space, and ``NUMBERS``."""
 
     ARRAYS: ClassVar[tuple[str, ...]] = ("volume",)
     NUMBERS: ClassVar[tuple[str, ...]] = ()
@@ -85,7 +85,7 @@ class Algorithm:
             setattr(self, name, self.system.space.array(state[name]))
         for name in self.NUMBERS:
             setattr(self, name, state[name].item())
-        if self.system.intensity is not None:  # J depends on the volume, A does not
+        if self.system.intensity is not None:  # J, unlike A, depends on the volume: it is set again
             self.system.expected(self.volume)
 
 
@@ -127,8 +127,7 @@ class MethodRun:
     def result(self, name: str, method: WithFacts) -> Reconstruction:
         """Runs a method in a loop. Returns its volume, convergence record and facts.
 
-        The record has a line per iteration: the residual ‖p − A x‖/‖p‖, the change ‖x − x'‖/‖x‖, and the seconds since the
-        start."""
+        The record has, for each iteration, the residual ‖p − A x‖/‖p‖, the change ‖x − x'‖/‖x‖, and the seconds so far."""
         loop = Loop(method, self.rt.ranks, self.report, self.started)
         loop.run(self.resume)
         facts: dict[str, object] = {
@@ -144,8 +143,8 @@ def voxel_method(
     name: str, default: IterativeOptions, make: Callable[[System, Any, MethodRun], Algorithm], *,
     volumes: int | Callable[[Scan, Any], int], frames: int,
 ) -> Method:
-    """Returns the algorithm that ``make`` builds as a method. volumes, frames: as in ``MethodRun.system``; volumes may be a
-    function of scan and options."""
+    """Returns a method that runs the algorithm that ``make`` builds. volumes, frames: how many volumes and arrays of all
+    frames it holds at one time; volumes may be a function of scan and options."""
 
     def reconstruct(scan: Scan, options: Any, rt: Runtime, **arguments: Any) -> Reconstruction:
         run = MethodRun(scan, options, rt, **arguments)
@@ -156,7 +155,7 @@ def voxel_method(
 
 
 class Iterations:
-    """An algorithm with its residual and change; a ``Loop`` runs it as a ``Stepwise``."""
+    """An algorithm, with the residual and the change of its last iteration, as a ``Stepwise`` for ``Loop``."""
 
     quantity, remedy = "residual", "check the scan for extreme values, or lower the relaxation"
 

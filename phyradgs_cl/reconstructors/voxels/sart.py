@@ -39,10 +39,11 @@ OS_SART = SartOptions(frames_per_subset=10)
 
 
 class Sart(Algorithm):
-    """SART, x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i of the frames, with W = 1/(Aᵢ 1) and V = 1/(Aᵢᵀ 1).
+    """SART, x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i of the frames, with the rays' W = 1/(Aᵢ 1) and the voxels' V =
+    1/(Aᵢᵀ 1).
 
-    The intensity model replaces Aᵢᵀ by Jᵢᵀ and Aᵢ x by Iᵢ(x). A pass's residual combines all subsets, each just before its
-    correction."""
+    The intensity model replaces Aᵢ x by the expected Iᵢ(x), and Aᵢᵀ by its transposed derivative Jᵢᵀ. The residual combines
+    all subsets, each before its correction."""
 
     NUMBERS = ("relaxation",)
 
@@ -96,15 +97,15 @@ METHOD, OS_METHOD = _method("sart", SartOptions()), _method("os-sart", OS_SART)
 
 @dataclass(frozen=True)
 class SirtOptions(IterativeOptions):
-    """Options of SIRT. relaxation: λ, between 0 and 2."""
+    """Options of SIRT. relaxation: λ, which fraction of each correction is applied, up to 2."""
 
     iterations: int = 100
     relaxation: float = ranged(1.0, 1e-6, 2)
 
 
 class Sirt(Algorithm):
-    """SIRT, x ← x + λ C Aᵀ R (p − A x), with R = 1/(A 1) and C = 1/(Aᵀ 1). The intensity model replaces Aᵀ by Jᵀ and A x by
-    I(x).
+    """SIRT, x ← x + λ C Aᵀ R (p − A x), with R = 1/(A 1) and C = 1/(Aᵀ 1). The intensity model replaces A x by the expected
+    I(x), and Aᵀ by its transposed derivative Jᵀ.
 
     An iteration's residual is the one before its correction. Weighted by √R, its norm falls in every step."""
 

@@ -23,7 +23,7 @@ class Stage:
     """One stage of a run. make: returns the stage's method, which starts from a volume (nz, ny, nx); None: from its own
     start.
 
-    merge: combines the stage's volume and the one before it to the result (nz, ny, nx) of the run. end: takes the finished
+    merge: combines the stage's volume with the one before it to the run's (nz, ny, nx). end: called with the finished
     method."""
 
     name: str
@@ -90,8 +90,8 @@ class Stages:
         self._facts.update(self.method.facts(True))
 
     def facts(self, is_complete: bool) -> Mapping[str, object]:
-        """Returns the facts of the last stage, with each stage's iterations and its seconds in this process. In a complete
-        run, stages without iterations end here."""
+        """Returns the facts of the last stage, with each stage's iterations and its seconds in this process. If the run is
+        complete, it first ends earlier stages, in case the last one had no iterations."""
         while is_complete and not self.is_last:
             self.advance()
         self._note()

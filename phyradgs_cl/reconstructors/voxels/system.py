@@ -58,8 +58,9 @@ class System:
         """Returns the system of a scan under the motion model ``motion``. deformation: how the object moves. state_times_s
         (K,): times in s of an object that changes; volumes are then stacks (K, nz, ny, nx).
 
-        detector_model: log, intensity, or scan for the scan's own. fewest_lines: as in ``RayOperator``, for an object at
-        rest. is_dense: as in ``subrays_of``."""
+        detector_model: log, intensity, or scan for the scan's own. fewest_lines: how many lines a pose must serve for the
+        fast kernels (``upright_of``), for an object at rest. is_dense: volumes have the object's density from the start,
+        which ``subrays_of`` uses."""
         tables = [motion.cells(scan, f).still() for f in range(scan.frames)]
         shape = scan.geometry.detector_shape
         projector = projector_of(rt, scan.grid, tables, deformation, state_times_s)
@@ -69,7 +70,7 @@ class System:
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
         intensity: IntensityOperator | SharedIntensity | None = None
-        if model == "intensity" and any(table.averages for table in tables):  # for single times both models agree
+        if model == "intensity" and any(table.averages for table in tables):  # for single times, log and intensity agree
             alone = IntensityOperator(rt, scan.grid, shape, tables, projector, subrays)
             intensity = SharedIntensity(rt.ranks, alone) if rt.ranks.size > 1 else alone
         if rt.ranks.size > 1:
@@ -83,8 +84,7 @@ class System:
         """Returns the system with its arrays on the device, if that has room for the operators, ``volumes`` volumes, and
         ``frames`` arrays of all frames. Otherwise they stay on the host.
 
-        They also stay there with several ranks, which sum on the host, and for a volume that is projected part after
-        part."""
+        They also stay there with several ranks, which sum on the host, and for a volume that is projected in parts."""
         kinds = RayOperator, WarpedOperator, IntensityOperator
         operators = [o for o in (self.operator, self.intensity) if isinstance(o, kinds)]
         if len(operators) < 1 + (self.intensity is not None):
@@ -108,8 +108,8 @@ class System:
         return replace(self, measured=space.array(self.measured), valid=valid, transmission=transmission, space=space)
 
     def leave_room(self, rt: Runtime, nbytes: int) -> bool:
-        """Frees the buffers of the ray operators if they leave less than ``nbytes`` of the memory limit. Returns whether it
-        did. The operators plan their buffers again at their next use."""
+        """Frees the ray operators' buffers if less than ``nbytes`` of the memory limit would remain beside them. Returns
+        whether it did. The operators plan their buffers again at their next use."""
         operators = [o for o in (self.operator, self.intensity) if isinstance(o, RayOperator | IntensityOperator)]
         planned_bytes = sum(operator.memory.planned_bytes for operator in operators)
         if rt.ledger.limit_bytes - max(planned_bytes, rt.ledger.held_bytes) >= nbytes:
@@ -147,8 +147,7 @@ class System:
         return self.operator.forward if self.intensity is None else self.intensity.expected
 
     def derivative(self, change: Any) -> Any:
-        """Returns A d or, in the intensity model, J d: how ``expected`` changes with a change d of the volume last
-        compared."""
+        """Returns A d or, with intensities, J d: how ``expected`` changes with a change d of the volume last compared."""
         operator = self.operator if self.intensity is None else self.intensity
         return self.masked(operator.forward(change, self.space.place(self.operator.frames_shape)))
 
@@ -159,7 +158,7 @@ class System:
 
     def residual(self, volume: Any) -> Any:
         """Returns p − A x or, in the intensity model, p − I(x), dimensionless; 0 at invalid pixels."""
-        # frames before the mask get no name, which would keep their memory
+        # the frames before masking get no name, because a name would keep their memory
         expected = self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
         return self.space.add(self.measured, expected, -1.0)
 
@@ -269,8 +268,7 @@ class SharedOperator:
         return exact_sum(self.ranks, parts, shape, self.ranks.size).reshape(self.volume_shape)
 
     def subset(self: S, frames: Sequence[int]) -> S:
-        """Returns the operator of the frames with the numbers ``frames``, in the order given, divided among the ranks
-        again."""
+        """Returns the operator of the frames with the numbers ``frames``, in this order, divided among the ranks again."""
         return type(self)(self.ranks, self.whole.subset(frames))
 
     def _gathered(self, part: np.ndarray | None) -> np.ndarray:
