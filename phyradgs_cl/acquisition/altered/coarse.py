@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+import scipy  # its parts load when they are used
 
 from phyradgs_cl.acquisition.altered.variants import altered_trajectory, with_trajectory
 from phyradgs_cl.acquisition.geometry import ConeGeometry, Geometry
@@ -47,10 +47,10 @@ def smooth(scan: Scan, pixels: float | tuple[float, float]) -> Scan:
     sigma = (0, v_px, u_px)
     p = np.asarray(scan.projections, np.float32)
     if scan.pixel_mask is None:
-        return replace(scan, projections=gaussian_filter(p, sigma, truncate=3))
+        return replace(scan, projections=scipy.ndimage.gaussian_filter(p, sigma, truncate=3))
     valid = scan.valid.astype(np.float32)
-    weight = gaussian_filter(valid, sigma, truncate=3)
-    return replace(scan, projections=gaussian_filter(p * valid, sigma, truncate=3) / np.maximum(weight, 1e-6))
+    weight = scipy.ndimage.gaussian_filter(valid, sigma, truncate=3)
+    return replace(scan, projections=scipy.ndimage.gaussian_filter(p * valid, sigma, truncate=3) / np.maximum(weight, 1e-6))
 
 
 def fewer_frames(scan: Scan, most: int) -> Scan:
