@@ -12,7 +12,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan
-from phyradgs_cl.acquisition.motion import MODELS, RAYS, SPLATS, motions_for
+from phyradgs_cl.acquisition.motion import MODELS, MOTIONS, RAYS, SPLATS, motions_for
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid, triple
 from phyradgs_cl.reconstructors.method import DEFAULT_METHOD, METHODS, check_able, method_name, method_of
@@ -90,7 +90,8 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
         return options.motion
     name = _implied_motion(options.motion.name, counts, models) if motion is None else motion
     if not isinstance(name, str) or name not in models:
-        named = [one for one, model in models.items() if getattr(model, "poses", one)]  # the command line has no others
+        hidden = {*MOTIONS} - {one.name for one in MODELS if one.poses}  # which the command line does not take
+        named = [one for one in models if one not in hidden]
         raise InputError("--motion", checks.short_repr(name), f"one of {', '.join(named)} for --method {method}")
     model = models[name]
     for key, value in counts.items():

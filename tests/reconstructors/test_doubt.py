@@ -202,6 +202,9 @@ def test_runs_whose_bars_would_not_hold_have_none_or_a_warning(rt, scan, caplog)
     with pytest.raises(InputError) as refused:
         reconstruct(scan, device=rt, doubt=True, initial=scan.reference, **FEW)
     assert refused.value.subject == "doubt"
+    few = static_scan(scan.projections[:3], scan.geometry, np.array([0.0, 120.0, 240.0]), grid=scan.grid)
+    with pytest.raises(InputError, match="doubt: found frames: 3; expected 4 or more"):
+        reconstruct(few, "fdk", device=rt, doubt=True, report=False)
     with pytest.raises(InputError, match="doubt: found iterations 0; .* raise iterations"):
         reconstruct(scan, device=rt, doubt=True, **{**FEW, "iterations": 0})
     caplog.clear()

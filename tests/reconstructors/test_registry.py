@@ -152,6 +152,12 @@ def test_counts_belong_to_the_motions_that_have_them() -> None:
             assert other not in refused.value.expected, (method, changes)
 
 
+@pytest.mark.parametrize(("method", "words"), [("fdk", "static, per-row for"), ("sirt", "static, micro-views, per-row for")])
+def test_a_refused_motion_names_words_that_the_command_line_takes(method, words) -> None:
+    with pytest.raises(InputError, match=f"one of {words}"):
+        method_options(method, None, {"motion": "exact"})
+
+
 def test_strips_mean_micro_views_where_the_motion_is_exact() -> None:
     for given, expected in [
         ({}, "exact"), ({"strips": 4}, "micro-views"), ({"sub_intervals": 3}, "micro-views"),
