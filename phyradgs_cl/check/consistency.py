@@ -148,7 +148,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     turned = best = scan
     least = _CLEAR * fit_squares(rt, scan).sum()
     for sense, rough, limits in zip(senses, roughs, limits_px, strict=True):
-        if rough.squares.mean() > _NEARLY * least_rough:  # if both fit alike, as in a narrow fan, both are refined
+        if rough.squares.mean() > _NEARLY * least_rough:  # far worse: a narrow fan keeps both senses
             continue
         shift = axis.refined_shift(rt, sense, rough, limits)
         if not shift.is_found:

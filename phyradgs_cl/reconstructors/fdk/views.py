@@ -154,7 +154,7 @@ def _filled_cells(ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
 
 
 def _distinct(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the number of each view's angle (F,), and the K distinct angles in rad, ascending within a turn."""
+    """Returns each view's index (F,) into the K distinct angles, and these in rad, ascending within a turn."""
     turned = np.mod(np.asarray(angle_rad, np.float64), 2 * np.pi)
     order = np.argsort(turned, kind="stable")
     tolerance = _SAME_VIEW * 2 * np.pi / turned.size

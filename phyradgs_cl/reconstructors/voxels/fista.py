@@ -38,7 +38,7 @@ from phyradgs_cl.runtime.algebra import HostSpace
 
 log = logging.getLogger(__name__)
 _VOLUMES = 16  # memory of a run in volumes, with the prior ``dct``
-_FRAMES = 3  # memory of a run in arrays of all frames
+_FRAMES = 3  # memory of a run in copies of all projections
 _HELD = 9  # volumes that the prior ``dct`` holds on the device
 _COPIES = 2  # if volumes are on the host, the device holds two copies while a prior maps one
 # The passes before those on smaller voxels are coarse. Their settings were measured (docs/results/settings.md).
@@ -174,7 +174,7 @@ class Fista(Accelerated):
         return residual
 
     def _update(self, subset: System, weight: float) -> Any:
-        """Steps down the gradient of a subset. Returns the residual of its frames at the extrapolated point."""
+        """Makes a step of FISTA: extrapolation, a subset's gradient, prior. Returns the residual at the extrapolated point."""
         space = self.system.space
         point = space.extrapolate(self.volume, self.previous, self.extrapolation)
         residual = subset.residual(point)

@@ -29,7 +29,7 @@ from phyradgs_cl.runtime import Runtime, Space
 # The length of a path is this many standard deviations of five positions at even times from its start to its end.
 _SPREAD = 2.83
 _EDGES = 0.09  # error of a ray's path length at the object's edges, over a voxel's side
-_LEAST = 1e-4  # the prior's weight is at least this fraction of the largest value of Aᵀp, for frames without noise
+_LEAST = 1e-4  # least weight of the prior, as a fraction of the largest value of Aᵀp: without noise it would be 0
 # The next five multiply the option ``prior_weight`` in a prior's maps. They were measured (docs/results/settings.md).
 _TV_ALONE = 1.6  # weight of TV in the prior ``tv``
 _TV_BEFORE_DCT = 0.8  # weight of TV in ``dct``

@@ -202,7 +202,7 @@ def row_weights(system: System) -> Any:
 
     A ray shorter than a tenth of the longest counts as that tenth. A ray that only grazes an edge of the volume would
     otherwise put its noise on one or two voxels, and corners of the volume would become bright. TIGRE measures paths in a
-    box that is a tenth larger, for the same reason."""
+    box that is a tenth wider in x and y, to the same effect."""
     return system.space.reciprocal(system.row_sums(), _SHORTEST_PATH)
 
 
