@@ -174,7 +174,7 @@ class Fista(Accelerated):
         return residual
 
     def _update(self, subset: System, weight: float) -> Any:
-        """Makes a step of FISTA: extrapolation, a subset's gradient, prior. Returns the residual at the extrapolated point."""
+        """Makes a step: extrapolation, a subset's gradient, prior. Returns the residual at the extrapolated point."""
         space = self.system.space
         point = space.extrapolate(self.volume, self.previous, self.extrapolation)
         residual = subset.residual(point)
