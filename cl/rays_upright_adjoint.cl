@@ -138,7 +138,7 @@ RAY_INLINE void meet_planes(const column_t r, const float sa, const int2 between
     }
 }
 
-/* Adds what a detector column contributes on plane p to columns of voxels, which begin at voxel z_first. Column j is summed
+/* Adds the part of a detector column on plane p to columns of voxels, which begin at voxel z_first. Column j is summed
    at sums + (j - b_first) step if b_first <= j < b_stop. Others are other work-items' and are summed at `beyond`, unused. */
 RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p, const int z_first, const int b_first,
                            const int b_stop, float *sums, const int step, float *beyond)

@@ -38,7 +38,7 @@ __kernel void rows_enter(
     norms[g] = norm;
 }
 
-/* Writes dL/d(users' rows) from dL/d(kernels' rows), or adds it to what is there if `add`. */
+/* Writes dL/d(users' rows) from dL/d(kernels' rows), or adds it to the values there if `add`. */
 __kernel void rows_leave(
     __global const float *gradients, /* (13, stride): dL/d(the 11 parameters), dL/d(centre u, v) */
     __global const float *norms,

@@ -1,4 +1,4 @@
-/* What a view whose lines have their own poses adds to a voxel; for backproject.cl and backproject_moving.cl. */
+/* Backprojects a view whose lines have their own poses to a voxel. For backproject.cl and backproject_moving.cl. */
 
 #define LINE_STEPS 6      /* most Newton steps to find the line that sees a voxel */
 #define LEAST_SPEED 0.1f  /* least `speed` of a voxel, since the Newton steps divide by it */

@@ -4,8 +4,8 @@
 
 #define LEAST_SLOPE 1e-6f /* least distance of lines, in voxels: at the source it is 0 */
 
-/* A detector column and its rays, which lie in a plane. On the plane of voxels that is `ahead` planes from the source, line
-   v has the height c = sc + ahead (dz + v ez) / (da + v ea), and b = sb + across ahead + along (c - sc). */
+/* A detector column and its rays, which lie in a plane. They meet the plane of voxels that is `ahead` planes from the source.
+   There line v has the height c = sc + ahead (dz + v ez) / (da + v ea), and b = sb + across ahead + along (c - sc). */
 typedef struct {
     __global const float *values, *slopes; /* one per line v; slopes (LEAN only): (dz + v ez) / (da + v ea) */
     int is_cut;                     /* whether further lines have the other main axis */
