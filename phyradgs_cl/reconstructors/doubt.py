@@ -136,7 +136,7 @@ class Doubter:
     def scan_of_run(self, result: Reconstruction, number: int) -> Scan:
         """Returns the scan of run ``number`` 1 or 2: every second frame for an analytic method, else a synthesised one.
 
-        A synthesised frame is that of the result's volume and the residual by a random sign. Run 2 has the opposite signs."""
+        A synthesised frame is the volume's projection and the residual by a random sign. Run 2 has the opposite signs."""
         if self.kind == "analytic":
             return some_frames(self.scan, np.arange(number - 1, self.scan.frames, 2))
         frames, sums = np.zeros(self.scan.projections.shape, np.float32), np.zeros(5)
