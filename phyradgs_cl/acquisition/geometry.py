@@ -219,7 +219,7 @@ def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
     if isinstance(geometry, ConeGeometry):
         high = min(max(1, round(wide * wide_mm / high_mm)), high)
     low_mm, top_mm = (0.0, 0.0) if poses is None else _travel_mm(poses, geometry)
-    if top_mm - low_mm < high_mm:  # less than a voxel: a wobble of the gantry
+    if top_mm - low_mm < high_mm:  # a travel of less than a voxel is a wobble of the gantry
         return Grid((high, wide, wide), (high_mm, wide_mm, wide_mm))
     high += math.ceil((top_mm - low_mm) / high_mm)
     return Grid((high, wide, wide), (high_mm, wide_mm, wide_mm), ((low_mm + top_mm) / 2, 0.0, 0.0))
@@ -263,7 +263,7 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_par
     corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(-1, 3)
     if is_parallel:
         basis = np.stack([pose[6:9], pose[9:12], pose[0:3]], -1)
-        at = np.linalg.solve(basis, (corners - pose[3:6]).T)[:2]  # columns and rows (2, 8)
+        at = np.linalg.solve(basis, (corners - pose[3:6]).T)[:2]  # the detector column and row of each corner, (2, 8)
         last = np.array(detector_shape[::-1])[:, None] - 0.5
         return "beside the rays" if ((at < -0.5).all(1) | (at > last).all(1)).any() else ""
     source, first, step_u, step_v = pose.reshape(4, 3)

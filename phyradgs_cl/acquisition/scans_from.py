@@ -132,7 +132,8 @@ def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = N
 
 
 def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as ``line_integrals`` does, after ``check_not_counts``: nobody stated their quantity."""
+    """Returns frames as ``line_integrals`` does. Nobody stated their quantity, so frames that look like counts are
+    refused."""
     values = checks.real_array("frames", frames)
     check_not_counts(values, "give −ln(counts / flats)", mask)
     return line_integrals(values, mask)

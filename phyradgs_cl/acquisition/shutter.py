@@ -102,9 +102,8 @@ class Shutter:
         return order / max(lines - 1, 1) * self.readout_s
 
     def line_windows_s(self, lines: int) -> np.ndarray:
-        """Returns when each line receives light, from and to, (lines, 2) in s after the frame's start.
-
-        Without a pulse the line opens and closes then. A line that the pulse misses has two equal times."""
+        """Returns when each line's light begins and ends, (lines, 2) in s after the frame's start. Without a pulse these are
+        the line's opening and closing. A line that the pulse misses has two equal times."""
         delay = self.delay_s(lines)
         return self.in_pulse(np.stack([delay, delay + self.exposure_s], -1))
 

@@ -92,7 +92,7 @@ class TimeCells:
         """Returns the cells with all lengths multiplied by ``factor``."""
         factors = np.full(POSE_LENGTH, factor)
         if self.is_parallel:
-            factors[:3] = 1  # the direction of rays has no length in mm
+            factors[:3] = 1  # a parallel beam's direction is not a length, so it is not scaled
         ends, conic = (None if p is None else p * factors for p in (self.end_poses, self.conic_pose))
         return replace(self, pose=self.pose * factors, end_poses=ends, conic_pose=conic)
 

@@ -265,7 +265,7 @@ def resting_poses(
 def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarray) -> CircularOrbit | PoseTable:
     """Returns a circular orbit if ``geometry`` has the poses (F, 12) of a gantry at rest; otherwise a pose table."""
     is_parallel = isinstance(geometry, ParallelGeometry)
-    side = -1 if is_parallel else 1  # a direction of rays points away from the source's side
+    side = -1 if is_parallel else 1  # parallel rays point away from the side of the source
     angle_rad = np.arctan2(side * poses[:, 1], side * poses[:, 0])
     if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME_PLACE * np.abs(poses).max()):
         return CircularOrbit(geometry, FrameSweeps(middle_s, 0.0, angle_rad, angle_rad))
@@ -328,7 +328,7 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
         poses = np.concatenate([checked_poses(trajectory, f, t) for f, t in enumerate(times)])
         time_s, at = np.unique(times.ravel(), return_index=True)  # unique, because frames may overlap in time
         table = PoseTable(time_s, poses[at], "trajectory", is_parallel(trajectory))
-        between = (time_s[:-1] + time_s[1:]) / 2  # midpoints between samples of any frames: these may overlap
+        between = (time_s[:-1] + time_s[1:]) / 2  # the table is tested between all samples, since frames may overlap
         inside = [between[(t[0] < between) & (between < t[-1])] for t in times]
         errors = (np.abs(table.pose(f, t) - trajectory.pose(f, t)).max(initial=0.0) for f, t in enumerate(inside))
         worst_mm = max(errors)
@@ -339,7 +339,7 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
             overlap = np.any(np.sort(times[:, 0])[1:] < np.sort(times[:, -1])[:-1])
             remedy = "take frames that do not overlap in time: a file has one pose at a time" if overlap else _AS_TABLE
             raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", remedy)
-        # Halves the intervals; the former samples are among the new ones.
+        # Halves the intervals between samples.
         samples = 2 * samples - 1
 
 

@@ -33,10 +33,10 @@ _BLUR_PX = 0.8
 _LEAST_ZEROS = 0.2  # if at least this fraction of the pixels is 0, the noise of air was clipped at 0
 _ZEROS_PX = 5  # the noise of clipped air follows from means of blocks with this many pixels a side
 _BACKGROUND = 4  # cosines along each side of a frame: together they describe holder, scatter and drift of the tube
-_STEP_PX = 0.25  # signals are central differences, for which the frame's edge moves by this much to each side
-_MOST_PX = 1.5  # one step of the placement moves a frame by at most this much: signals are not linear beyond
+_STEP_PX = 0.25  # derivatives are central differences, in which the frame's edge moves by this much to each side
+_MOST_PX = 1.5  # one step of the placement moves a frame by at most this much: beyond, its effect is not linear
 _SETTLED_PX = 0.01  # the search ends when a step moves the frame by less than this
-_LINEAR_PX = 0.3  # signals are computed again after a step that moves the frame by more than this
+_LINEAR_PX = 0.3  # derivatives are computed again after a step that moves the frame by more than this
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,9 +137,9 @@ class _PanelLines:
 
     @cached_property
     def _panel_axes(self) -> tuple[tuple[np.ndarray, ...], ...]:
-        """Three vectors (N, 3). Their inner products with a point in mm give its distance from the source (in distances of
-        the panel), and the line and pixel of its image. Each comes with its products with the source and with the first
-        pixel (N,), and its length (N,).
+        """Three vectors (N, 3). Their inner products with a point in mm give its distance from the source over that of the
+        panel, and the line and pixel of its image. Each comes with its products with the source and with the first pixel
+        (N,), and its length (N,).
 
         In a parallel beam the distance is 1, and lines and pixels are those that a ray through the point meets."""
         normal = np.cross(self.line_step, self.pixel_step)
@@ -154,7 +154,8 @@ class _PanelLines:
         return tuple((v, *both, np.linalg.norm(v, axis=-1)) for v, both in zip(vectors, products, strict=True))
 
     def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:
-        """Returns the lines (n,) that may see a body, the first of its pixels (n,) in each, and their number."""
+        """Returns the lines (n,) that may see a body, the first pixel (n,) of its shadow on each, and the shadow's width in
+        pixels."""
         (depth, depth_of_source, *_), *axes = self._panel_axes
         lowest, highest = [], []
         for end_mm in ends_mm:
@@ -219,7 +220,8 @@ class BeadProblem(CoarseFrames):
         return float(np.std(residual if self.valid is None else residual[self.valid]))
 
     def explained(self, operator: BeadOperator, placement: np.ndarray) -> float:
-        """Returns which fraction of the squares of the compared values the phantom explains; 0 for a negative density."""
+        """Returns how much of the compared values the phantom explains, as a fraction of their sum of squares; 0 for a
+        negative density."""
         residual = self.compared(self.residual(operator, placement))
         whole = self.compared(self.masked(self.measured))
         return float(1 - residual @ residual / max(float(whole @ whole), 1e-30)) if placement[DENSITY] > 0 else 0.0
@@ -257,7 +259,7 @@ class BeadProblem(CoarseFrames):
         return blurred.ravel()
 
     def _units(self) -> np.ndarray:
-        """Returns the step of each number of a placement (7,) that moves a frame's edge by a pixel, or doubles the
+        """Returns steps (7,) of a placement's numbers: each moves a frame's edge by a pixel, the last doubles the
         density."""
         scan = self.scans[0]
         pixel_mm = self.block * min(scan.geometry.pixel_size_mm) / scan.geometry.magnification

@@ -13,11 +13,11 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.removed import removal
 from phyradgs_cl.text import suggest_name
 
-_STEP_PX = 0.25  # signals are central differences, for which the image's edge moves by this much to each side
+_STEP_PX = 0.25  # derivatives are central differences, in which the image's edge moves by this much to each side
 _TIMING_STEP = 0.1  # a time is changed by at most this fraction of itself in a central difference
 _LARGEST_CUT = 0.7  # the search shortens a time by at most this fraction, so that it stays above 0
 _MOST_TILT_RAD = math.radians(2.0)  # an angle is changed by at most this in a central difference
-_SMALL_MISMATCH = 1.3  # mismatch of signals that change sign after half a turn: voxels' errors do not, and disturb them less
+_SMALL_MISMATCH = 1.3  # mismatch of effects that change sign after half a turn: voxels' errors do not, so they disturb less
 # An angle with a larger standard deviation counts as undetermined, because its sine is not linear over such a range.
 _LEAST_KNOWN_RAD = math.radians(10.0)
 _DEGREES = math.degrees(1.0)

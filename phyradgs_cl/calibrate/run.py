@@ -111,7 +111,7 @@ class _Calibrator:
         self.placement = np.zeros(0)
         self.stated = self.ready  # ``ready`` may later get the other readout direction
         stages = {one.block(self.scan): one for one in reversed(STAGES if self.phantom is None else BEAD_STAGES)}
-        self.stages = list(stages.values())[::-1]  # on a small panel, of stages with the same blocks the first is kept
+        self.stages = list(stages.values())[::-1]  # on a small panel several stages have the same blocks: the first is kept
         self.per_view: PerViewParameters | None = None
         if self.request.per_view == WOBBLE:
             self.per_view = WobbleParameters.of(self.ready[0], self.splines)
@@ -145,7 +145,7 @@ class _Calibrator:
         before = self._residual(as_stated, self.stages[-1], GeometryCorrection())
         after = self._residual(problem, self.stages[-1], correction, views)
         held = {name: value for name, value in corrections.items() if name in self.search.held}
-        before_rest = before  # residual with only the held parameters corrected: what the others add is compared with it
+        before_rest = before  # the residual if only the held parameters are corrected
         if held:
             known = correction_of(held)
             before_rest = after if held == corrections else self._residual(as_stated, self.stages[-1], known)
@@ -268,7 +268,7 @@ class _Calibrator:
         return problem.residual(operator, problem.reconstruct(operator, None, stage.first))
 
     def _plan(self) -> dict[str, Passes]:
-        """Returns the most passes through the frames, and their cost, of each phase by name, in order."""
+        """Returns by phase, in order, the largest number of passes through the frames, and their cost."""
         second, last = self.stages[min(1, len(self.stages) - 1)], self.stages[-1]
         parameters, views, most_frames = len(self.request.parameters), (0, 0.0), MOST_FRAMES
         if self.per_view is not None:

@@ -118,7 +118,7 @@ def reduced(
     """Returns the frames linearised at the parameters' values ``at`` (by name) and at the object ``volume``: a volume, or a
     placement of beads.
 
-    operator: of the problem at these values. iterations: of CGLS, which removes what a volume explains."""
+    operator: the projector at these values. iterations: how many CGLS makes to remove what a volume explains."""
     signals = [_signal(problem, one, at, volume) for one in parameters]
     images = [*signals, problem.residual(operator, volume)]
     *jacobian, residual = problem.beyond_object(operator, volume, images, iterations)
@@ -142,16 +142,16 @@ def _signal(
     for sign in (1, -1):
         correction = correction_of({**at, one.name: at.get(one.name, 0.0) + sign * step})
         operator: Any = problem.operator(correction)
-        ends.append(operator.forward(volume) - problem.measured)  # less is lost by rounding than with whole frames
+        ends.append(operator.forward(volume) - problem.measured)  # loses fewer digits than differences of frames
     return problem.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 
 def least_shares(problem: Reduced) -> dict[str, float]:
-    """Returns, by name, from which share on a parameter counts as determined. problem: with ``GAUGES``.
+    """Returns, by name, the share from which on a parameter counts as determined. ``problem`` includes the ``GAUGES``.
 
     No frame distinguishes a turn of all views from a turned object. Voxels do not follow such an object exactly, though:
-    they leave some of its signal unexplained, and as much of any other. So a parameter's share must exceed the share of the
-    turn; of a lift, if the parameter moves the image along the axis."""
+    they leave some of the turn's signal unexplained, and as much of any other signal. So a parameter's share must exceed
+    that of the turn, or of a lift if the parameter moves the image along the axis."""
     remaining = {gauge.is_axial: float(problem.only([gauge.name]).shares[0]) for gauge in GAUGES}
     names = [name for name in problem.names if name in PARAMETERS]
     gauge_shares = {name: min(remaining[PARAMETERS[name].is_axial], _MOST_GAUGE) for name in names}

@@ -99,7 +99,7 @@ def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None, unit: str =
             shape, name = tuple((np.array(before.shape) // step).tolist()), f"s{len(levels)}"
             level = group.create_array(
                 name, shape=shape, chunks=tuple(min(n, _CHUNK) for n in shape), dtype="float32",
-                dimension_names=list("zyx"), config={"write_empty_chunks": True},  # else a lost chunk looks empty
+                dimension_names=list("zyx"), config={"write_empty_chunks": True},  # else a lost chunk reads as zeros
             )  # fmt: skip
             for start in range(0, shape[0], _CHUNK):
                 stop = min(start + _CHUNK, shape[0])
@@ -138,7 +138,7 @@ def gaussians_of(volume: Volume, subject: str) -> dict[str, np.ndarray]:
 
 
 def write_npz(path: Path, cloud: dict[str, np.ndarray]) -> None:
-    """Writes the arrays of ``gaussians_of`` by their names, without a pickle."""
+    """Writes the arrays of ``gaussians_of`` to one .npz file, by their names and without a pickle."""
     with written_beside(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **cloud)  # type: ignore[arg-type]
 

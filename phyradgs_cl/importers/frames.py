@@ -40,7 +40,8 @@ _SAME = 1e-3  # flats up to this fraction above the saturation level are clipped
 @dataclass(frozen=True, eq=False)
 class Light:
     """Flats (G, v, u) at G times, and the dark (1, v, u) or None. place (P,): the time of each projection, counted in
-    flats: 0.5 is halfway from the first to the second. used: how many flats and darks are used. said: that as text."""
+    flats: 0.5 is halfway from the first to the second. used: the numbers of flats and darks that are used. said: the same in
+    words."""
 
     flats: np.ndarray
     dark: np.ndarray | None
@@ -61,7 +62,8 @@ def light_of(
 ) -> Light:
     """Returns the flats and dark for ``count`` projections, from flats and darks (n, v, u). Of three or more, those that do
     not fit the others are left out, with a warning. at (n,): when flats were taken, as in ``places``; None: not stated.
-    names: of the "flats" and "darks", for messages. Raises InputError for the option flats "time" if all are of one time."""
+    names: what messages call each of the "flats" and "darks". Raises InputError for the option flats "time" if all are of
+    one time."""
     at, assumed = _times(subject, len(flats), count, options, at)
     light = max(float(np.median(_levels(flats)[1])), 1e-30)
     times = [np.flatnonzero(at == time) for time in np.unique(at)]
@@ -112,9 +114,9 @@ def _fitting(
     kind: str, stack: np.ndarray, group: np.ndarray, tolerance: float, subject: str, light: float,
     names: Mapping[str, Sequence[str]],
 ) -> np.ndarray:
-    """Returns which frames, bool (k,), are like the others in median and pattern. group (k,): their indices in ``stack``.
-    tolerance: of the median, as a fraction of ``light``, the flats' median counts. All are kept if no majority shows which
-    are right. Warns of each that is unlike."""
+    """Returns which frames, bool (k,), are like most in median and pattern. group (k,): the frames' indices in ``stack``.
+    tolerance: largest difference of medians, as a fraction of ``light``, the flats' median counts. Keeps all if there is no
+    majority. Warns of each frame that it leaves out."""
     some, level = _levels(stack[group])
     usual = float(np.median(level))
     is_odd = np.abs(level - usual) > tolerance * light

@@ -285,7 +285,7 @@ def _in_rows(
     filled = ceil_div(fast.size, field.segment) * field.segment
     fast = np.concatenate([fast, fast[-1] + fine.voxel_size_mm[2] * np.arange(1, filled - fast.size + 1)])
     slows, middles, fasts = grid.shape
-    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # rows of points, grouped by rows of voxels
+    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # where each row of points lies, grouped by voxels
     rows[..., 0], rows[..., 1] = slow.reshape(slows, 1, points, 1), middle.reshape(1, middles, 1, points)
     rows = rows.reshape(slows * middles, points**2, 2)
     values = np.empty((slows * middles, fasts), np.float32)

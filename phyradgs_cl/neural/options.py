@@ -107,8 +107,8 @@ class NeuralOptions(MotionOptions):
 class LineOptions(NeuralOptions):
     """Options of a field with a transformer over line segments, and windows of pixels in addition to the scattered ones.
 
-    segment: samples of a line segment. heads, head_width, blocks: of its attention. windows: how many a step uses; each has
-    ``window`` by ``window`` pixels."""
+    segment: number of samples in a line segment. heads, head_width, blocks: sizes of the attention within segments. windows:
+    number of windows per step, each of ``window`` by ``window`` pixels."""
 
     segment: int = checks.ranged(2, 1, 256)
     heads: int = checks.ranged(8, 1, 256)

@@ -114,7 +114,7 @@ class PerturbedTrajectory:
         source, first, column, row = np.moveaxis(pose.reshape(*pose.shape[:-1], 4, 3), -2, 0)
         pitch_u_mm, pitch_v_mm = (np.linalg.norm(step, axis=-1, keepdims=True) for step in (column, row))
         u_hat, v_hat = column / pitch_u_mm, row / pitch_v_mm
-        normal = np.cross(u_hat, v_hat)  # it points towards the source
+        normal = np.cross(u_hat, v_hat)  # the panel's normal, which points towards the source
         half_v, half_u = ((n - 1) / 2 for n in self.shape)
         middle = first + half_u * column + half_v * row - correction.detector_distance_mm * normal
         middle = middle + (correction.offset_u_mm + shift_u_mm) * u_hat + (correction.offset_v_mm + shift_v_mm) * v_hat

@@ -17,7 +17,7 @@ from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_par
 
 _MIRROR_Y = np.array([1.0, -1.0, 1.0] * 4)
 _FIRST, _COLUMN_STEP, _ROW_STEP = slice(3, 6), slice(6, 9), slice(9, 12)
-_STEPS = _ROW_STEP, _COLUMN_STEP  # index: axis 0 (v), axis 1 (u)
+_STEPS = _ROW_STEP, _COLUMN_STEP  # the step along axis 0 (v), then along axis 1 (u)
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,7 +75,7 @@ class UprightPoses:
         table = self._table(cells, appears, slot, detector_shape)
         columns, rows = _largest(table)
         if (2 if leans else 1) * len(table) * columns * pitch_of(rows) > most_floats:
-            # A slot for cells whose lines are far apart would also hold all lines in between. So each cell gets its own.
+            # A slot for cells whose lines are far apart would also hold all lines between. So each cell gets its own slot.
             appears = slot = np.arange(len(cells))
             table = self._table(cells, appears, slot, detector_shape)
             columns, rows = _largest(table)

@@ -8,7 +8,7 @@ from phyradgs_cl.runtime import DeviceArray, LaterItem, MemoryShortage, Runtime
 _CHUNK = 512  # number of splats that a CPU's work-item counts
 _GROUP = 64  # number of splats that a GPU's work-group counts
 _LARGEST_GROUP = 256  # most splats per work-group on a GPU, taken where _GROUP would give more than _MANY_COUNTS
-_MANY_COUNTS = 1 << 22  # number of counts, tiles × work-groups, above which their memory and time matter
+_MANY_COUNTS = 1 << 22  # above this many counts, tiles × work-groups, counting takes much memory and time
 _SCANNED = 64  # number of counts that a work-group adds at a time in its prefix sum
 _SLACK = 1.5  # lists are allocated this many times larger than needed, because clouds grow
 _NEAR = 1.25  # lists less than this many times larger than needed are replaced by larger ones before they overflow

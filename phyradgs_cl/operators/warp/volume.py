@@ -49,7 +49,8 @@ class VolumeWarp:
         return self.states.is_still(state)
 
     def source(self, volume: DeviceArray) -> DeviceArray:
-        """Returns F E v, the spline coefficients of a volume v (nz, ny, nx). The memory is valid until the next call."""
+        """Returns the spline coefficients F E v of a volume v (nz, ny, nx), padded by E and filtered by F. Valid until the
+        next call."""
         if self._source is None:
             self._source = self.rt.empty(self._floats)
         self.rt.fill(self._source, 0)
@@ -58,7 +59,8 @@ class VolumeWarp:
         return self._source
 
     def _filter(self, values: DeviceArray) -> None:
-        """Applies F to padded coefficients, in place. Filters padded rows as a whole, because their zeros stay zero."""
+        """Applies the spline filter F in place to a padded volume. Filters padded rows as a whole, because their zeros stay
+        zero."""
         nz, ny, nx = (n + 2 * _BORDER for n in self.shape)
         slice_, row = self._strides.slice, self._strides.row
         start = np.int64(self._strides.start - _BORDER * (slice_ + row + 1))
@@ -94,7 +96,8 @@ class VolumeWarp:
         return self._total
 
     def adjoint(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Adds B_kᵀ v to ``total``, for a volume v in the memory that ``moved`` returned. ``read`` then applies Eᵀ F."""
+        """Adds a volume v of state k, by the transpose B_kᵀ of sampling the spline, to the coefficients ``total``. v is in
+        the memory that ``moved`` returned."""
         if self.rt.pixel_items:
             self._adjoint_fixed(state, moved, total)
             return
@@ -108,13 +111,14 @@ class VolumeWarp:
         )  # fmt: skip
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:
-        """Writes the volume Eᵀ F ``total`` (nz, ny, nx) to ``result``. Destroys ``total``."""
+        """Writes the volume (nz, ny, nx) of the coefficients ``total`` to ``result``: filtered, then without padding.
+        Destroys ``total``."""
         self._filter(total)
         move(self.rt, (total, self._strides), (result, Strides.plain(self.shape)), self.shape)
 
     def _adjoint_fixed(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Adds B_kᵀ v as integers, whose sums do not depend on the order. The largest voxel becomes 2³¹ / ``_HEADROOM``, so
-        rounding is as fine as float32's."""
+        """Does what ``adjoint`` does in integers, whose sums do not depend on the order. The largest voxel becomes 2³¹ /
+        ``_HEADROOM``, so rounding is as fine as float32's."""
         largest = self._space.largest(moved, absolute=True)
         if not largest > 0:
             return
