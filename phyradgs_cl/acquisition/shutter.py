@@ -58,7 +58,7 @@ class Shutter:
 
     @property
     def readout(self) -> Readout:
-        """Puts frames and poses into the order (lines, width)."""
+        """Converts frames and poses to the order (lines, width) in which the panel is read, and back."""
         return Readout(self.axis)
 
     @property

@@ -75,7 +75,7 @@ class TimeCells:
 
     @property
     def readout(self) -> Readout:
-        """Puts frames and poses into the order (lines, width)."""
+        """Converts frames and poses to the order (lines, width) in which the panel is read, and back."""
         return Readout(self.axis)
 
     @property
@@ -145,7 +145,8 @@ class TimeCells:
 
     @cached_property
     def layer_numbers(self) -> np.ndarray:
-        """The layer of each cell, (C,) from 0 on. Cells in the same layer share no line; layers are as few as possible.
+        """The number, from 0 on, of the layer in which each cell is, (C,). Cells in one layer share no line; layers are as
+        few as possible.
 
         To average intensities, a frame's layers are projected one by one."""
         numbers = np.zeros(self.count, np.int64)

@@ -159,7 +159,8 @@ def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
 
 
 def _is_without_jumps(steps_rad: np.ndarray) -> bool:
-    """Returns whether steps (N,) between angles are real: none exceeds half a turn, or half of them a quarter turn."""
+    """Returns whether steps (N,) between angles are real, not jumps by a turn: none exceeds half a turn, or half of them a
+    quarter turn."""
     size_rad = np.abs(steps_rad)
     return bool(size_rad.max(initial=0) <= np.pi or np.median(size_rad) >= np.pi / 2)
 
@@ -306,7 +307,7 @@ def _is_off_axis(poses: np.ndarray) -> bool:
 
 
 def grid_of_scan(geometry: Geometry, trajectory: Trajectory, frame_start_s: np.ndarray) -> Grid:
-    """Returns ``default_grid``, which is longer if the gantry travels along z."""
+    """Returns the grid of the field of view (``default_grid``), longer if the gantry travels along z."""
     if isinstance(trajectory, CircularOrbit):
         return default_grid(geometry)
     poses = [checked_poses(trajectory, f, np.array([t])) for f, t in enumerate(frame_start_s)]

@@ -103,7 +103,8 @@ class _PanelLines:
     """N lines of a panel, each at one time, in the phantom's frame of reference.
 
     - source, first (N, 3): the source, and the middle of the panel's first pixel, in mm.
-    - line_step, pixel_step (N, 3): the steps to the next line, and to the next of its ``pixels``. line (N,): its number.
+    - line_step, pixel_step (N, 3): the steps to the next line, and to the next of its ``pixels``. line (N,): the number of
+      each line.
     - is_parallel: ``source`` is the rays' direction."""
 
     source: np.ndarray

@@ -29,7 +29,7 @@ _GAPS = 15  # a missing or repeated frame is looked for at this many frames, eve
 class Hypothesis:
     """What may be wrong in a scan: a description, advice, and a function that returns the scan corrected for it.
 
-    factor: by which pixels are larger than stated. Hypotheses with the same factor, unless it is 1, differ only by the
+    factor: how many times larger pixels are than stated. Hypotheses with the same factor, unless it is 1, differ only by the
     panel's shift."""
 
     text: str
@@ -69,7 +69,7 @@ def frame_number(scan: Scan, frame: int) -> int:
 
 
 def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. stated: the scan of full
+    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. stated: the scan at full
     size."""
     yield from _other_units(scan, stated)
     yield from _other_images(scan, stated)

@@ -103,8 +103,8 @@ def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> 
 def check_rotation(stated: axis.AxisShift, other: axis.AxisShift) -> Finding:
     """Compares the residuals with the angles as stated and reversed, each with its own best shift of the panel.
 
-    A reversal needs four standard errors and 20 % of the squared residual, because a mirror image fits as well in a narrow
-    fan. Frames mirrored in u fit reversed angles and the opposite offset; ``with_cause`` decides between the two."""
+    A reversal must fit better by four standard errors and 20 % of the squared residual: in a narrow fan a mirror image fits
+    as well. Frames mirrored in u fit reversed angles and the opposite offset; ``with_cause`` decides between the two."""
     errors, ratio = t_statistic(stated.squares, other.squares), residual_ratio(stated.squares, other.squares)
     text = f"turned the other way, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"
     values = (errors, -_ERRORS, "standard errors", text)

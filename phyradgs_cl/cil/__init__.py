@@ -26,9 +26,9 @@ class ProjectionOperator(LinearOperator):
     image_geometry: None takes CIL's default. acquisition_geometry: cone, parallel or cone_flex, in 3D or 2D, with any
     offset or tilt, order of dimensions, origin of the panel and channels. A BlockGeometry gives a BlockOperator.
 
-    shutter, deg_per_s: of a fly-scan: when each line is exposed, and how fast the object turns, positive if angles rise.
-    The geometry's angles then hold in the middle of each frame. motion: a model of docs/methods.md except ``exact``.
-    device: what ``--device`` takes, or a Runtime.
+    shutter, deg_per_s: when each line of a fly-scan is exposed, and how fast the object turns, positive if angles rise. The
+    geometry's angles then hold in the middle of each frame. motion: a model of docs/methods.md except ``exact``. device:
+    what ``--device`` takes, or a Runtime.
 
     Raises InputError for a grid that no ray meets, an unknown motion, and a shutter with cone_flex."""
 

@@ -230,8 +230,8 @@ def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
 def parallel(
     options: ImportOptions, panel: tuple[int, int], pitch_mm: Pitch, offset_mm: tuple[float, float]
 ) -> ParallelGeometry:
-    """Returns a parallel beam from the options' numbers, else the arguments, which are the file's. Raises InputError for an
-    option that is a distance."""
+    """Returns a parallel beam, whose numbers are the options', or else those of the file, which are the arguments. Raises
+    InputError for an option that is a distance."""
     for name in options.given(_DISTANCES):
         expected, remedy = "no distance: this file has a parallel beam", "leave it out"
         raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
@@ -242,9 +242,9 @@ def cone(
     options: ImportOptions, to_axis_mm: Length, to_detector_mm: Length, panel: tuple[int, int], pitch_mm: Pitch,
     offset_mm: tuple[float, float], names: Mapping[str, str] | None = None,
 ) -> ConeGeometry:
-    """Returns a cone beam from the options' numbers, else the arguments, the file's. An argument may be a function, which is
-    called only if no option replaces it, so that a file may lack it. names: what the file calls the numbers, for messages.
-    Raises InputError unless the panel stands behind the axis."""
+    """Returns a cone beam, whose numbers are the options', or else those of the file, which are the arguments. An argument
+    may be a function that reads the file. It is called only if no option replaces it, so that the file may lack the number.
+    names: what the file calls the numbers, for messages. Raises InputError unless the panel stands behind the axis."""
     axis_mm, detector_mm = map(partial(_taken, options), _DISTANCES, (to_axis_mm, to_detector_mm))
     if detector_mm <= axis_mm:
         axis, detector = (options.called(name, names) for name in _DISTANCES)

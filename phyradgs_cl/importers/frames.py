@@ -140,8 +140,8 @@ def _fitting(
 
 @dataclass(frozen=True, eq=False)
 class LineIntegrals:
-    """Line integrals (P, v, u) float32 and the mask of unusable pixels: (v, u), (P, v, u) or None. saturation: of the raw
-    counts, or None. applied: entries about flats and darks for the provenance."""
+    """Line integrals (P, v, u) float32 and the mask of unusable pixels: (v, u), (P, v, u) or None. saturation: how raw
+    counts were clipped, or None. applied: entries about flats and darks for the provenance."""
 
     values: np.ndarray
     mask: Mask

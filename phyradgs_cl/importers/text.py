@@ -106,8 +106,8 @@ def _is_index(values: list[float]) -> bool:
 
 
 def _column(path: Path, names: list[str], table: list[list[float]], count: int, column: int | None) -> np.ndarray:
-    """Returns a table's angles in the stored unit: its only column or row, the column named as an angle, or that next to
-    an index, which gives the order. Raises InputError if several columns may be meant."""
+    """Returns a table's angles in the stored unit: its only column or row, the column named as an angle, or the one next to
+    an index, which gives the angles' order. Raises InputError if several columns may be meant."""
     widths = {len(row) for row in table}
     if widths == {1} or (len(table) == 1 and column is None) or (len(table) < count == sum(map(len, table))):
         return np.array([value for row in table for value in row])
@@ -209,7 +209,7 @@ def head_has(path: Path, *marks: bytes) -> bool:
 
 
 def say_missing(fields: Fields, meanings: Mapping[str, str]) -> None:
-    """Warns of names that the description lacks. meanings: by name, the value that is assumed instead."""
+    """Warns of names that the description lacks. meanings: the value that is assumed for each missing name."""
     if missing := [f"no {name} ({meaning})" for name, meaning in meanings.items() if not fields.has(name)]:
         _log.warning("%s %s", fields.subject, ", ".join(missing))
 

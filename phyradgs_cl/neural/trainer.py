@@ -201,7 +201,7 @@ class Trainer:
 class ExposureRays:
     """The rays of one frame's pixels.
 
-    - pose (C, 12): of each time cell, in units of half the volume's longest side about the volume's centre.
+    - pose (C, 12): the pose of each time cell, in units of half the volume's longest side about the volume's centre.
     - cell (K, lines): the time cell of each of a line's K times, which have equal weights.
     - axis: whether lines are rows or columns. is_parallel: poses begin with the direction of the rays."""
 
@@ -333,7 +333,8 @@ def line_integrals(
 ) -> torch.Tensor:
     """Returns the integrals (R,) of a field along rays (R, 3), with one sample in each of ``samples`` intervals in the box.
 
-    ``shifts``: from ``sample_shifts``. If they are drawn uniformly, the expectation is the exact integral of any field."""
+    ``shifts``: what ``sample_shifts`` returns. If they are drawn uniformly, the expectation is the exact integral of any
+    field."""
     first, length = box_span(source, direction, half_sides)
     step = length / samples
     number = torch.arange(samples, dtype=source.dtype, device=source.device)

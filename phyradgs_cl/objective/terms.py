@@ -44,7 +44,8 @@ class ImageLoss:
     def evaluate(
         self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float
     ) -> DeviceArray:
-        """Returns dL/d(rendered), valid until the next call. mask: 1 where a pixel counts, else 0. pixels: their number."""
+        """Returns dL/d(rendered), valid until the next call. mask: 1 where a pixel counts, else 0. pixels: the number of
+        pixels that count."""
         rt = self.rt
         vectors = ceil_div(self.width, rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))

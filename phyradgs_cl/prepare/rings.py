@@ -51,8 +51,8 @@ class RingOptions(checks.Checked):
 
 @dataclass(frozen=True)
 class Strength:
-    """Variances, in line integrals squared: of the pattern, of the part of it that whole columns share, and of the noise in
-    the mean of all views. least: the variance above which a pattern is certain."""
+    """Three variances, in line integrals squared: the pattern's, that of its part which whole columns share, and that of the
+    noise in the mean of all views. least: the variance above which a pattern is certain."""
 
     pattern: float
     column: float
@@ -138,7 +138,7 @@ def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: f
 
 def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarray:
     """Denoises an image (v, u): thresholds the coefficients of overlapping cosine blocks, then guides a Wiener filter by the
-    result. variances (2,): that of each pixel's own noise, and that of the noise that a whole column shares."""
+    result. variances (2,): the variance of each pixel's own noise, and of the noise that a whole column shares."""
     sigma = np.full((window, window), variances[0])
     # an error that a column shares is constant along it, so only the first row of coefficients has it
     sigma[0] += window * variances[1]

@@ -32,9 +32,10 @@ class ChangingOptions(IterativeOptions):
 
     - states: number of the object's states, each with as many frames; fewer if the scan has fewer frames.
     - prior_weight: weight of total variation in space, relative to the error of the data term's gradient.
-    - time_weight: weight of a voxel's change from one state to the next, relative to an equal step between two voxels.
-    - subsets: of the frames, with one step each; at most two for each frame of a state. tv_iterations: dual iterations per
-      proximal map."""
+    - time_weight: weight of a voxel's change from one state to the next, relative to an equal difference between
+      neighbouring voxels.
+    - subsets: number of subsets of the frames, each with one step; at most two for each frame of a state. tv_iterations:
+      dual iterations per proximal map."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 8)
     """Iterations of the two short runs that ``estimate`` times. Both begin with the slower first pass."""

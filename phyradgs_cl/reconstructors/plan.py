@@ -201,8 +201,8 @@ class ObjectMotion:
 
 @dataclass(frozen=True, eq=False)
 class RunPlan:
-    """What to run on a scan. method: a name as ``method_name`` returns it, or the user's own function. options: of the
-    method, checked. preprocessing: changes of the frames before the method.
+    """What to run on a scan. method: a name as ``method_name`` returns it, or the user's own function. options: the method's
+    options, checked. preprocessing: changes of the frames before the method.
 
     Raises InputError for a seed out of range, an object that moves with a method for objects at rest, and error bars of runs
     that cannot differ."""

@@ -51,7 +51,7 @@ def write_report(
 
 
 def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Change] = ()) -> str:
-    """Returns the page's HTML. views: from ``computed_views``. changes: from ``step_changes``."""
+    """Returns the page's HTML. views, changes: what ``computed_views`` and ``step_changes`` return."""
     of_scan = {} if run.scan is None else {
         "preparation": sections.preparation_section(run, changes),
         "projections": sections.projections_section(run.scan, views),

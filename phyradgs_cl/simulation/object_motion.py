@@ -41,7 +41,7 @@ class ObjectMotion(checks.Checked):
     - period_s: the time of a breath, or of sliding up and down. jitter: spread (std) of a breath's period over ``period_s``.
     - hysteresis: the delay of the motion along y, in periods.
     - settling_s: the time in which drying goes 63 % of its way. None takes a third of the scan.
-    - radius: of the sliding cylinder, over half of the shortest side. seed: of the jitter's random numbers.
+    - radius: the sliding cylinder's radius, over half of the shortest side. seed: the seed of the jitter's random numbers.
     - states: at how many times the true volume is stored.
 
     Raises InputError for an unknown kind and for numbers out of range."""

@@ -99,8 +99,9 @@ def run_reconstruction(
 
     An interrupted run does not change ``output``. It writes ``io.partial_path`` and a checkpoint, from which ``resume``
     continues; a complete run removes both. A killed run leaves its last checkpoint. inputs: other files that the output
-    must not overwrite. ranks: of the runtime; only rank 0 writes and has metrics. Raises OutputError if the output cannot
-    be written, BusyError while another run writes it, and InputError for a wrong scan, option or checkpoint."""
+    must not overwrite. ranks: the runtime's MPI processes, of which only rank 0 writes and has metrics. Raises OutputError
+    if the output cannot be written, BusyError while another run writes it, and InputError for a wrong scan, option or
+    checkpoint."""
     checks.within("--checkpoint-every (seconds)", checkpoint_every_s, 0, 1e9)
     leads = ranks is None or ranks.rank == 0
     if leads:

@@ -42,7 +42,6 @@ class AlteredTrajectory:
 
     @property
     def is_parallel(self) -> bool:
-        """True for a parallel beam, as in ``base``."""
         return is_parallel(self.base)
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
@@ -80,7 +79,6 @@ class MappedTrajectory:
 
     @property
     def is_parallel(self) -> bool:
-        """True for a parallel beam, as in ``base``."""
         return is_parallel(self.base)
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:

@@ -75,7 +75,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _angles(scan: Settings, measured: Path | None, count: int) -> np.ndarray:
-    """Returns angles (count,) in rad: those in the file ``measured``, or equal steps if it is None."""
+    """Returns angles (count,) in rad, from the file ``measured`` if there is one, else in equal steps."""
     if measured is not None and not scan.has("AngularStep"):
         return read_angles_rad(measured, count, column=1)
     steps_rad = np.deg2rad(scan.number("InitialAngle", 0.0) + scan.number("AngularStep") * np.arange(count))

@@ -129,7 +129,8 @@ def _frames_and_views(
 
 
 def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> ImportOptions:
-    """Returns options with a flat value: that given, else the brightest pixel, as in the published code, with a warning."""
+    """Returns options with a flat value. If none is given, it is the brightest pixel, as in the published code, with a
+    warning."""
     if options.flat_value is not None or options.quantity not in (None, "counts"):
         return options
     brightest = float(frames.max())

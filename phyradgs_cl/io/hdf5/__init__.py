@@ -59,7 +59,7 @@ def open_hdf5(path: str | Path, linked_folder: Path | None = None) -> "Iterator[
 
 @dataclass(frozen=True, eq=False)
 class Hdf5Source:
-    """An open HDF5 file. path: its name in messages. folders: where files that it links to may lie."""
+    """An open HDF5 file. path: the file's name in messages. folders: the only folders in which linked files may lie."""
 
     file: h5py.File
     path: Path

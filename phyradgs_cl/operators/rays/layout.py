@@ -103,8 +103,8 @@ class RayLayout:
         return padded[BORDER:-BORDER, BORDER:-BORDER, :nx]
 
     def constants(self) -> tuple[np.ndarray | np.int32, ...]:
-        """Returns arguments of kernels. Of the brick: shape (x, y, z), first voxel, pitch of rows in floats, voxel size in
-        mm. Of a frame: lines, width, pitch of lines."""
+        """Returns arguments of kernels: the brick's shape (x, y, z), first voxel, pitch of rows in floats and voxel size in
+        mm; a frame's lines, width and pitch of lines."""
         nz, ny, nx = self.brick.shape
         dz, dy, dx = self.grid.voxel_size_mm
         return (

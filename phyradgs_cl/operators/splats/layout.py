@@ -89,8 +89,8 @@ class DeviceCells:
     def upload(
         cls, rt: Runtime, table: TimeCells, states: tuple[np.ndarray, np.ndarray] | None = None
     ) -> "DeviceCells":
-        """Uploads a frame's cells. states: for an object that moves, what ``states_of`` returns. Raises InputError for
-        cells that have another weight in each line."""
+        """Uploads a frame's cells. states: what ``states_of`` returns for an object that moves. Raises InputError for cells
+        that have another weight in each line."""
         shares, cell_states = (np.zeros(1), np.zeros(1)) if states is None else states
         if table.line_share is not None:
             raise InputError("--motion", "cells with a weight for each line", "cells with one weight", "take micro-views")

@@ -136,7 +136,6 @@ class VolumeWarp:
         self.rt.launch(self.kernel("warp_adjoint_sum"), self._floats, *sums, group=self.rt.group())
 
     def kernel(self, name: str) -> Kernel:
-        """Returns a kernel of cl/warp.cl."""
         return self.rt.kernel("warp", name, RANK=len(self.states.fields_mm))
 
     def _layout(self) -> tuple[int, Strides]:

@@ -47,7 +47,7 @@ class Arc:
     """The angles that the views cover, and how much of them each view stands for.
 
     - gap_rad (F,): each view's part of the arc.
-    - progress_rad (F,): its angle from the arc's start, which is half a step before the first view; the end is half a step
+    - progress_rad (F,): each view's angle from the arc's start, half a step before the first view; the arc ends half a step
       behind the last. In a full turn it counts from the view of the least angle.
     - parts_rad (P, 2): progress at which each part between gaps begins and ends.
     - filled_rad: total width of the gaps for which neighbouring views stand."""
@@ -211,7 +211,7 @@ def ray_weight(
 def opposite_weight(
     canonical: np.ndarray, shape: tuple[int, int], arc: Arc, is_parallel: bool
 ) -> Callable[[int], np.ndarray | float]:
-    """Returns a function from a view's index to weights (rows, columns): those of a ray and its opposite sum to 2."""
+    """Returns a function from a view's index to weights (rows, columns). The weights of a ray and its opposite sum to 2."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
 
     def weight(view: int) -> np.ndarray | float:

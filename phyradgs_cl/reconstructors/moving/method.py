@@ -83,8 +83,8 @@ def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: floa
 
 
 class FieldSearch:
-    """Searches the field on a coarse copy of the scan, as a ``Stepwise``. rounds: its iterations. bending: stiffness of the
-    field."""
+    """Searches the displacement field on a coarse copy of the scan, as a ``Stepwise``. rounds: number of iterations.
+    bending: the field's stiffness."""
 
     quantity, remedy = "residual", "check the scan for extreme values"
 
@@ -151,9 +151,9 @@ class FieldSearch:
         return resampled(self.volume, self.scan.grid, self.grid)[0], self.grid
 
     def finding(self) -> tuple[Deformation, float]:
-        """Returns the field, and its gain: by which fraction its squared residual is below that of an object at rest after
-        as many passes. The field is zeros if the gain is within ``LEAST_GAIN``, or not above what so many free numbers would
-        explain of noise alone."""
+        """Returns the field, and its gain: the fraction by which it lowers the squared residual, compared with an object at
+        rest after as many passes. The field is zeros if the gain is at most ``LEAST_GAIN``, or what as many free numbers
+        would explain of noise alone."""
         if not self.field.control_mm.any():
             return self.field.deformation(), 0.0
         moving = self._reconstructed(self.field, self.volume, _PASSES)

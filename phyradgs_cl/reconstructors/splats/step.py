@@ -80,7 +80,7 @@ class DeviceCloud:
 
 
 class DeviceFrames:
-    """Each frame on the device: its time cells, its measurement in internal units, and its mask."""
+    """All frames on the device, each with its time cells, its measurement in internal units, and its mask."""
 
     def __init__(
         self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, deformation: Deformation | None = None
@@ -196,8 +196,8 @@ class FrameStep:
         self, cloud: DeviceCloud, frame: int, corner: Corner | None, late: bool, statistics: DeviceArray
     ) -> None:
         """Writes one frame's dL/d(raw parameters) into the gradients of an activated cloud, and adds to the ``statistics``
-        (2, stride) of density control. corner: of the sub-volume for total variation, or None. late: whether the density
-        term applies."""
+        (2, stride) of density control. corner: the corner of the sub-volume for total variation, or None. late: whether the
+        density term applies."""
         options, gaussians, by_cloud = self.options, cloud.gaussians, cloud.gradients
         cells, measured, mask, pixels = self.frames.get(frame)
         rendered = self.projector.forward(gaussians, cells)

@@ -62,8 +62,8 @@ class FistaOptions(IterativeOptions):
       the frames and from edges inside large voxels.
     - subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0 takes 2 for slices of up to 90² voxels where memory
       allows, else 1.
-    - subsets: of the frames, with one step each; the passes before smaller voxels have 1.6 times as many. If their steps
-      diverge, they are joined two by two. tv_iterations: dual iterations per proximal map of TV.
+    - subsets: number of subsets of the frames, each with one step; the passes before smaller voxels have 1.6 times as many.
+      If their steps diverge, they are joined two by two. tv_iterations: dual iterations per proximal map of TV.
     - transmission_weights: weights pixels by their transmission, as in ``fista-tv``."""
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
@@ -121,7 +121,7 @@ class Accelerated(Algorithm):
         return (self.momentum - 1) / self.next_momentum
 
     def accept(self, point: Any, volume: Any) -> None:
-        """Takes ``volume``, the result of the step from ``point``, as the present volume."""
+        """Makes ``volume``, the result of the step from the extrapolated ``point``, the present volume."""
         # restart if the step points against the last movement: momentum then carried the point past a minimum
         is_uphill = self.system.space.turn(point, volume, self.volume) > 0
         self.momentum = 1.0 if is_uphill else self.next_momentum

@@ -20,11 +20,9 @@ _STAGE, _VOLUME = "stage", "volume_before"  # entries of a state: the stage's nu
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a run. make: returns the stage's method, which starts from a volume (nz, ny, nx); None: from its own
-    start.
-
-    merge: combines the stage's volume with the one before it to the run's (nz, ny, nx). end: called with the finished
-    method."""
+    """One stage of a run. make: returns the stage's method, which starts from a volume (nz, ny, nx), or from its own start
+    for None. merge: combines the volumes (nz, ny, nx) of this stage and the one before to the run's. end: called with the
+    finished method."""
 
     name: str
     iterations: int
