@@ -26,8 +26,7 @@ Served = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
-    """Returns one cell of all lines, midway between the frame's first and last light. No other single pose fits a frame
-    better."""
+    """Returns one cell of all lines, midway between the frame's first and last light. No single pose fits a frame better."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.middle_s, lines)
 
 
@@ -110,8 +109,7 @@ def common_time_cells(
 
 @lru_cache(maxsize=8)  # the lines' windows are the same in all frames of a scan
 def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray, Served]:
-    """Returns the cells' edges (K + 1,) in s, the fraction (K, lines) of each line's window in each cell, and
-    ``_served_lines``.
+    """Returns the cells' edges (K + 1,) in s, the part (K, lines) of each line's window in each cell, and ``_served_lines``.
 
     windows: the bytes of the windows (lines, 2) in s after a frame's start; bytes can be a key of the cache. The returned
     arrays are cached too: do not write to them."""
@@ -163,7 +161,7 @@ def exact_cells(
 ) -> TimeCells:
     """Divides the time from a frame's first light to its last into equal ``segments``, in which Gaussians move on the panel.
 
-    Every line integrates over its own window (docs/mathematics.md). For a gantry at rest, or a time of 0 s, returns
+    Every line integrates over its own window (docs/mathematics.md). At rest, or for a time of 0 s, returns
     ``static_cells``."""
     first_s, last_s = shutter.lit_span_s
     if last_s <= first_s:
@@ -184,8 +182,8 @@ def exact_cells(
 def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     """Returns ``TimeCells.line_times`` (K, 3, lines), for windows (lines, 2) in s and edges (K + 1,) in s of equal segments.
 
-    Where a window covers at most ``_OVERHANG`` of a segment, that part counts to the next segment: fewer Gaussians must then
-    be projected."""
+    Where a window covers at most ``_OVERHANG`` of a segment, that part counts to the next one, to project fewer
+    Gaussians."""
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
     opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in lengths of a segment after the frame's first light
@@ -220,8 +218,8 @@ def segments_for(
     In a segment, Gaussians move along straight lines and keep their shape. The error grows with the square of the gantry's
     turn in a segment. The factor was measured (benchmarks/time_exact.py) for Gaussians of 0.5 to 4 % of the half-width.
     intensity_peak: the largest line integral if the detector averages intensities, else 0. Then half the variance of the
-    line integrals in a segment is a further error. Up to a peak of 4 it is smaller than the others; above, more segments
-    are needed."""
+    line integrals in a segment is a further error. Up to a peak of 4 it is smaller than the other; above, it takes more
+    segments."""
     first_s, last_s = shutter.lit_span_s
     pose = trajectory.pose(frame, start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1))
     fastest_rad = float(np.max(_turns_rad(pose))) * _TURN_SAMPLES

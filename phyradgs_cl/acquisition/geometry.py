@@ -180,7 +180,7 @@ def plain_geometry(pose: np.ndarray, panel: tuple[int, int], is_parallel: bool =
 
 
 def towards_source(pose: np.ndarray, is_parallel: bool) -> np.ndarray:
-    """Returns vectors (..., 3) from the origin to the source, for poses (..., 12). In a parallel beam they are unit vectors
+    """Returns vectors (..., 3) from the origin to the source, for poses (..., 12). A parallel beam's are unit vectors
     against the rays."""
     return -pose[..., :3] if is_parallel else pose[..., :3]
 
@@ -210,8 +210,8 @@ def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
     """Returns the grid of a full turn's field of view: a cube, or lower if the panel sees less along z.
 
     Voxels are as large as pixels at the axis: the pitch of rows along z, the pitch of columns along y and x. In a parallel
-    beam the grid is as high as the panel. poses (F, 12): if they travel along z, as in a helix, the grid is longer by the
-    travel."""
+    beam the grid is as high as the panel. If ``poses`` (F, 12) travel along z, as in a helix, the grid is longer by as
+    much."""
     half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
     high_mm, wide_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     wide = max(1, math.ceil(2 * radius_mm / wide_mm))

@@ -146,7 +146,7 @@ class PerRow(_Model):
     """Every line averages over its own exposure, at times that all lines of a frame share.
 
     ``sub_intervals`` is the number of times in an exposure; 0 takes as many as the scan needs (``of``). Each time stands
-    for a cell of the frame's time, and a line weights it by the fraction of its exposure in the cell. Raises InputError for
+    for a cell of the frame's time, weighted for each line by the fraction of its exposure in the cell. Raises InputError for
     a number below 0."""
 
     poses: ClassVar = "one per line"
@@ -242,8 +242,8 @@ def motions_for(*operators: str) -> tuple[Motion, ...]:
 
 
 def motion_of(motion: str | Motion) -> Motion:
-    """Returns the motion model of a name, with its default numbers; a model is returned itself. Raises InputError for an
-    unknown name."""
+    """Returns the motion model of a name, with default numbers; a model is returned itself. Raises InputError for other
+    names."""
     if not isinstance(motion, str):
         return motion
     if motion not in MOTIONS:
@@ -252,8 +252,7 @@ def motion_of(motion: str | Motion) -> Motion:
 
 
 def with_times(motion: Motion, scan: Scan, deformation: Deformation | None = None) -> Motion:
-    """Returns the motion model. A ``PerRow`` without a stated number of times gets the number that scan and deformation
-    need."""
+    """Returns the motion model. A ``PerRow`` without a stated number of times gets the number that the scan needs."""
     speed_mm_per_s = 0.0 if deformation is None else deformation.fastest_mm_per_s
     return motion.of(scan, speed_mm_per_s) if isinstance(motion, PerRow) else motion
 

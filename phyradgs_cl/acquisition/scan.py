@@ -182,8 +182,7 @@ class Scan:
         return self.shutter.lines(self.geometry.detector_shape)
 
     def on_grid(self, grid: Grid) -> "Scan":
-        """Returns the scan with another grid. A true volume is cut to the new grid if the old one contains it, else
-        dropped."""
+        """Returns the scan with another grid. The true volume is cut to it if the old grid contains it, else dropped."""
         if grid == self.grid:
             return self
         part = grid.slices_in(self.grid)

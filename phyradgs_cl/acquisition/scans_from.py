@@ -132,16 +132,14 @@ def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = N
 
 
 def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as ``line_integrals`` does. Nobody stated their quantity, so frames that look like counts are
-    refused."""
+    """Returns frames as ``line_integrals`` does, but refuses what looks like counts, since nobody stated the quantity."""
     values = checks.real_array("frames", frames)
     check_not_counts(values, "give −ln(counts / flats)", mask)
     return line_integrals(values, mask)
 
 
 def line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as float32, with 0 for masked pixels that are not finite. Raises InputError if an unmasked pixel is
-    not finite."""
+    """Returns frames as float32, with 0 for masked pixels that are not finite. Raises InputError for unmasked ones."""
     values = checks.real_array("projections", frames)
     with np.errstate(over="ignore"):
         values = values.astype(np.float32, copy=False)

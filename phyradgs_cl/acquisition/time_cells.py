@@ -116,8 +116,7 @@ class TimeCells:
         return self
 
     def line_poses(self) -> np.ndarray:
-        """Returns one pose per line, (lines, 12): that of the cell nearest to its mid-exposure. A table with a single cell
-        gives (1, 12).
+        """Returns one pose per line, (lines, 12): that of the cell nearest to its mid-exposure. A single cell gives (1, 12).
 
         Raises InputError for a line without a cell."""
         if self.count == 1:
@@ -137,16 +136,16 @@ class TimeCells:
         return self.pose[cell[nearest[first]]]
 
     def line_cells(self) -> np.ndarray:
-        """Returns a range [first, stop) of cells for each line, (lines, 2). It includes all cells that serve the line, and
-        may include others."""
+        """Returns a range [first, stop) of cells for each line, (lines, 2). It has all cells that serve the line, and maybe
+        others."""
         line = np.arange(self.lines)
         first = np.searchsorted(np.maximum.accumulate(self.line_stop), line, side="right")
         return np.stack([first, np.searchsorted(self.line_start, line, side="right")], -1)
 
     @cached_property
     def layer_numbers(self) -> np.ndarray:
-        """The number, from 0 on, of the layer in which each cell is, (C,). Cells in one layer share no line; layers are as
-        few as possible.
+        """The layer of each cell, as a number (C,) from 0 on. Cells of one layer share no line; layers are as few as
+        possible.
 
         To average intensities, a frame's layers are projected one by one."""
         numbers = np.zeros(self.count, np.int64)

@@ -143,7 +143,7 @@ class FrameSweeps:
 
 
 def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
-    """Extends an orbit's encoder table by ``by_s`` at either end, at the speed there. Returns other trajectories as they
+    """Extends an orbit's encoder table by ``by_s`` at either end, at the speed there. Other trajectories stay as they
     are."""
     if not (isinstance(trajectory, CircularOrbit) and isinstance(trajectory.kinematics, EncoderTable)):
         return trajectory
@@ -159,8 +159,8 @@ def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
 
 
 def _is_without_jumps(steps_rad: np.ndarray) -> bool:
-    """Returns whether steps (N,) between angles are real, not jumps by a turn: none exceeds half a turn, or half of them a
-    quarter turn."""
+    """Returns whether steps (N,) of angles are no jumps by a turn: none exceeds half a turn, nor half of them a quarter
+    turn."""
     size_rad = np.abs(steps_rad)
     return bool(size_rad.max(initial=0) <= np.pi or np.median(size_rad) >= np.pi / 2)
 
@@ -274,8 +274,7 @@ def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarr
 
 
 def behind_axis(geometry: Geometry, trajectory: Trajectory) -> tuple[Geometry, Trajectory]:
-    """Returns geometry and trajectory with a panel at the axis moved away from the source, and enlarged to see the same
-    rays.
+    """Returns geometry and trajectory with a panel at the axis moved away from the source, enlarged to see the same rays.
 
     Some programs state a panel scaled to the axis. Rays end at the panel, so there they would end within the object.
     User-defined trajectories and panels elsewhere stay as they are."""

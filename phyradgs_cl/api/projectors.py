@@ -114,7 +114,7 @@ def splat_operator(
 def voxel_operator(grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, device: Device = None) -> Operator:
     """Returns the operator from Gaussians, or parameter rows (11, G), to a volume (nz, ny, nx) in 1/mm on ``grid``.
 
-    Values are those at the voxels' centres in mm. The whole volume must fit on the device. cutoff_sigma, device: as in
+    Values are those at the voxels' centres in mm. The volume must fit on the device. cutoff_sigma, device: as in
     ``splat_operator``.
 
     Raises InputError for anything but a Grid, and for a cutoff out of range."""

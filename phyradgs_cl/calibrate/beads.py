@@ -53,8 +53,7 @@ class BeadOperator:
     clipped_noise: float
 
     def forward(self, placement: np.ndarray) -> np.ndarray:
-        """Returns the phantom's frames at a placement (7,): a turn (rotation vector, rad), a shift (mm), and a density
-        factor."""
+        """Returns the phantom's frames at a placement (7,): turn (rotation vector, rad), shift (mm), and density factor."""
         pose, weight = _poses_by_line(self.tables)
         frames, lines, samples = weight.shape
         turn = Rotation.from_rotvec(placement[:3]).as_matrix()
@@ -103,8 +102,7 @@ class _PanelLines:
     """N lines of a panel, each at one time, in the phantom's frame of reference.
 
     - source, first (N, 3): the source, and the middle of the panel's first pixel, in mm.
-    - line_step, pixel_step (N, 3): the steps to the next line, and to the next of its ``pixels``. line (N,): the number of
-      each line.
+    - line_step, pixel_step (N, 3): the steps to the next line, and to the next of its ``pixels``. line (N,): line numbers.
     - is_parallel: ``source`` is the rays' direction."""
 
     source: np.ndarray
@@ -155,8 +153,8 @@ class _PanelLines:
         return tuple((v, *both, np.linalg.norm(v, axis=-1)) for v, both in zip(vectors, products, strict=True))
 
     def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:
-        """Returns the lines (n,) that may see a body, the first pixel (n,) of its shadow on each, and the shadow's width in
-        pixels."""
+        """Returns the lines (n,) that may see a body, the first pixel (n,) of its shadow on each, and a width in pixels for
+        all."""
         (depth, depth_of_source, *_), *axes = self._panel_axes
         lowest, highest = [], []
         for end_mm in ends_mm:
@@ -221,8 +219,8 @@ class BeadProblem(CoarseFrames):
         return float(np.std(residual if self.valid is None else residual[self.valid]))
 
     def explained(self, operator: BeadOperator, placement: np.ndarray) -> float:
-        """Returns how much of the compared values the phantom explains, as a fraction of their sum of squares; 0 for a
-        negative density."""
+        """Returns the fraction of the compared values' sum of squares that the phantom explains; 0 if its density is
+        negative."""
         residual = self.compared(self.residual(operator, placement))
         whole = self.compared(self.masked(self.measured))
         return float(1 - residual @ residual / max(float(whole @ whole), 1e-30)) if placement[DENSITY] > 0 else 0.0
@@ -254,14 +252,13 @@ class BeadProblem(CoarseFrames):
         return list(beyond.reshape(len(images), *self.measured.shape))
 
     def compared(self, frames: np.ndarray) -> np.ndarray:
-        """Returns the values (F · pixels,) float64 by which frames are compared: blurred until single rays do not show, and
-        without background."""
+        """Returns the values (F · pixels,) float64 by which frames are compared: without background, and blurred to hide
+        single rays."""
         blurred = gaussian_filter(self._without_background(frames), (0, _BLUR_PX, _BLUR_PX), output=np.float64)
         return blurred.ravel()
 
     def _units(self) -> np.ndarray:
-        """Returns steps (7,) of a placement's numbers: each moves a frame's edge by a pixel, the last doubles the
-        density."""
+        """Returns steps (7,) of a placement: each moves a frame's edge by a pixel, the last doubles the density."""
         scan = self.scans[0]
         pixel_mm = self.block * min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
         return np.array([pixel_mm / (max(scan.grid.size_mm) / 2)] * 3 + [pixel_mm] * 3 + [1.0])

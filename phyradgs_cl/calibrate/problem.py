@@ -153,11 +153,10 @@ class CoarseProblem(CoarseFrames):
         return replace(problem, measured=problem.masked(measured))
 
     def operator(self, correction: GeometryCorrection, views: Views | Sway | None = None) -> RayOperator:
-        """Returns the operator A of the coarse frames of all scans, in the geometry that ``correction`` and ``views``
-        change.
+        """Returns the projector A to the coarse frames of all scans, in the geometry corrected by ``correction`` and
+        ``views``.
 
-        Each line integrates over 2 to 8 times of its exposure. views: changes of single views or of the object's pose, if
-        any."""
+        Each line integrates over 2 to 8 times of its exposure. views: changes of single views or of the object's pose."""
         tables = []
         for scan in self.scans:
             small = coarse.binned(perturb(scan, correction, views), self.block)
@@ -174,15 +173,15 @@ class CoarseProblem(CoarseFrames):
         return self.measured + self.masked(operator.forward(volume) - self._expected(operator, volume))
 
     def _expected(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
-        """Returns the frames (F, rows, columns) of a volume, with line integrals or intensities averaged, as the detector
+        """Returns the frames (F, rows, columns) of a volume. They average line integrals or intensities, as the detector
         does."""
         if self.scans[0].detector_model != "intensity":
             return operator.forward(volume)
         return IntensityOperator(self.rt, self.grid, operator.detector_shape, operator.tables).expected(volume)
 
     def reconstruct(self, operator: RayOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
-        """Returns a nonnegative volume (nz, ny, nx) of little total variation, ``iterations`` after ``start`` (None:
-        zeros)."""
+        """Returns a nonnegative volume (nz, ny, nx) of little total variation, after ``iterations`` from ``start`` or
+        zeros."""
         volume = np.zeros(self.grid.shape, np.float32) if start is None else start
         system = System(operator, self.line_integrals(operator, volume), self.valid)
         method = FistaTv(system, _TV, TvProx(self.rt, self.grid.shape, axis_weights(self.grid)))

@@ -177,7 +177,7 @@ class _Calibrator:
             self.search.fallback = {OFFSET_U: Fallback(shift.pixels * pitch_mm, shift.deviation * pitch_mm, is_significant)}
 
     def _search_common(self) -> None:
-        """Searches the parameters that all views share. Single views are corrected first: their errors would look like a
+        """Searches the parameters that all views share, after correcting single views, whose errors would look like a
         roll."""
         steady = self.ready
         if self.per_view is not None:
@@ -221,8 +221,8 @@ class _Calibrator:
         return replace(problem, count_pass=self.passes.counter(pass_cost(scans, stage.columns, most_frames)))
 
     def _place(self, phantom: EllipsoidPhantom) -> np.ndarray:
-        """Returns a first placement (7,) of the phantom: of those where its beads are seen, the one that fits the frames
-        best."""
+        """Returns a first placement (7,) of the phantom: the one that fits the frames best, of those where its beads are
+        seen."""
         bead_centres_mm(phantom)
         correction = correction_of(self.search.at)
         voxels = CoarseProblem.of(self.rt, self.ready, STAGES[-1])
@@ -240,8 +240,7 @@ class _Calibrator:
         return placement
 
     def _test_direction(self) -> list[ParameterEstimate]:
-        """Compares the residuals with lines read from either end, and corrects the scans' direction. Returns its line of the
-        table.
+        """Compares the residuals with lines read from either end, and corrects the direction. Returns its line of the table.
 
         A correction needs four standard errors and 4 % of the squared residual. The direction is 1 or −1, and its deviation
         is in the same unit."""

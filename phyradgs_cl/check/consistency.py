@@ -85,8 +85,7 @@ class _CoarseFit:
 def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
     """Finds frames and hypotheses that explain why the frames of a coarse ``scan`` do not fit together.
 
-    The finding's value is the residual's norm in the stated order over that in a random order. as_stated: the scan of full
-    size."""
+    The finding's value is the residual's norm in the stated order over that in a random order. as_stated: the full scan."""
     pixels = float(scan.valid.sum()) / scan.frames
     if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
@@ -140,8 +139,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     """Chooses another sense of rotation and shift of the panel if they fit far better than the stated ones. A scan with
     opposite views keeps its sense: both senses fit it equally well.
 
-    Returns the scan with the chosen sense, that scan with the shift too, and the mean squared residual of the best rough
-    fit."""
+    Returns the scan with the chosen sense, then with the shift too, and the mean squared residual of the best rough fit."""
     senses, limits_px = [scan], [axis.ANYWHERE]
     if not has_opposite_views(scan):
         senses, limits_px = [scan, reversed_rotation(scan)], [axis.ANYWHERE, hypotheses.shifts_for_sense_px(scan)]

@@ -103,8 +103,7 @@ def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) ->
 
 
 def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
-    """Returns the level of two columns: the largest mean over an eighth of the rows, at the 90th percentile of the
-    frames."""
+    """Returns the level of two columns: their largest mean over an eighth of the rows, the 90th percentile over frames."""
     edge = p[:, :, columns]
     weight = valid[:, :, columns].astype(float)
     rows = max(1, edge.shape[1] // 8)

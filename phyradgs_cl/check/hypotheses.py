@@ -69,8 +69,7 @@ def frame_number(scan: Scan, frame: int) -> int:
 
 
 def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. stated: the scan at full
-    size."""
+    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. stated: the full scan."""
     yield from _other_units(scan, stated)
     yield from _other_images(scan, stated)
 
@@ -106,7 +105,7 @@ def _times(name: str, factor: float) -> str:
 
 
 def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Scan:
-    """Returns the coarse scan with pixels ``factor`` times as large, and a fitting grid. keeps_axis: the axis stays in its
+    """Returns the coarse scan with pixels ``factor`` times as large, and a fitting grid. keeps_axis: keeps the axis'
     column."""
     v_mm, u_mm = stated.geometry.pixel_size_mm
     off_v_mm, off_u_mm = (offset * (factor if keeps_axis else 1) for offset in stated.geometry.detector_offset_mm)
@@ -195,8 +194,7 @@ def nearly_sized(scan: Scan, factor: float) -> Scan:
 
 
 def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses of a missing or a repeated frame, at up to 15 frames: all later ones are a step further on, or
-    back."""
+    """Yields hypotheses of a missing or a repeated frame, at up to 15 frames: later ones are a step further on, or back."""
     sense = -1.0 if variants.altered_trajectory(scan).is_reversed else 1.0
     step = float(np.median(wrapped(np.diff(_azimuths(scan))))) * sense
     for at in np.unique(np.linspace(1, scan.frames - 1, _GAPS).round().astype(int)):

@@ -137,8 +137,7 @@ class Spectrum:
     bone: Array
 
     def hardened(self, soft: Array, bone: Array | float = 0.0) -> Array:
-        """Returns the line integrals (any shape) that this beam measures, from those of soft tissue and bone without
-        hardening."""
+        """Returns the line integrals (any shape) that this beam measures. soft, bone: line integrals without hardening."""
         soft, energies = np.asarray(soft, np.float64), zip(self.weight, self.soft, self.bone, strict=True)
         # One energy at a time: ``intensity_average`` would hold all of them in memory.
         return -np.log(sum(w * np.exp(-(s * soft + b * np.asarray(bone))) for w, s, b in energies))

@@ -42,8 +42,8 @@ def is_address(text: object) -> bool:
 class Places:
     """The addresses in HDF5 of a scan's arrays.
 
-    - stated: by name of the array (one of ``NAMES``), a list of FILE:/ADDRESS, or of /ADDRESS in ``source``. Under "axes"
-      it has the order of the frames' axes. subject: what states the addresses, for messages.
+    - stated: for each array (one of ``NAMES``), a list of FILE:/ADDRESS, or of /ADDRESS in ``source``. Under "axes" it has
+      the order of the frames' axes. subject: what states the addresses, for messages.
     - linked_folder: see ``open_hdf5``. folder: the only folder from which files are read; None allows any."""
 
     stated: Mapping[str, Sequence[str]]

@@ -91,7 +91,7 @@ class LineAttention(nn.Module):
 
 
 class LineAttentionBlocks(nn.Module):
-    """Alternates attention and feed-forward layers on values (P, width), each after a layer norm and with a skip
+    """Alternates attention and feed-forward layers on values (P, width), each with a layer norm before it and a skip
     connection."""
 
     def __init__(self, width: int, segment: int, heads: int, head_width: int, blocks: int) -> None:

@@ -333,8 +333,7 @@ def line_integrals(
 ) -> torch.Tensor:
     """Returns the integrals (R,) of a field along rays (R, 3), with one sample in each of ``samples`` intervals in the box.
 
-    ``shifts``: what ``sample_shifts`` returns. If they are drawn uniformly, the expectation is the exact integral of any
-    field."""
+    ``shifts``: what ``sample_shifts`` returns. If they are drawn uniformly, the expected result is the exact integral."""
     first, length = box_span(source, direction, half_sides)
     step = length / samples
     number = torch.arange(samples, dtype=source.dtype, device=source.device)

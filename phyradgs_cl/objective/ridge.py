@@ -66,8 +66,8 @@ def learned_ridge() -> Ridge:
 
 
 class RidgeStep:
-    """Steps down the ridge regulariser for volumes of a fixed ``shape`` (nz, ny, nx). A volume thinner than a filter stays
-    the same."""
+    """Steps down the ridge regulariser for volumes of one ``shape`` (nz, ny, nx). Those thinner than a filter stay the
+    same."""
 
     VOLUMES = 4
     """Most memory of a step, in volumes of floats, if a volume has at least 50 slices and 64 voxels a row."""

@@ -32,8 +32,8 @@ def moved_to(rt: Runtime, values: Values, on_device: bool) -> Any:
 
 
 def computed(rt: Runtime, on_device: bool, function: Callable[[Any], Values], values: Values) -> Any:
-    """Applies a function that needs its argument on the device (``on_device``), or on the host. The result is on the same
-    side as ``values``."""
+    """Applies a function that needs its argument on the device (``on_device``) or the host. Its result goes where ``values``
+    are."""
     return moved_to(rt, function(moved_to(rt, values, on_device)), isinstance(values, DeviceArray))
 
 

@@ -62,8 +62,8 @@ class Lattice:
         return (z, y, x)
 
     def coverage(self, distance: Field) -> Field:
-        """Returns the fraction of each voxel inside a body at signed ``distance``, as if its surface were flat and parallel
-        to a voxel's face."""
+        """Returns the fraction of each voxel in a body at signed ``distance``, as if its surface were parallel to a voxel's
+        face."""
         return np.clip(0.5 - distance / np.float32(self.step), 0.0, 1.0)
 
 

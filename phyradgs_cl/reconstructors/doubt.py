@@ -57,8 +57,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Law:
-    """The factors by which ``spread`` computes σ. near: smoothing (std) in voxels. multiple_95: the 95 % error bar over
-    σ."""
+    """The factors in ``spread``, which computes σ. near: smoothing (std) in voxels. multiple_95: the 95 % bar over σ."""
 
     shape: float
     noise: float
@@ -138,8 +137,7 @@ class Doubter:
     def scan_of_run(self, result: Reconstruction, number: int) -> Scan:
         """Returns the scan of run ``number`` 1 or 2: every second frame for an analytic method, else a synthesised one.
 
-        A synthesised frame is the volume's projection plus the frame's residual with a random sign. Run 2 has the opposite
-        signs."""
+        A synthesised frame is the volume's projection plus the residual with a random sign. Run 2 has the opposite signs."""
         if self.kind == "analytic":
             return some_frames(self.scan, np.arange(number - 1, self.scan.frames, 2))
         frames, sums = np.zeros(self.scan.projections.shape, np.float32), np.zeros(5)
@@ -157,8 +155,8 @@ class Doubter:
         return replace(self.scan, projections=self.rt.ranks.bcast(frames))
 
     def _pairs(self, result: Reconstruction, count: int) -> Iterator[FramePair]:
-        """Yields ``count`` measured frames, each with the frame computed from a result. Voxels are divided before they are
-        projected."""
+        """Yields ``count`` measured frames, each with the one computed from a result, whose voxels are divided for
+        projection."""
         chosen, moves = spread_frames(self.whole.frames, count), result.moves or self.deformation
         volume, grid = finer(result.volume), result.grid.finer(PARTS)
         if isinstance(moves, States):
@@ -217,8 +215,7 @@ def _warn_of(residual_square: float, noise_square: float, square: float, mean: f
 
 
 def _counted(progress: Progress, results: list[Reconstruction]) -> Progress:
-    """Returns progress that counts the iterations of all runs together. It shows the first run's volume while the others
-    run."""
+    """Returns progress that counts the iterations of all runs together. While later runs go on it shows the first volume."""
     done, each = progress.iteration + len(results) * progress.iterations, RUNS * progress.iterations
     progress = progress.mapped(state=lambda state: {**state, **_kept(results)}, iteration=done, iterations=each)
     if not results:

@@ -70,8 +70,7 @@ def preprocessing_of(changes: Mapping[str, Any]) -> Preprocessing:
 
 
 def _models(options: Any) -> dict[str, Any]:
-    """Returns by name the motion models that a method's options allow. The preset's own keeps its numbers of strips and
-    times."""
+    """Returns by name the motion models that a method's options allow. The preset's model keeps its strips and times."""
     own = [options.motion] if hasattr(options.motion, "name") else []
     return {model.name: model for model in (*getattr(options, "MOTIONS", _ALL), *own)}
 

@@ -201,8 +201,8 @@ class Progress:
     def mapped(
         self, state: "Callable[[State], State] | None" = None, volume: "VolumeMap | None" = None, **changes: Any
     ) -> "Progress":
-        """Returns the report with other fields. ``state`` and ``volume`` change what the report's functions of these names
-        return."""
+        """Returns the report with other fields. ``state`` and ``volume`` change the results of the report's functions of
+        that name."""
         own_state, own_volume = self.state, self.volume
         if state is not None and own_state is not None:
             changes["state"] = lambda: state(own_state())

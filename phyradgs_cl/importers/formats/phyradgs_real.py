@@ -129,8 +129,7 @@ def _frames_and_views(
 
 
 def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> ImportOptions:
-    """Returns options with a flat value. If none is given, it is the brightest pixel, as in the published code, with a
-    warning."""
+    """Returns options with a flat value: by default, with a warning, the brightest pixel, as in the published code."""
     if options.flat_value is not None or options.quantity not in (None, "counts"):
         return options
     brightest = float(frames.max())

@@ -38,8 +38,7 @@ def launch_adjoint(
     rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, frames: DeviceArray,
     volume: DeviceArray, *, add: bool = False,
 ) -> None:
-    """Backprojects padded frames, with the numbers ``frame_list``, to a padded volume. add: adds to the volume, else
-    overwrites it."""
+    """Backprojects padded frames, with the numbers ``frame_list``, to a padded volume. add: adds to the volume's values."""
     owned, kernel = _owners(rt, layout, cells)
     nz, ny, nx = layout.brick.shape
     columns, rows, slices = (ceil_div(n, side) for n, side in zip((nx, ny, nz), owned, strict=True))

@@ -138,8 +138,7 @@ class RayCells:
     def upload(
         cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells], rows_across: int | None = None
     ) -> "RayCells":
-        """Uploads the tables of all frames. rows_across: the panel's number of rows with ``RayLayout.is_across``, else
-        None."""
+        """Uploads the tables of all frames. rows_across: the number of rows with ``RayLayout.is_across``, else None."""
         starts = np.concatenate([[0], np.cumsum([table.count for table in tables])])
         pose = np.concatenate([table.readout.poses(table.pose) for table in tables])
         weights = [table.weights_of(cell) for table in tables for cell in range(table.count)]

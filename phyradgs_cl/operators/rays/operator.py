@@ -208,7 +208,8 @@ class RayOperator:
         self._slots: dict[tuple[int, int], Slots] = {}
 
     def _listed(self, part: slice) -> DeviceArray:
-        """Returns on the device the numbers of this operator's frames ``part`` in the whole scan. Uploads them once."""
+        """Returns the numbers that this operator's frames ``part`` have in the whole scan. Uploads them to the device
+        once."""
         key = part.start, part.stop
         if key not in self._lists:
             self._lists[key] = self.rt.upload(self._chosen[part], np.int32)

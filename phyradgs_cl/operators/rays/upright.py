@@ -108,7 +108,7 @@ def launch_upright(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, columns: DeviceArray,
     target: tuple[DeviceArray, np.ndarray],
 ) -> None:
-    """Projects a volume, transposed to ``columns`` (y, x, z), to slots. target: an array with its strides in floats, as
+    """Projects a volume, transposed to ``columns`` (y, x, z), to slots. target: an array with strides as in
     ``Slots.strides``."""
     shape, origin, _, pitch_mm, *_ = layout.constants()
     array, strides = target
@@ -124,8 +124,8 @@ def launch_upright_adjoint(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, values: DeviceArray,
     target: tuple[DeviceArray, Strides], *, add: bool = False,
 ) -> None:
-    """Backprojects slots, as ``split_slots`` writes them, to ``target``, a volume with its strides. add: adds to the volume,
-    else overwrites it."""
+    """Backprojects slots, as ``split_slots`` writes them, to ``target``, a volume with its strides. add: adds to its
+    values."""
     shape, origin, *_ = layout.constants()
     (x, y, z), items = _owned(layout.brick.shape, rt.device.compute_units)
     rt.launch(

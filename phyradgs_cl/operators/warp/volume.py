@@ -49,7 +49,7 @@ class VolumeWarp:
         return self.states.is_still(state)
 
     def source(self, volume: DeviceArray) -> DeviceArray:
-        """Returns the spline coefficients F E v of a volume v (nz, ny, nx), padded by E and filtered by F. Valid until the
+        """Returns the spline coefficients F E v of a volume v (nz, ny, nx), padded (E) and filtered (F). Valid until the
         next call."""
         if self._source is None:
             self._source = self.rt.empty(self._floats)
@@ -59,7 +59,7 @@ class VolumeWarp:
         return self._source
 
     def _filter(self, values: DeviceArray) -> None:
-        """Applies the spline filter F in place to a padded volume. Filters padded rows as a whole, because their zeros stay
+        """Applies the spline filter F in place to a padded volume. Filters whole padded rows, because their zeros stay
         zero."""
         nz, ny, nx = (n + 2 * _BORDER for n in self.shape)
         slice_, row = self._strides.slice, self._strides.row
@@ -111,7 +111,7 @@ class VolumeWarp:
         )  # fmt: skip
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:
-        """Writes the volume (nz, ny, nx) of the coefficients ``total`` to ``result``: filtered, then without padding.
+        """Writes the volume (nz, ny, nx) of the coefficients ``total``, filtered and without padding, to ``result``.
         Destroys ``total``."""
         self._filter(total)
         move(self.rt, (total, self._strides), (result, Strides.plain(self.shape)), self.shape)

@@ -102,7 +102,7 @@ class Fan:
 
 
 def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = False) -> Fan:
-    """Returns the fan that all views see on a detector of ``shape`` (rows, columns). pose (F, ..., 12): as in
+    """Returns the fan that all views see on a panel of ``shape`` (rows, columns). pose (F, ..., 12): as in
     ``pixel_rays``."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
     outer = pose[:, :, [0, -1]] if pose.shape[2] > 1 else pose

@@ -11,7 +11,7 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 @dataclass(frozen=True)
 class CglsOptions(IterativeOptions):
-    """Options of CGLS. noise_stop: ends the run at this many times the noise. nonnegative must stay False: CGLS does not
+    """Options of CGLS. noise_stop: ends the run at this many times the noise. nonnegative stays False: CGLS does not
     clip."""
 
     iterations: int = 60

@@ -233,8 +233,7 @@ def fista_passes(
     has_few_times: bool = False,
 ) -> Iterations:  # fmt: skip
     """Returns ``passes`` passes from ``volume`` (nz, ny, nx; None: the method's own start), with every voxel divided into
-    ``parts`` along each side. subsets: replaces the option, unless 0. has_few_times: takes a third of an exposure's
-    times."""
+    ``parts`` along each side. subsets: replaces the option, unless 0. has_few_times: takes 1/3 of an exposure's times."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
     options, rt = replace(whole.options, iterations=passes), whole.rt

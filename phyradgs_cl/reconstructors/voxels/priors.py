@@ -218,7 +218,7 @@ class TvAndDct(Prior):
 
 
 class ThenRidge(Prior):
-    """The prior ridge: the map of the prior ``before``. Every fourth map is followed by a step down the learned ridge
+    """The prior ridge: the map of the prior ``before``. After every fourth map, it steps down the learned ridge
     regulariser."""
 
     VOLUMES = RidgeStep.VOLUMES
