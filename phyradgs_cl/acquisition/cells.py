@@ -101,7 +101,7 @@ def common_time_cells(
     if length_s <= 0 or last_s - first_s > lines * step_s:
         return per_line_cells(trajectory, shutter, frame, start_s, lines, samples if length_s > 0 else 1)
     edges_s, share, (used, line_start, line_stop, order) = _common_shares(windows_s.tobytes(), samples)
-    latest_s = float(np.max(frame_start_s)) + last_s - step_s / 2  # later times may be beyond a trajectory's table
+    latest_s = float(np.max(frame_start_s)) + last_s - step_s / 2  # the trajectory's table may end at the scan's last light
     middle_s = np.minimum(_middles_s(frame_start_s, frame, edges_s), latest_s)[used]
     table = cell_table(trajectory, shutter, frame, middle_s, line_start, line_stop, np.ones(used.size), lines)
     return replace(table, line_share=share[used][order])

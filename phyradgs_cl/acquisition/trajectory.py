@@ -24,7 +24,7 @@ _LEAST_SPAN_S = 1e-6  # ``sampled`` needs two different times in a frame, also i
 _MOST_SAMPLES = 1024  # ``sampled`` gives up when more samples per frame are not close enough
 _LEAST_INCIDENCE = 1e-6  # least sine of the angle between rays and panel
 _AT_AXIS = 1e-6  # a panel within this fraction of the source-to-axis distance is at the axis
-_AWAY = 2.0  # how many times further from the source a panel at the axis is moved, and how many times larger it becomes
+_AWAY = 2.0  # a panel at the axis is moved this many times as far from the source, and enlarged as much
 _SAME_PLACE = 1e-9  # poses that differ by less, relative to their largest number, are equal: float64 rounds by less
 
 

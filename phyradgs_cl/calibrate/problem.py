@@ -29,7 +29,7 @@ _VOXELS_PER_TIME = 2.0  # an exposure is sampled so often that the volume's rim 
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
-_LEAST_SHARE = 0.1  # progress reports count a phase's remaining passes with at least this fraction of their full cost
+_LEAST_SHARE = 0.1  # in progress reports, a phase's remaining passes cost at least this fraction of their full cost
 Passes = tuple[int, float]
 """How many passes may still come at most, and their expected total cost."""
 
@@ -71,7 +71,7 @@ class PassCounter:
         self.plan = dict(plan)
         self._report = report
         self._done, self._spent, self._text = 0, 0.0, ""
-        self._current: Passes = (0, 0.0)  # passes that remain in this phase
+        self._current: Passes = (0, 0.0)  # remaining passes of the present phase, and their cost
 
     def begin(self, phase: str, text: str) -> None:
         """Begins a phase of the plan, which reports call ``text``, and drops the phases before it."""

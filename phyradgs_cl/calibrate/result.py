@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CORRECTED, AGREES, CANNOT_TELL = "corrected", "agrees", "cannot tell"
-_FRAMES = 4  # frames shown in the figure, at most
+_FRAMES = 4  # at most this many frames are shown in the figure
 _ROW_INCH, _CURVES_INCH, _WIDTH_INCH = 1.8, 2.4, 7.0
 
 

@@ -24,8 +24,8 @@ _TOUCHING = 0.5  # saturation covers areas: pixels at an extreme are clipped if 
 _SAME = 1e-3  # flats and the largest count that differ by less than this fraction are equally bright: such pixels may be air
 _MOST_FRAMES = 8  # noise beside saturated pixels is sought in at most this many frames
 _LONGEST_EDGE = 1024  # of larger frames only the middle, this many pixels a side, is searched for noise
-_ROUNDING = 0.5  # rounding of counts alone gives estimates of noise up to this
-_RELATIVE = 2e-5  # estimates of noise up to this fraction of the largest count are no noise
+_ROUNDING = 0.5  # rounding of counts alone causes an estimate up to this, in counts
+_RELATIVE = 2e-5  # an estimate up to this fraction of the largest count does not prove noise
 # Noise estimated along both axes is white if it is at least this fraction of noise estimated along rows; else structure.
 _WHITE = 0.5
 _ROOT_OF_NORMAL = 0.8222  # mean of √|x| over the root of the standard deviation of a normal x with mean 0
@@ -180,6 +180,6 @@ def _shows_noise(frames: NDArray[np.generic], level: float) -> bool:
     rows, both = np.concatenate(along_rows), np.concatenate(along_both)
     unclipped = np.isfinite(both)
     if not unclipped.any():
-        return True  # every pixel is clipped or next to one that is: no pixel can tell
+        return True  # all pixels are clipped or beside clipped ones, so none can tell
     in_rows, in_both = (float(np.median(np.abs(d[unclipped]))) / norm for d, norm in ((rows, 6**0.5), (both, 6.0)))
     return in_both > max(_ROUNDING, _RELATIVE * level, _WHITE * in_rows)

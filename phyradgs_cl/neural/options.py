@@ -13,7 +13,7 @@ from phyradgs_cl.errors import InputError
 JITTERS = ("ray", "sample", "none")
 LAST_ACTIVATIONS = ("sigmoid", "leaky-relu")
 TORCH_DEVICES = ("auto", "cpu", "cuda", "mps")
-# The next three numbers hold unless the options state their own.
+# Densities of grid cells and samples, unless options state them.
 CELLS_PER_VOXEL = 1.0  # grid cells of the encoding's finest level per voxel of the longest side
 SAMPLES_PER_VOXEL = 1.5  # samples along a ray per voxel of the longest side: NAF takes 192 for 128 voxels
 # Fewer samples are enough for a pixel with a ray at each of several times: only the mean over its rays must be exact.

@@ -39,7 +39,7 @@ class Trainer:
         self.scan, self.options, self.device, self.iterations = scan, options, device, options.iterations
         self.field = field.to(device)
         self.density_per_mm = density_per_mm
-        self.unit = density_per_mm * scan.grid.half_longest_mm  # line integrals are divided by this
+        self.unit = density_per_mm * scan.grid.half_longest_mm  # internal unit of line integrals
         self.rng = np.random.default_rng(seed)
         motion = options.motion
         if type(motion) is PerRow:  # rays are evaluated one by one: times that lines share would save nothing
@@ -242,7 +242,7 @@ class ExposureRays:
         Parallel rays begin in front of the volume."""
         rows, columns = pixels.T
         line = rows if self.axis == "rows" else columns
-        pose = self.pose[self.cell[times, line[:, None]]]  # (R, s, 12)
+        pose = self.pose[self.cell[times, line[:, None]]]  # the pose of each ray, (R, s, 12)
         along_row, down = columns[:, None, None], rows[:, None, None]
         centre = pose[..., 3:6] + along_row * pose[..., 6:9] + down * pose[..., 9:12]
         direction = pose[..., :3] if self.is_parallel else centre - pose[..., :3]
@@ -256,7 +256,7 @@ class ExposureRays:
         """Returns the rows and columns outside which no ray meets a box of ``half_sides`` (x, y, z) about 0."""
         corners = np.array(np.meshgrid(*[(-h, h) for h in half_sides], indexing="ij")).reshape(3, -1).T
         source, first, steps = self.pose[:, None, :3], self.pose[:, None, 3:6], self.pose[:, None, 6:12]
-        to_corner = corners - source  # (C, 8, 3)
+        to_corner = corners - source  # from each source to each corner of the box, (C, 8, 3)
         along, to_first = (source, first - corners) if self.is_parallel else (to_corner, first - source)
         matrix = np.stack(np.broadcast_arrays(along, -steps[..., :3], -steps[..., 3:]), -1)
         try:

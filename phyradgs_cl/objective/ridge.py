@@ -95,7 +95,7 @@ class RidgeStep:
         observed, result = beside(self.rt, volume, out)
         padded = self._padded, Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))
         move(self.rt, (observed, Strides.plain(self.shape)), padded, self.shape)
-        is_thin = min(self.shape) < EDGE  # no filter fits in: the gradient stays 0
+        is_thin = min(self.shape) < EDGE  # the volume is thinner than a filter, so the gradient stays 0
         end = np.float32(step), np.int32(nonnegative), result
         # A response needs three slices of channels, so responses follow two slices behind the channels.
         for first in range(0, nz + 2, _SLICES):

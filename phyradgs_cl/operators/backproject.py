@@ -85,7 +85,7 @@ class Views:
         return (columns, rows) if self.is_turned else (rows, columns)
 
     def bytes(self, count: int) -> int:
-        """Returns the bytes that ``count`` views take on the device."""
+        """Returns how many bytes ``count`` views take on the device."""
         rows, width = self.shape
         return 4 * count * int(2 * GUARD + rows * pitch_of(width) + self.matrices.shape[1] + 1)
 
@@ -134,7 +134,7 @@ def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch)
             for part in parts:
                 images = _images(rt, views, part)
                 launch(images, brick, padded)
-                del images  # frees their memory before the next views are uploaded
+                del images  # frees the views' memory before the next are uploaded
             if isinstance(volume, DeviceArray):
                 move(rt, (padded, _strides(brick)), (volume, Strides.plain(grid.shape, brick.start)), brick.shape)
             else:

@@ -29,7 +29,7 @@ _REWEIGHTINGS = 12
 _LEAST_PIXELS = 20  # with fewer pixels of air in a frame, their median is too noisy
 _AROUND = np.ones((3, 3), bool)
 _MARGIN = 2  # pixels this near to the object are no air, because its edge is blurred
-_PASSES = 3  # bright or dim light shifts the air, so the threshold follows its median, in this many rounds
+_PASSES = 3  # rounds in which the threshold of air follows the air's median, which bright or dim light shifts
 Counts = np.ndarray
 
 

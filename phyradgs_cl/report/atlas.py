@@ -12,7 +12,7 @@ from phyradgs_cl.report.viewer import decimals_of, slider
 
 MOST_EDGE = 128  # larger volumes are averaged over blocks to this many voxels along each side
 MOST_TEXT = 2_000_000  # limit of base64 characters for voxels and centres together, so that the page stays small
-MOST_CENTRES = 20_000  # Gaussians whose centres are shown; of more, evenly chosen ones
+MOST_CENTRES = 20_000  # the centres of at most this many Gaussians are shown, evenly chosen
 MOST_ZOOM = 8
 _TURN_DEG, _TILT_DEG = 325, 20  # initial view, in which the edges marked x, y, z are in front and on the left
 _PATIENCE_MS = 1500  # the picture at rest becomes finer until drawing takes this long

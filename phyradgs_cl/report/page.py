@@ -22,7 +22,7 @@ from phyradgs_cl.runtime import Runtime
 DEFAULT_VIEWS = 3  # frames that a page compares with frames computed from the volume
 # slices.js sends the grey values when it loads, so space.js and motion.js, which listen for them, must come first.
 _SCRIPT = ("common", "shaders", "render", "space", "motion", "slices", "rows")
-_SCRIPTED = ("volume",)  # sections that are hidden until the script shows them
+_SCRIPTED = ("volume",)  # these sections stay hidden until the page's script shows them
 
 
 @np.errstate(all="ignore")  # a file's values may overflow; the page shows what it can

@@ -17,7 +17,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.sources import AnalyticSource, DeformedSource, FrameSource, VolumeSource, on_panel
 
 _DENSE = 0.5  # in a beam of many energies, voxels above this fraction of the largest attenuation may be bone
-# Bone begins at an attenuation with fewer voxels than this fraction of the commonest one's: there no material is cut.
+# Bone begins at an attenuation that few voxels have, at most this fraction of the commonest one's: that cuts no material.
 _RARE = 0.2
 log = logging.getLogger(__name__)
 Moves = Callable[[Grid], Deformation]

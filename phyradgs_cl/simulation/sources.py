@@ -67,7 +67,7 @@ class VolumeSource(FrameSource):
             return volume
         try:
             return self._rt.upload(volume)
-        except MemoryShortage:  # from the host, the operator projects one part of it after the other
+        except MemoryShortage:  # a volume on the host is projected part by part
             return volume
 
 

@@ -181,7 +181,7 @@ def _reconstructed(
                 _keep_checkpoint(output, result)
                 _warn_of_residual(path, scan, result)
     except signals.InterruptedAfterwards:
-        # after an incomplete run the caller reports the interruption; in all other cases nobody would
+        # the caller reports the interruption of an incomplete run, but of no other
         if result is None or result.state is None:
             raise
     return result, metrics

@@ -45,7 +45,7 @@ def launch_adjoint(
     group = rt.group(1, math.prod(owned))
     each = _SAMPLES_PER_VOXEL * nz * ny * nx * cells.most_per_line
     for first, stop in _parts(rt, frame_list.size, each):
-        adds = add or first > 0  # the launch continues the sums of the one before, so the bits are those of a single launch
+        adds = add or first > 0  # later launches continue the sums, as if it were one launch
         rt.launch(
             kernel, (columns * group, rows, slices), frames, cells.cells, cells.cell_lines, cells.matrices,
             cells.matrix_stride, cells.frame_cells, frame_list, cells.weights, cells.weight_at, first, stop,

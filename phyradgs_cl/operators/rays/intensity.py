@@ -61,7 +61,7 @@ class IntensityOperator:
 
     def expected(self, volume: SameArray, out: DeviceArray | None = None) -> SameArray:
         """Returns I(x), (F, rows, columns) float32, of a volume (nz, ny, nx) in 1/mm, and sets J to the derivative there."""
-        self._shares = []  # frees their memory before new ones are computed
+        self._shares = []  # frees the old weights' memory before new weights are computed
         frames: Array
         if isinstance(volume, DeviceArray):
             p = [operator.forward(volume, self._device.place(self.frames_shape)) for operator in self._operators]
@@ -119,7 +119,7 @@ class IntensityOperator:
     def _shares_for(self, like: Array) -> list[Any]:
         """Returns the softmax weights of each layer, on the device if ``like`` is there, else on the host."""
         is_there = isinstance(like, DeviceArray)
-        # if they lie on the host and the device asks for them, or the reverse, they are copied
+        # copies the weights if they are on the host and needed on the device, or the reverse
         if self._shares and isinstance(self._shares[0], DeviceArray) != is_there:
             brought = self._device.array if is_there else self._device.numpy
             self._shares = [brought(share) for share in self._shares]

@@ -93,7 +93,7 @@ class RayLayout:
         return (strides.start, *steps, strides.slice)
 
     def column_floats(self, axis: str) -> int:
-        """Returns the floats of a padded frame stored column by column, for a panel that is read along ``axis``."""
+        """Returns how many floats a padded frame takes, stored column by column, of a panel that is read along ``axis``."""
         return (self.turned if axis == "rows" else self).frames_strides.slice
 
     def inside(self, flat: np.ndarray) -> np.ndarray:

@@ -83,7 +83,7 @@ def _is_steep(cells: np.ndarray, rows: int, columns: int) -> bool:
 
 
 def _least_horizontal(d00: np.ndarray, eu: np.ndarray, width: int) -> np.ndarray:
-    """Returns the smallest length (C,) of d00 + u eu over u in [0, width − 1], for vectors d00 and eu (C, 2)."""
+    """Returns the smallest horizontal length (C,) of rays d00 + u eu to columns u in [0, width − 1]; d00, eu: (C, 2)."""
     nearest = -np.sum(d00 * eu, 1) / np.maximum(np.sum(eu * eu, 1), 1e-30)
     return np.asarray(np.linalg.norm(d00 + np.clip(nearest, 0, width - 1)[:, None] * eu, axis=1))
 
@@ -99,7 +99,7 @@ def _lies_between(grid: Grid, source: np.ndarray, d00: np.ndarray, eu: np.ndarra
 
 
 def columns_floats(grid: Grid) -> int:
-    """Returns the floats of a padded volume that is transposed to (y, x, z)."""
+    """Returns how many floats a padded volume takes that is transposed to (y, x, z)."""
     nz, ny, nx = grid.shape
     return 2 * GUARD + (ny + 2 * BORDER) * (nx + 2 * BORDER) * pitch_of(nz)
 

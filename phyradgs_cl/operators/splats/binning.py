@@ -5,8 +5,8 @@ import numpy as np
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime import DeviceArray, LaterItem, MemoryShortage, Runtime
 
-_CHUNK = 512  # number of splats that a CPU's work-item counts
-_GROUP = 64  # number of splats that a GPU's work-group counts
+_CHUNK = 512  # a CPU's work-item counts the tiles of this many splats
+_GROUP = 64  # a GPU's work-group counts the tiles of this many splats
 _LARGEST_GROUP = 256  # most splats per work-group on a GPU, taken where _GROUP would give more than _MANY_COUNTS
 _MANY_COUNTS = 1 << 22  # above this many counts, tiles × work-groups, counting takes much memory and time
 _SCANNED = 64  # number of counts that a work-group adds at a time in its prefix sum
@@ -85,7 +85,7 @@ class TileLists:
 
     @staticmethod
     def bytes(rt: Runtime, tiles: int, count: int) -> int:
-        """Returns the bytes of the lists of ``count`` splats, without the entries themselves."""
+        """Returns how many bytes the lists of ``count`` splats take, without their entries."""
         return 4 * (tiles + 1 + tiles * max(ceil_div(count, chunk_of(rt, tiles, count)), 1))
 
     def _make_room(self, needed: int, share: float) -> None:

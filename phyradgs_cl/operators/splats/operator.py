@@ -191,7 +191,7 @@ class SplatProjection(GaussianOperator):
     def forward(self, point: SplatPoint) -> DeviceArray:
         """Renders Gaussians to frames (F, rows, columns) float32."""
         frames = self.rt.empty((len(self._cells), *self._detector_shape))
-        self._ready.clear()  # now, because a failure below may leave the buffers half written
+        self._ready.clear()  # at once, because a failure below may leave the buffers half written
         for number, cells in enumerate(self._cells):
             self._images.leave(self._projector.forward(point.gaussians, cells), frames, number)
         self._ready[:] = point, self._cells[-1]
@@ -214,7 +214,7 @@ class SplatProjection(GaussianOperator):
         self._ready.clear()
         if not is_ready:
             see = self._projector.forward if self._is_layered else self._projector.prepare
-            see(point.gaussians, cells)  # averaged intensities depend on all layers, which must be drawn
+            see(point.gaussians, cells)  # averages of intensities need all layers, so these are drawn
         self._projector.backward(point.gaussians, cells, by_image, gradients)
 
     def by_poses(self, gaussians: Any, by_frames: Any) -> np.ndarray:
@@ -233,7 +233,7 @@ class SplatProjection(GaussianOperator):
             turn, along, across = by_pose(rows[:, : cloud.count], by_rows)
             shifts = [across / (self._projector.lines / 2), along / (self._projector.width / 2)]
             found[number] = turn, *(shifts[::-1] if self._images.turned else shifts)
-            if not (self._affine or cells.is_parallel):  # in these models all rays are as long as the central one
+            if not (self._affine or cells.is_parallel):  # there all rays count as equally long
                 found[number, 1:] += by_length(self._poses[self._chosen[number]], weighed[number])
         return found
 

@@ -153,7 +153,7 @@ def lines_backprojection(
     for frame, poses, share, moved in zip(frames.astype(np.float64), pose, weight, pushes, strict=True):
         positions = [detector_position(p, grid, is_parallel, moved) for p in poses]
         u, v, depth = (np.stack(parts) for parts in zip(*positions, strict=True))
-        ahead = v - np.arange(lines)[:, None, None, None]  # goes from above to below 0 at the line that sees the voxel
+        ahead = v - np.arange(lines)[:, None, None, None]  # changes its sign at the line that sees the voxel
         for index in np.ndindex(*grid.shape):
             at = (slice(None), *index)
             volume[index] += share * _seen(frame, u[at], ahead[at], depth[at], power, speed_power)

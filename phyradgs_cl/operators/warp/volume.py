@@ -13,7 +13,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
 _BORDER = 4  # width in voxels around the volume in which coefficients are kept, as in cl/warp.cl: further ones are < 3e-3
 _MOST_OWNED = 8  # most slices for which a CPU's work-item sums; voxels near their ends are computed by two work-items
 _ITEMS_PER_UNIT = 4  # wanted work-items per compute unit, so that none waits long for the last
-_HEADROOM = 64  # weights with which voxels add to one may sum to this: the field then contracts by 4 along each axis
+_HEADROOM = 64  # a voxel may receive weights with this sum, which a field that contracts by 4 along each axis causes
 _TOGETHER = 8, 8, 4  # box of voxels (x, y, z) of a GPU's work-group, which adds in local memory
 _SAMPLES = 16  # reading the 4³ coefficients of a voxel takes this many times longer than a ray's sample
 _ADDED = 64  # adding to the 4³ coefficients of a voxel takes this many times longer than a ray's sample

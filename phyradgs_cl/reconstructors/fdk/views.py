@@ -35,7 +35,7 @@ _NO_PLANE_DEG = 45.0
 _LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the plane of the rotation
 _NO_LEAN_DEG = 10.0
 _ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: there densities are 0.1 % too low
-_NO_ROLL_DEG = 10.0  # angle at which densities are 1.5 % too low; at 90° they are 0
+_NO_ROLL_DEG = 10.0  # larger angles of the rows are refused: here densities are 1.5 % too low, at 90° they are 0
 _LEAST_OVERLAP = 2.0  # a displaced panel must reach this many columns beyond the axis, or a warning comes
 # A smaller missing angle causes no warning: nearly parallel rays have so narrow a fan that half a turn is enough.
 _TOLERATED_RAD = np.deg2rad(0.5)
@@ -95,7 +95,7 @@ def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
         whole = np.array([[0.0, 2 * np.pi]])
         return Arc((gap / count)[cell], (centre - centre[0])[cell], 2 * np.pi, True, whole, _filled_rad(ahead))
     first = (int(np.argmax(np.where(wide, ahead, 0))) + 1) % ahead.size
-    ahead, wide = np.roll(ahead, -first), np.roll(wide, -first)  # now the widest gap that stands out is the last
+    ahead, wide = np.roll(ahead, -first), np.roll(wide, -first)  # so that the widest gap that stands out is the last
     forward, back = _steps(ahead, wide)
     progress = np.concatenate([[0.0], np.cumsum(ahead[:-1])]) + back[0] / 2
     parts = np.stack([(progress - back / 2)[np.roll(wide, 1)], (progress + forward / 2)[wide]], -1)

@@ -14,11 +14,11 @@ from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-# Unknown errors of flats affect frames this much, relative to the volume. At 1 they would explain away motion.
+# In a fit, errors of flats change frames by this much relative to the volume. At 1 they would explain motion too.
 _FREEDOM = 0.3
 _ITERATIONS = 20  # iterations of CGLS in a fit, unless stated
 _MOST_TIMES = 12  # most times per exposure: each costs a projection
-_DRAWS = 200  # resamplings of the bootstrap that gives a deviation
+_DRAWS = 200  # number of resamplings in a bootstrap, which gives a standard deviation
 _TINY = 1e-30  # keeps divisions finite where residuals are 0
 
 

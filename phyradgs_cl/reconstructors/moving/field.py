@@ -26,7 +26,7 @@ _DAMPING = 1e-3  # Levenberg damping over the mean diagonal of JᵀJ: control ve
 _ROUGHNESS = 1e-2  # β, the penalty on the weights' roughness in time, relative to the mean diagonal of JᵀJ
 _SHORTER = (1.0, 0.5, 0.25)  # fractions of a step, tried in turn until one lowers the misfit
 _LEAST_DETERMINANT = 0.1  # a step may lower det(I + ∂w/∂y) of the displacement w(y) to this: at 0 matter folds
-_LEAST_VOXELS = 1.0  # voxels per unit weight, added to distances between states: fields of zeros then have several too
+_LEAST_VOXELS = 1.0  # least voxels that a change of a weight by 1 counts as, so that fields of zeros have several states
 _SUPPORT = 4  # a cubic spline in time extends over this many intervals between knots
 
 

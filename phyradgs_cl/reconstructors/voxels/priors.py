@@ -165,8 +165,8 @@ class Prior:
     """Fraction, 0 to 1, of this pass's weight that is due to noise; the rest is due to the discretisation of edges."""
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
-        """Maps a volume (nz, ny, nx) of ``space``. weight: that of one short step, in 1/mm, about 1/50 of the noise that a
-        denoiser would be told."""
+        """Maps a volume (nz, ny, nx) of ``space``. weight: the weight of one short step, in 1/mm: about 1/50 of the volume's
+        noise."""
         return space.add(volume, volume, 0.0, nonnegative=nonnegative)
 
     def state(self) -> dict[str, np.ndarray]:

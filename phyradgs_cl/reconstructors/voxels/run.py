@@ -22,7 +22,7 @@ from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
 MOST_ITERATIONS = 1_000_000
-# Arrays of all frames that a system holds: measurement, mask, transmission, and what computing a residual takes.
+# A system holds this many arrays of all frames: measurement, mask, transmission, and those to compute a residual.
 _SYSTEM_FRAMES = 6
 
 
@@ -85,7 +85,7 @@ class Algorithm:
             setattr(self, name, self.system.space.array(state[name]))
         for name in self.NUMBERS:
             setattr(self, name, state[name].item())
-        if self.system.intensity is not None:  # J, unlike A, depends on the volume: it is set again
+        if self.system.intensity is not None:  # the derivative J depends on the volume
             self.system.expected(self.volume)
 
 

@@ -15,7 +15,7 @@ from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.voxels.run import MethodRun, WithFacts
 
-_STAGE, _VOLUME = "stage", "volume_before"  # entries of a state: the stage's number, and the volume from which it started
+_STAGE, _VOLUME = "stage", "volume_before"  # arrays in a state: the stage's number and its first volume
 
 
 @dataclass(frozen=True)

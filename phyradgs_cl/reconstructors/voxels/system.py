@@ -158,7 +158,7 @@ class System:
 
     def residual(self, volume: Any) -> Any:
         """Returns p − A x or, in the intensity model, p − I(x), dimensionless; 0 at invalid pixels."""
-        # the frames before masking get no name, because a name would keep their memory
+        # the frames before masking get no name, because a name would keep their memory in use
         expected = self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
         return self.space.add(self.measured, expected, -1.0)
 
