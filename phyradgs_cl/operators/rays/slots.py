@@ -146,7 +146,6 @@ class Slots:
 
     @property
     def floats(self) -> int:
-        """The floats of all slots."""
         return self.count * self.columns * self.pitch
 
     @property

@@ -164,7 +164,6 @@ class TimeStates:
 
     @property
     def count(self) -> int:
-        """The number of states K."""
         return len(self.times_s)
 
     def shares(self, times_s: np.ndarray) -> np.ndarray:

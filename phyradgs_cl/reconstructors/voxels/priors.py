@@ -170,7 +170,6 @@ class Prior:
         return space.add(volume, volume, 0.0, nonnegative=nonnegative)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the arrays from which the next map starts."""
         return {}
 
     def restore(self, state: State) -> None:
