@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 _MOST_RAD = 20 * np.pi  # angles in rad that span more than these ten turns are most likely degrees
-_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # fields of ``Scan``
+_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # other fields of ``Scan``
 
 
 def from_poses(

@@ -68,7 +68,7 @@ class Deformation:
         dense_mm = checks.numbers("displacements_mm", displacements_mm, (len(times_s), *grid.shape, 3))
         checks.whole("rank", rank, 1, 1000)
         rows = dense_mm.reshape(len(times_s), -1)
-        squares, vectors = np.linalg.eigh(rows @ rows.T)  # (T, T): much smaller than ``rows``
+        squares, vectors = np.linalg.eigh(rows @ rows.T)  # of a matrix (T, T), much smaller than ``rows``
         weights = vectors[:, ::-1][:, : min(rank, len(times_s))]
         largest = np.abs(weights).max(0)
         fields_mm = (weights * largest).T @ rows
@@ -166,7 +166,7 @@ class Deformation:
         Without a grid, points half a control spacing apart are tested. To save time, weights are rounded to a 16th of each
         field's largest weight, and slopes below 1e-4 count as 0."""
         grid = grid or self._half_spacing_grid()
-        slopes = np.stack([self._slopes(grid, control_mm) for control_mm in self.control_mm])  # (R, 3, 3, n)
+        slopes = np.stack([self._slopes(grid, control_mm) for control_mm in self.control_mm])  # of each field, (R, 3, 3, n)
         largest = np.abs(self.weights).max(axis=0)
         step = np.maximum(largest / _LEVELS, np.finfo(float).tiny)
         states = np.unique(np.round(self.weights / step), axis=0) * step

@@ -124,7 +124,7 @@ class Places:
         for name, addresses in (("flats", flats), ("darks", darks), ("mask", mask)):
             if parts := self.stack(name, addresses, panel):
                 stacks[name] = parts[0]
-                at = {"pre": -0.5, "post": int(used.sum()) - 0.5}  # time of flats, by the end of their address
+                at = {"pre": -0.5, "post": int(used.sum()) - 0.5}  # when flats were taken, by the end of their address
                 ends = [text.rpartition("_")[2] for text in parts[1]]
                 if name == "flats":
                     flats_at = np.repeat([at.get(end, np.nan) for end in ends], list(parts[1].values()))

@@ -22,8 +22,8 @@ from phyradgs_cl.reconstructors.voxels.priors import PriorWeight, TvPrior, axis_
 from phyradgs_cl.reconstructors.voxels.run import Iterations, IterativeOptions, MethodRun
 from phyradgs_cl.runtime import Runtime
 
-_STACKS = 18  # memory of the method in arrays of all states' volumes
-_FRAMES = 3  # memory of the method in arrays of all frames
+_STACKS = 18  # memory of a run, in stacks of all states' volumes
+_FRAMES = 3  # memory of a run, in copies of all projections
 
 
 @dataclass(frozen=True)

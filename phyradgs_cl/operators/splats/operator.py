@@ -184,7 +184,7 @@ class SplatProjection(GaussianOperator):
 
     def _part(self, few: Sequence[int]) -> "SplatProjection":
         part = copy(self)
-        part.__dict__.pop("intensity", None)  # the cached operator to all frames
+        part.__dict__.pop("intensity", None)  # this cached operator was for all frames
         part._choose([self._chosen[f] for f in few], self.rows)
         return part
 

@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl.fields import Deformation, Grid
 
 MOST_STATES = 12
-_SPACING = 0.6  # if states are blended, no time's object is farther from one: RMS displacement of moving voxels, in voxels
+_SPACING = 0.6  # if states are blended, every time is this near to a state: RMS displacement of moving voxels, in voxels
 _SPACING_OF_NEAREST = 0.3  # the same if each time takes the nearest state, without a blend
 _MOVES = 0.1  # a voxel counts as moving if its squared displacement is at least this fraction of the largest one
 

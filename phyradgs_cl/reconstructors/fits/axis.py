@@ -20,8 +20,8 @@ _ROUGH_ITERATIONS = 8  # few iterations are enough to tell coarse shifts of the 
 _STEP = 0.25  # distance of three shifts that bracket the best one, in coarse pixels
 _MOST_STEPS = 8  # most moves of the three shifts that bracket the best one, so that a search that leads away ends
 ANYWHERE = (-math.inf, math.inf)  # no limits of the shift, in pixels
-_MOST_VIEWS = 60  # views that are compared with their opposites, at most, to save time
-_MOST_ROWS = 64  # blocks of rows that are compared, at most, to save time
+_MOST_VIEWS = 60  # most views that are compared with their opposites, to save time
+_MOST_ROWS = 64  # most blocks of rows that are compared, to save time
 _BEYOND = 1.5  # at the scan's end, a view's opposite may lie this many steps beyond the last view
 WIDEST_STEP_RAD = math.radians(10.0)  # views further apart differ too much to be interpolated
 # Smoothing along rows (std, in pixels). Without it, interpolation would lower noise between pixels, which biases shifts.

@@ -39,9 +39,9 @@ from phyradgs_cl.reconstructors.voxels.run import MethodRun
 from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages
 from phyradgs_cl.runtime import Runtime
 
-_MOST_COLUMNS = 64  # blocks of pixels along the longer side of the panel in the coarse scan, at most
-_MOST_VOXELS = 32  # voxels along the longest side of the coarse scan's grid, at most
-_MOST_FRAMES = 600  # frames of the coarse scan, at most, unless the signal has more knots
+_MOST_COLUMNS = 64  # most blocks of pixels along the longer side of the coarse scan's panel
+_MOST_VOXELS = 32  # most voxels along the longest side of the coarse scan's grid
+_MOST_FRAMES = 600  # most frames of the coarse scan, unless the signal has more knots
 _TIMES_PER_PERIOD = 12  # times per period of a motion at which exposures sample it
 _MOST_TIMES = 6  # most times per exposure that a period may ask for: each costs a projection
 _FIRST_PASSES = 8  # passes of fista before the first round, for an object at rest: the field needs a volume to start from
