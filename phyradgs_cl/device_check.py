@@ -50,8 +50,8 @@ Comparison = tuple[np.ndarray, np.ndarray, float]
 class Verdict:
     """The result of a device's check.
 
-    agreeing: the kernels that agree with their twins. failures: a text about each of the others. group_limits: the
-    largest work-group that the driver allows, in work-items, by kernel; only for kernels that use work-groups."""
+    agreeing: the kernels that agree with their twins. failures: a text about each other kernel. group_limits: the largest
+    work-group that the driver allows, in work-items, by kernel; only for kernels that use work-groups."""
 
     device: str
     agreeing: frozenset[str]

@@ -88,7 +88,7 @@ class _Trials:
         self.scan, self.plan, self.rt = scan, plan, rt
 
     def run(self, iterations: int | None) -> float:
-        """Runs that many iterations, or all of the method for None. Returns the seconds that it took."""
+        """Runs that many iterations, or the whole method for None. Returns the seconds that the run took."""
         options = self.plan.options
         plan = self.plan if iterations is None else replace(self.plan, options=shortened(options, iterations))
         self.rt.reset_peak()

@@ -162,8 +162,8 @@ def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarr
 def plain_geometry(pose: np.ndarray, panel: tuple[int, int], is_parallel: bool = False) -> Geometry:
     """Returns the circular geometry with the mean distances and offsets of poses (F, 12).
 
-    The distance to the detector is measured at right angles to it. The offset is measured from the point of its plane that
-    is nearest to the source (in a parallel beam, to the origin) to the panel's middle."""
+    The distance to the detector is measured at right angles to the panel. The offset runs from the point of the panel's
+    plane nearest to the source (in a parallel beam, to the origin) to the panel's middle."""
     source, first, step_u, step_v = (pose[:, i : i + 3] for i in (0, 3, 6, 9))
     pitch_u, pitch_v = (np.linalg.norm(step, axis=1, keepdims=True) for step in (step_u, step_v))
     u_hat, v_hat = step_u / pitch_u, step_v / pitch_v

@@ -126,8 +126,8 @@ class MicroViews(_Model):
 class Centres(MicroViews):
     """``MicroViews`` that move only the Gaussians' centres on the panel, as in GS-on-the-Move (the paper's reference 21).
 
-    The shapes and densities of Gaussians on the panel are computed for one pose per frame, that of ``Static``. ``strips``
-    and ``sub_intervals`` are those of ``MicroViews``. Raises InputError for numbers below 1."""
+    The shapes and densities of Gaussians on the panel are computed for one pose per frame, the pose of ``Static``.
+    ``strips`` and ``sub_intervals`` mean the same as in ``MicroViews``. Raises InputError for numbers below 1."""
 
     poses: ClassVar = "M×N for centres of splats"
     is_implied: ClassVar = False

@@ -116,7 +116,8 @@ class TimeCells:
         return self
 
     def line_poses(self) -> np.ndarray:
-        """Returns one pose per line, (lines, 12): that of the cell nearest to its mid-exposure. A single cell gives (1, 12).
+        """Returns one pose per line, (lines, 12): the pose of the cell nearest to its mid-exposure. A single cell gives (1,
+        12).
 
         Raises InputError for a line without a cell."""
         if self.count == 1:

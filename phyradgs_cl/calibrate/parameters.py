@@ -30,7 +30,7 @@ class Parameter:
     - scale: displayed units per unit of the field.
     - object_instead: another object that explains the frames as well, if they do not determine the parameter.
     - pixels: how many pixels a unit of the field moves the image at its edge.
-    - mismatch: measured errors (docs/calibrate.md) over those of noise alone, as voxels do not represent objects exactly.
+    - mismatch: measured errors (docs/calibrate.md) over errors by noise alone, as voxels do not represent objects exactly.
     - is_axial: the parameter moves the image along the axis, like ``LIFT``. The others move it across, like ``TURN``."""
 
     name: str

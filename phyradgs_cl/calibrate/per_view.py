@@ -50,7 +50,7 @@ class PerViewParameters(ABC):
 
     - units (K,): how much of each kind moves a frame by a pixel at its edge.
     - circle (n, 2): values that vary as cosine and sine of the angle, as far as the basis can.
-    - MISMATCH: measured errors (docs/calibrate.md) over those of noise alone, as voxels do not represent objects exactly.
+    - MISMATCH: measured errors (docs/calibrate.md) over errors by noise alone, as voxels do not represent objects exactly.
     - RESTARTED: kinds that start from 0 on each grid."""
 
     values: np.ndarray
@@ -224,7 +224,7 @@ def _norms(basis: np.ndarray, signals: np.ndarray) -> np.ndarray:
 
 
 def _strength(operator: RayOperator) -> float:
-    """Returns about the largest singular value of A, in mm. Parameters scaled to it converge as fast as the volume does."""
+    """Returns about the largest singular value of A, in mm. If scaled to this, parameters converge as fast as the volume."""
     lengths = operator.forward(np.ones(operator.volume_shape, np.float32))
     return float(np.linalg.norm(operator.adjoint(lengths)) / np.linalg.norm(lengths))
 

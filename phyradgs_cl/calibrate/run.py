@@ -163,8 +163,8 @@ class _Calibrator:
         """Starts from the offset that ``check`` finds, because steps reach it from a distance of a few pixels only.
 
         In half a turn of nearly parallel rays, a volume explains most of what an offset changes. The search cannot determine
-        the offset there, so ``check``'s answer stands. It stands too if the panel sees few rays twice: a shift that leaves
-        fewer of them fits better, whatever the truth."""
+        the offset there, so ``check``'s answer stands. It stands too if the panel sees few rays twice: a shift under which
+        fewer are seen twice fits better, whatever the truth."""
         if self.phantom is None and has_axis_near_edge(self.ready[0]):
             self.search.held = (OFFSET_U,)
         quick, pitch_mm = coarse(self.ready[0], QUICK_COLUMNS), self.scan.geometry.pixel_size_mm[1]

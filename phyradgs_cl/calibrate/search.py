@@ -30,8 +30,8 @@ LEAST_SHARE = 0.2
 # For a known object (beads) a smaller share is enough: there are no voxels that explain signals by accident.
 LEAST_SHARE_OF_BEADS = 0.02
 _TINY = 1e-9  # added to the diagonal of a matrix before its inverse, because signals may be linearly dependent
-_GAUGE_FACTOR = 2.0  # voxels leave some signal of a gauge (``GAUGES``) by error: a parameter must leave twice as much
-_MOST_GAUGE = 0.2  # a gauge's share counts as this at most: in a wrong geometry it grows, and would refuse every parameter
+_GAUGE_FACTOR = 2.0  # voxels leave part of a turn's or lift's signal (``GAUGES``) by error: others must leave twice as much
+_MOST_GAUGE = 0.2  # a turn's or lift's share counts as at most this: in a wrong geometry it grows, and would refuse all
 DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
 _MOST_PX = 2.0  # a step moves the image by at most this many coarse pixels at its edge: signals are not linear beyond
 _SETTLED = 0.1  # the steps on a grid end when all are smaller than this many standard deviations
@@ -84,8 +84,8 @@ class Reduced:
     def shares(self) -> np.ndarray:
         """The fraction (K,) of each parameter's signal that no object explains, 0 to 1.
 
-        This is the smaller of two ratios. One is the signal's norm without what an object explains, over its whole norm. The
-        other is how certain the parameter is among all unknowns, over how certain it would be with a known object."""
+        This is the smaller of two ratios. One is the norm of the unexplained signal over that of the whole signal. The other
+        is the parameter's certainty among all unknowns, over its certainty with a known object."""
         tiny = _TINY * np.eye(len(self.names))
         variance, variance_with_object = (np.diag(np.linalg.inv(gram + tiny)) for gram in (self.gram, self.whole_gram))
         certainty = variance_with_object / variance
@@ -270,7 +270,8 @@ class Search:
     def corrections(self) -> dict[str, float]:
         """Returns the values, by name, of the parameters that differ from their stated values by three deviations.
 
-        All other parameters go back to their stated values. That changes the rest, so the test repeats until all differ."""
+        All other parameters go back to their stated values. That changes the remaining values, so the test repeats until all
+        differ."""
         values, deviations = self.estimates()
         deviation = dict(zip(self.determined or (), deviations, strict=True))
         names = self.determined or ()
@@ -285,7 +286,7 @@ class Search:
 
     def table(self, scan: Scan, corrections: Mapping[str, float]) -> list[ParameterEstimate]:
         """Returns an estimate per parameter in displayed units. corrections: values by name, in the fields' units, which
-        replace those found."""
+        replace the values found."""
         values, deviations = self.estimates()
         estimates = {name: (estimate.value, estimate.deviation) for name, estimate in self.fixed.items()}
         estimates |= dict(zip(self.determined or (), zip(values.tolist(), deviations.tolist(), strict=True), strict=True))

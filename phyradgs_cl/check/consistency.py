@@ -226,8 +226,8 @@ def _best_below(rt: Runtime, candidates: Iterable[Hypothesis], stated: Fit, most
 
 
 def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:
-    """Finds odd and repeated frames before any reconstruction. Returns the indices (n,) of the other frames, and a note for
-    each frame that is left out."""
+    """Finds odd and repeated frames before any reconstruction. Returns the indices (n,) of the frames that stay, and a note
+    for each frame that is left out."""
     odd, repeated = odd_frames(scan.projections, scan.pixel_mask), repeated_frames(scan)
     notes = [f"frame {frame_number(scan, f)} is unlike all others (black, bright, or no image)" for f in odd]
     notes += [f"frame {frame_number(scan, f)} is frame {frame_number(scan, f - 1)} recorded twice" for f in repeated]
@@ -235,7 +235,7 @@ def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:
 
 
 def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
-    """Returns the indices of the frames of p (F, v, u) whose mean line integral is far from that of their neighbours."""
+    """Returns the indices of the frames of p (F, v, u) whose mean line integral is far from their neighbours' means."""
     if len(p) < _FEWEST_FRAMES:
         return []
     valid = 1.0 if mask is None else (np.asarray(mask) == 0).astype(np.float32)
@@ -285,8 +285,8 @@ def without_outliers(
     """Removes frames whose residual is far above the others', the worst first, with a new fit after each.
 
     stated: the fit of all frames. random_square: the mean squared residual of frames in a random order. Returns the indices
-    (n,) of the other frames, their fit, and notes. If a fifth of the frames would go, the cause is common to all, and none
-    is removed. Two outliers may be two exchanged frames, which a note says."""
+    (n,) of the frames that stay, their fit, and notes. If a fifth of the frames would go, the cause is common to all, and
+    none is removed. Two outliers may be two exchanged frames, which a note says."""
     remaining, current = np.arange(scan.frames), stated
     outliers: list[int] = []
     while len(outliers) < _MOST_OUTLIERS * scan.frames:

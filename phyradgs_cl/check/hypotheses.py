@@ -54,8 +54,8 @@ def shifts_for_sense_px(scan: Scan) -> tuple[float, float]:
     """Returns how far the panel may be shifted, (lowest, highest) in pixels of the recorded scan, to compare senses of
     rotation.
 
-    If the axis is near the panel's edge, the panel may only move towards it. Away from it fewer rays are measured twice, and
-    any angles would fit."""
+    If the axis is near the panel's edge, the panel may only move towards it. If it moved away from the axis, fewer rays
+    would be measured twice, and any angles would fit."""
     offset_mm, pitch_mm = scan.geometry.detector_offset_mm[1], scan.geometry.pixel_size_mm[1]
     if not has_axis_near_edge(scan):
         return axis.ANYWHERE

@@ -157,7 +157,7 @@ def _panel(frames: AcquisitionGeometry, detector: Any) -> tuple[np.ndarray, np.n
 
 
 def _turned(at_zero: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
-    """Returns ASTRA's vectors (F, 12) at angles (F,) of the object: those of ``_at_zero``, turned the other way about z."""
+    """Returns ASTRA's vectors (F, 12) at angles (F,) of the object: the vectors ``at_zero`` turned the other way about z."""
     (x, y, z), cos, sin = at_zero.T, np.cos(angles_rad)[:, None], np.sin(angles_rad)[:, None]
     return np.stack([cos * x + sin * y, cos * y - sin * x, z + 0 * cos], -1).reshape(-1, 12)
 

@@ -1,4 +1,4 @@
-"""Options that several commands share, such as those of a reconstruction, and how their values are parsed."""
+"""Options that several commands share, such as a reconstruction's, and how their values are parsed."""
 
 import functools
 import inspect

@@ -63,8 +63,8 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
     Noise grows with attenuation. So it is estimated in each tenth of the ``valid`` line integrals (F, v, u), and averaged by
     how many chosen pixels lie in each. An estimate is the median of |second differences along rows and then along columns|,
     which vanish at edges along either (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300). Detail as fine as a pixel
-    raises it, by up to 70 % on panels of 64² with noise of 0.5 %. On panels of fewer than three rows, differences are along
-    rows alone."""
+    raises the estimate, by up to 70 % on panels of 64² with noise of 0.5 %. On panels of fewer than three rows, differences
+    are along rows alone."""
     usable, differences = valid, line_integrals
     means = line_integrals
     cuts = (_along_rows, _along_columns) if line_integrals.shape[-2] >= 3 else (_along_rows,)
@@ -169,7 +169,7 @@ def _flat_differs(frames: NDArray[np.generic], flat: NDArray[np.floating], level
 
 def _shows_noise(frames: NDArray[np.generic], level: float) -> bool:
     """Returns whether unclipped pixels are noisy, by their second differences along both axes. These must exceed what
-    rounding causes, and half of those along rows alone: structure makes smaller ones."""
+    rounding causes, and half of the differences along rows alone: structure causes smaller ones."""
     along_rows, along_both = [], []
     top, left = (max(0, n - _LONGEST_EDGE) // 2 for n in frames.shape[1:])
     middle = np.s_[top : top + _LONGEST_EDGE, left : left + _LONGEST_EDGE]

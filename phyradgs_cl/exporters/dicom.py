@@ -28,7 +28,7 @@ _LONGEST = 64  # DICOM's limit in characters for names (PN) and descriptions (LO
 @dataclass(frozen=True)
 class DicomLabels:
     """Labels by which viewers and archives list a series; None writes none. patient: name (Family^Given) and ID. title, date
-    (YYYY-MM-DD): those of the study. description: that of the series. Raises InputError for text that DICOM cannot hold."""
+    (YYYY-MM-DD): the study's. description: the series'. Raises InputError for text that DICOM cannot hold."""
 
     patient: str | None = None
     title: str | None = None

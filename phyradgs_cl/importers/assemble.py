@@ -144,7 +144,8 @@ class Turned:
         return array[..., ::-1] if self.columns else array
 
     def poses(self, pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-        """Converts poses (..., 12), see ``PoseTable``, of stored images to those of flipped ones. panel: (rows, columns)."""
+        """Converts poses (..., 12), see ``PoseTable``, of stored images to the poses of flipped images. panel: (rows,
+        columns)."""
         pose = np.array(pose, np.float64)
         sides = (self.rows, panel[0], slice(9, 12)), (self.columns, panel[1], slice(6, 9))
         for count, step in ((count, step) for is_flipped, count, step in sides if is_flipped):
@@ -223,7 +224,7 @@ def _check_turn(trajectory: CircularOrbit | PoseTable, middle_s: np.ndarray, sub
 
 
 def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
-    """Replaces a geometry's lengths by those that options give. Raises InputError for distances of a parallel beam."""
+    """Replaces a geometry's lengths by the lengths that options give. Raises InputError for distances of a parallel beam."""
     return (parallel if isinstance(geometry, ParallelGeometry) else cone)(options, *astuple(geometry))
 
 

@@ -70,7 +70,7 @@ class Places:
             yield other, f"/{address}"
 
     def _at(self, name: str, usual: Sequence[str]) -> Sequence[str]:
-        """Returns the addresses stated for an array, else those of the format (``usual``) that the file has."""
+        """Returns the addresses stated for an array, else the format's (``usual``), as far as the file has them."""
         there = [address for address in usual if self.source is not None and self.source.find(address) is not None]
         return self.stated.get(name, there)
 
@@ -275,8 +275,8 @@ def beam(
 
 def exposure_s(source: Hdf5Source, address: str, used: np.ndarray, options: ImportOptions) -> float | None:
     """Returns the exposure in s of the frames marked in ``used``, bool (F,), or the option that replaces it; None if the
-    file has none. If it differs between frames, a fly-scan raises InputError. A gantry that stops for every frame does not
-    need it: the result is then None, with a warning."""
+    file has none. If it differs between frames, a fly-scan raises InputError. A scan whose gantry stops needs no exposure:
+    the result is then None, with a warning."""
     if options.exposure_s is not None:
         return options.exposure_s if source.find(address) is not None else None
     try:

@@ -142,7 +142,7 @@ def read_image_volume(path: Path, state: int | None = None) -> Volume:
 
 
 def _nrrd_header(path: Path) -> dict[str, str]:
-    """Reads the header of a NRRD file; SimpleITK shows only some of it. Raises InputError for an unknown space."""
+    """Reads the header of a NRRD file, of which SimpleITK shows only a part. Raises InputError for an unknown space."""
     with open(path, "rb") as file:
         lines = file.read(_HEAD_BYTES).split(b"\n\n")[0].decode("latin-1").splitlines()
     header = {key.strip().lower(): value.strip() for key, sign, value in (line.partition(":") for line in lines) if sign}

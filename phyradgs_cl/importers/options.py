@@ -106,7 +106,7 @@ class ImportOptions:
             raise InputError(error.subject, error.found, error.expected, remedy) from error
 
     def angle_rad(self, count: int, stored: Callable[[], np.ndarray]) -> np.ndarray:
-        """Returns angles (count,) in rad: those of the option ``angles``, else what ``stored`` reads."""
+        """Returns angles (count,) in rad, from the option ``angles``, else those that ``stored`` reads."""
         if self.angles is None:
             return self.taken("angles", stored)
         if not (steps := _STEPS.fullmatch(self.angles)):

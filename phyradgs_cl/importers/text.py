@@ -147,7 +147,7 @@ def measured_angles_rad(path: Path, steps_rad: np.ndarray) -> np.ndarray:
 
 
 class Settings(Fields):
-    """Fields whose values are texts. Its methods read numbers from them, also those followed by a unit."""
+    """Fields whose values are texts. Its methods read numbers from the texts, also numbers with a unit behind."""
 
     def __init__(self, subject: str, values: Mapping[str, str | list[str]], comma_is_decimal: bool = False) -> None:
         super().__init__(subject, values)

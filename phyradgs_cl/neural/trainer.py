@@ -349,10 +349,11 @@ def intensity_average(integrals: torch.Tensor, unit: float) -> torch.Tensor:
 
 
 def log_squares(integrals: torch.Tensor, measured: torch.Tensor, times: int) -> torch.Tensor:
-    """Returns squared errors (R,) of the mean over all K ``times`` of a pixel, estimated from s of them, integrals (R, s).
+    """Returns squared errors (R,) of the mean over all K ``times`` of a pixel, estimated from the line integrals (R, s) at s
+    of them.
 
     The squared error of a subset's mean is too large by the variance of that mean. This is estimated as the s samples'
-    variance times (1/s − 1/K), and subtracted. Expectation and gradient are then those of all K times."""
+    variance times (1/s − 1/K), and subtracted. Expectation and gradient are then the same as with all K times."""
     count = integrals.shape[1]
     squares = (integrals.mean(1) - measured) ** 2
     return squares if count == times else squares - (1 / count - 1 / times) * integrals.var(1, unbiased=True)

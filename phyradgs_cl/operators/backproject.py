@@ -39,7 +39,7 @@ def backproject(
 
     frames (F, rows, columns) are interpolated bilinearly, and 0 outside; pose (F, 12) mm; weight (F,). power: 2 for FDK's
     distance weight, or 1. In a parallel beam z is 1. The volume (nz, ny, nx) float32 is on the device if ``frames`` are,
-    else on the host. Raises OutOfMemoryError if not even the smallest part of it fits."""
+    else on the host. Raises OutOfMemoryError if not even the smallest part of the volume fits."""
     matrices = voxel_matrices(pose, grid, is_parallel)
     block, leans = (0, False) if rt.pixel_items else _upright_block(matrices, grid)
     views = Views(frames, bool(block), matrices, weight)

@@ -42,9 +42,9 @@ _ONCE = ("scatter", "hardening", "phase")  # a second correction would take away
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """flats: one of ``light.WAYS``; it acts when a file is read. steps: names of ``STEPS``, separated by commas. The other
-    fields are the options of the step of that name. Raises InputError for unknown steps, and for options of steps that are
-    not named."""
+    """flats: one of ``light.WAYS``; it acts when a file is read. steps: names of ``STEPS``, separated by commas. Each other
+    field has the options of the step of its name. Raises InputError for unknown steps, and for options of steps that are not
+    named."""
 
     flats: str = checks.option("mean", words=WAYS)
     steps: str = checks.option("", STEPS_HELP, "none", metavar="NAME,...")

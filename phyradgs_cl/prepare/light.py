@@ -34,7 +34,8 @@ Counts = np.ndarray
 
 
 def flat_correction(way: str) -> ToAttenuation:
-    """Returns the function that converts counts to line integrals for ``read_scan``. way: how it uses the flats (``WAYS``).
+    """Returns the function that converts counts to line integrals for ``read_scan``. way: how the function uses the flats
+    (``WAYS``).
 
     The function takes data (F, v, u), image_key (F,) and the quantity, and returns line integrals (P, v, u) and bad pixels.
     It raises InputError for too few flats and, with "time" or "pca", for other quantities than counts."""

@@ -51,8 +51,8 @@ class RingOptions(checks.Checked):
 
 @dataclass(frozen=True)
 class Strength:
-    """Three variances, in line integrals squared: the pattern's, that of its part which whole columns share, and that of the
-    noise in the mean of all views. least: the variance above which a pattern is certain."""
+    """Three variances, in line integrals squared: of the pattern, of its part that whole columns share, and of the noise in
+    the mean of all views. least: the variance above which a pattern is certain."""
 
     pattern: float
     column: float

@@ -4,8 +4,9 @@
   the first hold the noise, other causes of the residual, and what the method does to such an object: blur, prior, missing
   views. That is a wild bootstrap (Wu, Ann. Stat. 14 (1986) 1261): each frame's residual keeps its size and shape, but a
   random sign. The second scan has the opposite signs (antithetic variables).
-- Analytic methods get every second frame, and the others. Half the difference of both volumes has the noise of the whole
-  scan's volume, and the streaks of missing views. A synthesised scan would not show these: FDK returns them unchanged.
+- Analytic methods get one half of the frames, every second one, and then the other half. Half the difference of both volumes
+  has the noise of the whole scan's volume, and the streaks of missing views. A synthesised scan would not show these: FDK
+  returns them unchanged.
 
 The numbers that turn this into σ come from procedural volumes (benchmarks/doubt.py), and from held-out pixels if there are
 any."""

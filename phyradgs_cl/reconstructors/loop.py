@@ -74,8 +74,8 @@ class Loop:
         self._reported = time.perf_counter()
 
     def run(self, resume: State | None) -> None:
-        """Makes all steps, or those after the state ``resume``. Ctrl-C, or a report that raises KeyboardInterrupt, ends the
-        run after the present step, unless that is the last."""
+        """Makes all steps, or all that follow the state ``resume``. Ctrl-C, or a report that raises KeyboardInterrupt, ends
+        the run after the present step, unless that is the last."""
         method = self.method
         if resume is not None:
             method.restore(resume)

@@ -188,9 +188,9 @@ def _reconstructed(
 
 
 def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
-    """Returns the metrics against the scan's true volume, on the grid of ``metrics.aligned``, and those on held-out pixels.
-    If the object moves or changes, they are means over the times at which the truth is known. Removes the held-out metrics
-    from the result's facts, and adds there how volumes were compared, unless voxel by voxel."""
+    """Returns the metrics against the scan's true volume, on the grid of ``metrics.aligned``, and metrics on held-out
+    pixels. If the object moves or changes, they are means over the times at which the truth is known. Removes the held-out
+    metrics from the result's facts, and adds there how volumes were compared, unless voxel by voxel."""
     held_out = result.facts.pop(HELD_OUT, {})
     if scan.reference is None:
         return held_out

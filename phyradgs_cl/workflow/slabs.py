@@ -1,6 +1,6 @@
 """Reconstructs a parallel-beam scan in slabs: some detector rows at a time are read, reconstructed and kept on disk.
 
-Times are those of a slab's rows: the motion model ``static`` takes the middle of their time, not of the whole frame's."""
+A slab has the times of its rows: the motion model ``static`` takes the middle of their time, not of the whole frame's."""
 
 import logging
 import shutil

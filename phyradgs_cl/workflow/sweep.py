@@ -57,7 +57,8 @@ runtime_of_process = functools.cache(Runtime)  # one Runtime per process and dev
 
 @dataclass(frozen=True)
 class SweepRun:
-    """One reconstruction of a sweep, ready for a worker. facts: first entries of its line of results; "run" is its name."""
+    """One reconstruction of a sweep, ready for a worker. facts: the first entries of the run's line of results; "run" is its
+    name."""
 
     scan: Path
     plan: RunPlan

@@ -30,8 +30,8 @@ def sum_frames(
     scan: F projections (F, rows, columns); each stands for the interval in s until the next, in which the gantry turns
     evenly. count: the projections in an exposure. readout_ratio, readout, readout_direction: how the new panel is read, as
     in ``fly_scan``. A line whose exposure begins within a projection takes a fraction of it. Frames that would need further
-    projections are left out. Photons, detector and object are those of the given scan, so the result is a real test of a
-    motion model. For this the object must move by less than a pixel from projection to projection.
+    projections are left out. Photons, detector and object are the given scan's, so the result is a real test of a motion
+    model. For this the object must move by less than a pixel from projection to projection.
 
     Raises InputError for a count that no frame can have, a rolling shutter or lag in ``scan``, and uneven intervals."""
     if not isinstance(scan, Scan):

@@ -207,7 +207,7 @@ def _is_parallel(source: Hdf5Source, entry: str) -> bool:
 
 
 def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool) -> Shutter:
-    """Reads the shutter. Exposure and readout are required only if the gantry moves, and the order of lines only if they
+    """Reads the shutter. Exposure and readout are required only if the gantry moves, and the order of lines only if lines
     are read one after the other. used, bool (F,): which stored frames are projections."""
     exposure_s = read_duration(source, f"{entry}/{schema.DETECTOR}/count_time", used, moving)
     needed = moving and exposure_s > 0

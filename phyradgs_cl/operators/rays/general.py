@@ -73,8 +73,8 @@ def _parts(rt: Runtime, frames: int, samples_per_frame: int) -> Iterator[tuple[i
 
 
 def brick_of(rt: Runtime) -> tuple[int, int, int]:
-    """Returns the box of voxels (x, y, z) for which a CPU's work-item sums. The larger of two is 14 % faster, and is taken
-    if local memory can hold it."""
+    """Returns the box of voxels (x, y, z) for which a CPU's work-item sums. The larger of two boxes is 14 % faster, and is
+    taken if local memory can hold it."""
     tile_bytes = 4 * math.prod(n + 2 for n in _BRICK)
     return _BRICK if rt.device.handle.local_mem_size >= tile_bytes else _SMALL_BRICK
 

@@ -135,8 +135,8 @@ class RayOperator:
             merge_slots(self.rt, self._cells, slots, there, target, self._rays_shape, self._axis)
 
     def _slots_of(self, part: slice) -> Iterator[tuple[int, Slots]]:
-        """Divides the frames ``part`` so that their slots fit into memory. Yields the slots of each group of frames, after
-        the number within ``part`` of its first frame."""
+        """Divides the frames ``part`` so that their slots fit into memory. Yields, for each group of frames, the number of
+        its first frame within ``part``, and its slots."""
         assert self._upright is not None and self._poses is not None
         for first in range(part.start, part.stop, self.memory.slot_frames):
             key = first, min(first + self.memory.slot_frames, part.stop)

@@ -22,8 +22,8 @@ class TileLists:
 
     tile: a tile's size in pixels or voxels along x, y, z. tiles: the number of tiles along x, y, z. Lists keep the order of
     the splats, so that sums over them repeat bit for bit. The number of list entries is known only on the device. The host
-    waits for it if the number of splats is new, ``waits`` is set, or a GPU would take long without lists. Else it reads the
-    number later. Until then, kernels test all splats in a tile whose list did not fit (cl/common/tile.h)."""
+    waits for it if the number of splats is new, ``waits`` is set, or a GPU would take long without lists. Otherwise it reads
+    the number later. Until then, kernels test all splats in a tile whose list did not fit (cl/common/tile.h)."""
 
     def __init__(self, rt: Runtime, tile: tuple[int, int, int], tiles: tuple[int, int, int]) -> None:
         self.rt = rt

@@ -7,7 +7,8 @@ of the source. The kernel works in detector coordinates and shares no formula wi
 In motion, the definition is integrated over time numerically. In a segment a splat keeps the conic, amplitude and
 perspective factor Q of the middle time, while its centre moves on the panel along a straight line at constant speed. From
 end to end it moves as the mean μ projected by the two end poses. Its mid-time centre is the average of the parabola through
-both ends and the middle. Conic and Q come from the difference C − b bᵀ. It loses digits, of which float32 has too few."""
+both ends and the middle. Conic and Q come from the difference C − b bᵀ. This difference loses digits, of which float32 has
+too few."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -63,7 +63,7 @@ def seen_volume(
     it.
 
     pose (F, 12) or (F, lines, 12) mm. counted: gives a view's redundancy weights (rows, columns). Both backprojections
-    weight each view by the angle for which it stands; ``backproject_seen`` divides by the distance once, not twice."""
+    weight each view by the angle for which it stands. ``backproject_seen`` divides by the distance once, not twice."""
     by_pixel, shape = pose_of_pixels(pose, axis), frames.shape[1:]
     angle_rad, pace = _directions(by_pixel[:, [by_pixel.shape[1] // 2]], shape, is_parallel)
     turn_rad = 2 * np.pi if is_displaced else np.pi  # a centred panel measures every ray in half a turn

@@ -152,7 +152,7 @@ def fit_squares(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> np.nd
 
 
 def t_statistic(stated: np.ndarray, other: np.ndarray) -> float:
-    """Returns by how many standard errors the stated hypothesis explains the frames better than the other.
+    """Returns by how many standard errors the stated hypothesis explains the frames better than the other hypothesis.
 
     stated, other (F,): mean squared residuals of each frame. The sample is their difference over their sum, one value per
     frame. Returns 0 with fewer than three frames, or if all differences are equal."""
@@ -164,7 +164,7 @@ def t_statistic(stated: np.ndarray, other: np.ndarray) -> float:
 
 
 def residual_ratio(stated: np.ndarray, other: np.ndarray) -> float:
-    """Returns the squared residual of the other hypothesis over that of the stated one, from each frame's squares (F,)."""
+    """Returns the ratio of squared residuals, other hypothesis over stated hypothesis, from each frame's squares (F,)."""
     return float(other.sum() / max(float(stated.sum()), _TINY))
 
 

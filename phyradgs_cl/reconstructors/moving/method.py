@@ -1,7 +1,7 @@
 """``moving``: the volume of an object that moves in an unknown way, and its displacement field.
 
 First the field is sought on a coarse copy of the scan. Each round makes a few passes of ``fista`` with the present field,
-then a Gauss-Newton step of the field and one of its weights (``field.py``). Motion and image together: J. Wang and X. Gu,
+then a Gauss-Newton step of the field and a step of its weights (``field.py``). Motion and image together: J. Wang and X. Gu,
 Simultaneous motion estimation and image reconstruction (SMEIR) for 4D cone-beam CT, Med. Phys. 40, 101912 (2013).
 
 Then ``fista`` reconstructs the reference volume with that field, as it does with ``--object-motion``. An object that shows
@@ -236,7 +236,8 @@ class MovingOptions(FistaOptions):
 
 @dataclass
 class _Field:
-    """Hands the field from the search to the passes. A state of the passes holds it too, because they need it to resume."""
+    """Hands the field from the search to the passes. A state of the passes holds the field too, because they need it to
+    resume."""
 
     deformation: Deformation | None = None
     gain: float = 0.0

@@ -119,7 +119,7 @@ def tables_of(
 ) -> tuple[list[TimeCells], bool]:
     """Returns the time cells of every frame in mm, and whether frames average intensities over a line's cells.
 
-    If ``exact`` chooses the segments, an object that moves gets as many as its paths need."""
+    If ``exact`` chooses the number of segments, an object that moves gets as many as its paths need."""
     peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
     cells = partial(motion.cells, intensity_peak=peak) if isinstance(motion, Exact) else motion.cells
     tables = [cells(scan, frame) for frame in range(scan.frames)]

@@ -2,8 +2,8 @@
 
 Each subset S, one of M, makes one step: xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁). The step
 and its momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The gradient of a
-subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34
-(2015) 167). L bounds the norm of AᵀA.
+subset, times the number of subsets, stands for the gradient of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
+34 (2015) 167). L bounds the norm of AᵀA.
 
 The last 2/5 of the passes run on smaller voxels, whose means make up most of the result (``stages.py``). The passes before
 them only provide their first volume, so they may be coarser: with more subsets, and fewer times in an exposure.
@@ -203,7 +203,7 @@ METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initia
 
 
 def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
-    """Returns the passes on the scan's own voxels and, if the options or the grid ask for them, those on smaller voxels. A
+    """Returns the passes on the scan's own voxels and, if the options or the grid ask for them, passes on smaller voxels. A
     stage takes its run from ``now`` when it starts, because the motion of the object may be known only then."""
     options = run.options
     parts = options.subvoxels or (2 if _gains_from_subvoxels(run, 2) else 1)

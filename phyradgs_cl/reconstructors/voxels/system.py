@@ -109,7 +109,7 @@ class System:
 
     def leave_room(self, rt: Runtime, nbytes: int) -> bool:
         """Frees the ray operators' buffers if less than ``nbytes`` of the memory limit would remain beside them. Returns
-        whether it did. The operators plan their buffers again at their next use."""
+        whether it freed them. The operators plan their buffers again at their next use."""
         operators = [o for o in (self.operator, self.intensity) if isinstance(o, RayOperator | IntensityOperator)]
         planned_bytes = sum(operator.memory.planned_bytes for operator in operators)
         if rt.ledger.limit_bytes - max(planned_bytes, rt.ledger.held_bytes) >= nbytes:
@@ -236,7 +236,8 @@ class OrderedSubsets:
         self._systems = [self.system.subset(range(first, frames, count)) for first in spread_order(count)]
 
     def join_if_diverging(self, residual: float) -> bool:
-        """Joins subsets two by two if the ``residual`` of a pass shows that their steps diverge. Returns whether it did."""
+        """Joins subsets two by two if the ``residual`` of a pass shows that their steps diverge. Returns whether they were
+        joined."""
         diverges = residual > _GROWTH * self.least_residual and len(self) > 1
         if diverges:
             self.split(ceil_div(len(self), 2))
