@@ -161,7 +161,7 @@ def exact_cells(
 ) -> TimeCells:
     """Divides the time from a frame's first light to its last into equal ``segments``, in which Gaussians move on the panel.
 
-    Every line integrates over its own window (docs/mathematics.md). At rest, or for a time of 0 s, returns
+    Every line integrates over its own window (docs/mathematics.md). For a gantry at rest, or a time of 0 s, returns
     ``static_cells``."""
     first_s, last_s = shutter.lit_span_s
     if last_s <= first_s:
@@ -182,8 +182,7 @@ def exact_cells(
 def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     """Returns ``TimeCells.line_times`` (K, 3, lines), for windows (lines, 2) in s and edges (K + 1,) in s of equal segments.
 
-    Where a window covers at most ``_OVERHANG`` of a segment, that part counts to the next one, to project fewer
-    Gaussians."""
+    Where a window covers at most ``_OVERHANG`` of a segment, that part counts to the next, to project fewer Gaussians."""
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
     opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in lengths of a segment after the frame's first light
@@ -218,7 +217,7 @@ def segments_for(
     In a segment, Gaussians move along straight lines and keep their shape. The error grows with the square of the gantry's
     turn in a segment. The factor was measured (benchmarks/time_exact.py) for Gaussians of 0.5 to 4 % of the half-width.
     intensity_peak: the largest line integral if the detector averages intensities, else 0. Then half the variance of the
-    line integrals in a segment is a further error. Up to a peak of 4 it is smaller than the other; above, it takes more
+    line integrals in a segment is a further error. Up to a peak of 4 it is the smaller one; above, it takes more
     segments."""
     first_s, last_s = shutter.lit_span_s
     pose = trajectory.pose(frame, start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1))

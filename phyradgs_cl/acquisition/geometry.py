@@ -194,7 +194,7 @@ def field_of_view_mm(geometry: Geometry) -> tuple[float, float, float]:
     """Returns half the sides (z, y, x) in mm of the field of view of a full turn, a box about the origin.
 
     The radius is DSO·sin(atan(half width/DSD)), where the half width reaches to the farther edge of a shifted panel. The
-    height is the cone's height at that radius behind the axis. In a parallel beam the box reaches to the panel's farther
+    height is the cone's height at that radius behind the axis. A parallel beam's box reaches to the panel's farther
     edges."""
     sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)
     half_height_mm, half_width_mm = (count * pitch / 2 + abs(offset) for count, pitch, offset in sides)
@@ -210,8 +210,7 @@ def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
     """Returns the grid of a full turn's field of view: a cube, or lower if the panel sees less along z.
 
     Voxels are as large as pixels at the axis: the pitch of rows along z, the pitch of columns along y and x. In a parallel
-    beam the grid is as high as the panel. If ``poses`` (F, 12) travel along z, as in a helix, the grid is longer by as
-    much."""
+    beam the grid is as high as the panel. If ``poses`` (F, 12) travel along z, as in a helix, the grid is as much longer."""
     half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
     high_mm, wide_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     wide = max(1, math.ceil(2 * radius_mm / wide_mm))

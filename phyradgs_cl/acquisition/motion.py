@@ -242,8 +242,7 @@ def motions_for(*operators: str) -> tuple[Motion, ...]:
 
 
 def motion_of(motion: str | Motion) -> Motion:
-    """Returns the motion model of a name, with default numbers; a model is returned itself. Raises InputError for other
-    names."""
+    """Returns the motion model of a name, with default numbers, or the given model. Raises InputError for other names."""
     if not isinstance(motion, str):
         return motion
     if motion not in MOTIONS:

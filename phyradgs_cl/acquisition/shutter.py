@@ -120,8 +120,7 @@ class Shutter:
         return np.where(seen_s > _DARK * longest_s, seen_s / longest_s, 0.0)
 
     def strip_ranges(self, lines: int, strips: int) -> list[tuple[int, int]]:
-        """Divides the lines into ``strips``; returns the lines [start, stop) of each, in reading order. Strips may be
-        empty."""
+        """Divides lines into ``strips``; returns each one's lines [start, stop), in reading order. Strips may be empty."""
         edges = [checks.ceil_div(strip * lines, strips) for strip in range(strips + 1)]
         ranges = list(zip(edges[:-1], edges[1:], strict=True))
         if self.direction < 0:

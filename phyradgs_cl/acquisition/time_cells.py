@@ -116,8 +116,7 @@ class TimeCells:
         return self
 
     def line_poses(self) -> np.ndarray:
-        """Returns one pose per line, (lines, 12): the pose of the cell nearest to its mid-exposure. A single cell gives (1,
-        12).
+        """Returns one pose per line, (lines, 12), from the cell nearest to its mid-exposure. A single cell gives (1, 12).
 
         Raises InputError for a line without a cell."""
         if self.count == 1:
@@ -145,8 +144,7 @@ class TimeCells:
 
     @cached_property
     def layer_numbers(self) -> np.ndarray:
-        """The layer of each cell, as a number (C,) from 0 on. Cells of one layer share no line; layers are as few as
-        possible.
+        """The layer of each cell, a number (C,) from 0 on. Cells of a layer share no line; layers are as few as possible.
 
         To average intensities, a frame's layers are projected one by one."""
         numbers = np.zeros(self.count, np.int64)

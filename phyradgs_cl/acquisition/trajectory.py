@@ -143,8 +143,7 @@ class FrameSweeps:
 
 
 def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
-    """Extends an orbit's encoder table by ``by_s`` at either end, at the speed there. Other trajectories stay as they
-    are."""
+    """Extends an orbit's encoder table by ``by_s`` at either end, at the speed there. Other trajectories stay the same."""
     if not (isinstance(trajectory, CircularOrbit) and isinstance(trajectory.kinematics, EncoderTable)):
         return trajectory
     table = trajectory.kinematics
@@ -159,8 +158,8 @@ def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
 
 
 def _is_without_jumps(steps_rad: np.ndarray) -> bool:
-    """Returns whether steps (N,) of angles are no jumps by a turn: none exceeds half a turn, nor half of them a quarter
-    turn."""
+    """Returns whether steps (N,) of angles are no jumps by a turn: none exceeds half a turn, and half of them stay below a
+    quarter turn."""
     size_rad = np.abs(steps_rad)
     return bool(size_rad.max(initial=0) <= np.pi or np.median(size_rad) >= np.pi / 2)
 

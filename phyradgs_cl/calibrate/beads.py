@@ -219,7 +219,7 @@ class BeadProblem(CoarseFrames):
         return float(np.std(residual if self.valid is None else residual[self.valid]))
 
     def explained(self, operator: BeadOperator, placement: np.ndarray) -> float:
-        """Returns the fraction of the compared values' sum of squares that the phantom explains; 0 if its density is
+        """Returns the fraction of the compared values' sum of squares that the phantom explains. It is 0 if the density is
         negative."""
         residual = self.compared(self.residual(operator, placement))
         whole = self.compared(self.masked(self.measured))

@@ -45,8 +45,7 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class PerViewParameters(ABC):
-    """Parameters of views, with ``values`` (n, K) of K kinds. View f has (``basis`` @ ``values``)[f], (K,), with basis (F,
-    n).
+    """Parameters of views: ``values`` (n, K) of K kinds. View f has (``basis`` @ ``values``)[f], (K,), with basis (F, n).
 
     - units (K,): how much of each kind moves a frame by a pixel at its edge.
     - circle (n, 2): values that vary as cosine and sine of the angle, as far as the basis can.
@@ -244,8 +243,8 @@ def _signal(
 def _share(
     problem: CoarseProblem, operator: RayOperator, basis: np.ndarray, signals: np.ndarray, iterations: int
 ) -> float:
-    """Returns the fraction, 0 to 1, of signals (F, rows, columns) that no object explains, given random signs of the
-    views."""
+    """Returns the fraction, 0 to 1, of signals (F, rows, columns) that no object explains, if each view's signal has a
+    random sign."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], basis.shape[1]).astype(np.float32)
     probe = signals * (basis @ signs).astype(np.float32)[:, None, None]
     (rest,) = problem.beyond_object(operator, np.zeros(operator.volume_shape, np.float32), [probe], iterations)
@@ -273,7 +272,7 @@ def estimate_views(
     rt: Runtime, scan: Scan, parameters: PerViewParameters, stages: Sequence[Stage],
     correction: GeometryCorrection, passes: PassCounter,
 ) -> ViewsEstimate:
-    """Estimates ``parameters`` of a scan that ``correction`` has changed, in a few Gauss–Newton steps on each of finer
+    """Estimates ``parameters`` of a scan that ``correction`` has changed, in a few Gauss–Newton steps on each of ever finer
     grids.
 
     A deviation combines noise and discretisation error, which is half the change since the coarser grid."""

@@ -87,8 +87,7 @@ def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
 def _matching_triangles(
     beads_mm: np.ndarray, spots_mm: np.ndarray, within_mm: float
 ) -> Iterator[tuple[tuple[int, int, int], list[int]]]:
-    """Yields triangles of beads (n, 3) and of spots (m, 3), as three indices, whose sides differ by less than
-    ``within_mm``."""
+    """Yields triangles of beads (n, 3) and spots (m, 3), as indices, whose sides differ by less than ``within_mm``."""
     rng = np.random.default_rng(0)
     apart = np.linalg.norm(spots_mm[:, None] - spots_mm, axis=-1)
     for _ in range(_TRIANGLES):

@@ -153,8 +153,7 @@ class CoarseProblem(CoarseFrames):
         return replace(problem, measured=problem.masked(measured))
 
     def operator(self, correction: GeometryCorrection, views: Views | Sway | None = None) -> RayOperator:
-        """Returns the projector A to the coarse frames of all scans, in the geometry corrected by ``correction`` and
-        ``views``.
+        """Returns the projector A to the coarse frames of all scans, in the geometry after ``correction`` and ``views``.
 
         Each line integrates over 2 to 8 times of its exposure. views: changes of single views or of the object's pose."""
         tables = []
@@ -180,8 +179,8 @@ class CoarseProblem(CoarseFrames):
         return IntensityOperator(self.rt, self.grid, operator.detector_shape, operator.tables).expected(volume)
 
     def reconstruct(self, operator: RayOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
-        """Returns a nonnegative volume (nz, ny, nx) of little total variation, after ``iterations`` from ``start`` or
-        zeros."""
+        """Returns a nonnegative volume (nz, ny, nx) of little total variation, after ``iterations`` from ``start`` (None:
+        zeros)."""
         volume = np.zeros(self.grid.shape, np.float32) if start is None else start
         system = System(operator, self.line_integrals(operator, volume), self.valid)
         method = FistaTv(system, _TV, TvProx(self.rt, self.grid.shape, axis_weights(self.grid)))

@@ -49,8 +49,7 @@ class ParameterEstimate:
 class Calibration:
     """The corrected ``scan``, in which everything else is unchanged, and how it was found.
 
-    - parameters: an estimate each. alike: combinations of parameters, in words, that no frame distinguishes from another
-      object.
+    - parameters: an estimate each. alike: combinations of parameters, in words, that no frame tells from another object.
     - residual_rms: RMS residual before and after, in line integrals, on the finest grid. before, after: these residuals (F,
       rows, columns).
     - views: corrections per view, or the object's motion, if significant. The table has the root mean square of each kind,
@@ -89,8 +88,8 @@ class Calibration:
     def per_view(self) -> dict[str, np.ndarray]:
         """Returns the corrections of every view, (F,) by name and unit; {} without corrections of views.
 
-        A wobble is added to the stated poses: source and panel turn counterclockwise as seen from above, and the panel moves
-        along its own v and u. A motion is the object's pose in the middle of each view: rotated, then shifted, by x, y,
+        A wobble is added to the stated poses: source and panel turn counterclockwise seen from above, and the panel moves
+        along its own v and u. A motion is the object's pose in the middle of each view: rotated, then shifted, in x, y,
         z."""
         if self.views is None:
             return {}

@@ -177,8 +177,7 @@ class _Calibrator:
             self.search.fallback = {OFFSET_U: Fallback(shift.pixels * pitch_mm, shift.deviation * pitch_mm, is_significant)}
 
     def _search_common(self) -> None:
-        """Searches the parameters that all views share, after correcting single views, whose errors would look like a
-        roll."""
+        """Searches the parameters that all views share. Corrects single views first: their errors would look like a roll."""
         steady = self.ready
         if self.per_view is not None:
             self.passes.begin("views before", "views, before the rest")
@@ -221,8 +220,8 @@ class _Calibrator:
         return replace(problem, count_pass=self.passes.counter(pass_cost(scans, stage.columns, most_frames)))
 
     def _place(self, phantom: EllipsoidPhantom) -> np.ndarray:
-        """Returns a first placement (7,) of the phantom: the one that fits the frames best, of those where its beads are
-        seen."""
+        """Returns a first placement (7,) of the phantom. Of the placements where its beads are seen, it fits the frames
+        best."""
         bead_centres_mm(phantom)
         correction = correction_of(self.search.at)
         voxels = CoarseProblem.of(self.rt, self.ready, STAGES[-1])

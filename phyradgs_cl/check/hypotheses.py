@@ -105,7 +105,7 @@ def _times(name: str, factor: float) -> str:
 
 
 def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Scan:
-    """Returns the coarse scan with pixels ``factor`` times as large, and a fitting grid. keeps_axis: keeps the axis'
+    """Returns the coarse scan with pixels ``factor`` times as large, and a fitting grid. keeps_axis: the axis stays in its
     column."""
     v_mm, u_mm = stated.geometry.pixel_size_mm
     off_v_mm, off_u_mm = (offset * (factor if keeps_axis else 1) for offset in stated.geometry.detector_offset_mm)
@@ -145,8 +145,7 @@ def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hy
 
 
 def _azimuths(scan: Scan) -> np.ndarray:
-    """Returns each frame's angle (F,) in rad from the first frame's. Whole turns are kept if the trajectory states
-    angles."""
+    """Returns each frame's angle (F,) in rad from the first frame's. Whole turns stay if the trajectory states angles."""
     trajectory = variants.altered_trajectory(scan)
     angle_rad = getattr(trajectory.base, "angle_rad", None)
     if angle_rad is None:

@@ -142,8 +142,7 @@ class Deformation:
     def inverse_on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
         """Returns u (nz, ny, nx, 3) float32 in mm: matter at x in the reference volume has moved to x + u(x).
 
-        u(x) = −w(x + u(x)) is iterated from u = 0. Raises InputError where this does not converge, as where the field
-        folds."""
+        u(x) = −w(x + u(x)) is iterated from u = 0. Raises InputError if this does not converge, as where the field folds."""
         z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
         centres_mm = np.stack([x.ravel(), y.ravel(), z.ravel()], -1)
         return self.inverse_mm(centres_mm, weights).reshape(*grid.shape, 3).astype(np.float32)

@@ -87,8 +87,7 @@ class Activation:
         return rows
 
     def invert(self, rows: np.ndarray) -> np.ndarray:
-        """Returns raw rows for parameter rows (11, G). Keeps scales a little inside their bounds: there the inverse is
-        finite."""
+        """Returns raw rows for parameter rows (11, G). Keeps scales a little inside their bounds for a finite inverse."""
         raw = np.array(rows, dtype=np.float64)
         span = self.scale_max - self.scale_min
         raw[SCALE] = scipy.special.logit(np.clip((rows[SCALE] - self.scale_min) / span, 1e-4, 1 - 1e-4))

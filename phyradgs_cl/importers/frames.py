@@ -40,8 +40,7 @@ _SAME = 1e-3  # flats up to this fraction above the saturation level are clipped
 @dataclass(frozen=True, eq=False)
 class Light:
     """Flats (G, v, u) at G times, and the dark (1, v, u) or None. place (P,): the time of each projection, counted in
-    flats: 0.5 is halfway from the first to the second. used: the numbers of flats and darks used. said: the same in
-    words."""
+    flats: 0.5 is halfway from the first to the second. used: the numbers of flats and darks used. said: this in words."""
 
     flats: np.ndarray
     dark: np.ndarray | None
@@ -62,7 +61,7 @@ def light_of(
 ) -> Light:
     """Returns the flats and dark for ``count`` projections, from flats and darks (n, v, u). Of three or more, those that do
     not fit the others are left out, with a warning. at (n,): when flats were taken, as in ``places``; None: not stated.
-    names: what messages call each of the "flats" and "darks". Raises InputError for the option flats "time" and a single
+    names: what messages call the "flats" and "darks". Raises InputError for the option flats "time" if all flats are of one
     time."""
     at, assumed = _times(subject, len(flats), count, options, at)
     light = max(float(np.median(_levels(flats)[1])), 1e-30)

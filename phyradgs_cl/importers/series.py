@@ -33,8 +33,7 @@ _MOST_NAMES = 8  # file names that a message lists at most
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Files in the scan's order. numbers (F,): the numbers in their names, or None. said: which files were taken, in
-    words."""
+    """Files in the scan's order. numbers (F,): the numbers in their names, or None. said: which files it has, in words."""
 
     paths: list[Path]
     numbers: np.ndarray | None

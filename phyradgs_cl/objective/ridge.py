@@ -66,7 +66,7 @@ def learned_ridge() -> Ridge:
 
 
 class RidgeStep:
-    """Steps down the ridge regulariser for volumes of one ``shape`` (nz, ny, nx). Those thinner than a filter stay the
+    """Steps down the ridge regulariser for volumes of one ``shape`` (nz, ny, nx). Volumes thinner than a filter stay the
     same."""
 
     VOLUMES = 4
@@ -107,7 +107,7 @@ class RidgeStep:
         return brought_to(self.rt, volume, result)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
-        """Runs a kernel on slices from ``first`` on. Its result has ``less`` fewer voxels along each axis than the
+        """Runs a kernel on slices from ``first`` on. Its result has ``less`` voxels fewer along each axis than the
         volume."""
         nz, ny, nx = (count - less for count in self.shape)
         start, stop = max(first, 0), min(first + _SLICES, nz)

@@ -44,8 +44,7 @@ class ImageLoss:
     def evaluate(
         self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float
     ) -> DeviceArray:
-        """Returns dL/d(rendered), valid until the next call. mask: 1 where a pixel counts, else 0. pixels: how many
-        count."""
+        """Returns dL/d(rendered), valid until the next call. mask: 1 if a pixel counts, else 0. pixels: how many count."""
         rt = self.rt
         vectors = ceil_div(self.width, rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))

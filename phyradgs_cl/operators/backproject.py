@@ -1,7 +1,6 @@
 """Voxel-driven backprojection with FDK's distance weight, with one pose per frame or one pose per line.
 
-If memory is short, the volume is computed part by part and fewer views are uploaded at a time. The result has the same
-bits."""
+If memory is short, the volume is computed part by part and fewer views are uploaded at a time. The bits stay the same."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass

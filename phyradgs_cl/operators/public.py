@@ -129,8 +129,7 @@ class Operator:
         return to_user_array(self.rt, y), by_x
 
     def derivative(self, x: Any) -> Any:
-        """Returns the derivative at x, for which it computes A(x). Its ``T`` maps dL/dy (range_shape) to dL/dx
-        (domain_shape)."""
+        """Computes A(x) and returns the derivative at x, whose ``T`` maps dL/dy (range_shape) to dL/dx (domain_shape)."""
         return Derivative(self.vjp(x)[1])
 
     @property

@@ -162,7 +162,8 @@ def control_density(
 ) -> Population:
     """Returns the population after one round of density control: cloned, split and pruned.
 
-    statistic (G,): mean gradient norm. box (2, 3): lowest and highest corner x y z; those centred outside are removed."""
+    statistic (G,): mean gradient norm. box (2, 3): lowest and highest corner x y z; Gaussians centred outside are
+    removed."""
     rows = activation.apply(population.raw)
     room = max(control.max_gaussians - statistic.size, 0)
     has_large_gradient = _strongest(statistic, control.threshold, room)

@@ -64,8 +64,7 @@ _HOLDER_AXES = (0.85, 0.85, 0.7)  # the holder contains every bead and stays in 
 
 
 def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
-    """Returns two horizontal circles of dense beads in a light holder. The beads of one circle stand above gaps of the
-    other.
+    """Returns two horizontal circles of dense beads in a light holder. Beads of one circle stand above gaps of the other.
 
     Their round edges show blur and distortion, as in the phantoms that calibrate cone-beam scanners. The cube of side 2 ·
     ``half_size_mm`` is about the origin. A bead attenuates 1 / ``half_size_mm``, the holder 0.15 times that."""

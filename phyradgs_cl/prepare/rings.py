@@ -206,8 +206,7 @@ def _rough(image: np.ndarray) -> np.ndarray:
 
 
 def _covariance(one: np.ndarray, other: np.ndarray) -> float:
-    """Returns a robust covariance, which few pixels at edges hardly change (Gnanadesikan and Kettenring, Biometrics
-    1972)."""
+    """Returns a robust covariance, which few edge pixels hardly change (Gnanadesikan and Kettenring, Biometrics 1972)."""
     return (robust_deviation(one + other) ** 2 - robust_deviation(one - other) ** 2) / 4
 
 

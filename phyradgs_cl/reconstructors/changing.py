@@ -50,8 +50,7 @@ class ChangingOptions(IterativeOptions):
 
 
 def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the object's states in 1/mm, and their mean as the volume. ``arguments``: as in ``MethodRun``; no seed is
-    used."""
+    """Returns the object's states in 1/mm, and their mean as volume. ``arguments``: as in ``MethodRun``; uses no seed."""
     times_s = state_times_s(scan, options.states)
     shape = (len(times_s), *scan.grid.shape)
     run = MethodRun(scan, options, rt, state_times_s=times_s, **arguments)

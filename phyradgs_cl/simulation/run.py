@@ -160,8 +160,8 @@ def simulated_scan(
     """Returns a scanner's scan of a phantom (given by name or as an object) or of a volume. The truth is its reference.
 
     name: the volume's name, for titles. size: voxels along the longest side of grid and reference; None: the scanner's or
-    the volume's. pixel_samples: rays along each side of a pixel; 0 chooses by the truth's voxels. Warns of an inverse
-    crime."""
+    the volume's. pixel_samples: rays along each side of a pixel; 0 chooses them by the size of the truth's voxels. Warns of
+    an inverse crime."""
     if size is not None:
         checks.within("--size", size, 1 if isinstance(of, Volume) else _SMALLEST_PHANTOM, _LARGEST_GRID)
     where, axis = (scanner.geometry, scanner.grid), options.readout_axis

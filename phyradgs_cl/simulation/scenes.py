@@ -61,7 +61,8 @@ def phantom_scene(
     """Returns the scene of a phantom, given as an object or by name, in the scanner's box, with ``size`` voxels per side.
 
     Closed forms are integrated exactly unless they deform. Other phantoms are projected at twice ``size``, and the truth is
-    their block mean. Pixels average ``pixel_samples``² rays over their area; 0 chooses by the truth's voxels."""
+    their block mean. Pixels average ``pixel_samples``² rays over their area; 0 chooses them by the size of the truth's
+    voxels."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
     if isinstance(phantom, MovingPhantom):

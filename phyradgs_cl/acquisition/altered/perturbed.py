@@ -89,8 +89,7 @@ class PerturbedTrajectory:
 
     @cached_property
     def _turn(self) -> np.ndarray:
-        """The panel's rotation (3, 3) by roll and tilts. Its columns are the new u, v and normal in the stated panel's
-        axes."""
+        """The panel's rotation (3, 3) by roll and tilts. Its columns: the new u, v and normal in the stated panel's axes."""
         angles_rad = [self.correction.tilt_u_rad, self.correction.tilt_v_rad, self.correction.roll_rad]
         return np.asarray(Rotation.from_rotvec(angles_rad).as_matrix())
 

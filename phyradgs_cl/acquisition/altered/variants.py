@@ -148,8 +148,7 @@ def stretched(scan: Scan, v: float, u: float) -> Scan:
 
 
 def mirrored(scan: Scan, axis: str) -> Scan:
-    """Returns the scan as if its frames were mirrored along ``axis``, u or v. Lines read along that axis are reversed
-    too."""
+    """Returns the scan as if frames were mirrored along ``axis``, u or v. Lines read along this axis are reversed too."""
     number = ("v", "u").index(axis)
     is_read_along = scan.shutter.axis == ("rows", "columns")[number]
     images = partial(_flipped, axis=number, count=altered_trajectory(scan).panel[number])

@@ -28,8 +28,7 @@ class IntensityOperator:
     where J averages line integrals.
 
     Arguments and arrays are those of ``RayOperator``. The cells of a frame are divided into layers in which every line has
-    at most one cell. Softmax weights (F, rows, columns) are kept for each layer. projector: makes the operator A_k of a
-    layer."""
+    at most one cell. Softmax weights (F, rows, columns) are kept for each layer. projector: makes a layer's operator A_k."""
 
     def __init__(
         self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells],

@@ -188,8 +188,7 @@ class RayMemory:
         return DeviceArray(self._frames.buffer, (floats,), self._frames.dtype)
 
     def _frames_floats(self, count: int) -> int:
-        """Returns how many floats a buffer for ``count`` frames takes. With slots it must also hold the frames
-        transposed."""
+        """Returns how many floats a buffer for ``count`` frames takes. With slots it also holds the frames transposed."""
         turned = self.layout.turned.frames_floats(count) if self.slot_floats else 0
         return max(self.layout.frames_floats(count), turned)
 

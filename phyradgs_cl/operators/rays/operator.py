@@ -208,8 +208,7 @@ class RayOperator:
         self._slots: dict[tuple[int, int], Slots] = {}
 
     def _listed(self, part: slice) -> DeviceArray:
-        """Returns the numbers that this operator's frames ``part`` have in the whole scan. Uploads them to the device
-        once."""
+        """Returns the numbers that this operator's frames ``part`` have in the scan. Uploads them to the device once."""
         key = part.start, part.stop
         if key not in self._lists:
             self._lists[key] = self.rt.upload(self._chosen[part], np.int32)

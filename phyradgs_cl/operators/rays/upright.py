@@ -108,8 +108,7 @@ def launch_upright(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, columns: DeviceArray,
     target: tuple[DeviceArray, np.ndarray],
 ) -> None:
-    """Projects a volume, transposed to ``columns`` (y, x, z), to slots. target: an array with strides as in
-    ``Slots.strides``."""
+    """Projects a volume, transposed to ``columns`` (y, x, z), to slots. target: an array and its ``Slots.strides``."""
     shape, origin, _, pitch_mm, *_ = layout.constants()
     array, strides = target
     rt.launch(
@@ -124,8 +123,7 @@ def launch_upright_adjoint(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, values: DeviceArray,
     target: tuple[DeviceArray, Strides], *, add: bool = False,
 ) -> None:
-    """Backprojects slots, as ``split_slots`` writes them, to ``target``, a volume with its strides. add: adds to its
-    values."""
+    """Backprojects slots, as ``split_slots`` writes them, to ``target``, a volume and its strides. add: adds to it."""
     shape, origin, *_ = layout.constants()
     (x, y, z), items = _owned(layout.brick.shape, rt.device.compute_units)
     rt.launch(
@@ -149,8 +147,7 @@ def _owned(shape: tuple[int, int, int], units: int) -> tuple[tuple[int, int, int
 def turn_volume(
     rt: Runtime, layout: RayLayout, volume: tuple[DeviceArray, Strides], columns: DeviceArray
 ) -> None:
-    """Transposes a volume (nz, ny, nx), given with its strides, to ``columns`` (y, x, z). Leaves the padding, which is
-    zero."""
+    """Transposes a volume (nz, ny, nx), given with its strides, to ``columns`` (y, x, z). The padding stays zero."""
     nz, ny, nx = layout.grid.shape
     shape, *_ = layout.constants()
     size = (ceil_div(nx, _TURN), ny, ceil_div(nz, _TURN))

@@ -76,8 +76,8 @@ class WarpedOperator:
             self.warp.stack.add(part.places, frames)
 
     def backprojections(self, frames: DeviceArray) -> Iterator[tuple[int, DeviceArray]]:
-        """Yields (k, P_kᵀ y) for frames y (F, rows, columns) and each state k that they use. Each (nz, ny, nx) is valid
-        until the next."""
+        """Yields (k, P_kᵀ y) for frames y (F, rows, columns) and each state k that they use. Each volume (nz, ny, nx) is
+        valid until the next one."""
         for part in self._parts:
             taken = self.warp.stack.take(frames, part.frames)
             yield part.state, part.operator.adjoint(taken, out=self.warp.moved())
@@ -200,8 +200,7 @@ class FieldDerivative:
         self.slopes = {k: warp_slopes(volume, displacement) * per_mm for k, displacement in displacements.items()}
 
     def forward(self, change_mm: np.ndarray) -> np.ndarray:
-        """Returns the frames' change J d (F, rows, columns) float32 for a change d (R, cz, cy, cx, 3) of the
-        coefficients."""
+        """Returns the frames' change J d (F, rows, columns) float32 for a change d (R, cz, cy, cx, 3) of coefficients."""
         fields_mm = np.stack([self._on_grid(one) for one in change_mm])
         return self._projected(lambda k: np.tensordot(self.weights[k].astype(np.float32), fields_mm, 1))
 

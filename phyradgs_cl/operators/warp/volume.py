@@ -59,8 +59,7 @@ class VolumeWarp:
         return self._source
 
     def _filter(self, values: DeviceArray) -> None:
-        """Applies the spline filter F in place to a padded volume. Filters whole padded rows, because their zeros stay
-        zero."""
+        """Applies the spline filter F in place to a padded volume. Filters whole padded rows, since their zeros stay 0."""
         nz, ny, nx = (n + 2 * _BORDER for n in self.shape)
         slice_, row = self._strides.slice, self._strides.row
         start = np.int64(self._strides.start - _BORDER * (slice_ + row + 1))

@@ -71,8 +71,7 @@ def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: 
 
 
 def _curvature(frames: np.ndarray) -> np.ndarray:
-    """Returns the curvature (F, v, 1), positive downwards, of the parabola through a row's squares; the median over
-    frames."""
+    """Returns the curvature (F, v, 1), positive downwards, of the parabola through a row's squares: the frames' median."""
     u = np.linspace(-1, 1, frames.shape[2])
     basis = np.stack([np.ones_like(u), u, u**2], axis=1)
     squares = np.maximum(frames, 0).astype(np.float64) ** 2

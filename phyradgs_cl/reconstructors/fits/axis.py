@@ -53,7 +53,7 @@ NOT_FOUND = AxisShift(math.nan, math.nan, np.empty(0))
 
 
 def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHERE) -> AxisShift:
-    """Returns the best of five shifts within ``limits_px``, a coarse pixel apart, after few iterations; its deviation is
+    """Returns the best of five shifts within ``limits_px``, a coarse pixel apart, after few iterations. Its deviation is
     NaN."""
     block = columns_per_block(scan)
     shifts_px = [block * shift for shift in _ROUGH_SHIFTS if limits_px[0] <= block * shift <= limits_px[1]]
@@ -184,8 +184,8 @@ def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _few_rows(scan: Scan, frame: int) -> np.ndarray:
-    """Returns a frame's means over blocks of rows, (few rows, columns) float64, smoothed along rows. Fills masked pixels
-    in."""
+    """Returns a frame's means over blocks of rows, (few rows, columns) float64, smoothed along rows. Masked pixels are
+    filled in."""
     image = np.asarray(scan.projections[frame], np.float64)
     if scan.pixel_mask is not None:
         columns = np.arange(image.shape[1])

@@ -33,7 +33,7 @@ def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
     """Returns the panel's shift along u under which rays and their opposites agree best, its deviation by a jackknife over
     the views, and the mean squares (F,) of their differences.
 
-    NaN for views more than 10° apart, for columns read one after the other, and if no shift up to 1/8 of the panel is
+    NaN for views more than 10° apart, for columns read one after the other, and if no shift within an eighth of the panel is
     best."""
     if scan.shutter.axis == "columns" and scan.shutter.readout_s > 0:
         return NOT_FOUND  # a ray and its opposite lie on different columns, read at different times

@@ -43,8 +43,7 @@ class MotionField:
 
     @classmethod
     def at_rest(cls, scan: Scan, spacing_mm: float, splines: TemporalSplines, temporal: np.ndarray) -> "MotionField":
-        """Returns a field of zeros over the scan's grid. Its weights, ``temporal`` (count, R), get mean 0 and largest size
-        1."""
+        """Returns a field of zeros over the scan's grid. The weights ``temporal`` (count, R) get mean 0, largest size 1."""
         origin_mm, counts = control_points(scan.grid, spacing_mm)
         centred = temporal - splines.at(splines.node_times_s).mean(0) @ temporal  # splines sum to 1: the weights get mean 0
         control_mm = np.zeros((temporal.shape[1], *counts, 3))

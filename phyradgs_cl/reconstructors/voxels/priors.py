@@ -217,8 +217,7 @@ class TvAndDct(Prior):
 
 
 class ThenRidge(Prior):
-    """The prior ridge: the map of the prior ``before``. After every fourth map, it steps down the learned ridge
-    regulariser."""
+    """The prior ridge: the map of the prior ``before`` and, after every fourth map, a step down the ridge regulariser."""
 
     VOLUMES = RidgeStep.VOLUMES
 
