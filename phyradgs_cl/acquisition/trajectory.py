@@ -158,8 +158,8 @@ def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
 
 
 def _is_without_jumps(steps_rad: np.ndarray) -> bool:
-    """Returns whether steps (N,) of angles are no jumps by a turn: none exceeds half a turn, and half of them stay below a
-    quarter turn."""
+    """Returns whether steps (N,) of angles are no jumps by a turn: none exceeds half a turn, or most exceed a quarter
+    turn."""
     size_rad = np.abs(steps_rad)
     return bool(size_rad.max(initial=0) <= np.pi or np.median(size_rad) >= np.pi / 2)
 
