@@ -27,7 +27,7 @@ from phyradgs_cl.runtime import Runtime
 CONSISTENCY = "consistency"
 # Consistent frames leave less than this fraction of their residual in a random order: correct scans have 0.02 to 0.23.
 _LARGEST = 0.35
-_DOUBTFUL = 0.1  # above this fraction of that residual, exchanged, missing and repeated frames are tried as explanations
+_DOUBTFUL = 0.1  # above this fraction of the residual in a random order, exchanged, missing and repeated frames are tried
 _RANDOM_ORDERS = 2  # the residual in a random order is averaged over this many orders
 _FEWEST_FRAMES = 5  # fewer frames cannot tell one order from another
 _FEWEST_PIXELS = 32  # fewer valid coarse pixels per frame cannot tell one order from another

@@ -33,9 +33,9 @@ class NeuralOptions(MotionOptions):
     - voxel_points: points along each side of a voxel, whose value is the field's mean over them.
 
     - levels (0: until the finest has one cell per voxel), features, base_resolution (cells along a side), level_growth,
-      table_log2 (each level has at most 2^table_log2 entries): sizes of the hash encoding. - layers, width, last_activation:
-      the network's shape. A sigmoid reaches at most density_bound, in units of FDK's 99.9th percentile. The field starts at
-      first_share of that everywhere.
+      table_log2 (each level has at most 2^table_log2 entries): sizes of the hash encoding.
+    - layers, width, last_activation: the network's shape. A sigmoid reaches at most density_bound, in units of FDK's 99.9th
+      percentile. The field starts at first_share of that everywhere.
     - rate: Adam's learning rate, multiplied by rate_factor every rate_step passes; step 0: once, gradually over the run.
     - detector_model: what the detector averages over a line's times, or the model that the scan states (scan).
     - torch_device: the device of PyTorch."""

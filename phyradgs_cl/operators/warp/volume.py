@@ -116,8 +116,8 @@ class VolumeWarp:
         move(self.rt, (total, self._strides), (result, Strides.plain(self.shape)), self.shape)
 
     def _adjoint_fixed(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Does what ``adjoint`` does in integers, whose sums do not depend on the order. The largest voxel becomes 2³¹ /
-        ``_HEADROOM``, so rounding is as fine as float32's."""
+        """Does in integers what ``adjoint`` does, since sums of integers do not depend on the order. The largest voxel
+        becomes 2³¹ / ``_HEADROOM``, so rounding is as fine as float32's."""
         largest = self._space.largest(moved, absolute=True)
         if not largest > 0:
             return
