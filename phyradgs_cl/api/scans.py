@@ -23,7 +23,7 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.removed import refuse_removed
 
 log = logging.getLogger(__name__)
-# Arguments of ``fly_scan`` by the names of the same values in a Scan's checks, for messages.
+# For messages: the arguments of ``fly_scan``, by the names that a Scan's checks have for the same values.
 _ARGUMENTS = {
     "angles": "angles_deg", "exposure_s": "exposure_deg", "frame_time_s": "exposure_s", "readout_s": "readout_ratio",
     "readout_axis": "readout",

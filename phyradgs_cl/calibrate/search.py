@@ -33,7 +33,7 @@ _TINY = 1e-9  # added to the diagonal of a matrix before its inverse, because si
 _GAUGE_FACTOR = 2.0  # voxels leave part of a turn's or lift's signal (``GAUGES``) by error: others must leave twice as much
 _MOST_GAUGE = 0.2  # a turn's or lift's share counts as at most this: in a wrong geometry it grows, and would refuse all
 DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
-_MOST_PX = 2.0  # a step moves the image by at most this many coarse pixels at its edge: signals are not linear beyond
+_MOST_PX = 2.0  # a step moves the image by at most this many coarse pixels at its edge: beyond, its effect is not linear
 _SETTLED = 0.1  # the steps on a grid end when all are smaller than this many standard deviations
 
 

@@ -78,7 +78,7 @@ class FBP(DataProcessor):
         self._shape_out = self.image_geometry.shape
 
     def process(self, out: DataContainer | None = None) -> DataContainer:
-        """Returns the volume reconstructed from the input, in ``out`` if given."""
+        """Reconstructs the volume from the input. Returns it, in ``out`` if given."""
         between = self.image_geometry, self.acquisition_geometry
         method = "fbp" if between[1].geom_type == "parallel" else "fdk"
 

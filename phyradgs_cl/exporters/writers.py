@@ -19,7 +19,7 @@ from phyradgs_cl.io.output import written_beside
 from phyradgs_cl.io.volume import Volume
 
 _WRITERS = {".mha": "MetaImageIO", ".nii": "NiftiImageIO", ".nii.gz": "NiftiImageIO", ".nrrd": "NrrdImageIO"}
-_MOST_NIFTI_VOXELS = 32_767  # NIfTI's limit along one axis
+_MOST_NIFTI_VOXELS = 32_767  # NIfTI allows at most this many voxels along an axis
 _MOST_IMAGEJ_BYTES = 4_000_000_000  # from this size on BigTIFF is written: offsets in ImageJ's TIFF have 32 bits
 _CHUNK = 64  # voxels of a chunk along each axis; halving of the resolution ends when all fits into one chunk
 _PLY_NAMES = (

@@ -27,8 +27,8 @@ _APART = 0.3  # largest difference among flats of several times, between which t
 _DARK = 0.02  # largest difference among darks
 
 # A flat or dark is left out too if its pixels differ from the others', in the mean, by more than the sum of these two.
-_PATTERN = 0.02  # allowed difference, as a fraction of the flats' median
-_TIMES = 5.0  # allowed difference, as a multiple of its median over the frames
+_PATTERN = 0.02  # allowed mean difference of pixels, as a fraction of the flats' median
+_TIMES = 5.0  # allowed mean difference of pixels, as a multiple of its median over the frames
 _BLOCK_BYTES = 1 << 26  # memory of a block of rows whose median is taken: a float64 copy of all frames would be large
 Mask = np.ndarray | None
 TAKEN = "taken"
@@ -92,7 +92,8 @@ def median(stack: np.ndarray) -> np.ndarray:
 def _times(
     subject: str, flats: int, count: int, options: ImportOptions, at: np.ndarray | None
 ) -> tuple[np.ndarray, str]:
-    """Returns when flats were taken (n,), as in ``places`` (all equal: use the median), and a text about assumptions."""
+    """Returns when flats were taken (n,), as in ``places``, and a text about assumptions. At equal times their median is
+    used."""
     if options.flats != "time":
         return np.zeros(flats) if at is None or options.flats else at, ""
     if flats < 2 or (at is not None and np.ptp(at) == 0):

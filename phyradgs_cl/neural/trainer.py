@@ -25,8 +25,8 @@ Field = Callable[[torch.Tensor], torch.Tensor]
 
 
 class Trainer:
-    """Fits a field to a scan's rays; a ``Loop`` runs it as a ``Stepwise``. A step takes one frame, an iteration all frames
-    once. Holds what changes from step to step: the field, its optimiser and the random draws.
+    """Fits a field to a scan's rays, step by step for a ``Loop``. A step takes one frame, an iteration all frames once.
+    Holds what changes from step to step: the field, its optimiser and the random draws.
 
     Lengths are in units of half the volume's longest side, attenuation in units of ``density_per_mm``."""
 
@@ -61,7 +61,7 @@ class Trainer:
 
     @property
     def iteration(self) -> int:
-        """How many times all frames have been used."""
+        """How many times the training has used all frames."""
         return self.steps // self.scan.frames
 
     @property

@@ -217,7 +217,7 @@ class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy ha
     def _transpose(self) -> "LinearOperator":
         return self.T
 
-    _adjoint = _transpose  # the same for real numbers
+    _adjoint = _transpose  # for real numbers it is the transpose
 
 
 def _is_index(number: object, count: int) -> bool:

@@ -124,5 +124,5 @@ def _between(steps: NDArray[np.uint8]) -> int:
     with np.errstate(all="ignore"):
         variance = below * above * (sums / below - (sums[-1] - sums) / above) ** 2
     variance = np.nan_to_num(variance)
-    best = np.flatnonzero(variance >= variance.max() * (1 - 1e-9))  # all levels in a gap between the classes are as good
+    best = np.flatnonzero(variance >= variance.max() * (1 - 1e-9))  # all levels between the two classes are equally good
     return int(np.clip(round(best.mean()) + 1, 1, 255))

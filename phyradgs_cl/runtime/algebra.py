@@ -19,7 +19,7 @@ Shape = tuple[int, ...]
 _CPU_SPAN = 1 << 14  # least number of elements that a CPU's work-item sums, so that the work outweighs its start
 _GPU_GROUP = 256  # largest work-group on a GPU, in work-items
 _GPU_GROUPS = 512  # a sum's largest number of work-groups on a GPU, or of work-items on a CPU
-_ITEMS = 64  # work-group of element-wise kernels on a CPU, in work-items
+_ITEMS = 64  # size of a work-group of element-wise kernels on a CPU, in work-items
 
 
 class Space(Protocol, Generic[A]):

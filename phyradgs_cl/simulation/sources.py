@@ -192,7 +192,7 @@ class _Average:
 
     def __init__(self, cells: TimeCells, model: str) -> None:
         self._readout, self._is_log = cells.readout, model == "log"
-        self._sum: np.ndarray | None = None  # Σ w p in the log model, ln Σ w exp(−p) in the intensity model
+        self._sum: np.ndarray | None = None  # so far: Σ w p in the log model, ln Σ w exp(−p) in the intensity model
 
     def add(self, frame: np.ndarray, share: np.ndarray) -> None:
         """Adds line integrals (rows, columns). share (lines,): which fraction of each line's weight they have."""

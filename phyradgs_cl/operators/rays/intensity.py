@@ -54,12 +54,13 @@ class IntensityOperator:
 
     @property
     def holds(self) -> tuple[int, int]:
-        """The numbers of volumes and of stacks of frames on the device besides ``memory``, such as each layer's line
+        """How many volumes, and how many stacks of frames, are on the device besides ``memory``, such as each layer's line
         integrals and weights."""
         return 2, 2 * len(self._operators) + 3
 
     def expected(self, volume: SameArray, out: DeviceArray | None = None) -> SameArray:
-        """Returns I(x), (F, rows, columns) float32, of a volume (nz, ny, nx) in 1/mm, and sets J to the derivative there."""
+        """Returns the expected measurement I(x), (F, rows, columns) float32, of a volume x (nz, ny, nx) in 1/mm. From then
+        on J is the derivative at x."""
         self._shares = []  # frees the old weights' memory before new weights are computed
         frames: Array
         if isinstance(volume, DeviceArray):
@@ -102,7 +103,7 @@ class IntensityOperator:
         return part
 
     def _set(self, weights: list[np.ndarray]) -> None:
-        """Sets the weights of each layer, (F, lines, 1) or (F, 1, lines), and J to that at x = 0."""
+        """Sets the weights of each layer, (F, lines, 1) or (F, 1, lines), and J to the derivative at x = 0."""
         self._weights = weights
         self._line_weights: list[DeviceArray] = []
         self._shares = []

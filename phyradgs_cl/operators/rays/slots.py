@@ -162,8 +162,8 @@ def merge_slots(
     rt: Runtime, cells: RayCells, slots: Slots, integrals: DeviceArray,
     target: tuple[DeviceArray, np.ndarray], detector_shape: tuple[int, int], axis: str,
 ) -> None:
-    """Averages the line integrals in slots to frames. target: the frames, and where they start and the steps to the next
-    column, row and frame in them, in floats."""
+    """Averages the line integrals in slots to frames. target: the frames and, in floats, where they start and the steps to
+    their next column, row and frame."""
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "merge_slots", **{**slots.defines, "LEAN": 0}),

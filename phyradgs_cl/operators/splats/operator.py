@@ -170,7 +170,7 @@ class SplatProjection(GaussianOperator):
         self._images = PlainImages(rt, self._projector.lines, self._projector.width, turned=readout.axis != "rows")
         self._tables = [DeviceCells.upload(rt, table.scaled(1 / length_mm)) for table in tables]
         self._poses = [table.pose[table.count // 2] for table in tables]
-        self._ready: list[object] = []  # Gaussians and cells that the kernels' buffers hold; parts share this list
+        self._ready: list[object] = []  # for which Gaussians and cells the kernels' buffers are valid; parts share this list
         self._detector_shape = detector_shape
         self._choose(range(len(tables)), PlainRows(rt, length_mm, line_integrals=True))
 
@@ -267,7 +267,7 @@ class VoxelOperator(GaussianOperator):
         self._inside = grid.scaled(1 / length_mm)
         self._voxeliser = Voxeliser(rt, grid.shape, cutoff_sigma=cutoff_sigma)
         self._images = PlainImages(rt, nz * ny, nx)
-        self._ready: list[object] = []  # the Gaussians that the kernels' buffers hold
+        self._ready: list[object] = []  # for which Gaussians the kernels' buffers are valid
 
     def forward(self, point: SplatPoint) -> DeviceArray:
         """Returns the volume (nz, ny, nx) float32 of Gaussians."""

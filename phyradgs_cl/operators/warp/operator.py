@@ -123,7 +123,8 @@ class WarpedOperator:
 
     @property
     def holds(self) -> tuple[int, int]:
-        """The numbers of volumes and of stacks of frames on the device besides ``memory`` and the displacement fields."""
+        """How many volumes, and how many stacks of frames, are on the device besides ``memory`` and the displacement
+        fields."""
         return self.warp.volumes, 1
 
 

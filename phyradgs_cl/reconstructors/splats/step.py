@@ -1,8 +1,8 @@
 """One step of a splatting run on the device: its Gaussians and frames there, and the gradient, summed over ranks.
 
-Only ``FrameStep.gradient`` renders a frame, compares it, goes back, adds total variation and applies the chain rule. Each
-rank has all Gaussians, and some frames of the batch. The bits of summed gradients depend on the batch, not on the number of
-ranks."""
+All of it is in ``FrameStep.gradient``: render a frame, compare it, differentiate, add total variation, apply the chain rule.
+Each rank has all Gaussians, and some frames of the batch. The bits of summed gradients depend on the batch, not on the
+number of ranks."""
 
 from dataclasses import dataclass, replace
 from functools import partial

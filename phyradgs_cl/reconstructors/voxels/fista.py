@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 _VOLUMES = 16  # memory of a run in volumes, with the prior ``dct``
 _FRAMES = 3  # memory of a run in copies of all projections
 _HELD = 9  # volumes that the prior ``dct`` holds on the device
-_COPIES = 2  # if volumes are on the host, the device holds two copies while a prior maps one
+_COPIES = 2  # the device holds two copies of a volume on the host while a prior maps it
 # The passes before those on smaller voxels are coarse. Their settings were measured (docs/results/settings.md).
 _COARSE_PASSES = 0.6  # fraction of all passes that are coarse
 _COARSE_SUBSETS = 1.6  # a coarse pass has this many times ``subsets`` subsets

@@ -90,7 +90,7 @@ class Algorithm:
 
 
 class WithFacts(Stepwise, Protocol):
-    """A ``Stepwise`` that adds facts to the result."""
+    """A ``Stepwise`` method that adds facts to the result."""
 
     def facts(self, is_complete: bool) -> Mapping[str, object]:
         """Returns the facts after the last step. is_complete: the run came to its end, without an interruption."""
@@ -155,7 +155,7 @@ def voxel_method(
 
 
 class Iterations:
-    """An algorithm, with the residual and the change of its last iteration, as a ``Stepwise`` for ``Loop``."""
+    """Runs an algorithm step by step for a ``Loop``, and keeps the residual and the change of its last iteration."""
 
     quantity, remedy = "residual", "check the scan for extreme values, or lower the relaxation"
 

@@ -32,7 +32,7 @@ class Stage:
 
 
 class Stages:
-    """Stages, one after the other, which a ``Loop`` runs, reports, stops and resumes as one ``Stepwise``.
+    """Stages, one after the other, which a ``Loop`` runs, reports, stops and resumes as if they were one method.
 
     The first stage starts from the run's first volume, if any."""
 

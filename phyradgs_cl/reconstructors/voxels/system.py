@@ -284,5 +284,6 @@ class SharedIntensity(SharedOperator):
     _part: IntensityOperator | None
 
     def expected(self, volume: np.ndarray, out: None = None) -> np.ndarray:
-        """Returns I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) in 1/mm, and sets J to the derivative there."""
+        """Returns the expected measurement I(x), (F, rows, columns) float32, of a volume x (nz, ny, nx) in 1/mm. From then
+        on J is the derivative at x."""
         return self._gathered(None if self._part is None else self._part.expected(volume))
