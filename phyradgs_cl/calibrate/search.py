@@ -142,7 +142,7 @@ def _signal(
     for sign in (1, -1):
         correction = correction_of({**at, one.name: at.get(one.name, 0.0) + sign * step})
         operator: Any = problem.operator(correction)
-        ends.append(operator.forward(volume) - problem.measured)  # loses fewer digits than differences of frames
+        ends.append(operator.forward(volume) - problem.measured)  # minus measured, to lose fewer digits in float32
     return problem.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 

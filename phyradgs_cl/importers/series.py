@@ -28,7 +28,7 @@ _STEADY_ANGLES = 0.75  # angles or times with fewer regular steps are uneven: no
 _SMALL = 0.25  # a group of files with the same words holds no frames if it is smaller than this fraction of the largest
 _BEFORE, _AFTER = (re.compile(rf"(?<![a-z])({words})(?![a-z])", re.I) for words in ("before|pre|start", "after|post|end"))
 _STAMP = 10**7  # numbers from here on are times in milliseconds, not indices
-_MOST_NAMES = 8  # file names that a message lists at most
+_MOST_NAMES = 8  # a message lists at most this many file names
 
 
 @dataclass(frozen=True, eq=False)

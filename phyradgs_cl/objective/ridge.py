@@ -119,7 +119,7 @@ class RidgeStep:
 
 
 def ridge_gradient(volume: np.ndarray, sigma: float, ridge: Ridge) -> np.ndarray:
-    """Returns ∇R of a volume (nz, ny, nx), float64; sigma in the volume's unit."""
+    """Returns the regulariser's gradient ∇R at a volume (nz, ny, nx), float64; sigma in the volume's unit."""
     volume = np.asarray(volume, np.float64)
     if min(volume.shape) < EDGE:
         return np.zeros_like(volume)
@@ -128,7 +128,7 @@ def ridge_gradient(volume: np.ndarray, sigma: float, ridge: Ridge) -> np.ndarray
 
 
 def ridge_step(volume: np.ndarray, sigma: float, step: float, *, ridge: Ridge, nonnegative: bool) -> np.ndarray:
-    """Returns v − ``step`` ∇R(v), float64: the twin of ``RidgeStep``, with the same arguments."""
+    """Returns a volume after a step down the regulariser, v − ``step`` ∇R(v), float64: the twin of ``RidgeStep``."""
     moved: np.ndarray = np.asarray(volume, np.float64) - step * ridge_gradient(volume, sigma, ridge)
     return np.maximum(moved, 0) if nonnegative else moved
 

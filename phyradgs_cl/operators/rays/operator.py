@@ -80,7 +80,7 @@ class RayOperator:
             self._poses = UprightPoses.upload(rt, grid, tables)
             self.slot_floats = self._poses.floats_per_frame(rays_shape, self._upright.leans)
         self.memory = memory or RayMemory(rt, layout, len(tables), self.slot_floats)
-        if self.slot_floats > self.memory.slot_floats:  # the shared memory has no room for slots
+        if self.slot_floats > self.memory.slot_floats:  # the given memory has no room for slots
             self._upright = None
         self._rays_shape = rays_shape
         self._cells = RayCells.upload(rt, grid, tables, rays_shape[0] if layout.is_across else None)

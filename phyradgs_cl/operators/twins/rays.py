@@ -205,8 +205,8 @@ def _on(position: np.ndarray, count: int) -> np.ndarray:
 
 
 def warp_forward(volume: Volume, displacement: np.ndarray) -> Volume:
-    """Returns v(y + w(y)), (nz, ny, nx), where v interpolates a volume by cubic splines and the displacement w (nz, ny, nx,
-    3) is in voxels, x, y, z. v is 0 further than ``_REACH`` voxels outside the volume."""
+    """Returns the warped volume v(y + w(y)), (nz, ny, nx). v interpolates a volume by cubic splines, and the displacement w
+    (nz, ny, nx, 3) is in voxels, x, y, z. v is 0 further than ``_REACH`` voxels outside the volume."""
     padded = _coefficients(np.pad(np.asarray(volume, np.float64), _BORDER))
     result = np.zeros(volume.shape)
     for place, weight in _taps(displacement):

@@ -133,7 +133,7 @@ def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: boo
         ahead = ((first - corners) * normal).sum(-1) / (source * normal).sum(-1)
         hit = corners + ahead[..., None] * source - first
     else:
-        depth = ((corners - source) * normal).sum(-1) / ((first - source) * normal).sum(-1)  # the panel has a depth of 1
+        depth = ((corners - source) * normal).sum(-1) / ((first - source) * normal).sum(-1)  # over the panel's depth
         hit = (corners - source) / np.maximum(depth, 1e-6)[..., None] - (first - source)
     across = np.cross(step_v, normal)
     column = (hit * across).sum(-1) / (step_u * across).sum(-1)

@@ -104,7 +104,7 @@ class FieldProblem:
         return WarpedOperator(self.rt, self.scan.grid, shape, tables, warp=warp, subrays=subrays)
 
     def residual(self, one: MotionField, volume: np.ndarray) -> np.ndarray:
-        """Returns p − A v (F, rows, columns), dimensionless, at the valid pixels; 0 elsewhere."""
+        """Returns the residual p − A v, (F, rows, columns), dimensionless, at the valid pixels; 0 elsewhere."""
         return self._masked(self.scan.projections - self.operator(one).forward(volume))
 
     def space_step(self, one: MotionField, volume: np.ndarray) -> MotionField:

@@ -43,7 +43,7 @@ _RIDGE_EVERY = 4  # one ridge step follows after this many maps of the prior ``d
 # _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals. For other noise, _TV_AT_REST is
 # multiplied by the sixth root of the ratio to this noise, and _RIDGE_NOISE_AT_REST divided by it.
 _USUAL_NOISE = 0.01
-_LEAST_NOISE = 0.001  # some scans have no noise: it counts as at least this
+_LEAST_NOISE = 0.001  # less noise counts as this, because some scans have none
 _LEAST_NOISE_SHARE = 0.1  # a ridge step counts at least this fraction of the weight as noise, because some scans have none
 _SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result; the larger voxels of the passes before have the rest
 _SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels with the prior ``ridge``, which leaves less noise

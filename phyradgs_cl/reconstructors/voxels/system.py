@@ -131,11 +131,11 @@ class System:
         return frames if self.valid is None else self.space.multiply(frames, self.valid)
 
     def forward(self, volume: Any) -> Any:
-        """Returns A x (F, rows, columns), 0 at invalid pixels."""
+        """Returns the projections A x (F, rows, columns), 0 at invalid pixels."""
         return self.masked(self.operator.forward(volume, self.space.place(self.operator.frames_shape)))
 
     def adjoint(self, frames: Any) -> Any:
-        """Returns Aᵀ y (nz, ny, nx) of frames y that are 0 at invalid pixels."""
+        """Returns the backprojection Aᵀ y (nz, ny, nx) of frames y that are 0 at invalid pixels."""
         return self.operator.adjoint(frames, self.space.place(self.volume_shape))
 
     def expected(self, volume: Any) -> Any:
@@ -157,7 +157,7 @@ class System:
         return operator.adjoint(frames, self.space.place(self.volume_shape))
 
     def residual(self, volume: Any) -> Any:
-        """Returns p − A x or, in the intensity model, p − I(x), dimensionless; 0 at invalid pixels."""
+        """Returns the residual p − A x or, in the intensity model, p − I(x), dimensionless; 0 at invalid pixels."""
         # the frames before masking get no name, because a name would keep their memory in use
         expected = self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
         return self.space.add(self.measured, expected, -1.0)
@@ -170,7 +170,7 @@ class System:
         return float(noise_level(measured, valid) * np.sqrt(pixels))
 
     def row_sums(self) -> Any:
-        """Returns A 1 (F, rows, columns) in mm: the length of every ray in the volume."""
+        """Returns the length of every ray in the volume, A 1 (F, rows, columns) in mm."""
         return self.forward(self.space.full(self.volume_shape, 1.0))
 
     def column_sums(self) -> Any:
@@ -198,7 +198,7 @@ class System:
 
 
 def row_weights(system: System) -> Any:
-    """Returns 1/(A 1) of every ray in 1/mm.
+    """Returns the inverse length 1/(A 1) of every ray in 1/mm.
 
     A ray shorter than a tenth of the longest counts as that tenth. A ray that only grazes an edge of the volume would
     otherwise put its noise on one or two voxels, and corners of the volume would become bright. TIGRE measures paths in a
