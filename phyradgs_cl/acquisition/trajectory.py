@@ -40,7 +40,7 @@ class Trajectory(Protocol):
 
 
 def is_parallel(trajectory: Trajectory) -> bool:
-    """Returns whether the beam is parallel. A user's own trajectory says so by an attribute of this name."""
+    """Returns whether the beam is parallel. A user's own trajectory states it by an attribute of this name."""
     return bool(getattr(trajectory, "is_parallel", False))
 
 

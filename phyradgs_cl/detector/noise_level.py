@@ -22,7 +22,7 @@ LEAST_SHARE = 1e-3
 """Saturation is suspected if a larger fraction of the pixels has one extreme value."""
 _TOUCHING = 0.5  # saturation covers areas: pixels at an extreme are clipped if most of them have four neighbours at it
 _SAME = 1e-3  # flats and the largest count that differ by less than this fraction are equally bright: such pixels may be air
-_MOST_FRAMES = 8  # noise beside saturated pixels is sought in at most this many frames
+_MOST_FRAMES = 8  # noise outside saturated pixels is sought in at most this many frames
 _LONGEST_EDGE = 1024  # of larger frames only the middle, this many pixels a side, is searched for noise
 _ROUNDING = 0.5  # rounding of counts alone causes an estimate up to this, in counts
 _RELATIVE = 2e-5  # an estimate up to this fraction of the largest count does not prove noise
@@ -180,6 +180,6 @@ def _shows_noise(frames: NDArray[np.generic], level: float) -> bool:
     rows, both = np.concatenate(along_rows), np.concatenate(along_both)
     unclipped = np.isfinite(both)
     if not unclipped.any():
-        return True  # all pixels are clipped or beside clipped ones, so none can tell
+        return True  # all pixels are clipped or next to clipped ones, so none can tell
     in_rows, in_both = (float(np.median(np.abs(d[unclipped]))) / norm for d, norm in ((rows, 6**0.5), (both, 6.0)))
     return in_both > max(_ROUNDING, _RELATIVE * level, _WHITE * in_rows)

@@ -19,7 +19,7 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
-_PIXELS = 1 << 16  # so many pixels of each frame are compared with other frames; all would take long and tell little more
+_PIXELS = 1 << 16  # this many pixels of each frame are compared with other frames; all would take long and show little more
 
 # A flat or dark is left out if its median differs from the others' by more than this fraction of the flats' median.
 _TOGETHER = 0.1  # largest difference among flats of one time, in which the tube hardly drifts

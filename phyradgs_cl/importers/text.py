@@ -21,7 +21,7 @@ _COLUMNS = re.compile(r",\s+|[;:\s]+")
 _ANGLE, _RAD = re.compile(r"angle|theta|phi|rot|deg", re.I), re.compile(r"\brad", re.I)
 _BRIGHTER = 1.2  # a pixel above this many times the stated counts of air is too bright: noise does not reach so far
 _FEW = 0.01  # this fraction of the pixels may be too bright, because they are broken
-_HEAD_BYTES = 1 << 14  # words of a format are searched in so many bytes at a file's start
+_HEAD_BYTES = 1 << 14  # words of a format are searched in this many bytes at a file's start
 TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
 
 

@@ -162,7 +162,7 @@ def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
 class HashEncoding(nn.Module):
     """Maps positions (P, 3) in [0, 1]³ to features (P, levels · features), interpolated linearly from a grid cell's corners.
 
-    Each level is a finer grid. If it has at most 2^table_log2 corners, each has an entry of its own in the level's table.
+    Each level is a finer grid. If it has at most 2^table_log2 corners, each has its own entry in the level's table.
     Otherwise a hash assigns entries, and corners share them."""
 
     def __init__(

@@ -17,7 +17,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural.field import NeuralField, repeatable, to_array, to_tensor, voxel_values
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
-_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's decay rates of both moments, and what it adds to its denominator
+_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's decay rates of both moments, and the constant in its denominator
 _POINTS_ON_CPU = 2**14  # a CPU evaluates the field at this many points at once: its cache holds them
 _POINTS_ELSEWHERE = 2**20  # another device evaluates more points at once: the memory of a GPU holds them
 _BEYOND_VOLUME = 2.0  # parallel rays begin this far from the volume's middle, in longest half-sides: beyond every corner
@@ -343,8 +343,8 @@ def line_integrals(
 
 
 def intensity_average(integrals: torch.Tensor, unit: float) -> torch.Tensor:
-    """Returns what a detector that averages intensity measures (R,), from the line integrals (R, K) at a pixel's K times.
-    Both are in multiples of ``unit``."""
+    """Returns the measurement (R,) of a detector that averages intensity, from the line integrals (R, K) at a pixel's K
+    times. Both are in multiples of ``unit``."""
     return (math.log(integrals.shape[1]) - torch.logsumexp(-unit * integrals, 1)) / unit
 
 

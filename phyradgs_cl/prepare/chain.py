@@ -37,7 +37,7 @@ DEFAULT_STEPS = "sparks,dead,rings"
 STEPS_HELP = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 PREPARED_KEY = "prepared"
 """The key under which a scan's provenance lists the steps that were applied to it."""
-_ONCE = ("scatter", "hardening", "phase")  # a second correction would take away from what the first one left
+_ONCE = ("scatter", "hardening", "phase")  # a second correction would correct too much
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ _USUAL_REACH = 0.18  # where the user states to_primary alone: spread (std) of s
 _HEIGHT_STEP = 1.25  # each kernel that is tried is stronger than the one before by this factor
 _MOST_STEPS = 8  # at most this many steps make the kernel stronger, up to 6 times the fitted one
 _TRIALS = 6  # most strengths tried in the final search, between the neighbours of the best one
-# The stronger kernel must leave less than this fraction of what the fitted one leaves unexplained; else the fit stands.
+# A stronger kernel is taken if it leaves less than this fraction of the rest that the fitted kernel leaves unexplained.
 _BETTER = 0.65
 _AS_WELL = 1.05  # no stronger kernel is tried once a kernel leaves this many times the least unexplained rest
 _LARGEST_HEIGHT = 20.0  # no kernel for a stated to_primary is stronger than this

@@ -216,7 +216,7 @@ def _warn_of(residual_square: float, noise_square: float, square: float, mean: f
 
 
 def _counted(progress: Progress, results: list[Reconstruction]) -> Progress:
-    """Returns progress that counts the iterations of all runs together. While later runs go on it shows the first volume."""
+    """Returns progress that counts the iterations of all runs together. During later runs it shows the first volume."""
     done, each = progress.iteration + len(results) * progress.iterations, RUNS * progress.iterations
     progress = progress.mapped(state=lambda state: {**state, **_kept(results)}, iteration=done, iterations=each)
     if not results:

@@ -25,7 +25,7 @@ _SCRIPT = ("common", "shaders", "render", "space", "motion", "slices", "rows")
 _SCRIPTED = ("volume",)  # these sections stay hidden until the page's script shows them
 
 
-@np.errstate(all="ignore")  # a file's values may overflow; the page shows what it can
+@np.errstate(all="ignore")  # values from a file may overflow; the page still shows all others
 def write_report(
     volume: Path, output: Path, make_runtime: Callable[[], Runtime], *, scan: Path | None = None,
     views: int = DEFAULT_VIEWS,

@@ -25,7 +25,7 @@ from phyradgs_cl.report.scan_charts import (
 from phyradgs_cl.report.viewer import stills, viewer
 from phyradgs_cl.text import flattened, to_digits_of
 
-# Limits of what a page shows, since a file may hold more.
+# Limits of a page's content, since a file may hold more.
 _MOST_ROWS = 400  # at most this many rows of a table are shown
 _STATES = 5  # a changing object is shown at this many times
 _MOST_CHARTS = 6  # at most this many charts of a calibration are shown

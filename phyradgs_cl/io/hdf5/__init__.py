@@ -168,7 +168,7 @@ class Hdf5Source:
         """Raises InputError if a linked file has no data at ``inside``; HDF5 itself would return nothing, or zeros."""
         own = Path(file.filename)
         place = own if name == "." else own.parent / name
-        if os.path.isabs(name) and not place.exists():  # HDF5 then looks for the name beside the linking file
+        if os.path.isabs(name) and not place.exists():  # HDF5 then looks for the name next to the linking file
             place = own.parent / place.name
         self._check_place(address, place)
         if "%" in name:  # a pattern of numbered files, of which HDF5 reads all that exist

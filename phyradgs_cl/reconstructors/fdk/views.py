@@ -74,7 +74,7 @@ class Arc:
 
 
 def filled_gap_rad(fan: weights.Fan) -> float:
-    """Returns the width in rad up to which gaps are filled by the views beside them: no others see some of their rays."""
+    """Returns the width in rad up to which the views at both sides fill gaps: no others see some of the gaps' rays."""
     if fan.is_put_aside:
         return 2 * np.pi
     return _FILLED_RAD if fan.is_displaced else 0.0
@@ -84,7 +84,7 @@ def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
     """Returns the arc that views at gantry angles (F,) cover, in any order and over any number of turns.
 
     Gaps that stand out divide the arc into parts. If none is wider than ``filled_rad``, the arc is a full turn, and the
-    views beside the gaps stand for them."""
+    views at both sides stand for the gaps."""
     cell, centre = _distinct(angle_rad)
     count = np.bincount(cell)
     ahead = np.diff(centre, append=centre[0] + 2 * np.pi)
@@ -119,7 +119,7 @@ def _stand_out(ahead: np.ndarray) -> np.ndarray:
 
 def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
     """Returns which narrow gaps (K,) have a gap on the opposite side too, bool (K,): no opposite ray stands for them, so the
-    views beside them must. The widest gap is never among them."""
+    views at both sides must. The widest gap is never among them."""
     narrow = wide & (ahead <= _FILLED_RAD) & (np.arange(ahead.size) != np.argmax(ahead))
     opposite = centre + ahead / 2 + np.pi
     before = np.searchsorted(centre, np.mod(opposite - centre[0], 2 * np.pi) + centre[0], side="right") - 1

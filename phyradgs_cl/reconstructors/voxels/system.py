@@ -108,8 +108,8 @@ class System:
         return replace(self, measured=space.array(self.measured), valid=valid, transmission=transmission, space=space)
 
     def leave_room(self, rt: Runtime, nbytes: int) -> bool:
-        """Frees the ray operators' buffers if less than ``nbytes`` of the memory limit would remain beside them. Returns
-        whether it freed them. The operators plan their buffers again at their next use."""
+        """Frees the ray operators' buffers if they leave less than ``nbytes`` of the memory limit. Returns whether it freed
+        them. The operators plan their buffers again at their next use."""
         operators = [o for o in (self.operator, self.intensity) if isinstance(o, RayOperator | IntensityOperator)]
         planned_bytes = sum(operator.memory.planned_bytes for operator in operators)
         if rt.ledger.limit_bytes - max(planned_bytes, rt.ledger.held_bytes) >= nbytes:
