@@ -29,10 +29,10 @@ class Finding:
 
 
 def too_narrow(question: str, unit: str) -> Finding:
-    """Returns the answer "cannot tell" to ``question``, for a panel with too few columns."""
+    """Answers ``question`` by "cannot tell", because the panel has too few columns."""
     return Finding(question, CANNOT_TELL, 0.0, 0.0, unit, f"fewer than {FEWEST_COLUMNS} columns")
 
 
 def same_from_everywhere(question: str) -> Finding:
-    """Returns the answer "cannot tell" to ``question``, for an object that looks the same from every angle."""
+    """Answers ``question`` by "cannot tell", because the object looks the same from every angle."""
     return Finding(question, CANNOT_TELL, 0.0, 0.0, "", "the object looks too much the same from every angle")

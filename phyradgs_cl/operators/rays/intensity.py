@@ -75,7 +75,7 @@ class IntensityOperator:
         return cast(SameArray, self._given(frames, out))
 
     def forward(self, volume: SameArray, out: DeviceArray | None = None) -> SameArray:
-        """Returns J d, frames (F, rows, columns) float32, for a change d of the volume (nz, ny, nx)."""
+        """Returns the change of the frames, J d (F, rows, columns) float32, for a change d of the volume (nz, ny, nx)."""
         space = self._space(volume)
         total: Any = None
         for share, operator in zip(self._shares_for(volume), self._operators, strict=True):
@@ -84,7 +84,7 @@ class IntensityOperator:
         return cast(SameArray, self._given(total, out))
 
     def adjoint(self, frames: SameArray, out: DeviceArray | None = None) -> SameArray:
-        """Returns Jᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
+        """Returns the transpose of ``forward``, a volume Jᵀ y (nz, ny, nx) float32, for frames y (F, rows, columns)."""
         space = self._space(frames)
         total: Any = None
         for share, operator in zip(self._shares_for(frames), self._operators, strict=True):

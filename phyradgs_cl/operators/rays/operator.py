@@ -37,10 +37,10 @@ class LinearOperator(Protocol):
     def frames_shape(self) -> tuple[int, int, int]: ...
 
     def forward(self, volume: Any, out: Any = None) -> Any:
-        """Returns A x, frames (F, rows, columns) float32, of a volume x (nz, ny, nx) in 1/mm."""
+        """Projects a volume x (nz, ny, nx) in 1/mm: returns A x, frames (F, rows, columns) float32."""
 
     def adjoint(self, frames: Any, out: Any = None) -> Any:
-        """Returns Aᵀ y, a volume (nz, ny, nx) float32, of frames y (F, rows, columns)."""
+        """Backprojects frames y (F, rows, columns): returns Aᵀ y, a volume (nz, ny, nx) float32."""
 
     def subset(self, frames: Sequence[int]) -> "LinearOperator":
         """Returns the operator to the frames with the numbers ``frames``, in that order."""
@@ -92,7 +92,7 @@ class RayOperator:
         return [self._tables[f] for f in self._chosen]
 
     def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
-        """Returns A x for a volume (nz, ny, nx) in 1/mm: frames (F, rows, columns) float32."""
+        """Projects a volume x (nz, ny, nx) in 1/mm to frames A x, (F, rows, columns) float32."""
         _check_shape("volume", volume, self.volume_shape)
         result: SameArray = _room_for(self.rt, self.frames_shape, volume, out)
         for attempt in attempts("ray-driven projector"):
@@ -148,7 +148,7 @@ class RayOperator:
             yield first - part.start, self._slots[key]
 
     def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
-        """Returns Aᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
+        """Backprojects frames y (F, rows, columns) to a volume Aᵀ y, (nz, ny, nx) float32."""
         _check_shape("frames", frames, self.frames_shape)
         result: SameArray = _room_for(self.rt, self.volume_shape, frames, out)
         for attempt in attempts("ray-driven backprojector"):

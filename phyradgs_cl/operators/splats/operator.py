@@ -124,7 +124,7 @@ class GaussianOperator(Operator):
         super().__init__(rows.rt, (_ROWS, (ROWS, None)), range_, self._at_rows, **parts)
 
     def forward(self, point: SplatPoint) -> DeviceArray:
-        """Returns y float32 for Gaussians in the kernels' layout."""
+        """Applies the operator to Gaussians in the kernels' layout. Returns y float32."""
         raise NotImplementedError
 
     def back(self, point: SplatPoint, by_y: DeviceArray) -> DeviceArray:
@@ -209,7 +209,8 @@ class SplatProjection(GaussianOperator):
     def _differentiate(
         self, point: SplatPoint, cells: DeviceCells, by_image: DeviceArray, gradients: DeviceArray
     ) -> None:
-        """Writes dL/d(kernels' rows), (13, stride), for one frame from its dL/d(frame), ``by_image``, in padded layout."""
+        """Writes one frame's part of dL/d(kernels' rows), (13, stride), from ``by_image``: dL/d(frame) in the padded
+        layout."""
         is_ready = self._ready == [point, cells]
         self._ready.clear()
         if not is_ready:

@@ -61,7 +61,7 @@ class WarpedOperator:
         self.frames_shape = (len(tables), *detector_shape)
 
     def forward(self, volume: SameArray, out: DeviceArray | None = None) -> SameArray:
-        """Returns A x for a volume (nz, ny, nx) in 1/mm: frames (F, rows, columns) float32."""
+        """Projects a volume x (nz, ny, nx) in 1/mm to frames A x, (F, rows, columns) float32."""
         return self._on_device(self._forward, volume, self.frames_shape, out)
 
     def _forward(self, volume: DeviceArray, frames: DeviceArray) -> None:
@@ -69,15 +69,16 @@ class WarpedOperator:
         self.project(lambda k: volume if self.warp.is_still(k) else self.warp.forward(k, source), frames)
 
     def project(self, volume_of: Callable[[int], DeviceArray], frames: DeviceArray) -> None:
-        """Writes Σ_k P_k v_k to frames (F, rows, columns). volume_of: returns the volume v_k (nz, ny, nx) of state k."""
+        """Projects all states to frames (F, rows, columns): Σ_k P_k v_k. volume_of: returns the volume v_k (nz, ny, nx) of
+        state k."""
         self.rt.fill(frames, 0)
         for part in self._parts:
             part.operator.forward(volume_of(part.state), out=self.warp.stack.of(len(part.frames), self.detector_shape))
             self.warp.stack.add(part.places, frames)
 
     def backprojections(self, frames: DeviceArray) -> Iterator[tuple[int, DeviceArray]]:
-        """Yields (k, P_kᵀ y) for frames y (F, rows, columns) and each state k that they use. Each volume (nz, ny, nx) is
-        valid until the next one."""
+        """Yields (k, P_kᵀ y): each state k that frames y (F, rows, columns) use, and their backprojection to it. Each volume
+        (nz, ny, nx) is valid until the next one."""
         for part in self._parts:
             taken = self.warp.stack.take(frames, part.frames)
             yield part.state, part.operator.adjoint(taken, out=self.warp.moved())
@@ -88,7 +89,7 @@ class WarpedOperator:
         return [part.state for part in self._parts]
 
     def adjoint(self, frames: SameArray, out: DeviceArray | None = None) -> SameArray:
-        """Returns Aᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
+        """Backprojects frames y (F, rows, columns) to a volume Aᵀ y, (nz, ny, nx) float32."""
         return self._on_device(self._adjoint, frames, self.volume_shape, out)
 
     def _adjoint(self, frames: DeviceArray, volume: DeviceArray) -> None:
@@ -206,7 +207,7 @@ class FieldDerivative:
         return self._projected(lambda k: np.tensordot(self.weights[k].astype(np.float32), fields_mm, 1))
 
     def adjoint(self, frames: np.ndarray) -> np.ndarray:
-        """Returns Jᵀ y, (R, cz, cy, cx, 3) float64, for frames y (F, rows, columns)."""
+        """Returns the transpose of ``forward``, Jᵀ y (R, cz, cy, cx, 3) float64, for frames y (F, rows, columns)."""
         rt = self.operator.rt
         by_field = np.zeros_like(self._fields_mm)
         for k, volume in self.operator.backprojections(rt.upload(frames, np.float32)):

@@ -45,7 +45,7 @@ class VolumeWarp:
     volumes = 4  # most volumes on the device, besides the displacement fields
 
     def is_still(self, state: int) -> bool:
-        """Returns whether W_k is the identity for state k = ``state``."""
+        """Returns whether the warp to state k = ``state`` displaces nothing."""
         return self.states.is_still(state)
 
     def source(self, volume: DeviceArray) -> DeviceArray:
@@ -71,7 +71,8 @@ class VolumeWarp:
             self.rt.launch(across, (width // lanes, planes), values, start, *sides, group=group)
 
     def forward(self, state: int, source: DeviceArray) -> DeviceArray:
-        """Returns W_k v (nz, ny, nx) from the coefficients ``source`` of v. The memory is valid until the next call."""
+        """Returns the volume warped to a state, W_k v (nz, ny, nx), from its coefficients ``source``. Valid until the next
+        call."""
         nz, ny, nx = self.shape
         result, blocks = self.moved(), ceil_div(nx, self.rt.lanes)
         self.rt.launch(
@@ -207,7 +208,8 @@ class StateStack:
         return self._total
 
     def adjoint(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Writes W_kᵀ v to volume k = ``state`` of ``total``. It need not add, because it is called once per state."""
+        """Writes a volume v of state k to volume k = ``state`` of ``total``. It need not add, because it is called once per
+        state."""
         self.rt.copy(moved, total, nbytes=4 * self._voxels, target_offset=4 * self._voxels * state)
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:

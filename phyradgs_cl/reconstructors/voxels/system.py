@@ -147,7 +147,8 @@ class System:
         return self.operator.forward if self.intensity is None else self.intensity.expected
 
     def derivative(self, change: Any) -> Any:
-        """Returns A d or, with intensities, J d: how ``expected`` changes with a change d of the volume last compared."""
+        """Returns how ``expected`` changes with a change d of the volume last compared: A d or, in the intensity model, J
+        d."""
         operator = self.operator if self.intensity is None else self.intensity
         return self.masked(operator.forward(change, self.space.place(self.operator.frames_shape)))
 
@@ -259,11 +260,11 @@ class SharedOperator:
         self._part = whole.subset(list(run)) if len(run) else None
 
     def forward(self, volume: np.ndarray, out: None = None) -> np.ndarray:
-        """Returns A x, frames (F, rows, columns) float32 in new memory of the host, of a volume (nz, ny, nx) in 1/mm."""
+        """Projects a volume x (nz, ny, nx) in 1/mm to frames A x, (F, rows, columns) float32, in new memory of the host."""
         return self._gathered(None if self._part is None else self._part.forward(volume))
 
     def adjoint(self, frames: np.ndarray, out: None = None) -> np.ndarray:
-        """Returns Aᵀ y, a volume (nz, ny, nx) float32, of frames (F, rows, columns)."""
+        """Backprojects frames y (F, rows, columns) to a volume Aᵀ y, (nz, ny, nx) float32."""
         shape = (self.volume_shape[0], self.volume_shape[1] * self.volume_shape[2])
         parts = [] if self._part is None else [self._part.adjoint(frames[self._own]).reshape(shape)]
         return exact_sum(self.ranks, parts, shape, self.ranks.size).reshape(self.volume_shape)
