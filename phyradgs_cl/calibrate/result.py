@@ -49,7 +49,7 @@ class ParameterEstimate:
 class Calibration:
     """The corrected ``scan``, in which everything else is unchanged, and how it was found.
 
-    - parameters: an estimate each. alike: combinations of parameters, in words, that no frame tells from another object.
+    - parameters: an estimate of each. alike: combinations of parameters, in words, that no frame tells from another object.
     - residual_rms: RMS residual before and after, in line integrals, on the finest grid. before, after: these residuals (F,
       rows, columns).
     - views: corrections per view, or the object's motion, if significant. The table has the root mean square of each kind,

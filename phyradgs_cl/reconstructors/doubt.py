@@ -127,7 +127,7 @@ class Doubter:
         results = _restored({name: arrays.pop(name) for name in list(arrays) if name.startswith(_KEPT)}, self.scan.grid)
         while len(results) < RUNS:
             scan = self.scan_of_run(results[0], len(results)) if results else self.scan
-            half = without_warnings() if results and self.kind == "analytic" else nullcontext()  # gaps between views double
+            half = without_warnings() if results and self.kind == "analytic" else nullcontext()  # no warnings of wider gaps
             with report.through(partial(_counted, results=results)), half:
                 result = once(scan, arrays or None)
             if result.state is not None:
@@ -204,7 +204,8 @@ class Doubter:
 
 
 def _warn_of(residual_square: float, noise_square: float, square: float, mean: float) -> None:
-    """Warns where error bars may be too narrow. Arguments are means over the valid pixels."""
+    """Warns where error bars may be too narrow, by means over the valid pixels: of squares, and of line integrals
+    (``mean``)."""
     unexplained, noisy = (residual_square / noise_square) ** 0.5, noise_square**0.5 / (square / mean)
     if unexplained > _UNEXPLAINED:
         text = "the volume leaves %.3g times the noise of the projections unexplained: error bars hold what causes that in "

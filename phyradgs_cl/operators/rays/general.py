@@ -54,7 +54,7 @@ def launch_adjoint(
 
 
 def _owners(rt: Runtime, layout: RayLayout, cells: RayCells) -> tuple[tuple[int, int, int], Kernel]:
-    """Returns the adjoint's kernel, after the box of voxels (x, y, z) for which one work-item or work-group sums."""
+    """Returns the box of voxels (x, y, z) for which one work-item or work-group sums, and the adjoint's kernel."""
     owned, defines = (_BLOCK,) * 3 if rt.pixel_items else brick_of(rt), _defines(layout, cells)
     if not rt.pixel_items:
         defines |= dict(zip(("BRICK_X", "BRICK_Y", "BRICK_Z"), owned, strict=True))

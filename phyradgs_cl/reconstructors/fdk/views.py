@@ -127,8 +127,8 @@ def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.nd
 
 
 def _steps(ahead: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles (K,) in rad from each view to the next, and from the view before to each. Instead of a gap, the
-    step on the view's other side counts."""
+    """Returns the angles (K,) in rad from each view to the next, and from the view before to each. The step on the view's
+    other side takes the place of a gap."""
     forward = np.where(wide, np.roll(ahead, 1), ahead)
     return forward, np.roll(np.where(wide, np.roll(ahead, -1), ahead), 1)
 
