@@ -89,8 +89,8 @@ class Calibration:
         """Returns the corrections of every view, (F,) by name and unit; {} without corrections of views.
 
         A wobble is added to the stated poses: source and panel turn counterclockwise seen from above, and the panel moves
-        along its own v and u. A motion is the object's pose in the middle of each view: rotated, then shifted, in x, y,
-        z."""
+        along its own v and u. A motion is the object's pose in the middle of each view: rotated about, then shifted along x,
+        y and z."""
         if self.views is None:
             return {}
         if isinstance(self.views, Views):

@@ -111,8 +111,7 @@ class Deformation:
         return np.stack([np.interp(times, self.times_s, column) for column in self.weights.T], -1)
 
     def displacement_mm(self, points_mm: "ArrayLike", weights: "ArrayLike") -> np.ndarray:
-        """Returns the displacement w (n, 3) float64 in mm at points (n, 3), x y z, for fields weighted by ``weights``
-        (R,)."""
+        """Returns displacements w (n, 3) float64 in mm at points (n, 3), x y z, for fields weighted by ``weights`` (R,)."""
         control_mm = self._state(weights)
         place = self._in_spacings(np.asarray(points_mm, np.float64)).T[::-1]
         components = [
@@ -134,7 +133,7 @@ class Deformation:
         return np.stack([np.einsum("na,nb,nc,nabci->ni", *three, vectors) for three in factors], -1)
 
     def on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
-        """Returns the displacement w (nz, ny, nx, 3) float32 in mm, x y z, at the voxel centres of ``grid`` for ``weights``
+        """Returns displacements w (nz, ny, nx, 3) float32 in mm, x y z, at the voxel centres of ``grid`` for ``weights``
         (R,)."""
         along_z, along_y, along_x = self.bases(grid)
         rows = np.einsum("zk,kyxi->zyxi", along_z, self._state(weights), optimize=True)
@@ -142,8 +141,7 @@ class Deformation:
         return np.einsum("xk,zyki->zyxi", along_x.astype(np.float32), planes, optimize=True)
 
     def inverse_on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
-        """Returns the displacement u (nz, ny, nx, 3) float32 in mm: matter at x in the reference volume has moved to x +
-        u(x).
+        """Returns displacements u (nz, ny, nx, 3) float32 in mm: matter at x in the reference volume has moved to x + u(x).
 
         u(x) = −w(x + u(x)) is iterated from u = 0. Raises InputError if this does not converge, as where the field folds."""
         z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
