@@ -58,7 +58,7 @@ RAY_INLINE int2 lines_along(__global const float *cell, const int u, const int f
     return begins ? (int2)(first, high) : (int2)(high, stop);
 }
 
-/* What the rays of a detector column meet on each plane of a box of voxels. */
+/* The voxels of a box that a detector column's rays meet, plane by plane. */
 typedef struct {
     int from[PLANES], stop[PLANES]; /* voxels [from, stop) along z that rays may touch; none if they miss the box */
     int first[PLANES];              /* the lowest column of voxels that a ray may touch */

@@ -19,7 +19,7 @@ ALWAYS_INLINE splat_sums no_sums(void)
     return sum;
 }
 
-/* Adds what LANES pixels of a line, from u on, contribute. h: dL/d(pixels). */
+/* Adds the contributions of LANES pixels of a line, from u on. h: dL/d(pixels). */
 #if MOVING
 ALWAYS_INLINE void gather(splat_sums *sum, const footprint_line line, const int u, const float limit, const vf h)
 {

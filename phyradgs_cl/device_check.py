@@ -41,7 +41,7 @@ GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 9, 4.1 / 12), (0.1, 0.2))
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.5))
 PARALLEL = CircularOrbit(ParallelGeometry(SHAPE, (2.6 / 9, 2.7 / 12), (0.1, 0.2)), ConstantSpeed(0.3, 0.5))
 UNIT = 2.0  # line integral that the pixel value 1 stands for, where intensities are averaged
-STEP = 1e-6  # half the step of central differences
+STEP = 1e-6  # central differences take this step to each side
 Comparison = tuple[np.ndarray, np.ndarray, float]
 """Computed, expected, and the largest difference allowed, relative to the largest number expected."""
 
@@ -50,8 +50,8 @@ Comparison = tuple[np.ndarray, np.ndarray, float]
 class Verdict:
     """The result of a device's check.
 
-    agreeing: the kernels that agree with their twins. failures: a text about each of the others. group_limits: the
-    largest work-group that the driver allows, in work-items, by kernel; only for kernels that use work-groups."""
+    agreeing: the kernels that agree with their twins. failures: a text about each other kernel. group_limits: the largest
+    work-group that the driver allows, in work-items, by kernel; only for kernels that use work-groups."""
 
     device: str
     agreeing: frozenset[str]
@@ -232,7 +232,7 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
     yield rt.download(operator.adjoint(rt.upload(frames))), twins.ray_volume(shares, GRID, finer), VALUE
     intensity = operators.IntensityOperator(rt, GRID, SHAPE, [table])
     mean, averaged = (twins.ray_frame(volume, GRID, table, SHAPE, model) for model in ("log", "intensity"))
-    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # about the volume 0 this is the plain mean
+    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # at a volume of zeros it averages line integrals
     yield rt.download(intensity.expected(on_device))[0], averaged, VALUE
     found = rt.download(intensity.adjoint(rt.upload(frames)))
     yield found, twins.intensity_volume(frames[0], volume, GRID, table), VALUE

@@ -62,8 +62,8 @@ def estimate(
 ) -> Estimate:
     """Estimates the time and memory of a run from short trials. A method without iterations or checkpoints runs as a whole.
 
-    around: from a result, returns the seconds that the run will spend outside the method. The first trial also builds the
-    kernels; their build is part of the estimate, since the run will build them again."""
+    around: a function that takes a result and returns the seconds that the run will spend outside the method. The first
+    trial also builds the kernels; their build is part of the estimate, since the run will build them again."""
     started = time.perf_counter()
     trials, total = _Trials(scan, plan, rt), getattr(plan.options, "iterations", None)
     few, more = getattr(plan.options, "TRIALS", _SPLAT_TRIALS if isinstance(plan.options, SplatOptions) else _TRIALS)
@@ -71,7 +71,7 @@ def estimate(
         seconds, each_s, total = trials.run(None), 0.0, 0
     elif total <= few:
         seconds = trials.run(total)
-        each_s = trials.run(total) / max(total, 1)  # the first run also built the kernels
+        each_s = trials.run(total) / max(total, 1)  # the run before built the kernels, so it took longer
     else:
         seconds, each_s = trials.extrapolated(few, more, total)
     around_s = around(trials.result) if around else 0.0
@@ -88,7 +88,7 @@ class _Trials:
         self.scan, self.plan, self.rt = scan, plan, rt
 
     def run(self, iterations: int | None) -> float:
-        """Runs that many iterations, or all of the method for None. Returns the seconds that it took."""
+        """Runs that many iterations, or the whole method for None. Returns the seconds that the run took."""
         options = self.plan.options
         plan = self.plan if iterations is None else replace(self.plan, options=shortened(options, iterations))
         self.rt.reset_peak()
@@ -100,7 +100,7 @@ class _Trials:
     def extrapolated(self, few: int, more: int, total: int) -> tuple[float, float]:
         """Returns the seconds of ``total`` iterations and of a single one, extrapolated from ``few`` and ``more``."""
         first_s = self.run(few) - self._control_s
-        again_s = self.run(few) - self._control_s  # without the building of kernels, which the first run did
+        again_s = self.run(few) - self._control_s  # the first run also built the kernels, so it took longer
         more = min(more, total)
         more_s = self.run(more) - self._control_s
         while more_s - again_s < _LEAST_DIFFERENCE_S and more < min(total, _LONGEST_TRIAL):

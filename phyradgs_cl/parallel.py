@@ -192,7 +192,7 @@ def failing_together(ranks: Communicator, report_error: Callable[[BaseException]
 
 
 def span(count: int, parts: int, part: int) -> range:
-    """Divides 0 … count−1 into ``parts`` ranges, equally long within one, and returns the one of number ``part``."""
+    """Divides 0 … count−1 into ``parts`` ranges whose lengths differ by one at most, and returns range number ``part``."""
     return range(part * count // parts, (part + 1) * count // parts)
 
 

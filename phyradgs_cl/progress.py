@@ -61,7 +61,7 @@ class Ticker:
             self.is_open = self.is_counting = True
 
     def note(self, text: str) -> None:
-        """Prints a line that stays; the progress goes on in a new line below it."""
+        """Prints a line that stays; the progress continues in a new line below it."""
         _write(self._over(text) if self.is_open else text)
         self.is_open = self.is_counting = False
 

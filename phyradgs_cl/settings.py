@@ -60,7 +60,7 @@ class Settings:
             return methods.plan_run(method, values, preset=preset, of_preprocessing=flags, **run)
 
     def preprocessing(self, defaults: Mapping[str, object]) -> methods.Preprocessing:
-        """Returns checked options of preprocessing alone. ``defaults`` stand for those that were not given."""
+        """Returns checked options of preprocessing alone. ``defaults`` stand for options that were not given."""
         with self.naming_origins():
             return methods.preprocessing_of({**defaults, **self.values})
 

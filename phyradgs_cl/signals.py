@@ -25,7 +25,7 @@ class InterruptedAfterwards(KeyboardInterrupt):
 
 class StopFlag:
     """The handler of both signals. waits: the first signal only sets the flag. keeps: this also holds after a loop of
-    iterations, until its result is written. farewell: what the command line prints when a signal has ended it."""
+    iterations, until its result is written. farewell: what the command line prints after a signal has ended the command."""
 
     def __init__(self) -> None:
         self.waits = self.keeps = False

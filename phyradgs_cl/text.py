@@ -98,7 +98,7 @@ def each_warning_once() -> Any:
 
 
 def without_warnings() -> AbstractContextManager[None]:
-    """Drops the warnings of this package in the body."""
+    """Silences this package's warnings while the body of a ``with`` runs."""
     return _filtered(lambda: lambda record: not _is_warning(record))
 
 

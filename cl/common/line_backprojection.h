@@ -43,7 +43,7 @@ static inline int line_seeing(
 }
 
 /* A sample's weight: BY_DISTANCE of backproject.cl, at the depth `middle` between both lines, divided by `scale`. */
-#if DISTANCE_POWER == 1 /* see backproject.cl */
+#if DISTANCE_POWER == 1 /* divides by the depth, as in backproject.cl */
 #define BY_LINE(weight, middle, scale) ((weight) / ((middle) * (scale)))
 #else
 #define BY_LINE(weight, middle, scale) ((weight) / ((middle) * (middle) * (scale)))

@@ -72,7 +72,7 @@
 #define CELL_DVV 16
 #define CELL_LAYER 17     /* LAYERED: the image into which the cell is drawn; each line has at most one cell in an image */
 
-/* What is constant of a splat along one line. */
+/* The terms of a splat that are constant along one line. */
 typedef struct {
     float l11, t0, k, b1, b0, inv_kappa, amp, d0, d1, d2;
 } splat_line;

@@ -22,7 +22,7 @@
 #define ROOT_HALF 0.70710678119f
 #define ROOT_HALF_PI 1.25331413732f
 
-/* What is constant of a moving splat along one line. z = along - speed * middle. */
+/* The terms of a moving splat that are constant along one line. z = along - speed * middle. */
 typedef struct {
     float z1, z0, c1, c0, shift, b1, b0, inv_kappa, amplitude, half_path, d0, d1, d2;
     int rule;

@@ -12,10 +12,10 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames, is_parallel
 
 _SAME_TIME = 1e-6  # times that differ by less than this fraction of a cell's duration are equal
-_NOTHING = 1e-9  # a smaller fraction of a line's window in a cell is rounding, and set to 0
-_INSTANT = 1e-9  # a window shorter than this fraction of the lit span is treated as a single time
-_OVERHANG = 0.1  # a line leaves a segment out if its window covers at most this fraction of it
-_TURN_SAMPLES = 32  # number of intervals of the lit span in which the gantry's highest speed is sought
+_NOTHING = 1e-9  # a cell's smaller fraction of a line's exposure is a rounding error, and set to 0
+_INSTANT = 1e-9  # an exposure of a line shorter than this fraction of the frame's is treated as a single time
+_OVERHANG = 0.1  # a line skips a segment of time of which its exposure covers at most this fraction
+_TURN_SAMPLES = 32  # the gantry's highest speed in a frame is sought in this many equal intervals
 _TURN_FACTOR = 0.32  # measured relative RMS error of a frame, per squared radian that the gantry turns in a segment
 _HARMLESS_PEAK = 4.0  # largest line integral up to which averaging intensities needs no more segments
 _MOST_SEGMENTS = 1000  # most segments that ``segments_for`` chooses for a frame
@@ -26,7 +26,7 @@ Served = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
-    """Returns one cell of all lines, at the middle of the frame's lit span. No other single pose fits a frame better."""
+    """Returns one cell of all lines, midway between the frame's first and last light. No single pose fits a frame better."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.middle_s, lines)
 
 
@@ -34,7 +34,7 @@ def static_start_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int
 ) -> TimeCells:
     """Returns one cell of all lines, at the frame's first light. The volume is then rotated by half of the arc that the
-    gantry turns in the lit span."""
+    gantry turns between first and last light."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.lit_span_s[0], lines)
 
 
@@ -83,7 +83,7 @@ def per_line_cells(
 def common_time_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, frame_start_s: np.ndarray, lines: int, samples: int
 ) -> TimeCells:
-    """Divides the lit span into cells of length exposure / ``samples``, which all lines share.
+    """Divides the time from first to last light into cells of length exposure / ``samples``, which all lines share.
 
     A line weights each cell by the fraction of its window in the cell: P(v) = Σ_k w_k(v) P(θ(t_k), v), where t_k is the
     cell's middle and w_k(v) = |window(v) ∩ cell k| / |window(v)|. So one projection from a pose serves many lines. This is
@@ -101,15 +101,15 @@ def common_time_cells(
     if length_s <= 0 or last_s - first_s > lines * step_s:
         return per_line_cells(trajectory, shutter, frame, start_s, lines, samples if length_s > 0 else 1)
     edges_s, share, (used, line_start, line_stop, order) = _common_shares(windows_s.tobytes(), samples)
-    latest_s = float(np.max(frame_start_s)) + last_s - step_s / 2  # a trajectory's table may end with the last exposure
+    latest_s = float(np.max(frame_start_s)) + last_s - step_s / 2  # the trajectory's table may end at the scan's last light
     middle_s = np.minimum(_middles_s(frame_start_s, frame, edges_s), latest_s)[used]
     table = cell_table(trajectory, shutter, frame, middle_s, line_start, line_stop, np.ones(used.size), lines)
     return replace(table, line_share=share[used][order])
 
 
-@lru_cache(maxsize=8)  # windows are the same in all frames of a scan
+@lru_cache(maxsize=8)  # the lines' windows are the same in all frames of a scan
 def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray, Served]:
-    """Returns the edges (K + 1,) in s of the cells, the ``_shares`` (K, lines) of windows in them, and ``_served_lines``.
+    """Returns the cells' edges (K + 1,) in s, the part (K, lines) of each line's window in each cell, and ``_served_lines``.
 
     windows: the bytes of the windows (lines, 2) in s after a frame's start; bytes can be a key of the cache. The returned
     arrays are cached too: do not write to them."""
@@ -122,7 +122,7 @@ def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _served_lines(served: np.ndarray) -> Served:
-    """Returns ``Served`` for a bool array (K, lines) that is True where a cell serves a line."""
+    """Returns which cells serve any line, and their first and last lines (``Served``). served: bool (K, lines)."""
     used = np.flatnonzero(served.any(axis=1))
     line_start = served[used].argmax(axis=1)
     line_stop = served.shape[1] - served[used, ::-1].argmax(axis=1)
@@ -136,7 +136,7 @@ def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np
     cells = (start_s - origin_s) / step_s
     number = np.arange(len(edges_s) - 1) + 0.5
     if abs(cells - round(cells)) < _SAME_TIME:
-        # Counted from frame 0, cells of two frames at the same time get equal bits, and so one pose, projected only once.
+        # Times count from frame 0, so that cells of two frames at one time get the same bits: their pose is projected once.
         start_s, number = origin_s, round(cells) + number
     return np.asarray(start_s + edges_s[0] + number * step_s)
 
@@ -159,9 +159,10 @@ def _shares(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
 def exact_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, segments: int
 ) -> TimeCells:
-    """Divides the frame's lit span into equal ``segments``, within which Gaussians move on the panel (docs/mathematics.md).
+    """Divides the time from a frame's first light to its last into equal ``segments``, in which Gaussians move on the panel.
 
-    Every line integrates over its own window. For a gantry at rest, or a lit span of 0 s, returns ``static_cells``."""
+    Every line integrates over its own window (docs/mathematics.md). For a gantry at rest, or a time of 0 s, returns
+    ``static_cells``."""
     first_s, last_s = shutter.lit_span_s
     if last_s <= first_s:
         return static_cells(trajectory, shutter, frame, start_s, lines)
@@ -181,11 +182,10 @@ def exact_cells(
 def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     """Returns ``TimeCells.line_times`` (K, 3, lines), for windows (lines, 2) in s and edges (K + 1,) in s of equal segments.
 
-    The part of a window in a segment of which it covers at most ``_OVERHANG`` counts to the next segment, so that fewer
-    Gaussians must be projected."""
+    Where a window covers at most ``_OVERHANG`` of a segment, that part counts to the next, to project fewer Gaussians."""
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
-    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # after first light, in units of a segment's length
+    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in lengths of a segment after the frame's first light
     first, last = _segments_of_lines(opens, closes, count)
     index = np.arange(count)[:, None]
     start = np.where(index == first, opens, index)
@@ -217,8 +217,8 @@ def segments_for(
     In a segment, Gaussians move along straight lines and keep their shape. The error grows with the square of the gantry's
     turn in a segment. The factor was measured (benchmarks/time_exact.py) for Gaussians of 0.5 to 4 % of the half-width.
     intensity_peak: the largest line integral if the detector averages intensities, else 0. Then half the variance of the
-    line integrals in a segment is a further error. Up to a peak of 4 it is smaller than the others; above, more segments
-    are needed."""
+    line integrals in a segment is a further error. Up to a peak of 4 it is the smaller one; above, it takes more
+    segments."""
     first_s, last_s = shutter.lit_span_s
     pose = trajectory.pose(frame, start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1))
     fastest_rad = float(np.max(_turns_rad(pose))) * _TURN_SAMPLES

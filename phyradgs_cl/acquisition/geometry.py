@@ -162,8 +162,8 @@ def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarr
 def plain_geometry(pose: np.ndarray, panel: tuple[int, int], is_parallel: bool = False) -> Geometry:
     """Returns the circular geometry with the mean distances and offsets of poses (F, 12).
 
-    The distance to the detector is measured at right angles to it. The offset is measured from the point of its plane that
-    is nearest to the source (in a parallel beam, to the origin) to the panel's middle."""
+    The distance to the detector is measured at right angles to the panel. The offset runs from the point of the panel's
+    plane nearest to the source (in a parallel beam, to the origin) to the panel's middle."""
     source, first, step_u, step_v = (pose[:, i : i + 3] for i in (0, 3, 6, 9))
     pitch_u, pitch_v = (np.linalg.norm(step, axis=1, keepdims=True) for step in (step_u, step_v))
     u_hat, v_hat = step_u / pitch_u, step_v / pitch_v
@@ -180,7 +180,7 @@ def plain_geometry(pose: np.ndarray, panel: tuple[int, int], is_parallel: bool =
 
 
 def towards_source(pose: np.ndarray, is_parallel: bool) -> np.ndarray:
-    """Returns vectors (..., 3) from the origin to the source, for poses (..., 12). In a parallel beam they are unit vectors
+    """Returns vectors (..., 3) from the origin to the source, for poses (..., 12). A parallel beam's are unit vectors
     against the rays."""
     return -pose[..., :3] if is_parallel else pose[..., :3]
 
@@ -194,7 +194,7 @@ def field_of_view_mm(geometry: Geometry) -> tuple[float, float, float]:
     """Returns half the sides (z, y, x) in mm of the field of view of a full turn, a box about the origin.
 
     The radius is DSO·sin(atan(half width/DSD)), where the half width reaches to the farther edge of a shifted panel. The
-    height is the cone's height at that radius behind the axis. In a parallel beam the box reaches to the panel's farther
+    height is the cone's height at that radius behind the axis. A parallel beam's box reaches to the panel's farther
     edges."""
     sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)
     half_height_mm, half_width_mm = (count * pitch / 2 + abs(offset) for count, pitch, offset in sides)
@@ -210,8 +210,7 @@ def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
     """Returns the grid of a full turn's field of view: a cube, or lower if the panel sees less along z.
 
     Voxels are as large as pixels at the axis: the pitch of rows along z, the pitch of columns along y and x. In a parallel
-    beam the grid is as high as the panel. poses (F, 12): if they travel along z, as in a helix, the grid is longer by the
-    travel."""
+    beam the grid is as high as the panel. If ``poses`` (F, 12) travel along z, as in a helix, the grid is as much longer."""
     half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
     high_mm, wide_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     wide = max(1, math.ceil(2 * radius_mm / wide_mm))
@@ -219,7 +218,7 @@ def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
     if isinstance(geometry, ConeGeometry):
         high = min(max(1, round(wide * wide_mm / high_mm)), high)
     low_mm, top_mm = (0.0, 0.0) if poses is None else _travel_mm(poses, geometry)
-    if top_mm - low_mm < high_mm:  # less than a voxel: a wobble of the gantry
+    if top_mm - low_mm < high_mm:  # a travel of less than a voxel is a wobble of the gantry
         return Grid((high, wide, wide), (high_mm, wide_mm, wide_mm))
     high += math.ceil((top_mm - low_mm) / high_mm)
     return Grid((high, wide, wide), (high_mm, wide_mm, wide_mm), ((low_mm + top_mm) / 2, 0.0, 0.0))
@@ -263,7 +262,7 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_par
     corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(-1, 3)
     if is_parallel:
         basis = np.stack([pose[6:9], pose[9:12], pose[0:3]], -1)
-        at = np.linalg.solve(basis, (corners - pose[3:6]).T)[:2]  # columns and rows (2, 8)
+        at = np.linalg.solve(basis, (corners - pose[3:6]).T)[:2]  # the detector column and row of each corner, (2, 8)
         last = np.array(detector_shape[::-1])[:, None] - 0.5
         return "beside the rays" if ((at < -0.5).all(1) | (at > last).all(1)).any() else ""
     source, first, step_u, step_v = pose.reshape(4, 3)
@@ -277,7 +276,7 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_par
     inward = sides * np.sign(sides @ rays.sum(axis=0))[:, None]
     if (corners @ away > rays[0] @ away).all():
         return "behind the panel"
-    planes = np.concatenate([inward, away[None]])  # the sides of the pyramid of rays, and the plane through the source
+    planes = np.concatenate([inward, away[None]])  # the four sides of the pyramid of rays, and the plane through the source
     return "beside the rays" if (corners @ planes.T < 0).all(axis=0).any() else ""
 
 

@@ -26,7 +26,7 @@ RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 _USUAL_TIMES = 6  # ``PerRow`` samples an exposure at no more times than this, unless motion is fast
 _MOST_TIMES = 100  # ``PerRow`` samples an exposure at no more times than this, however fast the motion
 _FINE_STEP_VOXELS = 0.3  # travel of the volume's rim from one time of ``PerRow`` to the next
-_OBJECT_STEP_VOXELS = 0.7  # the same for the fastest part of an object, of which the rest travels less
+_OBJECT_STEP_VOXELS = 0.7  # travel of an object's fastest part from one time to the next; its other parts travel less
 _COARSE_STEP_VOXELS = 3.6  # travel of rim or object from one time to the next where _USUAL_TIMES are too few
 _SUB_INTERVALS = "Sub-intervals N of an exposure; for phyradgs means micro-views."
 _WEIGHT_TOLERANCE = 1e-3  # in a user-defined model, the sum of a line's weights may differ from 1 by this much
@@ -70,7 +70,7 @@ def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int
 class _Model(checks.Checked):
     """Base of this module's models, with words for help texts and reports."""
 
-    operators: ClassVar[tuple[str, ...]]  # of RAYS, SPLATS, LINE_POSES: which methods take the model
+    operators: ClassVar[tuple[str, ...]]  # which methods take the model: some of RAYS, SPLATS, LINE_POSES
     poses: ClassVar[str] = ""  # a frame's poses in words, for the help of --motion; "" hides the model from the command line
     counts: ClassVar[str] = ""  # the model's numbers in words, appended to its name
     is_implied: ClassVar[bool] = True  # whether giving one of its numbers, such as --strips, chooses the model
@@ -126,8 +126,8 @@ class MicroViews(_Model):
 class Centres(MicroViews):
     """``MicroViews`` that move only the Gaussians' centres on the panel, as in GS-on-the-Move (the paper's reference 21).
 
-    The shapes and densities of Gaussians on the panel are computed for one pose per frame, that of ``Static``. ``strips``
-    and ``sub_intervals`` are those of ``MicroViews``. Raises InputError for numbers below 1."""
+    The shapes and densities of Gaussians on the panel are computed for one pose per frame, the pose of ``Static``.
+    ``strips`` and ``sub_intervals`` mean the same as in ``MicroViews``. Raises InputError for numbers below 1."""
 
     poses: ClassVar = "M×N for centres of splats"
     is_implied: ClassVar = False
@@ -146,7 +146,7 @@ class PerRow(_Model):
     """Every line averages over its own exposure, at times that all lines of a frame share.
 
     ``sub_intervals`` is the number of times in an exposure; 0 takes as many as the scan needs (``of``). Each time stands
-    for a cell of the frame's time, and a line weights it by the fraction of its exposure in the cell. Raises InputError for
+    for a cell of the frame's time, weighted for each line by the fraction of its exposure in the cell. Raises InputError for
     a number below 0."""
 
     poses: ClassVar = "one per line"
@@ -242,8 +242,7 @@ def motions_for(*operators: str) -> tuple[Motion, ...]:
 
 
 def motion_of(motion: str | Motion) -> Motion:
-    """Returns the model with a name and its default numbers. Returns a model unchanged. Raises InputError for an unknown
-    name."""
+    """Returns the motion model of a name, with default numbers, or the given model. Raises InputError for other names."""
     if not isinstance(motion, str):
         return motion
     if motion not in MOTIONS:
@@ -252,7 +251,7 @@ def motion_of(motion: str | Motion) -> Motion:
 
 
 def with_times(motion: Motion, scan: Scan, deformation: Deformation | None = None) -> Motion:
-    """Returns ``motion``, but a ``PerRow`` without a number of times with the number that scan and deformation need."""
+    """Returns the motion model. A ``PerRow`` without a stated number of times gets the number that the scan needs."""
     speed_mm_per_s = 0.0 if deformation is None else deformation.fastest_mm_per_s
     return motion.of(scan, speed_mm_per_s) if isinstance(motion, PerRow) else motion
 

@@ -48,7 +48,7 @@ def plot_frame(scan: "Scan", frame: int = 0) -> "Figure":
 
 
 def draw_windows(axes: "Axes", shutter: Shutter, lines: int, start_s: float = 0.0) -> None:
-    """Draws when each line is exposed, in s, for a frame that starts at ``start_s``. With a pulsed beam also draws when
+    """Draws when each line is exposed, in s, for a frame that starts at ``start_s``. With a pulsed beam it also draws when
     lines are open without light."""
     line = np.unique(np.linspace(0, lines - 1, _MOST_CORNERS).round().astype(int))
     lit_s = shutter.line_windows_s(lines)[line] + start_s

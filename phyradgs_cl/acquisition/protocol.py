@@ -132,8 +132,7 @@ PROTOCOLS = {
 
 
 def make_protocol(name: str, **changes: Any) -> Protocol:
-    """Returns the protocol ``name`` with fields changed by those ``changes`` that are not None. Raises InputError for an
-    unknown name."""
+    """Returns the protocol ``name`` with ``changes`` to its fields, except None. Raises InputError for an unknown name."""
     if name not in PROTOCOLS:
         raise InputError("protocol", repr(name), f"one of {', '.join(PROTOCOLS)}")
     return replace(PROTOCOLS[name], **{k: v for k, v in changes.items() if v is not None})

@@ -45,8 +45,8 @@ class Readout:
 def readout_order(
     first: str | None, axis: str | None, direction: int | None, named: Named = str
 ) -> tuple[str | None, int | None]:
-    """Returns the readout axis and direction: what ``first``, a key of ``FIRST_LINES``, means if given, else ``axis`` and
-    ``direction``. Raises InputError if the arguments contradict each other."""
+    """Returns the readout axis and direction. ``first``, a key of ``FIRST_LINES``, states both; without it ``axis`` and
+    ``direction`` count. Raises InputError if the arguments contradict each other."""
     if first is None:
         return axis, direction
     checks.one_of(named("first"), first, FIRST_LINES)

@@ -182,8 +182,7 @@ class Scan:
         return self.shutter.lines(self.geometry.detector_shape)
 
     def on_grid(self, grid: Grid) -> "Scan":
-        """Returns the scan with another grid. A true volume is cut to the new grid if the old one contains it, else
-        dropped."""
+        """Returns the scan with another grid. The true volume is cut to it if the old grid contains it, else dropped."""
         if grid == self.grid:
             return self
         part = grid.slices_in(self.grid)
@@ -209,13 +208,13 @@ class Scan:
         """Raises InputError for a trajectory that does not cover every frame, poses that are not finite, and an exposure too
         short for the precision of the scan's times."""
         self.shutter.check_resolved(self.frame_start_s)
-        last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # a gantry at rest has one pose
+        last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # at rest, a frame has one pose
         for frame, start_s in enumerate(self.frame_start_s):
             checked_poses(self.trajectory, frame, np.array([start_s, start_s + last_s]))
 
     def warn_of_near_panel(self) -> None:
         """Warns if the panel stands inside the grid as the first frame opens: no ray sees the part behind the panel."""
-        if self.is_parallel:  # rays do not end at the panel
+        if self.is_parallel:  # parallel rays are not taken to end at the panel
             return
         (pose,) = checked_poses(self.trajectory, 0, np.array(self.frame_start_s[:1]))
         behind_mm, half_mm = panel_behind_mm(self.grid, pose), min(self.grid.size_mm[1:]) / 2

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 _MOST_RAD = 20 * np.pi  # angles in rad that span more than these ten turns are most likely degrees
-_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # fields of ``Scan``
+_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # other fields of ``Scan``
 
 
 def from_poses(
@@ -132,15 +132,14 @@ def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = N
 
 
 def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as ``line_integrals`` does, after ``check_not_counts``: nobody stated their quantity."""
+    """Returns frames as ``line_integrals`` does, but refuses what looks like counts, since nobody stated the quantity."""
     values = checks.real_array("frames", frames)
     check_not_counts(values, "give −ln(counts / flats)", mask)
     return line_integrals(values, mask)
 
 
 def line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as float32, with 0 for masked pixels that are not finite. Raises InputError if an unmasked pixel is
-    not finite."""
+    """Returns frames as float32, with 0 for masked pixels that are not finite. Raises InputError for unmasked ones."""
     values = checks.real_array("projections", frames)
     with np.errstate(over="ignore"):
         values = values.astype(np.float32, copy=False)

@@ -58,7 +58,7 @@ class Shutter:
 
     @property
     def readout(self) -> Readout:
-        """Puts frames and poses into the order (lines, width)."""
+        """Converts frames and poses to the order (lines, width) in which the panel is read, and back."""
         return Readout(self.axis)
 
     @property
@@ -102,9 +102,8 @@ class Shutter:
         return order / max(lines - 1, 1) * self.readout_s
 
     def line_windows_s(self, lines: int) -> np.ndarray:
-        """Returns when each line receives light, from and to, (lines, 2) in s after the frame's start.
-
-        Without a pulse the line opens and closes then. A line that the pulse misses has two equal times."""
+        """Returns when each line's light begins and ends, (lines, 2) in s after the frame's start. Without a pulse these are
+        the line's opening and closing. A line that the pulse misses has two equal times."""
         delay = self.delay_s(lines)
         return self.in_pulse(np.stack([delay, delay + self.exposure_s], -1))
 
@@ -121,8 +120,7 @@ class Shutter:
         return np.where(seen_s > _DARK * longest_s, seen_s / longest_s, 0.0)
 
     def strip_ranges(self, lines: int, strips: int) -> list[tuple[int, int]]:
-        """Divides the lines into ``strips`` and returns the lines [start, stop) of each, in reading order. Strips may be
-        empty."""
+        """Divides lines into ``strips``; returns each one's lines [start, stop), in reading order. Strips may be empty."""
         edges = [checks.ceil_div(strip * lines, strips) for strip in range(strips + 1)]
         ranges = list(zip(edges[:-1], edges[1:], strict=True))
         if self.direction < 0:

@@ -16,7 +16,7 @@ HALO_ROWS = 4
 
 def check_has_slabs(scan: Scan, subject: str, found: str) -> None:
     """Raises InputError if ``has_slabs`` is False: slices then need rows of the whole panel. subject: the option that asked
-    for a slab. found: its value."""
+    for a slab. found: the option's value."""
     if not has_slabs(scan):
         expected = "all rows: only in a parallel beam about z does a slice need few of them"
         raise InputError(subject, found, expected, "take --roi-mm, with --margin-mm")

@@ -75,7 +75,7 @@ class TimeCells:
 
     @property
     def readout(self) -> Readout:
-        """Puts frames and poses into the order (lines, width)."""
+        """Converts frames and poses to the order (lines, width) in which the panel is read, and back."""
         return Readout(self.axis)
 
     @property
@@ -92,7 +92,7 @@ class TimeCells:
         """Returns the cells with all lengths multiplied by ``factor``."""
         factors = np.full(POSE_LENGTH, factor)
         if self.is_parallel:
-            factors[:3] = 1  # the direction of rays has no length in mm
+            factors[:3] = 1  # a parallel beam's direction is not a length, so it is not scaled
         ends, conic = (None if p is None else p * factors for p in (self.end_poses, self.conic_pose))
         return replace(self, pose=self.pose * factors, end_poses=ends, conic_pose=conic)
 
@@ -116,8 +116,7 @@ class TimeCells:
         return self
 
     def line_poses(self) -> np.ndarray:
-        """Returns one pose per line, (lines, 12): that of the cell nearest to its mid-exposure. A table with a single cell
-        gives (1, 12).
+        """Returns one pose per line, (lines, 12), from the cell nearest to its mid-exposure. A single cell gives (1, 12).
 
         Raises InputError for a line without a cell."""
         if self.count == 1:
@@ -137,15 +136,15 @@ class TimeCells:
         return self.pose[cell[nearest[first]]]
 
     def line_cells(self) -> np.ndarray:
-        """Returns a range [first, stop) of cells for each line, (lines, 2). It includes all cells that serve the line, and
-        may include others."""
+        """Returns a range [first, stop) of cells for each line, (lines, 2). It has all cells that serve the line, and maybe
+        others."""
         line = np.arange(self.lines)
         first = np.searchsorted(np.maximum.accumulate(self.line_stop), line, side="right")
         return np.stack([first, np.searchsorted(self.line_start, line, side="right")], -1)
 
     @cached_property
     def layer_numbers(self) -> np.ndarray:
-        """The layer of each cell, (C,) from 0 on. Cells in the same layer share no line; layers are as few as possible.
+        """The layer of each cell, a number (C,) from 0 on. Cells of a layer share no line; layers are as few as possible.
 
         To average intensities, a frame's layers are projected one by one."""
         numbers = np.zeros(self.count, np.int64)

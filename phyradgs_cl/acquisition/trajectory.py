@@ -24,7 +24,7 @@ _LEAST_SPAN_S = 1e-6  # ``sampled`` needs two different times in a frame, also i
 _MOST_SAMPLES = 1024  # ``sampled`` gives up when more samples per frame are not close enough
 _LEAST_INCIDENCE = 1e-6  # least sine of the angle between rays and panel
 _AT_AXIS = 1e-6  # a panel within this fraction of the source-to-axis distance is at the axis
-_AWAY = 2.0  # how many times further from the source a panel at the axis is moved, and how many times larger it becomes
+_AWAY = 2.0  # a panel at the axis is moved this many times as far from the source, and enlarged as much
 _SAME_PLACE = 1e-9  # poses that differ by less, relative to their largest number, are equal: float64 rounds by less
 
 
@@ -40,7 +40,7 @@ class Trajectory(Protocol):
 
 
 def is_parallel(trajectory: Trajectory) -> bool:
-    """Returns whether the beam is parallel. A user's own trajectory says so by an attribute of this name."""
+    """Returns whether the beam is parallel. A user's own trajectory states it by an attribute of this name."""
     return bool(getattr(trajectory, "is_parallel", False))
 
 
@@ -143,8 +143,7 @@ class FrameSweeps:
 
 
 def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
-    """Extends an orbit's encoder table by ``by_s`` at either end, at the speed there. Returns other trajectories as they
-    are."""
+    """Extends an orbit's encoder table by ``by_s`` at either end, at the speed there. Other trajectories stay the same."""
     if not (isinstance(trajectory, CircularOrbit) and isinstance(trajectory.kinematics, EncoderTable)):
         return trajectory
     table = trajectory.kinematics
@@ -159,7 +158,8 @@ def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
 
 
 def _is_without_jumps(steps_rad: np.ndarray) -> bool:
-    """Returns whether steps (N,) between angles are real: none exceeds half a turn, or half of them a quarter turn."""
+    """Returns whether steps (N,) of angles are no jumps by a turn: none exceeds half a turn, or most exceed a quarter
+    turn."""
     size_rad = np.abs(steps_rad)
     return bool(size_rad.max(initial=0) <= np.pi or np.median(size_rad) >= np.pi / 2)
 
@@ -265,7 +265,7 @@ def resting_poses(
 def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarray) -> CircularOrbit | PoseTable:
     """Returns a circular orbit if ``geometry`` has the poses (F, 12) of a gantry at rest; otherwise a pose table."""
     is_parallel = isinstance(geometry, ParallelGeometry)
-    side = -1 if is_parallel else 1  # a direction of rays points away from the source's side
+    side = -1 if is_parallel else 1  # parallel rays point away from the side of the source
     angle_rad = np.arctan2(side * poses[:, 1], side * poses[:, 0])
     if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME_PLACE * np.abs(poses).max()):
         return CircularOrbit(geometry, FrameSweeps(middle_s, 0.0, angle_rad, angle_rad))
@@ -273,8 +273,7 @@ def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarr
 
 
 def behind_axis(geometry: Geometry, trajectory: Trajectory) -> tuple[Geometry, Trajectory]:
-    """Returns geometry and trajectory with a panel at the axis moved away from the source, and enlarged to see the same
-    rays.
+    """Returns geometry and trajectory with a panel at the axis moved away from the source, enlarged to see the same rays.
 
     Some programs state a panel scaled to the axis. Rays end at the panel, so there they would end within the object.
     User-defined trajectories and panels elsewhere stay as they are."""
@@ -306,7 +305,7 @@ def _is_off_axis(poses: np.ndarray) -> bool:
 
 
 def grid_of_scan(geometry: Geometry, trajectory: Trajectory, frame_start_s: np.ndarray) -> Grid:
-    """Returns ``default_grid``, which is longer if the gantry travels along z."""
+    """Returns the grid of the field of view (``default_grid``), longer if the gantry travels along z."""
     if isinstance(trajectory, CircularOrbit):
         return default_grid(geometry)
     poses = [checked_poses(trajectory, f, np.array([t])) for f, t in enumerate(frame_start_s)]
@@ -328,7 +327,7 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
         poses = np.concatenate([checked_poses(trajectory, f, t) for f, t in enumerate(times)])
         time_s, at = np.unique(times.ravel(), return_index=True)  # unique, because frames may overlap in time
         table = PoseTable(time_s, poses[at], "trajectory", is_parallel(trajectory))
-        between = (time_s[:-1] + time_s[1:]) / 2  # midpoints between samples of any frames: these may overlap
+        between = (time_s[:-1] + time_s[1:]) / 2  # the table is tested between all samples, since frames may overlap
         inside = [between[(t[0] < between) & (between < t[-1])] for t in times]
         errors = (np.abs(table.pose(f, t) - trajectory.pose(f, t)).max(initial=0.0) for f, t in enumerate(inside))
         worst_mm = max(errors)
@@ -339,7 +338,7 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
             overlap = np.any(np.sort(times[:, 0])[1:] < np.sort(times[:, -1])[:-1])
             remedy = "take frames that do not overlap in time: a file has one pose at a time" if overlap else _AS_TABLE
             raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", remedy)
-        # Halves the intervals; the former samples are among the new ones.
+        # Halves the intervals between samples.
         samples = 2 * samples - 1
 
 

@@ -18,7 +18,7 @@ from phyradgs_cl.fields import Gaussians
 from phyradgs_cl.fields.gaussians import ROWS
 from phyradgs_cl.importers import load_beads
 
-_STEP_PX = 0.25  # central differences move the image's edge so many pixels: less drowns in voxels' errors, more is nonlinear
+_STEP_PX = 0.25  # central differences move the image's edge by this: less drowns in voxels' errors, more is nonlinear
 
 
 @naming_arguments()

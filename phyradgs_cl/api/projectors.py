@@ -76,7 +76,7 @@ def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
 
 
 def _in_new_memory(rt: Runtime, function: Callable[..., Any], values: Values, shape: tuple[int, ...]) -> Values:
-    """Returns ``function(values)`` in a new array on the device. The engine's own array is overwritten by its next call."""
+    """Returns a copy of ``function(values)`` on the device, because the engine's next call overwrites its own array."""
     return function(values, rt.empty(shape)) if isinstance(values, DeviceArray) else function(values)
 
 
@@ -114,7 +114,7 @@ def splat_operator(
 def voxel_operator(grid: Grid, *, cutoff_sigma: float = DEFAULT_CUTOFF_SIGMA, device: Device = None) -> Operator:
     """Returns the operator from Gaussians, or parameter rows (11, G), to a volume (nz, ny, nx) in 1/mm on ``grid``.
 
-    Values are those at the voxels' centres in mm. The whole volume must fit on the device. cutoff_sigma, device: as in
+    Values are those at the voxels' centres in mm. The volume must fit on the device. cutoff_sigma, device: as in
     ``splat_operator``.
 
     Raises InputError for anything but a Grid, and for a cutoff out of range."""
@@ -128,9 +128,9 @@ def voxelise(
 ) -> np.ndarray:
     """Returns the sum of Gaussians at the centres of a grid's voxels: (nz, ny, nx) float32, 1/mm.
 
-    gaussians: in mm and 1/mm. grid: of any size, since only a part of the volume is on the device at a time. cutoff_sigma:
-    the Mahalanobis radius at which a Gaussian ends; 0 never cuts. device: what ``--device`` takes, or a Runtime. For the
-    gradient use ``voxel_operator``.
+    gaussians: in mm and 1/mm. grid: the voxels, of any number, since only a part of the volume is on the device at a time.
+    cutoff_sigma: the Mahalanobis radius at which a Gaussian ends; 0 never cuts. device: what ``--device`` takes, or a
+    Runtime. For the gradient use ``voxel_operator``.
 
     Raises InputError for anything but Gaussians and a Grid, and for a cutoff out of range."""
     _check_cutoff(cutoff_sigma)
@@ -145,8 +145,8 @@ def voxelise(
 def initial_gaussians(scan: Scan, count: int = 0, *, seed: int = 0, device: Device = None) -> Gaussians:
     """Returns the Gaussians, in mm and 1/mm, from which ``phyradgs`` starts. They are drawn from an FDK volume.
 
-    count: their number; 0 derives it from the scan's grid. There are fewer if too few voxels attenuate. seed: of the random
-    draw. The result has mean and scale (G, 3). device: what ``--device`` takes, or a Runtime.
+    count: the number of Gaussians; 0 derives it from the scan's grid. There are fewer if too few voxels attenuate. seed: the
+    seed of the random draw. The result has mean and scale (G, 3). device: what ``--device`` takes, or a Runtime.
 
     Raises InputError for anything but a Scan, and for a count or a seed below 0."""
     check_scan(scan)

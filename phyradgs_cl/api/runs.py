@@ -228,7 +228,7 @@ def reconstruct(
     doubt: True also reconstructs two synthesised scans, which give the error bar σ (nz, ny, nx) in 1/mm of every voxel, the
     result's ``doubt`` (docs/methods.md#error-bars).
 
-    seed: of all random numbers; the same seed on the same device gives the same bits.
+    seed: the seed of all random numbers; the same seed on the same device gives the same bits.
 
     report: a function that is called with each ``Progress``: after every iteration of voxels, and every 50 iterations or
     ten seconds of splats. True shows a line with rate and remaining time, in a terminal or a notebook; False shows nothing.

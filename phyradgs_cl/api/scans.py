@@ -23,7 +23,7 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.removed import refuse_removed
 
 log = logging.getLogger(__name__)
-# Arguments of ``fly_scan`` by the names of the same values in a Scan's checks, for messages.
+# For messages: the arguments of ``fly_scan``, by the names that a Scan's checks have for the same values.
 _ARGUMENTS = {
     "angles": "angles_deg", "exposure_s": "exposure_deg", "frame_time_s": "exposure_s", "readout_s": "readout_ratio",
     "readout_axis": "readout",
@@ -49,11 +49,11 @@ def fly_scan(
     exposure_deg: how far the gantry turns while a line is exposed, degrees per second times exposure_s; below 0 if it turns
     clockwise. readout_ratio: readout over exposure time; readout lasts from the opening of the first line to that of the
     last, and 0 is a global shutter. readout: which lines are read one after the other, "rows" or "columns".
-    readout_direction: 1 reads index 0 (the lowest row, the left column) first, -1 last. exposure_s: of one line, in s; None
-    means 1.
+    readout_direction: 1 reads index 0 (the lowest row, the left column) first, -1 last. exposure_s: how long a line is
+    exposed, in s; None means 1.
     flats, darks: (n, rows, columns) counts without an object, and without a beam (None means 0).
     mask: (rows, columns) or (F, rows, columns), non-zero for pixels that must not be used.
-    quantity: of ``frames``, "attenuation", "transmission" or "counts"; None takes counts if there are ``flats``.
+    quantity: what ``frames`` are, "attenuation", "transmission" or "counts"; None takes counts if there are ``flats``.
     grid: None takes what a full turn sees, as high as the panel sees, in voxels of one pixel's size at the axis.
     others: ``detector_model`` ("log", "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``, as in ``Scan``.
 

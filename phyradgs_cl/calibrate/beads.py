@@ -33,10 +33,10 @@ _BLUR_PX = 0.8
 _LEAST_ZEROS = 0.2  # if at least this fraction of the pixels is 0, the noise of air was clipped at 0
 _ZEROS_PX = 5  # the noise of clipped air follows from means of blocks with this many pixels a side
 _BACKGROUND = 4  # cosines along each side of a frame: together they describe holder, scatter and drift of the tube
-_STEP_PX = 0.25  # signals are central differences, for which the frame's edge moves by this much to each side
-_MOST_PX = 1.5  # one step of the placement moves a frame by at most this much: signals are not linear beyond
+_STEP_PX = 0.25  # derivatives are central differences, in which the frame's edge moves by this much to each side
+_MOST_PX = 1.5  # one step of the placement moves a frame by at most this much: beyond, its effect is not linear
 _SETTLED_PX = 0.01  # the search ends when a step moves the frame by less than this
-_LINEAR_PX = 0.3  # signals are computed again after a step that moves the frame by more than this
+_LINEAR_PX = 0.3  # derivatives are computed again after a step that moves the frame by more than this
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +53,7 @@ class BeadOperator:
     clipped_noise: float
 
     def forward(self, placement: np.ndarray) -> np.ndarray:
-        """Returns the phantom's frames at a placement (7,): a turn (rotation vector, rad), a shift (mm), and a density
-        factor."""
+        """Returns the phantom's frames at a placement (7,): turn (rotation vector, rad), shift (mm), and density factor."""
         pose, weight = _poses_by_line(self.tables)
         frames, lines, samples = weight.shape
         turn = Rotation.from_rotvec(placement[:3]).as_matrix()
@@ -103,7 +102,7 @@ class _PanelLines:
     """N lines of a panel, each at one time, in the phantom's frame of reference.
 
     - source, first (N, 3): the source, and the middle of the panel's first pixel, in mm.
-    - line_step, pixel_step (N, 3): the steps to the next line, and to the next of its ``pixels``. line (N,): its number.
+    - line_step, pixel_step (N, 3): the steps to the next line, and to the next of its ``pixels``. line (N,): line numbers.
     - is_parallel: ``source`` is the rays' direction."""
 
     source: np.ndarray
@@ -137,9 +136,9 @@ class _PanelLines:
 
     @cached_property
     def _panel_axes(self) -> tuple[tuple[np.ndarray, ...], ...]:
-        """Three vectors (N, 3). Their inner products with a point in mm give its distance from the source (in distances of
-        the panel), and the line and pixel of its image. Each comes with its products with the source and with the first
-        pixel (N,), and its length (N,).
+        """Three vectors (N, 3). Their inner products with a point in mm give its distance from the source over that of the
+        panel, and the line and pixel of its image. Each comes with its products with the source and with the first pixel
+        (N,), and its length (N,).
 
         In a parallel beam the distance is 1, and lines and pixels are those that a ray through the point meets."""
         normal = np.cross(self.line_step, self.pixel_step)
@@ -154,7 +153,8 @@ class _PanelLines:
         return tuple((v, *both, np.linalg.norm(v, axis=-1)) for v, both in zip(vectors, products, strict=True))
 
     def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:
-        """Returns the lines (n,) that may see a body, the first of its pixels (n,) in each, and their number."""
+        """Returns the lines (n,) that may see a body, the first pixel (n,) of its shadow on each, and a width in pixels for
+        all."""
         (depth, depth_of_source, *_), *axes = self._panel_axes
         lowest, highest = [], []
         for end_mm in ends_mm:
@@ -219,7 +219,8 @@ class BeadProblem(CoarseFrames):
         return float(np.std(residual if self.valid is None else residual[self.valid]))
 
     def explained(self, operator: BeadOperator, placement: np.ndarray) -> float:
-        """Returns which fraction of the squares of the compared values the phantom explains; 0 for a negative density."""
+        """Returns the fraction of the compared values' sum of squares that the phantom explains. It is 0 if the density is
+        negative."""
         residual = self.compared(self.residual(operator, placement))
         whole = self.compared(self.masked(self.measured))
         return float(1 - residual @ residual / max(float(whole @ whole), 1e-30)) if placement[DENSITY] > 0 else 0.0
@@ -251,14 +252,13 @@ class BeadProblem(CoarseFrames):
         return list(beyond.reshape(len(images), *self.measured.shape))
 
     def compared(self, frames: np.ndarray) -> np.ndarray:
-        """Returns the values (F · pixels,) float64 by which frames are compared: blurred until single rays do not show, and
-        without background."""
+        """Returns the values (F · pixels,) float64 by which frames are compared: without background, and blurred to hide
+        single rays."""
         blurred = gaussian_filter(self._without_background(frames), (0, _BLUR_PX, _BLUR_PX), output=np.float64)
         return blurred.ravel()
 
     def _units(self) -> np.ndarray:
-        """Returns the step of each number of a placement (7,) that moves a frame's edge by a pixel, or doubles the
-        density."""
+        """Returns steps (7,) of a placement: each moves a frame's edge by a pixel, the last doubles the density."""
         scan = self.scans[0]
         pixel_mm = self.block * min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
         return np.array([pixel_mm / (max(scan.grid.size_mm) / 2)] * 3 + [pixel_mm] * 3 + [1.0])

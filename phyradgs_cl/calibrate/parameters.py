@@ -13,11 +13,11 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.removed import removal
 from phyradgs_cl.text import suggest_name
 
-_STEP_PX = 0.25  # signals are central differences, for which the image's edge moves by this much to each side
+_STEP_PX = 0.25  # derivatives are central differences, in which the image's edge moves by this much to each side
 _TIMING_STEP = 0.1  # a time is changed by at most this fraction of itself in a central difference
 _LARGEST_CUT = 0.7  # the search shortens a time by at most this fraction, so that it stays above 0
 _MOST_TILT_RAD = math.radians(2.0)  # an angle is changed by at most this in a central difference
-_SMALL_MISMATCH = 1.3  # mismatch of signals that change sign after half a turn: voxels' errors do not, and disturb them less
+_SMALL_MISMATCH = 1.3  # mismatch of effects that change sign after half a turn: voxels' errors do not, so they disturb less
 # An angle with a larger standard deviation counts as undetermined, because its sine is not linear over such a range.
 _LEAST_KNOWN_RAD = math.radians(10.0)
 _DEGREES = math.degrees(1.0)
@@ -30,7 +30,7 @@ class Parameter:
     - scale: displayed units per unit of the field.
     - object_instead: another object that explains the frames as well, if they do not determine the parameter.
     - pixels: how many pixels a unit of the field moves the image at its edge.
-    - mismatch: measured errors (docs/calibrate.md) over those of noise alone, as voxels do not represent objects exactly.
+    - mismatch: measured errors (docs/calibrate.md) over errors by noise alone, as voxels do not represent objects exactly.
     - is_axial: the parameter moves the image along the axis, like ``LIFT``. The others move it across, like ``TURN``."""
 
     name: str
@@ -139,7 +139,7 @@ OFFSET_U = "offset-u"
 TURN = Parameter("all angles", "turn_rad", "deg", _TURN, lambda s: 0.0, _edge_pixels, _DEGREES)
 LIFT = Parameter("all heights", "lift_mm", "mm", "a lower object", lambda s: 0.0, lambda s: 1 / _pitch_mm(s), is_axial=True)
 GAUGES = (TURN, LIFT)
-"""Parameters that no frame determines. What a volume leaves of their signals comes from errors of the voxels."""
+"""Parameters that no frame determines. A volume leaves parts of their signals only by errors of the voxels."""
 PARAMETER_GROUPS = {
     "offset": (OFFSET_U, "offset-v"),
     "tilt": ("tilt-v", "tilt-u"),

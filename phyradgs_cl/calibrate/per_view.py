@@ -24,7 +24,7 @@ from phyradgs_cl.runtime import Runtime
 
 SPLINES = 7  # default number of splines; each is about a seventh of the scan wide
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
-_STEP_PX = 0.25  # signals are central differences, for which a frame moves by this much to each side
+_STEP_PX = 0.25  # derivatives are central differences, in which a frame moves by this much to each side
 _LEAST_NORM = 0.1  # a signal's norm counts as at least this fraction of its kind's largest, which limits how it is scaled
 _DEG = float(np.rad2deg(1.0))
 # This fraction of the change since a grid half as fine counts as error: 1 suits errors ∝ voxel, 1/3 errors ∝ voxel².
@@ -36,7 +36,7 @@ _DEVIATIONS = 3.0  # a kind is corrected only if its RMS over the views exceeds 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of parameter: its name and unit in the table. scale: how many of these make an internal unit (rad or mm)."""
+    """A kind of parameter: its name and unit in the table. scale: how many of these units make a rad or a mm."""
 
     name: str
     unit: str
@@ -45,12 +45,11 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class PerViewParameters(ABC):
-    """Parameters of views, with ``values`` (n, K) of K kinds. View f has (``basis`` @ ``values``)[f], (K,), with basis (F,
-    n).
+    """Parameters of views: ``values`` (n, K) of K kinds. View f has (``basis`` @ ``values``)[f], (K,), with basis (F, n).
 
     - units (K,): how much of each kind moves a frame by a pixel at its edge.
     - circle (n, 2): values that vary as cosine and sine of the angle, as far as the basis can.
-    - MISMATCH: measured errors (docs/calibrate.md) over those of noise alone, as voxels do not represent objects exactly.
+    - MISMATCH: measured errors (docs/calibrate.md) over errors by noise alone, as voxels do not represent objects exactly.
     - RESTARTED: kinds that start from 0 on each grid."""
 
     values: np.ndarray
@@ -183,7 +182,7 @@ def view_step(
     norms = _norms(parameters.basis, signals)
     scale = _strength(operator) / np.maximum(norms, _LEAST_NORM * norms.max(0))
     if not np.array_equal(parameters.basis, np.eye(len(signals))):
-        # several splines act on a view, but its signal can be scaled only once: so all splines share one scale
+        # several splines act on a view, whose derivative has a single scale: so all splines share one
         scale = np.broadcast_to(scale.mean(0), scale.shape)
     per_view = parameters.basis @ scale / parameters.basis.sum(1, keepdims=True)
     scaled = (signals * per_view[:, :, None, None]).astype(np.float32)
@@ -224,7 +223,7 @@ def _norms(basis: np.ndarray, signals: np.ndarray) -> np.ndarray:
 
 
 def _strength(operator: RayOperator) -> float:
-    """Returns about the largest singular value of A, in mm. Parameters scaled to it converge as fast as the volume does."""
+    """Returns about the largest singular value of A, in mm. If scaled to this, parameters converge as fast as the volume."""
     lengths = operator.forward(np.ones(operator.volume_shape, np.float32))
     return float(np.linalg.norm(operator.adjoint(lengths)) / np.linalg.norm(lengths))
 
@@ -244,7 +243,8 @@ def _signal(
 def _share(
     problem: CoarseProblem, operator: RayOperator, basis: np.ndarray, signals: np.ndarray, iterations: int
 ) -> float:
-    """Returns which fraction, 0 to 1, of signals (F, rows, columns) no object explains, if each has a random sign."""
+    """Returns the fraction, 0 to 1, of signals (F, rows, columns) that no object explains, if each view's signal has a
+    random sign."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], basis.shape[1]).astype(np.float32)
     probe = signals * (basis @ signs).astype(np.float32)[:, None, None]
     (rest,) = problem.beyond_object(operator, np.zeros(operator.volume_shape, np.float32), [probe], iterations)
@@ -253,8 +253,8 @@ def _share(
 
 @dataclass(frozen=True, eq=False)
 class ViewsEstimate:
-    """The result of ``estimate_views``. views: the corrections, 0 for kinds that are not significant; None if no kind is.
-    table: an estimate per kind, whose value is the root mean square over the views."""
+    """The result of ``estimate_views``. views: the corrections, 0 for kinds that are not significant; None if no kind is
+    significant. table: an estimate per kind, whose value is the root mean square over the views."""
 
     views: Views | Sway | None
     table: list[ParameterEstimate]

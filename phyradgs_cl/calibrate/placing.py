@@ -36,8 +36,7 @@ def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> lis
     """Returns up to 6 placements (6,), the best first, that take most of the known beads to bright spots of ``volume`` (nz,
     ny, nx).
 
-    A placement is a turn (rotation vector, rad) and a shift (mm). Raises InputError if none fits three quarters of the
-    beads."""
+    A placement is a turn (rotation vector, rad) and a shift (mm). Raises InputError if none fits 3/4 of the beads."""
     beads_mm = bead_centres_mm(phantom)
     radius_mm = np.median([body.reach_mm for body in phantom.ellipsoids if isinstance(body, Ellipsoid)])
     smooth = gaussian_filter(volume, _SMOOTH * radius_mm / np.array(grid.voxel_size_mm))
@@ -88,8 +87,7 @@ def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
 def _matching_triangles(
     beads_mm: np.ndarray, spots_mm: np.ndarray, within_mm: float
 ) -> Iterator[tuple[tuple[int, int, int], list[int]]]:
-    """Yields triangles of beads (n, 3) and of spots (m, 3), three indices each, whose sides differ by less than
-    ``within_mm``."""
+    """Yields triangles of beads (n, 3) and spots (m, 3), as indices, whose sides differ by less than ``within_mm``."""
     rng = np.random.default_rng(0)
     apart = np.linalg.norm(spots_mm[:, None] - spots_mm, axis=-1)
     for _ in range(_TRIANGLES):

@@ -29,7 +29,7 @@ _VOXELS_PER_TIME = 2.0  # an exposure is sampled so often that the volume's rim 
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
-_LEAST_SHARE = 0.1  # progress reports count a phase's remaining passes with at least this fraction of their full cost
+_LEAST_SHARE = 0.1  # in progress reports, a phase's remaining passes cost at least this fraction of their full cost
 Passes = tuple[int, float]
 """How many passes may still come at most, and their expected total cost."""
 
@@ -71,7 +71,7 @@ class PassCounter:
         self.plan = dict(plan)
         self._report = report
         self._done, self._spent, self._text = 0, 0.0, ""
-        self._current: Passes = (0, 0.0)  # passes that remain in this phase
+        self._current: Passes = (0, 0.0)  # remaining passes of the present phase, and their cost
 
     def begin(self, phase: str, text: str) -> None:
         """Begins a phase of the plan, which reports call ``text``, and drops the phases before it."""
@@ -153,11 +153,9 @@ class CoarseProblem(CoarseFrames):
         return replace(problem, measured=problem.masked(measured))
 
     def operator(self, correction: GeometryCorrection, views: Views | Sway | None = None) -> RayOperator:
-        """Returns the operator A of the coarse frames of all scans, in the geometry that ``correction`` and ``views``
-        change.
+        """Returns the projector A to the coarse frames of all scans, in the geometry after ``correction`` and ``views``.
 
-        Each line integrates over 2 to 8 times of its exposure. views: changes of single views or of the object's pose, if
-        any."""
+        Each line integrates over 2 to 8 times of its exposure. views: changes of single views or of the object's pose."""
         tables = []
         for scan in self.scans:
             small = coarse.binned(perturb(scan, correction, views), self.block)
@@ -174,14 +172,14 @@ class CoarseProblem(CoarseFrames):
         return self.measured + self.masked(operator.forward(volume) - self._expected(operator, volume))
 
     def _expected(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
-        """Returns the frames (F, rows, columns) of a volume, with line integrals or intensities averaged, as the detector
+        """Returns the frames (F, rows, columns) of a volume. They average line integrals or intensities, as the detector
         does."""
         if self.scans[0].detector_model != "intensity":
             return operator.forward(volume)
         return IntensityOperator(self.rt, self.grid, operator.detector_shape, operator.tables).expected(volume)
 
     def reconstruct(self, operator: RayOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
-        """Returns a nonnegative volume (nz, ny, nx) of little total variation, ``iterations`` after ``start`` (None:
+        """Returns a nonnegative volume (nz, ny, nx) of little total variation, after ``iterations`` from ``start`` (None:
         zeros)."""
         volume = np.zeros(self.grid.shape, np.float32) if start is None else start
         system = System(operator, self.line_integrals(operator, volume), self.valid)

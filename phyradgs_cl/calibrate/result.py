@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CORRECTED, AGREES, CANNOT_TELL = "corrected", "agrees", "cannot tell"
-_FRAMES = 4  # frames shown in the figure, at most
+_FRAMES = 4  # at most this many frames are shown in the figure
 _ROW_INCH, _CURVES_INCH, _WIDTH_INCH = 1.8, 2.4, 7.0
 
 
@@ -23,8 +23,8 @@ _ROW_INCH, _CURVES_INCH, _WIDTH_INCH = 1.8, 2.4, 7.0
 class ParameterEstimate:
     """One parameter in ``unit``: its stated value, and the value found with its standard deviation.
 
-    The latter two are None if the frames do not determine the parameter. share: the fraction of the frames' change with the
-    parameter that no object and no other parameter explains, 0 to 1."""
+    The value found and its deviation are None if the frames do not determine the parameter. share: the fraction, 0 to 1, of
+    the frames' change with the parameter that no object and no other parameter explains."""
 
     name: str
     unit: str
@@ -49,8 +49,7 @@ class ParameterEstimate:
 class Calibration:
     """The corrected ``scan``, in which everything else is unchanged, and how it was found.
 
-    - parameters: an estimate each. alike: combinations of parameters, in words, that no frame distinguishes from another
-      object.
+    - parameters: an estimate of each. alike: combinations of parameters, in words, that no frame tells from another object.
     - residual_rms: RMS residual before and after, in line integrals, on the finest grid. before, after: these residuals (F,
       rows, columns).
     - views: corrections per view, or the object's motion, if significant. The table has the root mean square of each kind,
@@ -89,7 +88,7 @@ class Calibration:
     def per_view(self) -> dict[str, np.ndarray]:
         """Returns the corrections of every view, (F,) by name and unit; {} without corrections of views.
 
-        A wobble is added to the stated poses: source and panel turn counterclockwise as seen from above, and the panel moves
+        A wobble is added to the stated poses: source and panel turn counterclockwise seen from above, and the panel moves
         along its own v and u. A motion is the object's pose in the middle of each view: rotated about, then shifted along x,
         y and z."""
         if self.views is None:

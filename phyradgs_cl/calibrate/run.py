@@ -58,15 +58,15 @@ STAGES = (
     Stage(96, first=50, again=15, steps=3, project=30),
 )
 BEAD_STAGES = (Stage(48, first=8, again=4, steps=6, project=0), Stage(128, first=6, again=4, steps=6, project=0))
-_FEWEST_FRAMES = 8  # fewer frames do not determine geometry
-_FEWEST_COLUMNS = 12  # fewer columns do not determine geometry
+_FEWEST_FRAMES = 8  # with fewer frames a scan does not determine its geometry
+_FEWEST_COLUMNS = 12  # with fewer columns a scan does not determine its geometry
 _FEWEST_SPLINES = 4  # a cubic spline of a wobble needs four
 # In its best place, the right phantom explains at least this fraction of the frames' squares before any correction.
 _LEAST_EXPLAINED = 0.3
 _ORDER_ERRORS = 4.0  # a direction of readout must be better by this many standard errors, as in ``check``
 _ORDER_RATIO = 1.04  # the squared residuals of both directions must differ by this factor, as in ``check``
-_BEYOND = 1e6  # an encoder table is continued by this many frame times: first steps of the search may reach far beyond it
-# Progress expects a stage to cost this fraction of its most: few parameters are determined, and steps soon become small.
+_BEYOND = 1e6  # an encoder table is continued by this many frame times: first steps of the search may go far beyond it
+# Progress expects stages to cost this fraction of their most: few parameters are determined, and few steps are needed.
 _EXPECTED_SHARE = 0.25
 
 
@@ -111,7 +111,7 @@ class _Calibrator:
         self.placement = np.zeros(0)
         self.stated = self.ready  # ``ready`` may later get the other readout direction
         stages = {one.block(self.scan): one for one in reversed(STAGES if self.phantom is None else BEAD_STAGES)}
-        self.stages = list(stages.values())[::-1]  # on a small panel, of stages with the same blocks the first is kept
+        self.stages = list(stages.values())[::-1]  # on a small panel several stages have the same blocks: the first is kept
         self.per_view: PerViewParameters | None = None
         if self.request.per_view == WOBBLE:
             self.per_view = WobbleParameters.of(self.ready[0], self.splines)
@@ -145,7 +145,7 @@ class _Calibrator:
         before = self._residual(as_stated, self.stages[-1], GeometryCorrection())
         after = self._residual(problem, self.stages[-1], correction, views)
         held = {name: value for name, value in corrections.items() if name in self.search.held}
-        before_rest = before  # residual with only the held parameters corrected: what the others add is compared with it
+        before_rest = before  # the residual if only the held parameters are corrected
         if held:
             known = correction_of(held)
             before_rest = after if held == corrections else self._residual(as_stated, self.stages[-1], known)
@@ -163,8 +163,8 @@ class _Calibrator:
         """Starts from the offset that ``check`` finds, because steps reach it from a distance of a few pixels only.
 
         In half a turn of nearly parallel rays, a volume explains most of what an offset changes. The search cannot determine
-        the offset there, so ``check``'s answer stands. It stands too if the panel sees few rays twice: a shift that leaves
-        fewer of them fits better, whatever the truth."""
+        the offset there, so ``check``'s answer stands. It stands too if the panel sees few rays twice: a shift under which
+        fewer are seen twice fits better, whatever the truth."""
         if self.phantom is None and has_axis_near_edge(self.ready[0]):
             self.search.held = (OFFSET_U,)
         quick, pitch_mm = coarse(self.ready[0], QUICK_COLUMNS), self.scan.geometry.pixel_size_mm[1]
@@ -177,8 +177,7 @@ class _Calibrator:
             self.search.fallback = {OFFSET_U: Fallback(shift.pixels * pitch_mm, shift.deviation * pitch_mm, is_significant)}
 
     def _search_common(self) -> None:
-        """Searches the parameters that all views share. Single views are corrected first: their errors would look like a
-        roll."""
+        """Searches the parameters that all views share. Corrects single views first: their errors would look like a roll."""
         steady = self.ready
         if self.per_view is not None:
             self.passes.begin("views before", "views, before the rest")
@@ -221,7 +220,7 @@ class _Calibrator:
         return replace(problem, count_pass=self.passes.counter(pass_cost(scans, stage.columns, most_frames)))
 
     def _place(self, phantom: EllipsoidPhantom) -> np.ndarray:
-        """Returns a first placement (7,) of the phantom: of those where its beads are seen, the one that fits the frames
+        """Returns a first placement (7,) of the phantom. Of the placements where its beads are seen, it fits the frames
         best."""
         bead_centres_mm(phantom)
         correction = correction_of(self.search.at)
@@ -240,8 +239,7 @@ class _Calibrator:
         return placement
 
     def _test_direction(self) -> list[ParameterEstimate]:
-        """Compares the residuals with lines read from either end, and corrects the scans' direction. Returns its line of the
-        table.
+        """Compares the residuals with lines read from either end, and corrects the direction. Returns its line of the table.
 
         A correction needs four standard errors and 4 % of the squared residual. The direction is 1 or −1, and its deviation
         is in the same unit."""
@@ -268,7 +266,7 @@ class _Calibrator:
         return problem.residual(operator, problem.reconstruct(operator, None, stage.first))
 
     def _plan(self) -> dict[str, Passes]:
-        """Returns the most passes through the frames, and their cost, of each phase by name, in order."""
+        """Returns by phase, in order, the largest number of passes through the frames, and their cost."""
         second, last = self.stages[min(1, len(self.stages) - 1)], self.stages[-1]
         parameters, views, most_frames = len(self.request.parameters), (0, 0.0), MOST_FRAMES
         if self.per_view is not None:

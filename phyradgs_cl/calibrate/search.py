@@ -30,10 +30,10 @@ LEAST_SHARE = 0.2
 # For a known object (beads) a smaller share is enough: there are no voxels that explain signals by accident.
 LEAST_SHARE_OF_BEADS = 0.02
 _TINY = 1e-9  # added to the diagonal of a matrix before its inverse, because signals may be linearly dependent
-_GAUGE_FACTOR = 2.0  # voxels leave some signal of a gauge (``GAUGES``) by error: a parameter must leave twice as much
-_MOST_GAUGE = 0.2  # a gauge's share counts as this at most: in a wrong geometry it grows, and would refuse every parameter
+_GAUGE_FACTOR = 2.0  # voxels leave part of a turn's or lift's signal (``GAUGES``) by error: others must leave twice as much
+_MOST_GAUGE = 0.2  # a turn's or lift's share counts as at most this: in a wrong geometry it grows, and would refuse all
 DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
-_MOST_PX = 2.0  # a step moves the image by at most this many coarse pixels at its edge: signals are not linear beyond
+_MOST_PX = 2.0  # a step moves the image by at most this many coarse pixels at its edge: beyond, its effect is not linear
 _SETTLED = 0.1  # the steps on a grid end when all are smaller than this many standard deviations
 
 
@@ -65,7 +65,8 @@ class Reduced:
         )
 
     def relative_to_stated(self, at: Mapping[str, float]) -> "Reduced":
-        """Returns the problem with steps that count from the stated values; it was linearised at values ``at``, by name."""
+        """Returns the problem, which was linearised at values ``at`` (by name), with steps that count from the stated
+        values."""
         back = np.array([at.get(name, 0.0) for name in self.names]) @ self.jacobian
         return replace(self, residual=self.residual + back)
 
@@ -84,8 +85,8 @@ class Reduced:
     def shares(self) -> np.ndarray:
         """The fraction (K,) of each parameter's signal that no object explains, 0 to 1.
 
-        This is the smaller of two ratios. One is the signal's norm without what an object explains, over its whole norm. The
-        other is how certain the parameter is among all unknowns, over how certain it would be with a known object."""
+        This is the smaller of two ratios. One is the norm of the unexplained signal over that of the whole signal. The other
+        is the parameter's certainty among all unknowns, over its certainty with a known object."""
         tiny = _TINY * np.eye(len(self.names))
         variance, variance_with_object = (np.diag(np.linalg.inv(gram + tiny)) for gram in (self.gram, self.whole_gram))
         certainty = variance_with_object / variance
@@ -118,7 +119,7 @@ def reduced(
     """Returns the frames linearised at the parameters' values ``at`` (by name) and at the object ``volume``: a volume, or a
     placement of beads.
 
-    operator: of the problem at these values. iterations: of CGLS, which removes what a volume explains."""
+    operator: the projector at these values. iterations: how many CGLS makes to remove what a volume explains."""
     signals = [_signal(problem, one, at, volume) for one in parameters]
     images = [*signals, problem.residual(operator, volume)]
     *jacobian, residual = problem.beyond_object(operator, volume, images, iterations)
@@ -142,16 +143,16 @@ def _signal(
     for sign in (1, -1):
         correction = correction_of({**at, one.name: at.get(one.name, 0.0) + sign * step})
         operator: Any = problem.operator(correction)
-        ends.append(operator.forward(volume) - problem.measured)  # less is lost by rounding than with whole frames
+        ends.append(operator.forward(volume) - problem.measured)  # minus measured, to lose fewer digits in float32
     return problem.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 
 def least_shares(problem: Reduced) -> dict[str, float]:
-    """Returns, by name, from which share on a parameter counts as determined. problem: with ``GAUGES``.
+    """Returns, by name, the share from which on a parameter counts as determined. ``problem`` includes the ``GAUGES``.
 
     No frame distinguishes a turn of all views from a turned object. Voxels do not follow such an object exactly, though:
-    they leave some of its signal unexplained, and as much of any other. So a parameter's share must exceed the share of the
-    turn; of a lift, if the parameter moves the image along the axis."""
+    they leave some of the turn's signal unexplained, and as much of any other signal. So a parameter's share must exceed
+    that of the turn, or of a lift if the parameter moves the image along the axis."""
     remaining = {gauge.is_axial: float(problem.only([gauge.name]).shares[0]) for gauge in GAUGES}
     names = [name for name in problem.names if name in PARAMETERS]
     gauge_shares = {name: min(remaining[PARAMETERS[name].is_axial], _MOST_GAUGE) for name in names}
@@ -270,7 +271,8 @@ class Search:
     def corrections(self) -> dict[str, float]:
         """Returns the values, by name, of the parameters that differ from their stated values by three deviations.
 
-        All other parameters go back to their stated values. That changes the rest, so the test repeats until all differ."""
+        All other parameters go back to their stated values. That changes the remaining values, so the test repeats until all
+        differ."""
         values, deviations = self.estimates()
         deviation = dict(zip(self.determined or (), deviations, strict=True))
         names = self.determined or ()
@@ -285,7 +287,7 @@ class Search:
 
     def table(self, scan: Scan, corrections: Mapping[str, float]) -> list[ParameterEstimate]:
         """Returns an estimate per parameter in displayed units. corrections: values by name, in the fields' units, which
-        replace those found."""
+        replace the values found."""
         values, deviations = self.estimates()
         estimates = {name: (estimate.value, estimate.deviation) for name, estimate in self.fixed.items()}
         estimates |= dict(zip(self.determined or (), zip(values.tolist(), deviations.tolist(), strict=True), strict=True))

@@ -27,7 +27,7 @@ from phyradgs_cl.runtime import Runtime
 CONSISTENCY = "consistency"
 # Consistent frames leave less than this fraction of their residual in a random order: correct scans have 0.02 to 0.23.
 _LARGEST = 0.35
-_DOUBTFUL = 0.1  # above this fraction of it, exchanged, missing and repeated frames are tried as explanations
+_DOUBTFUL = 0.1  # above this fraction of the residual in a random order, exchanged, missing and repeated frames are tried
 _RANDOM_ORDERS = 2  # the residual in a random order is averaged over this many orders
 _FEWEST_FRAMES = 5  # fewer frames cannot tell one order from another
 _FEWEST_PIXELS = 32  # fewer valid coarse pixels per frame cannot tell one order from another
@@ -56,8 +56,8 @@ _EXCHANGED = 0.5  # two frames were exchanged if the opposite order leaves less 
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """The answer about consistency. frames (n,): indices of the frames that fit together. is_sound: further questions make
-    sense. sees_angles: the object looks different from different angles."""
+    """The answer about consistency. frames (n,): indices of the frames that fit together. is_sound: whether further
+    questions make sense. sees_angles: whether the object looks different from different angles."""
 
     finding: Finding
     frames: np.ndarray
@@ -85,7 +85,7 @@ class _CoarseFit:
 def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
     """Finds frames and hypotheses that explain why the frames of a coarse ``scan`` do not fit together.
 
-    The finding's value is √(squared residual in the stated order / in a random order). as_stated: the scan of full size."""
+    The finding's value is the residual's norm in the stated order over that in a random order. as_stated: the full scan."""
     pixels = float(scan.valid.sum()) / scan.frames
     if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
@@ -129,17 +129,17 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
 
 def _unseen(scan: Scan, as_stated: Scan) -> float:
     """Returns the residual in a random order below which the frames of a coarse ``scan`` tell nothing about their angles."""
-    # The smaller noise counts: edges raise that of coarse pixels, noise that differs between rays raises that of full ones.
+    # The smaller estimate counts: edges raise the one from coarse pixels, uneven noise the one from full pixels.
     levels = [noise_level(one.projections, np.broadcast_to(one.valid, one.projections.shape)) for one in (scan, as_stated)]
     noise = min(levels[0], levels[1] / float(np.prod(altered_trajectory(scan).blocks)) ** 0.5)
     return max(_SAME * float(np.asarray(scan.projections, np.float64).std()), _NOISY * noise)
 
 
 def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
-    """Chooses the sense of rotation and the panel's shift, where they fit far better than as stated. A scan with opposite
-    views keeps its sense: both senses fit it equally well.
+    """Chooses another sense of rotation and shift of the panel if they fit far better than the stated ones. A scan with
+    opposite views keeps its sense: both senses fit it equally well.
 
-    Returns the scan with the sense, the scan with sense and shift, and the mean squared residual of the best rough fit."""
+    Returns the scan with the chosen sense, then with the shift too, and the mean squared residual of the best rough fit."""
     senses, limits_px = [scan], [axis.ANYWHERE]
     if not has_opposite_views(scan):
         senses, limits_px = [scan, reversed_rotation(scan)], [axis.ANYWHERE, hypotheses.shifts_for_sense_px(scan)]
@@ -148,7 +148,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     turned = best = scan
     least = _CLEAR * fit_squares(rt, scan).sum()
     for sense, rough, limits in zip(senses, roughs, limits_px, strict=True):
-        if rough.squares.mean() > _NEARLY * least_rough:  # far worse: a narrow fan keeps both senses
+        if rough.squares.mean() > _NEARLY * least_rough:  # this sense fits far worse; in a narrow fan both fit alike
             continue
         shift = axis.refined_shift(rt, sense, rough, limits)
         if not shift.is_found:
@@ -226,8 +226,8 @@ def _best_below(rt: Runtime, candidates: Iterable[Hypothesis], stated: Fit, most
 
 
 def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:
-    """Finds odd and repeated frames before any reconstruction. Returns the indices (n,) of the other frames, and a note for
-    each frame that is left out."""
+    """Finds odd and repeated frames before any reconstruction. Returns the indices (n,) of the frames that stay, and a note
+    for each frame that is left out."""
     odd, repeated = odd_frames(scan.projections, scan.pixel_mask), repeated_frames(scan)
     notes = [f"frame {frame_number(scan, f)} is unlike all others (black, bright, or no image)" for f in odd]
     notes += [f"frame {frame_number(scan, f)} is frame {frame_number(scan, f - 1)} recorded twice" for f in repeated]
@@ -235,7 +235,7 @@ def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:
 
 
 def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
-    """Returns the indices of the frames of p (F, v, u) whose mean line integral is far from that of their neighbours."""
+    """Returns the indices of the frames of p (F, v, u) whose mean line integral is far from their neighbours' means."""
     if len(p) < _FEWEST_FRAMES:
         return []
     valid = 1.0 if mask is None else (np.asarray(mask) == 0).astype(np.float32)
@@ -285,8 +285,8 @@ def without_outliers(
     """Removes frames whose residual is far above the others', the worst first, with a new fit after each.
 
     stated: the fit of all frames. random_square: the mean squared residual of frames in a random order. Returns the indices
-    (n,) of the other frames, their fit, and notes. If a fifth of the frames would go, the cause is common to all, and none
-    is removed. Two outliers may be two exchanged frames, which a note says."""
+    (n,) of the frames that stay, their fit, and notes. If a fifth of the frames would go, the cause is common to all, and
+    none is removed. Two outliers may be two exchanged frames, which a note says."""
     remaining, current = np.arange(scan.frames), stated
     outliers: list[int] = []
     while len(outliers) < _MOST_OUTLIERS * scan.frames:

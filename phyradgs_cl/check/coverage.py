@@ -28,8 +28,8 @@ def check_coverage(scan: Scan) -> Finding:
     """Checks that the panel sees the whole object, and that the scan's values can be line integrals.
 
     The object touches a side if the two outermost columns are above noise and above a tenth of the largest line integral.
-    They are averaged over an eighth of the rows, and a tenth of the frames must show it. A displaced panel may cut the
-    object on its short side. The top and bottom are not checked.
+    The columns are averaged over an eighth of the rows, and a tenth of the frames must show the object there. A displaced
+    panel may cut the object on its short side. The top and bottom are not checked.
 
     Other findings: no object above the noise, inverted values, line integrals beyond 30, and pixels brighter than the flats.
     A size is wrong if the grid is over 5 times as wide as the panel's view, or the object as the grid."""
@@ -103,8 +103,7 @@ def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) ->
 
 
 def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
-    """Returns the level of two columns: the largest mean over an eighth of the rows, at the 90th percentile of the
-    frames."""
+    """Returns the level of two columns: their largest mean over an eighth of the rows, the 90th percentile over frames."""
     edge = p[:, :, columns]
     weight = valid[:, :, columns].astype(float)
     rows = max(1, edge.shape[1] // 8)

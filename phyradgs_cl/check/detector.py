@@ -115,7 +115,7 @@ def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
 
 
 def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
-    """Finds dead pixels that are not masked yet. Returns the finding, and a map of them, bool (v, u).
+    """Finds dead pixels that are not masked yet. Returns the finding, and the map of dead pixels, bool (v, u).
 
     A dead pixel always has the same value, or differs from its neighbours in nearly every frame. More than 0.02 % of the
     pixels are suspicious."""

@@ -12,8 +12,8 @@ FEWEST_COLUMNS = 8  # panels with fewer columns cannot be judged: four gave fals
 class Finding:
     """The answer to one ``question``, with the ``verdict`` "ok", "suspicious" or "cannot tell".
 
-    value: the measured number, in ``unit``. uncertainty: its standard deviation, where it is an estimate. threshold: the
-    value from which it is suspicious. text: what was found. advice: what to do about it."""
+    value: the measured number, in ``unit``. uncertainty: the standard deviation of an estimated value. threshold: the value
+    from which on it is suspicious. text: what was found. advice: what to do about it."""
 
     question: str
     verdict: str
@@ -29,10 +29,10 @@ class Finding:
 
 
 def too_narrow(question: str, unit: str) -> Finding:
-    """Returns the answer "cannot tell" to ``question``, for a panel with too few columns."""
+    """Answers ``question`` by "cannot tell", because the panel has too few columns."""
     return Finding(question, CANNOT_TELL, 0.0, 0.0, unit, f"fewer than {FEWEST_COLUMNS} columns")
 
 
 def same_from_everywhere(question: str) -> Finding:
-    """Returns the answer "cannot tell" to ``question``, for an object that looks the same from every angle."""
+    """Answers ``question`` by "cannot tell", because the object looks the same from every angle."""
     return Finding(question, CANNOT_TELL, 0.0, 0.0, "", "the object looks too much the same from every angle")

@@ -29,7 +29,7 @@ _GAPS = 15  # a missing or repeated frame is looked for at this many frames, eve
 class Hypothesis:
     """What may be wrong in a scan: a description, advice, and a function that returns the scan corrected for it.
 
-    factor: by which pixels are larger than stated. Hypotheses with the same factor, unless it is 1, differ only by the
+    factor: how many times larger pixels are than stated. Hypotheses with the same factor, unless it is 1, differ only by the
     panel's shift."""
 
     text: str
@@ -54,8 +54,8 @@ def shifts_for_sense_px(scan: Scan) -> tuple[float, float]:
     """Returns how far the panel may be shifted, (lowest, highest) in pixels of the recorded scan, to compare senses of
     rotation.
 
-    If the axis is near the panel's edge, the panel may only move towards it. Away from it fewer rays are measured twice, and
-    any angles would fit."""
+    If the axis is near the panel's edge, the panel may only move towards it. If it moved away from the axis, fewer rays
+    would be measured twice, and any angles would fit."""
     offset_mm, pitch_mm = scan.geometry.detector_offset_mm[1], scan.geometry.pixel_size_mm[1]
     if not has_axis_near_edge(scan):
         return axis.ANYWHERE
@@ -69,8 +69,7 @@ def frame_number(scan: Scan, frame: int) -> int:
 
 
 def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. stated: the scan of full
-    size."""
+    """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. stated: the full scan."""
     yield from _other_units(scan, stated)
     yield from _other_images(scan, stated)
 
@@ -146,8 +145,7 @@ def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hy
 
 
 def _azimuths(scan: Scan) -> np.ndarray:
-    """Returns each frame's angle (F,) in rad from the first frame's. Whole turns are kept if the trajectory states
-    angles."""
+    """Returns each frame's angle (F,) in rad from the first frame's. Whole turns stay if the trajectory states angles."""
     trajectory = variants.altered_trajectory(scan)
     angle_rad = getattr(trajectory.base, "angle_rad", None)
     if angle_rad is None:
@@ -195,8 +193,7 @@ def nearly_sized(scan: Scan, factor: float) -> Scan:
 
 
 def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses of a missing or a repeated frame, at up to 15 frames: all later ones are a step further on, or
-    back."""
+    """Yields hypotheses of a missing or a repeated frame, at up to 15 frames: later ones are a step further on, or back."""
     sense = -1.0 if variants.altered_trajectory(scan).is_reversed else 1.0
     step = float(np.median(wrapped(np.diff(_azimuths(scan))))) * sense
     for at in np.unique(np.linspace(1, scan.frames - 1, _GAPS).round().astype(int)):

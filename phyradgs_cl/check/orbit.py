@@ -43,7 +43,7 @@ _TOLERATED_PX = 1 / 3  # a shift of the panel by this many pixels is always tole
 _DEVIATIONS = 4.0  # a shift by this many of its standard deviations is always tolerated
 _BIAS_FULL_TURN = 0.003  # measured error of the axis in scans of a full turn, in coarse pixels
 _BIAS_HALF_TURN = 0.04  # measured error of the axis in coarse pixels, if some rays are measured only once
-_WHOLE_PIXELS = 2  # with pixels of full size, "ok" needs a threshold of at most this many pixels
+_WHOLE_PIXELS = 2  # if full pixels were compared, the answer "ok" needs a threshold of at most this many pixels
 _LEAST_REDUNDANCY = 0.1  # least fraction of columns seen twice, to divide by: it is 0 if the axis is at the panel's edge
 _NO_SIGN = "parallel rays show an object that turns one way and its mirror image that turns the other way alike"
 _SIGN_ADVICE = "look for a feature whose side is known: a mirror image would fit as well"
@@ -53,8 +53,8 @@ _SIZE_RATIO = 1.05  # a fan fits worse if it leaves this many times the squared 
 
 @dataclass(frozen=True, eq=False)
 class Orbit:
-    """The findings about sense of rotation (``sign``) and axis (``centre``). shift: of the panel, along u. is_reversed: the
-    gantry turns the other way."""
+    """The findings about sense of rotation (``sign``) and axis (``centre``). shift: how far the panel is shifted along u.
+    is_reversed: whether the gantry turns the other way."""
 
     sign: Finding
     centre: Finding
@@ -103,8 +103,8 @@ def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> 
 def check_rotation(stated: axis.AxisShift, other: axis.AxisShift) -> Finding:
     """Compares the residuals with the angles as stated and reversed, each with its own best shift of the panel.
 
-    A reversal needs four standard errors and 20 % of the squared residual, because a mirror image fits as well in a narrow
-    fan. Frames mirrored in u fit reversed angles and the opposite offset; ``with_cause`` decides between the two."""
+    A reversal must fit better by four standard errors and 20 % of the squared residual: in a narrow fan a mirror image fits
+    as well. Frames mirrored in u fit reversed angles and the opposite offset; ``with_cause`` decides between the two."""
     errors, ratio = t_statistic(stated.squares, other.squares), residual_ratio(stated.squares, other.squares)
     text = f"turned the other way, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"
     values = (errors, -_ERRORS, "standard errors", text)
@@ -133,7 +133,7 @@ def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px
 
 
 def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisShift, Finding]:
-    """Returns the panel's shift along u and the finding about it. shift: found with blocks of ``block`` pixels.
+    """Returns the panel's shift along u and the finding about it. ``shift`` was found with blocks of ``block`` pixels.
 
     Coarse pixels cause an error that the bootstrap over frames does not include: it is added to the standard deviation. This
     error is larger where ``scan`` measures fewer rays twice. Opposite views give a shift too, from pixels of full size; the

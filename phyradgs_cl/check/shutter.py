@@ -60,8 +60,8 @@ def check_readout(rt: Runtime, scan: Scan) -> Finding:
 
 
 def _compared(hypothesis: str, stated: np.ndarray, other: np.ndarray) -> tuple[str, float, float]:
-    """Returns a sentence about another readout, the standard errors by which the stated one fits better, and the other's
-    squared residual over the stated one's."""
+    """Returns a sentence about another readout, by how many standard errors the stated readout fits better, and the ratio of
+    squared residuals, other over stated."""
     ratio, errors = residual_ratio(stated, other), t_statistic(stated, other)
     return f"{hypothesis}, the squared residual is {ratio:.4g} times as large ({errors:+.1f} standard errors)", errors, ratio
 

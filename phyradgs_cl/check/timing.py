@@ -146,7 +146,7 @@ def is_full_turn(scan: Scan) -> bool:
 
 
 def _needed_turn(scan: Scan) -> tuple[float, float, str]:
-    """Returns after how many degrees views repeat, how many a volume needs, and the latter in words."""
+    """Returns after how many degrees views repeat, how many degrees a volume needs, and these in words."""
     geometry = scan.geometry
     if isinstance(geometry, ParallelGeometry):
         if has_opposite_views(scan):

@@ -26,9 +26,9 @@ class ProjectionOperator(LinearOperator):
     image_geometry: None takes CIL's default. acquisition_geometry: cone, parallel or cone_flex, in 3D or 2D, with any
     offset or tilt, order of dimensions, origin of the panel and channels. A BlockGeometry gives a BlockOperator.
 
-    shutter, deg_per_s: of a fly-scan: when each line is exposed, and how fast the object turns, positive if angles rise.
-    The geometry's angles then hold in the middle of each frame. motion: a model of docs/methods.md except ``exact``.
-    device: what ``--device`` takes, or a Runtime.
+    shutter, deg_per_s: when each line of a fly-scan is exposed, and how fast the object turns, positive if angles rise. The
+    geometry's angles then hold in the middle of each frame. motion: a model of docs/methods.md except ``exact``. device:
+    what ``--device`` takes, or a Runtime.
 
     Raises InputError for a grid that no ray meets, an unknown motion, and a shutter with cone_flex."""
 
@@ -78,7 +78,7 @@ class FBP(DataProcessor):
         self._shape_out = self.image_geometry.shape
 
     def process(self, out: DataContainer | None = None) -> DataContainer:
-        """Returns the volume reconstructed from the input, in ``out`` if given."""
+        """Reconstructs the volume from the input. Returns it, in ``out`` if given."""
         between = self.image_geometry, self.acquisition_geometry
         method = "fbp" if between[1].geom_type == "parallel" else "fdk"
 
@@ -157,7 +157,7 @@ def _panel(frames: AcquisitionGeometry, detector: Any) -> tuple[np.ndarray, np.n
 
 
 def _turned(at_zero: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
-    """Returns ASTRA's vectors (F, 12) at angles (F,) of the object: those of ``_at_zero``, turned the other way about z."""
+    """Returns ASTRA's vectors (F, 12) at angles (F,) of the object: the vectors ``at_zero`` turned the other way about z."""
     (x, y, z), cos, sin = at_zero.T, np.cos(angles_rad)[:, None], np.sin(angles_rad)[:, None]
     return np.stack([cos * x + sin * y, cos * y - sin * x, z + 0 * cos], -1).reshape(-1, 12)
 

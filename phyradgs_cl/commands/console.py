@@ -144,8 +144,8 @@ _KINDS |= {" <int>": " N", " <int range>": " N", " <float>": " NUMBER"}
 
 
 class GroupedCommand(TyperCommand):
-    """A command whose help lists options under headings. groups: by heading, the names of parameters. Options without a
-    group are listed under "Options"; ``--help`` is the last of the first group."""
+    """A command whose help lists options under headings. groups: the names of parameters under each heading. Options without
+    a group are listed under "Options"; ``--help`` is the last of the first group."""
 
     groups: Mapping[str, Sequence[str]] = {}
 

@@ -31,7 +31,7 @@ def evaluate_command(
     picture: Annotated[Path | None, file_option(_PICTURE, "--picture", default="v.evaluated.png for v.h5")] = None,
 ) -> None:
     """Measure a volume against the truth: 3D PSNR and SSIM, and a picture of slices."""
-    stem = volume.stem if volume.suffix in ("", ".h5") else volume.name  # v.h5 and v.nii in one folder need two pictures
+    stem = volume.stem if volume.suffix in ("", ".h5") else volume.name  # so that v.h5 and v.nii get different pictures
     usual = volume.with_name(f"{stem}.evaluated.png")  # not v.png, which may be the run's preview
     facts = run_evaluation(
         volume, reference, picture or usual, reference_voxel_mm, object_motion, rtk_reference, mu_water_per_mm

@@ -1,4 +1,4 @@
-"""Options that several commands share, such as those of a reconstruction, and how their values are parsed."""
+"""Options that several commands share, such as a reconstruction's, and how their values are parsed."""
 
 import functools
 import inspect
@@ -56,8 +56,8 @@ _NONE: Mapping[str, Any] = {}
 
 def of_fields(kind: type, makers: Mapping[str, Callable[[str, str, Any], Any]] = _NONE) -> dict[str, tuple[Any, Any]]:
     """Returns options of a command, (annotation, default) by name, for those fields of a dataclass that have a help text.
-    makers: by field, a function of (flag, help, usual) that returns the option, for values that need a special parser.
-    Other fields of tuples take numbers with commas between, which are checked later."""
+    makers: for fields that need a special parser, a function of (flag, help, usual) that returns the option. Other fields of
+    tuples take numbers with commas between, which are checked later."""
     return {one.name: _of_field(one, makers) for one in fields(kind) if one.metadata.get("help")}
 
 

@@ -53,7 +53,7 @@ _GROUPS = {
     ),
     "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
 }
-GROUPS = {"reconstruct": _GROUPS, "estimate": _GROUPS}  # a command shows the parameters that it has
+GROUPS = {"reconstruct": _GROUPS, "estimate": _GROUPS}  # each command shows only those that it has
 _ROWS = "Detector rows of a parallel scan to read and reconstruct; row 0 is the lowest."
 _SLAB = "Rows of a parallel scan at a time: slabs, kept on disk as they are done."
 _WATER = "Attenuation of water in 1/mm, for --initial in Hounsfield units that does not state its scale."
@@ -119,7 +119,7 @@ def reconstruct_command(
         if page is not None:
             _finish(page, result, scan, output, runtimes[-1])
     written = output if result.state is None else partial_path(output)
-    used_s = time.process_time()  # of the whole command; unlike clock time, it does not depend on other programs
+    used_s = time.process_time()  # the command's processor time, which other programs do not change
     motion = getattr(plan.options, "motion", None)
     method = plan.method_name if motion is None else f"{plan.method_name}, motion {motion_facts(motion)['name']}"
     how = f"{method}{result.early_stop}, {result.facts['seconds']:.1f} s ({used_s:.1f} s of processor time)"
@@ -161,7 +161,7 @@ def estimate_command(scan: Scan, settings: Settings, object_motion: ObjectMotion
     plan = settings.plan(object_motion=object_motion)
     loaded = load_scan(scan, plan.preprocessing.flats)
     rt = settings.runtime()
-    before_s = time.process_time()  # a run takes as long as this command did to start and read the scan
+    before_s = time.process_time()  # a run will need this time too, to start and to read the scan
 
     def around(result: Reconstruction) -> float:
         return before_s + seconds_around(scan, loaded, result)

@@ -117,7 +117,7 @@ def intensity_average(p: Iterable[np.ndarray], weights: Iterable[np.ndarray]) ->
     p: S arrays of line integrals; the result has their precision and cannot overflow. weights: S numbers or arrays that
     broadcast, with sum 1. Where all weights are 0, both results are 0."""
     pairs = list(zip(p, weights, strict=True))
-    least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # the least p, that of the brightest moment
+    least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # line integral of the brightest moment
     least = np.where(np.isfinite(least), least, 0)
     intensities = [w * np.exp(np.where(w > 0, least - q, 0)) for q, w in pairs]
     total = np.sum(intensities, axis=0)
@@ -137,8 +137,7 @@ class Spectrum:
     bone: Array
 
     def hardened(self, soft: Array, bone: Array | float = 0.0) -> Array:
-        """Returns the line integrals (any shape) that this beam measures, from those of soft tissue and bone without
-        hardening."""
+        """Returns the line integrals (any shape) that this beam measures. soft, bone: line integrals without hardening."""
         soft, energies = np.asarray(soft, np.float64), zip(self.weight, self.soft, self.bone, strict=True)
         # One energy at a time: ``intensity_average`` would hold all of them in memory.
         return -np.log(sum(w * np.exp(-(s * soft + b * np.asarray(bone))) for w, s, b in energies))

@@ -75,8 +75,8 @@ def beer_lambert_noise(
     light: ArrayLike = 1.0, lag: float = 0.0
 ) -> NDArray[np.float32]:
     """Returns −ln(counts/dose), (F, v, u) float32; ``COUNT_FLOOR`` is the least count. Negative values stay: with 0 in their
-    place the mean of air would rise. Arguments as in ``tigre_noise``. Lag λ mixes successive frames, before electronic
-    noise."""
+    place the mean of air would rise. Arguments as in ``tigre_noise``. Lag λ mixes successive frames, before electronic noise
+    is added."""
     expected = beer_lambert_counts(line_integrals, dose)
     share = np.asarray(light, dtype=np.float64)
     counts = add_lag(sample_counts(expected * share, 0.0, rng), lag)

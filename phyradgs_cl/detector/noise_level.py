@@ -22,10 +22,10 @@ LEAST_SHARE = 1e-3
 """Saturation is suspected if a larger fraction of the pixels has one extreme value."""
 _TOUCHING = 0.5  # saturation covers areas: pixels at an extreme are clipped if most of them have four neighbours at it
 _SAME = 1e-3  # flats and the largest count that differ by less than this fraction are equally bright: such pixels may be air
-_MOST_FRAMES = 8  # noise beside saturated pixels is sought in at most this many frames
+_MOST_FRAMES = 8  # noise outside saturated pixels is sought in at most this many frames
 _LONGEST_EDGE = 1024  # of larger frames only the middle, this many pixels a side, is searched for noise
-_ROUNDING = 0.5  # rounding of counts alone gives estimates of noise up to this
-_RELATIVE = 2e-5  # estimates of noise up to this fraction of the largest count are no noise
+_ROUNDING = 0.5  # rounding of counts alone causes an estimate up to this, in counts
+_RELATIVE = 2e-5  # an estimate up to this fraction of the largest count does not prove noise
 # Noise estimated along both axes is white if it is at least this fraction of noise estimated along rows; else structure.
 _WHITE = 0.5
 _ROOT_OF_NORMAL = 0.8222  # mean of √|x| over the root of the standard deviation of a normal x with mean 0
@@ -63,8 +63,8 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
     Noise grows with attenuation. So it is estimated in each tenth of the ``valid`` line integrals (F, v, u), and averaged by
     how many chosen pixels lie in each. An estimate is the median of |second differences along rows and then along columns|,
     which vanish at edges along either (Immerkær, Comput. Vis. Image Underst. 64 (1996) 300). Detail as fine as a pixel
-    raises it, by up to 70 % on panels of 64² with noise of 0.5 %. On panels of fewer than three rows, differences are along
-    rows alone."""
+    raises the estimate, by up to 70 % on panels of 64² with noise of 0.5 %. On panels of fewer than three rows, differences
+    are along rows alone."""
     usable, differences = valid, line_integrals
     means = line_integrals
     cuts = (_along_rows, _along_columns) if line_integrals.shape[-2] >= 3 else (_along_rows,)
@@ -169,7 +169,7 @@ def _flat_differs(frames: NDArray[np.generic], flat: NDArray[np.floating], level
 
 def _shows_noise(frames: NDArray[np.generic], level: float) -> bool:
     """Returns whether unclipped pixels are noisy, by their second differences along both axes. These must exceed what
-    rounding causes, and half of those along rows alone: structure makes smaller ones."""
+    rounding causes, and half of the differences along rows alone: structure causes smaller ones."""
     along_rows, along_both = [], []
     top, left = (max(0, n - _LONGEST_EDGE) // 2 for n in frames.shape[1:])
     middle = np.s_[top : top + _LONGEST_EDGE, left : left + _LONGEST_EDGE]
@@ -180,6 +180,6 @@ def _shows_noise(frames: NDArray[np.generic], level: float) -> bool:
     rows, both = np.concatenate(along_rows), np.concatenate(along_both)
     unclipped = np.isfinite(both)
     if not unclipped.any():
-        return True  # every pixel is clipped or next to one that is: no pixel can tell
+        return True  # all pixels are clipped or next to clipped ones, so none can tell
     in_rows, in_both = (float(np.median(np.abs(d[unclipped]))) / norm for d, norm in ((rows, 6**0.5), (both, 6.0)))
     return in_both > max(_ROUNDING, _RELATIVE * level, _WHITE * in_rows)

@@ -160,7 +160,8 @@ def export_stored(
     volume: Volume, to: str, target: Path, subject: str, scale_of: ScaleOf | None = None,
     labels: DicomLabels | None = None, unit: str = _PLAIN,
 ) -> None:  # fmt: skip
-    """Writes a volume as ``export_volume`` does. subject: names it in messages. unit: a note for values without HU scale."""
+    """Writes a volume as ``export_volume`` does. subject: names the volume in messages. unit: a note for values without HU
+    scale."""
     if to in CLOUDS:
         CLOUDS[to](target, writers.gaussians_of(volume, subject))
         return

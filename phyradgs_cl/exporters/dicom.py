@@ -28,7 +28,7 @@ _LONGEST = 64  # DICOM's limit in characters for names (PN) and descriptions (LO
 @dataclass(frozen=True)
 class DicomLabels:
     """Labels by which viewers and archives list a series; None writes none. patient: name (Family^Given) and ID. title, date
-    (YYYY-MM-DD): of the study. description: of the series. Raises InputError for text that DICOM cannot hold."""
+    (YYYY-MM-DD): the study's. description: the series'. Raises InputError for text that DICOM cannot hold."""
 
     patient: str | None = None
     title: str | None = None
@@ -74,7 +74,7 @@ def write_dicom(path: Path, volume: Volume, note: str, labels: DicomLabels) -> N
     unit = "HU" if of_note(note)[0] else "1/mm"
     slope, grid = _rescale_slope(volume.values, unit), volume.required_grid
     content = volume.values.tobytes() + repr((grid.voxel_size_mm[::-1], grid.first_centre_mm[::-1])).encode()
-    content += repr(labels.given).encode() if labels.given else b""  # other labels must give another study's UIDs
+    content += repr(labels.given).encode() if labels.given else b""  # other labels are another study with other UIDs
     seed, generate = hashlib.sha256(content).hexdigest(), pydicom.uid.generate_uid
     uid = {n: generate(entropy_srcs=[seed, unit, n]) for n in ("study", "series", "frame")}
     with folder_written_beside(path) as folder:

@@ -19,7 +19,7 @@ from phyradgs_cl.io.output import written_beside
 from phyradgs_cl.io.volume import Volume
 
 _WRITERS = {".mha": "MetaImageIO", ".nii": "NiftiImageIO", ".nii.gz": "NiftiImageIO", ".nrrd": "NrrdImageIO"}
-_MOST_NIFTI_VOXELS = 32_767  # NIfTI's limit along one axis
+_MOST_NIFTI_VOXELS = 32_767  # NIfTI allows at most this many voxels along an axis
 _MOST_IMAGEJ_BYTES = 4_000_000_000  # from this size on BigTIFF is written: offsets in ImageJ's TIFF have 32 bits
 _CHUNK = 64  # voxels of a chunk along each axis; halving of the resolution ends when all fits into one chunk
 _PLY_NAMES = (
@@ -99,7 +99,7 @@ def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None, unit: str =
             shape, name = tuple((np.array(before.shape) // step).tolist()), f"s{len(levels)}"
             level = group.create_array(
                 name, shape=shape, chunks=tuple(min(n, _CHUNK) for n in shape), dtype="float32",
-                dimension_names=list("zyx"), config={"write_empty_chunks": True},  # else a lost chunk looks empty
+                dimension_names=list("zyx"), config={"write_empty_chunks": True},  # else a lost chunk reads as zeros
             )  # fmt: skip
             for start in range(0, shape[0], _CHUNK):
                 stop = min(start + _CHUNK, shape[0])
@@ -138,7 +138,7 @@ def gaussians_of(volume: Volume, subject: str) -> dict[str, np.ndarray]:
 
 
 def write_npz(path: Path, cloud: dict[str, np.ndarray]) -> None:
-    """Writes the arrays of ``gaussians_of`` by their names, without a pickle."""
+    """Writes the arrays of ``gaussians_of`` to one .npz file, by their names and without a pickle."""
     with written_beside(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **cloud)  # type: ignore[arg-type]
 

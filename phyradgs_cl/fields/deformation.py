@@ -68,7 +68,7 @@ class Deformation:
         dense_mm = checks.numbers("displacements_mm", displacements_mm, (len(times_s), *grid.shape, 3))
         checks.whole("rank", rank, 1, 1000)
         rows = dense_mm.reshape(len(times_s), -1)
-        squares, vectors = np.linalg.eigh(rows @ rows.T)  # (T, T): much smaller than ``rows``
+        squares, vectors = np.linalg.eigh(rows @ rows.T)  # of a matrix (T, T), much smaller than ``rows``
         weights = vectors[:, ::-1][:, : min(rank, len(times_s))]
         largest = np.abs(weights).max(0)
         fields_mm = (weights * largest).T @ rows
@@ -111,7 +111,7 @@ class Deformation:
         return np.stack([np.interp(times, self.times_s, column) for column in self.weights.T], -1)
 
     def displacement_mm(self, points_mm: "ArrayLike", weights: "ArrayLike") -> np.ndarray:
-        """Returns w (n, 3) float64 in mm at points (n, 3), x y z, for fields weighted by ``weights`` (R,)."""
+        """Returns displacements w (n, 3) float64 in mm at points (n, 3), x y z, for fields weighted by ``weights`` (R,)."""
         control_mm = self._state(weights)
         place = self._in_spacings(np.asarray(points_mm, np.float64)).T[::-1]
         components = [
@@ -121,7 +121,7 @@ class Deformation:
         return np.stack(components, -1)
 
     def jacobian(self, points_mm: "ArrayLike", weights: "ArrayLike") -> np.ndarray:
-        """Returns ∂w_i/∂y_j (n, 3, 3) at points (n, 3), x y z, for fields weighted by ``weights`` (R,)."""
+        """Returns the derivative ∂w_i/∂y_j (n, 3, 3) at points (n, 3), x y z, for fields weighted by ``weights`` (R,)."""
         control_mm = np.pad(self._state(weights), [(1, 1)] * 3 + [(0, 0)])
         place = self._in_spacings(np.asarray(points_mm, np.float64))[..., None]
         taps = np.floor(place).astype(np.int64) + np.arange(-1, 3)  # (n, 3, 4): the control points that act on each point
@@ -133,17 +133,17 @@ class Deformation:
         return np.stack([np.einsum("na,nb,nc,nabci->ni", *three, vectors) for three in factors], -1)
 
     def on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
-        """Returns w (nz, ny, nx, 3) float32 in mm, x y z, at the voxel centres of ``grid`` for ``weights`` (R,)."""
+        """Returns displacements w (nz, ny, nx, 3) float32 in mm, x y z, at the voxel centres of ``grid`` for ``weights``
+        (R,)."""
         along_z, along_y, along_x = self.bases(grid)
         rows = np.einsum("zk,kyxi->zyxi", along_z, self._state(weights), optimize=True)
         planes = np.einsum("yk,zkxi->zyxi", along_y, rows, optimize=True).astype(np.float32)
         return np.einsum("xk,zyki->zyxi", along_x.astype(np.float32), planes, optimize=True)
 
     def inverse_on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
-        """Returns u (nz, ny, nx, 3) float32 in mm: matter at x in the reference volume has moved to x + u(x).
+        """Returns displacements u (nz, ny, nx, 3) float32 in mm: matter at x in the reference volume has moved to x + u(x).
 
-        u(x) = −w(x + u(x)) is iterated from u = 0. Raises InputError where this does not converge, as where the field
-        folds."""
+        u(x) = −w(x + u(x)) is iterated from u = 0. Raises InputError if this does not converge, as where the field folds."""
         z, y, x = np.meshgrid(*grid.axes_mm(), indexing="ij")
         centres_mm = np.stack([x.ravel(), y.ravel(), z.ravel()], -1)
         return self.inverse_mm(centres_mm, weights).reshape(*grid.shape, 3).astype(np.float32)
@@ -166,7 +166,7 @@ class Deformation:
         Without a grid, points half a control spacing apart are tested. To save time, weights are rounded to a 16th of each
         field's largest weight, and slopes below 1e-4 count as 0."""
         grid = grid or self._half_spacing_grid()
-        slopes = np.stack([self._slopes(grid, control_mm) for control_mm in self.control_mm])  # (R, 3, 3, n)
+        slopes = np.stack([self._slopes(grid, control_mm) for control_mm in self.control_mm])  # of each field, (R, 3, 3, n)
         largest = np.abs(self.weights).max(axis=0)
         step = np.maximum(largest / _LEVELS, np.finfo(float).tiny)
         states = np.unique(np.round(self.weights / step), axis=0) * step

@@ -62,7 +62,7 @@ class Gaussians:
     def of_covariance(cls, mean: np.ndarray, covariance: np.ndarray, density: np.ndarray) -> "Gaussians":
         """Makes a cloud from means (G, 3), covariances (G, 3, 3) and densities (G,)."""
         variance, axes = np.linalg.eigh(covariance)
-        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # eigenvectors may form a reflection: no quaternion fits
+        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # else eigenvectors may form a reflection
         x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(axes).as_quat().T
         return cls(mean, np.sqrt(variance), np.stack([w, x, y, z], -1), density)
 
@@ -87,8 +87,7 @@ class Activation:
         return rows
 
     def invert(self, rows: np.ndarray) -> np.ndarray:
-        """Returns raw rows for parameter rows (11, G). Scales are kept a little inside their bounds, where the sigmoid's
-        inverse is finite."""
+        """Returns raw rows for parameter rows (11, G). Keeps scales a little inside their bounds for a finite inverse."""
         raw = np.array(rows, dtype=np.float64)
         span = self.scale_max - self.scale_min
         raw[SCALE] = scipy.special.logit(np.clip((rows[SCALE] - self.scale_min) / span, 1e-4, 1 - 1e-4))

@@ -137,7 +137,7 @@ def _numbers(option: str, value: Any, counts: tuple[int, ...], example: str) -> 
     parts = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
     parts = [part.item() if isinstance(part, np.generic) else part for part in parts]
     fits = len(parts) in counts and all(isinstance(n, int | float) and not isinstance(n, bool) for n in parts)
-    if not (fits and all(abs(n) < 1e300 for n in parts)):  # false for NaN too
+    if not (fits and all(abs(n) < 1e300 for n in parts)):  # a comparison with NaN is false, so NaN is refused too
         many = " or ".join(str(count) for count in counts)
         expected = f"{many} finite numbers" if counts != (1, 3) else "a finite number, or three (z, y, x)"
         raise InputError(option, checks.short_repr(value), expected, f"write for example {example}")

@@ -112,7 +112,7 @@ class SplineVolume:
         self._coefficients: np.ndarray | None = None
 
     def deformed(self, deformation: Deformation, weights: np.ndarray) -> np.ndarray:
-        """Returns v(y + w(y)) (nz, ny, nx) float32 at every voxel centre y, for displacements w with ``weights`` (R,)."""
+        """Returns the deformed volume v(y + w(y)), (nz, ny, nx) float32, for displacements w with ``weights`` (R,)."""
         if not np.any(deformation.reach_mm * np.abs(weights)):
             return self.volume
         if self._coefficients is None:

@@ -27,7 +27,7 @@ _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_di
 Length = float | Callable[[], float]
 Pitch = tuple[float, float] | Callable[[], tuple[float, float]]
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_VIEW_DIGITS = 5  # views are equal if cosine and sine of their angles, or their scaled poses, agree to so many decimals
+_VIEW_DIGITS = 5  # views are equal if cosine and sine of their angles, or their scaled poses, agree to this many decimals
 _SLACK = 1e-6  # pose tables are extended by this fraction of a frame's duration, so that rounding leaves no time outside
 
 
@@ -144,7 +144,8 @@ class Turned:
         return array[..., ::-1] if self.columns else array
 
     def poses(self, pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-        """Converts poses (..., 12), see ``PoseTable``, of stored images to those of flipped ones. panel: (rows, columns)."""
+        """Converts poses (..., 12), see ``PoseTable``, of stored images to the poses of flipped images. panel: (rows,
+        columns)."""
         pose = np.array(pose, np.float64)
         sides = (self.rows, panel[0], slice(9, 12)), (self.columns, panel[1], slice(6, 9))
         for count, step in ((count, step) for is_flipped, count, step in sides if is_flipped):
@@ -223,15 +224,15 @@ def _check_turn(trajectory: CircularOrbit | PoseTable, middle_s: np.ndarray, sub
 
 
 def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
-    """Replaces a geometry's lengths by those that options give. Raises InputError for distances of a parallel beam."""
+    """Replaces a geometry's lengths by the lengths that options give. Raises InputError for distances of a parallel beam."""
     return (parallel if isinstance(geometry, ParallelGeometry) else cone)(options, *astuple(geometry))
 
 
 def parallel(
     options: ImportOptions, panel: tuple[int, int], pitch_mm: Pitch, offset_mm: tuple[float, float]
 ) -> ParallelGeometry:
-    """Returns a parallel beam from the options' numbers, else the arguments, which are the file's. Raises InputError for an
-    option that is a distance."""
+    """Returns a parallel beam, whose numbers are the options', or else those of the file, which are the arguments. Raises
+    InputError for an option that is a distance."""
     for name in options.given(_DISTANCES):
         expected, remedy = "no distance: this file has a parallel beam", "leave it out"
         raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
@@ -242,9 +243,9 @@ def cone(
     options: ImportOptions, to_axis_mm: Length, to_detector_mm: Length, panel: tuple[int, int], pitch_mm: Pitch,
     offset_mm: tuple[float, float], names: Mapping[str, str] | None = None,
 ) -> ConeGeometry:
-    """Returns a cone beam from the options' numbers, else the arguments, the file's. An argument may be a function, which is
-    called only if no option replaces it, so that a file may lack it. names: what the file calls the numbers, for messages.
-    Raises InputError unless the panel stands behind the axis."""
+    """Returns a cone beam, whose numbers are the options', or else those of the file, which are the arguments. An argument
+    may be a function that reads the file. It is called only if no option replaces it, so that the file may lack the number.
+    names: what the file calls the numbers, for messages. Raises InputError unless the panel stands behind the axis."""
     axis_mm, detector_mm = map(partial(_taken, options), _DISTANCES, (to_axis_mm, to_detector_mm))
     if detector_mm <= axis_mm:
         axis, detector = (options.called(name, names) for name in _DISTANCES)

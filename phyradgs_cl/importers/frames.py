@@ -19,7 +19,7 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
-_PIXELS = 1 << 16  # so many pixels of each frame are compared with other frames; all would take long and tell little more
+_PIXELS = 1 << 16  # this many pixels of each frame are compared with other frames; all would take long and show little more
 
 # A flat or dark is left out if its median differs from the others' by more than this fraction of the flats' median.
 _TOGETHER = 0.1  # largest difference among flats of one time, in which the tube hardly drifts
@@ -27,8 +27,8 @@ _APART = 0.3  # largest difference among flats of several times, between which t
 _DARK = 0.02  # largest difference among darks
 
 # A flat or dark is left out too if its pixels differ from the others', in the mean, by more than the sum of these two.
-_PATTERN = 0.02  # allowed difference, as a fraction of the flats' median
-_TIMES = 5.0  # allowed difference, as a multiple of its median over the frames
+_PATTERN = 0.02  # allowed mean difference of pixels, as a fraction of the flats' median
+_TIMES = 5.0  # allowed mean difference of pixels, as a multiple of its median over the frames
 _BLOCK_BYTES = 1 << 26  # memory of a block of rows whose median is taken: a float64 copy of all frames would be large
 Mask = np.ndarray | None
 TAKEN = "taken"
@@ -40,7 +40,7 @@ _SAME = 1e-3  # flats up to this fraction above the saturation level are clipped
 @dataclass(frozen=True, eq=False)
 class Light:
     """Flats (G, v, u) at G times, and the dark (1, v, u) or None. place (P,): the time of each projection, counted in
-    flats: 0.5 is halfway from the first to the second. used: how many flats and darks are used. said: that as text."""
+    flats: 0.5 is halfway from the first to the second. used: the numbers of flats and darks used. said: this in words."""
 
     flats: np.ndarray
     dark: np.ndarray | None
@@ -61,7 +61,8 @@ def light_of(
 ) -> Light:
     """Returns the flats and dark for ``count`` projections, from flats and darks (n, v, u). Of three or more, those that do
     not fit the others are left out, with a warning. at (n,): when flats were taken, as in ``places``; None: not stated.
-    names: of the "flats" and "darks", for messages. Raises InputError for the option flats "time" if all are of one time."""
+    names: what messages call the "flats" and "darks". Raises InputError for the option flats "time" if all flats are of one
+    time."""
     at, assumed = _times(subject, len(flats), count, options, at)
     light = max(float(np.median(_levels(flats)[1])), 1e-30)
     times = [np.flatnonzero(at == time) for time in np.unique(at)]
@@ -91,7 +92,8 @@ def median(stack: np.ndarray) -> np.ndarray:
 def _times(
     subject: str, flats: int, count: int, options: ImportOptions, at: np.ndarray | None
 ) -> tuple[np.ndarray, str]:
-    """Returns when flats were taken (n,), as in ``places`` (all equal: use the median), and a text about assumptions."""
+    """Returns when flats were taken (n,), as in ``places``, and a text about assumptions. At equal times their median is
+    used."""
     if options.flats != "time":
         return np.zeros(flats) if at is None or options.flats else at, ""
     if flats < 2 or (at is not None and np.ptp(at) == 0):
@@ -112,9 +114,9 @@ def _fitting(
     kind: str, stack: np.ndarray, group: np.ndarray, tolerance: float, subject: str, light: float,
     names: Mapping[str, Sequence[str]],
 ) -> np.ndarray:
-    """Returns which frames, bool (k,), are like the others in median and pattern. group (k,): their indices in ``stack``.
-    tolerance: of the median, as a fraction of ``light``, the flats' median counts. All are kept if no majority shows which
-    are right. Warns of each that is unlike."""
+    """Returns which frames, bool (k,), are like most in median and pattern. group (k,): the frames' indices in ``stack``.
+    tolerance: largest difference of medians, as a fraction of ``light``, the flats' median counts. Keeps all if there is no
+    majority. Warns of each frame that it leaves out."""
     some, level = _levels(stack[group])
     usual = float(np.median(level))
     is_odd = np.abs(level - usual) > tolerance * light
@@ -138,8 +140,8 @@ def _fitting(
 
 @dataclass(frozen=True, eq=False)
 class LineIntegrals:
-    """Line integrals (P, v, u) float32 and the mask of unusable pixels: (v, u), (P, v, u) or None. saturation: of the raw
-    counts, or None. applied: entries about flats and darks for the provenance."""
+    """Line integrals (P, v, u) float32 and the mask of unusable pixels: (v, u), (P, v, u) or None. saturation: how raw
+    counts were clipped, or None. applied: entries about flats and darks for the provenance."""
 
     values: np.ndarray
     mask: Mask

@@ -42,8 +42,8 @@ def is_address(text: object) -> bool:
 class Places:
     """The addresses in HDF5 of a scan's arrays.
 
-    - stated: by name of the array (one of ``NAMES``), a list of FILE:/ADDRESS, or of /ADDRESS in ``source``. Under "axes"
-      it has the order of the frames' axes. subject: what states the addresses, for messages.
+    - stated: for each array (one of ``NAMES``), a list of FILE:/ADDRESS, or of /ADDRESS in ``source``. Under "axes" it has
+      the order of the frames' axes. subject: what states the addresses, for messages.
     - linked_folder: see ``open_hdf5``. folder: the only folder from which files are read; None allows any."""
 
     stated: Mapping[str, Sequence[str]]
@@ -70,7 +70,7 @@ class Places:
             yield other, f"/{address}"
 
     def _at(self, name: str, usual: Sequence[str]) -> Sequence[str]:
-        """Returns the addresses stated for an array, else those of the format (``usual``) that the file has."""
+        """Returns the addresses stated for an array, else the format's (``usual``), as far as the file has them."""
         there = [address for address in usual if self.source is not None and self.source.find(address) is not None]
         return self.stated.get(name, there)
 
@@ -124,7 +124,7 @@ class Places:
         for name, addresses in (("flats", flats), ("darks", darks), ("mask", mask)):
             if parts := self.stack(name, addresses, panel):
                 stacks[name] = parts[0]
-                at = {"pre": -0.5, "post": int(used.sum()) - 0.5}  # time of flats, by the end of their address
+                at = {"pre": -0.5, "post": int(used.sum()) - 0.5}  # when flats were taken, by the end of their address
                 ends = [text.rpartition("_")[2] for text in parts[1]]
                 if name == "flats":
                     flats_at = np.repeat([at.get(end, np.nan) for end in ends], list(parts[1].values()))
@@ -275,8 +275,8 @@ def beam(
 
 def exposure_s(source: Hdf5Source, address: str, used: np.ndarray, options: ImportOptions) -> float | None:
     """Returns the exposure in s of the frames marked in ``used``, bool (F,), or the option that replaces it; None if the
-    file has none. If it differs between frames, a fly-scan raises InputError. A gantry that stops for every frame does not
-    need it: the result is then None, with a warning."""
+    file has none. If it differs between frames, a fly-scan raises InputError. A scan whose gantry stops needs no exposure:
+    the result is then None, with a warning."""
     if options.exposure_s is not None:
         return options.exposure_s if source.find(address) is not None else None
     try:

@@ -29,7 +29,7 @@ from phyradgs_cl.io.volume import Volume, finite_float32, shares_of_maximum
 _log = logging.getLogger(__name__)
 STACKS = (".mha", ".mhd")
 _SPACES = ("left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las", "")
-_HEAD_BYTES = 1 << 16  # a header is read from so many bytes at the file's start
+_HEAD_BYTES = 1 << 16  # a header is read from this many bytes at the file's start
 _VOXEL_BYTES = 8  # bytes of memory per voxel while a file is read
 _NOTE = "ITK_FileNotes"  # SimpleITK's name for a file's comment, which is NIfTI's field descrip
 _READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", ".nrrd": "Nrrd"}
@@ -142,7 +142,7 @@ def read_image_volume(path: Path, state: int | None = None) -> Volume:
 
 
 def _nrrd_header(path: Path) -> dict[str, str]:
-    """Reads the header of a NRRD file; SimpleITK shows only some of it. Raises InputError for an unknown space."""
+    """Reads the header of a NRRD file, of which SimpleITK shows only a part. Raises InputError for an unknown space."""
     with open(path, "rb") as file:
         lines = file.read(_HEAD_BYTES).split(b"\n\n")[0].decode("latin-1").splitlines()
     header = {key.strip().lower(): value.strip() for key, sign, value in (line.partition(":") for line in lines) if sign}

@@ -57,7 +57,7 @@ def _is_dicom(path: Path) -> bool:
         return file.read(132)[128:] == b"DICM"
 
 
-# By format: its module in formats/, which is loaded when it is needed, and whose scans it reads, for the help.
+# For each format: its module in formats/, loaded when it is needed, and the program whose scans it reads, for the help.
 # A module has recognises(path) -> bool and import_scan(path, options) -> Scan, for a file or a folder.
 # For MODULE:END the module's functions are recognises_END and import_scan_END.
 FORMATS = {

@@ -81,7 +81,7 @@ class ImportOptions:
     def __post_init__(self) -> None:
         checks.fields_within(self.named, self)
         axis, direction = readout_order(self.first, self.readout_axis, self.readout_direction, self.named)
-        stated = {  # values for the fields that every format reads
+        stated = {  # fields that every format reads, and their values
             "readout_axis": axis, "readout_direction": direction,
             "frame_time_s": frame_time_of(self.fps, self.frame_time_s, self.named),
             "exposure_s": seconds_of("exposure", self.exposure_ms, self.exposure_s, self.named),
@@ -106,7 +106,7 @@ class ImportOptions:
             raise InputError(error.subject, error.found, error.expected, remedy) from error
 
     def angle_rad(self, count: int, stored: Callable[[], np.ndarray]) -> np.ndarray:
-        """Returns angles (count,) in rad: those of the option ``angles``, else what ``stored`` reads."""
+        """Returns angles (count,) in rad, from the option ``angles``, else those that ``stored`` reads."""
         if self.angles is None:
             return self.taken("angles", stored)
         if not (steps := _STEPS.fullmatch(self.angles)):

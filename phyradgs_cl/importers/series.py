@@ -28,12 +28,12 @@ _STEADY_ANGLES = 0.75  # angles or times with fewer regular steps are uneven: no
 _SMALL = 0.25  # a group of files with the same words holds no frames if it is smaller than this fraction of the largest
 _BEFORE, _AFTER = (re.compile(rf"(?<![a-z])({words})(?![a-z])", re.I) for words in ("before|pre|start", "after|post|end"))
 _STAMP = 10**7  # numbers from here on are times in milliseconds, not indices
-_MOST_NAMES = 8  # file names that a message lists at most
+_MOST_NAMES = 8  # a message lists at most this many file names
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Files in the scan's order. numbers (F,): those in their names, or None. said: which files were taken, as text."""
+    """Files in the scan's order. numbers (F,): the numbers in their names, or None. said: which files it has, in words."""
 
     paths: list[Path]
     numbers: np.ndarray | None
@@ -83,8 +83,9 @@ def series_of(
     paths: Sequence[Path], subject: str, remedy: str, *, order: int | None = None, holes: bool = False, skip: int = 0
 ) -> Series:
     """Returns the frames among files, in order. subject: names the files in messages. remedy: what to do about a missing
-    number. order: which number in the names gives the order, 1 the first; None finds it. holes: numbers may be missing.
-    skip: length of a prefix that all files have. Raises InputError for a missing or repeated number, and several series."""
+    number. order: which number in the names gives the order, 1 the first; None finds it. holes: whether numbers may be
+    missing. skip: length of a prefix that all names have. Raises InputError for a missing or repeated number, and several
+    series."""
     paths = list(paths) if skip else _of_one_series(list(paths), subject)
     columns = _columns([path.stem[skip:] for path in paths])
     if order is not None and order not in {column.place for column in columns}:
@@ -207,8 +208,8 @@ def _column(place: int, numbers: tuple[re.Match[str], ...]) -> Iterator[_Column]
 
 
 def flat_places(flats: list[Path], darks: list[Path], series: Series) -> np.ndarray | None:
-    """Returns when flats were taken (n,), as in ``frames.places``. Words such as "before" in their names show it, or numbers
-    that continue through flats, darks and projections. Returns None if neither does."""
+    """Returns when flats were taken (n,), as in ``frames.places``. Words such as "before" in the flats' names show it, or
+    numbers that continue through flats, darks and projections. Returns None if neither does."""
     ends = [[bool(words.search(path.stem)) for path in flats] for words in (_BEFORE, _AFTER)]
     if flats and all(map(np.logical_xor, *ends)):
         return np.where(ends[0], -0.5, len(series.paths) - 0.5)

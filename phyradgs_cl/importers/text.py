@@ -21,7 +21,7 @@ _COLUMNS = re.compile(r",\s+|[;:\s]+")
 _ANGLE, _RAD = re.compile(r"angle|theta|phi|rot|deg", re.I), re.compile(r"\brad", re.I)
 _BRIGHTER = 1.2  # a pixel above this many times the stated counts of air is too bright: noise does not reach so far
 _FEW = 0.01  # this fraction of the pixels may be too bright, because they are broken
-_HEAD_BYTES = 1 << 14  # words of a format are searched in so many bytes at a file's start
+_HEAD_BYTES = 1 << 14  # words of a format are searched in this many bytes at a file's start
 TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
 
 
@@ -106,8 +106,8 @@ def _is_index(values: list[float]) -> bool:
 
 
 def _column(path: Path, names: list[str], table: list[list[float]], count: int, column: int | None) -> np.ndarray:
-    """Returns a table's angles in the stored unit: its only column or row, the column named as an angle, or that next to
-    an index, which gives the order. Raises InputError if several columns may be meant."""
+    """Returns a table's angles in the stored unit: its only column or row, the column named as an angle, or the one next to
+    an index, which gives the angles' order. Raises InputError if several columns may be meant."""
     widths = {len(row) for row in table}
     if widths == {1} or (len(table) == 1 and column is None) or (len(table) < count == sum(map(len, table))):
         return np.array([value for row in table for value in row])
@@ -147,7 +147,7 @@ def measured_angles_rad(path: Path, steps_rad: np.ndarray) -> np.ndarray:
 
 
 class Settings(Fields):
-    """Fields whose values are texts. Its methods read numbers from them, also those followed by a unit."""
+    """Fields whose values are texts. Its methods read numbers from the texts, also numbers with a unit behind."""
 
     def __init__(self, subject: str, values: Mapping[str, str | list[str]], comma_is_decimal: bool = False) -> None:
         super().__init__(subject, values)
@@ -209,7 +209,7 @@ def head_has(path: Path, *marks: bytes) -> bool:
 
 
 def say_missing(fields: Fields, meanings: Mapping[str, str]) -> None:
-    """Warns of names that the description lacks. meanings: by name, the value that is assumed instead."""
+    """Warns of names that the description lacks. meanings: the value that is assumed for each missing name."""
     if missing := [f"no {name} ({meaning})" for name, meaning in meanings.items() if not fields.has(name)]:
         _log.warning("%s %s", fields.subject, ", ".join(missing))
 

@@ -25,8 +25,8 @@ log = logging.getLogger(__name__)
 
 def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Volume:
     """Returns ``volume`` if it can be projected. Raises InputError about ``subject`` for values beyond 1e9 1/mm.
-    Raises it also if negative values sum to at least as much as positive ones, as in Hounsfield units. Warns if they sum to
-    more than a tenth of these, unless ``warn`` is False."""
+    Raises it also if negative values sum to at least as much as positive ones, as in Hounsfield units. Warns if negative
+    values sum to more than a tenth of the positive ones, unless ``warn`` is False."""
     values = volume.values
     if (size := float(np.abs(values).max())) > h5.ATTENUATION.largest:
         expected = f"attenuation of at most {h5.ATTENUATION.largest:g} 1/mm"
@@ -46,7 +46,7 @@ def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Vol
 
 def in_per_mm(subject: str, volume: Volume, mu_water_per_mm: float | None = None) -> Volume:
     """Returns a volume in 1/mm; if it was in Hounsfield units, with their scale. A file's note may say that values are in
-    Hounsfield units, and give their scale; else ``mu_water_per_mm`` gives it. Without a note, ``mu_water_per_mm`` converts
+    Hounsfield units, and state the scale; else ``mu_water_per_mm`` states it. Without a note, ``mu_water_per_mm`` converts
     volumes with values beyond 10 1/mm. Raises InputError about ``subject`` for noted Hounsfield units without a scale."""
     stated = None if mu_water_per_mm is None else Hounsfield(mu_water_per_mm)
     is_hu, scale = of_note(str(volume.provenance.get(VALUES, "")))

@@ -27,7 +27,7 @@ TABLES: dict[str, tuple[str, ...]] = {
     "readout": ("axis", "direction", "first", "ratio", "fps", "readout_ms"),
 }
 _WORDS = ("title",)
-MOST_LINES = 65_536  # no panel has more rows or columns
+MOST_LINES = 65_536  # a panel has at most this many rows or columns
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ def refuse_unknown(subject: str, names: Collection[str], allowed: Collection[str
 
 
 class Fields:
-    """A table whose values are read and checked one at a time. subject: names the table in messages. allowed: its possible
+    """A table whose values are read and checked one at a time. subject: names the table in messages. allowed: the possible
     keys; None allows any. Methods raise InputError, about "SUBJECT key", for missing and for wrong values."""
 
     def __init__(self, subject: str, values: object, allowed: Collection[str] | None = None) -> None:

@@ -15,7 +15,7 @@ COVERAGE = {
     "within_doubt_95": Metric("within the 95 % bar", "", ".3f"),
     "doubt_over_error": Metric("mean σ / RMS error", "", ".3f"),
 }
-_OBJECT, _AROUND = 0.01, 2  # the object is denser than 1 % of the truth's maximum; errors 2 voxels around it count too
+_OBJECT, _AROUND = 0.01, 2  # errors count in the object, denser than 1 % of the truth's maximum, and 2 voxels around
 
 
 def object_voxels(truth: Array) -> NDArray[np.bool_]:

@@ -171,7 +171,8 @@ def motion_error_mm(
 ) -> tuple[float, float]:
     """Returns the mean and 95th percentile of the distance in mm between two motions of the matter at ``points_mm`` (n, 3).
 
-    Both start there at the first time; distances are taken at the others. Raises InputError for fewer than two times."""
+    Both motions start from these points at the first time; distances are taken at all later times. Raises InputError for
+    fewer than two times."""
     if len(times_s) < 2:
         raise InputError("states", str(len(times_s)), "at least two, between which the object moves")
     error_mm = displaced_mm(estimate, points_mm, times_s) - displaced_mm(truth, points_mm, times_s)

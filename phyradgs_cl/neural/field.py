@@ -80,7 +80,7 @@ class LineAttention(nn.Module):
     def forward(self, values: torch.Tensor) -> torch.Tensor:
         query = self._by_head(self.to_query(values)) * self.scale
         key, value = (self._by_head(part) for part in self.to_key_value(values).chunk(2, -1))
-        likeness = (query.unsqueeze(2) * key.unsqueeze(1)).sum(-1)  # (L, segment, segment, heads)
+        likeness = (query.unsqueeze(2) * key.unsqueeze(1)).sum(-1)  # of each two values, (L, segment, segment, heads)
         share = (likeness + self.position.permute(1, 2, 0)).softmax(2)
         mixed = (share.unsqueeze(-1) * value.unsqueeze(1)).sum(2)
         return self.to_output(mixed.reshape(values.shape[0], -1))
@@ -91,7 +91,7 @@ class LineAttention(nn.Module):
 
 
 class LineAttentionBlocks(nn.Module):
-    """Alternates attention and feed-forward layers on values (P, width), each after a layer norm and with a skip
+    """Alternates attention and feed-forward layers on values (P, width), each with a layer norm before it and a skip
     connection."""
 
     def __init__(self, width: int, segment: int, heads: int, head_width: int, blocks: int) -> None:
@@ -160,10 +160,9 @@ def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
 
 
 class HashEncoding(nn.Module):
-    """Maps positions (P, 3) in [0, 1]³ to features (P, levels · features), interpolated linearly from the corners of a grid
-    cell.
+    """Maps positions (P, 3) in [0, 1]³ to features (P, levels · features), interpolated linearly from a grid cell's corners.
 
-    Each level is a finer grid. If it has at most 2^table_log2 corners, each has an entry of its own in the level's table.
+    Each level is a finer grid. If it has at most 2^table_log2 corners, each has its own entry in the level's table.
     Otherwise a hash assigns entries, and corners share them."""
 
     def __init__(
@@ -285,7 +284,7 @@ def _in_rows(
     filled = ceil_div(fast.size, field.segment) * field.segment
     fast = np.concatenate([fast, fast[-1] + fine.voxel_size_mm[2] * np.arange(1, filled - fast.size + 1)])
     slows, middles, fasts = grid.shape
-    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # rows of points, grouped by rows of voxels
+    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # where each row of points lies, grouped by voxels
     rows[..., 0], rows[..., 1] = slow.reshape(slows, 1, points, 1), middle.reshape(1, middles, 1, points)
     rows = rows.reshape(slows * middles, points**2, 2)
     values = np.empty((slows * middles, fasts), np.float32)

@@ -13,7 +13,7 @@ from phyradgs_cl.errors import InputError
 JITTERS = ("ray", "sample", "none")
 LAST_ACTIVATIONS = ("sigmoid", "leaky-relu")
 TORCH_DEVICES = ("auto", "cpu", "cuda", "mps")
-# The next three numbers hold unless the options state their own.
+# Densities of grid cells and samples, unless options state them.
 CELLS_PER_VOXEL = 1.0  # grid cells of the encoding's finest level per voxel of the longest side
 SAMPLES_PER_VOXEL = 1.5  # samples along a ray per voxel of the longest side: NAF takes 192 for 128 voxels
 # Fewer samples are enough for a pixel with a ray at each of several times: only the mean over its rays must be exact.
@@ -33,11 +33,10 @@ class NeuralOptions(MotionOptions):
     - voxel_points: points along each side of a voxel, whose value is the field's mean over them.
 
     - levels (0: until the finest has one cell per voxel), features, base_resolution (cells along a side), level_growth,
-      table_log2 (each level has at most 2^table_log2 entries): of the hash encoding.
-    - layers, width, last_activation: of the network. A sigmoid reaches at most density_bound, in units of FDK's 99.9th
+      table_log2 (each level has at most 2^table_log2 entries): sizes of the hash encoding.
+    - layers, width, last_activation: the network's shape. A sigmoid reaches at most density_bound, in units of FDK's 99.9th
       percentile. The field starts at first_share of that everywhere.
-    - rate: Adam's learning rate, multiplied by rate_factor every rate_step passes; step 0: once over the whole run,
-      gradually.
+    - rate: Adam's learning rate, multiplied by rate_factor every rate_step passes; step 0: once, gradually over the run.
     - detector_model: what the detector averages over a line's times, or the model that the scan states (scan).
     - torch_device: the device of PyTorch."""
 
@@ -107,8 +106,8 @@ class NeuralOptions(MotionOptions):
 class LineOptions(NeuralOptions):
     """Options of a field with a transformer over line segments, and windows of pixels in addition to the scattered ones.
 
-    segment: samples of a line segment. heads, head_width, blocks: of its attention. windows: how many a step uses; each has
-    ``window`` by ``window`` pixels."""
+    segment: number of samples in a line segment. heads, head_width, blocks: sizes of the attention within segments. windows:
+    number of windows per step, each of ``window`` by ``window`` pixels."""
 
     segment: int = checks.ranged(2, 1, 256)
     heads: int = checks.ranged(8, 1, 256)

@@ -17,7 +17,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural.field import NeuralField, repeatable, to_array, to_tensor, voxel_values
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
-_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's decay rates of both moments, and what it adds to its denominator
+_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's decay rates of both moments, and the constant in its denominator
 _POINTS_ON_CPU = 2**14  # a CPU evaluates the field at this many points at once: its cache holds them
 _POINTS_ELSEWHERE = 2**20  # another device evaluates more points at once: the memory of a GPU holds them
 _BEYOND_VOLUME = 2.0  # parallel rays begin this far from the volume's middle, in longest half-sides: beyond every corner
@@ -25,8 +25,8 @@ Field = Callable[[torch.Tensor], torch.Tensor]
 
 
 class Trainer:
-    """Fits a field to a scan's rays; a ``Loop`` runs it as a ``Stepwise``. A step takes one frame, an iteration all frames
-    once. Holds what changes from step to step: the field, its optimiser and the random draws.
+    """Fits a field to a scan's rays, step by step for a ``Loop``. A step takes one frame, an iteration all frames once.
+    Holds what changes from step to step: the field, its optimiser and the random draws.
 
     Lengths are in units of half the volume's longest side, attenuation in units of ``density_per_mm``."""
 
@@ -39,7 +39,7 @@ class Trainer:
         self.scan, self.options, self.device, self.iterations = scan, options, device, options.iterations
         self.field = field.to(device)
         self.density_per_mm = density_per_mm
-        self.unit = density_per_mm * scan.grid.half_longest_mm  # line integrals are divided by this
+        self.unit = density_per_mm * scan.grid.half_longest_mm  # internal unit of line integrals
         self.rng = np.random.default_rng(seed)
         motion = options.motion
         if type(motion) is PerRow:  # rays are evaluated one by one: times that lines share would save nothing
@@ -61,7 +61,7 @@ class Trainer:
 
     @property
     def iteration(self) -> int:
-        """How many times all frames have been used."""
+        """How many times the training has used all frames."""
         return self.steps // self.scan.frames
 
     @property
@@ -201,7 +201,7 @@ class Trainer:
 class ExposureRays:
     """The rays of one frame's pixels.
 
-    - pose (C, 12): of each time cell, in units of half the volume's longest side about the volume's centre.
+    - pose (C, 12): the pose of each time cell, in units of half the volume's longest side about the volume's centre.
     - cell (K, lines): the time cell of each of a line's K times, which have equal weights.
     - axis: whether lines are rows or columns. is_parallel: poses begin with the direction of the rays."""
 
@@ -242,7 +242,7 @@ class ExposureRays:
         Parallel rays begin in front of the volume."""
         rows, columns = pixels.T
         line = rows if self.axis == "rows" else columns
-        pose = self.pose[self.cell[times, line[:, None]]]  # (R, s, 12)
+        pose = self.pose[self.cell[times, line[:, None]]]  # the pose of each ray, (R, s, 12)
         along_row, down = columns[:, None, None], rows[:, None, None]
         centre = pose[..., 3:6] + along_row * pose[..., 6:9] + down * pose[..., 9:12]
         direction = pose[..., :3] if self.is_parallel else centre - pose[..., :3]
@@ -256,7 +256,7 @@ class ExposureRays:
         """Returns the rows and columns outside which no ray meets a box of ``half_sides`` (x, y, z) about 0."""
         corners = np.array(np.meshgrid(*[(-h, h) for h in half_sides], indexing="ij")).reshape(3, -1).T
         source, first, steps = self.pose[:, None, :3], self.pose[:, None, 3:6], self.pose[:, None, 6:12]
-        to_corner = corners - source  # (C, 8, 3)
+        to_corner = corners - source  # from each source to each corner of the box, (C, 8, 3)
         along, to_first = (source, first - corners) if self.is_parallel else (to_corner, first - source)
         matrix = np.stack(np.broadcast_arrays(along, -steps[..., :3], -steps[..., 3:]), -1)
         try:
@@ -333,7 +333,7 @@ def line_integrals(
 ) -> torch.Tensor:
     """Returns the integrals (R,) of a field along rays (R, 3), with one sample in each of ``samples`` intervals in the box.
 
-    ``shifts``: from ``sample_shifts``. If they are drawn uniformly, the expectation is the exact integral of any field."""
+    ``shifts``: what ``sample_shifts`` returns. If they are drawn uniformly, the expected result is the exact integral."""
     first, length = box_span(source, direction, half_sides)
     step = length / samples
     number = torch.arange(samples, dtype=source.dtype, device=source.device)
@@ -343,16 +343,17 @@ def line_integrals(
 
 
 def intensity_average(integrals: torch.Tensor, unit: float) -> torch.Tensor:
-    """Returns what a detector that averages intensity measures (R,), from the line integrals (R, K) at a pixel's K times.
-    Both are in multiples of ``unit``."""
+    """Returns the measurement (R,) of a detector that averages intensity, from the line integrals (R, K) at a pixel's K
+    times. Both are in multiples of ``unit``."""
     return (math.log(integrals.shape[1]) - torch.logsumexp(-unit * integrals, 1)) / unit
 
 
 def log_squares(integrals: torch.Tensor, measured: torch.Tensor, times: int) -> torch.Tensor:
-    """Returns squared errors (R,) of the mean over all K ``times`` of a pixel, estimated from s of them, integrals (R, s).
+    """Returns squared errors (R,) of the mean over all K ``times`` of a pixel, estimated from the line integrals (R, s) at s
+    of them.
 
     The squared error of a subset's mean is too large by the variance of that mean. This is estimated as the s samples'
-    variance times (1/s − 1/K), and subtracted. Expectation and gradient are then those of all K times."""
+    variance times (1/s − 1/K), and subtracted. Expectation and gradient are then the same as with all K times."""
     count = integrals.shape[1]
     squares = (integrals.mean(1) - measured) ** 2
     return squares if count == times else squares - (1 / count - 1 / times) * integrals.var(1, unbiased=True)

@@ -23,8 +23,8 @@ TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 
 
 class DctProx:
-    """Shrinks the block cosine transforms of volumes of a fixed ``shape`` (nz, ny, nx). A volume thinner than a block stays
-    the same."""
+    """Shrinks the block cosine transforms of volumes of one ``shape`` (nz, ny, nx). Volumes thinner than a block stay the
+    same."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int]) -> None:
         self.rt, self.shape = rt, shape
@@ -40,7 +40,8 @@ class DctProx:
     def __call__(
         self, volume: SameArray, threshold: float, turn: int, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Returns the shrunk volume (nz, ny, nx) float32. threshold: of the coefficients of the orthonormal transform.
+        """Returns the shrunk volume (nz, ny, nx) float32. threshold: by how much the coefficients of the orthonormal
+        transform shrink.
 
         turn: 0 to 3, chooses a quarter of the shifts. nonnegative: clips the result at 0. A device array gives a device
         array (``out``, if given)."""

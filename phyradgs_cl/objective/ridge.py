@@ -66,8 +66,8 @@ def learned_ridge() -> Ridge:
 
 
 class RidgeStep:
-    """Steps down the ridge regulariser for volumes of a fixed ``shape`` (nz, ny, nx). A volume thinner than a filter stays
-    the same."""
+    """Steps down the ridge regulariser for volumes of one ``shape`` (nz, ny, nx). Volumes thinner than a filter stay the
+    same."""
 
     VOLUMES = 4
     """Most memory of a step, in volumes of floats, if a volume has at least 50 slices and 64 voxels a row."""
@@ -95,7 +95,7 @@ class RidgeStep:
         observed, result = beside(self.rt, volume, out)
         padded = self._padded, Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))
         move(self.rt, (observed, Strides.plain(self.shape)), padded, self.shape)
-        is_thin = min(self.shape) < EDGE  # no filter fits in: the gradient stays 0
+        is_thin = min(self.shape) < EDGE  # the volume is thinner than a filter, so the gradient stays 0
         end = np.float32(step), np.int32(nonnegative), result
         # A response needs three slices of channels, so responses follow two slices behind the channels.
         for first in range(0, nz + 2, _SLICES):
@@ -107,7 +107,7 @@ class RidgeStep:
         return brought_to(self.rt, volume, result)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
-        """Runs a kernel on slices from ``first`` on. Its result has ``less`` fewer voxels along each axis than the
+        """Runs a kernel on slices from ``first`` on. Its result has ``less`` voxels fewer along each axis than the
         volume."""
         nz, ny, nx = (count - less for count in self.shape)
         start, stop = max(first, 0), min(first + _SLICES, nz)
@@ -119,7 +119,7 @@ class RidgeStep:
 
 
 def ridge_gradient(volume: np.ndarray, sigma: float, ridge: Ridge) -> np.ndarray:
-    """Returns ∇R of a volume (nz, ny, nx), float64; sigma in the volume's unit."""
+    """Returns the regulariser's gradient ∇R at a volume (nz, ny, nx), float64; sigma in the volume's unit."""
     volume = np.asarray(volume, np.float64)
     if min(volume.shape) < EDGE:
         return np.zeros_like(volume)
@@ -128,7 +128,7 @@ def ridge_gradient(volume: np.ndarray, sigma: float, ridge: Ridge) -> np.ndarray
 
 
 def ridge_step(volume: np.ndarray, sigma: float, step: float, *, ridge: Ridge, nonnegative: bool) -> np.ndarray:
-    """Returns v − ``step`` ∇R(v), float64: the twin of ``RidgeStep``, with the same arguments."""
+    """Returns a volume after a step down the regulariser, v − ``step`` ∇R(v), float64: the twin of ``RidgeStep``."""
     moved: np.ndarray = np.asarray(volume, np.float64) - step * ridge_gradient(volume, sigma, ridge)
     return np.maximum(moved, 0) if nonnegative else moved
 

@@ -44,7 +44,7 @@ class ImageLoss:
     def evaluate(
         self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float
     ) -> DeviceArray:
-        """Returns dL/d(rendered), valid until the next call. mask: 1 where a pixel counts, else 0. pixels: their number."""
+        """Returns dL/d(rendered), valid until the next call. mask: 1 if a pixel counts, else 0. pixels: how many count."""
         rt = self.rt
         vectors = ceil_div(self.width, rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
@@ -98,8 +98,7 @@ def _blur(image: np.ndarray) -> np.ndarray:
 
 
 class TotalVariation:
-    """Computes the anisotropic total variation of volumes of one ``shape`` (nz, ny, nx) with padded rows, and its
-    gradient."""
+    """Computes the anisotropic total variation of volumes of one ``shape`` (nz, ny, nx), padded, and its gradient."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], pitch: int) -> None:
         self.rt, self.shape, self.pitch = rt, shape, pitch

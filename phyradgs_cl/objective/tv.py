@@ -100,8 +100,8 @@ def tv_prox(
 
 
 def differences(volume: np.ndarray, axis_weights: tuple[float, ...]) -> np.ndarray:
-    """Returns weighted forward differences (3, z, y, x) along z, y, x; 0 at the last voxel. For states (K, z, y, x), those
-    between states come first."""
+    """Returns weighted forward differences (3, z, y, x) along z, y, x; 0 at the last voxel. For states (K, z, y, x), the
+    differences between states come first."""
     result = np.zeros((volume.ndim, *volume.shape))
     for axis, weight in enumerate(axis_weights):
         inner = tuple(slice(0, -1) if a == axis else slice(None) for a in range(volume.ndim))

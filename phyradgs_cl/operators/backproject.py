@@ -1,7 +1,6 @@
 """Voxel-driven backprojection with FDK's distance weight, with one pose per frame or one pose per line.
 
-If memory is short, the volume is computed part by part and fewer views are uploaded at a time. The result has the same
-bits."""
+If memory is short, the volume is computed part by part and fewer views are uploaded at a time. The bits stay the same."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -39,7 +38,7 @@ def backproject(
 
     frames (F, rows, columns) are interpolated bilinearly, and 0 outside; pose (F, 12) mm; weight (F,). power: 2 for FDK's
     distance weight, or 1. In a parallel beam z is 1. The volume (nz, ny, nx) float32 is on the device if ``frames`` are,
-    else on the host. Raises OutOfMemoryError if not even the smallest part of it fits."""
+    else on the host. Raises OutOfMemoryError if not even the smallest part of the volume fits."""
     matrices = voxel_matrices(pose, grid, is_parallel)
     block, leans = (0, False) if rt.pixel_items else _upright_block(matrices, grid)
     views = Views(frames, bool(block), matrices, weight)
@@ -85,7 +84,7 @@ class Views:
         return (columns, rows) if self.is_turned else (rows, columns)
 
     def bytes(self, count: int) -> int:
-        """Returns the bytes that ``count`` views take on the device."""
+        """Returns how many bytes ``count`` views take on the device."""
         rows, width = self.shape
         return 4 * count * int(2 * GUARD + rows * pitch_of(width) + self.matrices.shape[1] + 1)
 
@@ -134,7 +133,7 @@ def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch)
             for part in parts:
                 images = _images(rt, views, part)
                 launch(images, brick, padded)
-                del images  # frees their memory before the next views are uploaded
+                del images  # frees the views' memory before the next are uploaded
             if isinstance(volume, DeviceArray):
                 move(rt, (padded, _strides(brick)), (volume, Strides.plain(grid.shape, brick.start)), brick.shape)
             else:

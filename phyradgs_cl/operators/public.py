@@ -32,8 +32,8 @@ def moved_to(rt: Runtime, values: Values, on_device: bool) -> Any:
 
 
 def computed(rt: Runtime, on_device: bool, function: Callable[[Any], Values], values: Values) -> Any:
-    """Applies a function that needs its argument on the device (``on_device``), or on the host. The result is on the same
-    side as ``values``."""
+    """Applies a function that needs its argument on the device (``on_device``) or the host. Its result goes where ``values``
+    are."""
     return moved_to(rt, function(moved_to(rt, values, on_device)), isinstance(values, DeviceArray))
 
 
@@ -129,7 +129,7 @@ class Operator:
         return to_user_array(self.rt, y), by_x
 
     def derivative(self, x: Any) -> Any:
-        """Returns the derivative at x. Its ``T`` maps dL/dy (range_shape) to dL/dx (domain_shape). Computes A(x) for it."""
+        """Computes A(x) and returns the derivative at x, whose ``T`` maps dL/dy (range_shape) to dL/dx (domain_shape)."""
         return Derivative(self.vjp(x)[1])
 
     @property
@@ -217,7 +217,7 @@ class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy ha
     def _transpose(self) -> "LinearOperator":
         return self.T
 
-    _adjoint = _transpose  # the same for real numbers
+    _adjoint = _transpose  # for real numbers it is the transpose
 
 
 def _is_index(number: object, count: int) -> bool:

@@ -64,7 +64,7 @@ _HOLDER_AXES = (0.85, 0.85, 0.7)  # the holder contains every bead and stays in 
 
 
 def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
-    """Returns two horizontal circles of dense beads in a light holder. The beads of one stand above gaps of the other.
+    """Returns two horizontal circles of dense beads in a light holder. Beads of one circle stand above gaps of the other.
 
     Their round edges show blur and distortion, as in the phantoms that calibrate cone-beam scanners. The cube of side 2 ·
     ``half_size_mm`` is about the origin. A bead attenuates 1 / ``half_size_mm``, the holder 0.15 times that."""
@@ -172,9 +172,9 @@ def moving_sphere(half_size_mm: float, period_s: float = float(_STEPS)) -> Movin
     """Returns a ball in which a small sphere, half as dense, moves along y. The cube of side 2 · ``half_size_mm`` is about
     the origin.
 
-    With 64 mm it has the lengths of RTK's tests: a ball of radius 60 mm, and in it one of 8 mm that moves by ±8 mm in 8
+    With 64 mm it has the lengths of RTK's tests: a ball of radius 60 mm, and in it a sphere of 8 mm that moves by ±8 mm in 8
     frames of 1 s (S. Rit et al., J. Phys. Conf. Ser. 489, 012079, 2014). The ball attenuates 1 / ``half_size_mm`` and the
-    small sphere half of that, as with RTK's added densities of 2 and −1."""
+    small sphere half as much, as with RTK's added densities of 2 and −1."""
     positive("half_size_mm", half_size_mm)
     outer, inner, swing = (share * half_size_mm for share in (_OUTER, _INNER, _SWING))
     ball = Ellipsoid((0.0, 0.0, 0.0), (outer,) * 3, 1 / half_size_mm)

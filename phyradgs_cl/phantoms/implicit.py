@@ -62,8 +62,8 @@ class Lattice:
         return (z, y, x)
 
     def coverage(self, distance: Field) -> Field:
-        """Returns the fraction of each voxel inside a body at signed ``distance``, as if its surface were flat and parallel
-        to a voxel's face."""
+        """Returns the fraction of each voxel in a body at signed ``distance``, as if its surface were parallel to a voxel's
+        face."""
         return np.clip(0.5 - distance / np.float32(self.step), 0.0, 1.0)
 
 
@@ -135,7 +135,7 @@ def texture(
 ) -> Field:
     """Draws isotropic noise (n, n, n) float32 of variance 1: a sum of ``waves`` random cosines, averaged over each voxel.
 
-    Their wavelengths lie between the two given ones. The numbers drawn from ``rng`` do not depend on the resolution."""
+    Their wavelengths lie between the two ``wavelengths``. The numbers drawn from ``rng`` do not depend on the resolution."""
     direction = rng.standard_normal((waves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     k = 2 * np.pi * direction / rng.uniform(*wavelengths, waves)[:, None]  # rad per unit length

@@ -66,8 +66,9 @@ def find_sparks(
     """Returns the pixels, bool (F, v, u), of line integrals (F, v, u) that are brighter than an object can make them.
 
     They lie below the median of 5 × 5 pixels by ``least``, and by ``threshold`` standard deviations, estimated from the
-    median distance to it in 9 × 9 pixels. They are sharp in every direction and form groups of at most ``pixels``. A feature
-    that the frames before and after show nearby, at least half as high, is a gap of the moving object and no spark."""
+    median distance to that median in 9 × 9 pixels. They are sharp in every direction and form groups of at most ``pixels``.
+    A feature that the frames before and after show nearby, at least half as high, is a gap of the moving object and no
+    spark."""
     sparks = np.stack([_sparks_of(frame, threshold, least, pixels) for frame in frames])
     for f in np.flatnonzero(sparks.any(axis=(1, 2))) if len(frames) > 2 else ():
         height = _height(frames[f])
@@ -177,8 +178,8 @@ def _constant(frames: np.ndarray) -> np.ndarray:
 
 
 def _exceeding(frames: np.ndarray, deviations: float) -> np.ndarray:
-    """Returns the pixels, bool (v, u), far above or far below all neighbours in most frames. An object's edge is not: it
-    moves, or covers several pixels in a line."""
+    """Returns the pixels, bool (v, u), far above or far below all neighbours in most frames. Pixels at an object's edge are
+    not: the edge moves, or covers several pixels in a line."""
     above = np.mean([f > scipy.ndimage.maximum_filter(f, footprint=_NEIGHBOURS) for f in frames], axis=0)
     below = np.mean([f < scipy.ndimage.minimum_filter(f, footprint=_NEIGHBOURS) for f in frames], axis=0)
     difference = np.median([f - scipy.ndimage.median_filter(f, size=3) for f in frames], axis=0)

@@ -37,14 +37,14 @@ DEFAULT_STEPS = "sparks,dead,rings"
 STEPS_HELP = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 PREPARED_KEY = "prepared"
 """The key under which a scan's provenance lists the steps that were applied to it."""
-_ONCE = ("scatter", "hardening", "phase")  # a second correction would take away from what the first one left
+_ONCE = ("scatter", "hardening", "phase")  # a second correction would correct too much
 
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """flats: one of ``light.WAYS``; it acts when a file is read. steps: names of ``STEPS``, separated by commas. The other
-    fields are the options of the step of that name. Raises InputError for unknown steps, and for options of steps that are
-    not named."""
+    """flats: one of ``light.WAYS``; it acts when a file is read. steps: names of ``STEPS``, separated by commas. Each other
+    field has the options of the step of its name. Raises InputError for unknown steps, and for options of steps that are not
+    named."""
 
     flats: str = checks.option("mean", words=WAYS)
     steps: str = checks.option("", STEPS_HELP, "none", metavar="NAME,...")

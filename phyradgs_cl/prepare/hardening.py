@@ -29,16 +29,16 @@ log = logging.getLogger(__name__)
 Polynomial = tuple[float, float, float]
 BoneIn = Callable[[np.ndarray], np.ndarray]
 """Maps a volume (z, y, x) to the attenuation of the bone in each voxel."""
-_LARGEST = 1e3  # coefficients and attenuations beyond this cannot be meant
+_LARGEST = 1e3  # larger coefficients and attenuations must be mistakes
 _PASSES = 2  # rounds in which bone is taken from a volume and frames are corrected for it: the second round has better bone
 _BONE_VOXELS = 128  # a coarse volume is enough to find bone, because its hardening is smooth: voxels along the longest side
 # Candidates: soft tissue ends, and pure bone begins, at these fractions of the densest voxel (above 1: no voxel is pure).
 _BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in (0.4, 0.7, 1.0) if soft < bone]
 _BETWEEN += [(0.7, 1.0), (0.7, 1.5), (0.8, 1.5)]
-_AS_WELL = 0.1  # of candidates that explain at most this fraction less than the best one, the one with the least bone wins
+_AS_WELL = 0.1  # the candidate with least bone wins, of those that explain at most this fraction less than the best one
 _NEARLY = 1.02  # bone is corrected even if it leaves 2 % more unexplained than water: a stated voltage means a hardened scan
 _NEWTON = 3  # steps of Newton's method, enough for an error of 1e-12
-_UNIFORM = 0.08  # if the path leaves a larger relative RMS unexplained, the object has several materials
+_UNIFORM = 0.08  # the object has several materials if path lengths leave a larger relative RMS of line integrals unexplained
 _SHADOW = 0.1  # pixels whose path is longer than this fraction of the longest lie behind the object
 _WATER_TO = 8.0  # the polynomial of a voltage is fitted up to this line integral: 40 cm of water at 0.2/cm
 _NONE: Polynomial = (0.0, 0.0, 0.0)

@@ -29,12 +29,13 @@ _REWEIGHTINGS = 12
 _LEAST_PIXELS = 20  # with fewer pixels of air in a frame, their median is too noisy
 _AROUND = np.ones((3, 3), bool)
 _MARGIN = 2  # pixels this near to the object are no air, because its edge is blurred
-_PASSES = 3  # bright or dim light shifts the air, so the threshold follows its median, in this many rounds
+_PASSES = 3  # rounds in which the threshold of air follows the air's median, which bright or dim light shifts
 Counts = np.ndarray
 
 
 def flat_correction(way: str) -> ToAttenuation:
-    """Returns the function that converts counts to line integrals for ``read_scan``. way: how it uses the flats (``WAYS``).
+    """Returns the function that converts counts to line integrals for ``read_scan``. way: how the function uses the flats
+    (``WAYS``).
 
     The function takes data (F, v, u), image_key (F,) and the quantity, and returns line integrals (P, v, u) and bad pixels.
     It raises InputError for too few flats and, with "time" or "pca", for other quantities than counts."""

@@ -15,9 +15,9 @@ from phyradgs_cl.prepare.step import Facts, MakeModel
 
 _DENSER = 6.0  # metal attenuates 6 times as much as the main material: bone has up to 5 times water's, titanium 7 or more
 _FEWEST = 4  # fewer touching voxels than this are noise, not metal
-_BLIND = 2  # only masked rays pass this near to metal, in voxels, so the fill knows nothing there
+_BLIND = 2  # voxels this near to metal, in voxels, are filled from outside: all rays through them are masked
 _VOXELS = 128  # the volume that fills the shadow has at most this many voxels along its longest side, to save time
-_MOST, _OBJECT = 0.5, 0.02  # the shadow may cover half of the object, which exceeds 0.02 of the largest value in frames
+_MOST, _OBJECT = 0.5, 0.02  # the shadow may cover half of the object: of the pixels above 0.02 of the frames' largest value
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def _completed(masked: Scan, shadow: np.ndarray, is_metal: np.ndarray, make_mode
     """Returns the frames (F, v, u) with the shadow filled by the projection of a volume that the other pixels give. Its
     difference from the frames at the shadow's rim is interpolated across the shadow, so that no edge is left.
 
-    Only masked rays meet the voxels in and beside metal. These would stay near 0, so they get the density around them."""
+    Only masked rays meet the voxels in and next to metal. These would stay near 0, so they get the density around them."""
     model, _ = step.coarse_model(masked, make_model, _VOXELS)
     volume = model.regularised(masked.projections)
     factors = np.divide(volume.shape, is_metal.shape)
@@ -70,8 +70,8 @@ def _completed(masked: Scan, shadow: np.ndarray, is_metal: np.ndarray, make_mode
 
 
 def _main_level(volume: np.ndarray) -> float:
-    """Returns the attenuation of the main material in a volume (z, y, x): that above which half of the total attenuation
-    lies. Infinity for an empty volume."""
+    """Returns the main material's attenuation in a volume (z, y, x): voxels above it make up half of the total attenuation.
+    Infinity for an empty volume."""
     rising = np.sort(volume[volume > 0])
     if rising.size == 0:
         return float("inf")

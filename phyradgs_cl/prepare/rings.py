@@ -23,7 +23,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.bad_pixels import axis_column
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
-_LEAST_FRAMES = 8  # fewer views do not average the object enough to show rings: such scans stay as they are
+_LEAST_FRAMES = 8  # fewer views do not average the object enough to show rings: such scans stay unchanged
 _LEAST_PAIRS = 0.25  # columns are compared with their mirror images if at least this fraction of them has one on the panel
 _LEAST_SHARE = 0.25  # a pattern with less than this fraction of the variance of the mean's noise is not worth a correction
 _NEGLIGIBLE = 1e-4  # nobody sees a pattern with a smaller standard deviation in line integrals: gains off by 0.01 %
@@ -33,8 +33,8 @@ _SHIFTS = 8  # positions of the blocks along each side, over which the result is
 _DEVIATIONS = 8.0  # a wrong gain deviates by this many robust standard deviations, in both sets of views
 _LEAST = 2e-3  # a gain that is off by less, 0.2 %, is left alone
 _NEIGHBOURS = 7  # deviations are measured from the median of this many columns
-_NEAR = 21  # this many columns around a pixel tell how much its neighbours deviate
-_AXIS = 3  # near the axis an object's edges stay in one column, like rings: so many columns on each side are left alone
+_NEAR = 21  # the usual deviation near a pixel is the median over this many columns
+_AXIS = 3  # near the axis an object's edges stay in one column, like rings: this many columns on each side are left alone
 _UNEQUAL = 0.25  # the two sets of views may differ about a wrong gain by this fraction, plus 2 standard deviations
 _OBJECT = 0.5  # a pixel whose mirror image deviates by more than this fraction of its own deviation is left alone
 _EQUALLY_FAR = 1.15  # the sources of a full turn are nearly equally far from their mean: largest over smallest distance
@@ -51,7 +51,7 @@ class RingOptions(checks.Checked):
 
 @dataclass(frozen=True)
 class Strength:
-    """Variances, in line integrals squared: of the pattern, of the part of it that whole columns share, and of the noise in
+    """Three variances, in line integrals squared: of the pattern, of its part that whole columns share, and of the noise in
     the mean of all views. least: the variance above which a pattern is certain."""
 
     pattern: float
@@ -67,8 +67,8 @@ class Strength:
 def _strength(means: np.ndarray, axis_column: float) -> Strength:
     """Measures the pattern that all views share and no object can cause, from the means (2, v, u) of two sets of views.
 
-    Subtracting its mirror image from each column cancels the object, and second differences along rows remove what is left
-    of it. The covariance of both sets is the pattern's variance."""
+    Subtracting its mirror image from each column cancels the object, and second differences along rows remove the rest of
+    it. The covariance of both sets is the pattern's variance."""
     one, other = (_rough(_antisymmetric(mean, axis_column)) for mean in means)
     # a mean over half the views has twice the noise variance of that over all, and the difference of two such means four
     # times
@@ -138,7 +138,7 @@ def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: f
 
 def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarray:
     """Denoises an image (v, u): thresholds the coefficients of overlapping cosine blocks, then guides a Wiener filter by the
-    result. variances (2,): that of each pixel's own noise, and that of the noise that a whole column shares."""
+    result. variances (2,): the variance of each pixel's own noise, and of the noise that a whole column shares."""
     sigma = np.full((window, window), variances[0])
     # an error that a column shares is constant along it, so only the first row of coefficients has it
     sigma[0] += window * variances[1]
@@ -206,8 +206,7 @@ def _rough(image: np.ndarray) -> np.ndarray:
 
 
 def _covariance(one: np.ndarray, other: np.ndarray) -> float:
-    """Returns a robust covariance, which the few pixels at edges hardly change (Gnanadesikan and Kettenring, Biometrics
-    1972)."""
+    """Returns a robust covariance, which few edge pixels hardly change (Gnanadesikan and Kettenring, Biometrics 1972)."""
     return (robust_deviation(one + other) ** 2 - robust_deviation(one - other) ** 2) / 4
 
 

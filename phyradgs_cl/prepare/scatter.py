@@ -4,7 +4,7 @@ Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563. The square let
 ones, for which Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) take several kernels. The user states the width and the
 ratio of scatter to primary light. Otherwise a non-negative sum of Gaussians is fitted to the light in air beyond that of the
 flats, while each frame's light may vary. This may underestimate scatter behind the object. So stronger kernels are tried
-too. One is taken if the frames that it corrects agree far better with their own reprojection."""
+too. A stronger kernel is taken if the frames that it corrects agree far better with their own reprojection."""
 
 import itertools
 from collections.abc import Mapping
@@ -32,7 +32,7 @@ _USUAL_REACH = 0.18  # where the user states to_primary alone: spread (std) of s
 _HEIGHT_STEP = 1.25  # each kernel that is tried is stronger than the one before by this factor
 _MOST_STEPS = 8  # at most this many steps make the kernel stronger, up to 6 times the fitted one
 _TRIALS = 6  # most strengths tried in the final search, between the neighbours of the best one
-# The stronger kernel must leave less than this fraction of what the fitted one leaves unexplained; else the fit stands.
+# A stronger kernel is taken if it leaves less than this fraction of the rest that the fitted kernel leaves unexplained.
 _BETTER = 0.65
 _AS_WELL = 1.05  # no stronger kernel is tried once a kernel leaves this many times the least unexplained rest
 _LARGEST_HEIGHT = 20.0  # no kernel for a stated to_primary is stronger than this

@@ -21,9 +21,9 @@ _SMOOTH = 1 / 24  # blur over the panel's longer side: it leaves hardening and s
 class Model:
     """Reconstructs a scan and projects the volume again, on its grid: for steps that need to know the object.
 
-    volume: frames (F, v, u) to a volume (z, y, x) in 1/mm. frames: a volume to frames. regularised: as volume, but slower
-    and with a weak total-variation prior. shadow: from voxels, bool (z, y, x), the pixels, bool (F, v, u), whose rays meet
-    them at any time of the exposure."""
+    volume: reconstructs frames (F, v, u) to a volume (z, y, x) in 1/mm. frames: projects a volume. regularised: reconstructs
+    more slowly, with a weak total-variation prior. shadow: returns the pixels, bool (F, v, u), whose rays meet given voxels,
+    bool (z, y, x), at any time of the exposure."""
 
     volume: Callable[[np.ndarray], np.ndarray]
     frames: Callable[[np.ndarray], np.ndarray]
@@ -65,7 +65,7 @@ def _between_rows(frame: np.ndarray, good: np.ndarray, bad: np.ndarray) -> np.nd
 
 
 def with_masked(scan: Scan, bad: np.ndarray) -> Scan:
-    """Returns the scan with further pixels masked and interpolated: those of ``bad``, bool (v, u) or (F, v, u)."""
+    """Returns the scan with the pixels ``bad``, bool (v, u) or (F, v, u), masked and interpolated too."""
     if not bad.any():
         return scan
     mask = bad if scan.pixel_mask is None else (np.asarray(scan.pixel_mask) != 0) | bad
@@ -92,7 +92,7 @@ def object_in(volume: np.ndarray) -> np.ndarray:
 
 
 def densest(volume: np.ndarray) -> float:
-    """Returns the 99.9th percentile of a volume (z, y, x) in its middle: a cone beam does not see all of its ends."""
+    """Returns the 99.9th percentile in the middle of a volume (z, y, x), because a cone beam sees only part of its ends."""
     z, y, x = (np.abs(np.arange(n) - (n - 1) / 2) / max(n / 2, 1) for n in volume.shape)
     middle = (z[:, None, None] <= 0.6) & (y[None, :, None] ** 2 + x[None, None, :] ** 2 <= 0.9)
     return float(np.percentile(volume[middle], 99.9))

@@ -68,7 +68,7 @@ def remove_stripes(
 
 def _fluctuation(sinogram: np.ndarray) -> np.ndarray:
     """Returns the median change (u,) from view to view of a sinogram (F, u), by second differences. An object hardly adds to
-    it: it changes slowly, or passes in a few views."""
+    this change, because it changes slowly or passes in a few views."""
     return np.median(np.abs(np.diff(sinogram, 2, axis=0)), axis=0) / np.sqrt(6)
 
 

@@ -22,8 +22,8 @@ from phyradgs_cl.reconstructors.voxels.priors import PriorWeight, TvPrior, axis_
 from phyradgs_cl.reconstructors.voxels.run import Iterations, IterativeOptions, MethodRun
 from phyradgs_cl.runtime import Runtime
 
-_STACKS = 18  # memory of the method in arrays of all states' volumes
-_FRAMES = 3  # memory of the method in arrays of all frames
+_STACKS = 18  # memory of a run, in stacks of all states' volumes
+_FRAMES = 3  # memory of a run, in copies of all projections
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,10 @@ class ChangingOptions(IterativeOptions):
 
     - states: number of the object's states, each with as many frames; fewer if the scan has fewer frames.
     - prior_weight: weight of total variation in space, relative to the error of the data term's gradient.
-    - time_weight: weight of a voxel's change from one state to the next, relative to an equal step between two voxels.
-    - subsets: of the frames, with one step each; at most two for each frame of a state. tv_iterations: dual iterations per
-      proximal map."""
+    - time_weight: weight of a voxel's change from one state to the next, relative to an equal difference between
+      neighbouring voxels.
+    - subsets: number of subsets of the frames, each with one step; at most two for each frame of a state. tv_iterations:
+      dual iterations per proximal map."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 8)
     """Iterations of the two short runs that ``estimate`` times. Both begin with the slower first pass."""
@@ -49,8 +50,7 @@ class ChangingOptions(IterativeOptions):
 
 
 def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the object's states in 1/mm, and as the volume their mean. ``arguments``: as in ``MethodRun``; no seed is
-    used."""
+    """Returns the object's states in 1/mm, and their mean as volume. ``arguments``: as in ``MethodRun``; uses no seed."""
     times_s = state_times_s(scan, options.states)
     shape = (len(times_s), *scan.grid.shape)
     run = MethodRun(scan, options, rt, state_times_s=times_s, **arguments)

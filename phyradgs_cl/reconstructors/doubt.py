@@ -4,8 +4,9 @@
   the first hold the noise, other causes of the residual, and what the method does to such an object: blur, prior, missing
   views. That is a wild bootstrap (Wu, Ann. Stat. 14 (1986) 1261): each frame's residual keeps its size and shape, but a
   random sign. The second scan has the opposite signs (antithetic variables).
-- Analytic methods get every second frame, and the others. Half the difference of both volumes has the noise of the whole
-  scan's volume, and the streaks of missing views. A synthesised scan would not show these: FDK returns them unchanged.
+- Analytic methods get one half of the frames, every second one, and then the other half. Half the difference of both volumes
+  has the noise of the whole scan's volume, and the streaks of missing views. A synthesised scan would not show these: FDK
+  returns them unchanged.
 
 The numbers that turn this into σ come from procedural volumes (benchmarks/doubt.py), and from held-out pixels if there are
 any."""
@@ -36,28 +37,28 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import without_warnings
 
 MEASURED = ("fista", "fista-tv", "fdk", "asd-pocs", "cgls", "os-sart", "sart", "sirt")  # the law is fitted to the first 3
-RUNS = 3  # of the method: on the scan, and on two that are made of it
-PARTS = 2  # of a voxel along each side, for projections: the projector blurs by a voxel, which the scan did not
-_FEWEST_FRAMES = 4  # of analytic methods: with one frame in each half bars were 3 times too narrow
-_EDGE = 0.8  # voxels: standard deviation of the Gaussian whose derivative gives the slope of edges
-_DENSEST = 3.0  # times the object's mean density: denser matter counts as this
-LEAST = 0.01  # of the RMS of σ: no voxel is certain
-_SLOPES = (0.00387, -0.01443, 0.05385, -0.20096, 0, 0.20096, -0.05385, 0.01443, -0.00387)  # of a spline of cell means, / 4
-_KEPT = "doubt."  # begins the names of what a state keeps of the runs before
+RUNS = 3  # times that the method runs: on the scan, and on two scans made from it
+PARTS = 2  # voxels are divided by this along each side before they are projected: projecting large ones would blur
+_FEWEST_FRAMES = 4  # analytic methods need this many: with one frame in each half, bars were 3 times too narrow
+_EDGE = 0.8  # standard deviation, in voxels, of the Gaussian whose derivative gives the slope of edges
+_DENSEST = 3.0  # matter denser than this many times the object's mean density counts as this dense
+LEAST = 0.01  # least σ of a voxel, as a fraction of the RMS of σ: no voxel is certain
+_SLOPES = (0.00387, -0.01443, 0.05385, -0.20096, 0, 0.20096, -0.05385, 0.01443, -0.00387)  # 1/4 of a histospline's slopes
+_KEPT = "doubt."  # begins the names of arrays that a state keeps from complete runs
 _PARTS = {"gaussians": Gaussians, "deformation": Deformation, "states": States}
-_CHECKED_FRAMES = 16  # frames whose held-out pixels correct σ
-_AROUND = 9  # pixels along a side of the place whose bar is one number: that of two samples alone is rough
-_UNEXPLAINED = 2.0  # times the noise: larger residuals of iterative methods have other causes; 1.2 at most in simulation
-_NOISY = 0.03  # of the object: at 5 to 6 % (10³ photons) 43 to 59 % of voxels were within σ, below 2 % 59 % or more
-_WIDEST = 4.0  # times: held-out pixels farther off are no matter of error bars
-_SHARE, _NORMAL_95 = 0.68, 1.96  # covered by σ; the 95 % bar of pixels' noise
+_CHECKED_FRAMES = 16  # σ is corrected by the held-out pixels of this many frames
+_AROUND = 9  # bars are averaged over squares of this many pixels a side: two samples alone give a rough bar
+_UNEXPLAINED = 2.0  # a residual above this many times the noise has other causes than noise; simulations had at most 1.2
+_NOISY = 0.03  # noise over line integrals: at 0.05 to 0.06, 43 to 59 % of voxels were within σ; below 0.02, 59 % or more
+_WIDEST = 4.0  # σ is widened by at most this factor: held-out pixels farther off have other causes
+_SHARE, _NORMAL_95 = 0.68, 1.96  # fraction of errors within σ; 95 % of normal noise is within 1.96 of its deviations
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Law:
-    """The numbers of ``spread``, and how many times σ the 95 % bar is. near: standard deviation in voxels."""
+    """The factors in ``spread``, which computes σ. near: smoothing (std) in voxels. multiple_95: the 95 % bar over σ."""
 
     shape: float
     noise: float
@@ -73,13 +74,13 @@ def fitted_law(kind: str) -> Law:
 
 
 def spread(first: Array, second: Array, third: Array, law: Law) -> Array:
-    """Returns σ (nz, ny, nx) of the first of three volumes, or of images.
+    """Returns the error bar σ (nz, ny, nx) of the first of three volumes, or of the first of three images.
 
-    The mean of both differences from the first is what the method does to the object. Half the difference between them is
-    noise, whose signs are opposite. The squares of both, smoothed over ``near`` voxels, are weighed by ``shape``² and
-    ``noise``². Dense matter may have texture that all runs lack: it gets ``density``² of the object's mean variance, in
-    proportion to its density. Edges may be blurred in all runs: they get ``slope``² times the square of the change of
-    density in a voxel. σ is at least a hundredth of its RMS."""
+    Both others differ from the first. The mean of the two differences is what the method does to the object. Half the
+    difference between the two is noise, whose signs are opposite. The squares of both, smoothed over ``near`` voxels, are
+    weighed by ``shape``² and ``noise``². Dense matter may have texture that all runs lack: it gets ``density``² of the
+    object's mean variance, in proportion to its density. Edges may be blurred in all runs: they get ``slope``² times the
+    square of the change of density in a voxel. σ is at least a hundredth of its RMS."""
     one, two = (other.astype(np.float64) - first for other in (second, third))
     shape, noise = (scipy.ndimage.gaussian_filter(part**2 / 4, law.near) for part in (one + two, one - two))
     variance = law.shape**2 * shape + law.noise**2 * noise
@@ -95,7 +96,7 @@ def spread(first: Array, second: Array, third: Array, law: Law) -> Array:
 def finer(volume: Array) -> NDArray[np.float32]:
     """Returns a volume (nz, ny, nx) on voxels of half the side, whose means over the old voxels are the old values.
 
-    Along an axis, the halves differ as those of a cubic spline through the sums of voxels (histospline)."""
+    Along an axis, a voxel's halves are means of a spline that has the means of all voxels (histospline)."""
     for axis in range(3):
         half = scipy.ndimage.correlate1d(volume, _SLOPES, axis, mode="nearest")
         halves = np.stack([volume - half, volume + half], axis + 1)
@@ -105,8 +106,8 @@ def finer(volume: Array) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, eq=False)
 class Doubter:
-    """The runs of a method. scan: as the method sees it; whole: with its held-out pixels ``hidden`` (F, v, u).
-    kind: that of the method, as for ``fitted_law``."""
+    """The runs of a method. scan: what the method sees. whole: the scan with its held-out pixels ``hidden`` (F, v, u). kind:
+    ``iterative`` or ``analytic``, as in ``fitted_law``."""
 
     rt: Runtime
     scan: Scan
@@ -117,7 +118,8 @@ class Doubter:
     kind: str = "iterative"
 
     def run(self, once: Callable[..., Reconstruction], report: Report, resume: State | None) -> Reconstruction:
-        """Returns the method's result with ``doubt``. once: runs the method on a scan from a state. resume: of any run."""
+        """Returns the method's result with ``doubt``. once: runs the method on a scan from a state. resume: the state of
+        whichever run was interrupted."""
         if self.kind == "analytic" and self.scan.frames < _FEWEST_FRAMES:
             found, expected = f"frames: {self.scan.frames}", f"{_FEWEST_FRAMES} or more, two in each half"
             raise InputError("--doubt", found, expected, "leave it out")
@@ -125,7 +127,7 @@ class Doubter:
         results = _restored({name: arrays.pop(name) for name in list(arrays) if name.startswith(_KEPT)}, self.scan.grid)
         while len(results) < RUNS:
             scan = self.scan_of_run(results[0], len(results)) if results else self.scan
-            half = without_warnings() if results and self.kind == "analytic" else nullcontext()  # it has wider gaps
+            half = without_warnings() if results and self.kind == "analytic" else nullcontext()  # no warnings of wider gaps
             with report.through(partial(_counted, results=results)), half:
                 result = once(scan, arrays or None)
             if result.state is not None:
@@ -136,7 +138,7 @@ class Doubter:
     def scan_of_run(self, result: Reconstruction, number: int) -> Scan:
         """Returns the scan of run ``number`` 1 or 2: every second frame for an analytic method, else a synthesised one.
 
-        A synthesised frame is the volume's projection and the residual by a random sign. Run 2 has the opposite signs."""
+        A synthesised frame is the volume's projection plus the residual with a random sign. Run 2 has the opposite signs."""
         if self.kind == "analytic":
             return some_frames(self.scan, np.arange(number - 1, self.scan.frames, 2))
         frames, sums = np.zeros(self.scan.projections.shape, np.float32), np.zeros(5)
@@ -154,7 +156,8 @@ class Doubter:
         return replace(self.scan, projections=self.rt.ranks.bcast(frames))
 
     def _pairs(self, result: Reconstruction, count: int) -> Iterator[FramePair]:
-        """Yields ``count`` frames with those of a result, whose voxels are divided before they are projected."""
+        """Yields ``count`` measured frames, each with the one computed from a result, whose voxels are divided for
+        projection."""
         chosen, moves = spread_frames(self.whole.frames, count), result.moves or self.deformation
         volume, grid = finer(result.volume), result.grid.finer(PARTS)
         if isinstance(moves, States):
@@ -163,7 +166,7 @@ class Doubter:
             yield from frame_pairs(self.rt, self.whole, volume, grid, chosen[at : at + FRAMES_AT_A_TIME], moves)
 
     def finished(self, results: list[Reconstruction]) -> Reconstruction:
-        """Returns the first result with σ, its facts, and the seconds of all runs."""
+        """Returns the first run's result with σ, facts about σ, and the seconds of all runs."""
         law, first = fitted_law(self.kind), results[0]
         if all(np.array_equal(first.volume, other.volume) for other in results[1:]):
             log.warning("all three runs have the same volume: there are no error bars; give the method more iterations")
@@ -182,7 +185,7 @@ class Doubter:
     def _against_held_out(self, results: list[Reconstruction], hidden: NDArray[np.bool_], law: Law) -> dict[str, float]:
         """Returns the shares of held-out pixels within their bars, and the factor of σ, at least 1, for which 68 % are.
 
-        The bar of a pixel has the projected differences about it, by the same law, and the pixel's noise."""
+        A pixel's bar combines its noise with the ``spread`` of the projected volumes around it."""
         ratios, inside = [], []
         for first, one, two in zip(*(self._pairs(result, _CHECKED_FRAMES) for result in results), strict=True):
             held = hidden[first.frame]
@@ -201,7 +204,8 @@ class Doubter:
 
 
 def _warn_of(residual_square: float, noise_square: float, square: float, mean: float) -> None:
-    """Warns where error bars may be too narrow. All are means over the valid pixels: of squares, and of line integrals."""
+    """Warns where error bars may be too narrow, by means over the valid pixels: of squares, and of line integrals
+    (``mean``)."""
     unexplained, noisy = (residual_square / noise_square) ** 0.5, noise_square**0.5 / (square / mean)
     if unexplained > _UNEXPLAINED:
         text = "the volume leaves %.3g times the noise of the projections unexplained: error bars hold what causes that in "
@@ -213,7 +217,7 @@ def _warn_of(residual_square: float, noise_square: float, square: float, mean: f
 
 
 def _counted(progress: Progress, results: list[Reconstruction]) -> Progress:
-    """Counts the iterations of all runs as those of one, and shows the volume of the first while the others run."""
+    """Returns progress that counts the iterations of all runs together. During later runs it shows the first volume."""
     done, each = progress.iteration + len(results) * progress.iterations, RUNS * progress.iterations
     progress = progress.mapped(state=lambda state: {**state, **_kept(results)}, iteration=done, iterations=each)
     if not results:
@@ -232,7 +236,7 @@ def _interrupted(result: Reconstruction, results: list[Reconstruction]) -> Recon
 
 
 def _kept(results: list[Reconstruction]) -> State:
-    """Returns what a state keeps of complete runs: all of the first, volumes and seconds of the others."""
+    """Returns what a state keeps from complete runs: everything of the first run, and volume and seconds of the others."""
     if not results:
         return {}
     first, seconds = results[0], [one.facts["seconds"] for one in results]
@@ -244,7 +248,7 @@ def _kept(results: list[Reconstruction]) -> State:
 
 
 def _restored(kept: Mapping[str, np.ndarray], grid: Grid) -> list[Reconstruction]:
-    """Returns the complete runs that ``_kept`` has put into a state, none of them from nothing."""
+    """Returns the complete runs that ``_kept`` has put into a state; [] without any."""
     if not kept:
         return []
     arrays = {name.removeprefix(_KEPT): values for name, values in kept.items()}

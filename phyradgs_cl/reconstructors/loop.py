@@ -74,8 +74,8 @@ class Loop:
         self._reported = time.perf_counter()
 
     def run(self, resume: State | None) -> None:
-        """Makes all steps, or those after the state ``resume``. Ctrl-C, or a report that raises KeyboardInterrupt, ends the
-        run after the present step, unless that is the last."""
+        """Makes all steps, or all that follow the state ``resume``. Ctrl-C, or a report that raises KeyboardInterrupt, ends
+        the run after the present step, unless that is the last."""
         method = self.method
         if resume is not None:
             method.restore(resume)
@@ -111,7 +111,7 @@ class Loop:
     def _tell(self, before: int) -> bool:
         """Records and reports the step that began at iteration ``before``. Returns True if the report asks to stop."""
         is_recorded = self._reaches(self.record_every, before)
-        is_slow = time.perf_counter() - self._reported > SILENT_S and self.ranks.size == 1  # ranks have different clocks
+        is_slow = time.perf_counter() - self._reported > SILENT_S and self.ranks.size == 1  # each rank has its own clock
         is_reported = self._reaches(self.report_every, before) or (is_slow and self.method.iteration > before)
         if not (is_recorded or is_reported):
             return False
@@ -122,7 +122,7 @@ class Loop:
             raise NumericalError(name, found, "a finite number", self.method.remedy)
         if is_recorded:
             self.record.append({"iteration": iteration, **measures, "seconds": seconds})
-        if not is_reported or self.ranks.rank > 0:  # rank 0 reports for all
+        if not is_reported or self.ranks.rank > 0:  # only rank 0 reports, for all ranks
             return False
         self._reported = time.perf_counter()
         progress = Progress(

@@ -105,7 +105,7 @@ def imported(text: str, subject: str = "--method") -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Returns a value that JSON can hold: numbers and words as they are, tables of such, and the repr of everything else."""
+    """Returns a value that JSON can hold: numbers and words unchanged, tables of such, and the repr of everything else."""
     if isinstance(value, Mapping):
         return {key: _plain(one) for key, one in value.items()}
     return value if isinstance(value, int | float | str | None) else repr(value)
@@ -114,7 +114,7 @@ def _plain(value: Any) -> Any:
 def _default_options(subject: str, function: Any, parameter: inspect.Parameter) -> Any:
     try:
         kind = typing.get_type_hints(function).get(parameter.name)
-    except (NameError, TypeError):  # annotations may name what does not exist at run time
+    except (NameError, TypeError):  # annotations may have names that do not exist at run time
         kind = None
     if not (isinstance(kind, type) and is_dataclass(kind)):
         return OwnOptions()

@@ -2,7 +2,7 @@
 
 NAF: R. Zha, Y. Zhang, H. Li, "NAF: Neural Attenuation Fields for Sparse-View CBCT Reconstruction", MICCAI 2022: a hash
 encoding and a small network. SAX-NeRF: Y. Cai, J. Wang, A. Yuille, Z. Zhou, A. Wang, "Structure-Aware Sparse-View X-ray 3D
-Reconstruction", CVPR 2024: attention along line segments, and windows of rays beside scattered ones."""
+Reconstruction", CVPR 2024: attention along line segments, and windows of rays in addition to scattered ones."""
 
 import time
 from functools import partial
@@ -63,7 +63,7 @@ NAF = Method(partial(reconstruct_neural, method="naf"), NAF_PRESETS)
 
 # SAX-NeRF's released configuration Lineformer/chest_50 is NAF's with 256 samples for 128 voxels.
 SAX_PUBLISHED = LineOptions(**{**vars(NAF_PUBLISHED), "samples": 256})
-# No windows by default: they leave the expected gradient of a squared error as it is, and make it noisier.
+# No windows by default: they do not change the expected gradient of a squared error, but make it noisier.
 SAX_PRESETS = {"default": LineOptions(iterations=50, windows=0), "published": SAX_PUBLISHED}
 
 SAX_NERF = Method(partial(reconstruct_neural, method="sax-nerf"), SAX_PRESETS)

@@ -70,8 +70,7 @@ def preprocessing_of(changes: Mapping[str, Any]) -> Preprocessing:
 
 
 def _models(options: Any) -> dict[str, Any]:
-    """Returns by name the motion models that a method's options allow. The preset's own keeps its numbers of strips and
-    times."""
+    """Returns by name the motion models that a method's options allow. The preset's model keeps its strips and times."""
     own = [options.motion] if hasattr(options.motion, "name") else []
     return {model.name: model for model in (*getattr(options, "MOTIONS", _ALL), *own)}
 
@@ -90,7 +89,7 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
         return options.motion
     name = _implied_motion(options.motion.name, counts, models) if motion is None else motion
     if not isinstance(name, str) or name not in models:
-        hidden = {*MOTIONS} - {one.name for one in MODELS if one.poses}  # which the command line does not take
+        hidden = {*MOTIONS} - {one.name for one in MODELS if one.poses}  # the command line does not take these
         named = [one for one in models if one not in hidden]
         raise InputError("--motion", checks.short_repr(name), f"one of {', '.join(named)} for --method {method}")
     model = models[name]
@@ -136,7 +135,7 @@ def _changed(options: Any, changes: Mapping[str, Any], subject: str) -> Any:
         values[key] = value if is_function else _converted(known[key], value, f"{subject}: option {key}")
     try:
         return replace(options, **values)
-    except (TypeError, ValueError) as error:  # the user's own options have their own checks
+    except (TypeError, ValueError) as error:  # options of a user's method have their own checks
         raise InputError(subject, str(error), "values that its options take") from error
 
 
@@ -149,7 +148,7 @@ def _having(option: str) -> str:
 
 def _converted(current: Any, value: Any, subject: str) -> Any:
     """Returns ``value`` in the type of ``current``: number, word, tuple or nested table. None leaves it unchanged."""
-    if current is None:  # its type is not known: the options check the value themselves
+    if current is None:  # the option's type is unknown, so the options check it
         return value.item() if isinstance(value, np.generic) else value
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
@@ -161,7 +160,7 @@ def _converted(current: Any, value: Any, subject: str) -> Any:
         if not isinstance(value, (list, tuple)) or len(value) != len(current):
             raise InputError(subject, checks.short_repr(value), f"a list of {len(current)} numbers")
         return tuple(_converted(c, v, subject) for c, v in zip(current, value, strict=True))
-    if type(current) not in _EXPECTED:  # only a user's own options have other types: they check themselves
+    if type(current) not in _EXPECTED:  # a user's own options, which check themselves
         return value
     expected, fits = _EXPECTED[type(current)]
     if not fits(value):
@@ -201,8 +200,8 @@ class ObjectMotion:
 
 @dataclass(frozen=True, eq=False)
 class RunPlan:
-    """What to run on a scan. method: a name as ``method_name`` returns it, or the user's own function. options: of the
-    method, checked. preprocessing: changes of the frames before the method.
+    """What to run on a scan. method: a name as ``method_name`` returns it, or the user's own function. options: the method's
+    options, checked. preprocessing: changes of the frames before the method.
 
     Raises InputError for a seed out of range, an object that moves with a method for objects at rest, and error bars of runs
     that cannot differ."""

@@ -63,7 +63,7 @@ def prepared(scan: Scan, options: Preprocessing, rt: Runtime | None = None) -> S
 
 
 def stages(scan: Scan, options: Preprocessing, rt: Runtime) -> Iterator[tuple[str, Scan, Facts]]:
-    """Yields (name, scan, numbers) before the steps of ``options`` and after each of them."""
+    """Yields (name, scan, numbers) before the steps of ``options`` and after each step."""
     scan = regrid_and_remove_lag(scan, options)
     yield "", scan, {}
     yield from one_by_one(scan, options, partial(reprojection, rt))

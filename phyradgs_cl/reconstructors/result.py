@@ -150,8 +150,8 @@ class Reconstruction:
     def plot(self, scan: "Scan | None" = None, *, frame: int = 0, device: "str | Runtime | None" = None) -> "Figure":
         """Returns a figure: the three middle slices in 1/mm with a bar in mm, and the convergence if there is a record.
 
-        scan: of the result; adds a frame, its residual and, if the scan has a reference (nz, ny, nx) in 1/mm, the truth and
-        the difference. device: what projects the volume for the residual.
+        scan: the scan of the result. It adds a frame, the frame's residual and, if the scan has a reference (nz, ny, nx) in
+        1/mm, the truth and the difference. device: what projects the volume for the residual.
 
         Raises InputError if ``scan`` is no Scan or has no such frame."""
         from phyradgs_cl.reconstructors.plot import plot_result
@@ -201,7 +201,8 @@ class Progress:
     def mapped(
         self, state: "Callable[[State], State] | None" = None, volume: "VolumeMap | None" = None, **changes: Any
     ) -> "Progress":
-        """Returns the report with other fields. ``state`` and ``volume`` map what its functions of these names return."""
+        """Returns the report with other fields. ``state`` and ``volume`` change the results of the report's functions of
+        that name."""
         own_state, own_volume = self.state, self.volume
         if state is not None and own_state is not None:
             changes["state"] = lambda: state(own_state())
@@ -214,7 +215,7 @@ ProgressReport = Callable[[Progress], None]
 
 
 class Report:
-    """Passes a method's progress on to listeners. Stages that are under way may change it, by hooks."""
+    """Passes a method's progress on to listeners. While the body of ``through`` runs, a hook may change the progress."""
 
     def __init__(self, *listeners: ProgressReport) -> None:
         self.listeners = listeners
@@ -222,7 +223,7 @@ class Report:
 
     @classmethod
     def of(cls, report: ProgressReport) -> "Report":
-        """Returns ``report`` itself, or one that passes everything on to the function ``report``."""
+        """Returns ``report`` as a ``Report``: itself if it is one, else one that calls the function ``report``."""
         return report if isinstance(report, Report) else cls(report)
 
     def __call__(self, progress: Progress) -> None:

@@ -97,7 +97,7 @@ class _Prepared:
             _check_ranks(plan.method_name, rt)
         if preprocessing.margin_mm is not None:
             _check_margin(plan)
-        self.identity = cache(partial(plan.identity, scan))  # computed only if needed: it reads all frames
+        self.identity = cache(partial(plan.identity, scan))  # not computed before it is needed, since that reads all frames
         self.arguments: dict[str, Any] = {}
         if resume is not None:
             check_resumable(plan)
@@ -116,7 +116,7 @@ class _Prepared:
         if self.scan.metal is not None and (self.deformation is not None or plan.method_name == "moving"):
             log.warning("metal: found and masked as in an object at rest, and this one moves: do not trust what is near it")
         self.options = plan.options
-        if hasattr(self.options, "motion") and plan.method_name != "moving":  # moving finds the object's speed itself
+        if hasattr(self.options, "motion") and plan.method_name != "moving":  # ``moving`` finds the object's speed itself
             motion = with_times(self.options.motion, self.scan, self.deformation)
             self.options = replace(self.options, motion=motion)
         self.hidden = held_out(self.scan, preprocessing.holdout) if preprocessing.holdout else None

@@ -12,7 +12,7 @@ from phyradgs_cl.report.viewer import decimals_of, slider
 
 MOST_EDGE = 128  # larger volumes are averaged over blocks to this many voxels along each side
 MOST_TEXT = 2_000_000  # limit of base64 characters for voxels and centres together, so that the page stays small
-MOST_CENTRES = 20_000  # Gaussians whose centres are shown; of more, evenly chosen ones
+MOST_CENTRES = 20_000  # the centres of at most this many Gaussians are shown, evenly chosen
 MOST_ZOOM = 8
 _TURN_DEG, _TILT_DEG = 325, 20  # initial view, in which the edges marked x, y, z are in front and on the left
 _PATIENCE_MS = 1500  # the picture at rest becomes finer until drawing takes this long
@@ -124,5 +124,5 @@ def _between(steps: NDArray[np.uint8]) -> int:
     with np.errstate(all="ignore"):
         variance = below * above * (sums / below - (sums[-1] - sums) / above) ** 2
     variance = np.nan_to_num(variance)
-    best = np.flatnonzero(variance >= variance.max() * (1 - 1e-9))  # all levels in a gap between the classes are as good
+    best = np.flatnonzero(variance >= variance.max() * (1 - 1e-9))  # all levels between the two classes are equally good
     return int(np.clip(round(best.mean()) + 1, 1, 255))

@@ -18,7 +18,7 @@ from phyradgs_cl.report.markup import Markup, element, label, number, unit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MOST_CHARTS = 3  # charts of convergence that fit next to each other
+MOST_CHARTS = 3  # at most this many charts of convergence fit next to each other
 SIZE = 440, 320  # width and height of a chart in points of matplotlib; letters are 13 high
 _STYLE: Any = {"svg.fonttype": "none", "text.parse_math": False, "font.size": 13}
 Chart = tuple[str, Markup]

@@ -231,7 +231,7 @@ class LivePage:
         self.spent_s = 0.0
         """Time in s that the run has waited for pictures."""
         self._pictured_s = -every_s
-        self._waits = False  # whether nothing is written yet, to keep an existing file until the first iteration
+        self._waits = False  # whether an existing file is still kept, until the first iteration
         self._started_s = time.monotonic()
         self._is_over = threading.Event()
         self._writer = threading.Thread(target=self._keep_writing, name="live page", daemon=True)

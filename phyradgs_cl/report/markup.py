@@ -7,7 +7,7 @@ import math
 from phyradgs_cl.text import plain_text
 
 UNITS = {"_per_mm": "1/mm", "_mm": "mm", "_deg": "°", "_db": "dB", "_s": "s"}
-_RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # by unit; numbers below a millionth of these are shown as 0
+_RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # by unit: a number below a millionth of this is shown as 0
 _WORDS = {"psnr": "PSNR", "rms": "RMS", "ssim": "SSIM", "sha256": "SHA-256", "tv": "TV", "l1": "L1", "fdk": "FDK"}
 _LONGEST = 400  # longer values are cut after this many characters
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

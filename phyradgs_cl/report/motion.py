@@ -111,7 +111,7 @@ def fitting(deformation: Deformation, grid: Grid) -> Deformation:
         spacing_mm *= 1.25
         origin_mm, counts = control_points(grid, spacing_mm)
         axes_mm = [
-            np.clip(first_mm + spacing_mm * np.arange(n), centres_mm[0], centres_mm[-1])  # the field may end there
+            np.clip(first_mm + spacing_mm * np.arange(n), centres_mm[0], centres_mm[-1])  # beyond the grid the field may end
             for first_mm, n, centres_mm in zip(origin_mm[::-1], counts, grid.axes_mm(), strict=True)
         ]
         points_mm = np.stack(np.meshgrid(*axes_mm, indexing="ij")[::-1], -1).reshape(-1, 3)

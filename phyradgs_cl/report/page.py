@@ -22,10 +22,10 @@ from phyradgs_cl.runtime import Runtime
 DEFAULT_VIEWS = 3  # frames that a page compares with frames computed from the volume
 # slices.js sends the grey values when it loads, so space.js and motion.js, which listen for them, must come first.
 _SCRIPT = ("common", "shaders", "render", "space", "motion", "slices", "rows")
-_SCRIPTED = ("volume",)  # sections that are hidden until the script shows them
+_SCRIPTED = ("volume",)  # these sections stay hidden until the page's script shows them
 
 
-@np.errstate(all="ignore")  # a file's values may overflow; the page shows what it can
+@np.errstate(all="ignore")  # values from a file may overflow; the page still shows all others
 def write_report(
     volume: Path, output: Path, make_runtime: Callable[[], Runtime], *, scan: Path | None = None,
     views: int = DEFAULT_VIEWS,
@@ -51,7 +51,7 @@ def write_report(
 
 
 def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Change] = ()) -> str:
-    """Returns the page's HTML. views: from ``computed_views``. changes: from ``step_changes``."""
+    """Returns the page's HTML. views, changes: what ``computed_views`` and ``step_changes`` return."""
     of_scan = {} if run.scan is None else {
         "preparation": sections.preparation_section(run, changes),
         "projections": sections.projections_section(run.scan, views),

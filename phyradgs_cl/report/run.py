@@ -35,7 +35,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import plain_text
 
 log = logging.getLogger(__name__)
-_BINS = 80  # bars of the histograms of line integrals
+_BINS = 80  # number of bars in histograms of line integrals
 Image = NDArray[np.float32]
 
 

@@ -17,9 +17,9 @@ from phyradgs_cl.report.markup import Markup, number
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_MOST_FRAMES = 180  # of more source positions, about this many are marked
-_ARC_SAMPLES = 24  # poses along the first frame's arc
-_FIRST_FRAMES = 4  # frames in the chart of successive frames
+_MOST_FRAMES = 180  # about this many source positions are marked, even if there are more
+_ARC_SAMPLES = 24  # number of poses along the first frame's arc
+_FIRST_FRAMES = 4  # number of frames in the chart of successive frames
 _MOST_DOTS = 600  # limit of the dots that mark the times and lines of a motion model's poses
 _LINES_WITH_DOTS = 12  # detector lines that have such dots; dots of more lines would merge
 _BESIDE = 0.75  # a parallel beam's source and panel are drawn this many diagonals of the volume from its middle

@@ -25,11 +25,11 @@ from phyradgs_cl.report.scan_charts import (
 from phyradgs_cl.report.viewer import stills, viewer
 from phyradgs_cl.text import flattened, to_digits_of
 
-# Limits of what a page shows, since a file may hold more.
-_MOST_ROWS = 400  # rows of a table that are shown
-_STATES = 5  # times at which a changing object is shown
-_MOST_CHARTS = 6  # charts of a calibration that are shown
-_MOST_COMBINATIONS = 20  # combinations of parameters, not told apart by a calibration, that are shown
+# Limits of a page's content, since a file may hold more.
+_MOST_ROWS = 400  # at most this many rows of a table are shown
+_STATES = 5  # a changing object is shown at this many times
+_MOST_CHARTS = 6  # at most this many charts of a calibration are shown
+_MOST_COMBINATIONS = 20  # at most this many combinations of parameters that a calibration cannot tell apart are shown
 _ABSURD = 1e9  # larger parameters come from damaged files and are not rounded
 
 

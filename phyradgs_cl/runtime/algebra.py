@@ -19,7 +19,7 @@ Shape = tuple[int, ...]
 _CPU_SPAN = 1 << 14  # least number of elements that a CPU's work-item sums, so that the work outweighs its start
 _GPU_GROUP = 256  # largest work-group on a GPU, in work-items
 _GPU_GROUPS = 512  # a sum's largest number of work-groups on a GPU, or of work-items on a CPU
-_ITEMS = 64  # work-group of element-wise kernels on a CPU, in work-items
+_ITEMS = 64  # size of a work-group of element-wise kernels on a CPU, in work-items
 
 
 class Space(Protocol, Generic[A]):
@@ -134,7 +134,7 @@ class DeviceSpace:
     def __init__(self, rt: Runtime) -> None:
         self.rt = rt
         self._unused: dict[int, list[DeviceArray]] = defaultdict(list)
-        # Sums of work-groups; their total; the total over several arrays, which must survive other sums in between.
+        # Memory for the sums of work-groups, their total, and a total over several arrays, kept while others are summed.
         self._parts, self._whole, self._total = (rt.empty(count, np.float64) for count in (_GPU_GROUPS, 1, 1))
 
     def empty(self, shape: Shape) -> DeviceArray:
@@ -231,7 +231,8 @@ class DeviceSpace:
         return float(values[0] if self.rt.fp64 else values.view(np.float32).astype(np.float64).sum())
 
     def _sum(self, name: str, whole: DeviceArray, *arrays: DeviceArray, add: bool = False) -> None:
-        """Writes a sum over arrays to ``whole``, or adds it there. Kernel ``name`` sums in work-groups, another the rest."""
+        """Writes a sum over arrays to ``whole``, or adds it there. Kernel ``name`` sums in work-groups, a second one sums
+        over them."""
         groups = self._reduce(name, *arrays, scratch=8)
         kernel = self.rt.kernel("algebra", "dot_whole")
         group = self.rt.group(1, _GPU_GROUP, kernel)

@@ -119,7 +119,7 @@ class Runtime:
 
     @staticmethod
     def _allowed(source: str, options: tuple[str, ...]) -> list[str]:
-        """Returns the build options. Programs with float pairs lose the one that fuses multiply and add: it would destroy
+        """Returns the build options. Programs with float pairs lose the option that fuses multiply and add: it would destroy
         the pairs' low parts, and some drivers ignore the pragma against fusing."""
         has_pairs = "-DFP64=0" in options and _PAIRS in source
         return [option for option in options if not (has_pairs and option == _FUSING)]

@@ -99,7 +99,7 @@ def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, s
 
 
 def _next_of_name(first: DeviceInfo, devices: list[DeviceInfo], turn: int) -> DeviceInfo:
-    """Returns ``first``, or the ``turn``-th device after it among those of its platform and name."""
+    """Returns ``first``, or the ``turn``-th device after it of the same platform and name."""
     same = [d for d in devices if (d.platform, d.name) == (first.platform, first.name)]
     return same[(same.index(first) + turn) % len(same)]
 

@@ -134,8 +134,7 @@ class MemoryLedger:
         return Room(int(self.planned * free_bytes), min(largest_bytes, self.limit_bytes))
 
     def check(self, nbytes: int, largest_bytes: int) -> None:
-        """Raises MemoryShortage for a buffer of ``nbytes`` that is larger than ``largest_bytes`` or would exceed the
-        limit."""
+        """Raises MemoryShortage for a buffer of ``nbytes`` that is larger than ``largest_bytes`` or would pass the limit."""
         subject, found = f"memory of {self.device.name}", f"{mebibytes(nbytes)} in one buffer"
         remedy = "use a smaller problem"
         if nbytes > largest_bytes:

@@ -17,7 +17,7 @@ _SETTLING_NODES = 200  # drying is a slow curve, for which weights at this many 
 _SPACINGS = 8.0  # breathing and drying are smooth, so this many spacings of control points along the longest side are enough
 _SLIDING_SPACINGS = 16.0  # sliding has a sharp edge, which becomes about three control points wide
 _ASIDE = 1 / 3  # breathing moves the object along y, too, by this fraction of its motion along z
-_PERIODS = (0.5, 1.5)  # a random breath lasts at least and at most this many mean periods
+_PERIODS = (0.5, 1.5)  # a random breath lasts at least the first and at most the second number of mean periods
 _FADE = 3.0  # beyond the box, motion falls to 0 over this many amplitudes: with a slope of a third, the field cannot fold
 _MOST_CYCLES = 100_000  # most cycles of breathing or sliding in a scan: more would mean a wrong unit of time
 _COMMON = ("kind", "amplitude_mm", "amplitude", "states")
@@ -41,7 +41,7 @@ class ObjectMotion(checks.Checked):
     - period_s: the time of a breath, or of sliding up and down. jitter: spread (std) of a breath's period over ``period_s``.
     - hysteresis: the delay of the motion along y, in periods.
     - settling_s: the time in which drying goes 63 % of its way. None takes a third of the scan.
-    - radius: of the sliding cylinder, over half of the shortest side. seed: of the jitter's random numbers.
+    - radius: the sliding cylinder's radius, over half of the shortest side. seed: the seed of the jitter's random numbers.
     - states: at how many times the true volume is stored.
 
     Raises InputError for an unknown kind and for numbers out of range."""

@@ -134,7 +134,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
     timing = {key: values.pop(key) for key in _TIMING if key in values}
     sheet = {key: values.pop(key, None) for key in _DATA_SHEET}
     timed = make_protocol(protocol, **timing)
-    if given.get("jitter_deg") and not timed.is_fly:  # a gantry that stops does not wander
+    if given.get("jitter_deg") and not timed.is_fly:  # only a gantry that turns has jitter
         found, remedy = f"{given['jitter_deg']} with --protocol {protocol}", "leave it out, or choose a fly-scan"
         raise InputError("--jitter-deg", found, "0", remedy)
     unused = [name for name in ("dose", "electronic_noise") if name in given and given.get("noise", "none") == "none"]
@@ -159,8 +159,9 @@ def simulated_scan(
 ) -> Scan:
     """Returns a scanner's scan of a phantom (given by name or as an object) or of a volume. The truth is its reference.
 
-    name: of the volume, for titles. size: voxels along the longest side of grid and reference; None: the scanner's or the
-    volume's. pixel_samples: rays along each side of a pixel; 0: by the truth's voxels. Warns of an inverse crime."""
+    name: the volume's name, for titles. size: voxels along the longest side of grid and reference; None: the scanner's or
+    the volume's. pixel_samples: rays along each side of a pixel; 0 chooses them by the size of the truth's voxels. Warns of
+    an inverse crime."""
     if size is not None:
         checks.within("--size", size, 1 if isinstance(of, Volume) else _SMALLEST_PHANTOM, _LARGEST_GRID)
     where, axis = (scanner.geometry, scanner.grid), options.readout_axis

@@ -17,7 +17,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.sources import AnalyticSource, DeformedSource, FrameSource, VolumeSource, on_panel
 
 _DENSE = 0.5  # in a beam of many energies, voxels above this fraction of the largest attenuation may be bone
-# Bone begins at an attenuation with fewer voxels than this fraction of the commonest one's: there no material is cut.
+# Bone begins at an attenuation that few voxels have, at most this fraction of the commonest one's: that cuts no material.
 _RARE = 0.2
 log = logging.getLogger(__name__)
 Moves = Callable[[Grid], Deformation]
@@ -61,7 +61,8 @@ def phantom_scene(
     """Returns the scene of a phantom, given as an object or by name, in the scanner's box, with ``size`` voxels per side.
 
     Closed forms are integrated exactly unless they deform. Other phantoms are projected at twice ``size``, and the truth is
-    their block mean. Pixels average ``pixel_samples``² rays over their area; 0: by the truth's voxels."""
+    their block mean. Pixels average ``pixel_samples``² rays over their area; 0 chooses them by the size of the truth's
+    voxels."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
     if isinstance(phantom, MovingPhantom):

@@ -67,7 +67,7 @@ class VolumeSource(FrameSource):
             return volume
         try:
             return self._rt.upload(volume)
-        except MemoryShortage:  # from the host, the operator projects one part of it after the other
+        except MemoryShortage:  # a volume on the host is projected part by part
             return volume
 
 
@@ -126,9 +126,9 @@ def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:
 def on_panel(geometry: Geometry, grid: Grid, pixel_samples: int, make: Callable[[Geometry], FrameSource]) -> FrameSource:
     """Returns the source that ``make`` builds for the panel. With several samples per pixel it averages a finer panel.
 
-    pixel_samples: along each side of a pixel, at most 32. 0 takes one where a pixel, projected to the axis, has at most
-    ``WIDEST_RAY`` voxels of the grid, else one per voxel: rays through the middles of wide pixels would miss parts of the
-    object. Raises InputError for a number out of range."""
+    pixel_samples: samples along each side of a pixel, at most 32. 0 takes one where a pixel, projected to the axis, has at
+    most ``WIDEST_RAY`` voxels of the grid, else one per voxel: rays through the middles of wide pixels would miss parts of
+    the object. Raises InputError for a number out of range."""
     checks.within("--pixel-samples", pixel_samples, 0, _MOST_SAMPLES)
     if pixel_samples == 0:
         voxels = max(geometry.pixel_size_mm) / geometry.magnification / min(grid.voxel_size_mm)
@@ -192,7 +192,7 @@ class _Average:
 
     def __init__(self, cells: TimeCells, model: str) -> None:
         self._readout, self._is_log = cells.readout, model == "log"
-        self._sum: np.ndarray | None = None  # Σ w p in the log model, ln Σ w exp(−p) in the intensity model
+        self._sum: np.ndarray | None = None  # so far: Σ w p in the log model, ln Σ w exp(−p) in the intensity model
 
     def add(self, frame: np.ndarray, share: np.ndarray) -> None:
         """Adds line integrals (rows, columns). share (lines,): which fraction of each line's weight they have."""
@@ -214,7 +214,7 @@ class _Average:
 def part_of(cells: TimeCells, members: np.ndarray) -> tuple[TimeCells, np.ndarray]:
     """Returns a table of the cells ``members``, bool (C,), and which fraction (lines,) of each line's weight they have.
 
-    Weights are rescaled: in the new table those of a line sum to 1, or are all 0. The cells must have fixed poses."""
+    Weights are rescaled: in the new table a line's weights sum to 1, or are all 0. The cells must have fixed poses."""
     part = some_cells(cells, np.flatnonzero(members))
     share = part.line_weights()
     factors = np.divide(1.0, share, out=np.zeros_like(share), where=share > 0)

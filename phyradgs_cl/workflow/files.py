@@ -132,7 +132,7 @@ def summary(path: Path) -> dict[str, object]:
 
 
 def _facts_of_states(states: list[tuple[float, dict[str, Any]]]) -> dict[str, object]:
-    """Summarises volumes at several times: their number, times and extremes, and the other facts of the first."""
+    """Summarises volumes at several times: their number, times and extremes, and other facts of the first volume."""
     times = {"states": len(states), "first_s": states[0][0], "last_s": states[-1][0]}
     lowest = min(facts["minimum"] for _, facts in states)
     highest = max(facts["maximum"] for _, facts in states)

@@ -99,8 +99,9 @@ def run_reconstruction(
 
     An interrupted run does not change ``output``. It writes ``io.partial_path`` and a checkpoint, from which ``resume``
     continues; a complete run removes both. A killed run leaves its last checkpoint. inputs: other files that the output
-    must not overwrite. ranks: of the runtime; only rank 0 writes and has metrics. Raises OutputError if the output cannot
-    be written, BusyError while another run writes it, and InputError for a wrong scan, option or checkpoint."""
+    must not overwrite. ranks: the runtime's MPI processes, of which only rank 0 writes and has metrics. Raises OutputError
+    if the output cannot be written, BusyError while another run writes it, and InputError for a wrong scan, option or
+    checkpoint."""
     checks.within("--checkpoint-every (seconds)", checkpoint_every_s, 0, 1e9)
     leads = ranks is None or ranks.rank == 0
     if leads:
@@ -180,16 +181,16 @@ def _reconstructed(
                 _keep_checkpoint(output, result)
                 _warn_of_residual(path, scan, result)
     except signals.InterruptedAfterwards:
-        # after an incomplete run the caller reports the interruption; in all other cases nobody would
+        # the caller reports the interruption of an incomplete run, but of no other
         if result is None or result.state is None:
             raise
     return result, metrics
 
 
 def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
-    """Returns the metrics against the scan's true volume, on the grid of ``metrics.aligned``, and those on held-out pixels.
-    If the object moves or changes, they are means over the times at which the truth is known. Removes the held-out metrics
-    from the result's facts, and adds there how volumes were compared, unless voxel by voxel."""
+    """Returns the metrics against the scan's true volume, on the grid of ``metrics.aligned``, and metrics on held-out
+    pixels. If the object moves or changes, they are means over the times at which the truth is known. Removes the held-out
+    metrics from the result's facts, and adds there how volumes were compared, unless voxel by voxel."""
     held_out = result.facts.pop(HELD_OUT, {})
     if scan.reference is None:
         return held_out

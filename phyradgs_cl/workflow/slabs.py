@@ -1,6 +1,6 @@
 """Reconstructs a parallel-beam scan in slabs: some detector rows at a time are read, reconstructed and kept on disk.
 
-Times are those of a slab's rows: the motion model ``static`` takes the middle of their time, not of the whole frame's."""
+A slab has the times of its rows: the motion model ``static`` takes the middle of their time, not of the whole frame's."""
 
 import logging
 import shutil
@@ -115,7 +115,7 @@ def _slab(
     count, (first, stop) = whole.geometry.detector_shape[0], rows
     near = max(first - HALO_ROWS, 0), min(stop + HALO_ROWS, count)
     scan = load_scan(path, plan.preprocessing.flats, near).on_grid(part_of(whole.grid, slices_of(whole, *rows)))
-    if hasattr(plan.options, "iterations"):  # iterative methods must fit all rows that they read, so need their slices
+    if hasattr(plan.options, "iterations"):  # iterative methods need the slices of all rows that they read
         z_mm, *across_mm = np.broadcast_to(plan.preprocessing.margin_mm or 0.0, 3).tolist()
         margin_mm = (max(z_mm, HALO_ROWS * whole.geometry.pixel_size_mm[0]), *across_mm)
         plan = replace(plan, preprocessing=replace(plan.preprocessing, margin_mm=margin_mm))

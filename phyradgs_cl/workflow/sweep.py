@@ -57,7 +57,8 @@ runtime_of_process = functools.cache(Runtime)  # one Runtime per process and dev
 
 @dataclass(frozen=True)
 class SweepRun:
-    """One reconstruction of a sweep, ready for a worker. facts: first entries of its line of results; "run" is its name."""
+    """One reconstruction of a sweep, ready for a worker. facts: the first entries of the run's line of results; "run" is its
+    name."""
 
     scan: Path
     plan: RunPlan
@@ -188,7 +189,7 @@ def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None,
             if count is not None:
                 client.register_worker_callbacks(functools.partial(_begin, device))
                 client.cluster.adapt(minimum=count, maximum=count)  # else Dask does not replace a worker that dies early
-                device = None  # _begin has set each worker's device
+                device = None  # None, since _begin has chosen each worker's device
             run_of = {client.submit(make_run, run, device=device, retries=_RETRIES, pure=False): run for run in runs}
             for future in dask.as_completed(list(run_of)):
                 run = run_of.pop(future)

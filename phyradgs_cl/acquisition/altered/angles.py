@@ -13,7 +13,7 @@ def azimuth_rad(pose: np.ndarray) -> np.ndarray:
 
 
 def start_azimuths_rad(scan: Scan) -> np.ndarray:
-    """Returns ``azimuth_rad`` (F,) when each frame's first line opens."""
+    """Returns the source's angles (F,) about +z, as ``azimuth_rad``, when each frame's first line opens."""
     starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
     return azimuth_rad(np.concatenate(starts))
 

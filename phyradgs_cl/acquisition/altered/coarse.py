@@ -37,8 +37,8 @@ def coarse(scan: Scan, columns: int) -> Scan:
 
 
 def smooth(scan: Scan, pixels: float | tuple[float, float]) -> Scan:
-    """Returns the scan with frames smoothed by a Gaussian, so that averaging blocks does not alias. Masked pixels are left
-    out.
+    """Returns the scan with frames smoothed by a Gaussian, so that averaging blocks does not alias. Leaves out masked
+    pixels.
 
     pixels: the standard deviation in pixels, or a pair (v, u). Up to 0.5 the scan is returned unchanged."""
     v_px, u_px = pixels if isinstance(pixels, tuple) else (pixels, pixels)

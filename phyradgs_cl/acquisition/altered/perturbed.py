@@ -85,12 +85,11 @@ class PerturbedTrajectory:
 
     @property
     def is_parallel(self) -> bool:
-        """True for a parallel beam, as in ``base``."""
         return is_parallel(self.base)
 
     @cached_property
     def _turn(self) -> np.ndarray:
-        """The rotation (3, 3) by roll and tilts. Its columns are the new u, v and normal in terms of the stated ones."""
+        """The panel's rotation (3, 3) by roll and tilts. Its columns: the new u, v and normal in the stated panel's axes."""
         angles_rad = [self.correction.tilt_u_rad, self.correction.tilt_v_rad, self.correction.roll_rad]
         return np.asarray(Rotation.from_rotvec(angles_rad).as_matrix())
 
@@ -114,7 +113,7 @@ class PerturbedTrajectory:
         source, first, column, row = np.moveaxis(pose.reshape(*pose.shape[:-1], 4, 3), -2, 0)
         pitch_u_mm, pitch_v_mm = (np.linalg.norm(step, axis=-1, keepdims=True) for step in (column, row))
         u_hat, v_hat = column / pitch_u_mm, row / pitch_v_mm
-        normal = np.cross(u_hat, v_hat)  # it points towards the source
+        normal = np.cross(u_hat, v_hat)  # the panel's normal, which points towards the source
         half_v, half_u = ((n - 1) / 2 for n in self.shape)
         middle = first + half_u * column + half_v * row - correction.detector_distance_mm * normal
         middle = middle + (correction.offset_u_mm + shift_u_mm) * u_hat + (correction.offset_v_mm + shift_v_mm) * v_hat

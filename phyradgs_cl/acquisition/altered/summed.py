@@ -28,10 +28,10 @@ def sum_frames(
     """Makes a fly-scan without gaps, in which each frame sums the intensities of ``count`` successive projections.
 
     scan: F projections (F, rows, columns); each stands for the interval in s until the next, in which the gantry turns
-    evenly. count: the projections in an exposure. readout_ratio, readout, readout_direction: of the new panel, as in
-    ``fly_scan``. A line whose exposure begins within a projection takes a fraction of it. Frames that would need further
-    projections are left out. Photons, detector and object are those of the given scan, so the result is a real test of a
-    motion model. For this the object must move by less than a pixel from projection to projection.
+    evenly. count: the projections in an exposure. readout_ratio, readout, readout_direction: how the new panel is read, as
+    in ``fly_scan``. A line whose exposure begins within a projection takes a fraction of it. Frames that would need further
+    projections are left out. Photons, detector and object are the given scan's, so the result is a real test of a motion
+    model. For this the object must move by less than a pixel from projection to projection.
 
     Raises InputError for a count that no frame can have, a rolling shutter or lag in ``scan``, and uneven intervals."""
     if not isinstance(scan, Scan):
@@ -95,8 +95,8 @@ def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, i
 
 
 def _shares(delay: np.ndarray, count: int) -> np.ndarray:
-    """Returns what fraction of each projection's interval a line is exposed, (projections, lines). count: the exposure in
-    intervals. delay (lines,): when each line opens, in intervals after the frame's start."""
+    """Returns for which fraction of each projection's interval a line is exposed, (projections, lines). count: the exposure
+    in intervals. delay (lines,): when each line opens, in intervals after the frame's start."""
     number = np.arange(int(np.ceil(delay.max() - 1e-9)) + count)[:, None]
     overlap = np.minimum(number + 1, delay + count) - np.maximum(number, delay)
     return np.where(overlap > 1e-9, overlap, 0.0)

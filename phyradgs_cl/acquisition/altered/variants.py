@@ -17,7 +17,7 @@ from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_par
 
 _MIRROR_Y = np.array([1.0, -1.0, 1.0] * 4)
 _FIRST, _COLUMN_STEP, _ROW_STEP = slice(3, 6), slice(6, 9), slice(9, 12)
-_STEPS = _ROW_STEP, _COLUMN_STEP  # index: axis 0 (v), axis 1 (u)
+_STEPS = _ROW_STEP, _COLUMN_STEP  # the step along axis 0 (v), then along axis 1 (u)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,6 @@ class AlteredTrajectory:
 
     @property
     def is_parallel(self) -> bool:
-        """True for a parallel beam, as in ``base``."""
         return is_parallel(self.base)
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
@@ -80,7 +79,6 @@ class MappedTrajectory:
 
     @property
     def is_parallel(self) -> bool:
-        """True for a parallel beam, as in ``base``."""
         return is_parallel(self.base)
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
@@ -150,8 +148,7 @@ def stretched(scan: Scan, v: float, u: float) -> Scan:
 
 
 def mirrored(scan: Scan, axis: str) -> Scan:
-    """Returns the scan as if its frames were mirrored along ``axis``, u or v. If lines are read along that axis, their order
-    is reversed too."""
+    """Returns the scan as if frames were mirrored along ``axis``, u or v. Lines read along this axis are reversed too."""
     number = ("v", "u").index(axis)
     is_read_along = scan.shutter.axis == ("rows", "columns")[number]
     images = partial(_flipped, axis=number, count=altered_trajectory(scan).panel[number])

@@ -55,7 +55,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     sizes = ("Projections", "DetectorPixelsY", "DetectorPixelsX")
     count, *panel = (scan.count(name, _MOST_FRAMES) for name in sizes)
     prefix = scan.word("Name", default="") + scan.word("InputSeparator", default="_")
-    place, inside = folder, scan.word("InputFolderName", default="")  # often a path on the scanner's disk, absent here
+    place, inside = folder, scan.word("InputFolderName", default="")  # often a folder of the scanner's disk, absent here
     if inside and folder.exists(inside.split("\\")[0].split("/")[0]):
         place = SafeFolder(folder.root / checked_name(inside, scan.name("InputFolderName")))
     frames, at, said = read_numbered(place, prefix, (count, *panel), [*map(scan.name, sizes)], options, first=1)
@@ -75,7 +75,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _angles(scan: Settings, measured: Path | None, count: int) -> np.ndarray:
-    """Returns angles (count,) in rad: those in the file ``measured``, or equal steps if it is None."""
+    """Returns angles (count,) in rad, from the file ``measured`` if there is one, else in equal steps."""
     if measured is not None and not scan.has("AngularStep"):
         return read_angles_rad(measured, count, column=1)
     steps_rad = np.deg2rad(scan.number("InitialAngle", 0.0) + scan.number("AngularStep") * np.arange(count))

@@ -90,7 +90,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         expected, remedy = "a length in mm along v and along u", f"say {options.named('pixel_size_mm')}"
         raise InputError(f"{description} pixel size", "nothing", expected, remedy)
     share = np.linspace(0, shutter.span_s / shutter.exposure_s, _TIMES_A_FRAME)
-    poses = np.stack([  # (F, T, 12), see PoseTable: stored images, at T times of every frame
+    poses = np.stack([  # of the images as stored, at T times of every frame, (F, T, 12)
         _view_poses(view, source.at(i, share)[1], detector.at(i, share), detector.centre, panel, pitch)
         for i, view in enumerate(views)
     ])  # fmt: skip
@@ -129,7 +129,7 @@ def _frames_and_views(
 
 
 def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> ImportOptions:
-    """Returns options with a flat value: that given, else the brightest pixel, as in the published code, with a warning."""
+    """Returns options with a flat value: by default, with a warning, the brightest pixel, as in the published code."""
     if options.flat_value is not None or options.quantity not in (None, "counts"):
         return options
     brightest = float(frames.max())

@@ -116,7 +116,7 @@ class PlainUnpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         """Returns our function for an allowed name. Raises InputError for any other name."""
-        functions: dict[str, Any] = {  # made anew at each call, since a pickle can change a function's attributes
+        functions: dict[str, Any] = {  # made at each call again, since a pickle may change a function's attributes
             "numpy.ndarray": object,  # only passed to _reconstruct, which ignores it
             "numpy.dtype": lambda code, *_: _Type(code),
             "numpy.core.multiarray._reconstruct": lambda *_: _Array((0,)),

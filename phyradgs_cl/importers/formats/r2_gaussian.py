@@ -204,7 +204,7 @@ def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarra
 
 
 def start_times_s(first_rad: np.ndarray, closed_rad: np.ndarray, exposure_s: float) -> np.ndarray:
-    """Returns opening times (F,) in s. The gantry is taken to turn at its mean speed within exposures; the angles (F,) in
-    rad are those at which the first line opens and closes."""
+    """Returns opening times (F,) in s. The gantry is taken to turn at its mean speed within exposures; the first line opens
+    and closes at the angles (F,) in rad."""
     speed_rad_per_s = float(np.mean(closed_rad - first_rad)) / exposure_s
     return (first_rad - first_rad[0]) / speed_rad_per_s

@@ -24,7 +24,7 @@ _COPIES = 12  # bytes of memory for every byte of the files: some makers pack im
 @dataclass(frozen=True)
 class _Maker:
     """A maker's files. description, suffixes: how names of the description and of projections end. reader: RTK's class for
-    the geometry. below: pattern of projections in folders below the description's. options: those that apply."""
+    the geometry. below: pattern of projections below the description's folder. options: the import options that apply."""
 
     description: str
     suffixes: tuple[str, ...]

@@ -48,7 +48,7 @@ def open_hdf5(path: str | Path, linked_folder: Path | None = None) -> "Iterator[
         unknown = f"a file that HDF5 cannot open ({error})", ""
         found, remedy = next((known for words, known in _REASONS.items() if words in str(error)), unknown)
         raise InputError(subject, found, "a readable HDF5 file", remedy) from error
-    folders = filter(None, (path.parent, path.resolve().parent, linked_folder))  # a link's own folder, and its target's
+    folders = filter(None, (path.parent, path.resolve().parent, linked_folder))  # the folders of a link and of its target
     places = tuple(Path(place) for one in folders for place in (os.path.abspath(one), one.resolve()))
     with file:
         try:
@@ -59,7 +59,7 @@ def open_hdf5(path: str | Path, linked_folder: Path | None = None) -> "Iterator[
 
 @dataclass(frozen=True, eq=False)
 class Hdf5Source:
-    """An open HDF5 file. path: its name in messages. folders: where files that it links to may lie."""
+    """An open HDF5 file. path: the file's name in messages. folders: the only folders in which linked files may lie."""
 
     file: h5py.File
     path: Path
@@ -168,7 +168,7 @@ class Hdf5Source:
         """Raises InputError if a linked file has no data at ``inside``; HDF5 itself would return nothing, or zeros."""
         own = Path(file.filename)
         place = own if name == "." else own.parent / name
-        if os.path.isabs(name) and not place.exists():  # HDF5 then looks for the name beside the linking file
+        if os.path.isabs(name) and not place.exists():  # HDF5 then looks for the name next to the linking file
             place = own.parent / place.name
         self._check_place(address, place)
         if "%" in name:  # a pattern of numbered files, of which HDF5 reads all that exist

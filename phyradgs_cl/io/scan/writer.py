@@ -30,7 +30,7 @@ def write_scan(
     quantity: str = "attenuation",
 ) -> None:
     """Writes a scan file, completely or not at all; it replaces an existing one. data: raw frames (F, v, u), float32 or
-    uint16, with flats and darks; None writes the line integrals of ``scan``. quantity: of ``data``, "attenuation",
+    uint16, with flats and darks; None writes the line integrals of ``scan``. quantity: what ``data`` are, "attenuation",
     "transmission" or "counts". image_key (F,): 0 projection, 1 flat, 2 dark, 3 invalid, with as many 0 as ``scan`` has
     frames. A user's own class of trajectory becomes a table of poses. Raises InputError for arguments that contradict each
     other, and for a scan that the format cannot express; OutputError if the file cannot be written."""

@@ -38,15 +38,14 @@ def launch_adjoint(
     rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, frames: DeviceArray,
     volume: DeviceArray, *, add: bool = False,
 ) -> None:
-    """Backprojects padded frames, with the numbers ``frame_list``, to a padded volume. add: adds to the volume, else
-    overwrites it."""
+    """Backprojects padded frames, with the numbers ``frame_list``, to a padded volume. add: adds to the volume's values."""
     owned, kernel = _owners(rt, layout, cells)
     nz, ny, nx = layout.brick.shape
     columns, rows, slices = (ceil_div(n, side) for n, side in zip((nx, ny, nz), owned, strict=True))
     group = rt.group(1, math.prod(owned))
     each = _SAMPLES_PER_VOXEL * nz * ny * nx * cells.most_per_line
     for first, stop in _parts(rt, frame_list.size, each):
-        adds = add or first > 0  # the launch continues the sums of the one before, so the bits are those of a single launch
+        adds = add or first > 0  # later launches continue the sums, as if it were one launch
         rt.launch(
             kernel, (columns * group, rows, slices), frames, cells.cells, cells.cell_lines, cells.matrices,
             cells.matrix_stride, cells.frame_cells, frame_list, cells.weights, cells.weight_at, first, stop,
@@ -55,7 +54,7 @@ def launch_adjoint(
 
 
 def _owners(rt: Runtime, layout: RayLayout, cells: RayCells) -> tuple[tuple[int, int, int], Kernel]:
-    """Returns the adjoint's kernel, after the box of voxels (x, y, z) for which one work-item or work-group sums."""
+    """Returns the box of voxels (x, y, z) for which one work-item or work-group sums, and the adjoint's kernel."""
     owned, defines = (_BLOCK,) * 3 if rt.pixel_items else brick_of(rt), _defines(layout, cells)
     if not rt.pixel_items:
         defines |= dict(zip(("BRICK_X", "BRICK_Y", "BRICK_Z"), owned, strict=True))
@@ -74,8 +73,8 @@ def _parts(rt: Runtime, frames: int, samples_per_frame: int) -> Iterator[tuple[i
 
 
 def brick_of(rt: Runtime) -> tuple[int, int, int]:
-    """Returns the box of voxels (x, y, z) for which a CPU's work-item sums. The larger of two is 14 % faster, and is taken
-    if local memory can hold it."""
+    """Returns the box of voxels (x, y, z) for which a CPU's work-item sums. The larger of two boxes is 14 % faster, and is
+    taken if local memory can hold it."""
     tile_bytes = 4 * math.prod(n + 2 for n in _BRICK)
     return _BRICK if rt.device.handle.local_mem_size >= tile_bytes else _SMALL_BRICK
 

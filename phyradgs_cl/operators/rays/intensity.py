@@ -28,8 +28,7 @@ class IntensityOperator:
     where J averages line integrals.
 
     Arguments and arrays are those of ``RayOperator``. The cells of a frame are divided into layers in which every line has
-    at most one cell. Softmax weights (F, rows, columns) are kept for each layer. projector: makes the operator A_k of a
-    layer."""
+    at most one cell. Softmax weights (F, rows, columns) are kept for each layer. projector: makes a layer's operator A_k."""
 
     def __init__(
         self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells],
@@ -55,13 +54,14 @@ class IntensityOperator:
 
     @property
     def holds(self) -> tuple[int, int]:
-        """The numbers of volumes and of stacks of frames on the device besides ``memory``, such as each layer's line
+        """How many volumes, and how many stacks of frames, are on the device besides ``memory``, such as each layer's line
         integrals and weights."""
         return 2, 2 * len(self._operators) + 3
 
     def expected(self, volume: SameArray, out: DeviceArray | None = None) -> SameArray:
-        """Returns I(x), (F, rows, columns) float32, of a volume (nz, ny, nx) in 1/mm, and sets J to the derivative there."""
-        self._shares = []  # frees their memory before new ones are computed
+        """Returns the expected measurement I(x), (F, rows, columns) float32, of a volume x (nz, ny, nx) in 1/mm. From then
+        on J is the derivative at x."""
+        self._shares = []  # frees the old weights' memory before new weights are computed
         frames: Array
         if isinstance(volume, DeviceArray):
             p = [operator.forward(volume, self._device.place(self.frames_shape)) for operator in self._operators]
@@ -75,7 +75,7 @@ class IntensityOperator:
         return cast(SameArray, self._given(frames, out))
 
     def forward(self, volume: SameArray, out: DeviceArray | None = None) -> SameArray:
-        """Returns J d, frames (F, rows, columns) float32, for a change d of the volume (nz, ny, nx)."""
+        """Returns the change of the frames, J d (F, rows, columns) float32, for a change d of the volume (nz, ny, nx)."""
         space = self._space(volume)
         total: Any = None
         for share, operator in zip(self._shares_for(volume), self._operators, strict=True):
@@ -84,7 +84,7 @@ class IntensityOperator:
         return cast(SameArray, self._given(total, out))
 
     def adjoint(self, frames: SameArray, out: DeviceArray | None = None) -> SameArray:
-        """Returns Jᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
+        """Returns the transpose of ``forward``, a volume Jᵀ y (nz, ny, nx) float32, for frames y (F, rows, columns)."""
         space = self._space(frames)
         total: Any = None
         for share, operator in zip(self._shares_for(frames), self._operators, strict=True):
@@ -103,7 +103,7 @@ class IntensityOperator:
         return part
 
     def _set(self, weights: list[np.ndarray]) -> None:
-        """Sets the weights of each layer, (F, lines, 1) or (F, 1, lines), and J to that at x = 0."""
+        """Sets the weights of each layer, (F, lines, 1) or (F, 1, lines), and J to the derivative at x = 0."""
         self._weights = weights
         self._line_weights: list[DeviceArray] = []
         self._shares = []
@@ -119,7 +119,7 @@ class IntensityOperator:
     def _shares_for(self, like: Array) -> list[Any]:
         """Returns the softmax weights of each layer, on the device if ``like`` is there, else on the host."""
         is_there = isinstance(like, DeviceArray)
-        # if they lie on the host and the device asks for them, or the reverse, they are copied
+        # copies the weights if they are on the host and needed on the device, or the reverse
         if self._shares and isinstance(self._shares[0], DeviceArray) != is_there:
             brought = self._device.array if is_there else self._device.numpy
             self._shares = [brought(share) for share in self._shares]

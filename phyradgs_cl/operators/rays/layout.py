@@ -93,7 +93,7 @@ class RayLayout:
         return (strides.start, *steps, strides.slice)
 
     def column_floats(self, axis: str) -> int:
-        """Returns the floats of a padded frame stored column by column, for a panel that is read along ``axis``."""
+        """Returns how many floats a padded frame takes, stored column by column, of a panel that is read along ``axis``."""
         return (self.turned if axis == "rows" else self).frames_strides.slice
 
     def inside(self, flat: np.ndarray) -> np.ndarray:
@@ -103,8 +103,8 @@ class RayLayout:
         return padded[BORDER:-BORDER, BORDER:-BORDER, :nx]
 
     def constants(self) -> tuple[np.ndarray | np.int32, ...]:
-        """Returns arguments of kernels. Of the brick: shape (x, y, z), first voxel, pitch of rows in floats, voxel size in
-        mm. Of a frame: lines, width, pitch of lines."""
+        """Returns arguments of kernels: the brick's shape (x, y, z), first voxel, pitch of rows in floats and voxel size in
+        mm; a frame's lines, width and pitch of lines."""
         nz, ny, nx = self.brick.shape
         dz, dy, dx = self.grid.voxel_size_mm
         return (
@@ -138,8 +138,7 @@ class RayCells:
     def upload(
         cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells], rows_across: int | None = None
     ) -> "RayCells":
-        """Uploads the tables of all frames. rows_across: the panel's number of rows with ``RayLayout.is_across``, else
-        None."""
+        """Uploads the tables of all frames. rows_across: the number of rows with ``RayLayout.is_across``, else None."""
         starts = np.concatenate([[0], np.cumsum([table.count for table in tables])])
         pose = np.concatenate([table.readout.poses(table.pose) for table in tables])
         weights = [table.weights_of(cell) for table in tables for cell in range(table.count)]

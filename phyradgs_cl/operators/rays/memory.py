@@ -25,7 +25,7 @@ class RayMemory:
 
     A volume that does not fit is cut into bricks, as large as fit together with some frames. slot_floats: the floats of
     one frame's slots, 0 without slots. With slots the volume is also stored transposed, with z along rows, if both fit.
-    Several operators may share one memory if they run one after the other: no call needs an earlier one's values."""
+    Several operators may share one memory if they run one after the other, since no call needs values of an earlier call."""
 
     def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int, slot_floats: int = 0) -> None:
         self.rt, self.layout, self.most_frames = rt, layout, most_frames
@@ -188,7 +188,7 @@ class RayMemory:
         return DeviceArray(self._frames.buffer, (floats,), self._frames.dtype)
 
     def _frames_floats(self, count: int) -> int:
-        """Returns the floats of a buffer for ``count`` frames. With slots it must also hold the frames transposed."""
+        """Returns how many floats a buffer for ``count`` frames takes. With slots it also holds the frames transposed."""
         turned = self.layout.turned.frames_floats(count) if self.slot_floats else 0
         return max(self.layout.frames_floats(count), turned)
 

@@ -37,10 +37,10 @@ class LinearOperator(Protocol):
     def frames_shape(self) -> tuple[int, int, int]: ...
 
     def forward(self, volume: Any, out: Any = None) -> Any:
-        """Returns A x, frames (F, rows, columns) float32, of a volume x (nz, ny, nx) in 1/mm."""
+        """Projects a volume x (nz, ny, nx) in 1/mm: returns A x, frames (F, rows, columns) float32."""
 
     def adjoint(self, frames: Any, out: Any = None) -> Any:
-        """Returns Aᵀ y, a volume (nz, ny, nx) float32, of frames y (F, rows, columns)."""
+        """Backprojects frames y (F, rows, columns): returns Aᵀ y, a volume (nz, ny, nx) float32."""
 
     def subset(self, frames: Sequence[int]) -> "LinearOperator":
         """Returns the operator to the frames with the numbers ``frames``, in that order."""
@@ -80,7 +80,7 @@ class RayOperator:
             self._poses = UprightPoses.upload(rt, grid, tables)
             self.slot_floats = self._poses.floats_per_frame(rays_shape, self._upright.leans)
         self.memory = memory or RayMemory(rt, layout, len(tables), self.slot_floats)
-        if self.slot_floats > self.memory.slot_floats:  # the shared memory has no room for slots
+        if self.slot_floats > self.memory.slot_floats:  # the given memory has no room for slots
             self._upright = None
         self._rays_shape = rays_shape
         self._cells = RayCells.upload(rt, grid, tables, rays_shape[0] if layout.is_across else None)
@@ -92,7 +92,7 @@ class RayOperator:
         return [self._tables[f] for f in self._chosen]
 
     def forward(self, volume: SameArray, out: SameArray | None = None) -> SameArray:
-        """Returns A x for a volume (nz, ny, nx) in 1/mm: frames (F, rows, columns) float32."""
+        """Projects a volume x (nz, ny, nx) in 1/mm to frames A x, (F, rows, columns) float32."""
         _check_shape("volume", volume, self.volume_shape)
         result: SameArray = _room_for(self.rt, self.frames_shape, volume, out)
         for attempt in attempts("ray-driven projector"):
@@ -135,8 +135,8 @@ class RayOperator:
             merge_slots(self.rt, self._cells, slots, there, target, self._rays_shape, self._axis)
 
     def _slots_of(self, part: slice) -> Iterator[tuple[int, Slots]]:
-        """Divides the frames ``part`` so that their slots fit into memory. Yields the slots of each group of frames, after
-        the number within ``part`` of its first frame."""
+        """Divides the frames ``part`` so that their slots fit into memory. Yields, for each group of frames, the number of
+        its first frame within ``part``, and its slots."""
         assert self._upright is not None and self._poses is not None
         for first in range(part.start, part.stop, self.memory.slot_frames):
             key = first, min(first + self.memory.slot_frames, part.stop)
@@ -148,7 +148,7 @@ class RayOperator:
             yield first - part.start, self._slots[key]
 
     def adjoint(self, frames: SameArray, out: SameArray | None = None) -> SameArray:
-        """Returns Aᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
+        """Backprojects frames y (F, rows, columns) to a volume Aᵀ y, (nz, ny, nx) float32."""
         _check_shape("frames", frames, self.frames_shape)
         result: SameArray = _room_for(self.rt, self.volume_shape, frames, out)
         for attempt in attempts("ray-driven backprojector"):
@@ -208,7 +208,7 @@ class RayOperator:
         self._slots: dict[tuple[int, int], Slots] = {}
 
     def _listed(self, part: slice) -> DeviceArray:
-        """Returns on the device the numbers of this operator's frames ``part`` in the whole scan. Uploads them once."""
+        """Returns the numbers that this operator's frames ``part`` have in the scan. Uploads them to the device once."""
         key = part.start, part.stop
         if key not in self._lists:
             self._lists[key] = self.rt.upload(self._chosen[part], np.int32)

@@ -75,7 +75,7 @@ class UprightPoses:
         table = self._table(cells, appears, slot, detector_shape)
         columns, rows = _largest(table)
         if (2 if leans else 1) * len(table) * columns * pitch_of(rows) > most_floats:
-            # A slot for cells whose lines are far apart would also hold all lines in between. So each cell gets its own.
+            # A slot for cells whose lines are far apart would also hold all lines between. So each cell gets its own slot.
             appears = slot = np.arange(len(cells))
             table = self._table(cells, appears, slot, detector_shape)
             columns, rows = _largest(table)
@@ -146,7 +146,6 @@ class Slots:
 
     @property
     def floats(self) -> int:
-        """The floats of all slots."""
         return self.count * self.columns * self.pitch
 
     @property
@@ -163,8 +162,8 @@ def merge_slots(
     rt: Runtime, cells: RayCells, slots: Slots, integrals: DeviceArray,
     target: tuple[DeviceArray, np.ndarray], detector_shape: tuple[int, int], axis: str,
 ) -> None:
-    """Averages the line integrals in slots to frames. target: the frames, and where they start and the steps to the next
-    column, row and frame in them, in floats."""
+    """Averages the line integrals in slots to frames. target: the frames and, in floats, where they start and the steps to
+    their next column, row and frame."""
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "merge_slots", **{**slots.defines, "LEAN": 0}),

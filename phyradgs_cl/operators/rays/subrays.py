@@ -53,13 +53,15 @@ def _depth(grid: Grid, pose: np.ndarray, *, is_nearest: bool) -> np.ndarray:
 
 
 def means(fine: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
-    """Returns B y: frames (F, rows, columns) from frames y (F, rows · along_v, columns · along_u) of the finer panel."""
+    """Returns the means B y, frames (F, rows, columns), of frames y (F, rows · along_v, columns · along_u) of the finer
+    panel."""
     along_v, along_u = subrays
     return block_means(fine, (1, along_v, along_u))
 
 
 def spread(frames: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
-    """Returns Bᵀ y: frames (F, rows · along_v, columns · along_u) of the finer panel from frames y (F, rows, columns)."""
+    """Returns the transpose Bᵀ y, frames (F, rows · along_v, columns · along_u) of the finer panel, of frames y (F, rows,
+    columns)."""
     along_v, along_u = subrays
     shares = frames / np.float32(along_v * along_u)
     return np.asarray(shares.repeat(along_v, 1).repeat(along_u, 2))

@@ -83,7 +83,7 @@ def _is_steep(cells: np.ndarray, rows: int, columns: int) -> bool:
 
 
 def _least_horizontal(d00: np.ndarray, eu: np.ndarray, width: int) -> np.ndarray:
-    """Returns the smallest length (C,) of d00 + u eu over u in [0, width − 1], for vectors d00 and eu (C, 2)."""
+    """Returns the smallest horizontal length (C,) of rays d00 + u eu to columns u in [0, width − 1]; d00, eu: (C, 2)."""
     nearest = -np.sum(d00 * eu, 1) / np.maximum(np.sum(eu * eu, 1), 1e-30)
     return np.asarray(np.linalg.norm(d00 + np.clip(nearest, 0, width - 1)[:, None] * eu, axis=1))
 
@@ -99,7 +99,7 @@ def _lies_between(grid: Grid, source: np.ndarray, d00: np.ndarray, eu: np.ndarra
 
 
 def columns_floats(grid: Grid) -> int:
-    """Returns the floats of a padded volume that is transposed to (y, x, z)."""
+    """Returns how many floats a padded volume takes that is transposed to (y, x, z)."""
     nz, ny, nx = grid.shape
     return 2 * GUARD + (ny + 2 * BORDER) * (nx + 2 * BORDER) * pitch_of(nz)
 
@@ -108,8 +108,7 @@ def launch_upright(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, columns: DeviceArray,
     target: tuple[DeviceArray, np.ndarray],
 ) -> None:
-    """Projects a volume, transposed to ``columns`` (y, x, z), to slots. target: an array with its strides in floats, as
-    ``Slots.strides``."""
+    """Projects a volume, transposed to ``columns`` (y, x, z), to slots. target: an array and its ``Slots.strides``."""
     shape, origin, _, pitch_mm, *_ = layout.constants()
     array, strides = target
     rt.launch(
@@ -124,8 +123,8 @@ def launch_upright_adjoint(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, values: DeviceArray,
     target: tuple[DeviceArray, Strides], *, add: bool = False,
 ) -> None:
-    """Backprojects slots, as ``split_slots`` writes them, to ``target``, a volume with its strides. add: adds to the volume,
-    else overwrites it."""
+    """Backprojects slots, as ``split_slots`` writes them, to ``target``, a volume and its strides. add: adds to the
+    volume."""
     shape, origin, *_ = layout.constants()
     (x, y, z), items = _owned(layout.brick.shape, rt.device.compute_units)
     rt.launch(
@@ -149,8 +148,7 @@ def _owned(shape: tuple[int, int, int], units: int) -> tuple[tuple[int, int, int
 def turn_volume(
     rt: Runtime, layout: RayLayout, volume: tuple[DeviceArray, Strides], columns: DeviceArray
 ) -> None:
-    """Transposes a volume (nz, ny, nx), given with its strides, to ``columns`` (y, x, z). Leaves the padding, which is
-    zero."""
+    """Transposes a volume (nz, ny, nx), given with its strides, to ``columns`` (y, x, z). The padding stays zero."""
     nz, ny, nx = layout.grid.shape
     shape, *_ = layout.constants()
     size = (ceil_div(nx, _TURN), ny, ceil_div(nz, _TURN))

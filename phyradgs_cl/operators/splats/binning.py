@@ -5,10 +5,10 @@ import numpy as np
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime import DeviceArray, LaterItem, MemoryShortage, Runtime
 
-_CHUNK = 512  # number of splats that a CPU's work-item counts
-_GROUP = 64  # number of splats that a GPU's work-group counts
+_CHUNK = 512  # a CPU's work-item counts the tiles of this many splats
+_GROUP = 64  # a GPU's work-group counts the tiles of this many splats
 _LARGEST_GROUP = 256  # most splats per work-group on a GPU, taken where _GROUP would give more than _MANY_COUNTS
-_MANY_COUNTS = 1 << 22  # number of counts, tiles × work-groups, above which their memory and time matter
+_MANY_COUNTS = 1 << 22  # above this many counts, tiles × work-groups, counting takes much memory and time
 _SCANNED = 64  # number of counts that a work-group adds at a time in its prefix sum
 _SLACK = 1.5  # lists are allocated this many times larger than needed, because clouds grow
 _NEAR = 1.25  # lists less than this many times larger than needed are replaced by larger ones before they overflow
@@ -22,8 +22,8 @@ class TileLists:
 
     tile: a tile's size in pixels or voxels along x, y, z. tiles: the number of tiles along x, y, z. Lists keep the order of
     the splats, so that sums over them repeat bit for bit. The number of list entries is known only on the device. The host
-    waits for it if the number of splats is new, ``waits`` is set, or a GPU would take long without lists. Else it reads the
-    number later. Until then, kernels test all splats in a tile whose list did not fit (cl/common/tile.h)."""
+    waits for it if the number of splats is new, ``waits`` is set, or a GPU would take long without lists. Otherwise it reads
+    the number later. Until then, kernels test all splats in a tile whose list did not fit (cl/common/tile.h)."""
 
     def __init__(self, rt: Runtime, tile: tuple[int, int, int], tiles: tuple[int, int, int]) -> None:
         self.rt = rt
@@ -85,7 +85,7 @@ class TileLists:
 
     @staticmethod
     def bytes(rt: Runtime, tiles: int, count: int) -> int:
-        """Returns the bytes of the lists of ``count`` splats, without the entries themselves."""
+        """Returns how many bytes the lists of ``count`` splats take, without their entries."""
         return 4 * (tiles + 1 + tiles * max(ceil_div(count, chunk_of(rt, tiles, count)), 1))
 
     def _make_room(self, needed: int, share: float) -> None:

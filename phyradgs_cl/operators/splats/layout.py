@@ -89,8 +89,8 @@ class DeviceCells:
     def upload(
         cls, rt: Runtime, table: TimeCells, states: tuple[np.ndarray, np.ndarray] | None = None
     ) -> "DeviceCells":
-        """Uploads a frame's cells. states: for an object that moves, what ``states_of`` returns. Raises InputError for
-        cells that have another weight in each line."""
+        """Uploads a frame's cells. states: what ``states_of`` returns for an object that moves. Raises InputError for cells
+        that have another weight in each line."""
         shares, cell_states = (np.zeros(1), np.zeros(1)) if states is None else states
         if table.line_share is not None:
             raise InputError("--motion", "cells with a weight for each line", "cells with one weight", "take micro-views")
@@ -146,7 +146,7 @@ def cell_constants(
 ) -> np.ndarray:
     """Returns the table (C, 24) float32 that cl/common/splat.h describes, for cells with a pose (C, 12), weight (C,) and
     layer (C,)."""
-    if is_parallel:  # kernels compute the direction as origin minus source
+    if is_parallel:  # kernels take the direction as origin − source
         pose = np.concatenate([-pose[:, 0:3], np.zeros((len(pose), 3)), pose[:, 6:]], 1)
     source, d00 = pose[:, 0:3], pose[:, 3:6] - pose[:, 0:3]
     eu, ev = pose[:, 6:9], pose[:, 9:12]

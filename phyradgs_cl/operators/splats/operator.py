@@ -124,7 +124,7 @@ class GaussianOperator(Operator):
         super().__init__(rows.rt, (_ROWS, (ROWS, None)), range_, self._at_rows, **parts)
 
     def forward(self, point: SplatPoint) -> DeviceArray:
-        """Returns y float32 for Gaussians in the kernels' layout."""
+        """Applies the operator to Gaussians in the kernels' layout. Returns y float32."""
         raise NotImplementedError
 
     def back(self, point: SplatPoint, by_y: DeviceArray) -> DeviceArray:
@@ -170,7 +170,7 @@ class SplatProjection(GaussianOperator):
         self._images = PlainImages(rt, self._projector.lines, self._projector.width, turned=readout.axis != "rows")
         self._tables = [DeviceCells.upload(rt, table.scaled(1 / length_mm)) for table in tables]
         self._poses = [table.pose[table.count // 2] for table in tables]
-        self._ready: list[object] = []  # Gaussians and cells that the kernels' buffers hold; parts share this list
+        self._ready: list[object] = []  # for which Gaussians and cells the kernels' buffers are valid; parts share this list
         self._detector_shape = detector_shape
         self._choose(range(len(tables)), PlainRows(rt, length_mm, line_integrals=True))
 
@@ -184,14 +184,14 @@ class SplatProjection(GaussianOperator):
 
     def _part(self, few: Sequence[int]) -> "SplatProjection":
         part = copy(self)
-        part.__dict__.pop("intensity", None)  # the cached operator to all frames
+        part.__dict__.pop("intensity", None)  # this cached operator was for all frames
         part._choose([self._chosen[f] for f in few], self.rows)
         return part
 
     def forward(self, point: SplatPoint) -> DeviceArray:
         """Renders Gaussians to frames (F, rows, columns) float32."""
         frames = self.rt.empty((len(self._cells), *self._detector_shape))
-        self._ready.clear()  # now, because a failure below may leave the buffers half written
+        self._ready.clear()  # at once, because a failure below may leave the buffers half written
         for number, cells in enumerate(self._cells):
             self._images.leave(self._projector.forward(point.gaussians, cells), frames, number)
         self._ready[:] = point, self._cells[-1]
@@ -209,12 +209,13 @@ class SplatProjection(GaussianOperator):
     def _differentiate(
         self, point: SplatPoint, cells: DeviceCells, by_image: DeviceArray, gradients: DeviceArray
     ) -> None:
-        """Writes dL/d(kernels' rows), (13, stride), for one frame from its dL/d(frame), ``by_image``, in padded layout."""
+        """Writes one frame's part of dL/d(kernels' rows), (13, stride), from ``by_image``: dL/d(frame) in the padded
+        layout."""
         is_ready = self._ready == [point, cells]
         self._ready.clear()
         if not is_ready:
             see = self._projector.forward if self._is_layered else self._projector.prepare
-            see(point.gaussians, cells)  # averaged intensities depend on all layers, which must be drawn
+            see(point.gaussians, cells)  # averages of intensities need all layers, so these are drawn
         self._projector.backward(point.gaussians, cells, by_image, gradients)
 
     def by_poses(self, gaussians: Any, by_frames: Any) -> np.ndarray:
@@ -233,7 +234,7 @@ class SplatProjection(GaussianOperator):
             turn, along, across = by_pose(rows[:, : cloud.count], by_rows)
             shifts = [across / (self._projector.lines / 2), along / (self._projector.width / 2)]
             found[number] = turn, *(shifts[::-1] if self._images.turned else shifts)
-            if not (self._affine or cells.is_parallel):  # in these models all rays are as long as the central one
+            if not (self._affine or cells.is_parallel):  # there all rays count as equally long
                 found[number, 1:] += by_length(self._poses[self._chosen[number]], weighed[number])
         return found
 
@@ -267,7 +268,7 @@ class VoxelOperator(GaussianOperator):
         self._inside = grid.scaled(1 / length_mm)
         self._voxeliser = Voxeliser(rt, grid.shape, cutoff_sigma=cutoff_sigma)
         self._images = PlainImages(rt, nz * ny, nx)
-        self._ready: list[object] = []  # the Gaussians that the kernels' buffers hold
+        self._ready: list[object] = []  # for which Gaussians the kernels' buffers are valid
 
     def forward(self, point: SplatPoint) -> DeviceArray:
         """Returns the volume (nz, ny, nx) float32 of Gaussians."""

@@ -13,7 +13,7 @@ from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.operators.splats.layout import DeviceCells, DeviceGaussians, stride_of
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 
-STATE_ROWS = 12  # rows of a Gaussian in a state: its centre x, y, z, and the 9 numbers of G
+STATE_ROWS = 12  # numbers of a Gaussian in a state: its centre x, y, z, and the 3 × 3 matrix that deforms its shape
 _PROBED_SIDE = 9  # number of points along each axis of the grid at which the inverse of a field is checked
 _PROBED_STATES = 16  # number of evenly spaced times at which the inverse is checked, besides those of largest displacement
 _WRONG = 0.01  # largest accepted error of an inverse, in voxels
@@ -71,7 +71,7 @@ class CloudStates:
         mean = np.stack(np.meshgrid(x, y, z, indexing="ij")).reshape(3, -1)
         rows = np.ones((11, mean.shape[1]))
         rows[:3] = mean
-        # States in which each field moves most, and some at even times.
+        # The inverse is tested in the states in which each field moves most, and at some even times.
         ends = np.concatenate([self.deformation.weights.argmax(0), self.deformation.weights.argmin(0)])
         chosen = np.linspace(0, len(self.deformation.times_s) - 1, _PROBED_STATES).astype(int)
         weights = self.deformation.weights[np.unique([*ends, *chosen])]
@@ -91,8 +91,7 @@ class CloudStates:
 def segments_for_object(deformation: Deformation, lit_s: np.ndarray, voxel_mm: float) -> int:
     """Returns how many segments of time a frame needs that is exposed from lit_s[0] to lit_s[1], up to ``_MOST_SEGMENTS``.
 
-    Splats move straight in a segment. So no point of the object may deviate from a straight line by more than a quarter of
-    a voxel."""
+    Splats move straight in a segment. So no point of the object may deviate from a straight line by over 1/4 voxel."""
     for count in range(1, _MOST_SEGMENTS):
         weights = deformation.weights_at(np.linspace(lit_s[0], lit_s[1], 2 * count + 1))
         bend_mm = np.abs(weights[1::2] - (weights[:-1:2] + weights[2::2]) / 2) @ deformation.reach_mm

@@ -137,7 +137,7 @@ def _in_bricks(
         if voxels_bytes > brick_bytes and nz * ny > 1:
             return (room.free_bytes + 1,)  # rejects the shape: no buffer is larger than the free memory
         lists_bytes = TileLists.bytes(rt, int(np.prod(_tiles(rt, shape)[1])), gaussians.count)
-        entries_bytes = lists_bytes  # a guess: the number of list entries is known only after counting
+        entries_bytes = lists_bytes  # a guess, since the number of list entries is known only after counting
         return voxels_bytes, lists_bytes, entries_bytes, records_bytes
 
     room = rt.room()

@@ -153,7 +153,7 @@ def lines_backprojection(
     for frame, poses, share, moved in zip(frames.astype(np.float64), pose, weight, pushes, strict=True):
         positions = [detector_position(p, grid, is_parallel, moved) for p in poses]
         u, v, depth = (np.stack(parts) for parts in zip(*positions, strict=True))
-        ahead = v - np.arange(lines)[:, None, None, None]  # goes from above to below 0 at the line that sees the voxel
+        ahead = v - np.arange(lines)[:, None, None, None]  # changes its sign at the line that sees the voxel
         for index in np.ndindex(*grid.shape):
             at = (slice(None), *index)
             volume[index] += share * _seen(frame, u[at], ahead[at], depth[at], power, speed_power)
@@ -205,8 +205,8 @@ def _on(position: np.ndarray, count: int) -> np.ndarray:
 
 
 def warp_forward(volume: Volume, displacement: np.ndarray) -> Volume:
-    """Returns v(y + w(y)), (nz, ny, nx), where v interpolates a volume by cubic splines and the displacement w (nz, ny, nx,
-    3) is in voxels, x, y, z. v is 0 further than ``_REACH`` voxels outside the volume."""
+    """Returns the warped volume v(y + w(y)), (nz, ny, nx). v interpolates a volume by cubic splines, and the displacement w
+    (nz, ny, nx, 3) is in voxels, x, y, z. v is 0 further than ``_REACH`` voxels outside the volume."""
     padded = _coefficients(np.pad(np.asarray(volume, np.float64), _BORDER))
     result = np.zeros(volume.shape)
     for place, weight in _taps(displacement):

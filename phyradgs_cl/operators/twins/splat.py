@@ -7,7 +7,8 @@ of the source. The kernel works in detector coordinates and shares no formula wi
 In motion, the definition is integrated over time numerically. In a segment a splat keeps the conic, amplitude and
 perspective factor Q of the middle time, while its centre moves on the panel along a straight line at constant speed. From
 end to end it moves as the mean μ projected by the two end poses. Its mid-time centre is the average of the parabola through
-both ends and the middle. Conic and Q come from the difference C − b bᵀ. It loses digits, of which float32 has too few."""
+both ends and the middle. Conic and Q come from the difference C − b bᵀ. This difference loses digits, of which float32 has
+too few."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -161,7 +162,7 @@ def moving_frame(
         clouds = [rows] * 3
         if cloud_at is not None and table.end_times_s is not None:
             clouds = [cloud_at(time_s) for time_s in (table.time_s[cell], *table.end_times_s[cell])]
-        means = np.stack([cloud[:3] for cloud in clouds[1:]]).transpose(2, 0, 1)  # (G, 2, 3)
+        means = np.stack([cloud[:3] for cloud in clouds[1:]]).transpose(2, 0, 1)  # at both ends, (G, 2, 3)
         for row, precision, end_means in zip(clouds[0].T, precision_matrices(clouds[0]), means, strict=True):
             frame += _segment_image(
                 row, precision, pose, ends, end_means, times, shape, cutoff_sigma, affine, table.is_parallel, moved

@@ -61,7 +61,7 @@ class WarpedOperator:
         self.frames_shape = (len(tables), *detector_shape)
 
     def forward(self, volume: SameArray, out: DeviceArray | None = None) -> SameArray:
-        """Returns A x for a volume (nz, ny, nx) in 1/mm: frames (F, rows, columns) float32."""
+        """Projects a volume x (nz, ny, nx) in 1/mm to frames A x, (F, rows, columns) float32."""
         return self._on_device(self._forward, volume, self.frames_shape, out)
 
     def _forward(self, volume: DeviceArray, frames: DeviceArray) -> None:
@@ -69,15 +69,16 @@ class WarpedOperator:
         self.project(lambda k: volume if self.warp.is_still(k) else self.warp.forward(k, source), frames)
 
     def project(self, volume_of: Callable[[int], DeviceArray], frames: DeviceArray) -> None:
-        """Writes Σ_k P_k v_k to frames (F, rows, columns). volume_of: returns the volume v_k (nz, ny, nx) of state k."""
+        """Projects all states to frames (F, rows, columns): Σ_k P_k v_k. volume_of: returns the volume v_k (nz, ny, nx) of
+        state k."""
         self.rt.fill(frames, 0)
         for part in self._parts:
             part.operator.forward(volume_of(part.state), out=self.warp.stack.of(len(part.frames), self.detector_shape))
             self.warp.stack.add(part.places, frames)
 
     def backprojections(self, frames: DeviceArray) -> Iterator[tuple[int, DeviceArray]]:
-        """Yields (k, P_kᵀ y) for frames y (F, rows, columns) and each state k that they use. P_kᵀ y (nz, ny, nx) is valid
-        until the next one."""
+        """Yields (k, P_kᵀ y): each state k that frames y (F, rows, columns) use, and their backprojection to it. Each volume
+        (nz, ny, nx) is valid until the next one."""
         for part in self._parts:
             taken = self.warp.stack.take(frames, part.frames)
             yield part.state, part.operator.adjoint(taken, out=self.warp.moved())
@@ -88,7 +89,7 @@ class WarpedOperator:
         return [part.state for part in self._parts]
 
     def adjoint(self, frames: SameArray, out: DeviceArray | None = None) -> SameArray:
-        """Returns Aᵀ y for frames (F, rows, columns): a volume (nz, ny, nx) float32."""
+        """Backprojects frames y (F, rows, columns) to a volume Aᵀ y, (nz, ny, nx) float32."""
         return self._on_device(self._adjoint, frames, self.volume_shape, out)
 
     def _adjoint(self, frames: DeviceArray, volume: DeviceArray) -> None:
@@ -123,7 +124,8 @@ class WarpedOperator:
 
     @property
     def holds(self) -> tuple[int, int]:
-        """The numbers of volumes and of stacks of frames on the device besides ``memory`` and the displacement fields."""
+        """How many volumes, and how many stacks of frames, are on the device besides ``memory`` and the displacement
+        fields."""
         return self.warp.volumes, 1
 
 
@@ -200,13 +202,12 @@ class FieldDerivative:
         self.slopes = {k: warp_slopes(volume, displacement) * per_mm for k, displacement in displacements.items()}
 
     def forward(self, change_mm: np.ndarray) -> np.ndarray:
-        """Returns J d, the change of the frames (F, rows, columns) float32, for a change d (R, cz, cy, cx, 3) of the
-        coefficients."""
+        """Returns the frames' change J d (F, rows, columns) float32 for a change d (R, cz, cy, cx, 3) of coefficients."""
         fields_mm = np.stack([self._on_grid(one) for one in change_mm])
         return self._projected(lambda k: np.tensordot(self.weights[k].astype(np.float32), fields_mm, 1))
 
     def adjoint(self, frames: np.ndarray) -> np.ndarray:
-        """Returns Jᵀ y, (R, cz, cy, cx, 3) float64, for frames y (F, rows, columns)."""
+        """Returns the transpose of ``forward``, Jᵀ y (R, cz, cy, cx, 3) float64, for frames y (F, rows, columns)."""
         rt = self.operator.rt
         by_field = np.zeros_like(self._fields_mm)
         for k, volume in self.operator.backprojections(rt.upload(frames, np.float32)):
@@ -239,8 +240,8 @@ class FieldDerivative:
 
 
 def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Returns ∇v(y + w(y)), (nz, ny, nx, 3) float32 per voxel, x, y, z, at voxel centres y. v is the cubic spline through a
-    volume (nz, ny, nx), and 0 outside. displacement: w (nz, ny, nx, 3) in voxels, x, y, z."""
+    """Returns the slopes ∇v(y + w(y)), (nz, ny, nx, 3) float32 per voxel, x, y, z, at voxel centres y. v is the cubic spline
+    through a volume (nz, ny, nx), and 0 outside. displacement: w (nz, ny, nx, 3) in voxels, x, y, z."""
     wide = scipy.ndimage.spline_filter(np.pad(volume, _BORDER + _SETTLES), output=np.float32)
     padded = np.ascontiguousarray(wide[(slice(_SETTLES, -_SETTLES),) * 3])
     strides = (padded.shape[1] * padded.shape[2], padded.shape[2], 1)

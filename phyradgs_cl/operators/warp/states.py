@@ -11,7 +11,7 @@ from phyradgs_cl.fields import Deformation, Grid
 
 MOST_STATES = 12
 _SPACING = 0.6  # largest distance of a time from a state if states are blended: RMS displacement of moving voxels, in voxels
-_SPACING_OF_NEAREST = 0.3  # largest such distance if the nearest state stands for a time, without a blend
+_SPACING_OF_NEAREST = 0.3  # largest such distance if each time takes the nearest state, without a blend
 _MOVES = 0.1  # a voxel counts as moving if its squared displacement is at least this fraction of the largest one
 
 
@@ -19,9 +19,9 @@ _MOVES = 0.1  # a voxel counts as moving if its squared displacement is at least
 class MotionStates:
     """K representative states of ``deformation``, and which of them stand for a time.
 
-    fields_mm: (R, nz, ny, nx, 3) displacements on ``grid`` by each field with weight 1, x, y, z. weights: (K, R) of the
-    fields in each state. metric: (R, R); two states whose weights differ by d are √(dᵀ metric d) apart, an RMS displacement
-    in voxels. blends: a time between two states gets a blend of both; else the nearest state."""
+    fields_mm: (R, nz, ny, nx, 3) displacements on ``grid`` by each field with weight 1, x, y, z. weights: (K, R), the
+    fields' weights in each state. metric: (R, R); two states whose weights differ by d are √(dᵀ metric d) apart, an RMS
+    displacement in voxels. blends: a time between two states gets a blend of both; else the nearest state."""
 
     deformation: Deformation
     grid: Grid
@@ -38,8 +38,8 @@ class MotionStates:
         """Chooses at most ``most`` states for times (T,) in s. The next state is always the object at the time at which it
         differs most from all states so far.
 
-        least_voxels: changing a weight by 1 counts as a displacement by at least this. So fields that are still zero get
-        several states too."""
+        least_voxels: a change of a weight by 1 counts as at least this displacement, so that fields of zeros get several
+        states too."""
         units, fields_mm = np.eye(deformation.rank), unit_fields_mm(deformation, grid)
         voxel_mm = min(grid.voxel_size_mm)
         seen = np.unique(deformation.weights_at(times_s), axis=0)

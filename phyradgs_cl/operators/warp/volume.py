@@ -13,7 +13,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
 _BORDER = 4  # width in voxels around the volume in which coefficients are kept, as in cl/warp.cl: further ones are < 3e-3
 _MOST_OWNED = 8  # most slices for which a CPU's work-item sums; voxels near their ends are computed by two work-items
 _ITEMS_PER_UNIT = 4  # wanted work-items per compute unit, so that none waits long for the last
-_HEADROOM = 64  # weights with which voxels add to one may sum to this: the field then contracts by 4 along each axis
+_HEADROOM = 64  # a voxel may receive weights with this sum, which a field that contracts by 4 along each axis causes
 _TOGETHER = 8, 8, 4  # box of voxels (x, y, z) of a GPU's work-group, which adds in local memory
 _SAMPLES = 16  # reading the 4³ coefficients of a voxel takes this many times longer than a ray's sample
 _ADDED = 64  # adding to the 4³ coefficients of a voxel takes this many times longer than a ray's sample
@@ -45,11 +45,12 @@ class VolumeWarp:
     volumes = 4  # most volumes on the device, besides the displacement fields
 
     def is_still(self, state: int) -> bool:
-        """Returns whether W_k is the identity for state k = ``state``."""
+        """Returns whether the warp to state k = ``state`` displaces nothing."""
         return self.states.is_still(state)
 
     def source(self, volume: DeviceArray) -> DeviceArray:
-        """Returns F E v, the spline coefficients of a volume v (nz, ny, nx). The memory is valid until the next call."""
+        """Returns the spline coefficients F E v of a volume v (nz, ny, nx), padded (E) and filtered (F). Valid until the
+        next call."""
         if self._source is None:
             self._source = self.rt.empty(self._floats)
         self.rt.fill(self._source, 0)
@@ -58,7 +59,7 @@ class VolumeWarp:
         return self._source
 
     def _filter(self, values: DeviceArray) -> None:
-        """Applies F to padded coefficients, in place. Filters padded rows as a whole, because their zeros stay zero."""
+        """Applies the spline filter F in place to a padded volume. Filters whole padded rows, since their zeros stay 0."""
         nz, ny, nx = (n + 2 * _BORDER for n in self.shape)
         slice_, row = self._strides.slice, self._strides.row
         start = np.int64(self._strides.start - _BORDER * (slice_ + row + 1))
@@ -70,7 +71,8 @@ class VolumeWarp:
             self.rt.launch(across, (width // lanes, planes), values, start, *sides, group=group)
 
     def forward(self, state: int, source: DeviceArray) -> DeviceArray:
-        """Returns W_k v (nz, ny, nx) from the coefficients ``source`` of v. The memory is valid until the next call."""
+        """Returns the volume warped to a state, W_k v (nz, ny, nx), from its coefficients ``source``. Valid until the next
+        call."""
         nz, ny, nx = self.shape
         result, blocks = self.moved(), ceil_div(nx, self.rt.lanes)
         self.rt.launch(
@@ -94,7 +96,8 @@ class VolumeWarp:
         return self._total
 
     def adjoint(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Adds B_kᵀ v to ``total``, for a volume v in the memory that ``moved`` returned. ``read`` then applies Eᵀ F."""
+        """Adds a volume v of state k, by the transpose B_kᵀ of sampling the spline, to the coefficients ``total``. v is in
+        the memory that ``moved`` returned."""
         if self.rt.pixel_items:
             self._adjoint_fixed(state, moved, total)
             return
@@ -108,13 +111,14 @@ class VolumeWarp:
         )  # fmt: skip
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:
-        """Writes the volume Eᵀ F ``total`` (nz, ny, nx) to ``result``. Destroys ``total``."""
+        """Writes the volume (nz, ny, nx) of the coefficients ``total``, filtered and without padding, to ``result``.
+        Destroys ``total``."""
         self._filter(total)
         move(self.rt, (total, self._strides), (result, Strides.plain(self.shape)), self.shape)
 
     def _adjoint_fixed(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Adds B_kᵀ v as integers, whose sums do not depend on the order. The largest voxel becomes 2³¹ / ``_HEADROOM``, so
-        rounding is as fine as float32's."""
+        """Does in integers what ``adjoint`` does, since sums of integers do not depend on the order. The largest voxel
+        becomes 2³¹ / ``_HEADROOM``, so rounding is as fine as float32's."""
         largest = self._space.largest(moved, absolute=True)
         if not largest > 0:
             return
@@ -132,7 +136,6 @@ class VolumeWarp:
         self.rt.launch(self.kernel("warp_adjoint_sum"), self._floats, *sums, group=self.rt.group())
 
     def kernel(self, name: str) -> Kernel:
-        """Returns a kernel of cl/warp.cl."""
         return self.rt.kernel("warp", name, RANK=len(self.states.fields_mm))
 
     def _layout(self) -> tuple[int, Strides]:
@@ -161,7 +164,6 @@ class TimeStates:
 
     @property
     def count(self) -> int:
-        """The number of states K."""
         return len(self.times_s)
 
     def shares(self, times_s: np.ndarray) -> np.ndarray:
@@ -206,7 +208,8 @@ class StateStack:
         return self._total
 
     def adjoint(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Writes W_kᵀ v to volume k = ``state`` of ``total``. It need not add, because it is called once per state."""
+        """Writes a volume v of state k to volume k = ``state`` of ``total``. It need not add, because it is called once per
+        state."""
         self.rt.copy(moved, total, nbytes=4 * self._voxels, target_offset=4 * self._voxels * state)
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:

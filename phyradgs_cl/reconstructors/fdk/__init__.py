@@ -67,8 +67,8 @@ WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 @dataclass(frozen=True)
 class FdkOptions(MotionOptions):
-    """Options of FDK. window: of the ramp filter, one of ``WINDOWS``. extrapolate: how rows continue beyond the panel, one
-    of ``WAYS``.
+    """Options of FDK. window: the window of the ramp filter, one of ``WINDOWS``. extrapolate: how rows continue beyond the
+    panel, one of ``WAYS``.
 
     motion: static (one pose per frame, mid-window), static-start (the frame's first pose) or per-row (every line at the
     middle of its own exposure). Of a model with several poses per line FDK uses the middle pose."""

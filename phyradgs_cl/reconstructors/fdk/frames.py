@@ -71,8 +71,7 @@ def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: 
 
 
 def _curvature(frames: np.ndarray) -> np.ndarray:
-    """Returns the curvature (F, v, 1), positive downwards, of the parabola through a row's squares; the median over
-    frames."""
+    """Returns the curvature (F, v, 1), positive downwards, of the parabola through a row's squares: the frames' median."""
     u = np.linspace(-1, 1, frames.shape[2])
     basis = np.stack([np.ones_like(u), u, u**2], axis=1)
     squares = np.maximum(frames, 0).astype(np.float64) ** 2
@@ -134,7 +133,7 @@ def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: boo
         ahead = ((first - corners) * normal).sum(-1) / (source * normal).sum(-1)
         hit = corners + ahead[..., None] * source - first
     else:
-        depth = ((corners - source) * normal).sum(-1) / ((first - source) * normal).sum(-1)  # the panel has a depth of 1
+        depth = ((corners - source) * normal).sum(-1) / ((first - source) * normal).sum(-1)  # over the panel's depth
         hit = (corners - source) / np.maximum(depth, 1e-6)[..., None] - (first - source)
     across = np.cross(step_v, normal)
     column = (hit * across).sum(-1) / (step_u * across).sum(-1)

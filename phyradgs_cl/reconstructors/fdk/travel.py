@@ -23,8 +23,8 @@ _CLASS_RAD = np.deg2rad(15)  # width of a class of ray directions about z, unles
 _VIEWS_A_CLASS = 2.0  # each class needs this many views of one turn: with fewer views, classes are wider
 _EVEN = 0.5  # rows count fully up to this fraction of the panel's half height, then less
 _LEAST_ROW = 0.02  # least weight of a row: some voxels are seen by the outermost row alone
-_LEAST_SHARE = 0.01  # a class counts for a voxel if it is seen from at least this fraction of the class's directions
-_NAMED = 0.01  # if a larger fraction of the voxels misses directions, a warning says so
+_LEAST_SHARE = 0.01  # a class of directions counts for a voxel that is seen from at least this fraction of them
+_NAMED = 0.01  # a warning comes if a larger fraction of the voxels lacks views from some directions
 _FEW_VIEWS = 24  # a warning comes below this many views per turn: with 24, densities of balls are within 2 %
 Backproject = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """A function from frames (n, rows, columns) and the numbers (n,) of their views to a volume (z, y, x)."""
@@ -63,7 +63,7 @@ def seen_volume(
     it.
 
     pose (F, 12) or (F, lines, 12) mm. counted: gives a view's redundancy weights (rows, columns). Both backprojections
-    weight each view by the angle for which it stands; ``backproject_seen`` divides by the distance once, not twice."""
+    weight each view by the angle for which it stands. ``backproject_seen`` divides by the distance once, not twice."""
     by_pixel, shape = pose_of_pixels(pose, axis), frames.shape[1:]
     angle_rad, pace = _directions(by_pixel[:, [by_pixel.shape[1] // 2]], shape, is_parallel)
     turn_rad = 2 * np.pi if is_displaced else np.pi  # a centred panel measures every ray in half a turn

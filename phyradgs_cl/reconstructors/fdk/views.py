@@ -35,7 +35,7 @@ _NO_PLANE_DEG = 45.0
 _LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the plane of the rotation
 _NO_LEAN_DEG = 10.0
 _ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: there densities are 0.1 % too low
-_NO_ROLL_DEG = 10.0  # angle at which densities are 1.5 % too low; at 90° they are 0
+_NO_ROLL_DEG = 10.0  # larger angles of the rows are refused: here densities are 1.5 % too low, at 90° they are 0
 _LEAST_OVERLAP = 2.0  # a displaced panel must reach this many columns beyond the axis, or a warning comes
 # A smaller missing angle causes no warning: nearly parallel rays have so narrow a fan that half a turn is enough.
 _TOLERATED_RAD = np.deg2rad(0.5)
@@ -47,7 +47,7 @@ class Arc:
     """The angles that the views cover, and how much of them each view stands for.
 
     - gap_rad (F,): each view's part of the arc.
-    - progress_rad (F,): its angle from the arc's start, which is half a step before the first view; the end is half a step
+    - progress_rad (F,): each view's angle from the arc's start, half a step before the first view; the arc ends half a step
       behind the last. In a full turn it counts from the view of the least angle.
     - parts_rad (P, 2): progress at which each part between gaps begins and ends.
     - filled_rad: total width of the gaps for which neighbouring views stand."""
@@ -74,7 +74,7 @@ class Arc:
 
 
 def filled_gap_rad(fan: weights.Fan) -> float:
-    """Returns the width in rad up to which gaps are filled by the views beside them: no others see some of their rays."""
+    """Returns the width in rad up to which the views at both sides fill gaps: no others see some of the gaps' rays."""
     if fan.is_put_aside:
         return 2 * np.pi
     return _FILLED_RAD if fan.is_displaced else 0.0
@@ -84,7 +84,7 @@ def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
     """Returns the arc that views at gantry angles (F,) cover, in any order and over any number of turns.
 
     Gaps that stand out divide the arc into parts. If none is wider than ``filled_rad``, the arc is a full turn, and the
-    views beside the gaps stand for them."""
+    views at both sides stand for the gaps."""
     cell, centre = _distinct(angle_rad)
     count = np.bincount(cell)
     ahead = np.diff(centre, append=centre[0] + 2 * np.pi)
@@ -95,7 +95,7 @@ def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
         whole = np.array([[0.0, 2 * np.pi]])
         return Arc((gap / count)[cell], (centre - centre[0])[cell], 2 * np.pi, True, whole, _filled_rad(ahead))
     first = (int(np.argmax(np.where(wide, ahead, 0))) + 1) % ahead.size
-    ahead, wide = np.roll(ahead, -first), np.roll(wide, -first)  # now the widest gap that stands out is the last
+    ahead, wide = np.roll(ahead, -first), np.roll(wide, -first)  # so that the widest gap that stands out is the last
     forward, back = _steps(ahead, wide)
     progress = np.concatenate([[0.0], np.cumsum(ahead[:-1])]) + back[0] / 2
     parts = np.stack([(progress - back / 2)[np.roll(wide, 1)], (progress + forward / 2)[wide]], -1)
@@ -119,7 +119,7 @@ def _stand_out(ahead: np.ndarray) -> np.ndarray:
 
 def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
     """Returns which narrow gaps (K,) have a gap on the opposite side too, bool (K,): no opposite ray stands for them, so the
-    views beside them must. The widest gap is never among them."""
+    views at both sides must. The widest gap is never among them."""
     narrow = wide & (ahead <= _FILLED_RAD) & (np.arange(ahead.size) != np.argmax(ahead))
     opposite = centre + ahead / 2 + np.pi
     before = np.searchsorted(centre, np.mod(opposite - centre[0], 2 * np.pi) + centre[0], side="right") - 1
@@ -127,8 +127,8 @@ def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.nd
 
 
 def _steps(ahead: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles (K,) in rad from each view to the next, and from the view before to each. Instead of a gap, the
-    step on the view's other side counts."""
+    """Returns the angles (K,) in rad from each view to the next, and from the view before to each. The step on the view's
+    other side takes the place of a gap."""
     forward = np.where(wide, np.roll(ahead, 1), ahead)
     return forward, np.roll(np.where(wide, np.roll(ahead, -1), ahead), 1)
 
@@ -211,7 +211,7 @@ def ray_weight(
 def opposite_weight(
     canonical: np.ndarray, shape: tuple[int, int], arc: Arc, is_parallel: bool
 ) -> Callable[[int], np.ndarray | float]:
-    """Returns a function from a view's index to weights (rows, columns): those of a ray and its opposite sum to 2."""
+    """Returns a function from a view's index to weights (rows, columns). The weights of a ray and its opposite sum to 2."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
 
     def weight(view: int) -> np.ndarray | float:

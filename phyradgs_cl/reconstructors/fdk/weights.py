@@ -27,7 +27,8 @@ def turned_back(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
 
 
 def pixel_rays(pose: np.ndarray, rows: np.ndarray, columns: np.ndarray, is_parallel: bool = False) -> np.ndarray:
-    """Returns vectors (..., v, u, 3) mm from source, or the origin in a parallel beam, to pixels of rows (v,), columns (u,).
+    """Returns vectors (..., v, u, 3) in mm from the source, in a parallel beam from the origin, to pixels at rows (v,) and
+    columns (u,).
 
     pose broadcasts to (..., v, u, 12): one for all pixels (1, 1, 12), one per row (v, 1, 12), one per column (1, u, 12)."""
     corner = pose[..., 3:6] if is_parallel else pose[..., 3:6] - pose[..., 0:3]
@@ -102,7 +103,7 @@ class Fan:
 
 
 def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = False) -> Fan:
-    """Returns the fan that all views see on a detector of ``shape`` (rows, columns). pose (F, ..., 12): as in
+    """Returns the fan that all views see on a panel of ``shape`` (rows, columns). pose (F, ..., 12): as in
     ``pixel_rays``."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
     outer = pose[:, :, [0, -1]] if pose.shape[2] > 1 else pose

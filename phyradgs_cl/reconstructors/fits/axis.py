@@ -20,8 +20,8 @@ _ROUGH_ITERATIONS = 8  # few iterations are enough to tell coarse shifts of the 
 _STEP = 0.25  # distance of three shifts that bracket the best one, in coarse pixels
 _MOST_STEPS = 8  # most moves of the three shifts that bracket the best one, so that a search that leads away ends
 ANYWHERE = (-math.inf, math.inf)  # no limits of the shift, in pixels
-_MOST_VIEWS = 60  # views that are compared with their opposites, at most, to save time
-_MOST_ROWS = 64  # blocks of rows that are compared, at most, to save time
+_MOST_VIEWS = 60  # most views that are compared with their opposites, to save time
+_MOST_ROWS = 64  # most blocks of rows that are compared, to save time
 _BEYOND = 1.5  # at the scan's end, a view's opposite may lie this many steps beyond the last view
 WIDEST_STEP_RAD = math.radians(10.0)  # views further apart differ too much to be interpolated
 # Smoothing along rows (std, in pixels). Without it, interpolation would lower noise between pixels, which biases shifts.
@@ -53,7 +53,7 @@ NOT_FOUND = AxisShift(math.nan, math.nan, np.empty(0))
 
 
 def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHERE) -> AxisShift:
-    """Returns the best of five shifts within ``limits_px``, one coarse pixel apart, after few iterations; its deviation is
+    """Returns the best of five shifts within ``limits_px``, a coarse pixel apart, after few iterations. Its deviation is
     NaN."""
     block = columns_per_block(scan)
     shifts_px = [block * shift for shift in _ROUGH_SHIFTS if limits_px[0] <= block * shift <= limits_px[1]]
@@ -184,7 +184,7 @@ def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _few_rows(scan: Scan, frame: int) -> np.ndarray:
-    """Returns a frame as means over blocks of rows, (few rows, columns) float64, smoothed along rows; masked pixels are
+    """Returns a frame's means over blocks of rows, (few rows, columns) float64, smoothed along rows. Masked pixels are
     filled in."""
     image = np.asarray(scan.projections[frame], np.float64)
     if scan.pixel_mask is not None:

@@ -14,11 +14,11 @@ from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-# Unknown errors of flats affect frames this much, relative to the volume. At 1 they would explain away motion.
+# In a fit, errors of flats change frames by this much relative to the volume. At 1 they would explain motion too.
 _FREEDOM = 0.3
 _ITERATIONS = 20  # iterations of CGLS in a fit, unless stated
 _MOST_TIMES = 12  # most times per exposure: each costs a projection
-_DRAWS = 200  # resamplings of the bootstrap that gives a deviation
+_DRAWS = 200  # number of resamplings in a bootstrap, which gives a standard deviation
 _TINY = 1e-30  # keeps divisions finite where residuals are 0
 
 
@@ -152,7 +152,7 @@ def fit_squares(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> np.nd
 
 
 def t_statistic(stated: np.ndarray, other: np.ndarray) -> float:
-    """Returns by how many standard errors the stated hypothesis explains the frames better than the other.
+    """Returns by how many standard errors the stated hypothesis explains the frames better than the other hypothesis.
 
     stated, other (F,): mean squared residuals of each frame. The sample is their difference over their sum, one value per
     frame. Returns 0 with fewer than three frames, or if all differences are equal."""
@@ -164,7 +164,7 @@ def t_statistic(stated: np.ndarray, other: np.ndarray) -> float:
 
 
 def residual_ratio(stated: np.ndarray, other: np.ndarray) -> float:
-    """Returns the squared residual of the other hypothesis over that of the stated one, from each frame's squares (F,)."""
+    """Returns the ratio of squared residuals, other hypothesis over stated hypothesis, from each frame's squares (F,)."""
     return float(other.sum() / max(float(stated.sum()), _TINY))
 
 

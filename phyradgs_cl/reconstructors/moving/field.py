@@ -26,7 +26,7 @@ _DAMPING = 1e-3  # Levenberg damping over the mean diagonal of JᵀJ: control ve
 _ROUGHNESS = 1e-2  # β, the penalty on the weights' roughness in time, relative to the mean diagonal of JᵀJ
 _SHORTER = (1.0, 0.5, 0.25)  # fractions of a step, tried in turn until one lowers the misfit
 _LEAST_DETERMINANT = 0.1  # a step may lower det(I + ∂w/∂y) of the displacement w(y) to this: at 0 matter folds
-_LEAST_VOXELS = 1.0  # voxels per unit weight, added to distances between states: fields of zeros then have several too
+_LEAST_VOXELS = 1.0  # least voxels that a change of a weight by 1 counts as, so that fields of zeros have several states
 _SUPPORT = 4  # a cubic spline in time extends over this many intervals between knots
 
 
@@ -43,8 +43,7 @@ class MotionField:
 
     @classmethod
     def at_rest(cls, scan: Scan, spacing_mm: float, splines: TemporalSplines, temporal: np.ndarray) -> "MotionField":
-        """Returns a field of zeros over the scan's grid. Its weights, from ``temporal`` (count, R), get mean 0, largest size
-        1."""
+        """Returns a field of zeros over the scan's grid. The weights ``temporal`` (count, R) get mean 0, largest size 1."""
         origin_mm, counts = control_points(scan.grid, spacing_mm)
         centred = temporal - splines.at(splines.node_times_s).mean(0) @ temporal  # splines sum to 1: the weights get mean 0
         control_mm = np.zeros((temporal.shape[1], *counts, 3))
@@ -105,7 +104,7 @@ class FieldProblem:
         return WarpedOperator(self.rt, self.scan.grid, shape, tables, warp=warp, subrays=subrays)
 
     def residual(self, one: MotionField, volume: np.ndarray) -> np.ndarray:
-        """Returns p − A v (F, rows, columns), dimensionless, at the valid pixels; 0 elsewhere."""
+        """Returns the residual p − A v, (F, rows, columns), dimensionless, at the valid pixels; 0 elsewhere."""
         return self._masked(self.scan.projections - self.operator(one).forward(volume))
 
     def space_step(self, one: MotionField, volume: np.ndarray) -> MotionField:

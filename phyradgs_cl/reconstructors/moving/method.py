@@ -1,7 +1,7 @@
 """``moving``: the volume of an object that moves in an unknown way, and its displacement field.
 
 First the field is sought on a coarse copy of the scan. Each round makes a few passes of ``fista`` with the present field,
-then a Gauss-Newton step of the field and one of its weights (``field.py``). Motion and image together: J. Wang and X. Gu,
+then a Gauss-Newton step of the field and a step of its weights (``field.py``). Motion and image together: J. Wang and X. Gu,
 Simultaneous motion estimation and image reconstruction (SMEIR) for 4D cone-beam CT, Med. Phys. 40, 101912 (2013).
 
 Then ``fista`` reconstructs the reference volume with that field, as it does with ``--object-motion``. An object that shows
@@ -39,9 +39,9 @@ from phyradgs_cl.reconstructors.voxels.run import MethodRun
 from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages
 from phyradgs_cl.runtime import Runtime
 
-_MOST_COLUMNS = 64  # blocks of pixels along the longer side of the panel in the coarse scan, at most
-_MOST_VOXELS = 32  # voxels along the longest side of the coarse scan's grid, at most
-_MOST_FRAMES = 600  # frames of the coarse scan, at most, unless the signal has more knots
+_MOST_COLUMNS = 64  # most blocks of pixels along the longer side of the coarse scan's panel
+_MOST_VOXELS = 32  # most voxels along the longest side of the coarse scan's grid
+_MOST_FRAMES = 600  # most frames of the coarse scan, unless the signal has more knots
 _TIMES_PER_PERIOD = 12  # times per period of a motion at which exposures sample it
 _MOST_TIMES = 6  # most times per exposure that a period may ask for: each costs a projection
 _FIRST_PASSES = 8  # passes of fista before the first round, for an object at rest: the field needs a volume to start from
@@ -83,8 +83,8 @@ def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: floa
 
 
 class FieldSearch:
-    """Searches the field on a coarse copy of the scan, as a ``Stepwise``. rounds: its iterations. bending: stiffness of the
-    field."""
+    """Searches the displacement field on a coarse copy of the scan, round by round for a ``Loop``. rounds: their number.
+    bending: the field's stiffness."""
 
     quantity, remedy = "residual", "check the scan for extreme values"
 
@@ -151,9 +151,9 @@ class FieldSearch:
         return resampled(self.volume, self.scan.grid, self.grid)[0], self.grid
 
     def finding(self) -> tuple[Deformation, float]:
-        """Returns the field, and its gain: by which fraction its squared residual is below that of an object at rest after
-        as many passes. The field is zeros if the gain is within ``LEAST_GAIN``, or not above what so many free numbers would
-        explain of noise alone."""
+        """Returns the field, and its gain: the fraction by which it lowers the squared residual, compared with an object at
+        rest after as many passes. The field is zeros if the gain is at most ``LEAST_GAIN``, or what as many free numbers
+        would explain of noise alone."""
         if not self.field.control_mm.any():
             return self.field.deformation(), 0.0
         moving = self._reconstructed(self.field, self.volume, _PASSES)
@@ -236,7 +236,8 @@ class MovingOptions(FistaOptions):
 
 @dataclass
 class _Field:
-    """Hands the field from the search to the passes. A state of the passes holds it too, because they need it to resume."""
+    """Hands the field from the search to the passes. A state of the passes holds the field too, because they need it to
+    resume."""
 
     deformation: Deformation | None = None
     gain: float = 0.0

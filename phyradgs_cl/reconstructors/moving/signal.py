@@ -23,8 +23,8 @@ _FEWEST_CYCLES = 5  # a motion with fewer cycles in the scan is modelled freely 
 _BAND = 0.25  # breaths differ in length: rates that differ from the dominant one by up to this fraction count as it
 # A signal repeats if at least this fraction of its power lies in the band, not counting what white noise has there.
 _PERIODIC_SHARE = 0.5
-_FEWEST_FRAMES = 16  # fewer frames show no period
-_FEWEST = 4  # fewer values in a file are no signal
+_FEWEST_FRAMES = 16  # a scan of fewer frames shows no period
+_FEWEST = 4  # a file must have at least this many values to be a signal
 _KNOTS_PER_PERIOD = 6  # weights that follow a signal have this many knots per period
 _SLOWER = 0.95  # a stated signal that does not repeat gets knots for the slow rates that hold this fraction of its power
 _MOST_EVEN = 100_000  # a signal is interpolated to at most this many even steps
@@ -193,7 +193,7 @@ def _gantry(scan: Scan, times_s: np.ndarray, order: np.ndarray) -> np.ndarray:
     angle_rad = np.arctan2(towards[:, 1], towards[:, 0])
     harmonics = [wave(k * angle_rad) for k in range(1, _HARMONICS + 1) for wave in (np.cos, np.sin)]
     drift = (times_s - times_s[0]) / max(times_s[-1] - times_s[0], 1e-300)
-    most = max(1, len(times_s) // 4)  # with more terms than this, few frames would be explained completely
+    most = max(1, len(times_s) // 4)  # more terms than this would explain few frames completely
     return np.stack([np.ones(len(times_s)), drift, *harmonics][:most], -1)
 
 

@@ -37,7 +37,7 @@ LEAST_RECORDED = 20  # short runs record more often, to have a curve of this man
 
 
 class SplatRun:
-    """The state of an optimisation, the same on every rank; a ``Loop`` runs it as a ``Stepwise``."""
+    """The state of an optimisation, the same on every rank. A ``Loop`` runs it step by step."""
 
     quantity, remedy, finished = "loss", "check the scan for extreme values", None
 

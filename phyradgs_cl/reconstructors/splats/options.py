@@ -84,7 +84,7 @@ class SplatOptions(MotionOptions):
         return Static() if is_first else Exact(1, max(_COARSE_ERROR, self.motion.time_error))
 
     def batch_for(self, frames: int, ranks: int) -> int:
-        """Returns the frames per step: the option or, if it is 0, one per rank. Raises InputError for more than the scan
+        """Returns how many frames a step takes: the option or, for 0, one per rank. Raises InputError for more than the scan
         has."""
         if self.batch > frames:
             raise InputError("batch", str(self.batch), f"no more than the scan's {frames} frames")

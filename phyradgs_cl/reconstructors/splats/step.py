@@ -1,8 +1,8 @@
 """One step of a splatting run on the device: its Gaussians and frames there, and the gradient, summed over ranks.
 
-Only ``FrameStep.gradient`` renders a frame, compares it, goes back, adds total variation and applies the chain rule. Each
-rank has all Gaussians, and some frames of the batch. The bits of summed gradients depend on the batch, not on the number of
-ranks."""
+All of it is in ``FrameStep.gradient``: render a frame, compare it, differentiate, add total variation, apply the chain rule.
+Each rank has all Gaussians, and some frames of the batch. The bits of summed gradients depend on the batch, not on the
+number of ranks."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -80,7 +80,7 @@ class DeviceCloud:
 
 
 class DeviceFrames:
-    """Each frame on the device: its time cells, its measurement in internal units, and its mask."""
+    """All frames on the device, each with its time cells, its measurement in internal units, and its mask."""
 
     def __init__(
         self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, deformation: Deformation | None = None
@@ -119,7 +119,7 @@ def tables_of(
 ) -> tuple[list[TimeCells], bool]:
     """Returns the time cells of every frame in mm, and whether frames average intensities over a line's cells.
 
-    If ``exact`` chooses the segments, an object that moves gets as many as its paths need."""
+    If ``exact`` chooses the number of segments, an object that moves gets as many as its paths need."""
     peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
     cells = partial(motion.cells, intensity_peak=peak) if isinstance(motion, Exact) else motion.cells
     tables = [cells(scan, frame) for frame in range(scan.frames)]
@@ -134,8 +134,7 @@ def tables_of(
 
 
 def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[float]]:
-    """Uploads masks, 1 at valid pixels: one for all frames, or one per frame. Returns them and their numbers of valid
-    pixels."""
+    """Uploads masks, 1 at valid pixels: one for all frames, or one each. Returns them and their numbers of valid pixels."""
     masks = np.zeros((1, *scan.geometry.detector_shape)) if scan.pixel_mask is None else scan.pixel_mask
     stack = [(m == 0).astype(np.float32) for m in (masks if masks.ndim == 3 else masks[None])]
     arrays = [rt.upload(pad_rows(scan.shutter.readout.frames(m))) for m in stack]
@@ -196,8 +195,8 @@ class FrameStep:
         self, cloud: DeviceCloud, frame: int, corner: Corner | None, late: bool, statistics: DeviceArray
     ) -> None:
         """Writes one frame's dL/d(raw parameters) into the gradients of an activated cloud, and adds to the ``statistics``
-        (2, stride) of density control. corner: of the sub-volume for total variation, or None. late: whether the density
-        term applies."""
+        (2, stride) of density control. corner: the corner of the sub-volume for total variation, or None. late: whether the
+        density term applies."""
         options, gaussians, by_cloud = self.options, cloud.gaussians, cloud.gradients
         cells, measured, mask, pixels = self.frames.get(frame)
         rendered = self.projector.forward(gaussians, cells)

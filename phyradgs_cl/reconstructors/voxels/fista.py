@@ -2,8 +2,8 @@
 
 Each subset S, one of M, makes one step: xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁). The step
 and its momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The gradient of a
-subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging 34
-(2015) 167). L bounds the norm of AᵀA.
+subset, times the number of subsets, stands for the gradient of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
+34 (2015) 167). L bounds the norm of AᵀA.
 
 The last 2/5 of the passes run on smaller voxels, whose means make up most of the result (``stages.py``). The passes before
 them only provide their first volume, so they may be coarser: with more subsets, and fewer times in an exposure.
@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 _VOLUMES = 16  # memory of a run in volumes, with the prior ``dct``
 _FRAMES = 3  # memory of a run in copies of all projections
 _HELD = 9  # volumes that the prior ``dct`` holds on the device
-_COPIES = 2  # if volumes are on the host, the device holds two copies while a prior maps one
+_COPIES = 2  # the device holds two copies of a volume on the host while a prior maps it
 # The passes before those on smaller voxels are coarse. Their settings were measured (docs/results/settings.md).
 _COARSE_PASSES = 0.6  # fraction of all passes that are coarse
 _COARSE_SUBSETS = 1.6  # a coarse pass has this many times ``subsets`` subsets
@@ -62,8 +62,8 @@ class FistaOptions(IterativeOptions):
       the frames and from edges inside large voxels.
     - subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0 takes 2 for slices of up to 90² voxels where memory
       allows, else 1.
-    - subsets: of the frames, with one step each; the passes before smaller voxels have 1.6 times as many. If their steps
-      diverge, they are joined two by two. tv_iterations: dual iterations per proximal map of TV.
+    - subsets: number of subsets of the frames, each with one step; the passes before smaller voxels have 1.6 times as many.
+      If their steps diverge, they are joined two by two. tv_iterations: dual iterations per proximal map of TV.
     - transmission_weights: weights pixels by their transmission, as in ``fista-tv``."""
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
@@ -121,7 +121,7 @@ class Accelerated(Algorithm):
         return (self.momentum - 1) / self.next_momentum
 
     def accept(self, point: Any, volume: Any) -> None:
-        """Takes ``volume``, the result of the step from ``point``, as the present volume."""
+        """Makes ``volume``, the result of the step from the extrapolated ``point``, the present volume."""
         # restart if the step points against the last movement: momentum then carried the point past a minimum
         is_uphill = self.system.space.turn(point, volume, self.volume) > 0
         self.momentum = 1.0 if is_uphill else self.next_momentum
@@ -203,7 +203,7 @@ METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initia
 
 
 def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
-    """Returns the passes on the scan's own voxels and, if the options or the grid ask for them, those on smaller voxels. A
+    """Returns the passes on the scan's own voxels and, if the options or the grid ask for them, passes on smaller voxels. A
     stage takes its run from ``now`` when it starts, because the motion of the object may be known only then."""
     options = run.options
     parts = options.subvoxels or (2 if _gains_from_subvoxels(run, 2) else 1)
@@ -233,8 +233,7 @@ def fista_passes(
     has_few_times: bool = False,
 ) -> Iterations:  # fmt: skip
     """Returns ``passes`` passes from ``volume`` (nz, ny, nx; None: the method's own start), with every voxel divided into
-    ``parts`` along each side. subsets: replaces the option, unless 0. has_few_times: takes a third of an exposure's
-    times."""
+    ``parts`` along each side. subsets: replaces the option, unless 0. has_few_times: takes 1/3 of an exposure's times."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
     options, rt = replace(whole.options, iterations=passes), whole.rt

@@ -30,20 +30,20 @@ from phyradgs_cl.runtime import Runtime, Space
 _SPREAD = 2.83
 _EDGES = 0.09  # error of a ray's path length at the object's edges, over a voxel's side
 _LEAST = 1e-4  # least weight of the prior, as a fraction of the largest value of Aᵀp: without noise it would be 0
-# The next five multiply the option ``prior_weight`` in a prior's maps. They were measured (docs/results/settings.md).
+# Factors on the option ``prior_weight`` in a prior's maps, measured (docs/results/settings.md).
 _TV_ALONE = 1.6  # weight of TV in the prior ``tv``
-_TV_BEFORE_DCT = 0.8  # weight of TV in ``dct``
-_DCT = 1.5  # threshold of the block cosine transforms in ``dct``
+_TV_BEFORE_DCT = 0.8  # weight of TV in the prior ``dct``
+_DCT = 1.5  # threshold of the block cosine transforms in the prior ``dct``
 _TV_AT_REST = 0.5  # weight of TV before ridge steps, for scans that stop for each projection
 _DCT_AT_REST = 1.35  # threshold of the block cosine transforms before ridge steps, for scans that stop
 _RIDGE_NOISE = 17.0  # noise that a ridge step assumes, relative to the prior's weight, for fly-scans
 _RIDGE_NOISE_AT_REST = 20.0  # noise that a ridge step assumes, relative to the prior's weight, for scans that stop
 _RIDGE_LENGTH = 0.5  # length of a ridge step: factor on the regulariser's gradient
-_RIDGE_EVERY = 4  # after this many maps of the other prior comes one ridge step
-# _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals.
-# With the sixth root of the scan's noise, the first grows and the second falls.
+_RIDGE_EVERY = 4  # one ridge step follows after this many maps of the prior ``dct``
+# _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals. For other noise, _TV_AT_REST is
+# multiplied by the sixth root of the ratio to this noise, and _RIDGE_NOISE_AT_REST divided by it.
 _USUAL_NOISE = 0.01
-_LEAST_NOISE = 0.001  # some scans have no noise: it counts as at least this
+_LEAST_NOISE = 0.001  # less noise counts as this, because some scans have none
 _LEAST_NOISE_SHARE = 0.1  # a ridge step counts at least this fraction of the weight as noise, because some scans have none
 _SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result; the larger voxels of the passes before have the rest
 _SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels with the prior ``ridge``, which leaves less noise
@@ -81,8 +81,8 @@ def _blur_mm(scan: Scan, motion: Motion) -> float:
 
 
 def adjoint_response(system: System) -> tuple[float, float]:
-    """Returns how Aᵀ responds in the middle half of a volume, in mm: the standard deviation for independent unit noise of
-    every ray, and the mean for a unit error of all rays."""
+    """Returns how strongly Aᵀ responds to errors, in mm, in a volume's middle half: the standard deviation for independent
+    unit noise in every ray, and the mean for a unit error in all rays."""
     noise = np.random.default_rng(0).standard_normal(system.measured.shape, np.float32)
     by_noise = system.adjoint(system.masked(system.apply_weights(system.space.array(noise))))
     by_ones = system.column_sums()
@@ -109,7 +109,7 @@ class PriorWeight:
     def noise_share(self, weight: float) -> float:
         """Returns which part of ``weight`` is due to noise, 0 to 1. With many views or photons, edges make up most of it."""
         by_noise = self.strength * self.error.noise * self.noise_mm
-        return min(by_noise / weight, 1.0) if weight > 0 else 1.0  # empty frames have no weight
+        return min(by_noise / weight, 1.0) if weight > 0 else 1.0  # frames of zeros give a weight of 0
 
 
 def _density(space: Space[Any], volume: Any) -> float:
@@ -124,7 +124,7 @@ class PriorInputs:
 
     - tv_iterations: dual iterations per map. is_fly: frames expose over an arc.
     - noise: standard deviation of line integrals behind the object.
-    - image (nz, ny, nx) in 1/mm, share: of the prior piccs, its prior image and the weight of the change from it."""
+    - image (nz, ny, nx) in 1/mm, share: the prior image of the prior piccs, and the weight of the change from that image."""
 
     rt: Runtime
     grid: Grid
@@ -165,12 +165,11 @@ class Prior:
     """Fraction, 0 to 1, of this pass's weight that is due to noise; the rest is due to the discretisation of edges."""
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
-        """Maps a volume (nz, ny, nx) of ``space``. weight: that of one short step, in 1/mm, about 1/50 of the noise that a
-        denoiser would be told."""
+        """Maps a volume (nz, ny, nx) of ``space``. weight: the weight of one short step, in 1/mm: about 1/50 of the volume's
+        noise."""
         return space.add(volume, volume, 0.0, nonnegative=nonnegative)
 
     def state(self) -> dict[str, np.ndarray]:
-        """Returns the arrays from which the next map starts."""
         return {}
 
     def restore(self, state: State) -> None:
@@ -205,7 +204,7 @@ class TvAndDct(Prior):
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         smooth = self.tv(space, volume, weight, nonnegative=nonnegative)
         turn, out = self.turn, space.place(self.shrink.shape)
-        # each map takes the next quarter of the blocks' shifts: four maps have all
+        # each map takes the next quarter of the blocks' shifts, so that four maps take all
         self.turn = (turn + 1) % len(TURNS)
         return self.shrink(smooth, self.share * weight, turn, nonnegative=nonnegative, out=out)
 
@@ -218,7 +217,7 @@ class TvAndDct(Prior):
 
 
 class ThenRidge(Prior):
-    """The prior ridge: the map ``before`` and, after each fourth of its maps, a step down the learned ridge regulariser."""
+    """The prior ridge: the map of the prior ``before`` and, after every fourth map, a step down the ridge regulariser."""
 
     VOLUMES = RidgeStep.VOLUMES
 
@@ -279,8 +278,8 @@ Denoiser = Callable[[np.ndarray, float], np.ndarray]
 
 
 class OwnPrior(Prior):
-    """A user's denoiser on the host in place of a proximal map (plug-and-play: Venkatakrishnan et al. 2013). Its change at
-    such a small weight must not vanish: two weights must give two volumes."""
+    """A user's denoiser on the host in place of a proximal map (plug-and-play: Venkatakrishnan et al. 2013). Weights are
+    small, and two different ones must give two different volumes."""
 
     def __init__(self, denoiser: Denoiser) -> None:
         self.denoiser, self.subject = denoiser, f"--prior {function_name(denoiser)}"

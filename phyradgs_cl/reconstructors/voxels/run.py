@@ -22,7 +22,7 @@ from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
 MOST_ITERATIONS = 1_000_000
-# Arrays of all frames that a system holds: measurement, mask, transmission, and what computing a residual takes.
+# A system holds this many arrays of all frames: measurement, mask, transmission, and those to compute a residual.
 _SYSTEM_FRAMES = 6
 
 
@@ -85,12 +85,12 @@ class Algorithm:
             setattr(self, name, self.system.space.array(state[name]))
         for name in self.NUMBERS:
             setattr(self, name, state[name].item())
-        if self.system.intensity is not None:  # J, unlike A, depends on the volume: it is set again
+        if self.system.intensity is not None:  # the derivative J depends on the volume
             self.system.expected(self.volume)
 
 
 class WithFacts(Stepwise, Protocol):
-    """A ``Stepwise`` that adds facts to the result."""
+    """A ``Stepwise`` method that adds facts to the result."""
 
     def facts(self, is_complete: bool) -> Mapping[str, object]:
         """Returns the facts after the last step. is_complete: the run came to its end, without an interruption."""
@@ -155,7 +155,7 @@ def voxel_method(
 
 
 class Iterations:
-    """An algorithm, with the residual and the change of its last iteration, as a ``Stepwise`` for ``Loop``."""
+    """Runs an algorithm step by step for a ``Loop``, and keeps the residual and the change of its last iteration."""
 
     quantity, remedy = "residual", "check the scan for extreme values, or lower the relaxation"
 

@@ -15,16 +15,14 @@ from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.voxels.run import MethodRun, WithFacts
 
-_STAGE, _VOLUME = "stage", "volume_before"  # entries of a state: the stage's number, and the volume from which it started
+_STAGE, _VOLUME = "stage", "volume_before"  # arrays in a state: the stage's number and its first volume
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a run. make: returns the stage's method, which starts from a volume (nz, ny, nx); None: from its own
-    start.
-
-    merge: combines the stage's volume with the one before it to the run's (nz, ny, nx). end: called with the finished
-    method."""
+    """One stage of a run. make: returns the stage's method, which starts from a volume (nz, ny, nx), or from its own start
+    for None. merge: combines the volumes (nz, ny, nx) of this stage and the one before to the run's. end: called with the
+    finished method."""
 
     name: str
     iterations: int
@@ -34,7 +32,7 @@ class Stage:
 
 
 class Stages:
-    """Stages, one after the other, which a ``Loop`` runs, reports, stops and resumes as one ``Stepwise``.
+    """Stages, one after the other, which a ``Loop`` runs, reports, stops and resumes as if they were one method.
 
     The first stage starts from the run's first volume, if any."""
 

@@ -108,8 +108,8 @@ class System:
         return replace(self, measured=space.array(self.measured), valid=valid, transmission=transmission, space=space)
 
     def leave_room(self, rt: Runtime, nbytes: int) -> bool:
-        """Frees the ray operators' buffers if less than ``nbytes`` of the memory limit would remain beside them. Returns
-        whether it did. The operators plan their buffers again at their next use."""
+        """Frees the ray operators' buffers if they leave less than ``nbytes`` of the memory limit. Returns whether it freed
+        them. The operators plan their buffers again at their next use."""
         operators = [o for o in (self.operator, self.intensity) if isinstance(o, RayOperator | IntensityOperator)]
         planned_bytes = sum(operator.memory.planned_bytes for operator in operators)
         if rt.ledger.limit_bytes - max(planned_bytes, rt.ledger.held_bytes) >= nbytes:
@@ -131,11 +131,11 @@ class System:
         return frames if self.valid is None else self.space.multiply(frames, self.valid)
 
     def forward(self, volume: Any) -> Any:
-        """Returns A x (F, rows, columns), 0 at invalid pixels."""
+        """Returns the projections A x (F, rows, columns), 0 at invalid pixels."""
         return self.masked(self.operator.forward(volume, self.space.place(self.operator.frames_shape)))
 
     def adjoint(self, frames: Any) -> Any:
-        """Returns Aᵀ y (nz, ny, nx) of frames y that are 0 at invalid pixels."""
+        """Returns the backprojection Aᵀ y (nz, ny, nx) of frames y that are 0 at invalid pixels."""
         return self.operator.adjoint(frames, self.space.place(self.volume_shape))
 
     def expected(self, volume: Any) -> Any:
@@ -147,7 +147,8 @@ class System:
         return self.operator.forward if self.intensity is None else self.intensity.expected
 
     def derivative(self, change: Any) -> Any:
-        """Returns A d or, with intensities, J d: how ``expected`` changes with a change d of the volume last compared."""
+        """Returns how ``expected`` changes with a change d of the volume last compared: A d or, in the intensity model, J
+        d."""
         operator = self.operator if self.intensity is None else self.intensity
         return self.masked(operator.forward(change, self.space.place(self.operator.frames_shape)))
 
@@ -157,8 +158,8 @@ class System:
         return operator.adjoint(frames, self.space.place(self.volume_shape))
 
     def residual(self, volume: Any) -> Any:
-        """Returns p − A x or, in the intensity model, p − I(x), dimensionless; 0 at invalid pixels."""
-        # the frames before masking get no name, because a name would keep their memory
+        """Returns the residual p − A x or, in the intensity model, p − I(x), dimensionless; 0 at invalid pixels."""
+        # the frames before masking get no name, because a name would keep their memory in use
         expected = self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
         return self.space.add(self.measured, expected, -1.0)
 
@@ -170,7 +171,7 @@ class System:
         return float(noise_level(measured, valid) * np.sqrt(pixels))
 
     def row_sums(self) -> Any:
-        """Returns A 1 (F, rows, columns) in mm: the length of every ray in the volume."""
+        """Returns the length of every ray in the volume, A 1 (F, rows, columns) in mm."""
         return self.forward(self.space.full(self.volume_shape, 1.0))
 
     def column_sums(self) -> Any:
@@ -198,7 +199,7 @@ class System:
 
 
 def row_weights(system: System) -> Any:
-    """Returns 1/(A 1) of every ray in 1/mm.
+    """Returns the inverse length 1/(A 1) of every ray in 1/mm.
 
     A ray shorter than a tenth of the longest counts as that tenth. A ray that only grazes an edge of the volume would
     otherwise put its noise on one or two voxels, and corners of the volume would become bright. TIGRE measures paths in a
@@ -236,7 +237,8 @@ class OrderedSubsets:
         self._systems = [self.system.subset(range(first, frames, count)) for first in spread_order(count)]
 
     def join_if_diverging(self, residual: float) -> bool:
-        """Joins subsets two by two if the ``residual`` of a pass shows that their steps diverge. Returns whether it did."""
+        """Joins subsets two by two if the ``residual`` of a pass shows that their steps diverge. Returns whether they were
+        joined."""
         diverges = residual > _GROWTH * self.least_residual and len(self) > 1
         if diverges:
             self.split(ceil_div(len(self), 2))
@@ -258,11 +260,11 @@ class SharedOperator:
         self._part = whole.subset(list(run)) if len(run) else None
 
     def forward(self, volume: np.ndarray, out: None = None) -> np.ndarray:
-        """Returns A x, frames (F, rows, columns) float32 in new memory of the host, of a volume (nz, ny, nx) in 1/mm."""
+        """Projects a volume x (nz, ny, nx) in 1/mm to frames A x, (F, rows, columns) float32, in new memory of the host."""
         return self._gathered(None if self._part is None else self._part.forward(volume))
 
     def adjoint(self, frames: np.ndarray, out: None = None) -> np.ndarray:
-        """Returns Aᵀ y, a volume (nz, ny, nx) float32, of frames (F, rows, columns)."""
+        """Backprojects frames y (F, rows, columns) to a volume Aᵀ y, (nz, ny, nx) float32."""
         shape = (self.volume_shape[0], self.volume_shape[1] * self.volume_shape[2])
         parts = [] if self._part is None else [self._part.adjoint(frames[self._own]).reshape(shape)]
         return exact_sum(self.ranks, parts, shape, self.ranks.size).reshape(self.volume_shape)
@@ -283,5 +285,6 @@ class SharedIntensity(SharedOperator):
     _part: IntensityOperator | None
 
     def expected(self, volume: np.ndarray, out: None = None) -> np.ndarray:
-        """Returns I(x) (F, rows, columns) float32 of a volume (nz, ny, nx) in 1/mm, and sets J to the derivative there."""
+        """Returns the expected measurement I(x), (F, rows, columns) float32, of a volume x (nz, ny, nx) in 1/mm. From then
+        on J is the derivative at x."""
         return self._gathered(None if self._part is None else self._part.expected(volume))
