@@ -55,8 +55,8 @@ _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4
 _COARSE_SHARE = 0.6  # fraction of the rounds that have coarse control points
 _FREE_KNOTS = 6  # if weights follow no signal, their splines have this many intervals in time
 _AT_REST = "no motion found"
-# One in six iterations is a round of the search: by default 7 rounds, and then 35 passes as in fista.
-_ITERATIONS_PER_ROUND = 6
+# One in five iterations is a round of the search: by default 7 rounds, and then 24 passes as in fista.
+_ITERATIONS_PER_ROUND = 5
 _STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")
 
 
@@ -204,7 +204,7 @@ def _difference(one: MotionField, other: MotionField) -> float:
 class MovingOptions(FistaOptions):
     """Options of ``moving``, with those of ``fista``.
 
-    - iterations: a sixth are rounds of the search for the field, the rest passes of ``fista`` after it.
+    - iterations: a fifth are rounds of the search for the field, the rest passes of ``fista`` after it.
     - bending: stiffness of the field, relative to how strongly frames respond to it.
     - gating: what the motion follows at first: ``auto`` (the signal of the frames, if it repeats), ``free`` (any smooth
       curve in time), ``scan`` (the signal or phase that the scan states), or a file, NAME.csv (``load_gating``)."""
@@ -212,7 +212,7 @@ class MovingOptions(FistaOptions):
     TRIALS: ClassVar[tuple[int, int]] = (1, 7)
     """Iterations of the two short runs that ``estimate`` times: one round alone, and two rounds with five passes."""
 
-    iterations: int = 42
+    iterations: int = 31
     bending: float = checks.ranged(0.01, 0, 1e6)
     gating: str = "auto"
 

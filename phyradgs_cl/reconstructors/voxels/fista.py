@@ -1,12 +1,15 @@
-"""FISTA with a prior over ordered subsets of the frames: min ½‖p − A x‖² + R(x), x ≥ 0.
+"""A prior over ordered subsets of the frames: min ½‖p − A x‖² + R(x), x ≥ 0, first by POGM and at last by FISTA.
 
-Each subset S, one of M, makes one step: xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁). The step
-and its momentum are FISTA's (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The gradient of a
-subset, times the number of subsets, stands for the gradient of all frames (Kim, Ramani and Fessler, IEEE Trans. Med. Imaging
-34 (2015) 167). L bounds the norm of AᵀA.
+Each subset S, one of M, makes one step. FISTA's is xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁)
+(Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The proximal optimised gradient method, POGM, needs
+a third fewer steps (Taylor, Hendrickx and Glineur, SIAM J. Optim. 27 (2017) 1283; Kim and Fessler, J. Optim. Theory Appl.
+178 (2018) 240), but leaves more of the noise of subsets. FISTA takes that out in the last passes.
 
-The last 2/5 of the passes run on smaller voxels, whose means make up most of the result (``stages.py``). The passes before
-them only provide their first volume, so they may be coarser: with more subsets, and fewer times in an exposure.
+The gradient of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans.
+Med. Imaging 34 (2015) 167). L bounds the norm of AᵀA.
+
+The last 7 of 12 passes run on smaller voxels, whose means make up most of the result (``stages.py``). The passes before them
+only provide their first volume, so they may be coarser: with fewer times in an exposure.
 
 The calls of a run: ``MethodRun``, ``Stages``, ``Loop``, ``Iterations.step``, ``Fista.step``, ``System``, ``RayOperator``, a
 kernel. ``fista_passes`` already projects before its loop, for the step sizes and the ``PriorWeight``."""
@@ -41,10 +44,11 @@ _VOLUMES = 16  # memory of a run in volumes, with the prior ``dct``
 _FRAMES = 3  # memory of a run in copies of all projections
 _HELD = 9  # volumes that the prior ``dct`` holds on the device
 _COPIES = 2  # the device holds two copies of a volume on the host while a prior maps it
-# The passes before those on smaller voxels are coarse. Their settings were measured (docs/results/settings.md).
-_COARSE_PASSES = 0.6  # fraction of all passes that are coarse
-_COARSE_SUBSETS = 1.6  # a coarse pass has this many times ``subsets`` subsets
+# Measured: docs/results/settings.md.
+_COARSE_PASSES = 5 / 12  # fraction of all passes before those on smaller voxels; they are coarse
 _COARSE_TIMES = 1 / 3  # a coarse pass has this fraction of the times per exposure, but two at least
+_OPTIMISED_PASSES = 21  # most passes of POGM: its momentum has no restart, and the noise of subsets grows with it
+_CALM_PASSES = 3  # last passes on one grid, which are FISTA's: they take out the noise of subsets that POGM leaves
 _FAINTEST = 1e-6  # smaller row sums of AᵀA count as this fraction of the largest: dividing by less would inflate the bound
 # Voxels are divided if a slice (y, x) has at most this many of them: dividing is worth its time at 64³, not at 128³.
 # Slices are not counted, so that thick and thin slabs of one scan are reconstructed in the same manner.
@@ -60,10 +64,10 @@ class FistaOptions(IterativeOptions):
     - prior_share: s in the prior piccs, (1 − s) TV(x) + s TV(x − first volume).
     - prior_weight: strength of the prior, relative to the error of the data term's gradient. That error comes from noise of
       the frames and from edges inside large voxels.
-    - subvoxels: parts of a voxel's side in the last 2/5 of the passes; 0 takes 2 for slices of up to 90² voxels where memory
-      allows, else 1.
-    - subsets: number of subsets of the frames, each with one step; the passes before smaller voxels have 1.6 times as many.
-      If their steps diverge, they are joined two by two. tv_iterations: dual iterations per proximal map of TV.
+    - subvoxels: parts of a voxel's side in the last 7/12 of the passes; 0 takes 2 for slices of up to 90² voxels where it has
+      the memory, else 1.
+    - subsets: number of subsets of the frames, each with one step. If their steps diverge, they are joined two by two.
+      tv_iterations: dual iterations per proximal map of TV.
     - transmission_weights: weights pixels by their transmission, as in ``fista-tv``."""
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
@@ -73,7 +77,7 @@ class FistaOptions(IterativeOptions):
     """Iterations of the two short runs that ``estimate`` times. Of the five between, three are coarse, as in a whole run."""
 
     motion: Motion = PerRow()
-    iterations: int = 35
+    iterations: int = 24
     prior: str | Denoiser = "ridge"
     prior_weight: float = checks.ranged(0.39, 0, 1e6)
     subvoxels: int = checks.ranged(0, 0, 8)
@@ -98,7 +102,7 @@ class Accelerated(Algorithm):
     The restart is the gradient scheme of O'Donoghue and Candès, Found. Comput. Math. 15 (2015) 715."""
 
     ARRAYS: ClassVar[tuple[str, ...]] = ("volume", "previous")
-    NUMBERS = ("momentum",)
+    NUMBERS: ClassVar[tuple[str, ...]] = ("momentum",)
 
     def __init__(self, system: System, prior: Prior, *, has_long_steps: bool = False) -> None:
         super().__init__(system)
@@ -154,34 +158,70 @@ def _tight_curvature(system: System) -> float:
 
 
 class Fista(Accelerated):
-    """FISTA with subsets. A pass's residual combines all subsets, each at the extrapolated point of its step."""
+    """Passes over subsets by POGM, then by FISTA. A pass's residual combines all subsets, each where its step took it.
+
+    optimised: number of passes by POGM. ``previous`` and ``ahead`` are POGM's wₖ₋₁ and zₖ₋₁, ``momentum`` and ``length`` its
+    θₖ₋₁ and L γₖ₋₁."""
+
+    ARRAYS = ("volume", "previous", "ahead")
+    NUMBERS = ("momentum", "length", "optimised")
 
     def __init__(
         self, system: System, prior: Prior, weight: PriorWeight, *, subsets: int, nonnegative: bool,
-        has_long_steps: bool = False,
+        has_long_steps: bool = False, optimised: int = 0,
     ) -> None:  # fmt: skip
         super().__init__(system, prior, has_long_steps=has_long_steps)
-        self.nonnegative, self.weight = nonnegative, weight
+        self.nonnegative, self.weight, self.optimised = nonnegative, weight, optimised
         self.subsets = OrderedSubsets(system, subsets)
+        self._rest()
+
+    def start_from(self, volume: Any) -> None:
+        self.volume = volume
+        self._rest()
+
+    def _rest(self) -> None:
+        """Forgets all momentum, so that the next step is a plain proximal gradient step from ``volume``."""
+        self.momentum = self.length = 1.0
+        self.previous = self.ahead = self.volume
 
     def step(self) -> float:
         weight = self.weight.at(self.volume)
         self.prior.noise_share = self.weight.noise_share(weight)
-        residual = self.system.space.sum_squares(self._update(subset, weight) for subset in self.subsets) ** 0.5
+        update = self._optimised_update if self.optimised else self._update
+        residual = self.system.space.sum_squares(update(subset, weight) for subset in self.subsets) ** 0.5
         # joined subsets have another step length, for which the momentum so far would be wrong
-        if self.subsets.join_if_diverging(residual):
-            self.momentum, self.previous = 1.0, self.volume
+        if self.subsets.join_if_diverging(residual) or self.optimised == 1:
+            self._rest()
+        self.optimised = max(self.optimised - 1, 0)
         return residual
 
-    def _update(self, subset: System, weight: float) -> Any:
-        """Makes a step: extrapolation, a subset's gradient, prior. Returns the residual at the extrapolated point."""
-        space = self.system.space
-        point = space.extrapolate(self.volume, self.previous, self.extrapolation)
+    def _descended(self, point: Any, subset: System) -> tuple[Any, Any]:
+        """Returns ``point`` after a gradient step of a subset, and the residual at ``point``."""
         residual = subset.residual(point)
         downhill = subset.back(subset.apply_weights(residual))
-        descended = space.add(point, downhill, len(self.subsets) / self.curvature)
+        return self.system.space.add(point, downhill, len(self.subsets) / self.curvature), residual
+
+    def _update(self, subset: System, weight: float) -> Any:
+        """Makes FISTA's step: extrapolation, a subset's gradient, prior. Returns the residual at the extrapolated point."""
+        space = self.system.space
+        point = space.extrapolate(self.volume, self.previous, self.extrapolation)
+        descended, residual = self._descended(point, subset)
         volume = self.prior(space, descended, weight / self.curvature, nonnegative=self.nonnegative)
         self.accept(point, volume)
+        return residual
+
+    def _optimised_update(self, subset: System, weight: float) -> Any:
+        """Makes POGM's step: a subset's gradient, extrapolation, prior. Returns the residual before the step."""
+        space, before, after = self.system.space, self.momentum, self.next_momentum
+        descended, residual = self._descended(self.volume, subset)
+        back = (before - 1) / (self.length * after)
+        # zₖ = wₖ + (θₖ₋₁ − 1)/θₖ (wₖ − wₖ₋₁) + θₖ₋₁/θₖ (wₖ − xₖ₋₁) + (θₖ₋₁ − 1)/(L γₖ₋₁ θₖ) (zₖ₋₁ − xₖ₋₁)
+        point = space.extrapolate(descended, self.previous, self.extrapolation)
+        for volume, share in ((descended, before / after), (self.ahead, back), (self.volume, -before / after - back)):
+            point = space.add(point, volume, share)
+        self.length = (2 * before + after - 1) / after
+        self.previous, self.ahead, self.momentum = descended, point, after
+        self.volume = self.prior(space, point, weight * self.length / self.curvature, nonnegative=self.nonnegative)
         return residual
 
     def state(self) -> dict[str, np.ndarray]:
@@ -214,11 +254,10 @@ def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
         return Stage(name, passes, partial(fista_passes, now, passes, **how))
 
     if parts == 1:
-        return [stage("voxels", last)]
-    many = round(_COARSE_SUBSETS * options.subsets)
+        return [stage("voxels", last, optimised=min(max(last - _CALM_PASSES, 0), _OPTIMISED_PASSES))]
     share = priors.subvoxel_share(options.prior, run.scan.grid.finer(parts).shape)
     fine = replace(stage("subvoxels", last, parts=parts), merge=partial(merge_subvoxels, parts=parts, share=share))
-    return [stage("voxels", first, subsets=many, has_few_times=True), fine]
+    return [stage("voxels", first, has_few_times=True, optimised=min(first, _OPTIMISED_PASSES)), fine]
 
 
 def _few_times(motion: Motion) -> Motion:
@@ -229,11 +268,11 @@ def _few_times(motion: Motion) -> Motion:
 
 
 def fista_passes(
-    now: Callable[[], MethodRun], passes: int, volume: np.ndarray | None, parts: int = 1, subsets: int = 0,
-    has_few_times: bool = False,
+    now: Callable[[], MethodRun], passes: int, volume: np.ndarray | None, parts: int = 1, has_few_times: bool = False,
+    optimised: int = 0,
 ) -> Iterations:  # fmt: skip
-    """Returns ``passes`` passes from ``volume`` (nz, ny, nx; None: the method's own start), with every voxel divided into
-    ``parts`` along each side. subsets: replaces the option, unless 0. has_few_times: takes 1/3 of an exposure's times."""
+    """Returns ``passes`` passes from ``volume`` (nz, ny, nx; None: the method's own start), the first ``optimised`` by POGM,
+    with every voxel divided into ``parts`` along each side. has_few_times: takes a third of an exposure's times."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
     options, rt = replace(whole.options, iterations=passes), whole.rt
@@ -252,8 +291,10 @@ def fista_passes(
     prior = priors.prior_of(options.prior, prior_inputs)
     with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):
         weight = PriorWeight(system, error, options.prior_weight)
-        count, clips = subsets or options.subsets, options.nonnegative
-        method = Fista(system, prior, weight, subsets=count, nonnegative=clips, has_long_steps=True)
+        method = Fista(
+            system, prior, weight, subsets=options.subsets, nonnegative=options.nonnegative, has_long_steps=True,
+            optimised=optimised,
+        )  # fmt: skip
     return Iterations(method, run)
 
 
