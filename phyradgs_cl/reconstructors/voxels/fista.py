@@ -64,8 +64,8 @@ class FistaOptions(IterativeOptions):
     - prior_share: s in the prior piccs, (1 − s) TV(x) + s TV(x − first volume).
     - prior_weight: strength of the prior, relative to the error of the data term's gradient. That error comes from noise of
       the frames and from edges inside large voxels.
-    - subvoxels: parts of a voxel's side in the last 7/12 of the passes; 0 takes 2 for slices of up to 90² voxels where it has
-      the memory, else 1.
+    - subvoxels: parts of a voxel's side in the last 7/12 of the passes; 0 takes 2 for slices of up to 90² voxels
+      where memory allows, else 1.
     - subsets: number of subsets of the frames, each with one step. If their steps diverge, they are joined two by two.
       tv_iterations: dual iterations per proximal map of TV.
     - transmission_weights: weights pixels by their transmission, as in ``fista-tv``."""
