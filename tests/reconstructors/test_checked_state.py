@@ -1,5 +1,6 @@
 """States of checkpoints are taken only as a run has written them."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import Progress, plan_run, reconstruct
+from phyradgs_cl.reconstructors.checkpoint import RUN, with_identity
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.workflow import load_scan
 
@@ -26,13 +28,13 @@ def wrong_arrays(array: np.ndarray) -> dict[str, np.ndarray | None]:
     return wrong
 
 
+def stop(progress: Progress) -> None:
+    raise KeyboardInterrupt
+
+
 @pytest.mark.parametrize("method", ["sirt", "cgls", "fista-tv", "os-sart", "phyradgs"])
 def test_every_array_of_a_methods_state_is_checked(rt: Runtime, tiny_scan: Path, method: str) -> None:
     """Resumed with one array that is wrong, no method begins."""
-
-    def stop(progress: Progress) -> None:
-        raise KeyboardInterrupt
-
     changes = {"gaussians": 30, "iterations": 100, "motion": "static"} if method == "phyradgs" else {"iterations": 6}
     scan, plan = load_scan(tiny_scan), plan_run(method, changes | ({"noise_stop": 0} if method == "cgls" else {}))
     good = reconstruct(scan, plan, rt, report=stop).state
@@ -47,3 +49,12 @@ def test_every_array_of_a_methods_state_is_checked(rt: Runtime, tiny_scan: Path,
         with pytest.raises(InputError, match="checkpoint"):
             reconstruct(scan, plan, rt, resume=state)
             pytest.fail(f"taken: {name}, {how}")
+
+
+def test_a_state_of_another_version_is_refused(rt: Runtime, tiny_scan: Path) -> None:
+    scan, plan = load_scan(tiny_scan), plan_run("fista", {"iterations": 6})
+    good = reconstruct(scan, plan, rt, report=stop).state
+    assert good is not None
+    older = {name: array for name, array in good.items() if name not in ("ahead", RUN, "checksum")}
+    with pytest.raises(InputError, match="found a run of another version, without ahead"):
+        reconstruct(scan, plan, rt, resume=with_identity(older, json.loads(str(good[RUN]))))

@@ -13,6 +13,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, PerRow, Scan
 from phyradgs_cl.acquisition.motion import RAYS, MotionOptions, motions_for
 from phyradgs_cl.acquisition.scan import MODELS_OF_METHODS
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.loop import Loop, Stepwise
@@ -81,6 +82,9 @@ class Algorithm:
 
     def restore(self, state: State) -> None:
         """Continues from ``state``, with the derivative of the intensity model taken at ``volume`` again."""
+        if missing := {*self.ARRAYS, *self.NUMBERS} - {*state}:
+            found = f"a run of another version, without {', '.join(sorted(missing))}"
+            raise InputError("--resume", found, "the same version", "start without --resume")
         for name in self.ARRAYS:
             setattr(self, name, self.system.space.array(state[name]))
         for name in self.NUMBERS:
