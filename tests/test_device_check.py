@@ -25,10 +25,8 @@ GPU_ONLY = {"splat_forward_pixels", "splat_backward_group"}
 GPU_ONLY |= {"bin_count_group", "bin_within_group", "bin_starts_group", "bin_fill_group"}
 GPU_ONLY |= {"warp_adjoint_fixed", "warp_adjoint_sum"}
 GPU = {"lanes": 1, "pixel_items": True}
-SHAPES = {  # GPUs with doubles: the test of small limits below
-    "CPU": ({"pixel_items": False}, GPU_ONLY), "GPU without doubles": ({**GPU, "fp64": False}, CPU_ONLY),
-    "CPU, lanes 1": ({"lanes": 1, "pixel_items": False}, GPU_ONLY),
-}  # fmt: skip
+# GPUs with doubles: the test of small limits below. CPUs with lanes 1: the tests of kernels whose code differs then.
+SHAPES = {"CPU": ({"pixel_items": False}, GPU_ONLY), "GPU without doubles": ({**GPU, "fp64": False}, CPU_ONLY)}
 
 
 TWINS = ("splat_frame", "moving_frame", "splat_image", "deformed_frame", "voxel_field")
