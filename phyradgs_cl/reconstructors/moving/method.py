@@ -34,7 +34,7 @@ from phyradgs_cl.reconstructors.moving.signal import (
     signal_of,
 )
 from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress, Reconstruction, Report, option_facts
-from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_passes, fista_stages
+from phyradgs_cl.reconstructors.voxels.fista import FistaOptions, fista_stage, fista_stages
 from phyradgs_cl.reconstructors.voxels.run import MethodRun
 from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages
 from phyradgs_cl.runtime import Runtime
@@ -55,7 +55,7 @@ _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4
 _COARSE_SHARE = 0.6  # fraction of the rounds that have coarse control points
 _FREE_KNOTS = 6  # if weights follow no signal, their splines have this many intervals in time
 _AT_REST = "no motion found"
-# One in five iterations is a round of the search: by default 7 rounds, and then 24 passes as in fista.
+# One in five iterations is a round of the search: by default 7 rounds, and then 24 as in fista.
 _ITERATIONS_PER_ROUND = 5
 _STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")
 
@@ -175,7 +175,7 @@ class FieldSearch:
             motion=self.motion, iterations=passes, prior="dct", prior_weight=_WEIGHT, tv_iterations=_TV_ITERATIONS
         )
         deformation = one.deformation() if one.control_mm.any() else None
-        run = fista_passes(lambda: MethodRun(self.scan, options, self.rt, deformation=deformation), passes, volume)
+        run = fista_stage(lambda: MethodRun(self.scan, options, self.rt, deformation=deformation), passes, volume)
         for _ in range(passes):
             run.step()
         return run.present_volume()[0]

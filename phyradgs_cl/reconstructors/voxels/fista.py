@@ -1,4 +1,4 @@
-"""A prior over ordered subsets of the frames: min ½‖p − A x‖² + R(x), x ≥ 0, first by POGM and at last by FISTA.
+"""A prior over ordered subsets of the frames: min ½‖p − A x‖² + R(x), x ≥ 0, by POGM and FISTA.
 
 Each subset S, one of M, makes one step. FISTA's is xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁)
 (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The proximal optimised gradient method, POGM, needs
@@ -8,11 +8,12 @@ a third fewer steps (Taylor, Hendrickx and Glineur, SIAM J. Optim. 27 (2017) 128
 The gradient of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans.
 Med. Imaging 34 (2015) 167). L bounds the norm of AᵀA.
 
-The last 7 of 12 passes run on smaller voxels, whose means make up most of the result (``stages.py``). The passes before them
-only provide their first volume, so they may be coarser: with fewer times in an exposure.
+On small grids the last 7 of 12 iterations run on smaller voxels, whose means make up most of the result (``stages.py``). The
+iterations before them only provide their first volume, so they are coarser: two quick passes each, with more subsets, and
+fewer times in an exposure. They are FISTA's, because POGM diverges with so many subsets.
 
 The calls of a run: ``MethodRun``, ``Stages``, ``Loop``, ``Iterations.step``, ``Fista.step``, ``System``, ``RayOperator``, a
-kernel. ``fista_passes`` already projects before its loop, for the step sizes and the ``PriorWeight``."""
+kernel. ``fista_stage`` already projects before its loop, for the step sizes and the ``PriorWeight``."""
 
 import logging
 import math
@@ -45,10 +46,12 @@ _FRAMES = 3  # memory of a run in copies of all projections
 _HELD = 9  # volumes that the prior ``dct`` holds on the device
 _COPIES = 2  # the device holds two copies of a volume on the host while a prior maps it
 # Measured: docs/results/settings.md.
-_COARSE_PASSES = 5 / 12  # fraction of all passes before those on smaller voxels; they are coarse
+_COARSE_SHARE = 5 / 12  # fraction of the iterations before those on smaller voxels; they are coarse
+_COARSE_PASSES = 2  # passes in a coarse iteration: they cost little, and few views or photons need many
+_COARSE_SUBSETS = 1.6  # a coarse pass has this many times ``subsets`` subsets
 _COARSE_TIMES = 1 / 3  # a coarse pass has this fraction of the times per exposure, but two at least
-_OPTIMISED_PASSES = 21  # most passes of POGM: its momentum has no restart, and the noise of subsets grows with it
-_CALM_PASSES = 3  # last passes on one grid, which are FISTA's: they take out the noise of subsets that POGM leaves
+_MOST_OPTIMISED = 21  # most iterations by POGM: its momentum has no restart, and the noise of subsets grows with it
+_CALM = 3  # last iterations on one grid, which are FISTA's: they take out the noise of subsets that POGM leaves
 _FAINTEST = 1e-6  # smaller row sums of AᵀA count as this fraction of the largest: dividing by less would inflate the bound
 # Voxels are divided if a slice (y, x) has at most this many of them: dividing is worth its time at 64³, not at 128³.
 # Slices are not counted, so that thick and thin slabs of one scan are reconstructed in the same manner.
@@ -64,17 +67,17 @@ class FistaOptions(IterativeOptions):
     - prior_share: s in the prior piccs, (1 − s) TV(x) + s TV(x − first volume).
     - prior_weight: strength of the prior, relative to the error of the data term's gradient. That error comes from noise of
       the frames and from edges inside large voxels.
-    - subvoxels: parts of a voxel's side in the last 7/12 of the passes; 0 takes 2 for slices of up to 90² voxels
+    - subvoxels: parts of a voxel's side in the last 7/12 of the iterations; 0 takes 2 for slices of up to 90² voxels
       where memory allows, else 1.
-    - subsets: number of subsets of the frames, each with one step. If their steps diverge, they are joined two by two.
-      tv_iterations: dual iterations per proximal map of TV.
+    - subsets: number of subsets of the frames, each with one step; iterations before smaller voxels have 1.6 times as many.
+      If their steps diverge, they are joined two by two. tv_iterations: dual iterations per proximal map of TV.
     - transmission_weights: weights pixels by their transmission, as in ``fista-tv``."""
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
     """Options that may be a function."""
 
     TRIALS: ClassVar[tuple[int, int]] = (2, 7)
-    """Iterations of the two short runs that ``estimate`` times. Of the five between, three are coarse, as in a whole run."""
+    """Iterations of the two short runs that ``estimate`` times. Of the five between, two are coarse, as in a whole run."""
 
     motion: Motion = PerRow()
     iterations: int = 24
@@ -158,20 +161,20 @@ def _tight_curvature(system: System) -> float:
 
 
 class Fista(Accelerated):
-    """Passes over subsets by POGM, then by FISTA. A pass's residual combines all subsets, each where its step took it.
+    """Passes over subsets by POGM, then by FISTA. A pass's residual combines all subsets, each at the point of its gradient.
 
-    optimised: number of passes by POGM. ``previous`` and ``ahead`` are POGM's wₖ₋₁ and zₖ₋₁, ``momentum`` and ``length`` its
-    θₖ₋₁ and L γₖ₋₁."""
+    passes: number of passes in an iteration, whose residual is the last one's. optimised: number of passes by POGM.
+    ``previous`` and ``ahead`` are POGM's wₖ₋₁ and zₖ₋₁, ``momentum`` and ``length`` its θₖ₋₁ and L γₖ₋₁."""
 
     ARRAYS = ("volume", "previous", "ahead")
     NUMBERS = ("momentum", "length", "optimised")
 
     def __init__(
         self, system: System, prior: Prior, weight: PriorWeight, *, subsets: int, nonnegative: bool,
-        has_long_steps: bool = False, optimised: int = 0,
+        has_long_steps: bool = False, optimised: int = 0, passes: int = 1,
     ) -> None:  # fmt: skip
         super().__init__(system, prior, has_long_steps=has_long_steps)
-        self.nonnegative, self.weight, self.optimised = nonnegative, weight, optimised
+        self.nonnegative, self.weight, self.optimised, self.passes = nonnegative, weight, optimised, passes
         self.subsets = OrderedSubsets(system, subsets)
         self._rest()
 
@@ -185,6 +188,9 @@ class Fista(Accelerated):
         self.previous = self.ahead = self.volume
 
     def step(self) -> float:
+        return [self._pass() for _ in range(self.passes)][-1]
+
+    def _pass(self) -> float:
         weight = self.weight.at(self.volume)
         self.prior.noise_share = self.weight.noise_share(weight)
         update = self._optimised_update if self.optimised else self._update
@@ -243,21 +249,21 @@ METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initia
 
 
 def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
-    """Returns the passes on the scan's own voxels and, if the options or the grid ask for them, passes on smaller voxels. A
-    stage takes its run from ``now`` when it starts, because the motion of the object may be known only then."""
+    """Returns the stages of a run: on the scan's own voxels and, if options or grid ask for them, on smaller voxels. A stage
+    takes its run from ``now`` when it starts, because the motion of the object may be known only then."""
     options = run.options
     parts = options.subvoxels or (2 if _gains_from_subvoxels(run, 2) else 1)
-    first = round(_COARSE_PASSES * options.iterations) if parts > 1 else 0
+    first = round(_COARSE_SHARE * options.iterations) if parts > 1 else 0
     last = options.iterations - first
 
-    def stage(name: str, passes: int, **how: Any) -> Stage:
-        return Stage(name, passes, partial(fista_passes, now, passes, **how))
+    def stage(name: str, iterations: int, **how: Any) -> Stage:
+        return Stage(name, iterations, partial(fista_stage, now, iterations, **how))
 
     if parts == 1:
-        return [stage("voxels", last, optimised=min(max(last - _CALM_PASSES, 0), _OPTIMISED_PASSES))]
+        return [stage("voxels", last, optimised=min(max(last - _CALM, 0), _MOST_OPTIMISED))]
     share = priors.subvoxel_share(options.prior, run.scan.grid.finer(parts).shape)
     fine = replace(stage("subvoxels", last, parts=parts), merge=partial(merge_subvoxels, parts=parts, share=share))
-    return [stage("voxels", first, has_few_times=True, optimised=min(first, _OPTIMISED_PASSES)), fine]
+    return [stage("voxels", first, is_coarse=True), fine]
 
 
 def _few_times(motion: Motion) -> Motion:
@@ -267,16 +273,16 @@ def _few_times(motion: Motion) -> Motion:
     return replace(motion, sub_intervals=max(2, math.ceil(_COARSE_TIMES * motion.sub_intervals)))
 
 
-def fista_passes(
-    now: Callable[[], MethodRun], passes: int, volume: np.ndarray | None, parts: int = 1, has_few_times: bool = False,
+def fista_stage(
+    now: Callable[[], MethodRun], iterations: int, volume: np.ndarray | None, parts: int = 1, is_coarse: bool = False,
     optimised: int = 0,
 ) -> Iterations:  # fmt: skip
-    """Returns ``passes`` passes from ``volume`` (nz, ny, nx; None: the method's own start), the first ``optimised`` by POGM,
-    with every voxel divided into ``parts`` along each side. has_few_times: takes a third of an exposure's times."""
+    """Returns ``iterations`` from ``volume`` (nz, ny, nx; None: the method's own start), with every voxel divided into
+    ``parts`` along each side. is_coarse: they only provide the first volume of a stage. optimised: first ones by POGM."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
-    options, rt = replace(whole.options, iterations=passes), whole.rt
-    if has_few_times and scan.is_fly:
+    options, rt = replace(whole.options, iterations=iterations), whole.rt
+    if is_coarse and scan.is_fly:
         options = replace(options, motion=_few_times(options.motion))
     run = replace(whole, scan=scan, options=options, initial=repeated(volume, parts), resume=None)
     system = run.system(volumes=_VOLUMES + priors.volumes_of(options.prior), frames=_FRAMES)
@@ -291,9 +297,12 @@ def fista_passes(
     prior = priors.prior_of(options.prior, prior_inputs)
     with rt.ledger.reserved(_COPIES * volume_bytes if is_short else 0):
         weight = PriorWeight(system, error, options.prior_weight)
+        subsets, passes = options.subsets, 1
+        if is_coarse:
+            subsets, passes = round(_COARSE_SUBSETS * subsets), _COARSE_PASSES
         method = Fista(
-            system, prior, weight, subsets=options.subsets, nonnegative=options.nonnegative, has_long_steps=True,
-            optimised=optimised,
+            system, prior, weight, subsets=subsets, nonnegative=options.nonnegative, has_long_steps=True,
+            optimised=optimised, passes=passes,
         )  # fmt: skip
     return Iterations(method, run)
 
