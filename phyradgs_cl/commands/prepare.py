@@ -49,8 +49,9 @@ def prepare_command(scan: Scan, output: Output, settings: Settings, as_json: AsJ
 
 
 def _line(step: dict[str, Any]) -> str:
-    numbers = {key: value for key, value in step.items() if key not in ("step", "options")}
-    return f"{step['step']:12s} " + ", ".join(f"{key.replace('_', ' ')} {_short(value)}" for key, value in numbers.items())
+    told = {key.replace("_", " "): _short(value) for key, value in step.items() if key not in ("step", "options")}
+    words = (text if key == "result" else f"{key} {text}" for key, text in told.items())
+    return f"{step['step']:12s} {', '.join(words)}"
 
 
 def _short(value: Any) -> str:
@@ -58,4 +59,4 @@ def _short(value: Any) -> str:
         return f"{value:.4g}"
     if isinstance(value, dict):
         return ", ".join(f"{_short(own)} {key.replace('_', ' ')}" for key, own in value.items())
-    return (", ".join(map(_short, value)) or "none") if isinstance(value, list) else str(value)
+    return ", ".join(map(_short, value)) if isinstance(value, list) else str(value)

@@ -37,7 +37,8 @@ DEFAULT_STEPS = "sparks,dead,rings"
 STEPS_HELP = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 PREPARED_KEY = "prepared"
 """The key under which a scan's provenance lists the steps that were applied to it."""
-_ONCE = ("scatter", "hardening", "phase")  # a second correction would take away from what the first one left
+# A second correction would take away from what the first one left. A "result" of these says that nothing was corrected.
+_ONCE = ("scatter", "hardening", "phase")
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ def one_by_one(
     for name in options.chosen:
         step_options = getattr(options, name)
         earlier: Any = scan.provenance.get(PREPARED_KEY) or []
-        if name in _ONCE and any(entry["step"] == name for entry in earlier):
+        if name in _ONCE and any(entry["step"] == name and "result" not in entry for entry in earlier):
             remedy = "leave it out, or start from the scan before that step"
             raise InputError("--steps", f"{name}, which this scan has had", "a step to be done only once", remedy)
         scan, numbers = STEPS[name](scan, step_options, make_model)
