@@ -32,7 +32,7 @@ from phyradgs_cl.io.output import checkpoint_path, former_checkpoint_path, refus
 from phyradgs_cl.metrics import METRICS, VOXEL_BY_VOXEL, aligned, compare
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors.result import COMPARED, HELD_OUT
-from phyradgs_cl.reconstructors.run import check_resumable
+from phyradgs_cl.reconstructors.run import check_resumable, check_scan
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_output, expecting, load_scan
@@ -154,6 +154,7 @@ def _reconstructed(
     with hashing(path) as scan_hash_of:
         scan = load_scan(path, plan.preprocessing.flats)
         scan_hash = scan_hash_of()
+    check_scan(scan, plan)
     _warn_of_doubts(plan, path, scan)
     rt = make_runtime()
     leads, state = rt.ranks.rank == 0, None
