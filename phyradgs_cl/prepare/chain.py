@@ -81,9 +81,8 @@ class PrepareOptions:
     def step_facts(self) -> dict[str, object]:
         """Returns what the provenance records: the chosen steps and their options by name. It is empty for the defaults."""
         flats = {} if self.flats == "mean" else {"flats": self.flats}
-        if not self.chosen:
-            return {**flats}
-        return {**flats, "steps": ",".join(self.chosen), **{name: asdict(getattr(self, name)) for name in self.chosen}}
+        steps = {"steps": ",".join(self.chosen)} if self.chosen else {}
+        return {**flats, **steps, **{name: asdict(getattr(self, name)) for name in self.chosen}}
 
 
 STEP_FIELDS = frozenset(f.name for f in fields(PrepareOptions))
