@@ -107,9 +107,10 @@ def check(
         return answers.stop()
     quick = quick_scan(scan)
     consistent = consistency.check_consistency(rt, quick, scan)
-    hidden = {"verdict": CANNOT_TELL, "text": f"rests on {coverage.NOISE}: {SUSPICIOUS}", "advice": ""}
-    is_hidden = noisy and consistent.finding.verdict == SUSPICIOUS
-    answers.add(replace(consistent.finding, **hidden) if is_hidden else consistent.finding)
+    found = consistent.finding
+    if noisy and found.verdict == SUSPICIOUS:
+        found = replace(found, verdict=CANNOT_TELL, text=f"rests on {coverage.NOISE}: {SUSPICIOUS}", advice="")
+    answers.add(found)
     if not consistent.is_sound:
         return answers.stop()
     quick = some_frames(quick, consistent.frames)

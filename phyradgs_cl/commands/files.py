@@ -29,14 +29,12 @@ EXAMPLES = {
     "info": "Example: phyradgs info scan.h5",
     "export": "Example: phyradgs export volume.h5 -o volume.nii --hu",
 }
-GROUPS = {
-    "export": {
-        "Basics": ("output", "to", "doubt"),
-        "Hounsfield units": ("hu", "air_mm", "water_mm", "insert_hu", "mu_water_per_mm"),
-        "Objects that move": ("object_motion", "states", "during"),
-        "DICOM": ("patient", "title", "description", "date")
-    }
-}
+GROUPS = {"export": {
+    "Basics": ("output", "to", "doubt"),
+    "Hounsfield units": ("hu", "air_mm", "water_mm", "insert_hu", "mu_water_per_mm"),
+    "Objects that move": ("object_motion", "states", "during"),
+    "DICOM": ("patient", "title", "description", "date"),
+}}
 _MOTION = "Deformation of the object: the volume is written at several states."
 _STATES = "Number of states, at the middles of equal parts of the time; nii has them in one file."
 _DURING = "Time that the states cover, s."

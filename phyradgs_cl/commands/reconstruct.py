@@ -38,8 +38,7 @@ from phyradgs_cl.workflow.slabs import Slabs, rows_of
 EXAMPLES = {
     "reconstruct": (
         "Example: phyradgs reconstruct scan.h5 -o volume.h5 --method phyradgs --iterations 2000\n\n"
-        "Ctrl-C keeps the volume so far, here as volume.partial.h5, and a checkpoint; --resume continues from it. FDK and "
-        "FBP do not iterate: of them it keeps nothing."
+        "Ctrl-C keeps the volume so far, here as volume.partial.h5, and a checkpoint for --resume; of fdk and fbp nothing."
     ),
     "estimate": "Example: phyradgs estimate scan.h5 --method fista-tv --motion per-row",
 }

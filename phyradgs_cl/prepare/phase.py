@@ -43,8 +43,7 @@ class PhaseOptions(checks.Checked):
         if self.delta_beta is not None and both:
             raise InputError("phase.delta_beta", f"given with phase.{both[0]}", "δ/β, or δ and β", "leave one out")
         if self.beta == 0:
-            remedy = "an object without absorption hides its thickness"
-            raise InputError("phase.beta", "0", "a number above 0", remedy)
+            raise InputError("phase.beta", "0", "a number above 0", "an object without absorption hides its thickness")
 
     def stated(self) -> tuple[float, float]:
         """Returns energy in keV and δ/β. Raises one InputError for all that is missing: no scan file states it."""

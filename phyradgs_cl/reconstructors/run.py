@@ -86,8 +86,7 @@ def check_scan(scan: Scan, plan: RunPlan) -> None:
     """Raises InputError for a scan that the plan's method, or its error bars, cannot take. It gives no warnings."""
     method_of(plan.method).check(scan, plan.options)
     if plan.preprocessing.doubt and not hasattr(plan.options, "iterations") and scan.frames < FEWEST_FRAMES:
-        expected = f"{FEWEST_FRAMES} or more, two in each half"
-        raise InputError("--doubt", f"frames: {scan.frames}", expected, "leave it out")
+        raise InputError("--doubt", f"frames: {scan.frames}", f"{FEWEST_FRAMES} or more, two in each half", "leave it out")
 
 
 class _Prepared:

@@ -249,18 +249,11 @@ def simulate(
     recorded = _recorded(frames, options, np.where(share > 0, share, 1.0), rng)
     return Scan(
         projections=recorded if np.all(share > 0) else recorded * (share > 0),  # a line without light has no measurement
-        geometry=geometry,
-        trajectory=trajectory,
-        shutter=shutter,
-        frame_start_s=start_s,
-        grid=grid,
-        is_fly=protocol.is_fly,
-        detector_model=options.detector_model,
-        lag=options.lag,
+        geometry=geometry, trajectory=trajectory, shutter=shutter, frame_start_s=start_s, grid=grid, title=title,
+        is_fly=protocol.is_fly, detector_model=options.detector_model, lag=options.lag,
         reference=None if reference is None else (reference * factor).astype(np.float32),
-        title=title,
         provenance={"attenuation_factor": factor, "time_samples": samples},
-    )
+    )  # fmt: skip
 
 
 def _gating(scan: Scan, scene: Scene) -> Gating:
