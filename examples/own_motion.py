@@ -33,7 +33,7 @@ class Sagging:
 
 
 # Which readout time explains the frames? The panel of this scan takes 0.86 of an exposure.
-true = simulate("jaw", size=24, detector=32, views=60, exposure_deg=30.0)
+true = simulate("jaw", size=24, detector=32, views=60, turns=7, exposure_deg=30.0)
 residual = {}
 for ratio in (0.0, 0.43, 0.86, 1.29):
     result = reconstruct(true, "cgls", iterations=12, motion=ReadoutOf(ratio), report=False)

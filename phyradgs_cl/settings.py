@@ -19,6 +19,7 @@ from phyradgs_cl.io.tables import read_toml
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.runtime import Runtime, bytes_of
+from phyradgs_cl.text import flag_of
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -53,7 +54,7 @@ class Settings:
             "object_motion": None if object_motion is None else _object_motion(object_motion),
         }  # fmt: skip
         # A name that both a method and preprocessing have means preprocessing on the command line, as --help says.
-        flags = [f.name for f in fields(methods.Preprocessing) if self.origins.get(f.name) == _flag(f.name)]
+        flags = [f.name for f in fields(methods.Preprocessing) if self.origins.get(f.name) == flag_of(f.name)]
         method = method or methods.DEFAULT_METHOD
         refuse_removed(f"--motion {values.get('motion')}", self.origins.get("motion", ""))
         with self.naming_origins(method):
@@ -85,7 +86,7 @@ class Settings:
     def _word(self, values: dict[str, Any], name: str) -> str | None:
         value = values.pop(name, None)
         if value is not None and not isinstance(value, str):
-            raise InputError(self.origins.get(name, _flag(name)), checks.short_repr(value), "a word in quotation marks")
+            raise InputError(self.origins.get(name, flag_of(name)), checks.short_repr(value), "a word in quotation marks")
         return value
 
 
@@ -103,7 +104,7 @@ def read_settings(
     for key, value in given.items():
         if value is not None:
             values[key] = value
-            origins[key] = _flag(key)
+            origins[key] = flag_of(key)
     device, memory = values.pop("device", None), values.pop("memory", None)
     if isinstance(device, int) and not isinstance(device, bool) and 0 <= device < 1_000_000:
         device = str(device)  # the index of a device may be a number in TOML
@@ -125,10 +126,6 @@ def _initial_volume(path: Path, mu_water_per_mm: float | None) -> methods.Initia
 def _object_motion(path: Path) -> methods.ObjectMotion:
     facts = {"object_motion": str(path), "object_motion_sha256": sha256_of(path)}
     return methods.ObjectMotion(read_deformation(path), facts)
-
-
-def _flag(key: str) -> str:
-    return f"--{key.replace('_', '-')}"
 
 
 def _origin_of(subject: str, origins: Mapping[str, str]) -> str | None:

@@ -19,10 +19,6 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _SAME_PRESS_S = 1.0  # wrappers such as timeout and uv repeat a signal: within this time both count as one
 
 
-class InterruptedAfterwards(KeyboardInterrupt):
-    """Raised after work that a signal did not stop, once it is finished."""
-
-
 class StopFlag:
     """The handler of both signals. waits: the first signal only sets the flag. keeps: this also holds after a loop of
     iterations, until its result is written. farewell: what the command line prints after a signal has ended the command."""
@@ -93,7 +89,7 @@ def stop_on_interrupt(waits: bool = True) -> Iterator[StopFlag]:
 @contextmanager
 def keep_finished_work() -> Iterator[None]:
     """Delays signals from the first loop of iterations in the body to the end of the body, so that the loop's result is
-    written. Then raises InterruptedAfterwards if a signal has come."""
+    written. Then raises KeyboardInterrupt if a signal has come."""
     with stop_on_interrupt(waits=False) as flag:
         keeps, flag.keeps = flag.keeps, True
         try:
@@ -105,7 +101,7 @@ def keep_finished_work() -> Iterator[None]:
 
 @contextmanager
 def finish_despite_interrupt() -> Iterator[None]:
-    """Delays signals during short work such as writing. Then raises InterruptedAfterwards if one has come."""
+    """Delays signals during short work such as writing. Then raises KeyboardInterrupt if one has come."""
     with stop_on_interrupt() as flag:
         yield
     flag.farewell = COMPLETE
@@ -129,7 +125,7 @@ def _installed() -> StopFlag | None:
 
 
 def _raise_what_waited(flag: StopFlag) -> None:
-    """Raises InterruptedAfterwards if a signal was delayed, unless an outer block still delays it."""
+    """Raises KeyboardInterrupt if a signal was delayed, unless an outer block still delays it."""
     if flag.is_set and not flag.waits:
         flag.farewell = COMPLETE
-        raise InterruptedAfterwards
+        raise KeyboardInterrupt

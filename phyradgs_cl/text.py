@@ -12,6 +12,7 @@ from typing import Any
 
 # Control characters may move a terminal's cursor. Lone surrogates, which stand for bytes not in UTF-8, cannot be written.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+_MANY = 8  # longer lists are told by their ends
 
 
 def plain_text(text: str) -> str:
@@ -65,6 +66,24 @@ def repr_of_changes(thing: Any) -> str:
         elif value != field.default:
             texts.append(f"{field.name}={value!r}")
     return f"{type(thing).__name__}({', '.join(texts)})"
+
+
+def value_text(value: Any, digits: int = 6) -> str:
+    """Returns a value for a reader: numbers with ``digits`` significant digits, tables as "name value, name value". What is
+    None in a table is left out, a table in it gets parentheses, and a long list is told by its count and ends."""
+    match value:
+        case float():
+            return f"{value:.{digits}g}"
+        case Mapping():
+            told = {str(name).replace("_", " "): own for name, own in value.items() if own is not None}
+            forms = ((name, "({})" if isinstance(own, Mapping) else "{}", own) for name, own in told.items())
+            return ", ".join(f"{name} {form.format(value_text(own, digits))}" for name, form, own in forms)
+        case [Mapping(), *_]:
+            return "; ".join(value_text(one, digits) for one in value)
+        case list() | tuple():
+            texts = [value_text(one, digits) for one in value]
+            return f"({', '.join(texts)})" if len(texts) <= _MANY else f"{len(texts)} values from {texts[0]} to {texts[-1]}"
+    return str(value)
 
 
 def to_digits_of(value: float, deviation: float) -> str:

@@ -27,7 +27,7 @@ class Protocol:
     a frame's start, in units of T_exp; None means always. Raises InputError for values out of range."""
 
     views: int = checks.option(25, "Frames of the scan.", "protocol's", range=(1, 100_000))
-    exposure_deg: float = checks.option(14.4, "Arc of one exposure, degrees.", "protocol's", range=(0, 3600))
+    exposure_deg: float = checks.option(14.4, "Arc of one exposure, degrees.", "protocol's", range=(0, 360))
     readout_ratio: float = checks.ranged(0.86, 0, 1000)
     start_deg: float = checks.option(0.0, "Gantry angle at the start, degrees.", "0", range=(-1e6, 1e6))
     exposure_s: float = 1.0

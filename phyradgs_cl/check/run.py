@@ -81,7 +81,9 @@ def check(
 
     Raises InputError where every pixel is masked, and for NaN or infinity at other pixels."""
     scan = without_lag(_finite(scan))
-    questions = ["timing", "angles", "saturation", "dead pixels", "coverage", consistency.CONSISTENCY]
+    noisy = coverage.find_noise(scan)
+    questions = ["timing", "angles", "saturation", "dead pixels", *([coverage.NOISE] if noisy else []), "coverage"]
+    questions.append(consistency.CONSISTENCY)
     questions += [orbit.SIGN, orbit.CENTRE, *([] if scan.is_parallel else [orbit.DISTANCES]), detector.GAIN]
     if scan.is_fly and scan.shutter.exposure_s + scan.shutter.readout_s > 0:
         questions.append(shutter.READOUT)
@@ -97,13 +99,18 @@ def check(
     if finding.verdict == SUSPICIOUS and saturation.verdict != OK:  # a saturated pixel is as constant as a dead one
         finding = replace(finding, verdict=CANNOT_TELL, text=f"rests on saturation: {saturation.verdict}", advice="")
     answers.add(finding)
+    if noisy:
+        answers.add(noisy)
     scan = replace(scan, pixel_mask=united(scan.pixel_mask, dead))
     covered = answers.add(coverage.check_coverage(scan))
     if covered.unit in (coverage.NO_OBJECT, coverage.OPAQUE, coverage.TOO_BRIGHT):
         return answers.stop()
     quick = quick_scan(scan)
     consistent = consistency.check_consistency(rt, quick, scan)
-    answers.add(consistent.finding)
+    found = consistent.finding
+    if noisy and found.verdict == SUSPICIOUS:
+        found = replace(found, verdict=CANNOT_TELL, text=f"rests on {coverage.NOISE}: {SUSPICIOUS}", advice="")
+    answers.add(found)
     if not consistent.is_sound:
         return answers.stop()
     quick = some_frames(quick, consistent.frames)

@@ -1,6 +1,7 @@
 """The commands info and export: print a file's contents, and write a volume for other programs."""
 
 import json
+import textwrap
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,25 +22,25 @@ from phyradgs_cl.exporters import (
 from phyradgs_cl.fields import Hounsfield
 from phyradgs_cl.io import Volume, holds_deformation, read_deformation, read_states
 from phyradgs_cl.signals import finish_despite_interrupt
+from phyradgs_cl.text import value_text
 from phyradgs_cl.workflow.files import expecting, summary
 
 EXAMPLES = {
     "info": "Example: phyradgs info scan.h5",
     "export": "Example: phyradgs export volume.h5 -o volume.nii --hu",
 }
-GROUPS = {
-    "export": {
-        "Basics": ("output", "to", "doubt"),
-        "Hounsfield units": ("hu", "air_mm", "water_mm", "insert_hu", "mu_water_per_mm"),
-        "Objects that move": ("object_motion", "states", "during"),
-        "DICOM": ("patient", "title", "description", "date")
-    }
-}
+GROUPS = {"export": {
+    "Basics": ("output", "to", "doubt"),
+    "Hounsfield units": ("hu", "air_mm", "water_mm", "insert_hu", "mu_water_per_mm"),
+    "Objects that move": ("object_motion", "states", "during"),
+    "DICOM": ("patient", "title", "description", "date"),
+}}
 _MOTION = "Deformation of the object: the volume is written at several states."
 _STATES = "Number of states, at the middles of equal parts of the time; nii has them in one file."
 _DURING = "Time that the states cover, s."
 _PEAK, _BOX = "the volume's own peak", "Z0,Z1,Y0,Y1,X0,X1"
-_LONGEST = 2000  # longer values are cut after this many characters
+# Cuts a value into lines; paths stay in one piece.
+_LINES = textwrap.TextWrapper(100, max_lines=6, placeholder=" … (--json)", break_long_words=False, break_on_hyphens=False)
 _OUTPUT = "File to write, or for dicom and zarr a new folder; nii.gz is compressed."
 _TO = f"{', '.join(VOXELS)}, zarr and dicom (folders): the voxels; {', '.join(CLOUDS)}: the Gaussians."
 _WATER = "Attenuation of water in 1/mm; the values are then Hounsfield units, with air at 0."
@@ -60,8 +61,8 @@ def info_command(
         say(json.dumps(facts, default=str))
         return
     for key, value in facts.items():
-        text = _short(value)
-        say(f"{key.replace('_', ' '):24s} {text[:_LONGEST]}{'…' if len(text) > _LONGEST else ''}")
+        if value is not None:
+            say(f"{key.replace('_', ' '):24s} " + f"\n{'':25s}".join(_LINES.wrap(value_text(value))))
 
 
 def export_command(
@@ -121,17 +122,3 @@ def export_command(
     say(f"{written}: {form}{', error bars' if doubt else ''}{unit}{moving}")
     if scales and scales[0] is not None:
         say(f"Hounsfield units: {scales[0].line}")
-
-
-def _short(value: Any, is_inside: bool = False) -> str:
-    """Returns a value as text, with six significant digits. is_inside: it is in a container, where text gets quotes."""
-    match value:
-        case float():
-            return f"{value:.6g}"
-        case tuple():
-            return f"({', '.join(_short(part, True) for part in value)})"
-        case list():
-            return f"[{', '.join(_short(part, True) for part in value)}]"
-        case dict():
-            return f"{{{', '.join(f'{key!r}: {_short(part, True)}' for key, part in value.items())}}}"
-    return repr(value) if is_inside else str(value)

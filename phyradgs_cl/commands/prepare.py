@@ -9,19 +9,15 @@ from phyradgs_cl.commands.options import Device, Memory, Output, Scan, settings_
 from phyradgs_cl.prepare.chain import DEFAULT_STEPS, STEPS_HELP
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.settings import Settings
+from phyradgs_cl.text import value_text
 from phyradgs_cl.workflow import run_preparation
 
 EXAMPLES = {"prepare": "Example: phyradgs prepare scan.h5 -o clean.h5 --steps sparks,dead,rings --set rings.window=11"}
 GROUPS = {
-    "prepare": {
-        "Basics": ("output", "steps", "assignments", "as_json"),
-        "Run": ("config", "device", "memory"),
-    }
+    "prepare": {"Basics": ("output", "steps", "assignments", "as_json"), "Run": ("config", "device", "memory")}
 }
 _CONFIG = "TOML file of steps and their tables; the command line wins."
 _SET = "An option of a step, as --set rings.window=11 (docs: prepare.md)."
-
-
 _OPTIONS = {
     "steps": (Annotated[str | None, option(STEPS_HELP, DEFAULT_STEPS, metavar="NAME,...")], None),
     "config": (Annotated[Path | None, file_option(_CONFIG, "--config")], None),
@@ -49,13 +45,5 @@ def prepare_command(scan: Scan, output: Output, settings: Settings, as_json: AsJ
 
 
 def _line(step: dict[str, Any]) -> str:
-    numbers = {key: value for key, value in step.items() if key not in ("step", "options")}
-    return f"{step['step']:12s} " + ", ".join(f"{key.replace('_', ' ')} {_short(value)}" for key, value in numbers.items())
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, dict):
-        return ", ".join(f"{_short(own)} {key.replace('_', ' ')}" for key, own in value.items())
-    return (", ".join(map(_short, value)) or "none") if isinstance(value, list) else str(value)
+    numbers = {key: value for key, value in step.items() if key not in ("step", "options", "result")}
+    return f"{step['step']:12s} {', '.join(filter(None, (step.get('result'), value_text(numbers, 4))))}"

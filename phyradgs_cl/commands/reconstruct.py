@@ -38,7 +38,7 @@ from phyradgs_cl.workflow.slabs import Slabs, rows_of
 EXAMPLES = {
     "reconstruct": (
         "Example: phyradgs reconstruct scan.h5 -o volume.h5 --method phyradgs --iterations 2000\n\n"
-        "Ctrl-C keeps the volume so far, here as volume.partial.h5, and a checkpoint; --resume continues from it."
+        "Ctrl-C keeps the volume so far, here as volume.partial.h5, and a checkpoint for --resume; of fdk and fbp nothing."
     ),
     "estimate": "Example: phyradgs estimate scan.h5 --method fista-tv --motion per-row",
 }
@@ -62,6 +62,7 @@ _PREVIEW = "PNG of the three middle slices; during the run NAME.partial.png, eve
 
 
 @with_run_options()
+@signals.keep_finished_work()  # a run that Ctrl-C finds in its last iteration is complete, and told in full
 def reconstruct_command(
     scan: Scan, output: Output, settings: Settings,
     initial: Annotated[Path | None, file_option("Volume to start from.", "--initial")] = None,

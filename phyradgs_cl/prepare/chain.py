@@ -37,7 +37,8 @@ DEFAULT_STEPS = "sparks,dead,rings"
 STEPS_HELP = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 PREPARED_KEY = "prepared"
 """The key under which a scan's provenance lists the steps that were applied to it."""
-_ONCE = ("scatter", "hardening", "phase")  # a second correction would correct too much
+# A second correction would take away from what the first one left. A "result" of these says that nothing was corrected.
+_ONCE = ("scatter", "hardening", "phase")
 
 
 @dataclass(frozen=True)
@@ -80,9 +81,8 @@ class PrepareOptions:
     def step_facts(self) -> dict[str, object]:
         """Returns what the provenance records: the chosen steps and their options by name. It is empty for the defaults."""
         flats = {} if self.flats == "mean" else {"flats": self.flats}
-        if not self.chosen:
-            return {**flats}
-        return {**flats, "steps": ",".join(self.chosen), **{name: asdict(getattr(self, name)) for name in self.chosen}}
+        steps = {"steps": ",".join(self.chosen)} if self.chosen else {}
+        return {**flats, **steps, **{name: asdict(getattr(self, name)) for name in self.chosen}}
 
 
 STEP_FIELDS = frozenset(f.name for f in fields(PrepareOptions))
@@ -105,7 +105,7 @@ def one_by_one(
     for name in options.chosen:
         step_options = getattr(options, name)
         earlier: Any = scan.provenance.get(PREPARED_KEY) or []
-        if name in _ONCE and any(entry["step"] == name for entry in earlier):
+        if name in _ONCE and any(entry["step"] == name and "result" not in entry for entry in earlier):
             remedy = "leave it out, or start from the scan before that step"
             raise InputError("--steps", f"{name}, which this scan has had", "a step to be done only once", remedy)
         scan, numbers = STEPS[name](scan, step_options, make_model)

@@ -119,8 +119,9 @@ def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) ->
         model, blur = step.coarse_model(scan, make_model)
         mixed, facts["unexplained"] = find_bone(step.smooth(frames, blur), spectrum, water, model)
         if mixed is None:
-            log.warning("hardening: no correction at %g kV explains the frames better: they stay as they are", options.kvp)
-            return scan, {**facts, "left_alone": True}
+            result = f"no correction at {options.kvp:g} kV explains the projections better: they stay as they are"
+            log.warning("hardening: %s", result)
+            return scan, {**facts, "result": result}
         bone_in = partial(_between, *mixed)
         facts |= dict(zip(("soft_to", "bone_from"), mixed, strict=True)) if np.isfinite(mixed[0]) else {}
     fine = step.coarse_model(scan, make_model, _BONE_VOXELS)

@@ -39,26 +39,23 @@ class PhaseOptions(checks.Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        both = {name for name in ("delta", "beta") if getattr(self, name) is not None}
+        both = [name for name in ("beta", "delta") if getattr(self, name) is not None]
         if self.delta_beta is not None and both:
-            raise InputError("phase.delta_beta", f"given with phase.{min(both)}", "δ/β, or δ and β", "leave one out")
-        if len(both) == 1:
-            missing = min({"delta", "beta"} - both)
-            raise InputError(f"phase.{missing}", "missing", "phase.delta and phase.beta", "state both, or phase.delta_beta")
+            raise InputError("phase.delta_beta", f"given with phase.{both[0]}", "δ/β, or δ and β", "leave one out")
         if self.beta == 0:
-            remedy = "an object without absorption hides its thickness"
-            raise InputError("phase.beta", "0", "a number above 0", remedy)
+            raise InputError("phase.beta", "0", "a number above 0", "an object without absorption hides its thickness")
 
     def stated(self) -> tuple[float, float]:
-        """Returns energy in keV and δ/β. Raises InputError where one is missing: no scan file states them."""
-        if self.energy_kev is None:
-            raise InputError("phase.energy_kev", "no energy", "the one of the beam", "say --set phase.energy_kev=25")
-        if self.delta is not None and self.beta is not None:
-            return self.energy_kev, self.delta / self.beta
-        if self.delta_beta is None:
-            expected = "δ/β of the object: phase.delta_beta, or phase.delta and phase.beta"
-            raise InputError("phase.delta_beta", "no material", expected, "say --set phase.delta_beta=200")
-        return self.energy_kev, self.delta_beta
+        """Returns energy in keV and δ/β. Raises one InputError for all that is missing: no scan file states it."""
+        ratio = self.delta / self.beta if self.delta is not None and self.beta else self.delta_beta
+        if self.energy_kev is not None and ratio is not None:
+            return self.energy_kev, ratio
+        material = ("delta_beta",) if self.delta is None and self.beta is None else ("delta", "beta")
+        missing = [f"phase.{name}" for name in ("energy_kev", *material) if getattr(self, name) is None]
+        expected = "the beam's energy in keV, and δ/β of the object (delta_beta, or delta and beta)"
+        remedy = "say " + ", ".join(f"--set {name}=NUMBER" for name in missing)
+        remedy += "; a parallel beam needs phase.distance_mm too" if self.distance_mm is None else ""
+        raise InputError(", ".join(missing), "nothing", expected, remedy)
 
 
 def retrieve_phase(
@@ -101,7 +98,7 @@ def retrieve(scan: Scan, options: PhaseOptions, make_model: MakeModel) -> tuple[
     if distance_mm is None:
         if isinstance(geometry, ParallelGeometry):
             expected = "the distance from the object to the panel in mm: a parallel beam states none"
-            raise InputError("phase.distance_mm", "nothing", expected)
+            raise InputError("phase.distance_mm", "nothing", expected, "say --set phase.distance_mm=NUMBER")
         distance_mm = geometry.source_to_detector_mm - geometry.source_to_axis_mm
     distance_mm /= geometry.magnification
     clean = retrieve_phase(unmasked_frames(scan), pixel_mm, distance_mm, energy_kev, delta_beta)

@@ -59,6 +59,8 @@ def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel)
         air = enough_air(frames, 0.05, 0.01, "scatter", "state scatter.to_primary")
         fitted = fit_scatter(frames, air, options.reach)
         kernel = raised(fitted, frames, air, *step.coarse_model(scan, make_model))
+        if not kernel:
+            return scan, {"result": "no scatter found in the light beside the object: the projections stay as they are"}
     clean = remove_scatter(frames, kernel)
     terms = {"reach": [reach for reach, _ in kernel], "power": [power for _, power in kernel]}
     facts = {**terms, "height": list(kernel.values()), "to_primary": _ratio(frames, clean)}

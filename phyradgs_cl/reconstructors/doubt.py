@@ -27,7 +27,6 @@ from phyradgs_cl import resource
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.coarse import some_frames
 from phyradgs_cl.detector.noise_level import noise_map
-from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Gaussians, Grid, States
 from phyradgs_cl.metrics.coverage import object_voxels
 from phyradgs_cl.reconstructors.checkpoint import State
@@ -39,7 +38,7 @@ from phyradgs_cl.text import without_warnings
 MEASURED = ("fista", "fista-tv", "fdk", "asd-pocs", "cgls", "os-sart", "sart", "sirt")  # the law is fitted to the first 3
 RUNS = 3  # times that the method runs: on the scan, and on two scans made from it
 PARTS = 2  # voxels are divided by this along each side before they are projected: projecting large ones would blur
-_FEWEST_FRAMES = 4  # analytic methods need this many: with one frame in each half, bars were 3 times too narrow
+FEWEST_FRAMES = 4  # analytic methods need this many: with one frame in each half, bars were 3 times too narrow
 _EDGE = 0.8  # standard deviation, in voxels, of the Gaussian whose derivative gives the slope of edges
 _DENSEST = 3.0  # matter denser than this many times the object's mean density counts as this dense
 LEAST = 0.01  # least σ of a voxel, as a fraction of the RMS of σ: no voxel is certain
@@ -120,9 +119,6 @@ class Doubter:
     def run(self, once: Callable[..., Reconstruction], report: Report, resume: State | None) -> Reconstruction:
         """Returns the method's result with ``doubt``. once: runs the method on a scan from a state. resume: the state of
         whichever run was interrupted."""
-        if self.kind == "analytic" and self.scan.frames < _FEWEST_FRAMES:
-            found, expected = f"frames: {self.scan.frames}", f"{_FEWEST_FRAMES} or more, two in each half"
-            raise InputError("--doubt", found, expected, "leave it out")
         arrays = dict(resume or {})
         results = _restored({name: arrays.pop(name) for name in list(arrays) if name.startswith(_KEPT)}, self.scan.grid)
         while len(results) < RUNS:

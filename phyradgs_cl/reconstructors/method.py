@@ -35,7 +35,8 @@ class Method:
     """A reconstruction method: its function, and its presets of options by name, of which the first is the default.
 
     is_resumable: has checkpoints. is_shared: several ranks can share its work. takes_initial: can start from a volume.
-    takes_deformation: can take an object that moves. finds_motion: finds how the object moves or changes."""
+    takes_deformation: can take an object that moves. finds_motion: finds how the object moves or changes.
+    check(scan, options): raises InputError for a scan that the method cannot take. It is called before any warning."""
 
     run: Callable[..., Reconstruction]
     presets: Mapping[str, Any]
@@ -44,6 +45,7 @@ class Method:
     takes_initial: bool = False
     takes_deformation: bool = False
     finds_motion: bool = False
+    check: Callable[[Scan, Any], object] = lambda scan, options: None
 
 
 @dataclass(frozen=True)

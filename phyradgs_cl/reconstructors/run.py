@@ -19,7 +19,7 @@ from phyradgs_cl.metrics import resampled, shared_slices
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.prepare.step import with_masked
 from phyradgs_cl.reconstructors.checkpoint import State, with_identity, without_identity
-from phyradgs_cl.reconstructors.doubt import MEASURED, Doubter
+from phyradgs_cl.reconstructors.doubt import FEWEST_FRAMES, MEASURED, Doubter
 from phyradgs_cl.reconstructors.method import METHODS, check_able, method_of
 from phyradgs_cl.reconstructors.plan import InitialVolume, RunPlan, check_object_motion, preprocessing_of
 from phyradgs_cl.reconstructors.preprocess import prepared
@@ -72,7 +72,9 @@ def reconstruct(
     with report.through(run.shown), _naming_size_that_fits(rt, run.scan, plan), naming_host_memory():
         if plan.preprocessing.doubt:
             kind = "iterative" if hasattr(run.options, "iterations") else "analytic"
-            _warn_of_doubt(plan)
+            if plan.method not in MEASURED:
+                text = "error bars were measured for %s: those of %s may be far too narrow; --holdout 2 widens them in part"
+                log.warning(text, ", ".join(MEASURED), plan.method)
             doubter = Doubter(rt, run.visible, run.scan, run.hidden, run.deformation, plan.seed, kind)
             result = doubter.run(once, report, state)
         else:
@@ -80,11 +82,11 @@ def reconstruct(
     return run.finished(result)
 
 
-def _warn_of_doubt(plan: RunPlan) -> None:
-    """Warns of methods for which error bars were not measured."""
-    if plan.method not in MEASURED:
-        text = "error bars were measured for %s: those of %s may be far too narrow; --holdout 2 widens them in part"
-        log.warning(text, ", ".join(MEASURED), plan.method)
+def check_scan(scan: Scan, plan: RunPlan) -> None:
+    """Raises InputError for a scan that the plan's method, or its error bars, cannot take. It gives no warnings."""
+    method_of(plan.method).check(scan, plan.options)
+    if plan.preprocessing.doubt and not hasattr(plan.options, "iterations") and scan.frames < FEWEST_FRAMES:
+        raise InputError("--doubt", f"frames: {scan.frames}", f"{FEWEST_FRAMES} or more, two in each half", "leave it out")
 
 
 class _Prepared:
@@ -93,6 +95,7 @@ class _Prepared:
 
     def __init__(self, scan: Scan, plan: RunPlan, rt: Runtime, resume: State | None) -> None:
         preprocessing, self.plan, self.rt = plan.preprocessing, plan, rt
+        check_scan(scan, plan)
         if rt.ranks.size > 1:
             _check_ranks(plan.method_name, rt)
         if preprocessing.margin_mm is not None:
@@ -104,8 +107,6 @@ class _Prepared:
             self.arguments["resume"] = without_identity(resume, self.identity(), _with_defaults)
         self.scan = self.visible = prepared(scan, preprocessing, rt)
         self.scan.check_sight()
-        self.scan.warn_of_blind_places()
-        self.scan.warn_of_negative_integrals()
         check_own_motion(getattr(plan.options, "motion", None), self.scan)
         if plan.initial is not None:
             self.arguments["initial"] = _initial(plan, plan.initial, self.scan.grid)
@@ -113,6 +114,8 @@ class _Prepared:
         if self.deformation is not None:
             check_object_motion(self.deformation, self.scan)
             self.arguments["deformation"] = self.deformation
+        self.scan.warn_of_blind_places()
+        self.scan.warn_of_negative_integrals()
         if self.scan.metal is not None and (self.deformation is not None or plan.method_name == "moving"):
             log.warning("metal: found and masked as in an object at rest, and this one moves: do not trust what is near it")
         self.options = plan.options

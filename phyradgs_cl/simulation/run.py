@@ -43,6 +43,7 @@ _LARGEST_PEAK = 1e4  # limit of --peak, a line integral
 _LARGEST_NOISE = 1e9  # limit of --electronic-noise, in counts
 _SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12  # limits of --dose, in photons per pixel
 _LARGEST_DETECTOR = 32_000  # limit of --detector, in pixels along a side of the panel
+_SLACK = 1.001  # an exposure longer than this many steps from frame to frame is no rounding
 _TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse", "turns")
 _DATA_SHEET = ("first", "fps", "readout_ms")
 
@@ -118,7 +119,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
 
     Raises InputError for unknown options, values out of range, and values that contradict each other."""
     given = {key: value for key, value in given.items() if value is not None}
-    order = readout_order(given.get("first"), given.get("readout_axis"), given.get("readout_direction"), _flag)
+    order = readout_order(given.get("first"), given.get("readout_axis"), given.get("readout_direction"), flag_of)
     keys = ("readout_axis", "readout_direction", "lag", "readout_ratio", "pulse", "fps", "readout_ms")
     of_scanner = {key: getattr(scanner, key) for key in keys}
     if "readout_ratio" in given or "readout_ms" in given:  # each states the readout time, in place of the scanner's
@@ -128,7 +129,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
 
     def named(name: str) -> str:
         is_scanner_s = name not in given and of_scanner.get(name) is not None
-        return f"{scanner.name} [readout] {name}" if is_scanner_s else _flag(name)
+        return f"{scanner.name} [readout] {name}" if is_scanner_s else flag_of(name)
 
     check_readout(values.get("readout_ms"), values.get("readout_ratio"), values.get("fps"), named)
     timing = {key: values.pop(key) for key in _TIMING if key in values}
@@ -139,17 +140,13 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
         raise InputError("--jitter-deg", found, "0", remedy)
     unused = [name for name in ("dose", "electronic_noise") if name in given and given.get("noise", "none") == "none"]
     if unused:
-        subject = f"{_flag(unused[0])} {checks.short_repr(given[unused[0]])}"
+        subject = f"{flag_of(unused[0])} {checks.short_repr(given[unused[0]])}"
         raise InputError(subject, "--noise none", "a model of noise with it", "add --noise tigre or beer")
     if sheet["fps"] is not None:
         timed = timed.at_rate(sheet["fps"], sheet["readout_ms"], named)
     if isinstance(values.get("motion_of_object"), str | Path):
         values["motion_of_object"] = load_object_motion(values["motion_of_object"])
     return SimulationOptions(protocol=timed, **values)
-
-
-def _flag(name: str) -> str:
-    return {"readout_axis": "--readout"}.get(name, flag_of(name))
 
 
 def simulated_scan(
@@ -173,6 +170,10 @@ def simulated_scan(
     else:
         scene = volume_scene(rt, of, name, *where, size, axis, pixel_samples, moves)
     scene.warn_of_inverse_crime()
+    protocol, step_deg = options.protocol, abs(options.protocol.step_deg)
+    if protocol.is_fly and protocol.views > 1 and protocol.exposure_deg > _SLACK * step_deg:
+        text = "an exposure of %.4g°, and %.4g° from frame to frame: no panel exposes two frames at the same time; shorten "
+        log.warning(text + "the exposure (--exposure-deg), or take fewer frames", protocol.exposure_deg, step_deg)
     if options.time_samples == 0 and scene.fastest_mm_per_s > 0:
         samples = default_time_samples(options.protocol, scene.grid, scene.fastest_mm_per_s)
         options = replace(options, time_samples=samples)
@@ -249,18 +250,11 @@ def simulate(
     recorded = _recorded(frames, options, np.where(share > 0, share, 1.0), rng)
     return Scan(
         projections=recorded if np.all(share > 0) else recorded * (share > 0),  # a line without light has no measurement
-        geometry=geometry,
-        trajectory=trajectory,
-        shutter=shutter,
-        frame_start_s=start_s,
-        grid=grid,
-        is_fly=protocol.is_fly,
-        detector_model=options.detector_model,
-        lag=options.lag,
+        geometry=geometry, trajectory=trajectory, shutter=shutter, frame_start_s=start_s, grid=grid, title=title,
+        is_fly=protocol.is_fly, detector_model=options.detector_model, lag=options.lag,
         reference=None if reference is None else (reference * factor).astype(np.float32),
-        title=title,
         provenance={"attenuation_factor": factor, "time_samples": samples},
-    )
+    )  # fmt: skip
 
 
 def _gating(scan: Scan, scene: Scene) -> Gating:
@@ -285,20 +279,14 @@ def _recorded(frames: np.ndarray, options: SimulationOptions, light: np.ndarray,
         frames = effects.add_scatter(frames, options.scatter).astype(np.float32)
     if options.drift > 0:
         frames = frames - np.log(effects.drifting_light(len(frames), options.drift, rng)).astype(np.float32)[:, None, None]
-    frames = _with_noise(frames, options, light, rng)
+    if options.noise == "beer":
+        frames = effects.beer_lambert_noise(frames, options.dose, options.electronic_noise, rng, light, options.lag)
+    elif options.lag > 0:  # TIGRE's counts are no intensities: lag comes before their noise
+        frames = effects.lagged(frames, options.lag).astype(np.float32)
+    if options.noise == "tigre":
+        frames = effects.tigre_noise(frames, options.dose, options.electronic_noise, rng, light)
     if options.rings > 0:
         frames = frames - np.log(effects.pixel_gains(frames.shape[1:], options.rings, rng)).astype(np.float32)
     if options.sparks > 0:
         frames = effects.add_sparks(frames, options.sparks, rng)[0].astype(np.float32)
-    return frames
-
-
-def _with_noise(frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Adds lag and noise to frames (F, v, u). For TIGRE's counts, which are no intensities, lag comes before noise."""
-    if options.noise == "beer":
-        return effects.beer_lambert_noise(frames, options.dose, options.electronic_noise, rng, light, options.lag)
-    if options.lag > 0:
-        frames = effects.lagged(frames, options.lag).astype(np.float32)
-    if options.noise == "tigre":
-        return effects.tigre_noise(frames, options.dose, options.electronic_noise, rng, light)
     return frames

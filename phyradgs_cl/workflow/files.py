@@ -147,13 +147,7 @@ def _voxel_facts(volume: Volume) -> dict[str, object]:
 
 
 def _options_in_words(options: object) -> dict[str, object]:
-    """Returns a run's motion model, as text, and its iterations; {} without options."""
-    if not isinstance(options, Mapping):
-        return {}
-    told: dict[str, object] = {}
-    motion = options.get("motion")
-    if isinstance(motion, Mapping):
-        told["motion"] = motion_in_words(motion)
-    if "iterations" in options:
-        told["iterations_asked"] = options["iterations"]
-    return told
+    """Returns a run's motion model, as text, and its iterations, as far as ``options`` state them."""
+    stated = options if isinstance(options, Mapping) else {}
+    motion, iterations = stated.get("motion"), stated.get("iterations")
+    return {"motion": motion_in_words(motion) if isinstance(motion, Mapping) else None, "iterations_asked": iterations}

@@ -32,7 +32,7 @@ from phyradgs_cl.io.output import checkpoint_path, former_checkpoint_path, refus
 from phyradgs_cl.metrics import METRICS, VOXEL_BY_VOXEL, aligned, compare
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors.result import COMPARED, HELD_OUT
-from phyradgs_cl.reconstructors.run import check_resumable
+from phyradgs_cl.reconstructors.run import check_resumable, check_scan
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_output, expecting, load_scan
@@ -155,6 +155,7 @@ def _reconstructed(
     with hashing(path) as scan_hash_of:
         scan = load_scan(path, plan.preprocessing.flats)
         scan_hash = scan_hash_of()
+    check_scan(scan, plan)
     _warn_of_doubts(plan, path, scan)
     rt = make_runtime()
     leads, state = rt.ranks.rank == 0, None
@@ -163,27 +164,20 @@ def _reconstructed(
     elif leads:
         _set_aside(output)
     checkpoints = _Checkpoints(checkpoint_path(output), checkpoint_every_s)
-    result: methods.Reconstruction | None = None
-    metrics: dict[str, float] = {}
-    try:
-        with checkpoints.mentioned_in_errors(), signals.keep_finished_work():
-            listeners = report.listeners if isinstance(report, methods.Report) else (report,)
-            report = methods.Report(*listeners, checkpoints)
-            result = methods.reconstruct(scan, plan, rt, report=report, resume=state)
-            if not leads:
-                return result, metrics
-            with signals.finish_despite_interrupt():
-                metrics = _metrics(scan, result)
-                target = output if result.state is None else partial_path(output)
-                provenance = _provenance(result, scan_hash, plan, path, rt)
-                parts = result.volume, result.grid, provenance, result.gaussians, metrics or None
-                write_volume(target, *parts, deformation=result.deformation, states=result.states, doubt=result.doubt)
-                _keep_checkpoint(output, result)
-                _warn_of_residual(path, scan, result)
-    except signals.InterruptedAfterwards:
-        # the caller reports the interruption of an incomplete run, but of no other
-        if result is None or result.state is None:
-            raise
+    with checkpoints.mentioned_in_errors():
+        listeners = report.listeners if isinstance(report, methods.Report) else (report,)
+        report = methods.Report(*listeners, checkpoints)
+        result = methods.reconstruct(scan, plan, rt, report=report, resume=state)
+        if not leads:
+            return result, {}
+        with signals.finish_despite_interrupt():
+            metrics = _metrics(scan, result)
+            target = output if result.state is None else partial_path(output)
+            provenance = _provenance(result, scan_hash, plan, path, rt)
+            parts = result.volume, result.grid, provenance, result.gaussians, metrics or None
+            write_volume(target, *parts, deformation=result.deformation, states=result.states, doubt=result.doubt)
+            _keep_checkpoint(output, result)
+            _warn_of_residual(path, scan, result)
     return result, metrics
 
 
@@ -210,10 +204,11 @@ def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
 
 def _warn_of_doubts(plan: methods.RunPlan, path: Path, scan: Scan) -> None:
     motion, preprocessing = getattr(plan.options, "motion", None), plan.preprocessing
-    ignores_model = scan.detector_model == "intensity" and not hasattr(plan.options, "detector_model")
-    if ignores_model and _averages(scan, plan.options):
-        text = "%s averages intensity over an exposure; --method %s averages line integrals"
-        log.warning(text, path, plan.method_name)
+    if scan.detector_model == "intensity" and motion is not None and not hasattr(plan.options, "detector_model"):
+        cells = motion.cells(scan, 0)
+        if cells.is_moving or cells.averages:  # with one pose per line, both detector models are the same
+            text = "%s averages intensity over an exposure; --method %s averages line integrals"
+            log.warning(text, path, plan.method_name)
     if scan.is_fly and isinstance(motion, MicroViews) and motion.strips > scan.lines:
         text = "%d strips are more than the %d lines of %s: one strip per line is the most there is"
         log.warning(text, motion.strips, scan.lines, path)
@@ -249,14 +244,6 @@ def _warn_of_residual(path: Path, scan: Scan, result: methods.Reconstruction) ->
         text = "%s: the volume does not explain %.0f %% of the line integrals, and their noise is %.2g %%: angles, axis, "
         text += "flats or grid are wrong; run 'phyradgs check' and see what it doubts"
         log.warning(text, path, 100 * residual, 100 * noise)
-
-
-def _averages(scan: Scan, options: Any) -> bool:
-    """Returns whether the motion model has several poses per line. With one pose, both detector models are the same."""
-    if not hasattr(options, "motion"):
-        return False
-    cells = options.motion.cells(scan, 0)
-    return cells.is_moving or cells.averages
 
 
 def _provenance(
@@ -306,8 +293,3 @@ def resume_or_restart(
             if error.subject not in named and not error.subject.startswith("checkpoint"):
                 raise
     return run(resume=False)
-
-
-def is_complete(result: methods.Reconstruction) -> bool:
-    """Returns whether a result is of a run that was not interrupted."""
-    return result.facts.get("interrupted_at") is None

@@ -41,7 +41,7 @@ from phyradgs_cl.runtime.device import environment
 from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
 from phyradgs_cl.text import flattened, nested, plain_text
 from phyradgs_cl.workflow.files import expecting
-from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
+from phyradgs_cl.workflow.reconstruct import resume_or_restart
 
 log = logging.getLogger(__name__)
 RESULTS, TABLE = "results.jsonl", "results.md"
@@ -218,8 +218,7 @@ def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: st
         runtime_of_process.cache_clear()  # the device may have failed: the next run opens it again
         time.sleep(_BUSY_S if isinstance(error, BusyError) else 0)  # a worker that lost contact may be writing the output
         raise
-    if not is_complete(result):
-        raise KeyboardInterrupt
+    result.complete()
     facts = {name: result.facts.get(name) for name in ("seconds", "gaussians")}
     facts["metrics"] = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
     return {**run.facts, **facts, **environment(rt.device), "host": platform.node()}

@@ -15,6 +15,7 @@ from phyradgs_cl.check.detector import check_gain
 from phyradgs_cl.check.orbit import OTHER_CAUSE, check_centre
 from phyradgs_cl.check.shutter import check_exposure, check_readout
 from phyradgs_cl.commands.check import SUSPICIOUS_STATUS
+from phyradgs_cl.detector.effects import beer_lambert_noise
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import read_scan, write_scan
 from phyradgs_cl.reconstructors.fits.axis import AxisShift
@@ -116,6 +117,14 @@ def test_a_mask_that_leaves_a_few_pixels(rt, clean, left) -> None:
     mask.flat[np.random.default_rng(0).permutation(1024)[:left]] = False
     found = check(replace(clean, pixel_mask=mask), rt)
     assert found.suspicious == [] and verdicts(found)["consistency"] == CANNOT_TELL
+
+
+def test_of_frames_that_are_mostly_noise_the_noise_alone_is_named(rt, clean) -> None:
+    """Thirty photons in a pixel: no order of the frames fits better than another, and that is no fault of theirs."""
+    frames = clean.projections * (2 / clean.projections.max())
+    noisy = beer_lambert_noise(frames, 30, 10.0, np.random.default_rng(0))
+    found = check(replace(clean, projections=noisy), rt)
+    assert suspected(found) == ["noise"] and verdicts(found)["consistency"] == CANNOT_TELL
 
 
 def test_the_wrong_sign_of_readout(rt, scan_of) -> None:

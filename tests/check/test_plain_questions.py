@@ -19,9 +19,10 @@ from phyradgs_cl.acquisition.altered.angles import exposure_arc_rad
 from phyradgs_cl.api import static_scan
 from phyradgs_cl.check import OK, SUSPICIOUS, CountReader
 from phyradgs_cl.check.consistency import repeated_frames
-from phyradgs_cl.check.coverage import check_coverage
+from phyradgs_cl.check.coverage import check_coverage, find_noise
 from phyradgs_cl.check.detector import check_dead_pixels, check_saturation
 from phyradgs_cl.check.timing import check_angles, check_timing
+from phyradgs_cl.detector.effects import beer_lambert_noise, tigre_noise
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
 
@@ -32,6 +33,19 @@ def test_a_clean_scan_is_left_in_peace(clean) -> None:
     ]
     assert [f.verdict for f in findings] == [OK] * 5
     assert not dead.any() and not any(f.advice for f in findings)
+
+
+@pytest.mark.parametrize("noisy", [beer_lambert_noise, tigre_noise])
+def test_noise_is_named_only_where_it_dominates(clean, noisy) -> None:
+    """Not that of 1000 photons, nor noise without an object, which is another finding."""
+    rng, frames = np.random.default_rng(3), clean.projections * (2 / clean.projections.max())
+    for photons, is_named in ((1e4, False), (1e3, False), (30, True)):
+        finding = find_noise(replace(clean, projections=noisy(frames, photons, 10.0, rng)))
+        assert (finding is not None) == is_named, (photons, finding)
+    assert finding.verdict == SUSPICIOUS and "% of the line integrals" in finding.text
+    empty = rng.normal(0, 0.3, clean.projections.shape).astype(np.float32)
+    for p in (clean.projections, empty, 0 * empty):
+        assert find_noise(replace(clean, projections=p)) is None
 
 
 def test_frames_must_follow_each_other(clean) -> None:

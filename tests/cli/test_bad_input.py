@@ -69,7 +69,7 @@ SIMULATE = {
     "--size": ("--size 100000", "--size 1", f"--size {DIGITS}"),
     "--detector": (f"--detector {DIGITS}",),
     "--detector-offset": ("--detector-offset left", "--detector-offset 0,inf", "--detector-offset 1,2,3"),
-    "exposure": ("--exposure-deg=1e300",),
+    "exposure": ("--exposure-deg=1e300", "--exposure-deg=720"),
     "--readout-ms": ("--readout-ms 62", "--fps 15 --readout-ms 62000"),
     "--device": ("--device ' '",),
 }

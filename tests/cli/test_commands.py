@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.api import load_scan, save_scan
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import write_volume
 
 pytestmark = pytest.mark.slow
 
@@ -49,6 +51,27 @@ def test_info_has_no_more_digits_than_anybody_stated(cli, scan, tmp_path, capsys
     told = capsys.readouterr().out
     assert re.search(r"^pixel size mm +\(0\.3, 0\.3\)$", told, re.M)
     assert not re.search(r"\d\.\d{7}", told)
+
+
+def test_info_tells_tables_in_words_and_long_ones_in_few_lines(cli, tmp_path, capsys):
+    step = {"step": "sparks", "pixels": 3, "options": {"least": 0.1}}
+    facts = {
+        "prepared": [step] * 40, "doubt": {"runs": 3, "mean_per_mm": 0.0123456789, "held_out": None},
+        "interrupted_at": None, "times": [0.1 * n for n in range(500)], "scan": "/" + "a-b/" * 60,
+    }  # fmt: skip
+    grid = Grid.cube(2, 2.0)
+    write_volume(tmp_path / "v.h5", np.ones(grid.shape, np.float32), grid, facts)
+    assert cli.run(["info", str(tmp_path / "v.h5")]) == 0
+    told = capsys.readouterr().out
+    lines = told.splitlines()
+    for key, text in {
+        "doubt": "runs 3, mean per mm 0.0123457", "times": "500 values from 0 to 49.9", "scan": facts["scan"],
+    }.items():
+        assert f"{key:24s} {text}" in lines
+    (first,) = [line for line in lines if line.startswith("prepared")]
+    assert first[25:].startswith("step sparks, pixels 3, options (least 0.1); step sparks, pixels 3")
+    assert sum(line.startswith(" ") for line in lines) == 5 and "… (--json)" in told
+    assert "interrupted" not in told and "{" not in told
 
 
 def test_the_error_on_held_out_pixels_is_said_and_kept(scan, reconstructed, capsys):

@@ -30,7 +30,7 @@ def test_what_is_chosen_is_in_the_result_and_told(cli, scan, tmp_path, capsys, c
     line = capsys.readouterr().out
     assert f"PSNR {stored.metrics['psnr_db']:.2f} dB" in line and "resampled (linear) from 12×11×10 voxels" in line
     assert cli.run(["info", str(output)]) == 0
-    assert "{'size': [10, 11, 12], " in capsys.readouterr().out
+    assert " size (10, 11, 12), " in capsys.readouterr().out
     run = load_run(output, scan)
     assert run.reference is None and "its slices are not shown" in run.notes[-1]
     assert run.metrics == stored.metrics and "resampled" in run.compared

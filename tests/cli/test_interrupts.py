@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl import signals
+from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.signals import finish_despite_interrupt, stop_on_interrupt
 from phyradgs_cl.simulation import run as simulation_run
@@ -184,6 +185,23 @@ def test_a_loop_is_saved_beside_the_output_and_goes_on(cli, scan, tmp_path, caps
     with h5py.File(output) as a, h5py.File(whole) as b:
         name = "entry/reconstruction/volume"
         np.testing.assert_array_equal(a[name][()], b[name][()])
+
+
+def test_a_run_that_is_interrupted_in_its_last_iteration_is_told_in_full(cli, scan, tmp_path, capfd, monkeypatch) -> None:
+    """Its volume, pictures, quality and page are those of a complete run."""
+
+    def press(ticker: Ticker, done: int, total: int, *more: object) -> None:
+        if done == total:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Ticker, "show", press)
+    monkeypatch.chdir(tmp_path)
+    words = ["--method", "sart", "--iterations", "3", "--preview", "now.png", "--live", "page.html"]
+    assert cli.run(["reconstruct", str(scan), *words, "-o", "volume.h5"]) == 130
+    said = capfd.readouterr()
+    assert said.out.startswith("volume.h5: sart") and "PSNR" in said.out and said.err.splitlines()[-1] == COMPLETE.strip()
+    assert {path.name for path in tmp_path.iterdir()} == {"volume.h5", "now.png", "page.html"}
+    assert 'id="provenance"' in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
 def test_ctrl_c_that_ends_the_compiler_of_a_kernel_is_no_failure_of_the_device(scan, tmp_path):

@@ -102,3 +102,16 @@ def test_each_beam_has_its_methods_and_numbers(refused, parallel, scan, tmp_path
     refused(["simulate", "--scanner", toml, *output], "[source] to_axis_mm: found 5; expected no distance")
     refused(["import", parallel, "--source-to-axis-mm", "5", *output], "a scan file of this package")
     assert not (tmp_path / "out.h5").exists()
+
+
+def test_what_a_method_refuses_comes_before_any_warning(refused, simulated, parallel, scan, tmp_path) -> None:
+    """``refused`` takes one line alone; of the same words without the fault, each gives a warning."""
+    uneven, intensity = (simulated(*FLY.split(), *more.split()) for more in ("--jitter-deg 2", "--detector-model intensity"))
+    for source, words, part in (
+        (scan, "fbp --doubt", "--method fbp: found a cone beam"),
+        (intensity, "fdk", "--method fdk: found a parallel beam"),
+        (uneven, "fbp --set deblur=0.01 --doubt", "views at uneven angles"),
+        (parallel, "moving --set gating=scan --doubt", "no gating in the scan"),
+        (parallel, "phyradgs --set batch=99 --doubt", "no more than the scan's 20 frames"),
+    ):
+        refused(["reconstruct", source, "-o", tmp_path / "out.h5", "--method", *words.split()], part)

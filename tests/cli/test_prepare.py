@@ -16,6 +16,7 @@ SPOILT = (
     "--phantom", "jaw", "--size", "12", "--detector", "20", "--views", "8", "--time-samples", "2",
     "--noise", "beer", "--rings", "0.02", "--sparks", "0.005", "--seed", "3",
 )  # fmt: skip
+NO_SCATTER = "no scatter found in the light beside the object: the projections stay as they are"
 
 
 def test_a_clean_file_says_what_was_done_to_it(cli, simulated, tmp_path, capsys) -> None:
@@ -38,11 +39,15 @@ def test_a_clean_file_says_what_was_done_to_it(cli, simulated, tmp_path, capsys)
     assert [step["step"] for step in direct.provenance["prepared"]] == ["sparks", "dead", "rings"]
 
 
-def test_a_step_that_finds_nothing_says_none(cli, simulated, tmp_path, capsys) -> None:
-    source = simulated(*SPOILT[:-6], "--noise", "none")  # no scatter in it
-    assert cli.run(["prepare", str(source), "-o", str(tmp_path / "clean.h5"), "--steps", "scatter"]) == 0
+def test_a_step_that_finds_nothing_says_so_and_may_be_asked_again(cli, simulated, tmp_path, capsys) -> None:
+    source, clean = simulated(*SPOILT[:-6], "--noise", "none"), tmp_path / "clean.h5"  # no scatter in it
+    assert cli.run(["prepare", str(source), "-o", str(clean), "--steps", "scatter"]) == 0
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("scatter")]
-    assert "reach none, power none, height none, to primary 0" in line
+    assert line.split(maxsplit=1)[1] == NO_SCATTER
+    np.testing.assert_array_equal(load_scan(clean).projections, load_scan(source).projections)
+    stated = ["--steps", "scatter", "--set", "scatter.to_primary=0.2"]
+    assert cli.run(["prepare", str(clean), "-o", str(tmp_path / "again.h5"), *stated]) == 0
+    assert "to primary 0.2" in capsys.readouterr().out
 
 
 def test_a_configuration_file_says_the_same(cli, simulated, tmp_path, capsys) -> None:

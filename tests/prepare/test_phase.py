@@ -113,8 +113,9 @@ def test_without_a_phase_or_a_distance_nothing_changes() -> None:
 @pytest.mark.parametrize(
     ("options", "subject"),
     [
-        ({}, "phase.energy_kev"),
-        ({"energy_kev": 25}, "phase.delta_beta"),
+        ({}, r"phase.energy_kev, phase.delta_beta: .* phase.delta_beta=NUMBER; a parallel beam needs phase.distance_mm"),
+        ({"beta": 1e-9, "distance_mm": 5}, "phase.energy_kev, phase.delta: .*NUMBER$"),
+        ({"energy_kev": 25}, "^phase.delta_beta: "),
         ({"energy_kev": 25, "delta": 1e-6}, "phase.beta"),
         ({"energy_kev": 25, "delta_beta": 100, "beta": 1e-9}, "phase.delta_beta"),
         ({"energy_kev": 25, "delta": 1e-6, "beta": 0}, "phase.beta"),

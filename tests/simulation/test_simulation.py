@@ -9,6 +9,7 @@ import pytest
 from kernel_kit import assert_near
 from tolerances import ANALYTIC_FRAME, FLOAT32, TIME_SAMPLING, VOXEL_SOURCE
 
+from phyradgs_cl import api
 from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Protocol, make_protocol, pixel_centres
 from phyradgs_cl.acquisition.cells import per_line_cells
 from phyradgs_cl.detector import average
@@ -192,6 +193,15 @@ def test_a_box_that_a_procedural_phantom_does_not_fill_is_said(rt, caplog) -> No
     assert "not used" in caplog.text
     assert scene.grid == Grid.cube(8, 1.0)
     assert cube.grid == Grid.cube(8, 2.0)
+
+
+@pytest.mark.parametrize(("words", "overlaps"), [
+    ({"views": 30}, True), ({"views": 25}, False), ({"views": 30, "protocol": "static"}, False),
+    ({"views": 30, "turns": -2.0}, False), ({"views": 30, "exposure_deg": 12.0}, False), ({"views": 1}, False),
+])  # fmt: skip
+def test_exposures_of_two_frames_at_the_same_time_are_warned_of(rt, caplog, words, overlaps) -> None:
+    api.simulate("shepp-logan", size=4, detector=4, time_samples=1, **words, device=rt)
+    assert ("no panel exposes two frames at the same time" in caplog.text) == overlaps
 
 
 def test_wide_pixels_average_by_themselves(rt) -> None:

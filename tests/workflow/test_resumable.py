@@ -10,7 +10,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import checkpoint_path
 from phyradgs_cl.reconstructors import Progress, Reconstruction, RunPlan, plan_run
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.workflow.reconstruct import is_complete, resume_or_restart
+from phyradgs_cl.workflow.reconstruct import resume_or_restart
 
 pytestmark = pytest.mark.slow
 
@@ -45,7 +45,7 @@ def job(tiny_scan: Path, tmp_path: Path) -> Job:
 
 def stopped(job: Job, rt: Runtime) -> bytes:
     """The checkpoint of a run that was stopped in the middle."""
-    assert not is_complete(job.run(rt, Report(stop_at=3)))
+    assert job.run(rt, Report(stop_at=3)).interrupted_at
     return checkpoint_path(job.output).read_bytes()
 
 
@@ -53,7 +53,7 @@ def test_a_stopped_run_goes_on_to_the_same_bits(job, rt, tmp_path) -> None:
     stopped(job, rt)
     rest = Report()
     result = job.run(rt, rest)
-    assert is_complete(result) and min(rest.seen) > 3
+    assert not result.interrupted_at and min(rest.seen) > 3
     alone = replace(job, output=tmp_path / "alone.h5").run(rt, Report())
     np.testing.assert_array_equal(result.volume, alone.volume)
     assert not checkpoint_path(job.output).exists()
@@ -69,7 +69,7 @@ def test_a_checkpoint_that_does_not_fit_is_set_aside(job, rt, what) -> None:
         checkpoint_path(job.output).write_bytes(content)
     whole = Report()
     result = job.run(rt, whole)
-    assert is_complete(result) and min(whole.seen) <= 3
+    assert not result.interrupted_at and min(whole.seen) <= 3
     aside = Path(f"{checkpoint_path(job.output)}.bak")
     assert aside.read_bytes() == content
 
@@ -79,4 +79,4 @@ def test_a_checkpoint_outlives_a_missing_scan_and_no_other_method_takes_it(job, 
     with pytest.raises(InputError, match="none.h5"):
         replace(job, scan=job.scan.with_name("none.h5")).run(rt, Report())
     assert checkpoint_path(job.output).exists()
-    assert is_complete(replace(job, plan=plan_run("fdk")).run(rt, Report()))
+    assert not replace(job, plan=plan_run("fdk")).run(rt, Report()).interrupted_at

@@ -9,14 +9,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Motion, Scan, Static
-from phyradgs_cl.acquisition.altered.angles import azimuth_rad
+from phyradgs_cl.acquisition.altered.angles import azimuth_rad, middle_poses
 from phyradgs_cl.acquisition.motion import LINE_POSES, LineMiddles, MotionOptions, motions_for
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid
@@ -48,6 +48,7 @@ from phyradgs_cl.reconstructors.fdk.views import (
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
 from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.text import without_warnings
 
 log = logging.getLogger(__name__)
 # Views share their ray weights if their poses, rotated back to one angle, differ by at most this fraction.
@@ -74,6 +75,7 @@ class FdkOptions(MotionOptions):
     middle of its own exposure). Of a model with several poses per line FDK uses the middle pose."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(LINE_POSES)
+    METHOD: ClassVar[str] = "fdk"
 
     window: str = checks.option("ram-lak", words=WINDOWS, subject="FDK window")
     motion: Motion = LineMiddles()
@@ -86,6 +88,7 @@ class FbpOptions(FdkOptions):
     that of the signal, such as 0.01; 0: off. circle: sets voxels to 0 outside the circle that the panel's wider side
     reaches, unless rows are extrapolated."""
 
+    METHOD: ClassVar[str] = "fbp"
     deblur: float = checks.ranged(0.0, 0, 1)
     circle: bool = True
 
@@ -102,7 +105,7 @@ def fdk(
 
     Logs a warning for incomplete turns, and for an orbit that is not a circle about z. Raises InputError for the other
     method's beam, for an orbit far from a circle, and for parallel rays that are not at right angles to the axis."""
-    started, method = time.perf_counter(), "fbp" if isinstance(options, FbpOptions) else "fdk"
+    started, method = time.perf_counter(), options.METHOD
     if deformation is not None and options.extrapolate == "reprojected":
         expected, remedy = "another way of rows beyond the panel", "leave extrapolate out"
         raise InputError("--object-motion", "extrapolate=reprojected, of an object at rest", expected, remedy)
@@ -135,7 +138,16 @@ def _moving(
     return None if states.is_at_rest else MovingBackprojector(rt, states, states.shares(times_s))
 
 
-_KIND = {"is_resumable": False, "takes_deformation": True}
+def _check(scan: Scan, options: FdkOptions) -> None:
+    """Raises InputError for the other method's beam, and for orbits and views that the method cannot take."""
+    pose = middle_poses(scan)[_measured(scan)]
+    with without_warnings():  # of approximations: ``fdk`` gives them
+        check_beam(options.METHOD, pose, scan.is_parallel)
+    if isinstance(options, FbpOptions) and options.deblur > 0:
+        deblurred(scan, np.zeros((len(pose), 1, 1), np.float32), azimuth_rad(pose), options.deblur)
+
+
+_KIND: dict[str, Any] = {"is_resumable": False, "takes_deformation": True, "check": _check}
 METHOD = Method(fdk, {window: FdkOptions(window) for window in WINDOWS}, **_KIND)
 FBP_METHOD = Method(fdk, {window: FbpOptions(window) for window in WINDOWS}, **_KIND)
 
@@ -260,12 +272,14 @@ def static_fdk(rt: Runtime, scan: Scan, deformation: Deformation | None = None) 
 
 
 def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-    """Returns frames (n, v, u) with masked pixels filled in, and the frames' numbers (n,).
+    """Returns frames (n, v, u) with masked pixels filled in, and the frames' numbers (n,), those of ``_measured``."""
+    frames, numbers = unmasked_frames(scan), _measured(scan)
+    return frames if len(numbers) == scan.frames else frames[numbers], numbers
 
-    Completely masked frames are left out, so that their neighbours cover their angles, unless all frames are masked."""
-    frames, numbers = unmasked_frames(scan), np.arange(scan.frames)
-    if np.asarray(scan.pixel_mask).ndim == 3:
-        measured = np.flatnonzero(scan.valid.any(axis=(1, 2)))
-        if 0 < len(measured) < scan.frames:
-            return frames[measured], measured
-    return frames, numbers
+
+def _measured(scan: Scan) -> np.ndarray:
+    """Returns the numbers (n,) of frames without the completely masked ones, whose neighbours cover their angles. If all
+    frames are masked, it returns all."""
+    if np.asarray(scan.pixel_mask).ndim == 3 and len(measured := np.flatnonzero(scan.valid.any(axis=(1, 2)))):
+        return measured
+    return np.arange(scan.frames)

@@ -295,7 +295,10 @@ def moving(scan: Scan, options: MovingOptions, rt: Runtime, **arguments: Any) ->
     return replace(result, state=state, deformation=one.deformation)
 
 
-METHOD = Method(moving, {"default": MovingOptions()}, finds_motion=True)
+METHOD = Method(
+    moving, {"default": MovingOptions()}, finds_motion=True,
+    check=lambda scan, options: options.gating in ("auto", "free") or _signal_of(scan, options.gating),
+)
 
 
 def _signal_of(scan: Scan, gating: str) -> MotionSignal:

@@ -197,6 +197,7 @@ def _r2(scan: Scan, options: SplatOptions, rt: Runtime, **arguments: Any) -> Rec
     return reconstruct_splats(scan, replace(options, affine=True), rt, method="r2", **arguments)
 
 
-_KIND = {"is_shared": True, "takes_initial": True, "takes_deformation": True}
+_KIND: dict[str, Any] = {"is_shared": True, "takes_initial": True, "takes_deformation": True}
+_KIND["check"] = lambda scan, options: options.batch_for(scan.frames, 1)
 PHYRADGS = Method(partial(reconstruct_splats, method="phyradgs"), PRESETS, **_KIND)
 R2 = Method(_r2, {"published": R2_PUBLISHED}, **_KIND)
