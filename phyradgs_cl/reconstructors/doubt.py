@@ -4,9 +4,9 @@
   the first hold the noise, other causes of the residual, and what the method does to such an object: blur, prior, missing
   views. That is a wild bootstrap (Wu, Ann. Stat. 14 (1986) 1261): each frame's residual keeps its size and shape, but a
   random sign. The second scan has the opposite signs (antithetic variables).
-- Analytic methods get one half of the frames, every second one, and then the other half. Half the difference of both volumes
-  has the noise of the whole scan's volume, and the streaks of missing views. A synthesised scan would not show these: FDK
-  returns them unchanged.
+- Analytic methods get every second view, and then the other half. Half the difference of both volumes has the noise of the
+  whole scan's volume, and the streaks of missing views. A synthesised scan would not show these: FDK returns them
+  unchanged.
 
 The numbers that turn this into σ come from procedural volumes (benchmarks/doubt.py), and from held-out pixels if there are
 any."""
@@ -25,11 +25,14 @@ from numpy.typing import NDArray
 
 from phyradgs_cl import resource
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.altered.angles import azimuth_rad, middle_poses
 from phyradgs_cl.acquisition.altered.coarse import some_frames
 from phyradgs_cl.detector.noise_level import noise_map
 from phyradgs_cl.fields import Deformation, Gaussians, Grid, States
 from phyradgs_cl.metrics.coverage import object_voxels
 from phyradgs_cl.reconstructors.checkpoint import State
+from phyradgs_cl.reconstructors.fdk.travel import travels
+from phyradgs_cl.reconstructors.fdk.views import distinct_views
 from phyradgs_cl.reconstructors.projected import FRAMES_AT_A_TIME, FramePair, frame_pairs, spread_frames
 from phyradgs_cl.reconstructors.result import DOUBT, Progress, Reconstruction, Report
 from phyradgs_cl.runtime import Runtime
@@ -103,6 +106,18 @@ def finer(volume: Array) -> NDArray[np.float32]:
     return volume.astype(np.float32)
 
 
+def halves(scan: Scan) -> tuple[Array, Array]:
+    """Returns the frames of both halves of a scan: every second view in the order of angles.
+
+    Views of one angle are in one half: if both had them, their streaks would not differ. An orbit that travels along the
+    axis is halved in time, because each turn sees another height."""
+    pose = middle_poses(scan)
+    view, angles_rad = distinct_views(azimuth_rad(pose))
+    if len(angles_rad) < FEWEST_FRAMES or travels(pose[:, None, None], scan.projections.shape[1], scan.is_parallel):
+        view = np.arange(scan.frames)
+    return np.flatnonzero(view % 2 == 0), np.flatnonzero(view % 2 == 1)
+
+
 @dataclass(frozen=True, eq=False)
 class Doubter:
     """The runs of a method. scan: what the method sees. whole: the scan with its held-out pixels ``hidden`` (F, v, u). kind:
@@ -132,11 +147,11 @@ class Doubter:
         return self.finished(results)
 
     def scan_of_run(self, result: Reconstruction, number: int) -> Scan:
-        """Returns the scan of run ``number`` 1 or 2: every second frame for an analytic method, else a synthesised one.
+        """Returns the scan of run ``number`` 1 or 2: a half of the frames for an analytic method, else a synthesised one.
 
         A synthesised frame is the volume's projection plus the residual with a random sign. Run 2 has the opposite signs."""
         if self.kind == "analytic":
-            return some_frames(self.scan, np.arange(number - 1, self.scan.frames, 2))
+            return some_frames(self.scan, halves(self.scan)[number - 1])
         frames, sums = np.zeros(self.scan.projections.shape, np.float32), np.zeros(5)
         if self.rt.ranks.rank == 0:
             for pair in self._pairs(result, self.whole.frames):

@@ -7,6 +7,8 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.altered.angles import azimuth_rad, middle_poses
+from phyradgs_cl.acquisition.altered.coarse import some_frames
 from phyradgs_cl.api import reconstruct, simulate, static_scan
 from phyradgs_cl.detector.noise_level import noise_map
 from phyradgs_cl.errors import InputError
@@ -14,7 +16,7 @@ from phyradgs_cl.io import read_checkpoint, write_checkpoint
 from phyradgs_cl.metrics import coverage
 from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.reconstructors import doubt
-from phyradgs_cl.reconstructors.doubt import Doubter, Law, finer, spread
+from phyradgs_cl.reconstructors.doubt import Doubter, Law, finer, halves, spread
 from phyradgs_cl.reconstructors.projected import held_out
 from phyradgs_cl.reconstructors.result import DOUBT, interrupted
 
@@ -72,6 +74,25 @@ def test_an_analytic_method_gets_every_second_frame_and_its_error_bars_have_the_
     x0, x1, x2, true = (reconstruct(one, "fdk", device=rt, report=False).volume for one in (noisy, even, odd, clean))
     law = Law(0.0, 1.0, 0.0, 0.0, 1.0, 3.0)
     assert np.sqrt(np.mean(spread(x0, x1, x2, law) ** 2)) == pytest.approx(np.std(x0 - true), rel=0.3)
+
+
+def test_halves_are_of_angles_and_not_of_time(rt) -> None:
+    """Opposite views that alternate, as in a half-fan, are not torn apart. Two turns of an odd number of views are two equal
+    turns to each half. A helix is halved in time: its second turn sees other slices."""
+    usual = {"size": 12, "detector": 16, "protocol": "static", "device": rt}
+    turn = simulate("spheres", views=16, **usual)
+    order = np.arange(16).reshape(2, 8).T.ravel()
+    for scan in (turn, some_frames(turn, order)):
+        even, odd = (np.sort(azimuth_rad(middle_poses(some_frames(scan, half))) % (2 * np.pi)) for half in halves(scan))
+        np.testing.assert_allclose(np.diff(even), np.pi / 4, atol=1e-6)
+        np.testing.assert_allclose(odd - even, np.pi / 8, atol=1e-6)
+    twice = some_frames(simulate("spheres", views=15, **usual), np.tile(np.arange(15), 2))
+    evens, odds = [*range(0, 15, 2)], [*range(1, 15, 2)]
+    assert [half.tolist() for half in halves(twice)] == [evens + [15 + k for k in evens], odds + [15 + k for k in odds]]
+    travelling = middle_poses(twice)
+    travelling[:, [2, 5]] += np.linspace(-20, 20, 30)[:, None]
+    helix = Scan.from_poses(twice.projections, travelling, twice.grid)
+    assert [half.tolist() for half in halves(helix)] == [[*range(0, 30, 2)], [*range(1, 30, 2)]]
 
 
 def test_edges_have_wider_bars_by_their_slope() -> None:

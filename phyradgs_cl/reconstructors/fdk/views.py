@@ -85,7 +85,7 @@ def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
 
     Gaps that stand out divide the arc into parts. If none is wider than ``filled_rad``, the arc is a full turn, and the
     views at both sides stand for the gaps."""
-    cell, centre = _distinct(angle_rad)
+    cell, centre = distinct_views(angle_rad)
     count = np.bincount(cell)
     ahead = np.diff(centre, append=centre[0] + 2 * np.pi)
     wide = _stand_out(ahead)
@@ -153,7 +153,7 @@ def _filled_cells(ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
     return cells
 
 
-def _distinct(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def distinct_views(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns each view's index (F,) into the K distinct angles, and these in rad, ascending within a turn."""
     turned = np.mod(np.asarray(angle_rad, np.float64), 2 * np.pi)
     order = np.argsort(turned, kind="stable")
