@@ -42,7 +42,7 @@ def subrays_of(grid: Grid, tables: Sequence[TimeCells], *, is_dense: bool = Fals
 
 
 def _depth(grid: Grid, pose: np.ndarray, *, is_nearest: bool) -> np.ndarray:
-    """Returns the depth (F,) of the grid's middle seen from the source, over the panel's depth; 0 if behind the source.
+    """Returns the depth (F,) of the grid's middle from the source, as a fraction of the panel's; 0 if behind the source.
 
     is_nearest: takes the nearest point of the ellipsoid that the grid's box contains, in place of the middle."""
     normal = np.cross(pose[:, 6:9], pose[:, 9:12])
