@@ -29,8 +29,8 @@ _GAPS = 15  # a missing or repeated frame is looked for at this many frames, eve
 class Hypothesis:
     """What may be wrong in a scan: a description, advice, and a function that returns the scan corrected for it.
 
-    factor: how many times larger pixels are than stated. Hypotheses with the same factor, unless it is 1, differ only by the
-    panel's shift."""
+    factor: pixel size over stated pixel size. Hypotheses with the same factor above or below 1 differ only by the panel's
+    shift."""
 
     text: str
     advice: str
