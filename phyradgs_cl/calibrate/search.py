@@ -65,8 +65,7 @@ class Reduced:
         )
 
     def relative_to_stated(self, at: Mapping[str, float]) -> "Reduced":
-        """Returns the problem, which was linearised at values ``at`` (by name), with steps that count from the stated
-        values."""
+        """Returns the problem, linearised at values ``at`` (by name), with steps that count from the stated values."""
         back = np.array([at.get(name, 0.0) for name in self.names]) @ self.jacobian
         return replace(self, residual=self.residual + back)
 
