@@ -20,7 +20,7 @@ _TILE = 16  # a CPU's work-item transposes a tile of this many rows and columns,
 
 @dataclass(frozen=True)
 class Strides:
-    """Where a volume lies in memory: element (z, y, x) is at ``start`` + z ``slice`` + y ``row`` + x, counted in floats."""
+    """Offset and strides of a volume in memory, in floats: voxel (z, y, x) is at ``start`` + z ``slice`` + y ``row`` + x."""
 
     start: int
     slice: int
