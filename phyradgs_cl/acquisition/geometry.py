@@ -64,7 +64,7 @@ class ConeGeometry:
 
     @property
     def magnification(self) -> float:
-        """How many times larger the image of an object at the axis is than the object."""
+        """Source-to-detector over source-to-axis distance: how large an object at the axis appears, over its size."""
         return self.source_to_detector_mm / self.source_to_axis_mm
 
 
