@@ -21,7 +21,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.text import repr_of_changes
 
 _LEAST_SPAN_S = 1e-6  # ``sampled`` needs two different times in a frame, also in one without duration
-_MOST_SAMPLES = 1024  # ``sampled`` gives up when more samples per frame are not close enough
+_MOST_SAMPLES = 1024  # ``sampled`` raises an error when more samples per frame than this are not close enough
 _LEAST_INCIDENCE = 1e-6  # least sine of the angle between rays and panel
 _AT_AXIS = 1e-6  # a panel within this fraction of the source-to-axis distance is at the axis
 _AWAY = 2.0  # factor on the size of a panel at the axis, and on its distance from the source, to move it away

@@ -34,7 +34,7 @@ _LEAST_ZEROS = 0.2  # if at least this fraction of the pixels is 0, the noise of
 _ZEROS_PX = 5  # the noise of clipped air follows from means of blocks with this many pixels a side
 _BACKGROUND = 4  # cosines along each side of a frame: together they describe holder, scatter and drift of the tube
 _STEP_PX = 0.25  # step of central differences to each side, as the pixels by which it moves the frame's edge
-_MOST_PX = 1.5  # one step of the placement moves a frame by at most this much: beyond, its effect is not linear
+_MOST_PX = 1.5  # most pixels by which one step of the placement moves a frame: beyond, its effect is not linear
 _SETTLED_PX = 0.01  # the search ends when a step moves the frame by less than this
 _LINEAR_PX = 0.3  # derivatives are computed again after a step that moves the frame by more than this
 

@@ -20,7 +20,7 @@ _INVERTED = 0.9  # if the sides exceed this fraction of the largest value, brigh
 _BRIGHT = 0.05  # at most this fraction of the pixels may be brighter than the flats, by noise
 _FRAMES = 0.1  # the object may touch a side of the panel in this fraction of the frames
 _COVERED = 0.1  # a column shows the object if more than this fraction of its rows does
-# A unit is wrong if the grid is this many times wider than the panel's view, or the object wider than the grid.
+# A unit is wrong if the grid's width over that of the panel's view, or the object's over the grid's, exceeds this.
 _ANOTHER_SIZE = 5.0
 _NOISE_FRAMES, _NEAR = 16, 5  # frames in which noise is sought, and the side in pixels of a square of neighbours
 _MOST_NOISE, _NO_OBJECT_FROM = 0.4, 4.0  # noise over mean line integral: dominant noise; noise without any object

@@ -184,7 +184,7 @@ def check_distances(rt: Runtime, scan: Scan) -> Finding:
     """Fits a coarse scan with its fan 0.8 and 1.25 times as wide, each with its own best shift of the panel.
 
     Sizes and distances show in the fan alone. The answer is "ok" where both fit worse, otherwise "cannot tell". Sizes that
-    fit far better make the frames inconsistent, which another question finds."""
+    leave less than half of the squared residual make the frames inconsistent, which another question finds."""
     stated = fit_squares(rt, scan)
     others = {factor: fit_squares(rt, axis.with_best_shift(rt, nearly_sized(scan, factor))) for factor in _OTHER_SIZES}
     ratios = {factor: residual_ratio(stated, other) for factor, other in others.items()}

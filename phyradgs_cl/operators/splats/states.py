@@ -55,8 +55,8 @@ class CloudStates:
         return self._by_states
 
     def back(self, gaussians: DeviceGaussians, cells: DeviceCells, gradients: DeviceArray) -> None:
-        """Replaces dL/d(mean) in ``gradients`` (13, stride) by the gradient for the means in the reference. Reads
-        dL/d(states) from the memory of ``zeros``. The last ``forward`` must be for the same Gaussians and cells."""
+        """Replaces dL/d(mean) in ``gradients`` (13, stride) by dL/d(mean in the reference). Reads dL/d(states) from the
+        memory of ``zeros``. The last ``forward`` must be for the same Gaussians and cells."""
         rt, count = self.rt, cells.shares.shape[0]
         kernel, field = self._kernel("splat_states_back"), (*self._field, cells.shares, np.int32(count))
         rt.launch(

@@ -239,8 +239,8 @@ class FieldDerivative:
 
 
 def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Returns the slopes ∇v(y + w(y)), (nz, ny, nx, 3) float32 per voxel, x, y, z, at voxel centres y. v is the cubic spline
-    through a volume (nz, ny, nx), and 0 outside. displacement: w (nz, ny, nx, 3) in voxels, x, y, z."""
+    """Returns the gradients ∇v(y + w(y)), (nz, ny, nx, 3) float32 per voxel, x, y, z, at voxel centres y. v is the cubic
+    spline through a volume (nz, ny, nx), and 0 outside. displacement: w (nz, ny, nx, 3) in voxels, x, y, z."""
     wide = scipy.ndimage.spline_filter(np.pad(volume, _BORDER + _SETTLES), output=np.float32)
     padded = np.ascontiguousarray(wide[(slice(_SETTLES, -_SETTLES),) * 3])
     strides = (padded.shape[1] * padded.shape[2], padded.shape[2], 1)

@@ -218,7 +218,7 @@ def sum_squares(values: np.ndarray) -> float:
 
 
 def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], right: np.ndarray, steps: int) -> np.ndarray:
-    """Solves ``apply``(x) = ``right`` approximately, in ``steps`` steps from 0, or until the residual is 1 % as large."""
+    """Solves ``apply``(x) = ``right`` from x = 0 in ``steps`` steps, or fewer if the residual falls to 1 % of ``right``."""
     solution, residual = np.zeros_like(right), right.copy()
     direction, squares = residual.copy(), sum_squares(residual)
     least = 1e-4 * squares

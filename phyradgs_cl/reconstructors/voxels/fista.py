@@ -124,7 +124,7 @@ class Accelerated(Algorithm):
 
     @property
     def extrapolation(self) -> float:
-        """The factor of Beck and Teboulle's Eq. 4.3: the next step starts this fraction of the last change further on."""
+        """The momentum factor βₖ₊₁ of Beck and Teboulle's Eq. 4.3: the next step starts at xₖ + βₖ₊₁ (xₖ − xₖ₋₁)."""
         return (self.momentum - 1) / self.next_momentum
 
     def accept(self, point: Any, volume: Any) -> None:
@@ -278,7 +278,7 @@ def fista_stage(
     optimised: int = 0,
 ) -> Iterations:  # fmt: skip
     """Returns ``iterations`` from ``volume`` (nz, ny, nx; None: the method's own start), with every voxel divided into
-    ``parts`` along each side. is_coarse: they only provide the first volume of a stage. optimised: first ones by POGM."""
+    ``parts`` along each side. is_coarse: they only provide the first volume of a stage. optimised: how many POGM makes."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
     options, rt = replace(whole.options, iterations=iterations), whole.rt

@@ -154,7 +154,7 @@ class PriorInputs:
 
 
 class Prior:
-    """Maps x to argmin over x' of ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or to an approximation of it.
+    """A proximal map, from x to argmin over x' of ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or an approximation of one.
 
     A subclass that starts from its last result keeps that in ``state``. This class is the prior ``none``: only x ≥ 0."""
 
