@@ -173,7 +173,7 @@ class Prior:
         return {}
 
     def restore(self, state: State) -> None:
-        """Continues from what ``state`` returned."""
+        """Continues from the arrays that ``state`` returned."""
 
 
 class TvPrior(Prior):
