@@ -88,7 +88,7 @@ class WobbleParameters(PerViewParameters):
 
     @classmethod
     def of(cls, scan: Scan, count: int = 0) -> "WobbleParameters":
-        """Returns parameters of 0, as ``count`` splines of time, or separate ones for each view if ``count`` is 0."""
+        """Returns a wobble of 0, as ``count`` splines of time, or as separate parameters of each view if ``count`` is 0."""
         if count:
             basis = splines(scan_course(scan) + 0.5, count)
             circle = _fitted_circle(scan, basis)

@@ -52,7 +52,7 @@ class RayLayout:
         return cls(grid, *Readout(own).shape(shape), whole(grid.shape), subrays, own, is_across)
 
     def of(self, brick: Brick) -> "RayLayout":
-        """Returns the layout for the same frames and another brick of the grid."""
+        """Returns the memory layout for the same frames and another brick of the grid."""
         return replace(self, brick=brick)
 
     @property

@@ -20,7 +20,7 @@ _SAME_POSE = 10  # poses, divided by the largest number in any, are the same if 
 
 @dataclass(frozen=True, eq=False)
 class UprightPoses:
-    """The distinct poses of F frames on the device, and which of them each of the frames' E cells has.
+    """The distinct poses of F frames on the device, and which of them each of the frames' E time cells has.
 
     pose_of (E,): the number of a cell's pose. first, stop (E,): a cell's lines [first, stop). frame_cells (F + 1,): frame
     f has the cells frame_cells[f] to frame_cells[f + 1] − 1."""
@@ -56,7 +56,8 @@ class UprightPoses:
         )
 
     def floats_per_frame(self, detector_shape: tuple[int, int], leans: bool) -> int:
-        """Returns the most floats that the slots of one frame need: line integrals and, if columns lean, slopes."""
+        """Returns the most floats that a frame's slots need: line integrals and, if columns lean, the rays' slopes along
+        z."""
         rows, columns = detector_shape
         widest = int((self.stop - self.first).max())
         each = columns * pitch_of(widest) if self.axis == "rows" else widest * pitch_of(rows)
@@ -180,8 +181,8 @@ def split_slots(
     """Transpose of ``merge_slots``: writes weight × pixel to each slot, times the ray's length in mm from one plane of
     voxels to the next.
 
-    turned: frames stored transposed, (F, columns, rows), from float ``start`` on. values: receives a float per pixel of
-    each slot."""
+    turned: frames stored transposed, (F, columns, rows), from float ``start`` on. values: receives a float per pixel of each
+    slot, then, if columns lean, the rays' slopes along z."""
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "split_slots", **slots.defines), (slots.columns, slots.count),

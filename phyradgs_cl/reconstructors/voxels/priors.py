@@ -101,7 +101,7 @@ class PriorWeight:
         self.noise_mm, self.common_mm = adjoint_response(system)
 
     def at(self, volume: Any) -> float:
-        """Returns the weight at a volume (nz, ny, nx) in 1/mm, in the gradient's unit, mm."""
+        """Returns the prior's weight at a volume (nz, ny, nx) in 1/mm, in the unit of the data term's gradient, mm."""
         by_noise = self.error.noise * self.noise_mm
         by_edges = self.error.edges_mm * _density(self.space, volume) * self.common_mm
         return max(self.strength * math.hypot(by_noise, by_edges), self.least)

@@ -72,7 +72,7 @@ class Sart(Algorithm):
             self.volume = space.add_product(self.volume, columns, update, self.relaxation, nonnegative=clip)
 
     def _columns(self, index: int) -> Any:
-        """Returns the column weights (nz, ny, nx) of a subset; computes them again if the cache has no room for them."""
+        """Returns a subset's column weights 1/(Aᵢᵀ 1), (nz, ny, nx); computes them again if they are not in the cache."""
         is_cached = index < len(self._column_weights)
         return self._column_weights[index] if is_cached else column_weights(self.subsets[index])
 
