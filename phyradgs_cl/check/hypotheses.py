@@ -118,7 +118,8 @@ def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Sc
 
 
 def _matching_grid(stated: Scan, panel_grid: Grid) -> Grid:
-    """Returns the stated grid, or ``panel_grid`` if the other was derived from the panel or differs in width 3 times."""
+    """Returns ``panel_grid`` if the stated grid was derived from the panel or differs in width 3 times; else the stated
+    one."""
     ratio = max(stated.grid.size_mm) / max(panel_grid.size_mm)
     is_derived = stated.grid == default_grid(stated.geometry)
     return panel_grid if is_derived or not 1 / _GRID_FACTOR < ratio < _GRID_FACTOR else stated.grid
