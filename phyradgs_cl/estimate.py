@@ -116,7 +116,7 @@ class _Trials:
         return float(self.result.facts.get("density_control_seconds", 0.0))
 
     def _rounds_due(self, total: int) -> float:
-        """Returns how many times more rounds of density control the whole run has than the last trial had; 0 if none."""
+        """Returns the rounds of density control in a run of ``total`` iterations, over those in the last trial, or 0."""
         rounds = self.result.facts.get("density_control_rounds", 0)
         return sum(self.plan.options.control.is_due(i, total) for i in range(1, total + 1)) / rounds if rounds else 0.0
 

@@ -20,8 +20,9 @@ _SAME_PRESS_S = 1.0  # wrappers such as timeout and uv repeat a signal: within t
 
 
 class StopFlag:
-    """The handler of both signals. waits: the first signal only sets the flag. keeps: this also holds after a loop of
-    iterations, until its result is written. farewell: what the command line prints after a signal has ended the command."""
+    """The handler of both signals. waits: the first signal is remembered, but raises nothing yet. keeps: ``waits`` stays
+    True after a loop of iterations, until the loop's result is written. farewell: what the command line prints after a
+    signal has ended the command."""
 
     def __init__(self) -> None:
         self.waits = self.keeps = False
@@ -83,7 +84,7 @@ def stop_on_interrupt(waits: bool = True) -> Iterator[StopFlag]:
                 raise
             raise KeyboardInterrupt from error
         finally:
-            flag.waits = before or (flag.keeps and flag.waits)  # the loop's result is yet to be written
+            flag.waits = before or (flag.keeps and flag.waits)  # in ``keep_finished_work``, signals wait beyond the loop
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames, is_parallel
 
 _SAME_TIME = 1e-6  # times that differ by less than this fraction of a cell's duration are equal
-_NOTHING = 1e-9  # a cell's smaller fraction of a line's exposure is a rounding error, and set to 0
+_NOTHING = 1e-9  # a smaller fraction of a line's exposure in a cell is a rounding error, and set to 0
 _INSTANT = 1e-9  # an exposure of a line shorter than this fraction of the frame's is treated as a single time
 _OVERHANG = 0.1  # a line skips a segment of time of which its exposure covers at most this fraction
 _TURN_SAMPLES = 32  # the gantry's highest speed in a frame is sought in this many equal intervals

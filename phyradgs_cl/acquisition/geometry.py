@@ -64,7 +64,7 @@ class ConeGeometry:
 
     @property
     def magnification(self) -> float:
-        """How many times larger the image of an object at the axis is than the object."""
+        """Source-to-detector over source-to-axis distance: how large an object at the axis appears, over its size."""
         return self.source_to_detector_mm / self.source_to_axis_mm
 
 
@@ -210,7 +210,8 @@ def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
     """Returns the grid of a full turn's field of view: a cube, or lower if the panel sees less along z.
 
     Voxels are as large as pixels at the axis: the pitch of rows along z, the pitch of columns along y and x. In a parallel
-    beam the grid is as high as the panel. If ``poses`` (F, 12) travel along z, as in a helix, the grid is as much longer."""
+    beam the grid is as high as the panel. If ``poses`` (F, 12) travel along z, as in a helix, the grid is longer by that
+    travel."""
     half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
     high_mm, wide_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     wide = max(1, math.ceil(2 * radius_mm / wide_mm))

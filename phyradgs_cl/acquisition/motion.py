@@ -29,7 +29,7 @@ _FINE_STEP_VOXELS = 0.3  # travel of the volume's rim from one time of ``PerRow`
 _OBJECT_STEP_VOXELS = 0.7  # travel of an object's fastest part from one time to the next; its other parts travel less
 _COARSE_STEP_VOXELS = 3.6  # travel of rim or object from one time to the next where _USUAL_TIMES are too few
 _SUB_INTERVALS = "Sub-intervals N of an exposure; for phyradgs means micro-views."
-_WEIGHT_TOLERANCE = 1e-3  # in a user-defined model, the sum of a line's weights may differ from 1 by this much
+_WEIGHT_TOLERANCE = 1e-3  # largest difference from 1 of the sum of a line's weights in a user-defined model
 
 
 class Motion(Protocol):

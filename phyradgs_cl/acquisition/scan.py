@@ -37,7 +37,7 @@ MODELS_OF_METHODS = ("scan", *DETECTOR_MODELS)  # "scan" takes the detector mode
 APPLIED = ("flats_applied", "darks_applied")
 """Keys of a scan's provenance under which the numbers of applied flats and darks are stored."""
 _TITLE = "cone-beam scan"
-LARGEST_LAG = 0.9  # largest ``Scan.lag``: no panel has nearly as much, and near 1 a frame would show hardly anything new
+LARGEST_LAG = 0.9  # largest ``Scan.lag``: panels have less, and a frame with a lag of 1 would show only earlier frames
 
 
 @dataclass(frozen=True)

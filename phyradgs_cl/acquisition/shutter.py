@@ -63,7 +63,7 @@ class Shutter:
 
     @property
     def first(self) -> str:
-        """The side that is read first, seen from the source: "top", "bottom", "left" or "right"."""
+        """The panel's side that is read first, seen from the source: "top", "bottom", "left" or "right"."""
         return next(side for side, order in FIRST_LINES.items() if order == (self.axis, self.direction))
 
     @property

@@ -50,7 +50,7 @@ class TimeCells:
 
     @property
     def count(self) -> int:
-        """The number of cells C."""
+        """The number of time cells C."""
         return len(self.weight)
 
     def line_weights(self) -> np.ndarray:
@@ -89,7 +89,7 @@ class TimeCells:
         return bool(self.layer_numbers.any())
 
     def scaled(self, factor: float) -> "TimeCells":
-        """Returns the cells with all lengths multiplied by ``factor``."""
+        """Returns the time cells with all lengths multiplied by ``factor``."""
         factors = np.full(POSE_LENGTH, factor)
         if self.is_parallel:
             factors[:3] = 1  # a parallel beam's direction is not a length, so it is not scaled

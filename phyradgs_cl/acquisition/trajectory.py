@@ -21,10 +21,10 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.text import repr_of_changes
 
 _LEAST_SPAN_S = 1e-6  # ``sampled`` needs two different times in a frame, also in one without duration
-_MOST_SAMPLES = 1024  # ``sampled`` gives up when more samples per frame are not close enough
+_MOST_SAMPLES = 1024  # ``sampled`` raises an error when more samples per frame than this are not close enough
 _LEAST_INCIDENCE = 1e-6  # least sine of the angle between rays and panel
 _AT_AXIS = 1e-6  # a panel within this fraction of the source-to-axis distance is at the axis
-_AWAY = 2.0  # a panel at the axis is moved this many times as far from the source, and enlarged as much
+_AWAY = 2.0  # factor on the size of a panel at the axis, and on its distance from the source, to move it away
 _SAME_PLACE = 1e-9  # poses that differ by less, relative to their largest number, are equal: float64 rounds by less
 
 
@@ -265,7 +265,7 @@ def resting_poses(
 def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarray) -> CircularOrbit | PoseTable:
     """Returns a circular orbit if ``geometry`` has the poses (F, 12) of a gantry at rest; otherwise a pose table."""
     is_parallel = isinstance(geometry, ParallelGeometry)
-    side = -1 if is_parallel else 1  # parallel rays point away from the side of the source
+    side = -1 if is_parallel else 1  # poses begin with the source; in a parallel beam with the rays' direction, away from it
     angle_rad = np.arctan2(side * poses[:, 1], side * poses[:, 0])
     if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME_PLACE * np.abs(poses).max()):
         return CircularOrbit(geometry, FrameSweeps(middle_s, 0.0, angle_rad, angle_rad))

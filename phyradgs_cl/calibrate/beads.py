@@ -23,7 +23,7 @@ from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
 DENSITY = 6  # a placement is a turn (rotation vector, rad), a shift (mm) and, at this index, the density
-_MARGIN = 1.2  # an oblique panel widens a bead's shadow, at most by this factor
+_MARGIN = 1.2  # largest factor by which an oblique panel widens a bead's shadow
 # An exposure is sampled so often that the phantom's edge moves by a pixel between two times, within these limits.
 _FEWEST_TIMES, _MOST_TIMES = 6, 24
 _FEWEST_RAYS = 2  # fewest rays along each side of a pixel, and along a bead's radius: sharp edges need several
@@ -33,8 +33,8 @@ _BLUR_PX = 0.8
 _LEAST_ZEROS = 0.2  # if at least this fraction of the pixels is 0, the noise of air was clipped at 0
 _ZEROS_PX = 5  # the noise of clipped air follows from means of blocks with this many pixels a side
 _BACKGROUND = 4  # cosines along each side of a frame: together they describe holder, scatter and drift of the tube
-_STEP_PX = 0.25  # derivatives are central differences, in which the frame's edge moves by this much to each side
-_MOST_PX = 1.5  # one step of the placement moves a frame by at most this much: beyond, its effect is not linear
+_STEP_PX = 0.25  # step of central differences to each side, as the pixels by which it moves the frame's edge
+_MOST_PX = 1.5  # most pixels by which one step of the placement moves a frame: beyond, its effect is not linear
 _SETTLED_PX = 0.01  # the search ends when a step moves the frame by less than this
 _LINEAR_PX = 0.3  # derivatives are computed again after a step that moves the frame by more than this
 
@@ -153,7 +153,7 @@ class _PanelLines:
         return tuple((v, *both, np.linalg.norm(v, axis=-1)) for v, both in zip(vectors, products, strict=True))
 
     def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:
-        """Returns the lines (n,) that may see a body, the first pixel (n,) of its shadow on each, and a width in pixels for
+        """Returns the lines (n,) that may see a body, its shadow's first pixel (n,) on each, and a width in pixels for
         all."""
         (depth, depth_of_source, *_), *axes = self._panel_axes
         lowest, highest = [], []
@@ -219,7 +219,7 @@ class BeadProblem(CoarseFrames):
         return float(np.std(residual if self.valid is None else residual[self.valid]))
 
     def explained(self, operator: BeadOperator, placement: np.ndarray) -> float:
-        """Returns the fraction of the compared values' sum of squares that the phantom explains. It is 0 if the density is
+        """Returns the fraction of the compared values' sum of squares that the phantom explains; 0 if its density is
         negative."""
         residual = self.compared(self.residual(operator, placement))
         whole = self.compared(self.masked(self.measured))
@@ -245,15 +245,14 @@ class BeadProblem(CoarseFrames):
     def beyond_object(
         self, operator: BeadOperator, placement: np.ndarray, images: Sequence[np.ndarray], iterations: int
     ) -> list[np.ndarray]:
-        """Returns the part of each image (F, rows, columns) that no other placement or density explains."""
+        """Returns the part of each image (F, rows, columns) outside the Jacobian's range: no placement explains it."""
         basis, _ = np.linalg.qr(self._signals(operator, placement).T)
         compared = np.array([self.compared(image) for image in images])
         beyond = compared - compared @ basis @ basis.T
         return list(beyond.reshape(len(images), *self.measured.shape))
 
     def compared(self, frames: np.ndarray) -> np.ndarray:
-        """Returns the values (F · pixels,) float64 by which frames are compared: without background, and blurred to hide
-        single rays."""
+        """Returns the values (F · pixels,) float64 of frames to compare: background removed, blurred to hide single rays."""
         blurred = gaussian_filter(self._without_background(frames), (0, _BLUR_PX, _BLUR_PX), output=np.float64)
         return blurred.ravel()
 
@@ -264,7 +263,8 @@ class BeadProblem(CoarseFrames):
         return np.array([pixel_mm / (max(scan.grid.size_mm) / 2)] * 3 + [pixel_mm] * 3 + [1.0])
 
     def _signals(self, operator: BeadOperator, placement: np.ndarray) -> np.ndarray:
-        """Returns how the compared values change, (7, F · pixels), per unit (``_units``) of each number of the placement."""
+        """Returns the transposed Jacobian, (7, F · pixels): d(compared)/d(placement / ``_units``), by central
+        differences."""
         signals = []
         for number, unit in enumerate(self._units()):
             step = np.eye(DENSITY + 1)[number] * _STEP_PX * unit

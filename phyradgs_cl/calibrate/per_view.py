@@ -1,8 +1,8 @@
 """Estimates errors of single views (a wobble), or an object that moves slowly (a motion), as splines of time.
 
-A view's parameters change only its own frame, so their signals are images of that frame. CGLS solves the normal equations of
-a Gauss–Newton step for the volume and all parameters together. Parameters then explain only what the volume cannot.
-``estimate_views`` takes such steps from coarse to fine grids."""
+A view's parameters change only its own frame, so their signals (columns of the Jacobian) are images of that frame. CGLS
+solves the normal equations of a Gauss–Newton step for the volume and all parameters together. Parameters then explain only
+what the volume cannot. ``estimate_views`` takes such steps from coarse to fine grids."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from phyradgs_cl.runtime import Runtime
 
 SPLINES = 7  # default number of splines; each is about a seventh of the scan wide
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
-_STEP_PX = 0.25  # derivatives are central differences, in which a frame moves by this much to each side
+_STEP_PX = 0.25  # step of central differences to each side, as the pixels by which it moves a frame
 _LEAST_NORM = 0.1  # a signal's norm counts as at least this fraction of its kind's largest, which limits how it is scaled
 _DEG = float(np.rad2deg(1.0))
 # This fraction of the change since a grid half as fine counts as error: 1 suits errors ∝ voxel, 1/3 errors ∝ voxel².
@@ -36,7 +36,7 @@ _DEVIATIONS = 3.0  # a kind is corrected only if its RMS over the views exceeds 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of parameter: its name and unit in the table. scale: how many of these units make a rad or a mm."""
+    """A kind of parameter: its name and unit in the table. scale: the number of these units in a rad or a mm."""
 
     name: str
     unit: str
@@ -47,7 +47,7 @@ class Kind:
 class PerViewParameters(ABC):
     """Parameters of views: ``values`` (n, K) of K kinds. View f has (``basis`` @ ``values``)[f], (K,), with basis (F, n).
 
-    - units (K,): how much of each kind moves a frame by a pixel at its edge.
+    - units (K,): the value of each kind that moves a frame's edge by a pixel.
     - circle (n, 2): values that vary as cosine and sine of the angle, as far as the basis can.
     - MISMATCH: measured errors (docs/calibrate.md) over errors by noise alone, as voxels do not represent objects exactly.
     - RESTARTED: kinds that start from 0 on each grid."""
@@ -88,7 +88,7 @@ class WobbleParameters(PerViewParameters):
 
     @classmethod
     def of(cls, scan: Scan, count: int = 0) -> "WobbleParameters":
-        """Returns parameters of 0, as ``count`` splines of time, or separate ones for each view if ``count`` is 0."""
+        """Returns a wobble of 0, as ``count`` splines of time, or as separate parameters of each view if ``count`` is 0."""
         if count:
             basis = splines(scan_course(scan) + 0.5, count)
             circle = _fitted_circle(scan, basis)
@@ -175,7 +175,7 @@ def view_step(
     kinds: Sequence[int], iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns a Gauss–Newton step (n, K) of the parameters, at the object ``volume``; it is 0 for kinds outside of
-    ``kinds``. Also returns the signals (F, kinds, rows, columns): the frames' change when a kind moves them by a pixel."""
+    ``kinds``. Also returns the signals (F, kinds, rows, columns), the Jacobian of the frames per pixel of movement."""
     operator = parameters.operator(problem, correction)
     residual = problem.residual(operator, volume)
     signals = np.stack([_signal(problem, correction, parameters, volume, kind) for kind in kinds], 1)
@@ -205,8 +205,8 @@ def view_deviations(
     """Returns for each kind the standard deviation (K,) of a view's parameter, in the parameters' units, and the fraction
     (K,) of its signals that no object explains.
 
-    signals: (F, K, rows, columns), changes of the frames per pixel of movement, of all kinds. A view's value is a sum over
-    spline coefficients, whose errors count as independent."""
+    signals: (F, K, rows, columns), the Jacobian of the frames per pixel of movement, of all kinds. A view's value is a sum
+    over spline coefficients, whose errors count as independent."""
     operator = parameters.operator(problem, correction)
     norms = _norms(parameters.basis, signals)
     noise = noise_level(problem.measured, problem.valid)
@@ -218,12 +218,12 @@ def view_deviations(
 
 
 def _norms(basis: np.ndarray, signals: np.ndarray) -> np.ndarray:
-    """Returns the norm (n, K) of the frames' change per coefficient, from ``signals`` (F, K, rows, columns)."""
+    """Returns the norms (n, K) of the Jacobian's columns d(frames)/d(coefficient). signals: (F, K, rows, columns)."""
     return np.sqrt(basis.T**2 @ np.sum(np.square(signals, dtype=np.float64), (2, 3)))
 
 
 def _strength(operator: RayOperator) -> float:
-    """Returns about the largest singular value of A, in mm. If scaled to this, parameters converge as fast as the volume."""
+    """Estimates the largest singular value of A, in mm. Parameters scaled to it converge as fast as the volume."""
     lengths = operator.forward(np.ones(operator.volume_shape, np.float32))
     return float(np.linalg.norm(operator.adjoint(lengths)) / np.linalg.norm(lengths))
 
@@ -232,7 +232,7 @@ def _signal(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters, volume: np.ndarray,
     kind: int,
 ) -> np.ndarray:
-    """Returns the change of the frames (F, rows, columns) with ``kind``, per pixel of movement of each view."""
+    """Returns the Jacobian d(frames)/d(``kind``), (F, rows, columns), per pixel of movement of each view."""
     step_px = _STEP_PX * problem.block
     step = np.zeros(len(parameters.units))
     step[kind] = step_px * parameters.units[kind]
@@ -272,8 +272,7 @@ def estimate_views(
     rt: Runtime, scan: Scan, parameters: PerViewParameters, stages: Sequence[Stage],
     correction: GeometryCorrection, passes: PassCounter,
 ) -> ViewsEstimate:
-    """Estimates ``parameters`` of a scan that ``correction`` has changed, in a few Gauss–Newton steps on each of ever finer
-    grids.
+    """Estimates ``parameters`` of a scan that ``correction`` has changed, by some Gauss–Newton steps on ever finer grids.
 
     A deviation combines noise and discretisation error, which is half the change since the coarser grid."""
     for number, stage in enumerate(stages):

@@ -172,8 +172,7 @@ class CoarseProblem(CoarseFrames):
         return self.measured + self.masked(operator.forward(volume) - self._expected(operator, volume))
 
     def _expected(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
-        """Returns the frames (F, rows, columns) of a volume. They average line integrals or intensities, as the detector
-        does."""
+        """Returns a volume's frames (F, rows, columns), averages of line integrals or intensities, as the detector's."""
         if self.scans[0].detector_model != "intensity":
             return operator.forward(volume)
         return IntensityOperator(self.rt, self.grid, operator.detector_shape, operator.tables).expected(volume)

@@ -61,10 +61,10 @@ BEAD_STAGES = (Stage(48, first=8, again=4, steps=6, project=0), Stage(128, first
 _FEWEST_FRAMES = 8  # with fewer frames a scan does not determine its geometry
 _FEWEST_COLUMNS = 12  # with fewer columns a scan does not determine its geometry
 _FEWEST_SPLINES = 4  # a cubic spline of a wobble needs four
-# In its best place, the right phantom explains at least this fraction of the frames' squares before any correction.
+# In its best place, the right phantom explains at least this fraction of the frames' sum of squares, before corrections.
 _LEAST_EXPLAINED = 0.3
-_ORDER_ERRORS = 4.0  # a direction of readout must be better by this many standard errors, as in ``check``
-_ORDER_RATIO = 1.04  # the squared residuals of both directions must differ by this factor, as in ``check``
+_ORDER_ERRORS = 4.0  # least difference of the readout directions' squared residuals in standard errors, as in ``check``
+_ORDER_RATIO = 1.04  # least ratio of the readout directions' squared residuals, as in ``check``
 _BEYOND = 1e6  # an encoder table is continued by this many frame times: first steps of the search may go far beyond it
 # Progress expects stages to cost this fraction of their most: few parameters are determined, and few steps are needed.
 _EXPECTED_SHARE = 0.25

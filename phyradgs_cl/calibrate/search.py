@@ -30,7 +30,7 @@ LEAST_SHARE = 0.2
 # For a known object (beads) a smaller share is enough: there are no voxels that explain signals by accident.
 LEAST_SHARE_OF_BEADS = 0.02
 _TINY = 1e-9  # added to the diagonal of a matrix before its inverse, because signals may be linearly dependent
-_GAUGE_FACTOR = 2.0  # voxels leave part of a turn's or lift's signal (``GAUGES``) by error: others must leave twice as much
+_GAUGE_FACTOR = 2.0  # least share over that of a turn or lift (``GAUGES``), which errors of voxels alone leave
 _MOST_GAUGE = 0.2  # a turn's or lift's share counts as at most this: in a wrong geometry it grows, and would refuse all
 DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
 _MOST_PX = 2.0  # a step moves the image by at most this many coarse pixels at its edge: beyond, its effect is not linear
@@ -65,8 +65,7 @@ class Reduced:
         )
 
     def relative_to_stated(self, at: Mapping[str, float]) -> "Reduced":
-        """Returns the problem, which was linearised at values ``at`` (by name), with steps that count from the stated
-        values."""
+        """Returns the problem, linearised at values ``at`` (by name), with steps that count from the stated values."""
         back = np.array([at.get(name, 0.0) for name in self.names]) @ self.jacobian
         return replace(self, residual=self.residual + back)
 
@@ -151,8 +150,8 @@ def least_shares(problem: Reduced) -> dict[str, float]:
     """Returns, by name, the share from which on a parameter counts as determined. ``problem`` includes the ``GAUGES``.
 
     No frame distinguishes a turn of all views from a turned object. Voxels do not follow such an object exactly, though:
-    they leave some of the turn's signal unexplained, and as much of any other signal. So a parameter's share must exceed
-    that of the turn, or of a lift if the parameter moves the image along the axis."""
+    they leave some of the turn's signal unexplained, and as much of any other signal. So a parameter's share must be at
+    least twice that of the turn, or of a lift if the parameter moves the image along the axis."""
     remaining = {gauge.is_axial: float(problem.only([gauge.name]).shares[0]) for gauge in GAUGES}
     names = [name for name in problem.names if name in PARAMETERS]
     gauge_shares = {name: min(remaining[PARAMETERS[name].is_axial], _MOST_GAUGE) for name in names}

@@ -32,31 +32,31 @@ _RANDOM_ORDERS = 2  # the residual in a random order is averaged over this many 
 _FEWEST_FRAMES = 5  # fewer frames cannot tell one order from another
 _FEWEST_PIXELS = 32  # fewer valid coarse pixels per frame cannot tell one order from another
 _CLEAR = 0.5  # a hypothesis must leave less than this fraction of the stated scan's squared residual
-_NEARLY = 1.5  # a rough fit is refined unless another one is better by this factor in squares
+_NEARLY = 1.5  # a rough fit is refined unless its squared residual exceeds this many times the least one
 _ERRORS = 4.0  # a hypothesis must be better than the stated scan by this many standard errors
 # The frames look the same from every angle if a random order leaves a residual below _SAME or _NOISY.
 _SAME = 0.03  # residual over the standard deviation of the line integrals
 _NOISY = 1.6  # residual over the noise: round objects had up to 1.3, others 2.3 or more
 _MOST_REFINED = 2  # only this many hypotheses, the best ones, get a refined shift of the panel, which takes time
-_SHIFT_PENALTY = 1.5  # each coarse pixel of shift multiplies a hypothesis's squares by this: stated offsets are mostly right
+_SHIFT_PENALTY = 1.5  # factor on a hypothesis's squared residual per coarse pixel of shift: stated offsets are mostly right
 # A frame is odd if its mean line integral differs from its neighbours' by more than _DEVIATIONS and _LEAST_CHANGE.
 _DEVIATIONS = 12.0  # difference in robust standard deviations of all frames' differences
 _LEAST_CHANGE = 0.75  # difference over the frames' median mean line integral
-_REPEATED = 0.15  # a repeated frame differs from its predecessor by less than this fraction of what neighbouring frames do
-_JUMP = 2.5  # in an order that jumps, such as the golden angle, recorded steps are this many times as large as sorted ones
-_UNLIKE = 2.0  # a repeated frame differs this much, relative to the median, from the view nearest in angle
-_OUTLIER = 4.0  # the residual of an outlier is at least this many times the frames' median
+_REPEATED = 0.15  # RMS change from a frame to one that repeats it, at most, over the least change between frames nearby
+_JUMP = 2.5  # an order jumps, as the golden angle does, if its median step exceeds that of sorted angles by this factor
+_UNLIKE = 2.0  # least RMS difference of a repeated frame from the next view in angle, over the median of all frames
+_OUTLIER = 4.0  # least RMS residual of an outlier, over the frames' median
 # Both ends of an arc may fit badly if their residuals differ by less than this factor: right frames had 1.4, odd ones 2.3.
 _ALIKE = 1.7
 # Both ends must also leave less than this fraction of the residual in a random order: right ones had 0.2, odd mostly 0.3.
 _AT_BOTH_ENDS = 0.25
 _MOST_OUTLIERS = 0.2  # this many outliers, as a fraction of the frames, have a common cause: then none counts as one
-_EXCHANGED = 0.5  # two frames were exchanged if the opposite order leaves less than this fraction of the squares
+_EXCHANGED = 0.5  # two frames were exchanged if the opposite order leaves less than this fraction of the squared residual
 
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """The answer about consistency. frames (n,): indices of the frames that fit together. is_sound: whether further
+    """Whether frames fit together: the ``finding``. frames (n,): indices of those that do. is_sound: whether further
     questions make sense. sees_angles: whether the object looks different from different angles."""
 
     finding: Finding
@@ -136,7 +136,7 @@ def _unseen(scan: Scan, as_stated: Scan) -> float:
 
 
 def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
-    """Chooses another sense of rotation and shift of the panel if they fit far better than the stated ones. A scan with
+    """Chooses another sense of rotation and panel shift if they leave less than half of the squared residual. A scan with
     opposite views keeps its sense: both senses fit it equally well.
 
     Returns the scan with the chosen sense, then with the shift too, and the mean squared residual of the best rough fit."""
@@ -148,7 +148,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     turned = best = scan
     least = _CLEAR * fit_squares(rt, scan).sum()
     for sense, rough, limits in zip(senses, roughs, limits_px, strict=True):
-        if rough.squares.mean() > _NEARLY * least_rough:  # this sense fits far worse; in a narrow fan both fit alike
+        if rough.squares.mean() > _NEARLY * least_rough:  # a larger residual; in a narrow fan both senses fit alike
             continue
         shift = axis.refined_shift(rt, sense, rough, limits)
         if not shift.is_found:
@@ -167,7 +167,7 @@ def _random_order(rt: Runtime, scan: Scan) -> float:
 
 
 def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -> Hypothesis | None:
-    """Returns the best hypothesis that fits far better than the stated scan; None without one.
+    """Returns the best hypothesis that leaves less than half of the stated scan's squared residual; None without one.
 
     If the panel sees few rays twice, frames fit any geometry. Then the first hypothesis of other sizes under which frames
     are consistent is returned."""
@@ -247,9 +247,9 @@ def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
 
 
 def repeated_frames(scan: Scan) -> list[int]:
-    """Returns the indices of frames that repeat their predecessor although the gantry has turned: they differ far less than
-    neighbours do. In an order that jumps, such as the golden angle, distant views of a round object may look the same. So
-    there a repeated frame must also differ from the next view in angle."""
+    """Returns the indices of frames that repeat their predecessor although the gantry has turned: they differ by less than
+    0.15 of what frames nearby do. In an order that jumps, such as the golden angle, distant views of a round object may look
+    the same. So there a repeated frame must also differ from the next view in angle."""
     p = scan.projections
     if len(p) < _FEWEST_FRAMES:
         return []
@@ -282,7 +282,7 @@ def _neighbours(values: np.ndarray) -> np.ndarray:
 def without_outliers(
     rt: Runtime, scan: Scan, stated: Fit, random_square: float
 ) -> tuple[np.ndarray, Fit, list[str]]:
-    """Removes frames whose residual is far above the others', the worst first, with a new fit after each.
+    """Removes frames whose RMS residual is 4 times the median or more, the worst first, with a new fit after each.
 
     stated: the fit of all frames. random_square: the mean squared residual of frames in a random order. Returns the indices
     (n,) of the frames that stay, their fit, and notes. If a fifth of the frames would go, the cause is common to all, and

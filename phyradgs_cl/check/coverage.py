@@ -20,10 +20,10 @@ _INVERTED = 0.9  # if the sides exceed this fraction of the largest value, brigh
 _BRIGHT = 0.05  # at most this fraction of the pixels may be brighter than the flats, by noise
 _FRAMES = 0.1  # the object may touch a side of the panel in this fraction of the frames
 _COVERED = 0.1  # a column shows the object if more than this fraction of its rows does
-# A unit is wrong if the grid is this many times wider than the panel's view, or the object wider than the grid.
+# A unit is wrong if the grid's width over that of the panel's view, or the object's over the grid's, exceeds this.
 _ANOTHER_SIZE = 5.0
 _NOISE_FRAMES, _NEAR = 16, 5  # frames in which noise is sought, and the side in pixels of a square of neighbours
-_MOST_NOISE, _NO_OBJECT_FROM = 0.4, 4.0  # of the line integrals: noise beyond the first dominates
+_MOST_NOISE, _NO_OBJECT_FROM = 0.4, 4.0  # noise over mean line integral: dominant noise; noise without any object
 NOISE = "noise"
 NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # findings with these units end the check
 CUT_OFF = "line integral at the border"  # a finding with this unit says that the object reaches beyond the panel
@@ -67,7 +67,7 @@ def find_noise(scan: Scan) -> Finding | None:
 
 def _check_values(p: np.ndarray, valid: np.ndarray, largest: float, noise: float, threshold: float) -> Finding | None:
     """Returns a finding where the values cannot be line integrals of an object; None where they can. largest: the largest
-    line integral. noise: it alone does not exceed this. threshold: from here on a pixel sees the object."""
+    line integral. noise: values that noise alone does not exceed. threshold: least value of a pixel that sees the object."""
     if largest <= noise:
         text = f"no object: line integrals reach {largest:.3g}, noise {noise:.3g}"
         advice = "was the object in the beam? Are the values line integrals, larger behind more material?"

@@ -19,7 +19,7 @@ SIZE_FACTORS = (10.0, 0.1, 1e3, 1e-3)
 LEAST_REDUNDANCY = 0.5  # frames fit any pixel size if a smaller fraction of columns has rays that are measured twice
 _UNITS = {10.0: " (in cm, read as mm?)", 1e3: " (in m, read as mm?)", 1e-3: " (in µm, read as mm?)"}
 _FANS = (0.02, 3.0)  # real scanners have a panel's width over its distance from the source in this range
-_GRID_FACTOR = 3.0  # a grid wider or narrower than the panel's view by this factor is as wrong as the sizes, and replaced
+_GRID_FACTOR = 3.0  # a grid this many times wider or narrower than the panel's view is as wrong as the sizes: replaced
 _SAME_PLACE = 1.0  # shifts of the panel that differ by less, in coarse pixels, look the same
 _ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)  # changes of the angle between views, in percent, that are tried
 _GAPS = 15  # a missing or repeated frame is looked for at this many frames, evenly spread
@@ -29,8 +29,8 @@ _GAPS = 15  # a missing or repeated frame is looked for at this many frames, eve
 class Hypothesis:
     """What may be wrong in a scan: a description, advice, and a function that returns the scan corrected for it.
 
-    factor: how many times larger pixels are than stated. Hypotheses with the same factor, unless it is 1, differ only by the
-    panel's shift."""
+    factor: pixel size over stated pixel size. Hypotheses with the same factor above or below 1 differ only by the panel's
+    shift."""
 
     text: str
     advice: str
@@ -118,7 +118,8 @@ def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Sc
 
 
 def _matching_grid(stated: Scan, panel_grid: Grid) -> Grid:
-    """Returns the stated grid, or ``panel_grid`` if the stated one was derived from the panel or has quite another size."""
+    """Returns ``panel_grid`` if the stated grid was derived from the panel or differs in width 3 times; else the stated
+    one."""
     ratio = max(stated.grid.size_mm) / max(panel_grid.size_mm)
     is_derived = stated.grid == default_grid(stated.geometry)
     return panel_grid if is_derived or not 1 / _GRID_FACTOR < ratio < _GRID_FACTOR else stated.grid

@@ -37,8 +37,8 @@ SIGN, CENTRE, DISTANCES = "sign of rotation", "centre of rotation", "distances"
 OTHER_CAUSE = "pixels, if pixel sizes are right"  # unit of an offset that wrong pixel sizes explain as well
 UNVERIFIED = "neither pixel sizes nor distances are verified by these frames"
 _ERRORS = 4.0  # two hypotheses must differ by this many standard errors; else the answer is "cannot tell"
-_SIGN_RATIO = 1.2  # the wrong sense of rotation leaves this many times the squared residual of the right one
-_CLEAR_RATIO = 3.0  # if rough fits of both senses differ by this factor, they need no refined shifts
+_SIGN_RATIO = 1.2  # least squared residual of the wrong sense of rotation, over that of the right one
+_CLEAR_RATIO = 3.0  # if the squared residuals of both senses' rough fits have this ratio, they need no refined shifts
 _TOLERATED_PX = 1 / 3  # a shift of the panel by this many pixels is always tolerated
 _DEVIATIONS = 4.0  # a shift by this many of its standard deviations is always tolerated
 _BIAS_FULL_TURN = 0.003  # measured error of the axis in scans of a full turn, in coarse pixels
@@ -47,8 +47,8 @@ _WHOLE_PIXELS = 2  # if full pixels were compared, the answer "ok" needs a thres
 _LEAST_REDUNDANCY = 0.1  # least fraction of columns seen twice, to divide by: it is 0 if the axis is at the panel's edge
 _NO_SIGN = "parallel rays show an object that turns one way and its mirror image that turns the other way alike"
 _SIGN_ADVICE = "look for a feature whose side is known: a mirror image would fit as well"
-_OTHER_SIZES = (0.8, 1.25)  # distances are "ok" if a fan narrower or wider by these factors fits worse
-_SIZE_RATIO = 1.05  # a fan fits worse if it leaves this many times the squared residual of the stated one
+_OTHER_SIZES = (0.8, 1.25)  # distances are "ok" if the fan with its width times either factor fits worse
+_SIZE_RATIO = 1.05  # a fan fits worse if its squared residual, over that of the stated fan, reaches this ratio
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,10 +116,10 @@ def check_rotation(stated: axis.AxisShift, other: axis.AxisShift) -> Finding:
 
 
 def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px: float) -> Finding:
-    """Adds the cause to a suspicious finding about the sense of rotation: reversed angles, or frames mirrored in u.
+    """Returns the finding about a wrong sense of rotation with its cause: angles are reversed, or frames mirrored in u.
 
-    Under reversed angles the best panel offset is stated_px + shift_px. If it is nearer to the opposite of the stated
-    offset, frames are mirrored. A stated offset below ``tolerance_px`` does not decide."""
+    stated_px: the panel's offset along u. stated_px + shift_px: the offset that fits best under reversed angles. If this is
+    nearer to −stated_px, frames are mirrored. Offsets below ``tolerance_px`` cannot tell; then the advice names both."""
     if abs(stated_px) < tolerance_px:
         text = f"{finding.text}; frames mirrored in u would look the same"
         advice = f"change the sign of the angles ('gantry' for 'sample'), or import with the other {MIRROR_U}"
@@ -184,7 +184,7 @@ def check_distances(rt: Runtime, scan: Scan) -> Finding:
     """Fits a coarse scan with its fan 0.8 and 1.25 times as wide, each with its own best shift of the panel.
 
     Sizes and distances show in the fan alone. The answer is "ok" where both fit worse, otherwise "cannot tell". Sizes that
-    fit far better make the frames inconsistent, which another question finds."""
+    leave less than half of the squared residual make the frames inconsistent, which another question finds."""
     stated = fit_squares(rt, scan)
     others = {factor: fit_squares(rt, axis.with_best_shift(rt, nearly_sized(scan, factor))) for factor in _OTHER_SIZES}
     ratios = {factor: residual_ratio(stated, other) for factor, other in others.items()}

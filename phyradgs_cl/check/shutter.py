@@ -15,10 +15,10 @@ from phyradgs_cl.runtime import Runtime
 
 READOUT, EXPOSURE = "sign of readout", "exposure"
 _ERRORS = 4.0  # two hypotheses must differ by this many standard errors
-# The wrong order of readout must leave this many times the squared residual. Little is enough: both are equally free to fit.
+# Least squared residual of the wrong readout order over that of the right one: small, as both have as many unknowns.
 _ORDER_RATIO = 1.04
-_OTHER_RATIO = 1.5  # another readout axis or time must fit better than the stated one by this factor in squares
-# A gantry at rest must fit better by this factor: a model without blur always fits better, above all with few views.
+_OTHER_RATIO = 1.5  # least squared residual of the stated readout axis or time, over that of one that fits better
+# The same ratio for a gantry at rest: a model without blur always fits better, above all with few views.
 _REST_RATIO = 2.0
 _AS_GOOD = 1.15  # readouts that leave up to this many times the best one's squared residual are named too
 _READOUT_SHARE = 0.86  # if no readout time is stated, this fraction of the time between frames is tried
@@ -26,7 +26,7 @@ _OTHER_WAY, _AT_REST = "the other way", "all at once, the gantry at rest"
 _NEEDED_RATIO = {_OTHER_WAY: _ORDER_RATIO, _AT_REST: _REST_RATIO}
 # An exposure is suspicious if half of it leaves at most this fraction of the squared residual: correct scans have ≥ 0.8.
 _HALF_RATIO = 0.6
-_WORSE_RATIO = 1.05  # an exposure fits worse if it leaves this many times the squared residual of the stated one
+_WORSE_RATIO = 1.05  # an exposure fits worse if its squared residual, over that of the stated exposure, reaches this ratio
 
 
 def check_readout(rt: Runtime, scan: Scan) -> Finding:

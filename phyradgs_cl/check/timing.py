@@ -24,13 +24,13 @@ from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
 
 _TIMING, _ANGLES = "timing", "angles"
 _ROUNDING = 1e-3  # relative tolerance: files round times and angles
-_SPEED_TOLERANCE = 0.02  # steps between frames may differ this much from the speed within frames: gantries vary less
+_SPEED_TOLERANCE = 0.02  # largest relative difference of the speeds between and within frames: gantries vary less
 _LONGEST_TABLE = 100.0  # a table that lasts this many times as long as the scan belongs to more than one scan
 _FEW_RAD = math.radians(5)  # if frames see a smaller arc of a long table of angles, its times may be in another unit
 _MILLISECONDS = (900.0, 3000.0)  # if a table lasts this many times as long as the scan, it is in ms and the frames are in s
 _WIDE = 3.0  # a gap between views is wide above this multiple of the median gap
 _SAME_RAD = 1e-6  # views nearer to each other than this have the same angle
-_TOLERATED_DEG = 1.0  # coverage may be this much below half a turn and the fan: nearly parallel rays need half a turn only
+_TOLERATED_DEG = 1.0  # coverage may be less by this than half a turn plus fan: nearly parallel rays need half a turn only
 
 
 def check_timing(scan: Scan) -> Finding:

@@ -133,18 +133,18 @@ def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: 
 
 @dataclass(frozen=True)
 class Turned:
-    """Which flips, of rows and of columns, turn a stored image upright: v up and u to the right, seen from the source."""
+    """Which axes of a stored image to reverse, so that v points up and u to the right, seen from the source."""
 
     rows: bool
     columns: bool
 
     def frames(self, array: np.ndarray) -> np.ndarray:
-        """Returns flipped frames or masks (..., v, u)."""
+        """Returns frames or masks (..., v, u), reversed along v if ``rows`` and along u if ``columns``."""
         array = array[..., ::-1, :] if self.rows else array
         return array[..., ::-1] if self.columns else array
 
     def poses(self, pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-        """Converts poses (..., 12), see ``PoseTable``, of stored images to the poses of flipped images. panel: (rows,
+        """Converts poses (..., 12), as in ``PoseTable``, of stored images to those of flipped ones. panel: (rows,
         columns)."""
         pose = np.array(pose, np.float64)
         sides = (self.rows, panel[0], slice(9, 12)), (self.columns, panel[1], slice(6, 9))

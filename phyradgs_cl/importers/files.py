@@ -99,8 +99,8 @@ class SafeFolder:
         return [path for path in _files(self.root) if _is_one_of(path, suffixes)]
 
     def only(self, what: str, *suffixes: str) -> Path:
-        """Returns the only file with one of the suffixes. what: its role, for messages. Raises InputError for none or
-        several."""
+        """Returns the only file with one of the suffixes. Raises InputError for none or several, and calls the file
+        ``what``."""
         paths = self.matching(*suffixes)
         if len(paths) != 1:
             names = ", ".join(path.name for path in paths[:5]) or "none"

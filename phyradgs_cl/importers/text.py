@@ -19,7 +19,7 @@ _ENGLISH, _GERMAN = (re.compile(rf"[-+]?\d{{1,3}}({k}\d{{3}})+{d}") for k, d in 
 _ONE_COMMA, _EITHER = re.compile(r"[-+]?\d*,\d+"), re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
 _COLUMNS = re.compile(r",\s+|[;:\s]+")
 _ANGLE, _RAD = re.compile(r"angle|theta|phi|rot|deg", re.I), re.compile(r"\brad", re.I)
-_BRIGHTER = 1.2  # a pixel above this many times the stated counts of air is too bright: noise does not reach so far
+_BRIGHTER = 1.2  # a pixel is too bright above this many times the stated counts of air: noise does not reach so far
 _FEW = 0.01  # this fraction of the pixels may be too bright, because they are broken
 _HEAD_BYTES = 1 << 14  # words of a format are searched in this many bytes at a file's start
 TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
@@ -215,7 +215,8 @@ def say_missing(fields: Fields, meanings: Mapping[str, str]) -> None:
 
 
 def white_level(fields: Fields, key: str, frames: np.ndarray, remedy: str) -> float:
-    """Returns the counts of air that ``key`` states. Raises InputError where frames (F, v, u) are much brighter."""
+    """Returns the counts of air that ``key`` states. Raises InputError if over 1 % of the pixels of frames (F, v, u) exceed
+    it 1.2 times."""
     white = fields.length(key)
     brighter = sum(np.count_nonzero(frame > _BRIGHTER * white) for frame in frames) / frames.size
     if brighter > _FEW:

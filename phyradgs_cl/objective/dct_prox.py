@@ -17,8 +17,8 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, beside, brought_to, padded_zeros, pitch_of
 
 EDGE = 4  # voxels along each side of a block
-_SAMPLES = 8  # a voxel takes the time of this many samples of a ray: launches are divided, as drivers kill long ones
-# In each turn, the blocks' shift along y for every shift along z: each shift occurs once, and in four turns each pair does.
+_SAMPLES = 8  # time of a voxel over that of a ray's sample, by which launches are divided: drivers kill long ones
+# TURNS[turn][z]: the blocks' shift along y, in voxels, for their shift z along z. Four turns contain all 16 pairs once.
 TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 
 
@@ -40,8 +40,8 @@ class DctProx:
     def __call__(
         self, volume: SameArray, threshold: float, turn: int, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Returns the shrunk volume (nz, ny, nx) float32. threshold: by how much the coefficients of the orthonormal
-        transform shrink.
+        """Returns the shrunk volume (nz, ny, nx) float32. threshold: of the soft threshold T, for coefficients of the
+        orthonormal transform.
 
         turn: 0 to 3, chooses a quarter of the shifts. nonnegative: clips the result at 0. A device array gives a device
         array (``out``, if given)."""

@@ -19,7 +19,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, beside, brought_to, move,
 
 EDGE = 5
 """Voxels along each side of a filter."""
-_SAMPLES = 200  # a voxel takes at most the time of this many ray samples: launches are divided, as drivers kill long ones
+_SAMPLES = 200  # largest time of a voxel over that of a ray's sample, by which launches are divided: drivers kill long ones
 _SLICES = 2  # slices computed at a time: channels and responses of a whole volume would need 24 times its memory
 _RING = _SLICES + 2  # slices in memory: correlating two slices needs one more on either side
 
@@ -39,7 +39,7 @@ class Ridge:
     knot_down: np.ndarray
 
     def table(self) -> np.ndarray:
-        """Returns all numbers in one float32 array, in the order in which the kernels read them."""
+        """Returns the regulariser's numbers in one float32 array, in the order in which the kernels read them."""
         filters = np.moveaxis(self.first, 0, -1), np.moveaxis(self.second, 0, -1), np.moveaxis(self.second, (0, 1), (-2, -1))
         curves = self.slope_up, self.knot_up, self.slope_down, self.knot_down
         return np.concatenate([part.ravel() for part in (*filters, *curves)]).astype(np.float32)
@@ -107,8 +107,7 @@ class RidgeStep:
         return brought_to(self.rt, volume, result)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
-        """Runs a kernel on slices from ``first`` on. Its result has ``less`` voxels fewer along each axis than the
-        volume."""
+        """Runs a kernel on slices from ``first`` on, for a result that is ``less`` voxels shorter along each axis."""
         nz, ny, nx = (count - less for count in self.shape)
         start, stop = max(first, 0), min(first + _SLICES, nz)
         if start < stop:
@@ -134,7 +133,7 @@ def ridge_step(volume: np.ndarray, sigma: float, step: float, *, ridge: Ridge, n
 
 
 def correlated(channels: np.ndarray, filters: np.ndarray) -> np.ndarray:
-    """Correlates channels (c, z, y, x) with filters (i, c, 3, 3, 3) where windows lie inside: (i, z − 2, y − 2, x − 2)."""
+    """Correlates channels (c, z, y, x) with filters (i, c, 3, 3, 3), without padding: returns (i, z − 2, y − 2, x − 2)."""
     windows = np.lib.stride_tricks.sliding_window_view(channels, (3, 3, 3), axis=(1, 2, 3))
     return np.asarray(np.einsum("czyxkji,fckji->fzyx", windows, filters.astype(np.float64), optimize=True))
 

@@ -18,14 +18,14 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch
 
 _VIEWS_PER_LAUNCH = 64  # most views of a launch: the few lines of each that a work-item reads should stay in the cache
 _BYTES_A_LAUNCH = 1 << 28  # most bytes of frames that are uploaded together
-_VIEWS_SHARE = 0.25  # fraction of the free device memory that these frames may take; the volume needs the rest
+_VIEWS_SHARE = 0.25  # fraction of the free device memory for uploaded frames; the volume needs the rest
 _BLOCK_VOXELS = 128  # most voxels along z per work-item of the kernels for upright columns of voxels
-_COLUMN_ROWS = 512  # most detector rows to which these voxels may project
+_COLUMN_ROWS = 512  # most detector rows to which the voxels of such a work-item may project
 # A column of voxels along z is upright if over its height u·depth and depth change by at most this fraction of the depth.
 _UPRIGHT = 1e-7
 # Largest lean of the image of a column of voxels, in detector columns per row. Beyond it the general kernel is faster.
 _MOST_LEAN = 0.25
-LINE_SAMPLES = 4  # with one pose per line a voxel takes this many times longer than with one pose per view
+LINE_SAMPLES = 4  # time of a voxel with one pose per line, over its time with one pose per view
 _WIDEST = 16  # width of the widest vector of voxels along z, which may reach beyond the volume
 Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 

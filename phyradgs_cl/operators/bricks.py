@@ -61,7 +61,7 @@ def _candidates(shape: Shape, steps: tuple[int, int]) -> Iterator[Shape]:
 
 
 def _parts(count: int, step: int) -> Iterator[int]:
-    """Yields lengths into which ``count`` may be divided, the longest first. All but ``count`` are multiples of ``step``."""
+    """Yields lengths of bricks along an axis of ``count`` voxels, longest first: ``count``, then multiples of ``step``."""
     last = count + 1
     for pieces in range(1, ceil_div(count, step) + 1):
         fair = ceil_div(count, pieces)

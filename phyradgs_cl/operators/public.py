@@ -25,7 +25,7 @@ def to_user_array(rt: Runtime, values: Values) -> Any:
 
 
 def moved_to(rt: Runtime, values: Values, on_device: bool) -> Any:
-    """Returns values on the device, or on the host. They are copied only if they are not there."""
+    """Returns values on the device (``on_device``) or on the host. Copies them only from the one to the other."""
     if isinstance(values, DeviceArray):
         return values if on_device else rt.download(values)
     return rt.upload(values) if on_device else values
@@ -61,9 +61,9 @@ class Operator:
     give such Arrays, and nothing is copied between host and device. An operator, its transpose and its ``frames`` share
     memory on the device: use one at a time.
 
-    Operators come from ``ray_operator``, ``splat_operator`` and ``voxel_operator``. To write another one: rt is its
-    Runtime; domain and range_ are (name, shape); at maps x to (y, the function from dL/dy to dL/dx); frames and intensity
-    make the operators of the same names, if they exist.
+    Operators come from ``ray_operator``, ``splat_operator`` and ``voxel_operator``. To write another one, give: its Runtime
+    rt; domain and range_, each (name, shape); ``at``, a function that returns y and the function from dL/dy to dL/dx (vjp)
+    for an x. frames, intensity: functions that make the operators of these names, if any.
 
     Raises InputError, before anything is computed, for arrays of another shape, type or device."""
 
@@ -166,7 +166,7 @@ class Operator:
         return self._at(self._to_array(self._domain, x))
 
     def _to_array(self, side: tuple[str, Shape], values: Any) -> Values:
-        """Returns an x or a y as float32 in C order, on the side where it is. Copies only what is not so already."""
+        """Returns an x or a y as float32 in C order, on the side where it is. Copies only other types or layouts."""
         array = adopted(side[0], values, self.queue) if is_cl_array(values) else on_host(side[0], values)
         checks.shape(side[0], array, side[1])  # type: ignore[arg-type]
         return array

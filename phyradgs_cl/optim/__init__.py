@@ -20,7 +20,7 @@ _RANGE = (1e-12, 10)  # limits of a learning rate: 0 could not decay, and 1e-12 
 class Rates(checks.Checked):
     """The (first, last) learning rate of each kind of parameter, in internal units (half-sides of the volume).
 
-    The default rates are two to ten times the published ones, which are made for 20,000 iterations and more. In 3,000
+    The default rates are four to ten times the published ones, which are made for 20,000 iterations and more. In 3,000
     iterations, the published rates end 1 to 2 dB lower (docs/results/settings.md)."""
 
     PREFIX = "rates."
@@ -31,7 +31,7 @@ class Rates(checks.Checked):
     density: tuple[float, float] = checks.ranged((6e-2, 6e-3), *_RANGE)
 
     def at(self, progress: float) -> np.ndarray:
-        """Returns the rates (11,) of the parameter rows at ``progress``, 0 to 1, of the run."""
+        """Returns the learning rates (11,) of the parameter rows at ``progress``, 0 to 1, of the run."""
         position, scale, rotation, density = (
             first * (last / first) ** progress
             for first, last in (self.position, self.scale, self.rotation, self.density)
@@ -113,9 +113,9 @@ class DensityControl(checks.Checked):
     """When Gaussians are cloned, split and removed, and which. Lengths are in half-sides of the volume, times in fractions
     of a run.
 
-    ``every``: iterations between two rounds; 0 keeps the first population. Gaussians whose longest scale is more than
-    ``prune_aspect`` times their shortest are removed (0: never). Such thin sheets and needles lie between the rays, where no
-    measurement constrains them, and are visible in the volume."""
+    ``every``: iterations between two rounds of cloning, splitting and removing; 0 keeps the first population. Gaussians
+    whose longest scale is more than ``prune_aspect`` times their shortest are removed (0: never). Such thin sheets and
+    needles lie between the rays, where no measurement constrains them, and are visible in the volume."""
 
     PREFIX = "control."
 
@@ -136,7 +136,7 @@ class DensityControl(checks.Checked):
         return np.asarray(scale.max(0) <= self.prune_aspect * scale.min(0))
 
     def is_due(self, iteration: int, iterations: int) -> bool:
-        """Returns whether a round is due after ``iteration`` (counted from 1) of a run of ``iterations``."""
+        """Returns whether Gaussians are to be cloned, split and pruned after ``iteration`` (from 1) of ``iterations``."""
         inside = self.start_iteration < iteration < self.stop_fraction * iterations
         return self.every > 0 and inside and iteration % self.every == 0
 

@@ -89,7 +89,7 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
         return options.motion
     name = _implied_motion(options.motion.name, counts, models) if motion is None else motion
     if not isinstance(name, str) or name not in models:
-        hidden = {*MOTIONS} - {one.name for one in MODELS if one.poses}  # the command line does not take these
+        hidden = {*MOTIONS} - {one.name for one in MODELS if one.poses}  # models that the command line does not take
         named = [one for one in models if one not in hidden]
         raise InputError("--motion", checks.short_repr(name), f"one of {', '.join(named)} for --method {method}")
     model = models[name]

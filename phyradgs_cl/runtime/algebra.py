@@ -53,13 +53,13 @@ class Space(Protocol, Generic[A]):
         """Returns x y element by element. y may lack the first axes of x; it then repeats along them."""
 
     def reciprocal(self, x: A, share: float) -> A:
-        """Returns 1/max(x, ``share`` · largest x) where x > 0, else 0. So small values of x give no huge result."""
+        """Returns 1/max(x, ``share`` · largest x) where x > 0, else 0, so that small x give no huge result."""
 
     def inner(self, x: A, y: A) -> float:
         """Returns Σ x y, with the accuracy of float64."""
 
     def turn(self, x: A, y: A, z: A) -> float:
-        """Returns Σ (x − y)(y − z). It is positive if the steps from z to y and from y to x point the same way."""
+        """Returns Σ (x − y)(y − z), the inner product of the steps from z to y and from y to x."""
 
     def norm(self, x: A) -> float:
         """Returns √Σ x²."""

@@ -252,8 +252,8 @@ class Runtime:
             raise self.ledger.error(f"a launch of {kernel.function_name}", error, self.queue) from error
 
     def _sides(self, items: int, shape: Sides) -> Sides:
-        """Returns the sides of a work-group of ``items`` work-items, all along the first axis. If this axis of ``shape`` is
-        shorter, items past its end would idle on a GPU, so factors of 2 move to another axis that they divide."""
+        """Returns the sides of a work-group of ``items`` work-items for a launch of ``shape``: (items, 1, ...). On a GPU,
+        items past a short first axis would idle. Factors of 2 then move to an axis that they divide."""
         sides = [int(items), *([1] * (len(shape) - 1))]
         while self.pixel_items and sides[0] % 2 == 0 and sides[0] // 2 >= shape[0]:
             axis = next((k for k in range(1, len(shape)) if shape[k] % (2 * sides[k]) == 0), None)
@@ -263,7 +263,7 @@ class Runtime:
         return tuple(sides)
 
     def group(self, on_cpu: int = 1, on_gpu: int = 64, *kernels: Kernel) -> int:
-        """Returns the work-items of a work-group, ``on_cpu`` or ``on_gpu``. On a GPU it is halved until ``kernels`` can run.
+        """Returns a work-group's size in work-items, ``on_cpu`` or ``on_gpu``. A GPU's is halved until ``kernels`` can run.
         Name kernels that size local memory by the group here, because a later halving by ``launch`` would break them."""
         while self.pixel_items and any(on_gpu > self.most_items(kernel) for kernel in kernels):
             on_gpu //= 2

@@ -20,7 +20,7 @@ _TILE = 16  # a CPU's work-item transposes a tile of this many rows and columns,
 
 @dataclass(frozen=True)
 class Strides:
-    """Where a volume lies in memory: element (z, y, x) is at ``start`` + z ``slice`` + y ``row`` + x, counted in floats."""
+    """Offset and strides of a volume in memory, in floats: voxel (z, y, x) is at ``start`` + z ``slice`` + y ``row`` + x."""
 
     start: int
     slice: int
@@ -55,13 +55,13 @@ def move(
 
 
 def beside(rt: Runtime, volume: Array, out: DeviceArray | None) -> tuple[DeviceArray, DeviceArray]:
-    """Returns a host's or device's volume on the device, and memory for a result of its shape: ``out``, or new memory."""
+    """Returns a volume on the device, uploaded from a host, and memory for a result of its shape: ``out`` or new memory."""
     there = volume if isinstance(volume, DeviceArray) else rt.upload(volume, np.float32)
     return there, rt.empty(volume.shape) if out is None else out
 
 
 def brought_to(rt: Runtime, like: SameArray, result: DeviceArray) -> SameArray:
-    """Returns a device's result as a NumPy array if ``like`` is one; else unchanged."""
+    """Returns ``result`` as a NumPy array if ``like`` is one, else on the device as it is."""
     return cast(SameArray, result if isinstance(like, DeviceArray) else rt.download(result))
 
 

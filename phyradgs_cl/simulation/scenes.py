@@ -26,10 +26,11 @@ Moves = Callable[[Grid], Deformation]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """An object to scan: a source of frames, the grid to reconstruct, and the truth (nz, ny, nx) on it.
+    """An object to scan: source of its frames, grid to reconstruct on, and true volume ``reference`` (nz, ny, nx) in 1/mm.
 
-    - source_shape: voxels (z, y, x) of a user's volume that is projected. bone: makes the source of its dense part.
-    - deformation: how the object moves. state: returns the truth of a moving object at a time in s.
+    - source_shape: voxels (z, y, x) of the user's volume that frames are projected from. bone: makes the source of frames of
+      the dense part alone.
+    - deformation: how the object moves. state: returns the true volume of a moving object at a time in s.
     - period_s: the period of a phantom whose parts move by themselves.
     - fastest_mm_per_s: a bound on the speed of every part."""
 

@@ -19,9 +19,9 @@ SMOOTHING = 0.8  # standard deviation of the Gaussian that smooths frames before
 _LEAST_VALID = 0.5  # a block with a smaller fraction of valid pixels is masked
 _MOST_VOXELS = 64  # most voxels along the grid's longest side, without the margin
 _MARGIN = 1  # voxels added on each side: with an object as large as the grid, too small a pixel size would fit better
-_OBJECT_SHARE = 0.02  # a column shows the object if its largest line integral is above this fraction of the scan's
+_OBJECT_SHARE = 0.02  # a column shows the object if its largest line integral is above this fraction of the scan's largest
 _LEAST_COLUMNS = 12  # least number of blocks from left to right, if the panel has as many columns
-_NARROW = 3  # on a panel lower than two blocks, blocks are this much smaller: a single row of blocks tells little
+_NARROW = 3  # on a panel lower than two blocks, the blocks' side is divided by this: one row of blocks tells little
 
 
 def coarse(scan: Scan, columns: int) -> Scan:

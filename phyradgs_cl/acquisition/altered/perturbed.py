@@ -62,7 +62,7 @@ class Sway:
         return splines((np.asarray(time_s, np.float64) - self.start_s) / (self.end_s - self.start_s), len(self.coefficients))
 
     def at(self, time_s: np.ndarray) -> np.ndarray:
-        """Returns rotations in rad and shifts in mm, (..., 6), at times (...) in s."""
+        """Returns the object's rotations in rad and shifts in mm, (..., 6), at times (...) in s."""
         return np.asarray(self.basis(time_s) @ self.coefficients)
 
 

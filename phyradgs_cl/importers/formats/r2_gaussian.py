@@ -27,7 +27,7 @@ ROW_0 = "top"
 OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 OPTIONS_WITH_TIMES = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
 _KEYS = ("first_line_start", "first_line_end", "last_line_end")
-_SAME = 1e-3  # readout over exposure may differ by this much between frames; for ratios above 1, by this fraction
+_SAME = 1e-3  # largest difference between frames in readout over exposure, relative for ratios above 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -114,7 +114,7 @@ def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredT
 
 def _white(scan: settings.Settings, frames: np.ndarray, options: ImportOptions) -> float:
     """Returns the counts of air: the option's, else Reference Intensity, else the largest that Depth (bits) allows. Raises
-    InputError for frames (F, v, u) much brighter than that, and for uncorrected frames without the option."""
+    InputError for frames (F, v, u) brighter than Reference Intensity, and for uncorrected ones without the option."""
     remedy = f"say {options.named('flat_value')}"
     if not options.flat_value and scan.word("Flat Field Correction", default="ON").upper() == "OFF":
         raise scan.error("Flat Field Correction", "OFF", "frames that the scanner has corrected", remedy)

@@ -96,7 +96,7 @@ def _tables(path: Path) -> dict[str, Fields]:
 
 
 def in_words_of_file(options: ImportOptions) -> ImportOptions:
-    """Returns options whose messages name the TOML's key of a value, unless the user gave the value as an option."""
+    """Returns options whose error messages name a value by its key in the TOML, unless the user gave it as an option."""
     given = options.given(FIELDS)
     return replace(
         options, named=lambda field: (None if field in given else _KEYS.get(field)) or options.named(field)

@@ -52,7 +52,7 @@ class RayLayout:
         return cls(grid, *Readout(own).shape(shape), whole(grid.shape), subrays, own, is_across)
 
     def of(self, brick: Brick) -> "RayLayout":
-        """Returns the layout for the same frames and another brick of the grid."""
+        """Returns the memory layout for the same frames and another brick of the grid."""
         return replace(self, brick=brick)
 
     @property
@@ -85,7 +85,7 @@ class RayLayout:
         return Strides(GUARD, self.lines * row, row)
 
     def pixel_strides(self, axis: str, *, turned: bool = False) -> tuple[int, int, int, int]:
-        """Returns in floats where padded frames start, and the steps to the next column, row and frame of the detector.
+        """Returns the offset of padded frames, and the strides to the next detector column, row and frame, in floats.
 
         axis: along which the panel is read. turned: the frames are stored transposed, (F, width, lines)."""
         strides = self.turned.frames_strides if turned else self.frames_strides
@@ -242,7 +242,7 @@ def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np
 
 
 def some_cells(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
-    """Returns a table with only the cells of the numbers ``cells``. They must be still cells."""
+    """Returns a table of the time cells with the numbers ``cells`` alone. Each must have a fixed pose."""
     names = ["pose", "time_s", "line_start", "line_stop", "weight"]
     names += [] if table.line_share is None else ["line_share"]
     return replace(table, **{name: getattr(table, name)[cells] for name in names})

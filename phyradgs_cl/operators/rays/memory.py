@@ -169,7 +169,7 @@ class RayMemory:
         return self._columns
 
     def slots(self) -> DeviceArray:
-        """Returns memory for the slots of ``slot_frames`` frames, with undefined values."""
+        """Returns memory for the slots (line integrals of single poses) of ``slot_frames`` frames, with undefined values."""
         if self._slots is None:
             self._slots = self.rt.zeros(self._slots_floats)
         return self._slots

@@ -14,13 +14,13 @@ from phyradgs_cl.operators.rays.layout import RayCells, matrix_table, ray_consta
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pitch_of
 
-_SLOT_INTS, _SHARE_INTS = 8, 4  # integers per slot and per share, as in cl/common/ray_column.h and cl/rays_slots.cl
+_SLOT_INTS, _SHARE_INTS = 8, 4  # integers per slot (cl/common/ray_column.h) and per share (cl/rays_slots.cl)
 _SAME_POSE = 10  # poses, divided by the largest number in any, are the same if they agree to this many decimals
 
 
 @dataclass(frozen=True, eq=False)
 class UprightPoses:
-    """The distinct poses of F frames on the device, and which of them each of the frames' E cells has.
+    """The distinct poses of F frames on the device, and which of them each of the frames' E time cells has.
 
     pose_of (E,): the number of a cell's pose. first, stop (E,): a cell's lines [first, stop). frame_cells (F + 1,): frame
     f has the cells frame_cells[f] to frame_cells[f + 1] − 1."""
@@ -56,7 +56,8 @@ class UprightPoses:
         )
 
     def floats_per_frame(self, detector_shape: tuple[int, int], leans: bool) -> int:
-        """Returns the most floats that the slots of one frame need: line integrals and, if columns lean, slopes."""
+        """Returns the most floats that a frame's slots need: line integrals and, if columns lean, the rays' slopes along
+        z."""
         rows, columns = detector_shape
         widest = int((self.stop - self.first).max())
         each = columns * pitch_of(widest) if self.axis == "rows" else widest * pitch_of(rows)
@@ -65,8 +66,8 @@ class UprightPoses:
     def slots(
         self, rt: Runtime, frames: np.ndarray, detector_shape: tuple[int, int], leans: bool, most_floats: int
     ) -> "Slots":
-        """Returns slots for the frames with these numbers, in the order of their first use. They take at most
-        ``most_floats``, which must be at least ``floats_per_frame`` times the number of frames."""
+        """Returns the slots (buffers, each for the line integrals of one pose) of the frames numbered ``frames`` (n,), in
+        the order of first use. They take at most ``most_floats`` floats, which must be at least n · ``floats_per_frame``."""
         cells = np.concatenate([np.arange(self.frame_cells[f], self.frame_cells[f + 1]) for f in frames])
         of_frame = np.repeat(np.arange(len(frames)), np.diff(self.frame_cells)[frames])
         _, appears, slot = np.unique(self.pose_of[cells], return_index=True, return_inverse=True)
@@ -111,8 +112,8 @@ class UprightPoses:
         return table
 
     def _shares(self, cells: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Returns a row (E, 4) per cell: its slot or frame (``of``), its lines [first, stop), and where its weights begin
-        in ``RayCells``."""
+        """Returns the shares (E, 4), each a cell's part in a frame: number of its slot or frame (``of``), lines [first,
+        stop), and where its weights begin in ``RayCells``."""
         begins = np.concatenate([[0], np.cumsum(self.stop - self.first)])
         return np.stack([of, self.first[cells], self.stop[cells], begins[cells]], -1)
 
@@ -150,7 +151,7 @@ class Slots:
 
     @property
     def strides(self) -> np.ndarray:
-        """Where line integrals start, and the steps to the next column, row and slot: (4,) in floats."""
+        """The offset of the line integrals, and the strides to the next column, row and slot: (4,) in floats."""
         return np.array([GUARD, self.pitch, 1, self.columns * self.pitch], np.int64)
 
     @property
@@ -162,8 +163,8 @@ def merge_slots(
     rt: Runtime, cells: RayCells, slots: Slots, integrals: DeviceArray,
     target: tuple[DeviceArray, np.ndarray], detector_shape: tuple[int, int], axis: str,
 ) -> None:
-    """Averages the line integrals in slots to frames. target: the frames and, in floats, where they start and the steps to
-    their next column, row and frame."""
+    """Averages the line integrals in slots to frames. target: the frames, their offset, and their strides to the next
+    column, row and frame, in floats."""
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "merge_slots", **{**slots.defines, "LEAN": 0}),
@@ -180,8 +181,8 @@ def split_slots(
     """Transpose of ``merge_slots``: writes weight × pixel to each slot, times the ray's length in mm from one plane of
     voxels to the next.
 
-    turned: frames stored transposed, (F, columns, rows), from float ``start`` on. values: receives a float per pixel of
-    each slot."""
+    turned: frames stored transposed, (F, columns, rows), from float ``start`` on. values: receives a float per pixel of each
+    slot, then, if columns lean, the rays' slopes along z."""
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "split_slots", **slots.defines), (slots.columns, slots.count),

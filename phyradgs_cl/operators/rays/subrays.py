@@ -42,7 +42,7 @@ def subrays_of(grid: Grid, tables: Sequence[TimeCells], *, is_dense: bool = Fals
 
 
 def _depth(grid: Grid, pose: np.ndarray, *, is_nearest: bool) -> np.ndarray:
-    """Returns the depth (F,) of the grid's middle seen from the source, over the panel's depth; 0 if behind the source.
+    """Returns the depth (F,) of the grid's middle from the source, as a fraction of the panel's; 0 if behind the source.
 
     is_nearest: takes the nearest point of the ellipsoid that the grid's box contains, in place of the middle."""
     normal = np.cross(pose[:, 6:9], pose[:, 9:12])
@@ -53,15 +53,15 @@ def _depth(grid: Grid, pose: np.ndarray, *, is_nearest: bool) -> np.ndarray:
 
 
 def means(fine: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
-    """Returns the means B y, frames (F, rows, columns), of frames y (F, rows · along_v, columns · along_u) of the finer
-    panel."""
+    """Returns frames (F, rows, columns) whose pixels are the means of their sub-rays: B y, for frames y (F, rows · along_v,
+    columns · along_u) of the finer panel."""
     along_v, along_u = subrays
     return block_means(fine, (1, along_v, along_u))
 
 
 def spread(frames: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
-    """Returns the transpose Bᵀ y, frames (F, rows · along_v, columns · along_u) of the finer panel, of frames y (F, rows,
-    columns)."""
+    """Returns the transpose of ``means``, Bᵀ y, which gives every sub-ray an equal part of its pixel: frames (F, rows ·
+    along_v, columns · along_u) of the finer panel, for frames y (F, rows, columns)."""
     along_v, along_u = subrays
     shares = frames / np.float32(along_v * along_u)
     return np.asarray(shares.repeat(along_v, 1).repeat(along_u, 2))
@@ -70,7 +70,8 @@ def spread(frames: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
 def launch_means(
     rt: Runtime, fine: DeviceArray, strides: Sequence[int], subrays: tuple[int, int], frames: DeviceArray, part: slice
 ) -> None:
-    """Writes B y for padded frames ``fine`` to the frames ``part`` of ``frames`` (F, rows, columns), not padded."""
+    """Writes the means over sub-rays, B y, of padded frames ``fine`` to the frames ``part`` of ``frames`` (F, rows,
+    columns)."""
     _, rows, columns = frames.shape
     rt.launch(
         rt.kernel("subrays", "subray_means"), (columns, rows, part.stop - part.start), fine, np.array(strides, np.int64),
@@ -82,7 +83,8 @@ def launch_means(
 def launch_spread(
     rt: Runtime, frames: DeviceArray, part: slice, subrays: tuple[int, int], fine: DeviceArray, strides: Sequence[int]
 ) -> None:
-    """Writes Bᵀ y for the frames ``part`` of ``frames`` (F, rows, columns), not padded, to the padded frames ``fine``."""
+    """Writes Bᵀ y, each sub-ray's part of its pixel, of the frames ``part`` of ``frames`` (F, rows, columns) to padded
+    ``fine``."""
     _, rows, columns = frames.shape
     rt.launch(
         rt.kernel("subrays", "spread_subrays"), (columns, rows, part.stop - part.start), frames, np.int32(part.start),

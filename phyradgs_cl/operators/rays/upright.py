@@ -22,7 +22,7 @@ _LINES = 128  # most pixels of a detector column per work-item
 # Least number of lines that a pose must serve on average: with fewer, slots cost more time than they save.
 FEWEST_LINES = 8
 _VOXELS = 512  # most voxels along z that the rays of a work-item may meet in one plane of voxels
-# Boxes of voxels (x, y, z) that a work-item of the adjoint may take: the largest is best, as neighbours share rays.
+# Boxes of voxels (x, y, z) that a work-item of the adjoint may sum: the largest is fastest, as neighbours share rays.
 _OWNED = ((16, 16, 128), (8, 8, 128), (8, 4, 128))
 _ITEMS_PER_UNIT = 4  # wanted work-items per compute unit: with fewer, some units would wait long for the last item
 _UPRIGHT = 1e-6  # a column of pixels does not lean if x and y change by at most this many voxels over the detector
@@ -123,8 +123,7 @@ def launch_upright_adjoint(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, values: DeviceArray,
     target: tuple[DeviceArray, Strides], *, add: bool = False,
 ) -> None:
-    """Backprojects slots, as ``split_slots`` writes them, to ``target``, a volume and its strides. add: adds to the
-    volume."""
+    """Backprojects slots, written by ``split_slots``, to ``target``: a volume and its strides. add: adds to the volume."""
     shape, origin, *_ = layout.constants()
     (x, y, z), items = _owned(layout.brick.shape, rt.device.compute_units)
     rt.launch(
@@ -136,8 +135,8 @@ def launch_upright_adjoint(
 
 
 def _owned(shape: tuple[int, int, int], units: int) -> tuple[tuple[int, int, int], tuple[int, ...]]:
-    """Returns the box of voxels (x, y, z) of a work-item, and the number of work-items along x, y, z: the first box that
-    keeps all compute units busy."""
+    """Returns the box of voxels (x, y, z) that each work-item of the adjoint sums, and the number of work-items along x, y,
+    z. Takes the first box of ``_OWNED`` that keeps all compute units (``units``) busy."""
     for owned in _OWNED:
         items = tuple(ceil_div(n, own) for n, own in zip(shape[::-1], owned, strict=True))
         if math.prod(items) >= _ITEMS_PER_UNIT * units:

@@ -10,9 +10,9 @@ _GROUP = 64  # a GPU's work-group counts the tiles of this many splats
 _LARGEST_GROUP = 256  # most splats per work-group on a GPU, taken where _GROUP would give more than _MANY_COUNTS
 _MANY_COUNTS = 1 << 22  # above this many counts, tiles × work-groups, counting takes much memory and time
 _SCANNED = 64  # number of counts that a work-group adds at a time in its prefix sum
-_SLACK = 1.5  # lists are allocated this many times larger than needed, because clouds grow
-_NEAR = 1.25  # lists less than this many times larger than needed are replaced by larger ones before they overflow
-# If lists overflow, every splat is tested at every pixel. A second on a fast GPU is the most that this may take.
+_SLACK = 1.5  # new lists get memory for this many times the entries needed, because clouds grow
+_NEAR = 1.25  # lists with memory for less than this many times the entries needed are replaced before they overflow
+# Most tests of a splat at a pixel in a launch whose lists overflow, which tests every splat: a second on a fast GPU.
 _MOST_CHECKS = 2**38
 _MOST_ENTRIES = 2**31 - 1  # most entries of all lists together: kernels use 32-bit indices
 
@@ -89,8 +89,8 @@ class TileLists:
         return 4 * (tiles + 1 + tiles * max(ceil_div(count, chunk_of(rt, tiles, count)), 1))
 
     def _make_room(self, needed: int, share: float) -> None:
-        """Allocates memory for more than ``needed`` list entries, unless ``share`` times as many fit already. Raises
-        MemoryShortage for more entries than 32-bit indices can count."""
+        """Allocates memory for more than ``needed`` list entries, unless there is room for ``share`` · ``needed`` already.
+        Raises MemoryShortage for more entries than 32-bit indices can count."""
         if needed >= _MOST_ENTRIES:
             found, expected = f"{needed} entries or more", f"fewer than {_MOST_ENTRIES}"
             remedy = "use fewer or smaller Gaussians"
@@ -101,7 +101,7 @@ class TileLists:
 
 
 def chunk_of(rt: Runtime, tiles: int, count: int) -> int:
-    """Returns the splats of a CPU's work-item, or of a GPU's work-group, in which each work-item takes one splat."""
+    """Returns how many splats a CPU's work-item counts, or a GPU's work-group, whose work-items take one splat each."""
     if not rt.pixel_items:
         return _CHUNK
     kernels = (rt.kernel("binning", f"bin_{step}_group") for step in ("count", "fill"))

@@ -61,7 +61,7 @@ class PlainRows:
         return SplatPoint(DeviceGaussians(inside, count, stride), norms)
 
     def leave(self, gradients: DeviceArray, point: SplatPoint, rows: DeviceArray, *, add: bool = False) -> None:
-        """Converts gradients by the kernels' rows, (13, stride), to gradients by parameter rows in mm, (11, G), in ``rows``.
+        """Converts dL/d(kernels' rows), (13, stride), to dL/d(parameter rows in mm), (11, G), and writes them to ``rows``.
         add: adds to ``rows``, else overwrites it."""
         rt, cloud = self.rt, point.gaussians
         rt.launch(
@@ -209,8 +209,7 @@ class SplatProjection(GaussianOperator):
     def _differentiate(
         self, point: SplatPoint, cells: DeviceCells, by_image: DeviceArray, gradients: DeviceArray
     ) -> None:
-        """Writes one frame's part of dL/d(kernels' rows), (13, stride), from ``by_image``: dL/d(frame) in the padded
-        layout."""
+        """Writes one frame's part of dL/d(kernels' rows), (13, stride), from ``by_image``, its padded dL/d(frame)."""
         is_ready = self._ready == [point, cells]
         self._ready.clear()
         if not is_ready:

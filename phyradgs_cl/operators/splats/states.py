@@ -17,7 +17,7 @@ STATE_ROWS = 12  # numbers of a Gaussian in a state: its centre x, y, z, and the
 _PROBED_SIDE = 9  # number of points along each axis of the grid at which the inverse of a field is checked
 _PROBED_STATES = 16  # number of evenly spaced times at which the inverse is checked, besides those of largest displacement
 _WRONG = 0.01  # largest accepted error of an inverse, in voxels
-_BEND = 0.25  # largest deviation of a point's path in a segment from a straight line, in voxels; the blur is 0.3 of it
+_BEND = 0.25  # largest deviation of a point's path in a segment from a straight line, in voxels; the blur is 0.3 times this
 _MOST_SEGMENTS = 32  # most segments of a frame, even if paths then deviate more
 
 
@@ -55,8 +55,8 @@ class CloudStates:
         return self._by_states
 
     def back(self, gaussians: DeviceGaussians, cells: DeviceCells, gradients: DeviceArray) -> None:
-        """Replaces dL/d(mean) in ``gradients`` (13, stride) by the gradient for the means in the reference. Reads
-        dL/d(states) from the memory of ``zeros``. The last ``forward`` must be for the same Gaussians and cells."""
+        """Replaces dL/d(mean) in ``gradients`` (13, stride) by dL/d(mean in the reference). Reads dL/d(states) from the
+        memory of ``zeros``. The last ``forward`` must be for the same Gaussians and cells."""
         rt, count = self.rt, cells.shares.shape[0]
         kernel, field = self._kernel("splat_states_back"), (*self._field, cells.shares, np.int32(count))
         rt.launch(

@@ -186,7 +186,7 @@ def _seen(
     frame: np.ndarray, u: np.ndarray, ahead: np.ndarray, depth: np.ndarray, power: int, speed_power: int
 ) -> float:
     """Returns the contribution of a frame to one voxel. For the pose of each line: u (lines,) is the voxel's pixel along the
-    line, ahead (lines,) how many lines further it is, depth (lines,) its depth."""
+    line, ahead (lines,) its line minus the pose's line, depth (lines,) its depth."""
     crossing = np.flatnonzero((ahead[:-1] >= 0) & (ahead[1:] <= 0))
     if crossing.size == 0 or depth.min() <= 0:
         return 0.0

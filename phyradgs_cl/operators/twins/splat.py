@@ -127,7 +127,7 @@ def voxel_field(
 
 
 _PANELS = 6  # number of intervals of the numerical integral over time
-_NODES = 12  # number of Gauss–Legendre nodes in each
+_NODES = 12  # number of Gauss–Legendre nodes in each interval
 
 
 @dataclass(frozen=True)

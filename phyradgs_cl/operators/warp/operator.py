@@ -34,7 +34,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 _FRAMES_PER_STATE = 12
 _REACH = 2  # a cubic spline's coefficient acts up to this far, in voxels, as in cl/warp.cl
 _BORDER = 4  # width in voxels around the volume in which coefficients are kept, as in cl/warp.cl
-_SETTLES = 8  # width in voxels of further zeros around, over which coefficients decay to 3e-5
+_SETTLES = 8  # width in voxels of the zero padding around that border, over which coefficients decay to 3e-5
 
 
 class WarpedOperator:
@@ -124,8 +124,7 @@ class WarpedOperator:
 
     @property
     def holds(self) -> tuple[int, int]:
-        """How many volumes, and how many stacks of frames, are on the device besides ``memory`` and the displacement
-        fields."""
+        """The numbers of volumes and of stacks of frames on the device, besides ``memory`` and the displacement fields."""
         return self.warp.volumes, 1
 
 
@@ -137,7 +136,7 @@ class _Part:
         self.places = rt.upload(frames, np.int32)
 
     def subset(self, rt: Runtime, chosen: np.ndarray) -> "_Part | None":
-        """Returns the same for the frames with the numbers ``chosen``, or None if none of them needs this state."""
+        """Returns this state's part of the frames with the numbers ``chosen``, or None if none of them needs the state."""
         position = np.full(max(int(chosen.max()), int(self.frames.max())) + 1, -1)
         position[self.frames] = np.arange(len(self.frames))
         own = position[chosen]
@@ -240,8 +239,8 @@ class FieldDerivative:
 
 
 def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Returns the slopes ∇v(y + w(y)), (nz, ny, nx, 3) float32 per voxel, x, y, z, at voxel centres y. v is the cubic spline
-    through a volume (nz, ny, nx), and 0 outside. displacement: w (nz, ny, nx, 3) in voxels, x, y, z."""
+    """Returns the gradients ∇v(y + w(y)), (nz, ny, nx, 3) float32 per voxel, x, y, z, at voxel centres y. v is the cubic
+    spline through a volume (nz, ny, nx), and 0 outside. displacement: w (nz, ny, nx, 3) in voxels, x, y, z."""
     wide = scipy.ndimage.spline_filter(np.pad(volume, _BORDER + _SETTLES), output=np.float32)
     padded = np.ascontiguousarray(wide[(slice(_SETTLES, -_SETTLES),) * 3])
     strides = (padded.shape[1] * padded.shape[2], padded.shape[2], 1)

@@ -11,13 +11,13 @@ from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
 
 _BORDER = 4  # width in voxels around the volume in which coefficients are kept, as in cl/warp.cl: further ones are < 3e-3
-_MOST_OWNED = 8  # most slices for which a CPU's work-item sums; voxels near their ends are computed by two work-items
+_MOST_OWNED = 8  # most slices that a CPU's work-item sums; two work-items compute the voxels near the ends of such a block
 _ITEMS_PER_UNIT = 4  # wanted work-items per compute unit, so that none waits long for the last
-_HEADROOM = 64  # a voxel may receive weights with this sum, which a field that contracts by 4 along each axis causes
+_HEADROOM = 64  # largest sum of weights that a voxel may receive: 4³, where a field contracts by 4 along each axis
 _TOGETHER = 8, 8, 4  # box of voxels (x, y, z) of a GPU's work-group, which adds in local memory
-_SAMPLES = 16  # reading the 4³ coefficients of a voxel takes this many times longer than a ray's sample
-_ADDED = 64  # adding to the 4³ coefficients of a voxel takes this many times longer than a ray's sample
-_ROUNDING = 1e-3  # width in voxels by which the range of displacements along z is widened: more than they are rounded
+_SAMPLES = 16  # time to read the 4³ coefficients of a voxel, over the time of a ray's sample
+_ADDED = 64  # time to add to the 4³ coefficients of a voxel, over the time of a ray's sample
+_ROUNDING = 1e-3  # bounds of displacements along z are widened by this many voxels, to allow for rounding in float32
 
 
 class VolumeWarp:
@@ -241,8 +241,7 @@ class FrameStack:
         return taken
 
     def add(self, places: DeviceArray, frames: DeviceArray) -> None:
-        """Adds the frames in the memory that ``of`` or ``take`` returned last to frames number ``places`` (n,) of
-        ``frames``."""
+        """Adds the frames that ``of`` or ``take`` returned last to those of ``frames`` with the numbers ``places`` (n,)."""
         assert self._memory is not None
         count, pixels = self._shape[0], int(np.prod(self._shape[1:]))
         group = self.rt.group(on_cpu=min(pixels, 64))

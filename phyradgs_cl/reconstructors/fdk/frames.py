@@ -36,7 +36,7 @@ _SHARE = 0.5  # "cosine" and "cylinder" extend rows at each side by this fractio
 _SLOPE_PIXELS = 5  # the slope at a row's end is taken over this many pixels, to lower its noise
 _NOISE = 0.01  # below this fraction of the line integrals' 99.9th percentile, the end of a row is air
 _UNEVEN = 0.02  # steps between views may differ by this fraction from the median step and still count as even
-_REACH = 8  # the first and last view of an arc are repeated over this many arcs of an exposure, so that no edge is filtered
+_REACH = 8  # padding at both ends of an arc, in arcs of an exposure: the end views are repeated, so that no edge is filtered
 _FULL_TURN = 1.5  # if a gap between views is wider than this many median steps, they cover less than a full turn
 
 

@@ -134,7 +134,7 @@ def _steps(ahead: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _filled_rad(ahead: np.ndarray) -> float:
-    """Returns by how much in rad gaps (K,) are wider than the median step, summed over gaps much wider than that."""
+    """Returns Σ (gap − median) in rad over the gaps (K,) above both ``SHORT_SCAN_GAP`` medians and ``_NAMED_RAD``."""
     usual = np.median(ahead) if ahead.size else 0.0
     return float((ahead - usual)[ahead > max(SHORT_SCAN_GAP * usual, _NAMED_RAD)].sum())
 

@@ -82,8 +82,8 @@ class Fan:
 
     @property
     def is_put_aside(self) -> bool:
-        """Whether the detector was displaced on purpose: one side is much shorter. Less may be a misaligned panel that still
-        sees the whole object."""
+        """Whether the detector was displaced on purpose: its sides differ by over 10 % of the fan. Less may be a misaligned
+        panel that still sees the whole object."""
         return abs(self.low_rad + self.high_rad) > _ASIDE * (self.high_rad - self.low_rad)
 
     @property

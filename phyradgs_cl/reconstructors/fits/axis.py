@@ -17,7 +17,7 @@ from phyradgs_cl.runtime import Runtime
 
 _ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # shifts of the panel that are tried first, in coarse pixels
 _ROUGH_ITERATIONS = 8  # few iterations are enough to tell coarse shifts of the panel apart
-_STEP = 0.25  # distance of three shifts that bracket the best one, in coarse pixels
+_STEP = 0.25  # distance between the three shifts that bracket the best one, in coarse pixels
 _MOST_STEPS = 8  # most moves of the three shifts that bracket the best one, so that a search that leads away ends
 ANYWHERE = (-math.inf, math.inf)  # no limits of the shift, in pixels
 _MOST_VIEWS = 60  # most views that are compared with their opposites, to save time
@@ -53,8 +53,8 @@ NOT_FOUND = AxisShift(math.nan, math.nan, np.empty(0))
 
 
 def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHERE) -> AxisShift:
-    """Returns the best of five shifts within ``limits_px``, a coarse pixel apart, after few iterations. Its deviation is
-    NaN."""
+    """Returns the one of five shifts, a coarse pixel apart, within ``limits_px``, with the least residual after few
+    iterations. Its deviation is NaN."""
     block = columns_per_block(scan)
     shifts_px = [block * shift for shift in _ROUGH_SHIFTS if limits_px[0] <= block * shift <= limits_px[1]]
     trials = [fit_squares(rt, shifted(scan, shift_px), _ROUGH_ITERATIONS) for shift_px in shifts_px]
@@ -90,7 +90,7 @@ def refined_shift(
 
 
 def axis_shift(rt: Runtime, scan: Scan) -> AxisShift:
-    """Returns the panel's shift under which a coarse scan fits best, within a few coarse pixels of the stated one."""
+    """Returns the panel's shift, within a few coarse pixels of 0, under which a coarse scan has the least residual."""
     return refined_shift(rt, scan, rough_shift(rt, scan))
 
 

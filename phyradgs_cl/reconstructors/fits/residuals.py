@@ -14,7 +14,7 @@ from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-# In a fit, errors of flats change frames by this much relative to the volume. At 1 they would explain motion too.
+# In a fit, errors of flats have this fraction of the volume's effect on frames. At 1 they would explain motion too.
 _FREEDOM = 0.3
 _ITERATIONS = 20  # iterations of CGLS in a fit, unless stated
 _MOST_TIMES = 12  # most times per exposure: each costs a projection
@@ -45,7 +45,7 @@ class FlatErrors:
         return math.prod(self.frames_shape[1:]) + self.frames_shape[0]
 
     def add_to(self, frames: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Returns frames (F, rows, columns) + B b for unknowns b (count,)."""
+        """Returns frames (F, rows, columns) plus the effect B b of unknowns b (count,)."""
         pattern, level = self.parts(values)
         return frames + pattern + level[:, None, None]
 
@@ -62,7 +62,7 @@ class FlatErrors:
 @dataclass(frozen=True, eq=False)
 class ViewParameters:
     """Unknown parameters of views, of K kinds: coefficients b (n, K) of n functions of the view. View f has the values
-    (basis @ b)[f], with ``basis`` (F, n). signals (F, K, rows, columns): how a frame changes per unit of each value."""
+    (basis @ b)[f], with ``basis`` (F, n). signals (F, K, rows, columns): the Jacobian d(frame)/d(values)."""
 
     signals: np.ndarray
     basis: np.ndarray

@@ -24,7 +24,7 @@ from phyradgs_cl.runtime import Runtime
 _CG_STEPS = 8  # iterations of conjugate gradients for one step of the control vectors
 _DAMPING = 1e-3  # Levenberg damping over the mean diagonal of JᵀJ: control vectors that no ray sees stay where they are
 _ROUGHNESS = 1e-2  # β, the penalty on the weights' roughness in time, relative to the mean diagonal of JᵀJ
-_SHORTER = (1.0, 0.5, 0.25)  # fractions of a step, tried in turn until one lowers the misfit
+_SHORTER = (1.0, 0.5, 0.25)  # backtracking line search: fractions of a step, tried in turn until one lowers the misfit
 _LEAST_DETERMINANT = 0.1  # a step may lower det(I + ∂w/∂y) of the displacement w(y) to this: at 0 matter folds
 _LEAST_VOXELS = 1.0  # least voxels that a change of a weight by 1 counts as, so that fields of zeros have several states
 _SUPPORT = 4  # a cubic spline in time extends over this many intervals between knots
@@ -160,8 +160,8 @@ class FieldProblem:
     def _temporal_equations(
         self, one: MotionField, operator: WarpedOperator, volume: np.ndarray, residual: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns JᵀJ (count, R, count, R) and Jᵀ r (count, R) for the coefficients in time and the residual r (F, rows,
-        columns).
+        """Returns the normal equations of the coefficients in time: JᵀJ (count, R, count, R), and Jᵀ r (count, R) with the
+        residual r (F, rows, columns).
 
         Splines that no frame sees together are projected together."""
         count, rank = one.temporal.shape
@@ -218,7 +218,7 @@ def sum_squares(values: np.ndarray) -> float:
 
 
 def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], right: np.ndarray, steps: int) -> np.ndarray:
-    """Solves ``apply``(x) = ``right`` approximately, in ``steps`` steps from 0, or until the residual is 1 % as large."""
+    """Solves ``apply``(x) = ``right`` from x = 0 in ``steps`` steps, or fewer if the residual falls to 1 % of ``right``."""
     solution, residual = np.zeros_like(right), right.copy()
     direction, squares = residual.copy(), sum_squares(residual)
     least = 1e-4 * squares

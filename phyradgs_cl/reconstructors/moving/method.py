@@ -152,8 +152,8 @@ class FieldSearch:
 
     def finding(self) -> tuple[Deformation, float]:
         """Returns the field, and its gain: the fraction by which it lowers the squared residual, compared with an object at
-        rest after as many passes. The field is zeros if the gain is at most ``LEAST_GAIN``, or what as many free numbers
-        would explain of noise alone."""
+        rest after as many passes. The field is zeros if the gain is at most ``LEAST_GAIN``, or twice what as many parameters
+        would explain of noise."""
         if not self.field.control_mm.any():
             return self.field.deformation(), 0.0
         moving = self._reconstructed(self.field, self.volume, _PASSES)
@@ -192,7 +192,7 @@ def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:
 
 
 def _difference(one: MotionField, other: MotionField) -> float:
-    """Returns how much control vectors and weights changed in a round: the root of their summed squared relative changes."""
+    """Returns the relative change of control vectors and weights in a round: the root of the sum of both changes squared."""
     pairs = [(one.control_mm, other.control_mm), (one.temporal, other.temporal)]
     parts: list[Any] = [
         sum_squares(new - old) / sum_squares(new) for new, old in pairs if new.shape == old.shape and new.any()

@@ -26,7 +26,7 @@ _PERIODIC_SHARE = 0.5
 _FEWEST_FRAMES = 16  # a scan of fewer frames shows no period
 _FEWEST = 4  # a file must have at least this many values to be a signal
 _KNOTS_PER_PERIOD = 6  # weights that follow a signal have this many knots per period
-_SLOWER = 0.95  # a stated signal that does not repeat gets knots for the slow rates that hold this fraction of its power
+_SLOWER = 0.95  # a stated signal that does not repeat gets knots for its low frequencies, up to this share of its power
 _MOST_EVEN = 100_000  # a signal is interpolated to at most this many even steps
 _FORMS = f"at least {_FEWEST} lines: time in s, value; or one value for each frame"
 

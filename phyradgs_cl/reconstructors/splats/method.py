@@ -58,7 +58,7 @@ class SplatRun:
         self.cloud = DeviceCloud(rt, population)
 
     def step(self) -> None:
-        """Does one batch of frames: computes the gradient, steps, and controls density if it is due."""
+        """Takes a step of Adam down the gradient of one batch of frames, then controls density if it is due."""
         options, before = self.options, self.iteration
         self.frame_step.follow(self.motion_at(before))
         batch = self.next_batch()

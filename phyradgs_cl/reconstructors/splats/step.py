@@ -177,7 +177,7 @@ class FrameStep:
         self.adam = DeviceAdam(rt, options.activation(grid))
 
     def follow(self, motion: Motion) -> None:
-        """Takes another motion model from the next step on."""
+        """Renders frames with another motion model from the next step on."""
         if motion != self.motion:
             self.motion = motion
             self.frames.follow(motion)

@@ -17,11 +17,11 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 @dataclass(frozen=True)
 class AsdPocsOptions(SartOptions):
-    """Options of ASD-POCS. tv_steps: TV steps per iteration. tv_share: α, length of a TV step over the change by the first
-    SART pass.
+    """Options of ASD-POCS. tv_steps: TV steps per iteration. tv_share: α, a TV step's length over the first SART pass's
+    change.
 
-    tv_reduction: factor on that length when TV moves the volume by more than ``tv_ratio`` (r_max) times the SART pass's
-    change and the residual is above ε. residual_share: ε, the residual to aim at, over that of the FDK volume."""
+    tv_reduction: factor on a TV step's length when TV moves the volume by more than ``tv_ratio`` (r_max) times the SART
+    pass's change and the residual is above ε. residual_share: ε, the residual to aim at, over that of the FDK volume."""
 
     iterations: int = 10
     relaxation_reduction: float = 0.9999

@@ -6,7 +6,7 @@ a third fewer steps (Taylor, Hendrickx and Glineur, SIAM J. Optim. 27 (2017) 128
 178 (2018) 240), but leaves more of the noise of subsets. FISTA takes that out in the last passes.
 
 The gradient of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans.
-Med. Imaging 34 (2015) 167). L bounds the norm of AᵀA.
+Med. Imaging 34 (2015) 167). L is a Lipschitz constant of the gradient: it bounds the norm of AᵀA.
 
 On small grids the last 7 of 12 iterations run on smaller voxels, whose means make up most of the result (``stages.py``). The
 iterations before them only provide their first volume, so they are coarser: two quick passes each, with more subsets, and
@@ -112,7 +112,7 @@ class Accelerated(Algorithm):
         self.prior = prior
         self.previous = self.volume
         self.momentum = 1.0  # tₖ of Beck and Teboulle, 1 for the first step
-        self.curvature = (_tight_curvature if has_long_steps else _curvature)(system) or 1.0  # L, which bounds ‖AᵀA‖
+        self.curvature = (_tight_curvature if has_long_steps else _curvature)(system) or 1.0  # L, a Lipschitz constant
 
     def start_from(self, volume: Any) -> None:
         self.volume = self.previous = volume
@@ -124,7 +124,7 @@ class Accelerated(Algorithm):
 
     @property
     def extrapolation(self) -> float:
-        """The factor of Beck and Teboulle's Eq. 4.3: the next step starts this fraction of the last change further on."""
+        """The momentum factor βₖ₊₁ of Beck and Teboulle's Eq. 4.3: the next step starts at xₖ + βₖ₊₁ (xₖ − xₖ₋₁)."""
         return (self.momentum - 1) / self.next_momentum
 
     def accept(self, point: Any, volume: Any) -> None:
@@ -147,13 +147,13 @@ def _row_sums(system: System) -> Any:
 
 
 def _curvature(system: System) -> float:
-    """Returns the largest row sum of AᵀA in mm², which bounds its norm because no entry is negative."""
+    """Returns a Lipschitz constant in mm²: the largest row sum of AᵀA bounds its norm, as no entry is negative."""
     return system.space.largest(_row_sums(system))
 
 
 def _tight_curvature(system: System) -> float:
-    """Returns a bound in mm² of the norm of AᵀA, at the cost of one more pass: the largest (AᵀA x)/x of an x > 0 (Collatz
-    and Wielandt). With row sums as x the bound is a sixth smaller than the largest row sum."""
+    """Returns a smaller Lipschitz constant in mm² for one more pass: the norm of AᵀA is at most the largest (AᵀA x)/x of an
+    x > 0 (Collatz and Wielandt). With row sums as x the bound is a sixth smaller than the largest row sum."""
     sums, space = _row_sums(system), system.space
     again = system.adjoint(system.apply_weights(system.forward(sums)))
     bound = space.largest(space.multiply(again, space.reciprocal(sums, _FAINTEST)))
@@ -278,7 +278,7 @@ def fista_stage(
     optimised: int = 0,
 ) -> Iterations:  # fmt: skip
     """Returns ``iterations`` from ``volume`` (nz, ny, nx; None: the method's own start), with every voxel divided into
-    ``parts`` along each side. is_coarse: they only provide the first volume of a stage. optimised: first ones by POGM."""
+    ``parts`` along each side. is_coarse: they only provide the first volume of a stage. optimised: how many POGM makes."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
     options, rt = replace(whole.options, iterations=iterations), whole.rt

@@ -101,7 +101,7 @@ class PriorWeight:
         self.noise_mm, self.common_mm = adjoint_response(system)
 
     def at(self, volume: Any) -> float:
-        """Returns the weight at a volume (nz, ny, nx) in 1/mm, in the gradient's unit, mm."""
+        """Returns the prior's weight at a volume (nz, ny, nx) in 1/mm, in the unit of the data term's gradient, mm."""
         by_noise = self.error.noise * self.noise_mm
         by_edges = self.error.edges_mm * _density(self.space, volume) * self.common_mm
         return max(self.strength * math.hypot(by_noise, by_edges), self.least)
@@ -154,7 +154,7 @@ class PriorInputs:
 
 
 class Prior:
-    """Maps x to argmin over x' of ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or to an approximation of it.
+    """A proximal map, from x to argmin over x' of ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or an approximation of one.
 
     A subclass that starts from its last result keeps that in ``state``. This class is the prior ``none``: only x ≥ 0."""
 
@@ -173,7 +173,7 @@ class Prior:
         return {}
 
     def restore(self, state: State) -> None:
-        """Continues from what ``state`` returned."""
+        """Continues from the arrays that ``state`` returned."""
 
 
 class TvPrior(Prior):

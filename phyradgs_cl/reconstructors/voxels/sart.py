@@ -22,8 +22,7 @@ _WEIGHT_CACHE_BYTES = 1 << 29  # column weights of subsets are kept up to this s
 
 @dataclass(frozen=True)
 class SartOptions(IterativeOptions):
-    """Options of SART. relaxation: λ, which fraction of each correction is applied. relaxation_reduction: factor on it per
-    iteration.
+    """Options of SART. relaxation: λ, the factor on each correction. relaxation_reduction: the factor on λ per iteration.
 
     frames_per_subset: frames that are corrected for together, 1 for SART; they lie far apart in time. noise_stop: the run
     ends when the residual falls to this many times the estimated noise of the measurement (discrepancy principle, Morozov
@@ -73,7 +72,7 @@ class Sart(Algorithm):
             self.volume = space.add_product(self.volume, columns, update, self.relaxation, nonnegative=clip)
 
     def _columns(self, index: int) -> Any:
-        """Returns the column weights (nz, ny, nx) of a subset; computes them again if the cache has no room for them."""
+        """Returns a subset's column weights 1/(Aᵢᵀ 1), (nz, ny, nx); computes them again if they are not in the cache."""
         is_cached = index < len(self._column_weights)
         return self._column_weights[index] if is_cached else column_weights(self.subsets[index])
 
@@ -97,7 +96,7 @@ METHOD, OS_METHOD = _method("sart", SartOptions()), _method("os-sart", OS_SART)
 
 @dataclass(frozen=True)
 class SirtOptions(IterativeOptions):
-    """Options of SIRT. relaxation: λ, which fraction of each correction is applied, up to 2."""
+    """Options of SIRT. relaxation: λ, the factor on each correction, up to 2."""
 
     iterations: int = 100
     relaxation: float = ranged(1.0, 1e-6, 2)

@@ -21,8 +21,8 @@ _STAGE, _VOLUME = "stage", "volume_before"  # arrays in a state: the stage's num
 @dataclass(frozen=True)
 class Stage:
     """One stage of a run. make: returns the stage's method, which starts from a volume (nz, ny, nx), or from its own start
-    for None. merge: combines the volumes (nz, ny, nx) of this stage and the one before to the run's. end: called with the
-    finished method."""
+    for None. merge: combines this stage's volume (nz, ny, nx) and that of the stage before to the run's volume. end: called
+    with the finished method."""
 
     name: str
     iterations: int

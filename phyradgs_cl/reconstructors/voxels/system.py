@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 _SHORTEST_PATH = 0.1  # shorter paths of rays count as this fraction of the longest: a division by less amplifies noise
 _FAINTEST = 1e-6  # voxels that rays hardly meet count as if they had this fraction of the largest sum of path lengths
-_GROWTH = 1.2  # steps of subsets diverge if a pass leaves this many times the least residual so far
+_GROWTH = 1.2  # steps of subsets diverge if a pass's residual, over the least one so far, exceeds this
 S = TypeVar("S", bound="SharedOperator")
 
 
@@ -147,8 +147,8 @@ class System:
         return self.operator.forward if self.intensity is None else self.intensity.expected
 
     def derivative(self, change: Any) -> Any:
-        """Returns how ``expected`` changes with a change d of the volume last compared: A d or, in the intensity model, J
-        d."""
+        """Returns the change of ``expected`` for a change d of the volume last compared, by the Jacobian: A d or, in the
+        intensity model, J d."""
         operator = self.operator if self.intensity is None else self.intensity
         return self.masked(operator.forward(change, self.space.place(self.operator.frames_shape)))
 
