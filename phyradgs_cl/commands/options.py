@@ -94,7 +94,7 @@ RUN_OPTIONS: dict[str, Any] = {
     "method": _asked(str, _METHOD, DEFAULT_METHOD, metavar=f"{'|'.join(METHODS)}|MODULE:NAME"),
     "motion": _asked(Literal[tuple(model.name for model in _MODELS)], _MOTION, "per-row"),
     **OF_MOTION,
-    "iterations": _asked(int, "Iterations: of voxels all frames each, of splats one frame (then 3000).", "24"),
+    "iterations": _asked(int, "Iterations: of voxels all frames each, of splats one frame (then 3000).", "26"),
     "prior": _asked(str, _PRIOR, "ridge", metavar="NAME|MODULE:NAME"),
     "gaussians": _asked(int, "Gaussians at the start, for splats.", "from the grid"),
     **{name: kind for name, (kind, _) in OF_FRAMES.items()},

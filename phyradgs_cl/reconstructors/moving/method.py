@@ -55,7 +55,7 @@ _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4
 _COARSE_SHARE = 0.6  # fraction of the rounds that have coarse control points
 _FREE_KNOTS = 6  # if weights follow no signal, their splines have this many intervals in time
 _AT_REST = "no motion found"
-# One in five iterations is a round of the search: by default 7 rounds, and then 24 as in fista.
+# One in five iterations is a round of the search: by default 7 rounds, and then 26 as in fista.
 _ITERATIONS_PER_ROUND = 5
 _STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")
 
@@ -212,7 +212,7 @@ class MovingOptions(FistaOptions):
     TRIALS: ClassVar[tuple[int, int]] = (1, 7)
     """Iterations of the two short runs that ``estimate`` times: one round alone, and two rounds with five passes."""
 
-    iterations: int = 31
+    iterations: int = 33
     bending: float = checks.ranged(0.01, 0, 1e6)
     gating: str = "auto"
 

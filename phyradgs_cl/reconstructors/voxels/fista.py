@@ -8,7 +8,7 @@ a third fewer steps (Taylor, Hendrickx and Glineur, SIAM J. Optim. 27 (2017) 128
 The gradient of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans.
 Med. Imaging 34 (2015) 167). L is a Lipschitz constant of the gradient: it bounds the norm of AᵀA.
 
-On small grids the last 7 of 12 iterations run on smaller voxels, whose means make up most of the result (``stages.py``). The
+On small grids the last 7 of 13 iterations run on smaller voxels, whose means make up most of the result (``stages.py``). The
 iterations before them only provide their first volume, so they are coarser: two quick passes each, with more subsets, and
 fewer times in an exposure. They are FISTA's, because POGM diverges with so many subsets.
 
@@ -46,11 +46,11 @@ _FRAMES = 3  # memory of a run in copies of all projections
 _HELD = 9  # volumes that the prior ``dct`` holds on the device
 _COPIES = 2  # the device holds two copies of a volume on the host while a prior maps it
 # Measured: docs/results/settings.md.
-_COARSE_SHARE = 5 / 12  # fraction of the iterations before those on smaller voxels; they are coarse
+_COARSE_SHARE = 6 / 13  # fraction of the iterations before those on smaller voxels; they are coarse
 _COARSE_PASSES = 2  # passes in a coarse iteration: they cost little, and few views or photons need many
 _COARSE_SUBSETS = 1.6  # a coarse pass has this many times ``subsets`` subsets
 _COARSE_TIMES = 1 / 3  # a coarse pass has this fraction of the times per exposure, but two at least
-_MOST_OPTIMISED = 21  # most iterations by POGM: its momentum has no restart, and the noise of subsets grows with it
+_MOST_OPTIMISED = 23  # most iterations by POGM: its momentum has no restart, and the noise of subsets grows with it
 _CALM = 3  # last iterations on one grid, which are FISTA's: they take out the noise of subsets that POGM leaves
 _FAINTEST = 1e-6  # smaller row sums of AᵀA count as this fraction of the largest: dividing by less would inflate the bound
 # Voxels are divided if a slice (y, x) has at most this many of them: dividing is worth its time at 64³, not at 128³.
@@ -67,7 +67,7 @@ class FistaOptions(IterativeOptions):
     - prior_share: s in the prior piccs, (1 − s) TV(x) + s TV(x − first volume).
     - prior_weight: strength of the prior, relative to the error of the data term's gradient. That error comes from noise of
       the frames and from edges inside large voxels.
-    - subvoxels: parts of a voxel's side in the last 7/12 of the iterations; 0 takes 2 for slices of up to 90² voxels
+    - subvoxels: parts of a voxel's side in the last 7/13 of the iterations; 0 takes 2 for slices of up to 90² voxels
       where memory allows, else 1.
     - subsets: number of subsets of the frames, each with one step; iterations before smaller voxels have 1.6 times as many.
       If their steps diverge, they are joined two by two. tv_iterations: dual iterations per proximal map of TV.
@@ -80,7 +80,7 @@ class FistaOptions(IterativeOptions):
     """Iterations of the two short runs that ``estimate`` times. Of the five between, two are coarse, as in a whole run."""
 
     motion: Motion = PerRow()
-    iterations: int = 24
+    iterations: int = 26
     prior: str | Denoiser = "ridge"
     prior_weight: float = checks.ranged(0.39, 0, 1e6)
     subvoxels: int = checks.ranged(0, 0, 8)
