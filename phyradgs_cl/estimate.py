@@ -48,6 +48,8 @@ class Estimate:
         parts = []
         if self.seconds_per_iteration > 0:
             parts.append(f"{self.iterations} iterations of {1e3 * self.seconds_per_iteration:.3g} ms")
+            start_s = self.seconds - self.around_s - self.iterations * self.seconds_per_iteration
+            parts.append(f"{duration(max(start_s, 0.0))} to build kernels and begin")
         if self.around_s > 0:
             parts.append(f"{duration(self.around_s)} to read, compare and write")
         each = f" ({', '.join(parts)})" if parts else ""
