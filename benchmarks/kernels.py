@@ -37,7 +37,7 @@ _TRIES = 3  # of a work that seems slower
 _LEAST_S = 2e-4  # time of a kernel in one run, below which the measurement is not good
 SIZES = (64, 128)
 JOBS: dict[str, tuple[int, str, dict[str, object]]] = {
-    "default, S": (64, "fista", {"iterations": 7}),
+    "default, S": (64, "fista", {"iterations": 5}),
     "sirt, per-row": (64, "sirt", {"iterations": 10, "motion": "per-row"}),
     "phyradgs, exact": (64, "phyradgs", {"iterations": 60}),
     "default, M": (128, "fista", {"iterations": 2}),
