@@ -86,6 +86,32 @@ def test_subsets_that_pull_apart_are_joined(rt, scan) -> None:
     assert residuals[-1] < residuals[0]
 
 
+def test_pogm_is_as_published_needs_fewer_passes_and_resumes(rt, scan) -> None:
+    """Without a prior, five steps are those of Kim and Fessler (2018), written out with NumPy; w₀ = z₀ = x₀ = 0."""
+    system = System.of_scan(rt, scan, PerRow())
+
+    def method(optimised: int) -> Fista:
+        weight = PriorWeight(system, FrameError(0.01), 0.0)
+        return Fista(system, Prior(), weight, subsets=1, nonnegative=False, optimised=optimised)
+
+    fista, pogm, resumed = method(0), method(12), method(12)
+    x = w = z = np.zeros(scan.grid.shape)
+    theta = gamma = 1.0
+    for _ in range(5):
+        pogm.step()
+        theta_new = (1 + np.sqrt(1 + 4 * theta**2)) / 2
+        w_new = x + system.adjoint(system.measured - system.forward(x.astype(np.float32))).astype(float) / pogm.curvature
+        z_new = w_new + (theta - 1) / theta_new * (w_new - w) + theta / theta_new * (w_new - x)
+        z = z_new + (theta - 1) / (gamma * theta_new) * (z - x)
+        gamma, theta, w, x = (2 * theta + theta_new - 1) / theta_new, theta_new, w_new, z
+    np.testing.assert_allclose(pogm.volume, x, atol=1e-4 * np.abs(x).max())
+    resumed.restore(pogm.state())
+    for one in (pogm, resumed):
+        last = [one.step() for _ in range(7)][-1]
+    np.testing.assert_array_equal(pogm.volume, resumed.volume)
+    assert last < 0.95 * [fista.step() for _ in range(12)][-1]
+
+
 def test_a_prior_image_helps_where_it_is_right_and_costs_little_where_it_is_wrong(rt, scan) -> None:
     """The truth but for a part that has changed since, from a third of the views; then an object that is another."""
     few = Scan(
