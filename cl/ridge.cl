@@ -18,6 +18,8 @@
 #define SECOND_BACK (SECOND + TAPS * CHANNELS * FILTERS)
 #define CURVES (SECOND_BACK + TAPS * CHANNELS * FILTERS)
 
+#define AT_ONCE (LANES == 16 || LANES == 1 ? FILTERS : FILTERS / 2) /* sums that fit in registers beside weights */
+
 #if BLOCK_PIXEL
 #define FOR_X(x, width) const int x = (int)get_global_id(0); if (x < width)
 #else
@@ -68,31 +70,31 @@ __kernel void ridge_responses(
 {
     const int y = (int)get_global_id(1), z = first + (int)get_global_id(2);
     FOR_X(x, shape.x - 4)
-    {
-        vf sums[FILTERS];
-        #pragma unroll
-        for (int i = 0; i < FILTERS; i++)
-            sums[i] = (vf)(0.0f);
-        #pragma unroll
-        for (int c = 0; c < CHANNELS; c++)
-            for (int row = 0; row < 9; row++) {
-                __global const float *line = channels + row_of(shape, pitch, CHANNELS, c, y + row % 3, z + row / 3) + x;
-                for (int k = 0; k < 3; k++) {
-                    __constant const float *weights = table + SECOND + (c * TAPS + row * 3 + k) * FILTERS;
-                    const vf value = V_LOAD(line + k);
-                    #pragma unroll
-                    for (int i = 0; i < FILTERS; i++)
-                        sums[i] += weights[i] * value;
+        for (int from = 0; from < FILTERS; from += AT_ONCE) {
+            vf sums[AT_ONCE];
+            #pragma unroll
+            for (int i = 0; i < AT_ONCE; i++)
+                sums[i] = (vf)(0.0f);
+            #pragma unroll
+            for (int c = 0; c < CHANNELS; c++)
+                for (int row = 0; row < 9; row++) {
+                    __global const float *line = channels + row_of(shape, pitch, CHANNELS, c, y + row % 3, z + row / 3) + x;
+                    for (int k = 0; k < 3; k++) {
+                        __constant const float *weights = table + SECOND + (c * TAPS + row * 3 + k) * FILTERS + from;
+                        const vf value = V_LOAD(line + k);
+                        #pragma unroll
+                        for (int i = 0; i < AT_ONCE; i++)
+                            sums[i] += weights[i] * value;
+                    }
                 }
+            #pragma unroll
+            for (int i = 0; i < AT_ONCE; i++) {
+                __constant const float *curve = table + CURVES + from + i;
+                const vf up = (vf)(sigma * curve[FILTERS]), down = (vf)(sigma * curve[3 * FILTERS]);
+                const vf bent = curve[0] * clamp(sums[i], -up, up) - curve[2 * FILTERS] * clamp(sums[i], -down, down);
+                V_STORE(inside(bent, x, shape.x - 4), responses + row_of(shape, pitch, FILTERS, from + i, y, z) + x);
             }
-        #pragma unroll
-        for (int i = 0; i < FILTERS; i++) {
-            __constant const float *curve = table + CURVES + i;
-            const vf up = (vf)(sigma * curve[FILTERS]), down = (vf)(sigma * curve[3 * FILTERS]);
-            const vf bent = curve[0] * clamp(sums[i], -up, up) - curve[2 * FILTERS] * clamp(sums[i], -down, down);
-            V_STORE(inside(bent, x, shape.x - 4), responses + row_of(shape, pitch, FILTERS, i, y, z) + x);
         }
-    }
 }
 
 /* Applies the transpose of the second filters. Each k has its own sums, so that additions need not wait for each other. */
