@@ -87,10 +87,11 @@ def test_the_measure_of_panels_that_face_the_source_or_are_turned() -> None:
     np.testing.assert_allclose(weights.ray_measure(pose, rays)[0], expected, rtol=FLOAT64)
 
 
-@pytest.mark.parametrize("coverage_deg", [190.0, 210.0, 260.0, 350.0])
+@pytest.mark.parametrize("coverage_deg", [100.0, 170.0, 190.0, 210.0, 260.0, 350.0])
 def test_a_ray_and_its_opposite_in_a_short_scan_count_two(coverage_deg) -> None:
     coverage, rng = np.deg2rad(coverage_deg), np.random.default_rng(3)
-    for fan, progress in zip(rng.uniform(-0.08, 0.08, 200), rng.uniform(0, coverage, 200), strict=True):
+    half_fan = np.deg2rad(20.0) if coverage_deg < 180 else 0.08
+    for fan, progress in zip(rng.uniform(-half_fan, half_fan, 200), rng.uniform(0, coverage, 200), strict=True):
         opposite = (progress + np.pi + 2 * fan) % (2 * np.pi)
         both = weights.short_scan_weight(progress, np.array(fan), coverage)
         if opposite <= coverage:

@@ -141,10 +141,8 @@ def short_scan_weight(progress_rad: float, angle_rad: np.ndarray, coverage_rad: 
     """Returns Parker's weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc of
     ``coverage_rad``.
 
-    Rays without an opposite in the arc count 2: under half a turn, these are all rays."""
-    margin = (coverage_rad - np.pi) / 2
-    if margin <= 0:
-        return np.full(angle_rad.shape, 2.0)
+    The weights of a ray and its opposite add up to 2. A ray without an opposite in the arc counts 2."""
+    margin = (coverage_rad - np.pi) / 2  # below 0 for less than half a turn, in which a wide fan sees some rays twice
     rise = _eased(progress_rad, margin - angle_rad)
     return 2 * rise * _eased(coverage_rad - progress_rad, margin + angle_rad)
 
