@@ -55,7 +55,8 @@ def _rms(values: NDArray[np.floating]) -> float:
 
 def spread_frames(frames: int, count: int) -> list[int]:
     """Returns up to ``count`` frame numbers spread evenly over a scan of ``frames`` frames, from frame 0 on."""
-    return sorted({(k * frames) // count for k in range(min(count, frames))})
+    count = min(count, frames)
+    return [(k * frames) // count for k in range(count)]
 
 
 def frame_pairs(
