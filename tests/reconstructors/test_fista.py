@@ -209,6 +209,25 @@ def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:
     assert seen == [weight.at(algorithm.volume) / algorithm.curvature]
 
 
+@pytest.mark.parametrize(("subsets", "shares"), [(5, [3, 2]), (6, [3, 3]), (1, [1])])
+def test_a_map_of_the_prior_stands_for_several_steps_in_sparing_passes(rt, scan, subsets, shares) -> None:
+    """A pass has the weight of all of its steps, and ends with a map. The next pass has all maps."""
+    seen: list[float] = []
+
+    def noted(volume: np.ndarray, noise: float) -> np.ndarray:
+        seen.append(noise)
+        return volume
+
+    system = System.of_scan(rt, scan, PerRow())
+    weight = PriorWeight(system, FrameError(0.01), 0.42)
+    algorithm = Fista(system, OwnPrior(noted), weight, subsets=subsets, nonnegative=True, sparing=1)
+    least = weight.at(algorithm.volume) / algorithm.curvature
+    algorithm.step()
+    np.testing.assert_allclose(seen, [share * least for share in shares], rtol=1e-6)
+    algorithm.step()
+    np.testing.assert_allclose(seen[len(shares) :], [least] * subsets, rtol=1e-6)
+
+
 @pytest.mark.parametrize("method", [name for name, one in METHODS.items() if one.takes_initial])
 def test_a_first_volume_is_where_the_run_starts(rt, scan, method) -> None:
     """From the truth a few iterations are nearer to it than from nothing, on another grid too; FDK starts from none."""

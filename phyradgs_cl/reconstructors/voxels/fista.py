@@ -50,6 +50,10 @@ _COARSE_SHARE = 6 / 13  # fraction of the iterations before those on smaller vox
 _COARSE_PASSES = 2  # passes in a coarse iteration: they cost little, and few views or photons need many
 _COARSE_SUBSETS = 1.6  # a coarse pass has this many times ``subsets`` subsets
 _COARSE_TIMES = 1 / 3  # a coarse pass has this fraction of the times per exposure, but two at least
+# On smaller voxels a map of the prior takes as long as the rays of a subset. Therefore one map stands for several steps,
+# until the last passes: these have all maps, which takes out the noise of the passes before.
+_STEPS_PER_MAP = 3
+_FULL_PASSES = 5
 _MOST_OPTIMISED = 23  # most iterations by POGM: its momentum has no restart, and the noise of subsets grows with it
 _CALM = 3  # last iterations on one grid, which are FISTA's: they take out the noise of subsets that POGM leaves
 _FAINTEST = 1e-6  # smaller row sums of AᵀA count as this fraction of the largest: dividing by less would inflate the bound
@@ -163,18 +167,20 @@ def _tight_curvature(system: System) -> float:
 class Fista(Accelerated):
     """Passes over subsets by POGM, then by FISTA. A pass's residual combines all subsets, each at the point of its gradient.
 
-    passes: number of passes in an iteration, whose residual is the last one's. optimised: number of passes by POGM.
+    passes: number of passes in an iteration, whose residual is the last one's. optimised: number of passes by POGM. sparing:
+    number of passes in which a map of the prior follows only every third step, with the weight of three, and the last one.
     ``previous`` and ``ahead`` are POGM's wₖ₋₁ and zₖ₋₁, ``momentum`` and ``length`` its θₖ₋₁ and L γₖ₋₁."""
 
     ARRAYS = ("volume", "previous", "ahead")
-    NUMBERS = ("momentum", "length", "optimised")
+    NUMBERS = ("momentum", "length", "optimised", "sparing")
 
     def __init__(
         self, system: System, prior: Prior, weight: PriorWeight, *, subsets: int, nonnegative: bool,
-        has_long_steps: bool = False, optimised: int = 0, passes: int = 1,
+        has_long_steps: bool = False, optimised: int = 0, passes: int = 1, sparing: int = 0,
     ) -> None:  # fmt: skip
         super().__init__(system, prior, has_long_steps=has_long_steps)
         self.nonnegative, self.weight, self.optimised, self.passes = nonnegative, weight, optimised, passes
+        self.sparing = sparing
         self.subsets = OrderedSubsets(system, subsets)
         self._rest()
 
@@ -194,12 +200,19 @@ class Fista(Accelerated):
         weight = self.weight.at(self.volume)
         self.prior.noise_share = self.weight.noise_share(weight)
         update = self._optimised_update if self.optimised else self._update
-        residual = self.system.space.sum_squares(update(subset, weight) for subset in self.subsets) ** 0.5
+        steps = (update(subset, weight, maps) for subset, maps in zip(self.subsets, self._maps(), strict=True))
+        residual = self.system.space.sum_squares(steps) ** 0.5
         # joined subsets have another step length, for which the momentum so far would be wrong
         if self.subsets.join_if_diverging(residual) or self.optimised == 1:
             self._rest()
-        self.optimised = max(self.optimised - 1, 0)
+        self.optimised, self.sparing = max(self.optimised - 1, 0), max(self.sparing - 1, 0)
         return residual
+
+    def _maps(self) -> list[int]:
+        """Returns for each step of a pass how many steps its map of the prior stands for; 0 for a step without a map."""
+        count, spacing = len(self.subsets), _STEPS_PER_MAP if self.sparing else 1
+        maps = [0 if step % spacing else spacing for step in range(1, count)]
+        return [*maps, (count - 1) % spacing + 1]
 
     def _descended(self, point: Any, subset: System) -> tuple[Any, Any]:
         """Returns ``point`` after a gradient step of a subset, and the residual at ``point``."""
@@ -207,16 +220,20 @@ class Fista(Accelerated):
         downhill = subset.back(subset.apply_weights(residual))
         return self.system.space.add(point, downhill, len(self.subsets) / self.curvature), residual
 
-    def _update(self, subset: System, weight: float) -> Any:
+    def _mapped(self, volume: Any, weight: float, maps: int) -> Any:
+        """Applies the prior with the weight of ``maps`` steps; only x ≥ 0 for none."""
+        prior = self.prior if maps else Prior()
+        return prior(self.system.space, volume, maps * weight, nonnegative=self.nonnegative)
+
+    def _update(self, subset: System, weight: float, maps: int) -> Any:
         """Makes FISTA's step: extrapolation, a subset's gradient, prior. Returns the residual at the extrapolated point."""
         space = self.system.space
         point = space.extrapolate(self.volume, self.previous, self.extrapolation)
         descended, residual = self._descended(point, subset)
-        volume = self.prior(space, descended, weight / self.curvature, nonnegative=self.nonnegative)
-        self.accept(point, volume)
+        self.accept(point, self._mapped(descended, weight / self.curvature, maps))
         return residual
 
-    def _optimised_update(self, subset: System, weight: float) -> Any:
+    def _optimised_update(self, subset: System, weight: float, maps: int) -> Any:
         """Makes POGM's step: a subset's gradient, extrapolation, prior. Returns the residual before the step."""
         space, before, after = self.system.space, self.momentum, self.next_momentum
         descended, residual = self._descended(self.volume, subset)
@@ -227,7 +244,7 @@ class Fista(Accelerated):
             point = space.add(point, volume, share)
         self.length = (2 * before + after - 1) / after
         self.previous, self.ahead, self.momentum = descended, point, after
-        self.volume = self.prior(space, point, weight * self.length / self.curvature, nonnegative=self.nonnegative)
+        self.volume = self._mapped(point, weight * self.length / self.curvature, maps)
         return residual
 
     def state(self) -> dict[str, np.ndarray]:
@@ -302,7 +319,7 @@ def fista_stage(
             subsets, passes = round(_COARSE_SUBSETS * subsets), _COARSE_PASSES
         method = Fista(
             system, prior, weight, subsets=subsets, nonnegative=options.nonnegative, has_long_steps=True,
-            optimised=optimised, passes=passes,
+            optimised=optimised, passes=passes, sparing=max(iterations - _FULL_PASSES, 0) if parts > 1 else 0,
         )  # fmt: skip
     return Iterations(method, run)
 
