@@ -3,7 +3,7 @@
     scan = simulate("foot", size=32)
     result = reconstruct(scan, method="phyradgs", iterations=500)
 
-docs/api.md explains everything with runnable examples. ``device`` is what ``--device`` takes, or a Runtime."""
+docs/api.md explains everything with runnable examples. Arguments ``device`` are what ``--device`` takes, or a Runtime."""
 
 from phyradgs_cl.acquisition import (
     Centres,

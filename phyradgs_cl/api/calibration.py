@@ -18,7 +18,7 @@ from phyradgs_cl.fields import Gaussians
 from phyradgs_cl.fields.gaussians import ROWS
 from phyradgs_cl.importers import load_beads
 
-_STEP_PX = 0.25  # central differences move the image's edge by this: less drowns in voxels' errors, more is nonlinear
+_STEP_PX = 0.25  # a difference moves the image's edge so far each way: less is lost in voxels' errors, more is not linear
 
 
 @naming_arguments()
@@ -28,9 +28,10 @@ def calibrate(
 ) -> Calibration:
     """Estimates geometry and timing from the frames (docs/calibrate.md). Values that frames cannot show stay as stated.
 
-    what: names with commas. None means ``offset,roll,tilt``, for a fly-scan also ``readout,exposure``. More names are
-    ``distance``, ``direction``, ``motion`` and ``wobble`` (each view separately).
-    others: more scans of the same object in the same place, with the same panel; they share the errors of ``scan``.
+    what: parameters' names, with commas. None means ``offset,roll,tilt``; of a fly-scan with rolling readout also
+    ``readout,exposure``, and with a ``phantom`` also ``distance``; a parallel beam has neither tilt nor distance. Further
+    names are ``direction``, ``motion`` and ``wobble`` (each view separately).
+    others: more scans of the same object in the same place, with the same panel and the same errors as ``scan``.
     phantom: a TOML file of beads and wires (docs/formats.md) that describes the scanned object, at any place.
     splines: number of splines over time, at least 4, that describe a ``wobble``; 0 estimates every view separately.
     device: what ``--device`` takes, or a Runtime.
@@ -64,7 +65,7 @@ def move_views(scan: Scan, views: np.ndarray, *, without_gauges: bool = False) -
     turned or shifted object explains as well (docs/calibrate.md). If frames overlap in time, ``save_scan`` refuses the
     result, because a file has one pose at a time.
 
-    Raises InputError for anything but a Scan, and for other shapes."""
+    Raises InputError for anything but a Scan, and for ``views`` of another shape or with numbers that are not finite."""
     check_scan(scan)
     checks.numbers("views", views, (scan.frames, 3))
     numbers = np.asarray(views, np.float64)

@@ -76,7 +76,7 @@ def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
 
 
 def _in_new_memory(rt: Runtime, function: Callable[..., Any], values: Values, shape: tuple[int, ...]) -> Values:
-    """Returns a copy of ``function(values)`` on the device, because the engine's next call overwrites its own array."""
+    """Returns ``function(values)``; on the device in a new array, because the next call overwrites the engine's array."""
     return function(values, rt.empty(shape)) if isinstance(values, DeviceArray) else function(values)
 
 

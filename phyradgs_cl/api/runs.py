@@ -82,8 +82,8 @@ def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Recon
     Only an interrupted run has a state.
 
     path: the HDF5 file, or a file of ``phyradgs export`` (docs/export.md), which has only a volume and a grid.
-    mu_water_per_mm: water's attenuation, for an exported file in Hounsfield units that does not state it. Raises
-    InputError, which names the HDF5 path of the wrong value, also for Hounsfield units without a scale."""
+    mu_water_per_mm: water's attenuation, for an exported file in Hounsfield units that does not state it. Raises InputError
+    for a wrong value, which it names by its HDF5 path, for Hounsfield units without a scale, and for a scale of 1/mm."""
     file = _checked_path(path)
     if foreign_volume(file) is not None:
         volume = attenuation_of(str(file), load_voxels(file, mu_water_per_mm))
@@ -129,8 +129,8 @@ def save_volume(
     can be resumed from its file. metrics: what ``compare`` returns, stored too. hu: writes Hounsfield units to another
     format, by the scale of ``Reconstruction.hounsfield``; a volume file keeps 1/mm and stores the scale.
 
-    Raises InputError for anything but a result, a suffix that cannot be written, and ``hu`` without a scale; OutputError
-    if the file cannot be written."""
+    Raises InputError for anything but a result, a suffix that cannot be written, ``hu`` without a scale or for Gaussians,
+    and metrics for another format; OutputError if the file cannot be written."""
     if not isinstance(result, Reconstruction):
         remedy = "for an array, Reconstruction(volume, grid)"
         raise InputError("result", checks.short_repr(result), "a Reconstruction", remedy)
@@ -157,7 +157,7 @@ def simulate(
     detector: int | None = None, detector_offset_mm: tuple[float, float] | None = None,
     truncation: float = 0.0, pixel_samples: int = 0, device: Device = None, **options: Any,
 ) -> Scan:
-    """Simulates a fly-scan of a phantom, or with ``protocol="static"`` a stop-and-shoot scan. ``reference`` is its truth.
+    """Simulates a fly-scan of a phantom, or with ``protocol="static"`` a stop-and-shoot scan; ``reference`` is the truth.
 
     phantom: a name, or the path of a volume file (docs/formats.md), (z, y, x) in 1/mm, or of a .toml of beads and wires.
     scanner: a name, or a TOML file. protocol: "rapid", "standard" or "static".
@@ -217,7 +217,7 @@ def reconstruct(
 
     method: a name of docs/methods.md, "package.module:name", or your own function ``(scan, options, rt, ...)``
     (docs/api.md). options: the method's options by name. ``motion``, ``strips``, ``sub_intervals`` and so on choose the
-    motion model; nested options are dicts (``control={"every": 50}``). preset: the values that options replace.
+    motion model; nested options are dicts (``control={"every": 50}``). preset: the name of the values that options replace.
 
     grid: the voxel grid; None takes the scan's. The options ``size``, ``voxel_mm`` and ``roi_mm`` change parts of it, and
     ``margin_mm`` adds a margin that is reconstructed and discarded (docs/methods.md#the-grid).
@@ -225,8 +225,8 @@ def reconstruct(
     holdout: percentage of the pixels that the method does not see; the result's facts have the error there
     (docs/methods.md#quality-without-a-truth).
 
-    doubt: True also reconstructs two synthesised scans, which give the error bar σ (nz, ny, nx) in 1/mm of every voxel, the
-    result's ``doubt`` (docs/methods.md#error-bars).
+    doubt: True also reconstructs two scans made from this one, which give the error bar σ (nz, ny, nx) in 1/mm of every
+    voxel, the result's ``doubt`` (docs/methods.md#error-bars).
 
     seed: the seed of all random numbers; the same seed on the same device gives the same bits.
 
@@ -305,7 +305,7 @@ def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt:
 
 @contextmanager
 def _reporting(report: ProgressReport | bool) -> Iterator[tuple[ProgressReport, Callable[[str], None]]]:
-    """Yields the function to call with each ``Progress``, and one that ends the line in the terminal with a text."""
+    """Yields two functions: one to call with each ``Progress``, and one that ends the terminal's line with a text."""
     if not isinstance(report, bool):
         yield report, lambda text: None
     elif not (report and has_reader()):

@@ -23,7 +23,7 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.removed import refuse_removed
 
 log = logging.getLogger(__name__)
-# For messages: the arguments of ``fly_scan``, by the names that a Scan's checks have for the same values.
+# For messages: the arguments of ``fly_scan``, by the names under which a Scan's checks know the same values.
 _ARGUMENTS = {
     "angles": "angles_deg", "exposure_s": "exposure_deg", "frame_time_s": "exposure_s", "readout_s": "readout_ratio",
     "readout_axis": "readout",
@@ -148,7 +148,7 @@ def _pixels(
     mask: "ArrayLike | None", quantity: str | None,
 ) -> LineIntegrals:
     """Converts frames of any quantity to line integrals, with the mask of unusable pixels. Raises InputError for shapes that
-    do not fit, an unclear quantity, and a mask of all pixels."""
+    do not fit, flats or darks that contradict the quantity, values that look like counts, and a mask of all pixels."""
     if not isinstance(geometry, GEOMETRIES):
         raise InputError("geometry", checks.short_repr(geometry), "a ConeGeometry or a ParallelGeometry")
     panel = geometry.detector_shape

@@ -34,8 +34,8 @@ def numbers(text: str) -> float | list[float] | str:
 
 
 def option(help: str, default: bool | str = True, *flags: str, **more: Any) -> Any:
-    """Returns a Typer option with its help. default: True shows the default's value in the help, a text is shown instead
-    of it, and False shows none."""
+    """Returns a Typer option with its help. default: what the help shows as the default. True shows its value, a text is
+    shown in its place, and False shows nothing."""
     return typer.Option(*flags, help=help, show_default=default, **more)
 
 
@@ -50,8 +50,8 @@ def file_argument(name: str, help: str) -> Any:
 def pair_of(
     flag: str, form: str, example: str, largest: float = math.inf
 ) -> Callable[[str], tuple[float, float]]:
-    """Returns a parser of two numbers with a comma between, each at most ``largest`` in size. For other text it raises
-    InputError about ``flag``, which shows ``form`` and ``example``."""
+    """Returns a parser of two numbers with a comma between, each at most ``largest`` in size. The parser raises InputError
+    about ``flag`` for other text; the message shows ``form``, and an ``example`` if the text is not two numbers."""
 
     def pair(text: str) -> tuple[float, float]:
         try:
@@ -116,8 +116,8 @@ def scores(metrics: Mapping[str, float | None]) -> str:
 
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:
-    """Returns Typer's message about wrong arguments, with the value that it could not read. For options of earlier versions
-    it returns what replaces them."""
+    """Returns Typer's message about wrong arguments, with the value that it could not read; for an option of an earlier
+    version, the message that says what replaces the option."""
     flag, param = str(getattr(error, "option_name", "")), getattr(error, "param", None)
     value = _value_of(param, arguments)
     words = [(flag, ""), (flag.lstrip("-").replace("-", "_"), flag)]
@@ -144,8 +144,8 @@ _KINDS |= {" <int>": " N", " <int range>": " N", " <float>": " NUMBER"}
 
 
 class GroupedCommand(TyperCommand):
-    """A command whose help lists options under headings. groups: the names of parameters under each heading. Options without
-    a group are listed under "Options"; ``--help`` is the last of the first group."""
+    """A command whose help lists options under headings. groups: the names of the parameters under each heading. Options in
+    no group are listed under "Options"; ``--help`` ends the first group."""
 
     groups: Mapping[str, Sequence[str]] = {}
 

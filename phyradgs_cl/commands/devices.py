@@ -1,4 +1,4 @@
-"""The command devices: lists OpenCL devices and the one that is used, and checks that its kernels compute correctly."""
+"""The command devices: lists the OpenCL devices and says which one is used; --check compares its kernels with float64."""
 
 import time
 from typing import Annotated

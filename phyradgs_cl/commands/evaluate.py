@@ -57,7 +57,7 @@ def evaluate_command(
 
 
 def _without_infinity(value: Any) -> Any:
-    """Replaces infinity by None in facts, also nested ones, because JSON has no infinity."""
+    """Returns facts, also nested ones, with None in place of +inf (the PSNR of equal volumes): JSON has no infinity."""
     if isinstance(value, dict):
         return {key: _without_infinity(part) for key, part in value.items()}
     if isinstance(value, list):

@@ -99,7 +99,7 @@ def _applied_in_words(scan: Scan) -> list[str]:
 
 
 def _refuse_overwriting(source: Path, output: Path) -> None:
-    """Raises InputError for an output that is the input, or another file next to it that is no scan file: a frame, say."""
+    """Raises InputError for an output that is the input, or an existing file in its folder that is no scan file."""
     target, origin = output.resolve(), source.resolve()
     folder = origin if origin.is_dir() else origin.parent
     refuse_overwriting("--output", output, source)

@@ -34,7 +34,7 @@ ObjectMotion = Annotated[Path | None, file_option(_OBJECT_MOTION, "--object-moti
 
 _CHECKPOINT = "Seconds from checkpoint to checkpoint of a run, which continues from its last; 0: on Ctrl-C only."
 CheckpointEvery = Annotated[float, option(_CHECKPOINT, metavar="SECONDS")]
-CHECKPOINT_EVERY_S = 600.0  # a killed run loses at most this time, of which writing takes a small part
+CHECKPOINT_EVERY_S = 600.0  # a killed run loses about this time at most; writing a checkpoint takes a small part of it
 
 
 def lengths(flag: str, help: str, default: str) -> Any:
@@ -56,8 +56,8 @@ _NONE: Mapping[str, Any] = {}
 
 def of_fields(kind: type, makers: Mapping[str, Callable[[str, str, Any], Any]] = _NONE) -> dict[str, tuple[Any, Any]]:
     """Returns options of a command, (annotation, default) by name, for those fields of a dataclass that have a help text.
-    makers: for fields that need a special parser, a function of (flag, help, usual) that returns the option. Other fields of
-    tuples take numbers with commas between, which are checked later."""
+    makers: functions ``(flag, help, usual)`` that return the options of fields with a special parser. All other fields
+    whose type is a tuple take numbers with commas between, which are checked later."""
     return {one.name: _of_field(one, makers) for one in fields(kind) if one.metadata.get("help")}
 
 

@@ -62,7 +62,7 @@ _PREVIEW = "PNG of the three middle slices; during the run NAME.partial.png, eve
 
 
 @with_run_options()
-@signals.keep_finished_work()  # a run that Ctrl-C finds in its last iteration is complete, and told in full
+@signals.keep_finished_work()  # Ctrl-C in the last iteration leaves a complete run, whose results are printed as usual
 def reconstruct_command(
     scan: Scan, output: Output, settings: Settings,
     initial: Annotated[Path | None, file_option("Volume to start from.", "--initial")] = None,
@@ -145,8 +145,8 @@ def reconstruct_command(
 
 
 def _finish(page: "report.LivePage", result: Reconstruction, scan: Path, output: Path, rt: Runtime) -> None:
-    """Turns the live page of a complete run into its report; on that of an interrupted run it says how to continue. A run
-    in slabs gets no report, since its frames may exceed the memory."""
+    """Turns the live page of a complete run into its report. The page of an interrupted run says how to continue. The page
+    of a run in slabs names the command that makes a report, since the run's frames may exceed the memory."""
     if result.state is not None:
         page.end(f"Interrupted at {result.interrupted_at}: repeat the command with --resume to continue.")
     elif "slabs" in result.facts:

@@ -48,8 +48,9 @@ def export_volume(
     scale_of: instead of water's attenuation, a function from the volume to its scale, such as ``hu_scale``.
     labels: patient, study and series, for dicom only. doubt: write the error bars σ in 1/mm in place of the values.
 
-    Raises InputError for an unknown format, a damaged volume or one without Gaussians, a suffix of another format, and
-    labels with another format. Raises OutputError where the output cannot be written."""
+    Raises InputError for an unknown format, a damaged volume, one that lacks the Gaussians or error bars to write, a suffix
+    of another format, labels without dicom, and Hounsfield units of Gaussians or error bars. Raises OutputError where the
+    output cannot be written."""
     named = Path(path).with_name(f"{Path(path).stem}.doubt.h5") if doubt else Path(path)
     if doubt and to in (*CLOUDS, OWN):
         raise InputError("--doubt", f"given with the format {to}", "a format of voxels", "use nii or mha")
@@ -66,7 +67,8 @@ def export_volume(
 
 
 def hu_scale(volume: Volume, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0) -> Hounsfield | None:
-    """Returns the volume's scale of Hounsfield units; fits a new one if it has none, or if a box or insert is given."""
+    """Returns the volume's scale of Hounsfield units. Fits a new scale if there is none, or if ``air`` or ``water``, which
+    are boxes in mm, or an insert's HU is given."""
     if (stored := volume.scale) is not None and air is None and water is None and insert_hu == 0:
         return replace(stored, fitted=f"{stored.line}, as stored")
     return volume.hounsfield(air, water, insert_hu).scale
@@ -76,7 +78,8 @@ def _checked(
     path: Path, to: str, output: str | Path | None, mu_water_per_mm: float | None, labels: DicomLabels | None,
     scale_of: ScaleOf | None,
 ) -> tuple[Path, ScaleOf | None]:  # fmt: skip
-    """Returns the path to write and the function that gives the HU scale. Raises InputError for other formats' options."""
+    """Returns the path to write, and the function from the volume to its HU scale, or None. Raises InputError for an unknown
+    format, a suffix of another format, and options that the format does not have."""
     checks.one_of("--to", to, (*EXPORTS, OWN))
     if mu_water_per_mm is not None and scale_of is not None:
         raise InputError("--mu-water-per-mm", "given with --hu", "one of the two", "leave one out")
@@ -99,7 +102,7 @@ def _checked(
 
 
 def _in_unit(values: np.ndarray, scale: Hounsfield | None, unit: str = _PLAIN) -> tuple[np.ndarray, str]:
-    """Returns values (z, y, x) float32, in Hounsfield units if there is a scale, else in 1/mm, and a note of the unit."""
+    """Returns values (z, y, x) float32 and a note of their unit: Hounsfield units if there is a scale, else ``unit``."""
     plain = np.ascontiguousarray(values, np.float32)
     return (plain, unit) if scale is None else (scale.of(plain), scale.note)
 
@@ -107,7 +110,7 @@ def _in_unit(values: np.ndarray, scale: Hounsfield | None, unit: str = _PLAIN) -
 def state_times_s(moves: Deformation | States, count: int, during_s: tuple[float, float] | None = None) -> list[float]:
     """Returns times (count,) in s: middles of equal parts of ``during_s``, by default the motion's whole time. If a file
     stores ``count`` states and no ``during_s`` is given, it returns their times. Raises InputError for a count outside 1
-    to 1000, and for a ``during_s`` that ends before it begins or lies outside the motion's time."""
+    to 1000, and for a ``during_s`` that does not end after its begin, or lies entirely outside the motion's time."""
     checks.whole("--states", count, 1, 1000)
     if isinstance(moves, States) and during_s is None and count == len(moves.times_s):
         return moves.times_s.tolist()
@@ -127,7 +130,7 @@ def export_states(
 ) -> list[Path]:  # fmt: skip
     """Writes the object of a volume file at evenly spaced times in s, and returns the paths. deformation: how the object
     moves; None if the file has the object at several times. NIfTI has all times in one file of four dimensions. Other
-    formats have a file or folder for each: NAME_01.SUFFIX and so on. See ``export_volume`` for other arguments and errors.
+    formats have a file or folder per time: NAME_01.SUFFIX and so on. See ``export_volume`` for other arguments and errors.
     Raises InputError also for a format of Gaussians, and for a deformation that moves nothing in the volume's grid."""
     if to in (*CLOUDS, OWN):
         remedy = f"use {', '.join(VOXELS)}, zarr or dicom"
@@ -189,7 +192,7 @@ def _write_own(target: Path, volume: Volume, path: str, scale: Hounsfield | None
 
 
 def foreign_suffix(output: str | Path) -> str | None:
-    """Returns a path's suffix if another program's format has it, so that HDF5 must not be written there; else None."""
+    """Returns the path's suffix if it belongs to another program's format, so that no HDF5 may have it; else None."""
     suffixes = (*(suffix for to in EXPORTS for suffix in _suffixes(to)), ".mhd", ".dcm", ".png")
     return next((suffix for suffix in suffixes if Path(output).name.lower().endswith(suffix)), None)
 

@@ -27,8 +27,9 @@ _LONGEST = 64  # DICOM's limit in characters for names (PN) and descriptions (LO
 
 @dataclass(frozen=True)
 class DicomLabels:
-    """Labels by which viewers and archives list a series; None writes none. patient: name (Family^Given) and ID. title, date
-    (YYYY-MM-DD): the study's. description: the series'. Raises InputError for text that DICOM cannot hold."""
+    """Labels by which viewers and archives list a series; None leaves the usual text. patient: name (Family^Given) and ID.
+    title, date (YYYY-MM-DD): the study's. description: the series'. Raises InputError for text that DICOM cannot hold, and
+    for a date in another form."""
 
     patient: str | None = None
     title: str | None = None
@@ -90,8 +91,8 @@ def write_dicom(path: Path, volume: Volume, note: str, labels: DicomLabels) -> N
 
 
 def _rescale_slope(values: np.ndarray, unit: str) -> str:
-    """Returns, as a decimal string, the value of one step of the stored integers: 1 HU if 16 bits can hold the range, else
-    the smallest step with which they can."""
+    """Returns the value of one step of the stored integers, as a decimal string: 1 HU if 16 bits can hold all values, else
+    the smallest step for which 16 bits suffice."""
     peak = float(np.abs(values).max())
     if unit == "HU" and peak <= _LARGEST:
         return "1"
@@ -123,7 +124,7 @@ def _common(pydicom: Any, shape: tuple[int, ...], unit: str, slope: str, uid: di
 
 
 def _place(image: Any, grid: Grid, index: int) -> None:
-    """Sets number, position and spacing of slice ``index``, in mm. PixelSpacing has the distance of rows first."""
+    """Sets number, position and spacing of slice ``index``, in mm. PixelSpacing has the distance between rows first."""
     (dz, dy, dx), (z, y, x) = grid.voxel_size_mm, grid.first_centre_mm
     image.InstanceNumber = index + 1
     image.ImageOrientationPatient = [1, 0, 0, 0, 1, 0]

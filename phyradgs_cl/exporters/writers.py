@@ -21,7 +21,7 @@ from phyradgs_cl.io.volume import Volume
 _WRITERS = {".mha": "MetaImageIO", ".nii": "NiftiImageIO", ".nii.gz": "NiftiImageIO", ".nrrd": "NrrdImageIO"}
 _MOST_NIFTI_VOXELS = 32_767  # NIfTI allows at most this many voxels along an axis
 _MOST_IMAGEJ_BYTES = 4_000_000_000  # from this size on BigTIFF is written: offsets in ImageJ's TIFF have 32 bits
-_CHUNK = 64  # voxels of a chunk along each axis; halving of the resolution ends when all fits into one chunk
+_CHUNK = 64  # voxels of a chunk along each axis; the resolution is halved until the volume fits into one chunk
 _PLY_NAMES = (
     *("x", "y", "z", "scale_0", "scale_1", "scale_2"), *("rot_0", "rot_1", "rot_2", "rot_3", "density")
 )

@@ -1,6 +1,7 @@
 """The last steps of every importer: computes shutter, opening times and trajectory, and makes the scan.
 
-``RotaryStage`` describes a sample that turns between a source and a panel at rest. Its axis may be off the central ray."""
+``RotaryStage`` describes a sample that turns between a source and a panel at rest, about an axis that may miss the central
+ray."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -71,8 +72,8 @@ def make_timing(
     """Returns the timing of frames, given by their count or their numbers (F,). Options replace stored values. With start
     times, or a time from frame to frame, the scan is a fly-scan. Without them, every frame was taken at rest.
 
-    Raises InputError for a fly-scan without an exposure or without two rising start times. Raises it also for options
-    about the exposure or readout of frames at rest."""
+    Raises InputError for a fly-scan without an exposure, with fewer than two frames, or with start times that do not rise.
+    Raises it also for options about the exposure or readout of frames at rest, and for a pulse outside the exposure."""
     stored, place = stored or StoredTiming(), np.arange(frames) if isinstance(frames, int) else frames
     exposure_s, readout_s, frame_time_s = (
         getattr(stored, name) if getattr(options, name) is None else getattr(options, name)
@@ -120,7 +121,7 @@ def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> Circul
 
 
 def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
-    """Raises InputError for options that only a fly-scan has. Warns of an exposure, which frames at rest do not use."""
+    """Raises InputError for options that only a fly-scan has. Warns of an exposure, because it hints at a fly-scan."""
     turns = [name for name in options.given(_OF_A_TURN) if name != "exposure_s" or stored.exposure_s is None]
     frame_time = " or ".join(dict.fromkeys(map(options.named, ("frame_time_s", "fps"))))
     for name in (*map(options.called, turns), *stored.written):
@@ -133,7 +134,7 @@ def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: 
 
 @dataclass(frozen=True)
 class Turned:
-    """Which axes of a stored image to reverse, so that v points up and u to the right, seen from the source."""
+    """Tells which axes of a stored image to reverse, so that v points up and u to the right, seen from the source."""
 
     rows: bool
     columns: bool
@@ -144,7 +145,7 @@ class Turned:
         return array[..., ::-1] if self.columns else array
 
     def poses(self, pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-        """Converts poses (..., 12), as in ``PoseTable``, of stored images to those of flipped ones. panel: (rows,
+        """Converts poses (..., 12), as in ``PoseTable``, of stored images to the poses of the reversed images. panel: (rows,
         columns)."""
         pose = np.array(pose, np.float64)
         sides = (self.rows, panel[0], slice(9, 12)), (self.columns, panel[1], slice(6, 9))
@@ -186,7 +187,7 @@ def assemble_scan(
 ) -> Scan:
     """Returns a scan of line integrals whose row 0 is the lowest. grid: None takes ``grid_of_scan``. names: what the file
     calls its values, for messages. said: a text that says which frames were read. Raises InputError for implausible
-    values, and where more than half of the views are equal."""
+    values, and if more than half of the views have the same pose."""
     assumed = [*timing.assumed, *([] if options.detector_model else ["average"])] if timing.is_fly else []
     scan = Scan(
         projections=integrals.values, geometry=geometry, trajectory=trajectory, shutter=timing.shutter,
@@ -209,7 +210,7 @@ def assemble_scan(
 
 
 def _check_turn(trajectory: CircularOrbit | PoseTable, middle_s: np.ndarray, subject: str) -> None:
-    """Raises InputError where most views, at times (F,) in s, have one angle: the stored angles must then be wrong."""
+    """Raises InputError if more than half of the views, at ``middle_s`` (F,), have one angle, which must then be wrong."""
     if isinstance(trajectory, PoseTable):
         views = trajectory.pose(0, middle_s)
         views = views / np.abs(views).max(axis=0, initial=1e-9)
@@ -231,8 +232,8 @@ def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
 def parallel(
     options: ImportOptions, panel: tuple[int, int], pitch_mm: Pitch, offset_mm: tuple[float, float]
 ) -> ParallelGeometry:
-    """Returns a parallel beam, whose numbers are the options', or else those of the file, which are the arguments. Raises
-    InputError for an option that is a distance."""
+    """Returns a parallel beam. Options replace the file's values, which are the other arguments. Raises InputError for an
+    option that is a distance."""
     for name in options.given(_DISTANCES):
         expected, remedy = "no distance: this file has a parallel beam", "leave it out"
         raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
@@ -243,9 +244,9 @@ def cone(
     options: ImportOptions, to_axis_mm: Length, to_detector_mm: Length, panel: tuple[int, int], pitch_mm: Pitch,
     offset_mm: tuple[float, float], names: Mapping[str, str] | None = None,
 ) -> ConeGeometry:
-    """Returns a cone beam, whose numbers are the options', or else those of the file, which are the arguments. An argument
-    may be a function that reads the file. It is called only if no option replaces it, so that the file may lack the number.
-    names: what the file calls the numbers, for messages. Raises InputError unless the panel stands behind the axis."""
+    """Returns a cone beam. Options replace the file's values, which are the other arguments. A length or pitch may be a
+    function that reads it. The function is called only if no option replaces the value, which the file may then lack.
+    names: what the file calls its values, for messages. Raises InputError unless the panel stands behind the axis."""
     axis_mm, detector_mm = map(partial(_taken, options), _DISTANCES, (to_axis_mm, to_detector_mm))
     if detector_mm <= axis_mm:
         axis, detector = (options.called(name, names) for name in _DISTANCES)
@@ -266,8 +267,8 @@ def _taken(options: ImportOptions, name: str, stored: Any) -> Any:
 class RotaryStage:
     """A source and a panel of ``geometry`` at rest, and an axis of rotation that may be off the central ray.
 
-    axis_u_mm: how far the axis lies to the right of the central ray, seen from the source. roll_rad: how far the axis' top
-    leans to the right; tilt_rad: towards the panel. shift_mm (F, 2): the panel's shifts (v, u) per frame."""
+    axis_u_mm: how far the axis lies to the right of the central ray, seen from the source. roll_rad, tilt_rad: how far the
+    axis' top leans to the right, and towards the panel. shift_mm (F, 2): the panel's shifts (v, u) per frame."""
 
     geometry: Geometry
     axis_u_mm: float = 0.0

@@ -26,7 +26,7 @@ def check_room(subject: str, needed_bytes: int) -> None:
 
 @contextmanager
 def naming_damage(path: Path, found: str, expected: str, remedy: str = "") -> Iterator[None]:
-    """Turns any exception but MemoryError into InputError about ``path``: for damaged files, libraries raise every kind."""
+    """Turns any exception but MemoryError into InputError about ``path``: libraries raise all kinds for damaged files."""
     try:
         yield
     except (InputError, MemoryError):
@@ -66,8 +66,8 @@ def read_npy(path: Path, ndim: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SafeFolder:
-    """A folder that the user named. Methods accept only names inside it: no absolute path, no "..". They follow links in
-    the folder, because the user has put them there. Raises InputError for a path that is no folder."""
+    """A folder that the user named. ``file`` accepts only names inside it: no absolute path, no "..". Links in the folder
+    are followed, because the user has put them there. Raises InputError for a path that is no folder."""
 
     root: Path
 
@@ -110,8 +110,8 @@ class SafeFolder:
 
 
 def _files(folder: Path) -> list[Path]:
-    """Returns a folder's files in natural order. Links that lead nowhere stay in: reading them gives an error, while
-    leaving them out would lose a frame unseen."""
+    """Returns a folder's files in natural order. Links that lead nowhere are among them: reading one raises an error, while
+    leaving it out would lose a frame unnoticed."""
     paths = folder.iterdir() if folder.is_dir() else ()
     return in_natural_order([path for path in paths if path.is_file() or (path.is_symlink() and not path.exists())])
 

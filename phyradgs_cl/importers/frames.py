@@ -19,7 +19,7 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
-_PIXELS = 1 << 16  # this many pixels of each frame are compared with other frames; all would take long and show little more
+_PIXELS = 1 << 16  # most pixels of a frame that are compared with other frames; all would take long and show little more
 
 # A flat or dark is left out if its median differs from the others' by more than this fraction of the flats' median.
 _TOGETHER = 0.1  # largest difference among flats of one time, in which the tube hardly drifts
@@ -40,7 +40,7 @@ _SAME = 1e-3  # flats up to this fraction above the saturation level are clipped
 @dataclass(frozen=True, eq=False)
 class Light:
     """Flats (G, v, u) at G times, and the dark (1, v, u) or None. place (P,): the time of each projection, counted in
-    flats: 0.5 is halfway from the first to the second. used: the numbers of flats and darks used. said: this in words."""
+    flats: 0.5 is halfway from the first to the second. used: how many flats and darks were used. said: a text about them."""
 
     flats: np.ndarray
     dark: np.ndarray | None
@@ -92,8 +92,8 @@ def median(stack: np.ndarray) -> np.ndarray:
 def _times(
     subject: str, flats: int, count: int, options: ImportOptions, at: np.ndarray | None
 ) -> tuple[np.ndarray, str]:
-    """Returns when flats were taken (n,), as in ``places``, and a text about assumptions. At equal times their median is
-    used."""
+    """Returns when flats were taken (n,), as in ``places``, and a text about assumptions. Flats of equal times will be
+    combined by their median."""
     if options.flats != "time":
         return np.zeros(flats) if at is None or options.flats else at, ""
     if flats < 2 or (at is not None and np.ptp(at) == 0):
@@ -161,7 +161,8 @@ def line_integrals(
     - convention: the quantity of the format or file; the options' comes first. Without both, frames with flats or a flat
       value are counts. is_corrected: the scanner has subtracted the darks.
 
-    Raises InputError for an unknown quantity, counts without flats, and flats or darks of another size."""
+    Raises InputError for a quantity that nothing states, counts without flats, flats or darks of another size, flats of ones
+    for frames that look like line integrals, and frames without a usable pixel."""
     has_flats = flats is not None and len(flats) > 0
     quantity = options.quantity or convention or ("counts" if has_flats or options.flat_value is not None else None)
     if quantity is None:

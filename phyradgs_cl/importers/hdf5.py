@@ -42,8 +42,9 @@ def is_address(text: object) -> bool:
 class Places:
     """The addresses in HDF5 of a scan's arrays.
 
-    - stated: for each array (one of ``NAMES``), a list of FILE:/ADDRESS, or of /ADDRESS in ``source``. Under "axes" it has
-      the order of the frames' axes. subject: what states the addresses, for messages.
+    - stated: for each array (one of ``NAMES``), a list of FILE:/ADDRESS, or of /ADDRESS in ``source``. A FILE that does not
+      exist is sought beside ``source``. The entry "axes" is the order of the frames' axes instead. subject: what states the
+      addresses, for messages.
     - linked_folder: see ``open_hdf5``. folder: the only folder from which files are read; None allows any."""
 
     stated: Mapping[str, Sequence[str]]
@@ -109,9 +110,9 @@ class Places:
         self, projections: str = "/", *, key: Sequence[str] = (), flats: Sequence[str] = (), darks: Sequence[str] = (),
         mask: Sequence[str] = (),
     ) -> "Stacks":
-        """Reads all frames from the stated addresses, else from the format's, which are the arguments. key: address of the
-        types of frames (projection, flat, dark, invalid). Separate flats and darks replace those among the projections.
-        Raises InputError without projections, and for arrays that do not fit them."""
+        """Reads all frames from the stated addresses, else from the format's, which are the arguments. key: addresses, the
+        first of which in the file has the frames' types (projection, flat, dark, invalid). Separate flats and darks replace
+        those among the projections. Raises InputError without projections, and for arrays that do not fit them."""
         if self.source is not None and "projections" not in self.stated:
             self.source.dataset(projections)  # raises an error if the dataset is missing, and names a similar one
         if (stored := self.stack("projections", [projections])) is None:
@@ -225,8 +226,9 @@ class Lengths:
 def beam(
     source: Hdf5Source, lengths: Lengths, options: ImportOptions, panel: tuple[int, int], axis_columns: float = 0.0
 ) -> Geometry:
-    """Returns the geometry from the options' numbers, else the file's. If neither states the source's distance, it is a
-    parallel beam, with a warning. axis_columns: columns from axis to panel's middle. Raises InputError for wrong lengths."""
+    """Returns the geometry from the options' numbers, else the file's. Without a distance in the options or the source's in
+    the file, it is a parallel beam, with a warning. axis_columns: columns from the axis to the panel's middle, to the right.
+    Raises InputError for wrong lengths."""
     quantity = LENGTH
     for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):
         if source.find(address) is not None and not h5.read_attribute(source, address, "units"):

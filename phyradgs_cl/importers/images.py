@@ -1,7 +1,7 @@
 """Reads NIfTI, NRRD and MetaImage files by SimpleITK, and OME-Zarr 0.4 and 0.5 by zarr: one volume at full resolution, with
 its voxel sizes and position.
 
-SimpleITK passes over missing voxels, data in another folder, notes of Hounsfield units, and NRRD's units: checked here."""
+Checks what SimpleITK passes over: missing voxels, data in another folder, notes of Hounsfield units, and NRRD's units."""
 
 import gzip
 import logging

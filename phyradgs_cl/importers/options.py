@@ -44,8 +44,8 @@ class ImportOptions:
     those of the imported scan: row 0 the lowest, column 0 on the left, seen from the source.
 
     Users may also give timing as data sheets do: ``first``, ``fps``, ``exposure_ms`` and ``readout_ms``. Readout axis and
-    direction, ``frame_time_s``, ``exposure_s`` and ``readout_s`` are computed from these. named: returns what messages call
-    a field. Raises InputError for values out of range, and for contradictions."""
+    direction, ``frame_time_s``, ``exposure_s`` and ``readout_s`` are computed from these. named: the function that returns
+    a field's name for messages. Raises InputError for values out of range, and for contradictions."""
 
     exposure_s: float | None = _option("Exposure of a line, s, in place of --exposure-ms.", range=(0, 1e6))
     readout_s: float | None = checks.option(None, range=(0, 1e6))

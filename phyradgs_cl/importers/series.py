@@ -33,7 +33,7 @@ _MOST_NAMES = 8  # a message lists at most this many file names
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Files in the scan's order. numbers (F,): the numbers in their names, or None. said: which files it has, in words."""
+    """Files in the scan's order. numbers (F,): the numbers in their names, or None. said: a text about files and order."""
 
     paths: list[Path]
     numbers: np.ndarray | None
@@ -84,8 +84,8 @@ def series_of(
 ) -> Series:
     """Returns the frames among files, in order. subject: names the files in messages. remedy: what to do about a missing
     number. order: which number in the names gives the order, 1 the first; None finds it. holes: whether numbers may be
-    missing. skip: length of a prefix that all names have. Raises InputError for a missing or repeated number, and several
-    series."""
+    missing. skip: length of a prefix that all names have. Raises InputError for a missing or repeated number, several
+    series, and an ``order`` that is not the place of a number."""
     paths = list(paths) if skip else _of_one_series(list(paths), subject)
     columns = _columns([path.stem[skip:] for path in paths])
     if order is not None and order not in {column.place for column in columns}:
@@ -190,7 +190,7 @@ def _read(names: list[str]) -> list[_Column]:
 
 
 def _column(place: int, numbers: tuple[re.Match[str], ...]) -> Iterator[_Column]:
-    """Yields the numbers at one position: twice where a point separates two indices, as in 3.12, instead of decimals."""
+    """Yields the numbers at one position as one column; as two if a point separates two indices, as in 3.9 and 3.12."""
     befores, afters = ([one.string[: one.start()] for one in numbers], [one.string[one.end() :] for one in numbers])
     is_angle = all(map(_DEGREES.match, afters)) or all(map(_ANGLE.search, befores))
     signs, decimals = [one[1] for one in numbers], [one[3] or "" for one in numbers]

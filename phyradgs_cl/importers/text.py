@@ -27,7 +27,7 @@ TO_RAD = {"deg": np.pi / 180, "rad": 1.0}
 
 def number_at_start(text: str, comma_is_decimal: bool = False) -> tuple[float, str] | None:
     """Returns the number at the start of a text, and the text behind it, such as a unit; None without a number. In 1,000
-    the comma may be decimal or separate thousands: it is decimal with ``comma_is_decimal``, else the result is None."""
+    the comma may be decimal or separate thousands. It is decimal with ``comma_is_decimal``; else the result is None."""
     if not (found := _BEGINNING.match(text.strip())):
         return None
     digits, power, rest = found[1], found[2] or "", found[3]
@@ -136,8 +136,8 @@ def file_of_angles(folder: SafeFolder, name: str, *ends: str) -> Path | None:
 
 
 def measured_angles_rad(path: Path, steps_rad: np.ndarray) -> np.ndarray:
-    """Reads measured angles (F,) in rad. Files differ in sign and order, so it takes the sign and order that are nearest to
-    equal steps ``steps_rad`` (F,). Warns with the largest difference."""
+    """Reads measured angles (F,) in rad, relative to the first of the equal steps ``steps_rad`` (F,). Files differ in sign
+    and order, so the sign and order nearest to the steps are taken. Warns with the largest difference."""
     listed_rad = np.unwrap(read_angles_rad(path, len(steps_rad), column=1))
     ways = [steps_rad[0] + way - way[0] for way in (listed_rad, listed_rad[::-1], -listed_rad, -listed_rad[::-1])]
     best = min(ways, key=lambda way: float(np.abs(way - steps_rad).max()))
@@ -147,14 +147,14 @@ def measured_angles_rad(path: Path, steps_rad: np.ndarray) -> np.ndarray:
 
 
 class Settings(Fields):
-    """Fields whose values are texts. Its methods read numbers from the texts, also numbers with a unit behind."""
+    """Fields whose values are texts. Its methods read numbers from the texts, also numbers that a unit follows."""
 
     def __init__(self, subject: str, values: Mapping[str, str | list[str]], comma_is_decimal: bool = False) -> None:
         super().__init__(subject, values)
         self.comma_is_decimal = comma_is_decimal
 
     def measured(self, key: str, quantity: Quantity, unit: str) -> float:
-        """Returns a number above 0, in the package's unit of ``quantity``. unit: assumed where none follows the number."""
+        """Returns a number above 0, in the package's unit of ``quantity``. unit: assumed if no known unit follows it."""
         found = number_at_start(str(self.get(key)), self.comma_is_decimal)
         stated = quantity.factor(found[1]) if found and found[1] else None
         factor = stated or quantity.factor(unit)
@@ -215,8 +215,8 @@ def say_missing(fields: Fields, meanings: Mapping[str, str]) -> None:
 
 
 def white_level(fields: Fields, key: str, frames: np.ndarray, remedy: str) -> float:
-    """Returns the counts of air that ``key`` states. Raises InputError if over 1 % of the pixels of frames (F, v, u) exceed
-    it 1.2 times."""
+    """Returns the counts of air that ``key`` states. Raises InputError if more than 1 % of the pixels of frames (F, v, u)
+    exceed 1.2 times these counts."""
     white = fields.length(key)
     brighter = sum(np.count_nonzero(frame > _BRIGHTER * white) for frame in frames) / frames.size
     if brighter > _FEW:

@@ -60,10 +60,10 @@ def read_numbered(
     first: int = 0, pattern: str = r"\d+",
 ) -> tuple[np.ndarray, np.ndarray, str]:
     """Reads a folder's TIFFs whose names are ``prefix`` and a number. Returns frames (F, v, u) in the numbers' order, their
-    numbers (F,) from 0 on, and a text about which were taken. shape: expected, with None for any size. subject: names
-    what states the shape, or its three sizes, in messages. first: the first frame's number, needed if that frame is
-    missing. pattern: the form of numbers. Files beyond the stated count are left out, with a warning. Raises InputError for
-    fewer, unless the options say to take those found."""
+    numbers (F,) from 0 on, and a text about which were taken. shape: the expected (F, v, u), None where any size fits.
+    subject: what states the shape, or each of its sizes, for messages. first: the number of the first frame, needed if that
+    frame is missing. pattern: the form of numbers. Files beyond the stated count are left out, with a warning. Raises
+    InputError for fewer, unless the options say to take those found, and for images of another size."""
     subjects = [subject] * 3 if isinstance(subject, str) else subject
     name = re.compile(re.escape(prefix) + pattern, re.I)
     paths = [path for path in folder.matching(*SUFFIXES) if name.fullmatch(path.stem)]
@@ -89,7 +89,8 @@ def read_numbered(
 
 
 def stack_shape(paths: list[Path]) -> tuple[int, int, int]:
-    """Returns the shape (frames, rows, columns) that ``read_tiffs`` would read; reads only headers, sizes from the first."""
+    """Returns the shape (frames, rows, columns) that ``read_tiffs`` would read. Reads only headers; rows and columns are the
+    first file's."""
     headers = [_header(path) for path in paths]
     return sum(count for count, _ in headers), *headers[0][1][0]
 

@@ -1,4 +1,5 @@
-"""Reads and writes files of scans, volumes and scanner descriptions. Outputs are written completely or not at all."""
+"""Reads and writes files of scans, volumes and deformations, and reads descriptions of scanners. Writes a file completely
+or not at all."""
 
 import lazy_loader
 

@@ -1,5 +1,5 @@
-"""Reads and writes deformations, alone or in a scan file, and the truth of simulated scans: a reference volume, and an
-object's deformation and volumes (states) at several times if it moves."""
+"""Reads and writes deformations, alone or in a scan file, and the truth of simulated scans: a reference volume, and of an
+object that moves its deformation and its volumes (states) at several times."""
 
 from pathlib import Path
 
@@ -88,7 +88,8 @@ def read_deformation_group(source: Hdf5Source, address: str) -> Deformation:
 
 
 def write_truth(extra: h5py.Group, scan: Scan) -> None:
-    """Writes a scan's true volume, and its true volumes at several times, into the group ``reference``, if it has them."""
+    """Writes a scan's true volume, its true volumes at several times and its deformation, as far as it has them, into the
+    group ``reference``."""
     moving = scan.moving_truth
     if scan.reference is None and moving is None:
         return

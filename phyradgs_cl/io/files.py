@@ -63,8 +63,8 @@ def decoded(data: bytes) -> str:
 
 
 def sha256_of(path: str | Path, given_up: threading.Event | None = None) -> str:
-    """Returns the SHA-256 of a file, or of a folder's names and files, as 64 hexadecimal digits. given_up: when set, ends
-    the computation early; the result then means nothing. Raises InputError for a file that cannot be read."""
+    """Returns the SHA-256 of a file, or of a folder's file names and their hashes, as 64 hexadecimal digits. given_up: when
+    set, ends the computation early; the result then means nothing. Raises InputError for a file that cannot be read."""
     digest, subject = hashlib.sha256(), str(path)
     if (folder := Path(path)).is_dir():
         for part in sorted(part for part in folder.rglob("*") if part.is_file()):

@@ -62,7 +62,7 @@ def lock_path(output: str | Path) -> Path:
 @contextmanager
 def only_run(output: str | Path) -> Iterator[None]:
     """Locks ``output`` against other runs. The system releases the lock when a process ends. Raises BusyError if another
-    run has the lock, OutputError if its file cannot be created."""
+    run has the lock, OutputError if the lock file cannot be created."""
     from filelock import FileLock, Timeout
 
     path = lock_path(output)
@@ -144,8 +144,8 @@ def _create_beside(target: Path, suffix: str = "") -> Path:
 
 
 def temporary_name(target: Path, suffix: str = "") -> Path:
-    """Returns a new temporary path in the target's folder, whose name has this process' number. Removes temporary files
-    of the same target that dead processes left."""
+    """Returns a new temporary path in the target's folder. Its name states this machine and process, so that temporary files
+    of the same target that dead processes left are found and removed."""
     for path in target.parent.glob(f".{glob.escape(target.stem[:_LONGEST])}*.part*"):
         writer = _WRITER.search(path.name)
         if writer and writer[1] == _machine() and _is_dead(int(writer[2])):
@@ -239,7 +239,7 @@ def write_checkpoint(path: str | Path, state: Mapping[str, np.ndarray]) -> None:
 
 
 def read_checkpoint(path: str | Path) -> dict[str, np.ndarray]:
-    """Returns a checkpoint's arrays by name. Raises InputError for a missing, damaged or other version's file."""
+    """Returns a checkpoint's arrays by name. Raises InputError for a missing or damaged file, and for another version's."""
     if not Path(path).is_file():
         raise InputError("--resume", f"no checkpoint {path}", "one left by an interrupted run", _RESTART)
     try:

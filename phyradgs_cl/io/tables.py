@@ -44,8 +44,9 @@ def read_toml(path: Path, subject: str = "") -> dict[str, Any]:
 
 
 def read_facts(subject: str, text: str, types: Mapping[str, tuple[type, ...]]) -> dict[str, object]:
-    """Parses a JSON object that users may have edited, such as provenance. Fields whose type is not in ``types`` are left
-    out, with a warning; null is always accepted. Raises InputError for text that is not a JSON object."""
+    """Parses a JSON object that users may have edited, such as provenance. types: the allowed types of some fields, beside
+    null. A field of another type, and one that ``_fits`` refuses, is left out, with a warning. Raises InputError for text
+    that is not a JSON object."""
     try:
         facts = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -62,7 +63,7 @@ def read_facts(subject: str, text: str, types: Mapping[str, tuple[type, ...]]) -
 
 
 def _fits(value: object) -> bool:
-    """Returns whether a value is usable: lists must have only tables as entries, and numbers be finite and fit 64 bits."""
+    """Returns whether a value is usable. A list must have only tables as entries; a number must be finite and below 2^63."""
     if isinstance(value, list):
         return all(isinstance(line, dict) for line in value)
     return not isinstance(value, (int, float)) or abs(value) < 2**63

@@ -27,7 +27,7 @@ _VOLUME, _DOUBT, _BARE = f"{_DATA}/volume", f"{_DATA}/doubt", "/volume"
 _AXES = ("z", "y", "x")
 _GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/time_series"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
-_AXIS_TOLERANCE = 1e-3  # stored voxel centres may miss even steps by this fraction of a step, as rounding to float32 causes
+_AXIS_TOLERANCE = 1e-3  # stored voxel centres may be off even steps by this fraction of a step, as float32 rounds them
 log = logging.getLogger(__name__)
 
 

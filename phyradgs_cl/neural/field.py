@@ -41,8 +41,8 @@ def torch_device(name: str) -> torch.device:
 
 @contextmanager
 def repeatable(device: torch.device) -> Iterator[None]:
-    """Makes PyTorch use algorithms that give the same bits in every run. On CPUs this package sums in a fixed order anyway,
-    and the switch would only slow it down."""
+    """Makes PyTorch on CUDA use algorithms that give the same bits in every run. On CPUs this package sums in a fixed order
+    anyway, and the switch would only slow it down."""
     if device.type != "cuda":
         yield
         return
@@ -66,7 +66,7 @@ def to_array(tensor: torch.Tensor) -> np.ndarray:
 
 
 class LineAttention(nn.Module):
-    """Multi-head attention among each ``segment`` successive values of (P, width). ``segment`` divides P."""
+    """Multi-head attention within each group of ``segment`` successive rows of values (P, width). ``segment`` divides P."""
 
     def __init__(self, width: int, segment: int, heads: int, head_width: int) -> None:
         super().__init__()
@@ -120,7 +120,7 @@ class AttenuationNetwork(nn.Module):
     """Maps features (P, inputs) to attenuation (P,) in the unit of ``options.density_bound``.
 
     middle: the modules between the first and the last layer. skip: the index of the layer that gets the features again.
-    Leaky ReLU follows every layer but the last."""
+    Leaky ReLU follows every layer but the last, which ``options.last_activation`` follows."""
 
     def __init__(self, inputs: int, middle: list[nn.Module], skip: int, options: NeuralOptions) -> None:
         super().__init__()
@@ -221,7 +221,8 @@ def weighted_rows(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor
 
 
 class _Interpolate(torch.autograd.Function):
-    """Returns Σ weight · table[index] over 8 corners, (B, 8). Its gradient is summed in a fixed order: runs repeat."""
+    """Returns Σ weight · table[index] over 8 corners, for index and weight (B, 8). The gradient, by the table alone, is
+    summed in a fixed order, so that runs repeat."""
 
     @staticmethod
     def forward(ctx: Any, table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
@@ -262,7 +263,7 @@ def voxel_values(
     """Returns the field in all voxels (nz, ny, nx) float32. ``grid``: centred, in units of half the longest side.
 
     A voxel is the mean over the centres of its ``points``³ equal parts. With segments, a point's value depends on its
-    neighbours along the segment. So it is averaged over segments along x, y and z."""
+    neighbours along the segment. The result is then the mean over segments along x, y and z."""
     orders = _ORDERS if field.segment > 1 else _ORDERS[:1]
     values = np.zeros(grid.shape, np.float32)
     for order in orders:

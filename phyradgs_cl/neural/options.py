@@ -16,7 +16,7 @@ TORCH_DEVICES = ("auto", "cpu", "cuda", "mps")
 # Densities of grid cells and samples, unless options state them.
 CELLS_PER_VOXEL = 1.0  # grid cells of the encoding's finest level per voxel of the longest side
 SAMPLES_PER_VOXEL = 1.5  # samples along a ray per voxel of the longest side: NAF takes 192 for 128 voxels
-# Fewer samples are enough for a pixel with a ray at each of several times: only the mean over its rays must be exact.
+# For a pixel with rays at several times fewer samples per ray are enough, because only the mean over its rays must be exact.
 SAMPLES_PER_TIME = 1.2
 _FINEST = 2**24  # with more grid cells along a side, float32 coordinates have no fraction within a cell
 

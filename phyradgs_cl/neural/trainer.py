@@ -236,8 +236,8 @@ class ExposureRays:
         return len(self.cell)
 
     def __call__(self, pixels: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns sources and unit directions (R, s, 3) of pixels (R, 2), row and column, at s times of each, given by (R,
-        s).
+        """Returns the rays' sources and unit directions (R, s, 3). pixels (R, 2): row and column. times (R, s): which of a
+        line's K times each ray has.
 
         Parallel rays begin in front of the volume."""
         rows, columns = pixels.T
@@ -276,7 +276,7 @@ def _within(place: np.ndarray, count: int) -> slice:
 
 
 def scattered_pixels(usable: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draws ``count`` different pixels, (R, 2) row and column, from the ``usable`` ones, bool (rows, columns)."""
+    """Draws ``count`` different pixels, (R, 2) row and column, or fewer if fewer are ``usable``, bool (rows, columns)."""
     where = np.flatnonzero(usable)
     chosen = rng.choice(where, min(count, where.size), replace=False, shuffle=False)
     return np.stack(np.unravel_index(chosen, usable.shape), -1)
@@ -287,7 +287,7 @@ def windows_and_scattered_pixels(
 ) -> np.ndarray:
     """Draws the pixels (R, 2) of ``windows`` windows of ``edge``² usable pixels, and ``count`` scattered ones outside them.
 
-    Windows are tiles of the frame. Where fewer tiles are usable throughout, there are fewer windows."""
+    Windows are tiles of the frame. If fewer tiles have only usable pixels, there are fewer windows."""
     down, across = (n // edge for n in usable.shape)
     tiles = usable[: down * edge, : across * edge].reshape(down, edge, across, edge).all(axis=(1, 3))
     whole = np.flatnonzero(tiles)
@@ -301,7 +301,8 @@ def windows_and_scattered_pixels(
 
 
 def chosen_times(pixels: int, times: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draws ``count`` different ones of each pixel's ``times``, (pixels, count), all equally likely."""
+    """Draws ``count`` different numbers below ``times`` for each pixel, (pixels, count), all equally likely. If ``count`` is
+    at least ``times``, returns all numbers."""
     if count >= times:
         return np.broadcast_to(np.arange(times), (pixels, times))
     return np.argsort(rng.random((pixels, times)), axis=1)[:, :count]

@@ -97,8 +97,9 @@ def _height(frame: np.ndarray) -> np.ndarray:
 
 
 def _opposite(frame: np.ndarray) -> Iterable[np.ndarray]:
-    """Yields, for each of four directions, the lower value (v, u) of the two opposite pixels 2 pixels away. The two 3 pixels
-    away count where they are higher: a near one may be a spark too. The frame is mirrored at the panel's edge."""
+    """Yields, for each of four directions, the lower value (v, u) of the two opposite pixels 2 pixels away. Where the lower
+    value 3 pixels away is higher, it counts instead, because a nearer pixel may be a spark too. The frame is mirrored at the
+    panel's edge."""
     wide = np.pad(frame, _FAR, mode="symmetric")
     rows, columns = frame.shape
 
@@ -131,10 +132,10 @@ def find_dead(
     """Returns the dead pixels, bool (v, u), of line integrals (F, v, u); none for fewer than five frames.
 
     A pixel is dead if it never changes while its neighbours do. It is also dead if it is above all its neighbours, or below
-    all, in 70 % of the frames. It must then differ from the median of 3 × 3 pixels by more than ``deviations`` standard
-    deviations of the panel's pixels. Near ``axis_column`` small parts of the object stay on one pixel: there a dead pixel
-    must also be sharper than the optics. A whole row or column is dead if it differs from both neighbours over 90 % of its
-    length."""
+    all, in more than 70 % of the frames. It must then differ from the median of 3 × 3 pixels by more than ``deviations``
+    standard deviations of this difference over the panel. Near ``axis_column`` small parts of the object stay on one pixel:
+    there a dead pixel must also be sharper than the optics. A whole row or column is dead if it lies above or below both
+    neighbours over more than 90 % of its length. At most 40 frames, evenly spread, are examined."""
     if len(frames) < LEAST_FRAMES:
         return np.zeros(frames.shape[1:], bool)
     numbers = np.unique(np.linspace(0, len(frames) - 1, _MOST_FRAMES).round().astype(int))
@@ -179,7 +180,7 @@ def _constant(frames: np.ndarray) -> np.ndarray:
 
 def _exceeding(frames: np.ndarray, deviations: float) -> np.ndarray:
     """Returns the pixels, bool (v, u), far above or far below all neighbours in most frames. Pixels at an object's edge are
-    not: the edge moves, or covers several pixels in a line."""
+    not among them, because the edge moves, or covers several pixels in a line."""
     above = np.mean([f > scipy.ndimage.maximum_filter(f, footprint=_NEIGHBOURS) for f in frames], axis=0)
     below = np.mean([f < scipy.ndimage.minimum_filter(f, footprint=_NEIGHBOURS) for f in frames], axis=0)
     difference = np.median([f - scipy.ndimage.median_filter(f, size=3) for f in frames], axis=0)
@@ -189,8 +190,8 @@ def _exceeding(frames: np.ndarray, deviations: float) -> np.ndarray:
 
 
 def _shared(frames: np.ndarray) -> np.ndarray:
-    """Returns the pixels, bool (v, u), whose four neighbours also differ from the median of 5 × 5, as in a blurred image of
-    an object. The neighbours' median counts, since one of them may be dead too."""
+    """Returns the pixels, bool (v, u), whose four neighbours differ from the median of 5 × 5 in the same direction, as in a
+    blurred image of an object. The median over the four counts, since one of them may be dead too."""
     difference = np.median([f - scipy.ndimage.median_filter(f, size=5) for f in frames], axis=0)
     wide = np.pad(difference, 1, mode="edge")
     sides = np.median([wide[:-2, 1:-1], wide[2:, 1:-1], wide[1:-1, :-2], wide[1:-1, 2:]], axis=0)

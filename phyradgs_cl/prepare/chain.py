@@ -37,7 +37,8 @@ DEFAULT_STEPS = "sparks,dead,rings"
 STEPS_HELP = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 PREPARED_KEY = "prepared"
 """The key under which a scan's provenance lists the steps that were applied to it."""
-# A second correction would take away from what the first one left. A "result" of these says that nothing was corrected.
+# Steps to run only once: a second run would subtract from what the first one left. A "result" of theirs tells that a run
+# corrected nothing.
 _ONCE = ("scatter", "hardening", "phase")
 
 

@@ -6,8 +6,8 @@
 - Tube voltage: bone in a reconstruction is projected, and the spectrum gives the soft tissue that remains (Joseph and
   Spital, J. Comput. Assist. Tomogr. 2 (1978) 100). This is repeated with the better volume.
 
-For a voltage the user states from which attenuation a voxel is bone, or candidates are tried, also water alone and no
-correction. The one whose corrected frames agree best with their own projection wins."""
+For a voltage the user may state the attenuation from which a voxel is bone. Otherwise candidates are tried, also water alone
+and no correction. The one whose corrected frames agree best with the projections of their own reconstruction wins."""
 
 import logging
 from collections.abc import Callable
@@ -35,7 +35,7 @@ _BONE_VOXELS = 128  # a coarse volume is enough to find bone, because its harden
 # Candidates: soft tissue ends, and pure bone begins, at these fractions of the densest voxel (above 1: no voxel is pure).
 _BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in (0.4, 0.7, 1.0) if soft < bone]
 _BETWEEN += [(0.7, 1.0), (0.7, 1.5), (0.8, 1.5)]
-_AS_WELL = 0.1  # the candidate with least bone wins, of those that explain at most this fraction less than the best one
+_AS_WELL = 0.1  # of the candidates that gain at most this fraction less over water than the best one, least bone wins
 _NEARLY = 1.02  # bone is corrected even if it leaves 2 % more unexplained than water: a stated voltage means a hardened scan
 _NEWTON = 3  # steps of Newton's method, enough for an error of 1e-12
 _UNIFORM = 0.08  # the object has several materials if path lengths leave a larger relative RMS of line integrals unexplained
@@ -190,10 +190,10 @@ def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> n
 
 
 def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:
-    """Fits the polynomial of ``straighten``, only p², to line integrals (F, v, u) of an object of one material.
+    """Fits the polynomial of ``straighten``, with p² alone, to line integrals (F, v, u) of an object of one material.
 
     The coefficient that the same fit finds in a reprojection of the volume, which has no hardening, is subtracted. Raises
-    InputError for an object of several materials, and for none."""
+    InputError for an object of several materials, and if there is no object."""
     path, level, bend, rest = _bend(frames, model)
     if rest > _UNIFORM:
         found = f"{100 * rest:.2g} % of the line integrals that the path through one material does not explain"
@@ -205,7 +205,7 @@ def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:
 
 def _bend(frames: np.ndarray, model: Model) -> tuple[np.ndarray, float, float, float]:
     """Fits p = t + b t² to line integrals (F, v, u), where t is the path through the object times its attenuation. Returns
-    the path (F, v, u) in mm, the attenuation in 1/mm, b, and the relative RMS of the residual."""
+    the path (F, v, u) in mm, the attenuation of the object's voxels in 1/mm, b, and the relative RMS of the residual."""
     volume = model.volume(frames)
     level = float(np.median(volume[volume > 0.5 * np.percentile(volume, 99)])) if volume.max() > 0 else 0.0
     path = model.frames(np.clip(volume / max(level, 1e-20), 0, 1).astype(np.float32))

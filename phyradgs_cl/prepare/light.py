@@ -24,7 +24,7 @@ from phyradgs_cl.io import ToAttenuation, read_scan
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 WAYS = ("mean", "time", "pca")
-_MOST_COMPONENTS, _CLEAR = 4, 4.0  # most components used; one must vary 4 times as much as the median one, or it is noise
+_MOST_COMPONENTS, _CLEAR = 4, 4.0  # most components used; one is noise unless its variance is 4 times their median
 _REWEIGHTINGS = 12
 _LEAST_PIXELS = 20  # with fewer pixels of air in a frame, their median is too noisy
 _AROUND = np.ones((3, 3), bool)
@@ -139,8 +139,8 @@ def normalise_air(scan: Scan, options: AirOptions, make_model: MakeModel) -> tup
 def find_air(frames: np.ndarray, *, below: float = 0.05) -> np.ndarray:
     """Returns the pixels of line integrals (F, v, u) that no object covers, bool (F, v, u).
 
-    They are below the fraction ``below`` of the largest line integral (the 99.9th percentile), connected with the first or
-    last column, and at least two pixels away from all others."""
+    They exceed the air's median by less than the fraction ``below`` of the largest line integral (99.9th percentile), are
+    connected with the first or last column through such pixels, and lie at least two pixels away from all others."""
     limit = below * float(np.percentile(frames, 99.9))
     air = np.empty(frames.shape, bool)
     for f, frame in enumerate(frames):

@@ -46,7 +46,7 @@ class PhaseOptions(checks.Checked):
             raise InputError("phase.beta", "0", "a number above 0", "an object without absorption hides its thickness")
 
     def stated(self) -> tuple[float, float]:
-        """Returns energy in keV and δ/β. Raises one InputError for all that is missing: no scan file states it."""
+        """Returns energy in keV and δ/β. Raises one InputError for all missing values, which no scan file states."""
         ratio = self.delta / self.beta if self.delta is not None and self.beta else self.delta_beta
         if self.energy_kev is not None and ratio is not None:
             return self.energy_kev, ratio

@@ -3,7 +3,7 @@
 Over a full turn, the mean of all views shows the object averaged around the axis, which is symmetric about it. So a column
 that differs from its mirror image shows an error of the panel. Two independent sets of views both show this error: their
 covariance says whether there are rings, and how strong. Without rings the frames stay unchanged. The pattern is the mean
-over views minus the same mean, denoised: in overlapping blocks of cosines, strong coefficients belong to the object.
+over views minus its denoised copy, which keeps the strong cosine coefficients of overlapping blocks: the object's.
 
 A single column or pixel of wrong gain deviates on one side of the axis only. Its neighbours and their mirror images do not,
 and both sets of views show it. (On an arc the mean is symmetric for a round object only.)"""
@@ -114,7 +114,7 @@ def surround_evenly(scan: Scan) -> bool:
 
 
 def _means(frames: np.ndarray, full_turn: bool) -> np.ndarray:
-    """Returns the means (2, v, u) of two independent sets of views: even and odd ones. On an arc, its two halves, which see
+    """Returns the means (2, v, u) of two independent sets of views: even and odd ones; on an arc its two halves, which show
     the object differently."""
     half = (len(frames) + 1) // 2
     sets = (frames[::2], frames[1::2]) if full_turn else (frames[:half], frames[half:])
@@ -122,8 +122,8 @@ def _means(frames: np.ndarray, full_turn: bool) -> np.ndarray:
 
 
 def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: float | None) -> np.ndarray:
-    """Returns the pattern (v, u) float32, given its strength. The symmetric and the antisymmetric part of the mean over
-    views each hold half of the pattern's variance, and are denoised separately."""
+    """Returns the pattern (v, u) float32, given its strength. If all columns have a mirror image, the symmetric and the
+    antisymmetric part of the mean over views hold half of the pattern's variance each, and are denoised separately."""
     mean = frames.mean(axis=0, dtype=np.float64)
     if not strength.is_certain:
         return np.zeros(mean.shape, np.float32)
@@ -184,7 +184,8 @@ def _joined(blocks: np.ndarray) -> np.ndarray:
 
 
 def mirror_columns(columns: int, axis_column: float | None) -> np.ndarray:
-    """Returns each column's mirror image about the axis, in descending order. Images that lie off the panel are left out."""
+    """Returns each column's mirror image about the axis, in descending order. Images that lie off the panel are left out.
+    ``axis_column`` None: the axis is in the panel's middle."""
     twice = columns - 1 if axis_column is None else 2 * axis_column
     if not abs(twice) < 2 * columns:
         return np.zeros(0, int)

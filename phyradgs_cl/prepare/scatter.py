@@ -94,7 +94,8 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
 
 def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
     """Returns the kernel with the strength that leaves the least ``unexplained``, or unchanged if that gains little. frames:
-    line integrals (F, v, u), blurred by ``blur`` pixels for a coarse model. Each frame's ``air`` is shifted to 0."""
+    line integrals (F, v, u), which are first blurred by ``blur`` pixels to fit a coarse model. The corrected frames are
+    shifted so that the median of each frame's ``air``, bool (F, v, u), is 0."""
     if not kernel:
         return kernel
     coarse = step.smooth(frames, blur)

@@ -103,7 +103,7 @@ def unexplained(frames: np.ndarray, volume: np.ndarray, inside: np.ndarray, mode
     blurring.
 
     Only voxels ``inside`` the object, bool (z, y, x), are projected. The grid and the number of views cause a difference
-    too: it is measured by reconstructing and projecting the projection itself, and subtracted. What remains is hardening,
+    too, which is measured by reconstructing and projecting the projection itself, and subtracted. What remains is hardening,
     scatter and the like."""
 
     def reprojected(values: np.ndarray) -> np.ndarray:

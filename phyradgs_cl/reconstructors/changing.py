@@ -30,7 +30,7 @@ _FRAMES = 3  # memory of a run, in copies of all projections
 class ChangingOptions(IterativeOptions):
     """Options of ``changing``.
 
-    - states: number of the object's states, each with as many frames; fewer if the scan has fewer frames.
+    - states: number of the object's states, over which frames are shared evenly; fewer if the scan has fewer frames.
     - prior_weight: weight of total variation in space, relative to the error of the data term's gradient.
     - time_weight: weight of a voxel's change from one state to the next, relative to an equal difference between
       neighbouring voxels.
@@ -50,7 +50,8 @@ class ChangingOptions(IterativeOptions):
 
 
 def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the object's states in 1/mm, and their mean as volume. ``arguments``: as in ``MethodRun``; uses no seed."""
+    """Returns the object's states in 1/mm, and their mean as volume. ``arguments``: further fields of ``MethodRun``, whose
+    seed has no effect."""
     times_s = state_times_s(scan, options.states)
     shape = (len(times_s), *scan.grid.shape)
     run = MethodRun(scan, options, rt, state_times_s=times_s, **arguments)
@@ -77,7 +78,7 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
 
 
 def state_times_s(scan: Scan, count: int) -> np.ndarray:
-    """Returns the mean times (K,) in s of up to ``count`` states, each with the same number of successive frames."""
+    """Returns the mean times (K,) in s of up to ``count`` states, over which successive frames are shared evenly."""
     middles_s = np.unique(np.asarray(scan.frame_start_s, np.float64)) + scan.shutter.span_s / 2
     shares = np.array_split(middles_s, min(count, len(middles_s)))
     return np.array([share.mean() for share in shares])

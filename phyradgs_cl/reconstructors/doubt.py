@@ -8,8 +8,8 @@
   whole scan's volume, and the streaks of missing views. A synthesised scan would not show these: FDK returns them
   unchanged.
 
-The numbers that turn this into σ come from procedural volumes (benchmarks/doubt.py), and from held-out pixels if there are
-any."""
+The factors that turn these differences into σ come from procedural volumes (benchmarks/doubt.py), and from held-out pixels
+if there are any."""
 
 import json
 import logging
@@ -120,8 +120,9 @@ def halves(scan: Scan) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Doubter:
-    """The runs of a method. scan: what the method sees. whole: the scan with its held-out pixels ``hidden`` (F, v, u). kind:
-    ``iterative`` or ``analytic``, as in ``fitted_law``."""
+    """Runs a method three times, and computes error bars. scan: what the method sees. whole: the scan with the held-out
+    pixels, which ``hidden``, bool (F, v, u), marks. deformation: how the object moves. kind: ``iterative`` or ``analytic``,
+    as in ``fitted_law``."""
 
     rt: Runtime
     scan: Scan
@@ -194,7 +195,7 @@ class Doubter:
         return replace(first, doubt=sigma, facts={**first.facts, **facts})
 
     def _against_held_out(self, results: list[Reconstruction], hidden: NDArray[np.bool_], law: Law) -> dict[str, float]:
-        """Returns the shares of held-out pixels within their bars, and the factor of σ, at least 1, for which 68 % are.
+        """Returns the shares of held-out pixels within their bars, and the factor of σ, 1 to 4, for which 68 % would be.
 
         A pixel's bar combines its noise with the ``spread`` of the projected volumes around it."""
         ratios, inside = [], []
@@ -215,8 +216,8 @@ class Doubter:
 
 
 def _warn_of(residual_square: float, noise_square: float, square: float, mean: float) -> None:
-    """Warns where error bars may be too narrow, by means over the valid pixels: of squares, and of line integrals
-    (``mean``)."""
+    """Warns if error bars may be too narrow. Takes means over the valid pixels: of the squares of residual, noise and line
+    integrals, and of the size of line integrals."""
     unexplained, noisy = (residual_square / noise_square) ** 0.5, noise_square**0.5 / (square / mean)
     if unexplained > _UNEXPLAINED:
         text = "the volume leaves %.3g times the noise of the projections unexplained: error bars hold what causes that in "

@@ -107,7 +107,7 @@ def imported(text: str, subject: str = "--method") -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Returns a value that JSON can hold: numbers and words unchanged, tables of such, and the repr of everything else."""
+    """Returns a value that JSON can hold: numbers and texts unchanged, mappings of such values, the repr of all others."""
     if isinstance(value, Mapping):
         return {key: _plain(one) for key, one in value.items()}
     return value if isinstance(value, int | float | str | None) else repr(value)

@@ -30,7 +30,7 @@ class Preprocessing(PrepareOptions, GridChoice):
 
     - size, voxel_mm, roi_mm, margin_mm: the grid, as in ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
     - holdout: percentage of the pixels that the method does not use, to measure its error on them.
-    - doubt: run the method on two synthesised scans too, for error bars of voxels.
+    - doubt: run the method on two more scans, made from this one, for error bars of voxels.
     - steps, and a table for each: as in ``PrepareOptions``."""
 
     ignore_lag: bool = False
@@ -58,7 +58,7 @@ class Preprocessing(PrepareOptions, GridChoice):
 def prepared(scan: Scan, options: Preprocessing, rt: Runtime | None = None) -> Scan:
     """Returns the scan for a method, on a grid with its margin; the scan itself if there is nothing to do.
 
-    ``rt``: the device for steps that reconstruct and project."""
+    ``rt``: the device for steps that reconstruct and project, which raise InputError without one."""
     return prepare(regrid_and_remove_lag(scan, options), options, partial(reprojection, rt))
 
 

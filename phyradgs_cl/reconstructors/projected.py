@@ -87,7 +87,7 @@ def frame_pairs(
 
 
 def held_out(scan: Scan, percent: float) -> np.ndarray:
-    """Draws ``percent`` of the valid pixels, bool (F, v, u), the same in every run. Raises InputError if none is drawn."""
+    """Draws about ``percent`` % of the valid pixels, bool (F, v, u), the same in every run. Raises InputError for none."""
     drawn = np.random.default_rng(_HOLDOUT_SEED).random(scan.projections.shape, np.float32) < percent / 100
     held: np.ndarray = drawn & scan.valid
     if not held.any():
@@ -102,7 +102,7 @@ def holdout_errors(
     """Returns by name: the RMS residual of a volume (nz, ny, nx) in 1/mm at held-out pixels (F, v, u), the noise of these
     pixels, and their number.
 
-    Both are dimensionless, as line integrals are. No reconstruction can have a smaller true error than the noise."""
+    Residual and noise are dimensionless, as line integrals are. A perfect volume would leave the noise as its residual."""
     squares = 0.0
     for first in range(0, scan.frames, FRAMES_AT_A_TIME):
         frames = range(first, min(first + FRAMES_AT_A_TIME, scan.frames))

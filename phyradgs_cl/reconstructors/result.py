@@ -122,7 +122,7 @@ class Reconstruction:
         air, water: boxes (z0, z1, y0, y1, x0, x1) in mm, whose mean counts; None: a peak of the volume's histogram, the
         lowest for air, the largest above that for water. insert_hu: the HU of the second point, if it is not water.
         ``result.scale.line`` says what was fitted, ``result.scale.of(result.volume)`` is the volume in HU. ``save_volume``
-        keeps it.
+        keeps the scale.
 
         Raises InputError for less than 100 voxels, air that is not below water, and peaks that cannot be air and water."""
         scale = fitted(self.volume, self.grid, air, water, insert_hu)
@@ -163,7 +163,7 @@ class Reconstruction:
 def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
     """Returns a KeyboardInterrupt whose attribute ``partial`` is the result so far, or None if there is no volume yet.
 
-    It is no subclass: only for KeyboardInterrupt itself does Python end by the signal, so that shells stop too."""
+    It is no subclass, because only after KeyboardInterrupt itself does Python end by the signal, so that shells stop too."""
     kept = "before there was a volume"
     if partial is not None:
         when = f"after {partial.interrupted_at}" if partial.interrupted_at else "at its end"

@@ -1,11 +1,11 @@
 """HDF5 files of beamlines: NXtomo of other programs, and Data Exchange. Options give values that the files lack.
 
 NXtomo does not state which row is on top. Row 0 is taken as the lowest, with a warning, after the flips that the file
-declares. The nxtomo package declares them in two ways, and both are read. The column of the rotation axis becomes a
+declares. The nxtomo package declares flips in two ways, and both are read. The column of the rotation axis becomes a
 detector offset. Without a source distance the beam is parallel.
 
 Data Exchange has /exchange with data, data_white, data_dark and theta, of parallel beams; distances from the options make a
-cone. Angles are the sample's, in degrees unless units differ; row 0 is the top of the image."""
+cone. Angles are the sample's, in degrees unless the file states other units. Row 0 is the top of the image."""
 
 import logging
 from pathlib import Path
@@ -129,8 +129,8 @@ def _axis_columns(source: Hdf5Source, detector: str, turn: assemble.Turned, opti
 def _motion(
     places: hdf5.Places, entry: str, used: np.ndarray, geometry: Geometry, options: ImportOptions
 ) -> tuple[assemble.Timing, CircularOrbit]:
-    """Reads timing and orbit. ``rotation_angle_end`` states the angle at which each frame ends. Without it, the angles of
-    neighbouring frames give the speed."""
+    """Reads timing and orbit. ``rotation_angle_end`` states the angle at the end of each frame's exposure. Without it, or
+    with angles or a frame time from the options, the angles of neighbouring frames give the speed."""
     assert places.source is not None
     source, detector, angles = places.source, f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SAMPLE}/rotation_angle"
     sign = gantry_sign(options, h5.read_attribute(source, angles, "rotates") or "sample")

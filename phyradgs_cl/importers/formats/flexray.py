@@ -67,7 +67,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:
-    """Returns the stage that the settings describe. Heights count from the source, which is thus at z = 0."""
+    """Returns the stage that the settings describe. Heights count from the source, which is therefore at z = 0."""
     to_axis_mm = options.taken("source_to_axis_mm", partial(scan.length, "SOD"))
     to_detector_mm = options.taken("source_to_detector_mm", partial(scan.length, "SDD"))
 
@@ -90,7 +90,7 @@ def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names
 
 
 def _window_mm(scan: Settings) -> tuple[float, float]:
-    """Returns how far right and up, in mm, the middle of the window that was read lies from the panel's middle."""
+    """Returns how far the middle of the window that was read lies to the right of and above the panel's middle, in mm."""
     if not scan.has("ROI (LTRB)"):
         return 0.0, 0.0
     left, top, right, bottom = scan.listed("ROI (LTRB)", 4).tolist()

@@ -1,8 +1,8 @@
 """Real scans of PhyRadGS: a JSON of calibrated views with the arcs of their rolling shutter, and 16-bit TIFF frames.
 
 A view's ``detector`` is a 4×4 matrix from the panel to the world (mm). Column 0 points to the image's next column, column 1
-to its next row, and column 3 is the panel's centre. The matrix describes the panel at that centre; at another angle of the
-gantry the panel is rotated about +z. The first stored row is read first."""
+to its next row, and column 3 is the panel's centre. During an exposure the panel leaves this centre and is rotated about
++z with the gantry. The first stored row is read first."""
 
 import logging
 from dataclasses import dataclass, replace
@@ -37,7 +37,7 @@ _GAP = 1e-3  # least pause between two frames, as a fraction of a frame's durati
 @dataclass(frozen=True, eq=False)
 class Circle:
     """The circle on which the source or the panel moves: centre (x, y) and radius in mm. For each view: height z (F,) in
-    mm, and angles (F, 3) in rad when its first line opens and closes and when its last line closes."""
+    mm, and angles (F, 3) in rad at which its first line opens and closes and its last line closes."""
 
     centre: np.ndarray
     radius: float
@@ -76,7 +76,7 @@ def recognises(path: Path) -> bool:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a folder with one JSON and TIFF frames, in it or in its folder ``projections``. ``path`` may be the JSON."""
+    """Imports a folder with one JSON. The TIFF frames lie in it or its folder ``projections``. ``path`` may be the JSON."""
     options.refuse_unused("phyradgs-real", OPTIONS)
     checks.one_of(options.called("readout_axis"), options.readout_axis or "rows", ("rows",))
     description = path if path.is_file() else SafeFolder(path).only("description of the views", ".json")
@@ -111,7 +111,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 def _frames_and_views(
     description: Path, views: list[Fields], options: ImportOptions
 ) -> tuple[np.ndarray, list[Fields]]:
-    """Reads frames (F, v, u) as stored. Returns them and their F views: all, or those from ``first_view`` on."""
+    """Reads frames (F, v, u) as stored, and returns them with their views. The F views are all of the JSON's, or F from
+    ``first_view`` on. Raises InputError unless there is one frame per view."""
     below = description.parent / PROJECTIONS
     folder = SafeFolder(below if below.exists() else description.parent)
     paths = folder.matching(*tiff.SUFFIXES)
@@ -141,7 +142,7 @@ def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> Impo
 
 
 def _timing(subject: str, detector: Circle, options: ImportOptions) -> tuple[Shutter, np.ndarray]:
-    """Returns shutter and opening times (F,) in s. Moves overlapping frames apart: a pose table has one pose at a time."""
+    """Returns shutter and opening times (F,) in s. Delays frames that would overlap: a pose table has one pose at a time."""
     exposure_s = synthetic.exposure_of_blurred_s(options)
     first, closed, done = np.unwrap(detector.angle_rad, axis=1).T
     ratio = synthetic.readout_ratio(subject, closed - first, done - closed)
@@ -156,7 +157,7 @@ def _view_poses(
     panel: tuple[int, int], pitch: tuple[float, float],
 ) -> np.ndarray:
     """Returns a view's poses (T, 12), see ``PoseTable``. detector: the panel's angles (T,) in rad and centres (T, 3) in mm.
-    The panel is rotated about +z from the angle at which its matrix holds. centre: (x, y) of its circle."""
+    The panel is rotated about +z from the angle for which its matrix holds. centre: (x, y) in mm of the panel's circle."""
     rotation, stands_at = _matrix(view)
     angle_rad, centre_mm = detector
     turned_rad = angle_rad - np.arctan2(stands_at[1] - centre[1], stands_at[0] - centre[0])

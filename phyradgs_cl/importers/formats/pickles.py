@@ -97,8 +97,8 @@ def _array(table: Fields, key: str, ndim: int) -> np.ndarray:
 
 
 def read_pickle(path: Path, unpickler: "type[PlainUnpickler] | None" = None) -> object:
-    """Reads dicts, lists, tuples, text, numbers and NumPy arrays of plain numbers. Raises InputError for a damaged file,
-    and for what ``unpickler`` refuses; None stands for ``PlainUnpickler``."""
+    """Reads dicts, lists, tuples, text, numbers and NumPy arrays of plain numbers. Raises InputError for a damaged file, one
+    too large for this machine's memory, and what ``unpickler`` refuses; None stands for ``PlainUnpickler``."""
     subject = str(path)
     size = regular_file(path, subject).st_size
     check_room(subject, _COPIES * size)
@@ -112,11 +112,11 @@ def read_pickle(path: Path, unpickler: "type[PlainUnpickler] | None" = None) -> 
 
 
 class PlainUnpickler(pickle.Unpickler):
-    """An unpickler that calls no function which a file names, but only a few of our own."""
+    """An unpickler that calls none of the functions that a file names. A few functions of our own take their place."""
 
     def find_class(self, module: str, name: str) -> Any:
         """Returns our function for an allowed name. Raises InputError for any other name."""
-        functions: dict[str, Any] = {  # made at each call again, since a pickle may change a function's attributes
+        functions: dict[str, Any] = {  # new functions at each call, since a pickle may change a function's attributes
             "numpy.ndarray": object,  # only passed to _reconstruct, which ignores it
             "numpy.dtype": lambda code, *_: _Type(code),
             "numpy.core.multiarray._reconstruct": lambda *_: _Array((0,)),
@@ -223,7 +223,7 @@ def _named(content: dict[object, Any], *words: str) -> Any:
 def _trajectory(
     geo: Any, poses: np.ndarray, angle_rad: np.ndarray, timing: Timing, subject: str
 ) -> tuple[CircularOrbit | PoseTable, Geometry]:
-    """Returns trajectory and geometry: a circular orbit if one geometry describes all poses (F, 12), else a pose table."""
+    """Returns trajectory and geometry: a circular orbit if it has all the poses (F, 12), else a pose table."""
     rows, columns = np.ravel(geo.nDetector).tolist()
     pitch_v, pitch_u = np.ravel(geo.dDetector).tolist()
     off_v, off_u = np.resize(0.0 if geo.offDetector is None else geo.offDetector, 2).tolist()

@@ -1,8 +1,9 @@
 """Folders of R2-Gaussian: meta_data.json with .npy projections and the true volume, taken at rest. Axes are as in NAF and
 PhyRadGS: projections [v, u] with row 0 at +z, volumes [x, y, z].
 
-Synthetic folders of PhyRadGS also have the gantry's angles at every frame's first and last line, but no times. The exposure
-is the option ``exposure_s``, or 1 s; the gantry's speed is the angle of an exposure over this time."""
+Synthetic folders of PhyRadGS also have the gantry's angles at which every frame's first line opens and closes and its last
+line closes, but no times. The exposure is the option ``exposure_s``, or 1 s. The gantry's speed is the mean angle of an
+exposure over this time."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,7 +52,7 @@ class R2Folder:
     def frame(self, entry: Fields) -> np.ndarray:
         """Reads the projection (v, u) of an entry, as stored."""
         name = entry.word("file_path")
-        first_copy = name.replace("_sim1", "")  # _sim1 marks a repeated simulation; some folders have only the first one
+        first_copy = name.replace("_sim1", "")  # _sim1 marks a repeated simulation; the first one is read if it exists
         path = self.folder.file(first_copy if self.folder.exists(first_copy) else name, entry.name("file_path"))
         image = read_npy(path, 2)
         checks.shape(str(path), image, self.geometry.detector_shape)
@@ -183,7 +184,7 @@ def timing_of_marks(subject: Fields, marks_rad: np.ndarray, options: ImportOptio
 
 
 def exposure_of_blurred_s(options: ImportOptions) -> float:
-    """Returns the options' exposure in s, else 1 s, because the files state none. Raises InputError for 0 s or less."""
+    """Returns the options' exposure, or 1 s without it, because the files state none. Raises InputError for 0 s or less."""
     exposure_s = 1.0 if options.exposure_s is None else options.exposure_s
     if exposure_s <= 0:
         raise InputError(options.named("exposure_s"), f"{exposure_s:g}", "a time above 0 s", "the frames are blurred")
@@ -191,8 +192,8 @@ def exposure_of_blurred_s(options: ImportOptions) -> float:
 
 
 def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarray) -> float:
-    """Returns readout time over exposure time, from the gantry's arcs (F,) in rad during both. Raises
-    InputError where the ratio differs between frames, and for exposures without a turn."""
+    """Returns readout time over exposure time, from the gantry's arcs (F,) in rad during both. Raises InputError for a ratio
+    below 0, or one that differs between frames, and for exposures without a turn or with turns of both signs."""
     if np.any(exposure_arc == 0) or np.any(np.sign(exposure_arc) != np.sign(exposure_arc[0])):
         found = f"arcs from {exposure_arc.min():.6g} to {exposure_arc.max():.6g} rad"
         raise InputError(f"{subject} exposure", found, "arcs that turn one way, none of them 0")
@@ -204,7 +205,7 @@ def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarra
 
 
 def start_times_s(first_rad: np.ndarray, closed_rad: np.ndarray, exposure_s: float) -> np.ndarray:
-    """Returns opening times (F,) in s. The gantry is taken to turn at its mean speed within exposures; the first line opens
-    and closes at the angles (F,) in rad."""
+    """Returns opening times (F,) in s, from 0 on. first_rad, closed_rad (F,): the gantry's angles when each frame's first
+    line opens and closes. The gantry is taken to turn at the mean speed of the exposures all the time."""
     speed_rad_per_s = float(np.mean(closed_rad - first_rad)) / exposure_s
     return (first_rad - first_rad[0]) / speed_rad_per_s

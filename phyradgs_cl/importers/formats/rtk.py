@@ -53,8 +53,8 @@ class Stack:
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a folder with an .xml file and a MetaImage, or one of the two files. An .xml file in a
-    folder of raw projections is left to rtk_projections.py."""
+    """Returns whether ``path`` is a folder with an .xml file and a MetaImage, or one of the two files. An .ora.xml file, and
+    an .xml file in a folder of raw projections, are left to rtk_projections.py."""
     folder = SafeFolder(path if path.is_dir() else path.parent)
     is_stack = path.suffix.lower() in STACKS
     descriptions = folder.matching(".xml") if path.is_dir() or is_stack else [path] if path.suffix.lower() == ".xml" else []
@@ -82,8 +82,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 def scan_of(
     rtk: "RtkGeometry", stack: Stack, options: ImportOptions, subjects: tuple[str, str], title: str, source: str
 ) -> Scan:
-    """Returns the scan of a geometry and its projections. subjects: names of the two in messages. Raises InputError where
-    they have different numbers of frames."""
+    """Returns the scan of a geometry and its projections. subjects: the names of both for messages. Raises InputError if
+    their numbers of frames differ."""
     described, stored = subjects
     if len(stack.frames) != rtk.frames:
         found = f"{len(stack.frames)} frames, {rtk.frames} projections in {Path(described).name}"
@@ -98,8 +98,8 @@ def scan_of(
 def stack_of(
     frames: np.ndarray, origin_mm: tuple[float, ...], spacing_mm: tuple[float, ...], direction: np.ndarray, subject: str
 ) -> Stack:
-    """Returns projections (F, v, u) with ITK's origin and spacing (3,) in mm and its direction (3, 3). Raises InputError
-    unless the third axis, which counts frames, is perpendicular to the others."""
+    """Returns a stack of projections (F, v, u), from ITK's origin and spacing (3,) in mm and its direction (3, 3). Raises
+    InputError unless the third axis, which counts frames, is perpendicular to the others."""
     steps_mm = direction * spacing_mm  # its columns are the steps along u, along v and to the next frame
     if np.abs([*steps_mm[:2, 2], *steps_mm[2, :2]]).max() > 1e-9 * np.abs(steps_mm).max():
         raise InputError(subject, str(steps_mm.tolist())[:80], "axes of a stack: columns, rows, frames")
@@ -145,7 +145,8 @@ class RtkGeometry:
 
     @property
     def is_circular(self) -> bool:
-        """Whether source and panel move on one circle about the axis, without tilt or change."""
+        """Whether source and panel turn about the axis at constant distances and offsets, without tilts; in a cone beam also
+        without offsets of the source."""
         of_source = (_TO_AXIS, "SourceOffsetX", "SourceOffsetY") if self.is_parallel else ()
         steady = [v for name, v in self.values.items() if name not in (_ANGLE, *of_source)]
         still = all(np.ptp(v) <= 1e-9 * (1 + np.abs(v).max()) for v in steady)

@@ -23,8 +23,9 @@ _COPIES = 12  # bytes of memory for every byte of the files: some makers pack im
 
 @dataclass(frozen=True)
 class _Maker:
-    """A maker's files. description, suffixes: how names of the description and of projections end. reader: RTK's class for
-    the geometry. below: pattern of projections below the description's folder. options: the import options that apply."""
+    """A maker's files. description, suffixes: how names of the description and of projections end. reader: RTK's class that
+    reads the geometry. below: pattern of projections in folders below the description's. options: import options that
+    apply."""
 
     description: str
     suffixes: tuple[str, ...]
@@ -42,7 +43,7 @@ _MAKERS = (
 
 
 def _read_geometry(rtk: Any, reader_name: str, description: str, names: list[str]) -> Any:
-    """Reads RTK's geometry from the description and, for makers that store angles there, from the projections' headers."""
+    """Reads RTK's geometry from the description, and from the projections' headers if the maker stores angles there."""
     reader = getattr(rtk, reader_name).New()
     if hasattr(reader, "SetFilename"):  # Elekta's reader: the description has the geometry of all projections
         reader.SetFilename(description)

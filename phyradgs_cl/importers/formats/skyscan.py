@@ -90,7 +90,7 @@ def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOp
         return width_mm / next((scan.length(name) for name in _RATIOS if scan.has(name)), 1.0), width_mm
 
     pitch_mm = options.taken("pixel_size_mm", stored_mm)
-    # the central ray may lie outside a cropped image; if it is more than the image's height away, the log is wrong
+    # the central ray may lie outside a cropped image; if it is more than the image's height beyond it, the log is wrong
     up_mm = (panel[0] / 2 - scan.number("Optical Axis (line)", panel[0] / 2, -panel[0], 2 * panel[0])) * pitch_mm[0]
     if options.detector_offset_mm is None:
         settings.say_missing(scan, {"place of the axis": "the middle of the panel; check --fix-offset or calibrate find it"})
@@ -98,9 +98,9 @@ def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOp
 
 
 def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredTiming:
-    """Returns the exposure in s, summed over averaged frames. Leaves it out where the log has none, and where the scanner
-    stopped for each frame and no option gives a frame time. Raises InputError for a Frame Averaging other than OFF, or ON
-    with a count."""
+    """Returns the exposure in s, summed over averaged frames. Leaves it out if the log has none, if an option replaces it,
+    and if the scanner stopped for each frame and no option gives a frame time. Raises InputError for a Frame Averaging that
+    is neither OFF nor ON with a count."""
     motion = next((scan.word(name) for name in ("Type of Detector Motion", "Type of Motion") if scan.has(name)), "")
     averaging = scan.word("Frame Averaging", default="OFF")
     averaged = re.fullmatch(r"ON *\(([1-9]\d{0,5})\)", averaging, re.I)
@@ -114,7 +114,7 @@ def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredT
 
 def _white(scan: settings.Settings, frames: np.ndarray, options: ImportOptions) -> float:
     """Returns the counts of air: the option's, else Reference Intensity, else the largest that Depth (bits) allows. Raises
-    InputError for frames (F, v, u) brighter than Reference Intensity, and for uncorrected ones without the option."""
+    InputError for frames (F, v, u) brighter than Reference Intensity, and for uncorrected frames without the option."""
     remedy = f"say {options.named('flat_value')}"
     if not options.flat_value and scan.word("Flat Field Correction", default="ON").upper() == "OFF":
         raise scan.error("Flat Field Correction", "OFF", "frames that the scanner has corrected", remedy)

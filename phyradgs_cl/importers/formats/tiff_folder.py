@@ -182,7 +182,7 @@ def _scanner(path: Path, scanner: Fields, panel: tuple[int, int], options: Impor
         "detector": dict(zip(("pixel_size_v_mm", "pixel_size_u_mm"), options.pixel_size_mm or (), strict=False)),
     }
     for table, values in ((source, given["source"]), (detector, given["detector"])):
-        if isinstance(table, dict) and table.get("beam") != "parallel":  # distances of a parallel beam are an error
+        if isinstance(table, dict) and table.get("beam") != "parallel":  # with_options refuses a parallel beam's distances
             table.update({key: value for key, value in values.items() if value is not None})
     if isinstance(detector, dict):
         content["detector"] = {"rows": panel[0], "columns": panel[1], **detector}

@@ -58,7 +58,8 @@ class Streams(Fields):
         return values[:count]
 
     def steady(self, name: str) -> float:
-        """Returns a length in mm without its sign, the same in all images. Raises InputError if it differs or is 0."""
+        """Returns a length in mm without its sign. Images in which it is 0 do not count. Raises InputError if it differs
+        between the others, or is 0 in all images."""
         lengths = np.abs(self.numbers(name))
         lengths = lengths[lengths > 0]
         if not len(lengths) or np.ptp(lengths) > _STEADY * lengths[0]:
@@ -121,7 +122,7 @@ def _type(scan: Streams, name: str, default: float | None = None) -> str:
 
 
 def _stage(scan: Streams, at: np.ndarray, panel: tuple[int, int], options: ImportOptions) -> RotaryStage:
-    """Returns a stage whose panel is shifted in every image as the alignment says. at (F,): the images' numbers."""
+    """Returns a stage whose panel is shifted in each image by the image's alignment shift. at (F,): the images' numbers."""
     is_cone = not scan.has(f"{_INFO}/XrayGeometry") or scan.first_of(f"{_INFO}/XrayGeometry") == 1
 
     def pixel_mm(magnification: float = 1.0) -> tuple[float, float]:

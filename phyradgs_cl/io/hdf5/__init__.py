@@ -105,7 +105,8 @@ class Hdf5Source:
         raise self.error(address, found, f"a group {name!r}", self.misspelling(parent, name))
 
     def optional_group(self, address: str) -> h5py.Group | None:
-        """Returns the group at an address, or None. Raises InputError if there is a similar name: it is a misspelling."""
+        """Returns the group at an address, or None. Raises InputError for a dataset there, and if the address is missing but
+        a similar name exists, which must be a misspelling."""
         return self._optional(address, h5py.Group, "a dataset", "a group")
 
     def optional(self, address: str) -> h5py.Dataset | None:

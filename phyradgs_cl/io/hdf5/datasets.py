@@ -125,8 +125,8 @@ def _finite(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quan
 def read_number(
     source: Hdf5Source, address: str, quantity: Quantity | None = None, default: float | None = None
 ) -> float:
-    """Reads a finite number from a dataset of one element, in the package's unit of ``quantity``. Raises InputError for a
-    missing dataset that has no ``default``."""
+    """Reads a finite number from a dataset of one element, in the package's unit of ``quantity``. Raises InputError for more
+    elements, other values, and a missing dataset that has no ``default``."""
     if default is not None and source.optional(address) is None:
         return default
     dataset = source.dataset(address)
@@ -153,7 +153,7 @@ def read_integers(source: Hdf5Source, address: str, shape: Sequence[int | None])
 def read_word(
     source: Hdf5Source, address: str, allowed: Collection[str] | None = None, default: str | None = None
 ) -> str:
-    """Reads a string, one of ``allowed`` if given. Raises InputError for others, and if dataset and default are missing."""
+    """Reads a string, one of ``allowed`` if given. Raises InputError for others, and for a missing one without default."""
     if default is not None and source.optional(address) is None:
         return default
     dataset, word = source.dataset(address), None
@@ -197,9 +197,9 @@ def _text(value: object) -> str | None:
 
 
 def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quantity) -> np.ndarray:
-    """Converts finite values of any shape from the unit in the dataset's attribute "units" to the package's unit. Without
-    the attribute it assumes ``quantity.assumed``, and warns unless the dataset's name ends in that unit. Raises InputError
-    for an unknown unit, and for values beyond ``quantity.largest``."""
+    """Converts finite values of any shape to the package's unit from the unit in the dataset's attribute "units" or "unit".
+    Without it, assumes ``quantity.assumed``, and warns unless the dataset's name ends in that unit. Raises InputError for an
+    unknown unit, and for values beyond ``quantity.largest``."""
     unit = (read_attribute(source, address, "units") or read_attribute(source, address, "unit") or "").strip()
     if not unit:
         unit = quantity.assumed

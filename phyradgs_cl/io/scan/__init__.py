@@ -22,7 +22,7 @@ QUANTITIES = ("attenuation", "transmission", "counts")
 ROTATES = ("gantry", "sample")
 BEAMS = ("cone", "parallel")
 
-# Fields of NXtomo that would change the geometry. They are not read; a file that has them gives a warning.
+# Fields of NXtomo that would change the geometry. ``read_header`` does not read them, and warns of a file that has them.
 IGNORED = (
     *(f"{DETECTOR}/{name}" for name in ("transformations", "x_rotation_axis_pixel_position")),
     *(f"{DETECTOR}/{name}" for name in ("y_rotation_axis_pixel_position", "estimated_cor_from_motor")),

@@ -26,7 +26,7 @@ from phyradgs_cl.io.scan.motion import has_motion, read_gating, read_trajectory
 from phyradgs_cl.io.tables import read_facts
 
 _log = logging.getLogger(__name__)
-_JITTER = 0.01  # measured times of frames may differ from their median by this fraction of it
+_JITTER = 0.01  # exposures or readouts measured per frame may differ from their median by this fraction of it
 _DEEPEST_ENTRY = 3  # levels of groups in which NXtomo entries and subentries are searched
 
 
@@ -235,8 +235,8 @@ def _read_pulse(source: Hdf5Source, entry: str, span_s: float) -> tuple[float, f
 
 
 def read_duration(source: Hdf5Source, address: str, used: np.ndarray, needed: bool) -> float:
-    """Reads one time in s for all projections, stored once or for every frame. Measured times may differ by a percent; the
-    result is their median. Returns 0 if the dataset is missing and not ``needed``."""
+    """Reads one time in s for all projections, stored once or for every frame. Stored times may differ from their median by
+    1 %, and the result is the median. Returns 0 if the dataset is missing and not ``needed``."""
     dataset = source.dataset(address) if needed else source.optional(address)
     if dataset is None:
         return 0.0

@@ -20,7 +20,7 @@ from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5.datasets import ATTENUATION, read_array, read_grid, read_values
 from phyradgs_cl.io.scan.header import ScanHeader, read_header
 
-LARGEST_LINE_INTEGRAL = 1e6  # a larger one cannot be measured, so it raises an error
+LARGEST_LINE_INTEGRAL = 1e6  # no larger one can be measured: in a scan file it is an error, and an import masks it
 # Takes data (F, v, u), image_key (F,) and quantity; returns line integrals (P, v, u) and a mask of bad pixels or None.
 ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.ndarray | None]]
 
@@ -32,8 +32,8 @@ def read_scan_header(path: str | Path) -> Scan:
 
 
 def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, int] | None = None) -> Scan:
-    """Reads a scan file. rows: detector rows [first, stop) that alone are read of a parallel-beam scan, which then keeps
-    the whole grid; None reads all.
+    """Reads a scan file. rows: the detector rows [first, stop) to read, of a parallel-beam scan only, whose grid stays
+    whole; None reads all.
 
     to_attenuation: takes (data (F, v, u), image_key (F,), quantity) and returns line integrals (P, v, u) of the P
     projections. It also returns a mask (v, u) or (P, v, u) of unusable values, or None. It leaves flat, dark and invalid
@@ -149,7 +149,8 @@ def _read_mask(source: Hdf5Source, header: ScanHeader, rows: slice | None) -> np
 def _read_frames(
     source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None, rows: slice | None
 ) -> np.ndarray:
-    """Reads all stored frames (F, v, u), or their ``rows``. Raises InputError for NaN and infinity that are not masked."""
+    """Reads all stored frames (F, v, u), or their ``rows``. Raises InputError for NaN and infinity in valid frames, unless
+    they are masked."""
     address = f"{header.entry}/{schema.DATA}"
     data = read_values(source, address, source.dataset(address), rows=rows)
     if data.dtype.kind == "f":

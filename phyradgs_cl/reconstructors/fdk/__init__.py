@@ -97,9 +97,9 @@ def fdk(
     scan: Scan, options: FdkOptions, rt: Runtime, *, seed: int = 0, report: ProgressReport = ignore_progress,
     deformation: Deformation | None = None,
 ) -> Reconstruction:
-    """Returns the FDK volume of a scan in 1/mm, or with ``FbpOptions`` the filtered backprojection of a parallel beam: half
-    turns, full turns, and full turns with the axis near the panel's edge. For a moving object the volume is its reference
-    state.
+    """Returns the FDK volume of a scan in 1/mm, or with ``FbpOptions`` the filtered backprojection of a parallel beam. Both
+    take short scans, full turns, and full turns with the axis near the panel's edge. Of a moving object the volume shows the
+    reference state.
 
     ``seed`` is part of the common signature and not used.
 
@@ -141,7 +141,7 @@ def _moving(
 def _check(scan: Scan, options: FdkOptions) -> None:
     """Raises InputError for the other method's beam, and for orbits and views that the method cannot take."""
     pose = middle_poses(scan)[_measured(scan)]
-    with without_warnings():  # of approximations: ``fdk`` gives them
+    with without_warnings():  # ``fdk`` itself warns of approximations
         check_beam(options.METHOD, pose, scan.is_parallel)
     if isinstance(options, FbpOptions) and options.deblur > 0:
         deblurred(scan, np.zeros((len(pose), 1, 1), np.float32), azimuth_rad(pose), options.deblur)

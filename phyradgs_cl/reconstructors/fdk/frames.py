@@ -1,6 +1,6 @@
 """Changes frames before FDK's filter: continues detector rows beyond the panel, and removes motion blur along the angle.
 
-Rows continue so that the filter does not ring where they are cut off. The first two WAYS leave the object there unknown.
+Rows continue so that the filter does not ring where they are cut off. Only ``reprojected`` knows the object there.
 
 - cosine: rows end in a quarter of a cosine (similar to Ohnesorge et al., Med. Phys. 27 (2000) 39).
 - cylinder: rows continue as chords of a cylinder, from their last values and slope (Hsieh et al., Med. Phys. 31 (2004)
@@ -145,7 +145,7 @@ def deblurred(scan: Scan, frames: np.ndarray, angle_rad: np.ndarray, noise: floa
     """Returns frames (F, rows, columns) float32 without motion blur along the angle, as if the gantry stopped for each view.
     angle_rad (F,): gantry angles at the frames' middles. noise: the power of noise over that of the signal.
 
-    Raises InputError where views are not evenly spaced in angle; their order does not matter."""
+    Raises InputError unless the views, in any order, are evenly spaced in angle."""
     arc_rad = exposure_arc_rad(scan)
     if arc_rad == 0:
         return frames

@@ -32,7 +32,7 @@ Backproject = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 def travels(pose: np.ndarray, rows: int, is_parallel: bool) -> bool:
     """Returns whether poses (F, r, c, 12) travel along the axis so far that voxels miss some views: the origin's image moves
-    along the panel's columns."""
+    over more than one row and 5 % of the rows."""
     middle = pose[:, pose.shape[1] // 2, pose.shape[2] // 2]
     first, across = middle[:, 3:6], np.cross(middle[:, 6:9], middle[:, 9:12])
     source = middle[:, :3]
@@ -63,7 +63,7 @@ def seen_volume(
     it.
 
     pose (F, 12) or (F, lines, 12) mm. counted: gives a view's redundancy weights (rows, columns). Both backprojections
-    weight each view by the angle for which it stands. ``backproject_seen`` divides by the distance once, not twice."""
+    weight each view by the angle for which it stands. ``backproject_seen`` divides by the distance, not by its square."""
     by_pixel, shape = pose_of_pixels(pose, axis), frames.shape[1:]
     angle_rad, pace = _directions(by_pixel[:, [by_pixel.shape[1] // 2]], shape, is_parallel)
     turn_rad = 2 * np.pi if is_displaced else np.pi  # a centred panel measures every ray in half a turn

@@ -74,7 +74,8 @@ class Arc:
 
 
 def filled_gap_rad(fan: weights.Fan) -> float:
-    """Returns the width in rad up to which the views at both sides fill gaps: no others see some of the gaps' rays."""
+    """Returns the width in rad up to which the views at both sides fill gaps: 2π for a panel put aside, 15° for another
+    displaced one, because no opposite views measure some of a gap's rays there; else 0."""
     if fan.is_put_aside:
         return 2 * np.pi
     return _FILLED_RAD if fan.is_displaced else 0.0
@@ -118,8 +119,8 @@ def _stand_out(ahead: np.ndarray) -> np.ndarray:
 
 
 def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Returns which narrow gaps (K,) have a gap on the opposite side too, bool (K,): no opposite ray stands for them, so the
-    views at both sides must. The widest gap is never among them."""
+    """Returns which wide gaps (K,) of at most 15° have a wide gap on the opposite side too, bool (K,). No opposite
+    rays stand for these, so the views at both sides must. The widest gap is never among them."""
     narrow = wide & (ahead <= _FILLED_RAD) & (np.arange(ahead.size) != np.argmax(ahead))
     opposite = centre + ahead / 2 + np.pi
     before = np.searchsorted(centre, np.mod(opposite - centre[0], 2 * np.pi) + centre[0], side="right") - 1

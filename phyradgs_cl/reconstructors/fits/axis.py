@@ -122,9 +122,9 @@ class _Pair:
 def opposite_shift(scan: Scan) -> AxisShift:
     """Returns the panel's shift along u under which views half a turn apart are mirror images, with its deviation.
 
-    A view's opposite is interpolated between its two neighbours in angle. A half turn has opposites at its ends only: there
-    it may be extrapolated by a step. NaN for cone beams, panels that are rolled or move along the axis, and scans without
-    opposite views. NaN also if columns are read one after the other: mirror images are then seen from other angles."""
+    A view's opposite is interpolated between its two neighbours in angle. A half turn has opposites at its ends only, where
+    they may be extrapolated by up to 1.5 steps. NaN for cone beams, panels that are rolled or move along the axis, and scans
+    without opposite views. NaN also if columns are read one after the other: mirrored columns then have other angles."""
     if not has_opposite_views(scan) or (scan.shutter.axis == "columns" and scan.shutter.readout_s > 0):
         return NOT_FOUND
     pairs = _pairs(scan)

@@ -97,8 +97,8 @@ def _best(scan: Scan, turned: np.ndarray, frames: np.ndarray, pose: np.ndarray, 
 
 
 def _mean_squares(turned: np.ndarray, frames: np.ndarray, fan: np.ndarray, is_parallel: bool) -> np.ndarray | None:
-    """Returns the mean squared differences (F,) of rays and their opposites; None if the columns do not see the axis. turned
-    (F,): views' angles in rad. fan (columns,): fan angles of the columns."""
+    """Returns the mean squared differences (F,) of rays and their opposites; None if the axis lies less than a pixel inside
+    the columns' ends. turned (F,): views' angles in rad. fan (columns,): fan angles, in a parallel beam distances in mm."""
     columns = np.arange(fan.size)
     if fan[-1] < fan[0]:
         fan, columns = fan[::-1], columns[::-1]

@@ -2,8 +2,8 @@
 
     min over U, φ of ‖p − Σ_k P_k W_k v‖² + γ bending(U) + β roughness(φ)
 
-W_k deforms the volume v to state k, and P_k projects that. The control vectors U and the weights' coefficients in time φ are
-improved in turn. A step is taken only if it lowers the sum and matter does not fold."""
+W_k deforms the volume v to state k, and P_k projects this state. The control vectors U and the weights' coefficients in time
+φ are improved in turn. A step is taken only if it lowers the sum and matter does not fold."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
@@ -26,7 +26,7 @@ _DAMPING = 1e-3  # Levenberg damping over the mean diagonal of JᵀJ: control ve
 _ROUGHNESS = 1e-2  # β, the penalty on the weights' roughness in time, relative to the mean diagonal of JᵀJ
 _SHORTER = (1.0, 0.5, 0.25)  # backtracking line search: fractions of a step, tried in turn until one lowers the misfit
 _LEAST_DETERMINANT = 0.1  # a step may lower det(I + ∂w/∂y) of the displacement w(y) to this: at 0 matter folds
-_LEAST_VOXELS = 1.0  # least voxels that a change of a weight by 1 counts as, so that fields of zeros have several states
+_LEAST_VOXELS = 1.0  # a weight's change by 1 counts as at least so many voxels, so that fields of zeros have several states
 _SUPPORT = 4  # a cubic spline in time extends over this many intervals between knots
 
 

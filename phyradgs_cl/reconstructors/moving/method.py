@@ -104,7 +104,7 @@ class FieldSearch:
 
     @property
     def finished(self) -> str | None:
-        """Why the search ends early: the object rests, because in two rounds no step lowered the residual. Else None."""
+        """Why the search ends early: two rounds found no step that lowers the misfit, so the object rests. Else None."""
         return _AT_REST if self.iteration >= 2 and not self.field.control_mm.any() else None
 
     def step(self) -> None:
@@ -267,7 +267,7 @@ class _Field:
 
 
 def moving(scan: Scan, options: MovingOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the reference volume in 1/mm, with the object's ``deformation``. ``arguments``: as in ``MethodRun``."""
+    """Returns the reference volume in 1/mm, with the object's ``deformation``. ``arguments``: fields of ``MethodRun``."""
     run, one = MethodRun(scan, options, rt, **arguments), _Field()
     if run.resume is not None:
         run = replace(run, resume=one.restore(run.resume))
@@ -303,7 +303,7 @@ METHOD = Method(
 
 def _signal_of(scan: Scan, gating: str) -> MotionSignal:
     """Returns the signal of the scan, of a file, or of the frames; with ``free`` it has no period. Raises InputError if the
-    scan should state a signal and does not."""
+    scan should state a signal and does not, and for a file or signal that does not fit the scan."""
     if gating == "scan":
         if scan.gating is None:
             remedy = "take --set gating=auto, or a file NAME.csv"

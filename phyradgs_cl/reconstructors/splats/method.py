@@ -72,7 +72,7 @@ class SplatRun:
             self.control_density()
 
     def motion_at(self, iteration: int) -> Motion:
-        """Returns the motion model of an iteration. It is coarse in early iterations, unless the object moves."""
+        """Returns the motion model of an iteration. In a fly-scan of an object at rest it is coarse in early iterations."""
         is_coarse = self.frames.scan.is_fly and self.frames.deformation is None
         return self.options.motion_at(iteration / max(self.iterations, 1)) if is_coarse else self.options.motion
 
@@ -121,7 +121,7 @@ class SplatRun:
         }  # fmt: skip
 
     def restore(self, state: State) -> None:
-        """Continues from ``state``, with any number of ranks that a batch has frames for."""
+        """Continues from ``state``, on any number of ranks up to the number of frames in a batch."""
         self.iteration, self.batch = int(state["iteration"]), int(state["batch"])
         self.sharing = sharing_of(self.rt.ranks, self.batch)
         self.rng.bit_generator.state = json.loads(str(state["rng"]))

@@ -16,8 +16,8 @@ _REFERENCE_PERCENTILE = 99.9  # the unit of density is this percentile of the fi
 
 
 def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:
-    """Returns the internal units: half the longest side in mm, and the 99.9th percentile of an FDK volume in 1/mm; if that
-    is not positive, one over the half side. Raises NumericalError if the percentile is not finite."""
+    """Returns the internal units: half the longest side in mm, and the 99.9th percentile of an FDK volume in 1/mm. If the
+    percentile is not positive, one over the half side replaces it. Raises NumericalError if it is not finite."""
     reference = float(np.percentile(fdk, _REFERENCE_PERCENTILE))
     if not np.isfinite(reference):
         raise NumericalError("projections", "values that overflow in FDK", "line integrals of order 1")
