@@ -118,7 +118,7 @@ def numbers(subject: str, value: ArrayLike, expected: Sequence[int | None] | Non
 
 
 def rising(subject: str, value: ArrayLike) -> NDArray[np.float64]:
-    """Returns times (n,) as float64. Raises InputError unless there is at least one and each is later than the last."""
+    """Returns times (n,) as float64. Raises InputError for no time, and for one that is not later than the one before."""
     times = numbers(subject, value, (None,))
     if len(times) == 0 or (np.diff(times) <= 0).any():
         raise InputError(subject, short_repr(times.tolist()), "at least one time, rising")

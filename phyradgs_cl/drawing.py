@@ -31,7 +31,8 @@ _LOG_RATIO = 20.0  # an axis is logarithmic where the largest value is more than
 
 
 def new_figure(width_inch: float, height_inch: float) -> "Figure":
-    """Returns an empty figure. If the user has imported pyplot, pyplot makes it, so that ``plt.show()`` shows it."""
+    """Returns an empty figure. If the user has imported pyplot outside a notebook, pyplot makes the figure, so that
+    ``plt.show()`` shows it."""
     if "ipykernel" in sys.modules:
         with suppress(ImportError):  # with this backend a notebook shows a returned figure, and shows it once
             importlib.import_module("matplotlib_inline.backend_inline")

@@ -135,7 +135,8 @@ def shortened(options: Any, iterations: int) -> Any:
 
 
 def seconds_around(path: Path, scan: Scan, result: Reconstruction) -> float:
-    """Times what ``reconstruct`` does besides the method: hashes the scan, compares with the truth, writes the volume."""
+    """Times what ``reconstruct`` does besides the method: hashes the scan, compares with a truth of the volume's shape, and
+    writes the volume."""
     started = time.perf_counter()
     sha256_of(path)
     if scan.reference is not None and result.volume.shape == scan.reference.shape:

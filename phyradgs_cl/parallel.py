@@ -1,9 +1,9 @@
 """Lets several MPI processes (ranks) work on one scan: how they were launched, how they communicate and share the work.
 
 Sums over ranks have the same bits for any order and number of ranks. Each row of values is scaled by a power of two and
-rounded to 64-bit integers, whose addition is exact. The scale is the largest for which the sum cannot overflow. A sum of 64
-terms loses what is below 2⁻³⁷ of the largest value in its row. mpi4py is imported only where mpiexec or srun started several
-processes."""
+rounded to 64-bit integers, whose addition is exact. The scale is the largest for which the sum cannot overflow. In a sum of
+64 terms each is rounded by at most 2⁻⁵⁶ of the largest value in its row. mpi4py is imported only where mpiexec or srun
+started several processes."""
 
 import os
 import time

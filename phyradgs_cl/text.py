@@ -111,8 +111,8 @@ def _is_new(said: set[str], record: logging.LogRecord) -> bool:
 
 
 def each_warning_once() -> Any:
-    """Drops this package's warnings that the body repeats word for word, as when several stages of a run check one scan. It
-    is a context and a decorator."""
+    """Drops this package's warnings that the body repeats word for word, as when several stages of a run check one scan. Use
+    it as a context manager or as a decorator."""
     return _filtered(lambda: partial(_is_new, set()))
 
 
@@ -123,7 +123,7 @@ def without_warnings() -> AbstractContextManager[None]:
 
 @contextmanager
 def _filtered(make_filter: Callable[[], Callable[[logging.LogRecord], bool]]) -> Iterator[None]:
-    """Adds a filter to every handler of log records, which drops those for which it returns False."""
+    """Adds a filter to every handler of log records while the body runs. It drops the records for which it returns False."""
     handlers = [*logging.getLogger(__package__).handlers, *logging.getLogger().handlers, logging.lastResort]
     filters = [(handler, make_filter()) for handler in handlers if handler is not None]
     for handler, one in filters:

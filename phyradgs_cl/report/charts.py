@@ -71,7 +71,7 @@ def _inline(svg: str) -> str:
 
 
 def convergence_charts(record: Sequence[Mapping[str, float]]) -> list[Chart]:
-    """Returns a chart over the iterations for each recorded quantity that changes."""
+    """Returns a chart over the iterations for each recorded quantity that changes, up to ``MOST_CHARTS``."""
     names = dict.fromkeys(key for line in record for key in line if key not in ("iteration", "seconds"))
     charts = []
     for name in names:
@@ -123,7 +123,8 @@ def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:
 
 
 def profile_chart(x_mm: NDArray[Any], line: NDArray[Any], sigma: NDArray[Any], truth: NDArray[Any] | None) -> Markup:
-    """Returns a chart of voxels (n,) in 1/mm along ``x_mm``, with a band of ± ``sigma``, and of the ``truth`` if known."""
+    """Returns a chart of voxels ``line`` (n,) in 1/mm along ``x_mm``, with a band of ± ``sigma``, and of the ``truth`` if it
+    is known."""
 
     def draw(axes: "Axes") -> None:
         axes.fill_between(x_mm, line - sigma, line + sigma, color=SOFT, alpha=0.4, lw=0)

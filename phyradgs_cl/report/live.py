@@ -218,12 +218,12 @@ log = logging.getLogger(__name__)
 
 
 class LivePage:
-    """Writes a page about a run. Use it as a context manager around the run, and call it with each progress report.
+    """Writes a page about a run. Use a LivePage as a context manager around the run, and call it with each progress report.
 
-    A thread writes the page every ``every_s`` seconds; an older page shows that the run was killed. Pictures are made
-    between two iterations, as long as they take less than ``SHARE`` of the run's time. An error or Ctrl-C leaves its
-    reason on the page. An existing file is replaced at the first iteration, so that a refused run does not change it. A
-    page that cannot be written gives one warning, and no error."""
+    A thread writes the page every ``every_s`` seconds; a page that is much older shows that the run was killed. Pictures are
+    made between two iterations, as long as they take less than ``SHARE`` of the run's time. An error or Ctrl-C leaves its
+    reason on the page. An existing file is replaced at the first progress report, so that a refused run does not change it.
+    A page that cannot be written gives one warning, and no error."""
 
     def __init__(self, path: Path, title: str, settings: Mapping[str, object], every_s: float = EVERY_S) -> None:
         self.path, self.every_s = path, every_s

@@ -86,7 +86,7 @@ def shown(value: object, unit_name: str = "") -> str:
 
 
 def number(value: float, resolution: float = 0.0) -> str:
-    """Returns a number as text with at most four significant digits; 0 for values below a millionth of ``resolution``."""
+    """Returns a number as text with at most four significant digits; 0 for sizes up to a millionth of ``resolution``."""
     if abs(value) <= 1e-6 * resolution:
         value = 0.0
     if not math.isfinite(value):

@@ -84,7 +84,7 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
         image = bytes_of(np.take(volume, volume.shape[axis] // 2, axis=axis), low, high)
         size_mm = [side for a, side in enumerate(grid.size_mm) if a != axis]
         shape = [max(1, round(side * per_mm)) for side in size_mm]
-        ends = zip(shape, image.shape, strict=True)  # takes the nearest voxel, so that single ones stay visible
+        ends = zip(shape, image.shape, strict=True)  # pixels take their nearest voxel, so that single voxels stay visible
         rows, columns = (((np.arange(n) + 0.5) * m / n).astype(int) for n, m in ends)
         slices.append(top_row_first(image[rows[:, None], columns]))
     height, width = max(s.shape[0] for s in slices), sum(s.shape[1] + _GAP for s in slices) - _GAP

@@ -134,7 +134,8 @@ def panel_corners(pose: Points, detector_shape: tuple[int, int]) -> Points:
 
 
 def _first_arc(scan: Scan) -> Points:
-    """Returns ``PoseTable``'s poses (T, 12) from when the first frame's first line opens to when its last line closes."""
+    """Returns poses (T, 12), as in ``PoseTable``, evenly over the time in which a fly-scan's first frame is exposed to the
+    beam; of a gantry at rest, its one pose."""
     first_s, last_s = scan.shutter.lit_span_s if scan.is_fly else (scan.shutter.middle_s,) * 2
     times_s = scan.frame_start_s[0] + np.linspace(first_s, last_s, _ARC_SAMPLES)
     return with_sources(scan, scan.trajectory.pose(0, times_s))
@@ -208,8 +209,8 @@ def _draw_samples(axes: "Axes", scan: Scan, motion: Motion) -> None:
 
 
 def pose_times(scan: Scan, motion: Motion) -> tuple[Points, Points | None]:
-    """Returns the times (N,) of the first frame's poses, in s after its start, and their detector lines (N,). Of many lines
-    it takes some; None stands for all. For segments in which Gaussians move it returns the segments' ends."""
+    """Returns the times (N,) of the first frame's poses, in s after its start, and their detector lines (N,), evenly chosen
+    if there are many; None if poses hold for all lines. For segments in which Gaussians move, returns the segments' ends."""
     cells = motion.cells(scan, 0)
     if cells.is_moving:
         return np.linspace(*scan.shutter.lit_span_s, cells.count + 1), None

@@ -75,8 +75,8 @@ def stills(planes: list[Plane], of: str, high: float) -> Markup:
 
 
 def picture(plane: Plane, of: str, *, canvases: int = 0, has_lines: bool = False) -> Markup:
-    """Returns a slice with world axes at its edges and a scale bar. canvases: how many the script draws on, on top of it.
-    has_lines: two lines on top show where the other slices are."""
+    """Returns a slice with world axes at its edges and a scale bar. canvases: number of canvases on top of the slice, for
+    the script. has_lines: two lines on top show where the other slices are."""
     width_mm, height_mm = plane.size_mm
     image = element(
         "img", src=data_uri(plane.still),

@@ -41,7 +41,7 @@ from phyradgs_cl.workflow.volumes import compared_states
 
 log = logging.getLogger(__name__)
 # A converged run with a large last residual (a fraction of the line integrals' norm) gives a warning.
-_SETTLED = 5  # fewer recorded residuals say nothing about convergence: the first is always 1
+_SETTLED = 5  # fewer recorded residuals say nothing about convergence: without a first volume, the first one is 1
 _UNLIKELY = 0.15  # smaller residuals give no warning: correct scans had at most 0.13, besides noise
 _AT_REST = 1.05  # converged: the residual after 3/4 of the iterations is at most this many times the last one
 _BEYOND_NOISE = 1.5  # no warning up to this many times the noise; correct scans, even of 100 photons, had at most 1.1
@@ -95,7 +95,8 @@ def run_reconstruction(
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
     """Reconstructs a scan file and writes a volume file; returns the result and its metrics.
 
-    A parallel-beam scan whose frames exceed half of this machine's memory is reconstructed in ``slabs`` of rows.
+    A parallel-beam scan is reconstructed in slabs of rows if ``slabs`` asks for them, or if four copies of its frames exceed
+    half of this machine's memory.
 
     An interrupted run does not change ``output``. It writes ``io.partial_path`` and a checkpoint, from which ``resume``
     continues; a complete run removes both. A killed run leaves its last checkpoint. inputs: other files that the output

@@ -37,7 +37,7 @@ _COPIES = 4  # arrays of the frames' size that a method holds at a time
 @dataclass(frozen=True)
 class Slabs:
     """Which detector rows to reconstruct, and how many at a time. rows: [first, stop); None takes all. rows_at_a_time: 0
-    takes stated ``rows`` at once, and of all rows as many as half of this machine's memory can hold."""
+    takes stated ``rows`` at once, and of all rows as many as half of this machine's memory holds in four copies."""
 
     rows: tuple[int, int] | None = None
     rows_at_a_time: int = 0
@@ -81,7 +81,8 @@ def reconstruct_slabs(
     """Returns the volume of all slabs, memory-mapped from a file. Finished slabs are kept in a folder next to ``output``;
     with ``resume`` they are read from there.
 
-    Raises InputError if these slabs are of another run, and KeyboardInterrupt if a slab is interrupted."""
+    Raises InputError if these slabs are of another run, or see no slice of the grid, and KeyboardInterrupt if a slab is
+    interrupted."""
     header = read_scan_header(path)
     grid = header.with_grid(plan.preprocessing).grid
     whole = header.on_grid(grid)

@@ -176,7 +176,7 @@ def _made_here(runs: Sequence[SweepRun], device: str | None, report: ProgressRep
 
 def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None, page: Path) -> Iterator[Line]:
     """Yields lines of runs as they finish; writes Dask's report to ``page``. Raises InputError if no scheduler answers."""
-    os.environ.setdefault("DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION", "1.0")  # else a dead worker fails its queue
+    os.environ.setdefault("DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION", "1.0")  # else a worker's death fails queued runs
     dask = checks.package("distributed", "the package that --workers needs", "phyradgs-cl[cluster]")
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # the InputError below reports the same
     count, where = int(workers) if workers.isdigit() else None, {"address": workers, "timeout": _CONNECT_S}

@@ -91,7 +91,7 @@ def run_evaluation(
     with finish_despite_interrupt(), written_beside(picture) as temporary:
         try:
             slices_png(temporary, volume, reference, title)
-        except OutputError as error:  # the error names the temporary file; raises its cause under the picture's name
+        except OutputError as error:  # it names the temporary file; from its cause ``written_beside`` names the picture
             raise error.__cause__ or error from None
     known: dict[str, object] = {key: provenance[key] for key in ("method", "seconds", "gaussians") if key in provenance}
     files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}

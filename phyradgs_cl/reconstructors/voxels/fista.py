@@ -74,7 +74,7 @@ class FistaOptions(IterativeOptions):
     - subvoxels: parts of a voxel's side in the last 7/13 of the iterations; 0 takes 2 for slices of up to 90² voxels
       where memory allows, else 1.
     - subsets: number of subsets of the frames, each with one step; iterations before smaller voxels have 1.6 times as many.
-      If their steps diverge, they are joined two by two. tv_iterations: dual iterations per proximal map of TV.
+      Subsets whose steps diverge are joined two by two. tv_iterations: dual iterations per proximal map of TV.
     - transmission_weights: weights pixels by their transmission, as in ``fista-tv``."""
 
     FUNCTIONS: ClassVar[tuple[str, ...]] = ("prior",)
@@ -295,7 +295,8 @@ def fista_stage(
     optimised: int = 0,
 ) -> Iterations:  # fmt: skip
     """Returns ``iterations`` from ``volume`` (nz, ny, nx; None: the method's own start), with every voxel divided into
-    ``parts`` along each side. is_coarse: they only provide the first volume of a stage. optimised: how many POGM makes."""
+    ``parts`` along each side. is_coarse: the iterations only provide the first volume of the next stage. optimised: how many
+    iterations are POGM's."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
     options, rt = replace(whole.options, iterations=iterations), whole.rt

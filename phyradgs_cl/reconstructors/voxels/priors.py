@@ -40,8 +40,8 @@ _RIDGE_NOISE = 17.0  # noise that a ridge step assumes, relative to the prior's 
 _RIDGE_NOISE_AT_REST = 20.0  # noise that a ridge step assumes, relative to the prior's weight, for scans that stop
 _RIDGE_LENGTH = 0.5  # length of a ridge step: factor on the regulariser's gradient
 _RIDGE_EVERY = 4  # one ridge step follows after this many maps of the prior ``dct``
-# _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals. For other noise, _TV_AT_REST is
-# multiplied by the sixth root of the ratio to this noise, and _RIDGE_NOISE_AT_REST divided by it.
+# _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals. For other noise, _TV_AT_REST is multiplied by
+# the sixth root of the other noise over this one, and _RIDGE_NOISE_AT_REST is divided by that root.
 _USUAL_NOISE = 0.01
 _LEAST_NOISE = 0.001  # less noise counts as this, because some scans have none
 _LEAST_NOISE_SHARE = 0.1  # a ridge step counts at least this fraction of the weight as noise, because some scans have none
@@ -278,8 +278,8 @@ Denoiser = Callable[[np.ndarray, float], np.ndarray]
 
 
 class OwnPrior(Prior):
-    """A user's denoiser on the host in place of a proximal map (plug-and-play: Venkatakrishnan et al. 2013). Weights are
-    small, and two different ones must give two different volumes."""
+    """A user's denoiser on the host in place of a proximal map (plug-and-play: Venkatakrishnan et al. 2013). Its weights are
+    small, and two different weights must give two different volumes."""
 
     def __init__(self, denoiser: Denoiser) -> None:
         self.denoiser, self.subject = denoiser, f"--prior {function_name(denoiser)}"
@@ -325,8 +325,8 @@ def volumes_of(prior: str | Denoiser) -> int:
 
 
 def subvoxel_share(prior: str | Denoiser, shape: tuple[int, int, int]) -> float:
-    """Returns the weight of the smaller voxels in a result of ``shape`` (nz, ny, nx), 0 to 1. It is larger with ridge: large
-    voxels average noise, of which ridge leaves less."""
+    """Returns the weight of the smaller voxels in a result, 0 to 1. shape: (nz, ny, nx) of the smaller voxels. The weight is
+    larger with ridge, because large voxels serve to average noise, of which ridge leaves less."""
     return _SUBVOXELS_WITH_RIDGE if prior == "ridge" and min(shape) >= RIDGE_EDGE else _SUBVOXELS
 
 

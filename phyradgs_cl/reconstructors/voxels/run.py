@@ -148,7 +148,7 @@ def voxel_method(
     volumes: int | Callable[[Scan, Any], int], frames: int,
 ) -> Method:
     """Returns a method that runs the algorithm that ``make`` builds. volumes, frames: how many volumes and arrays of all
-    frames it holds at one time; volumes may be a function of scan and options."""
+    frames the algorithm holds at one time; volumes may be a function of scan and options."""
 
     def reconstruct(scan: Scan, options: Any, rt: Runtime, **arguments: Any) -> Reconstruction:
         run = MethodRun(scan, options, rt, **arguments)

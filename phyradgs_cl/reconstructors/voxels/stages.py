@@ -20,9 +20,9 @@ _STAGE, _VOLUME = "stage", "volume_before"  # arrays in a state: the stage's num
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a run. make: returns the stage's method, which starts from a volume (nz, ny, nx), or from its own start
-    for None. merge: combines this stage's volume (nz, ny, nx) and that of the stage before to the run's volume. end: called
-    with the finished method."""
+    """One stage of a run. make: from a first volume (nz, ny, nx), or from None for the method's own start, to the stage's
+    method. merge: from this stage's volume and the volume of the stage before to the run's volume. end: called with the
+    finished method."""
 
     name: str
     iterations: int
@@ -32,7 +32,7 @@ class Stage:
 
 
 class Stages:
-    """Stages, one after the other, which a ``Loop`` runs, reports, stops and resumes as if they were one method.
+    """Several stages, one after the other, which a ``Loop`` runs, reports, stops and resumes as if they were one method.
 
     The first stage starts from the run's first volume, if any."""
 
@@ -88,8 +88,8 @@ class Stages:
         self._facts.update(self.method.facts(True))
 
     def facts(self, is_complete: bool) -> Mapping[str, object]:
-        """Returns the facts of the last stage, with each stage's iterations and its seconds in this process. If the run is
-        complete, it first ends earlier stages, in case the last one had no iterations."""
+        """Returns the facts of the last stage, with each stage's iterations and its seconds in this process. Of a complete
+        run it first ends all stages but the last, in case the last one has no iterations."""
         while is_complete and not self.is_last:
             self.advance()
         self._note()

@@ -60,7 +60,7 @@ class VolumeRenderer {
   }
 
   // camera; ends: grey levels 0 to 255 of black and white; threshold: a level, or null for the maximum; points: whether they
-  // are shown; share: of the screen's pixels along each side. Returns the milliseconds that it took.
+  // are shown; share: of the screen's pixels along each side. Returns the milliseconds that drawing took.
   draw({ camera, ends, threshold, points, share }) {
     const { gl, canvas } = this, started = performance.now();
     const density = Math.min(devicePixelRatio, 2) * share;

@@ -117,7 +117,7 @@
   makeTurnable(canvas, camera, redraw);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   new ResizeObserver(redraw).observe(canvas.parentElement);
-  // It moves once, when it is first seen, unless the reader wants no motion.
+  // The picture plays once, when it is first seen, unless the reader wants no motion.
   new IntersectionObserver(([entry]) => {
     if (entry.isIntersecting && !wasSeen && !isStill.matches) player.start();
     wasSeen = wasSeen || entry.isIntersecting;
