@@ -1,4 +1,4 @@
-"""Estimates a scan's geometry and timing from its frames; moves views, and computes a loss' gradient by their poses."""
+"""Estimates a scan's geometry and timing from its frames, moves its views, and differentiates a loss by their poses."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -63,7 +63,7 @@ def _rays(engine: RayOperator) -> LinearOperator:
 
 def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
     def at(volume: Values) -> tuple[Values, Map]:
-        own, on_device = copy(engine), isinstance(volume, DeviceArray)  # a copy, so that a later call keeps this derivative
+        own, on_device = copy(engine), isinstance(volume, DeviceArray)  # a copy: later calls leave this derivative alone
 
         def adjoint(frames: Values) -> Values:
             return _in_new_memory(rt, own.adjoint, frames, engine.volume_shape)

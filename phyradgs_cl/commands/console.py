@@ -80,7 +80,7 @@ def say(text: str) -> None:
     """Prints a result on stdout. Raises OutputError if that fails. A pipe that its reader has closed is no error."""
     try:
         typer.echo(plain_text(text))
-    except BrokenPipeError:  # as after `| head`
+    except BrokenPipeError:  # the reader has ended early, as `| head` does
         give_up_stdout()
     except OSError as error:
         give_up_stdout()

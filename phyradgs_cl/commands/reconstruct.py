@@ -53,7 +53,7 @@ _GROUPS = {
     ),
     "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
 }
-GROUPS = {"reconstruct": _GROUPS, "estimate": _GROUPS}  # each command shows only those that it has
+GROUPS = {"reconstruct": _GROUPS, "estimate": _GROUPS}  # each command shows only the options that it has
 _ROWS = "Detector rows of a parallel scan to read and reconstruct; row 0 is the lowest."
 _SLAB = "Rows of a parallel scan at a time: slabs, kept on disk as they are done."
 _WATER = "Attenuation of water in 1/mm, for --initial in Hounsfield units that does not state its scale."

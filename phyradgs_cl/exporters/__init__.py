@@ -1,4 +1,4 @@
-"""Writes volumes in other programs' formats, with spacing, origin and directions: `export_volume`."""
+"""Writes volumes in other programs' formats, with spacing, origin and directions. Call ``export_volume``."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -163,8 +163,8 @@ def export_stored(
     volume: Volume, to: str, target: Path, subject: str, scale_of: ScaleOf | None = None,
     labels: DicomLabels | None = None, unit: str = _PLAIN,
 ) -> None:  # fmt: skip
-    """Writes a volume as ``export_volume`` does. subject: names the volume in messages. unit: a note for values without HU
-    scale."""
+    """Writes a volume as ``export_volume`` does. subject: what messages call the volume. unit: a note for values without a
+    scale of Hounsfield units."""
     if to in CLOUDS:
         CLOUDS[to](target, writers.gaussians_of(volume, subject))
         return

@@ -220,8 +220,8 @@ def _mask_clipped(
     """Sets ``unusable`` (P, v, u) at clipped pixels where the flat is brighter: even air would look like an object there.
     air: the reason why other clipped pixels count as air, as a text.
 
-    Where the flat is clipped too, the integral is 0. That is right for air and loses thin parts of the object. Masking
-    these pixels would leave no air, and made the reconstruction's error 2 to 3 times larger than that loss."""
+    Where the flat is clipped too, the integral becomes 0, which is right for air and loses thin parts of the object. Masking
+    these pixels would leave no air: the reconstruction's error was then 2 to 3 times larger than by that loss."""
     brighter = flat > saturation.level * (1 + _SAME)
     for frame, bad in zip(frames, unusable, strict=True):
         bad |= (frame == saturation.level) & brighter

@@ -116,7 +116,7 @@ def _header(path: Path) -> tuple[int, tuple[tuple[int, int], np.dtype]]:
         raise InputError(str(path), "no page", "at least one image")
     if any(kind != kinds[0] for kind in kinds):
         raise InputError(str(path), "pages of several sizes or types", "one for all frames")
-    if stated_images > images:  # ImageJ's files of more than 4 GB list fewer than they have
+    if stated_images > images:  # ImageJ's files of more than 4 GB list fewer images than they have
         found, expected = f"{stated_images} images and {images} of them in its directory", "a directory of all images"
         raise InputError(str(path), found, expected, "save it as BigTIFF, or as one file per image")
     return images, kinds[0]

@@ -18,7 +18,7 @@ except ImportError:  # Windows has no such module
 
 HOST_SHARE = 0.8
 """Fraction of this machine's memory that one array may take; larger ones are refused before they are read."""
-_BLOCK_BYTES = 1 << 20  # bytes read at a time for a hash, so that a large file never is in memory
+_BLOCK_BYTES = 1 << 20  # bytes read at a time for a hash, so that a large file is never in memory as a whole
 
 
 def regular_file(path: Path, subject: str, expected: str = "a regular file") -> os.stat_result:

@@ -22,7 +22,7 @@ from phyradgs_cl.errors import InputError, OutputError
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
 """Error numbers of a full disk, a file that is too large, and a user's exhausted quota."""
-_LONGEST = 50  # characters of the target's name kept in a temporary one: at 4 bytes each, the name stays below 255 bytes
+_LONGEST = 50  # a temporary name has at most this many characters of the target's: it stays below 255 bytes, at 4 bytes each
 _LONGEST_BYTES = 255  # longest file name that common file systems allow
 _SPARE_BYTES = 1 << 16  # room on the disk that is reserved for headers, besides the arrays
 _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part(\.[a-z.]+)?$")

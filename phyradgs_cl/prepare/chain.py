@@ -44,7 +44,7 @@ _ONCE = ("scatter", "hardening", "phase")
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """flats: one of ``light.WAYS``; it acts when a file is read. steps: names of ``STEPS``, separated by commas. Each other
+    """flats: one of ``light.WAYS``, applied when a file is read. steps: names of ``STEPS``, separated by commas. Each other
     field has the options of the step of its name. Raises InputError for unknown steps, and for options of steps that are not
     named."""
 
@@ -80,7 +80,7 @@ class PrepareOptions:
         return [name for name in STEPS if name in names]
 
     def step_facts(self) -> dict[str, object]:
-        """Returns what the provenance records: the chosen steps and their options by name. It is empty for the defaults."""
+        """Returns what the provenance records: ``flats`` and ``steps`` if not the default, and each step's options."""
         flats = {} if self.flats == "mean" else {"flats": self.flats}
         steps = {"steps": ",".join(self.chosen)} if self.chosen else {}
         return {**flats, **steps, **{name: asdict(getattr(self, name)) for name in self.chosen}}

@@ -53,10 +53,10 @@ def mask_metal(scan: Scan, options: MetalOptions, make_model: MakeModel) -> tupl
 
 
 def _completed(masked: Scan, shadow: np.ndarray, is_metal: np.ndarray, make_model: MakeModel) -> np.ndarray:
-    """Returns the frames (F, v, u) with the shadow filled by the projection of a volume that the other pixels give. Its
-    difference from the frames at the shadow's rim is interpolated across the shadow, so that no edge is left.
+    """Returns the frames (F, v, u) with the shadow filled by the projection of a volume that the other pixels give. That
+    projection's difference from the frames at the shadow's rim is interpolated across the shadow, so that no edge is left.
 
-    Only masked rays meet the voxels in and next to metal. These would stay near 0, so they get the density around them."""
+    Only masked rays meet the voxels in and next to metal, so they would stay near 0. They get the density around them."""
     model, _ = step.coarse_model(masked, make_model, _VOXELS)
     volume = model.regularised(masked.projections)
     factors = np.divide(volume.shape, is_metal.shape)

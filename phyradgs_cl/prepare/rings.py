@@ -151,7 +151,7 @@ def _blockwise(
     image: np.ndarray, guide: np.ndarray, share_of: Callable[[np.ndarray], np.ndarray], window: int
 ) -> np.ndarray:
     """Multiplies the cosine coefficients of overlapping blocks by ``share_of`` the coefficients of ``guide``, and averages
-    blocks. Each keeps its mean value. A block of fewer remaining coefficients has less noise, and more weight."""
+    blocks. Each block keeps its mean value. A block of fewer remaining coefficients has less noise and weighs more."""
     width = [(window, window + (-n) % window) for n in image.shape]
     padded, guiding = (np.pad(part, width, mode="symmetric") for part in (image, guide))
     total, weight = np.zeros_like(padded), np.zeros_like(padded)

@@ -3,7 +3,7 @@
 Ohnesorge, Flohr and Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563. The square lets thick rays scatter differently from thin
 ones, for which Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) take several kernels. The user states the width and the
 ratio of scatter to primary light. Otherwise a non-negative sum of Gaussians is fitted to the light in air beyond that of the
-flats, while each frame's light may vary. This may underestimate scatter behind the object. So stronger kernels are tried
+flats, while each frame's light may vary. This may underestimate scatter behind the object, so stronger kernels are tried
 too. A stronger kernel is taken if the frames that it corrects agree far better with their own reprojection."""
 
 import itertools

@@ -139,7 +139,7 @@ class Doubter:
         results = _restored({name: arrays.pop(name) for name in list(arrays) if name.startswith(_KEPT)}, self.scan.grid)
         while len(results) < RUNS:
             scan = self.scan_of_run(results[0], len(results)) if results else self.scan
-            half = without_warnings() if results and self.kind == "analytic" else nullcontext()  # no warnings of wider gaps
+            half = without_warnings() if results and self.kind == "analytic" else nullcontext()  # of the gaps
             with report.through(partial(_counted, results=results)), half:
                 result = once(scan, arrays or None)
             if result.state is not None:

@@ -189,7 +189,7 @@ def _settings(status: Status) -> Markup:
 
 
 def _curve(status: Status) -> Markup:
-    """Draws the convergence as SVG. It does without matplotlib, whose import would hold up the run."""
+    """Draws the convergence as SVG, without matplotlib, because its import would hold up the run."""
     x, y = np.array(status.points, float).T
     words = status.progress.quantity if status.progress is not None else ""
     is_log = 0 < _LOG_RATIO * y.min() < y.max()
@@ -231,7 +231,7 @@ class LivePage:
         self.spent_s = 0.0
         """Time in s that the run has waited for pictures."""
         self._pictured_s = -every_s
-        self._waits = False  # whether an existing file is still kept, until the first iteration
+        self._waits = False  # whether an existing file is still kept, until the first progress
         self._started_s = time.monotonic()
         self._is_over = threading.Event()
         self._writer = threading.Thread(target=self._keep_writing, name="live page", daemon=True)

@@ -106,7 +106,7 @@ def read_pickle(path: Path, unpickler: "type[PlainUnpickler] | None" = None) -> 
     kind = unpickler or PlainUnpickler
     with naming_damage(path, "a damaged pickle", "a pickle of plain containers and NumPy arrays"):
         try:
-            return kind(io.BytesIO(data), encoding="latin1").load()  # Python 2 wrote arrays' bytes as text
+            return kind(io.BytesIO(data), encoding="latin1").load()  # latin1, because Python 2 wrote arrays' bytes as text
         except InputError as error:
             raise InputError(subject, error.found, error.expected, error.remedy) from error
 

@@ -37,8 +37,8 @@ _DAMAGE = (OSError, RuntimeError, KeyError, TypeError, ValueError)  # what h5py 
 
 @contextmanager
 def open_hdf5(path: str | Path, linked_folder: Path | None = None) -> "Iterator[Hdf5Source]":
-    """Opens a file for reading. linked_folder: a folder, besides its own, with files to which it may link. Raises
-    InputError for a file that is not readable HDF5, and for HDF5's errors while it is open."""
+    """Opens a file for reading. linked_folder: a folder, besides the file's own, with files to which it may link. Raises
+    InputError for a file that is not readable HDF5, and for HDF5's errors while the file is open."""
     path, subject = Path(path), str(path)
     if regular_file(path, subject, "an HDF5 file").st_size == 0:
         raise InputError(subject, "an empty file", "an HDF5 file", "copy or write it again")

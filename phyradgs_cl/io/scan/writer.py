@@ -184,7 +184,7 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
             write_motion(entry, scan, frame_of)
         elif isinstance(scan.trajectory, PoseTable):
             _remove(entry, schema.POSES)
-            if not scan.is_fly:  # stored without exposure (_stored_durations), with the times of the poses
+            if not scan.is_fly:  # poses at rest are stored with their times and without exposure (_stored_durations)
                 detector = entry[schema.DETECTOR]
                 _replace(detector, "count_time", 0.0, "s")
                 _replace(detector, "detector_readout_time", 0.0, "s")

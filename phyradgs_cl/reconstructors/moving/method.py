@@ -83,8 +83,8 @@ def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: floa
 
 
 class FieldSearch:
-    """Searches the displacement field on a coarse copy of the scan, round by round for a ``Loop``. rounds: their number.
-    bending: the field's stiffness."""
+    """Searches the displacement field on a coarse copy of the scan, in rounds, which are iterations of a ``Loop``. bending:
+    the field's stiffness."""
 
     quantity, remedy = "residual", "check the scan for extreme values"
 

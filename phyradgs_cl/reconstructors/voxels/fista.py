@@ -3,7 +3,7 @@
 Each subset S, one of M, makes one step. FISTA's is xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁)
 (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The proximal optimised gradient method, POGM, needs
 a third fewer steps (Taylor, Hendrickx and Glineur, SIAM J. Optim. 27 (2017) 1283; Kim and Fessler, J. Optim. Theory Appl.
-178 (2018) 240), but leaves more of the noise of subsets. FISTA takes that out in the last passes.
+178 (2018) 240), but leaves more of the noise of subsets. So the last passes are FISTA's.
 
 The gradient of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans.
 Med. Imaging 34 (2015) 167). L is a Lipschitz constant of the gradient: it bounds the norm of AᵀA.
@@ -46,7 +46,7 @@ _FRAMES = 3  # memory of a run in copies of all projections
 _HELD = 9  # volumes that the prior ``dct`` holds on the device
 _COPIES = 2  # the device holds two copies of a volume on the host while a prior maps it
 # Measured: docs/results/settings.md.
-_COARSE_SHARE = 6 / 13  # fraction of the iterations before those on smaller voxels; they are coarse
+_COARSE_SHARE = 6 / 13  # fraction of the iterations that are coarse: those before smaller voxels
 _COARSE_PASSES = 2  # passes in a coarse iteration: they cost little, and few views or photons need many
 _COARSE_SUBSETS = 1.6  # a coarse pass has this many times ``subsets`` subsets
 _COARSE_TIMES = 1 / 3  # a coarse pass has this fraction of the times per exposure, but two at least

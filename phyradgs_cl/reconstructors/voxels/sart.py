@@ -24,7 +24,7 @@ _WEIGHT_CACHE_BYTES = 1 << 29  # column weights of subsets are kept up to this s
 class SartOptions(IterativeOptions):
     """Options of SART. relaxation: λ, the factor on each correction. relaxation_reduction: the factor on λ per iteration.
 
-    frames_per_subset: frames that are corrected for together, 1 for SART; they lie far apart in time. noise_stop: the run
+    frames_per_subset: frames, far apart in time, that are corrected for together, 1 for SART. noise_stop: the run
     ends when the residual falls to this many times the estimated noise of the measurement (discrepancy principle, Morozov
     1966); further iterations would fit the noise. 0 runs all iterations."""
 
