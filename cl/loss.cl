@@ -12,7 +12,8 @@ static inline vf masked(__global const float *image, __global const float *mask,
     return V_LOAD(image + at) * V_LOAD(mask + at);
 }
 
-/* Pass along rows: window means of x, y, xx, yy and xy, where x is rendered and y measured. */
+/* Pass along rows: weighted means of x, y, xx, yy and xy over the window, with x rendered and y measured. Both are 0 where
+   the mask is. */
 __kernel void ssim_moments(
     __global const float *rendered, __global const float *measured, __global const float *mask,
     __constant float *window, const int lines, const int width, const int pitch,
@@ -99,7 +100,7 @@ __kernel void ssim_spread(
     }
 }
 
-/* Applies the window along columns, and writes the gradient l1_weight sign(x - y) - ssim_weight dSSIM/dx. */
+/* Applies the window along columns, and writes the gradient mask (l1_weight sign(x - y) - ssim_weight dSSIM/dx). */
 __kernel void image_gradient(
     __global const float *spread, __global const float *rendered, __global const float *measured,
     __global const float *mask, __constant float *window,

@@ -1,5 +1,5 @@
-"""Estimates the time and memory of a reconstruction from two short runs of different length. They give the time per
-iteration, and the time of everything else.
+"""Estimates the time and memory of a reconstruction from short runs of two lengths. Their difference gives the time per
+iteration, and the rest is the time of everything else. A method without iterations or checkpoints runs as a whole.
 
 Density control adds Gaussians during a run and makes iterations slower. Short runs of a method with Gaussians therefore go
 through the whole schedule of density control, in fewer iterations."""

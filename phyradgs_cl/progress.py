@@ -86,7 +86,7 @@ class Ticker:
         self.is_open = self.is_counting = self.is_terminal
 
     def _over(self, line: str) -> str:
-        """Returns what must be written to show ``line`` in place of the open line."""
+        """Returns the text, with control characters, that replaces the unfinished line on the screen by ``line``."""
         if not _in_notebook():
             return f"{_OVER}{line}"
         before, self._width = self._width, len(line)

@@ -62,7 +62,7 @@
 #define CELL_SOURCE 0     /* 3 floats: the source; PARALLEL: minus the rays' direction */
 #define CELL_EU 3         /* 3 floats: the step to the next pixel of a line */
 #define CELL_EV 6         /* 3 floats: the step to the next line */
-#define CELL_VOLUME 9     /* (eu x ev) . (first pixel - source) */
+#define CELL_VOLUME 9     /* (eu x ev) . (first pixel - source); PARALLEL: (eu x ev) . (the rays' direction) */
 #define CELL_WEIGHT 10
 #define CELL_D00 11       /* |d|^2 = D00 + u (DU + DUV v + DUU u) + v (DV + DVV v) */
 #define CELL_DU 12

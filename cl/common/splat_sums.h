@@ -11,7 +11,7 @@
 #define SUM_ZZ 2         /* dL/d(num) times z^2, z across and across^2 */
 #define SUM_ZC 3
 #define SUM_CC 4
-#define SUM_Z 5          /* dL/d(num) times z and across, for dL/d(centre) */
+#define SUM_Z 5          /* sums of dL/d(num) z and of dL/d(num) across, for dL/d(centre) */
 #define SUM_C 6
 #define SUM_TZ 10        /* dL/d(num) times t z and t across, with the time t, for dL/d(path) */
 #define SUM_TC 11

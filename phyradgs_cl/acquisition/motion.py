@@ -282,7 +282,8 @@ def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
 
 
 def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
-    """Raises InputError for a value that is no model, and for a model of this module that is not among ``taken``."""
+    """Raises InputError for a value that is not a motion model, and for one of ``MODELS`` whose class is not among those of
+    ``taken``. A model of the user's own is accepted."""
     if isinstance(motion, type) and hasattr(motion, "cells"):
         raise InputError("--motion", f"the class {motion.__name__}", "a model", f"write {motion.__name__}()")
     if not callable(getattr(motion, "cells", None)):

@@ -102,9 +102,10 @@ def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Recon
 
 @naming_arguments()
 def load_deformation(path: str | Path) -> Deformation:
-    """Reads how an object moves from a file (docs/formats.md), or from a scan simulated with a motion of its object.
+    """Reads the motion of an object from a deformation file (docs/formats.md), or from a scan that was simulated with one.
 
-    path: the HDF5 file. Raises InputError, which names the HDF5 path of the wrong value, also if the motion folds matter."""
+    path: the HDF5 file. Raises InputError, which names the HDF5 path, for a wrong value and for a motion that folds
+    matter."""
     return read_deformation(_checked_path(path))
 
 

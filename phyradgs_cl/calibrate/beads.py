@@ -309,7 +309,8 @@ def _with_spread_of(scan: Scan, times: int) -> Scan:
 
 
 def _moved(placement: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Returns the placement (7,) after a further turn about the axes of space, a shift, and a change of density."""
+    """Returns the placement (7,) turned further about the axes of space through the origin, then shifted by ``step``, with
+    its density changed."""
     turn = Rotation.from_rotvec(step[:3])
     turned = (turn * Rotation.from_rotvec(placement[:3])).as_rotvec()
     return np.concatenate([turned, turn.apply(placement[3:DENSITY]) + step[3:DENSITY], placement[DENSITY:] + step[DENSITY:]])

@@ -141,8 +141,9 @@ class MotionParameters(PerViewParameters):
         return replace(self.still, coefficients=values)
 
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """Returns values (n, K) without what an object at rest explains. An object in another place explains the mean of
-        each kind. A larger or smaller one explains shifts along x and y that follow the source."""
+        """Returns values (n, K) without the part that an object at rest would explain as well. An object that is turned or
+        shifted explains the mean of each turn and shift over the views. A larger or smaller object explains shifts along x
+        and y in proportion to the source's position."""
         rest = values - (self.basis @ values).mean(0)
         towards_source = self.circle - (self.basis @ self.circle).mean(0)
         shifts, pattern = self.basis @ rest[:, 3:5], self.basis @ towards_source

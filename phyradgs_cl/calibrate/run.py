@@ -111,7 +111,8 @@ class _Calibrator:
         self.placement = np.zeros(0)
         self.stated = self.ready  # ``ready`` may later get the other readout direction
         stages = {one.block(self.scan): one for one in reversed(STAGES if self.phantom is None else BEAD_STAGES)}
-        self.stages = list(stages.values())[::-1]  # on a small panel several stages have the same blocks: the first is kept
+        # on a small panel several stages bin pixels to blocks of the same size: the first of them is kept
+        self.stages = list(stages.values())[::-1]
         self.per_view: PerViewParameters | None = None
         if self.request.per_view == WOBBLE:
             self.per_view = WobbleParameters.of(self.ready[0], self.splines)

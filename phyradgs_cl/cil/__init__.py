@@ -50,7 +50,7 @@ class ProjectionOperator(LinearOperator):
         return _mapped(self.rays, x, self.domain_geometry(), self.range_geometry(), out)
 
     def adjoint(self, x: DataContainer, out: DataContainer | None = None) -> DataContainer:
-        """Applies the transpose of ``direct`` to line integrals; returns it in ``out`` if given."""
+        """Returns the image to which the transpose of ``direct`` maps line integrals, in ``out`` if given."""
         return _mapped(self.rays.T, x, self.range_geometry(), self.domain_geometry(), out)
 
 

@@ -30,7 +30,8 @@ _log = logging.getLogger(__name__)
 STACKS = (".mha", ".mhd")
 _SPACES = ("left-posterior-superior", "lps", "right-anterior-superior", "ras", "left-anterior-superior", "las", "")
 _HEAD_BYTES = 1 << 16  # a header is read from this many bytes at the file's start
-_VOXEL_BYTES = 8  # bytes of memory per voxel while a file is read
+# Bytes of memory per voxel for which there must be room while a file is read: as much as two copies in float32.
+_VOXEL_BYTES = 8
 _NOTE = "ITK_FileNotes"  # SimpleITK's name for a file's comment, which is NIfTI's field descrip
 _READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", ".nrrd": "Nrrd"}
 _DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$", re.M)
@@ -57,7 +58,8 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def image_times_s(path: Path) -> list[float]:
-    """Returns the times in s of volumes along a file's fourth axis; [] without one. Raises InputError for a damaged file."""
+    """Returns the times in s of the volumes along a file's fourth axis; [] if the file has a single volume. Raises
+    InputError for a damaged file."""
     with _opened(path) as (_, reader):
         count = reader.GetSize()[3] if reader.GetDimension() > 3 else 1
         return [reader.GetOrigin()[3] + k * reader.GetSpacing()[3] for k in range(count if count > 1 else 0)]

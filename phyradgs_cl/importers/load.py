@@ -37,7 +37,8 @@ _KINDS = {
     ("fit", "fits"): ("FITS", "convert them to TIFF: astropy.io.fits and tifffile.imwrite"),
     ("xrm", "txm"): ("single images or a volume of Xradia", "import the scan's .txrm, or export TIFFs"),
 }  # fmt: skip
-_MOST_FILES = 1000  # files of a folder whose suffixes are read for an error about its format; more would take long
+# An error about a folder's format reads the suffixes of at most this many entries: more would take long.
+_MOST_FILES = 1000
 
 
 def refuse_unread(path: Path, expected: str) -> None:

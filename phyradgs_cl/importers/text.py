@@ -162,7 +162,7 @@ class Settings(Fields):
         return self.length(key) * factor
 
     def listed(self, key: str, count: int) -> np.ndarray:
-        """Returns the numbers (count,) of a comma-separated text."""
+        """Returns the numbers (count,) in the comma-separated text of ``key``. Raises InputError for another count."""
         return Settings(self.subject, {key: self.word(key).split(",")}).numbers(key, count)
 
     def _finite(self, key: str, value: object, largest: float = LARGEST) -> float:

@@ -1,4 +1,5 @@
-"""Tests error bars of voxels against a truth: which fraction of the errors do they cover?"""
+"""Tests error bars of voxels against a true volume: the fraction of errors within the bars, and the mean σ over the RMS
+error."""
 
 from pathlib import Path
 

@@ -80,7 +80,8 @@ class LineAttention(nn.Module):
     def forward(self, values: torch.Tensor) -> torch.Tensor:
         query = self._by_head(self.to_query(values)) * self.scale
         key, value = (self._by_head(part) for part in self.to_key_value(values).chunk(2, -1))
-        likeness = (query.unsqueeze(2) * key.unsqueeze(1)).sum(-1)  # of each two values, (L, segment, segment, heads)
+        # products of all queries with all keys of a segment, per head: (P / segment, segment, segment, heads)
+        likeness = (query.unsqueeze(2) * key.unsqueeze(1)).sum(-1)
         share = (likeness + self.position.permute(1, 2, 0)).softmax(2)
         mixed = (share.unsqueeze(-1) * value.unsqueeze(1)).sum(2)
         return self.to_output(mixed.reshape(values.shape[0], -1))

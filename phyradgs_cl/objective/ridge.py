@@ -39,7 +39,8 @@ class Ridge:
     knot_down: np.ndarray
 
     def table(self) -> np.ndarray:
-        """Returns the regulariser's numbers in one float32 array, in the order in which the kernels read them."""
+        """Returns filters, slopes and knots in one float32 array, in the order in which the kernels read them. ``second`` is
+        in it twice, with its axes in two orders."""
         filters = np.moveaxis(self.first, 0, -1), np.moveaxis(self.second, 0, -1), np.moveaxis(self.second, (0, 1), (-2, -1))
         curves = self.slope_up, self.knot_up, self.slope_down, self.knot_down
         return np.concatenate([part.ravel() for part in (*filters, *curves)]).astype(np.float32)

@@ -81,7 +81,7 @@ def tv_prox(
     volume: np.ndarray, weight: float, iterations: int, *, nonnegative: bool,
     axis_weights: tuple[float, ...] = (1.0, 1.0, 1.0),
 ) -> np.ndarray:
-    """Returns the map of a volume, float64, from a dual of zeros: the twin of ``TvProx``, with the same arguments."""
+    """Returns the proximal map of TV of a volume, float64: the twin of ``TvProx``. Its dual always starts from zeros."""
     b = np.asarray(volume, np.float64)
     dual = np.zeros((b.ndim, *b.shape))
     moved = dual.copy()

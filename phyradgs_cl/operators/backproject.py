@@ -19,7 +19,8 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch
 _VIEWS_PER_LAUNCH = 64  # most views of a launch: the few lines of each that a work-item reads should stay in the cache
 _BYTES_A_LAUNCH = 1 << 28  # most bytes of frames that are uploaded together
 _VIEWS_SHARE = 0.25  # fraction of the free device memory for uploaded frames; the volume needs the rest
-_BLOCK_VOXELS = 128  # most voxels along z per work-item of the kernels for upright columns of voxels
+# Most voxels along z that a work-item sums in the kernels for upright columns of voxels (see ``_UPRIGHT``).
+_BLOCK_VOXELS = 128
 _COLUMN_ROWS = 512  # most detector rows to which the voxels of such a work-item may project
 # A column of voxels along z is upright if over its height u·depth and depth change by at most this fraction of the depth.
 _UPRIGHT = 1e-7

@@ -38,7 +38,8 @@ from phyradgs_cl.reconstructors.result import DOUBT, Progress, Reconstruction, R
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import without_warnings
 
-MEASURED = ("fista", "fista-tv", "fdk", "asd-pocs", "cgls", "os-sart", "sart", "sirt")  # the law is fitted to the first 3
+# Methods whose error bars were measured against true volumes; both laws are fitted to runs of the first 3.
+MEASURED = ("fista", "fista-tv", "fdk", "asd-pocs", "cgls", "os-sart", "sart", "sirt")
 RUNS = 3  # times that the method runs: on the scan, and on two scans made from it
 PARTS = 2  # voxels are divided by this along each side before they are projected: projecting large ones would blur
 FEWEST_FRAMES = 4  # analytic methods need this many: with one frame in each half, bars were 3 times too narrow

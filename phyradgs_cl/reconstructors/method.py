@@ -1,8 +1,9 @@
-"""The methods by name, and the user's own. A new method is a file with a METHOD, and a line in METHODS.
+"""The methods by name, and the user's own. A new method is a file with a METHOD, which is a ``Method``, and a line in
+METHODS.
 
-A method is a function ``(scan, options, rt, *, seed, report, resume)``. A user's function needs only ``(scan, options,
-rt)``. If ``options`` is annotated with a dataclass, its fields are the options of ``--set`` and ``reconstruct``. The
-function returns a ``Reconstruction``, or a volume (nz, ny, nx) in 1/mm on the scan's grid."""
+A method's function takes ``(scan, options, rt, *, seed, report, resume)``; a user's function needs only the first three. If
+``options`` is annotated with a dataclass, its fields are the options of ``--set`` and ``reconstruct``. The function returns
+a ``Reconstruction``, or a volume (nz, ny, nx) in 1/mm on the scan's grid."""
 
 import importlib
 import inspect

@@ -1,4 +1,5 @@
-"""Makes pictures for the report: values as grey or coloured PNG, and slices of a volume within the page's size."""
+"""Makes pictures for the report: values as grey or coloured PNG, and as many slices of a volume as the page's budget of
+pixels allows."""
 
 import base64
 import io

@@ -1,4 +1,5 @@
-"""Shows a volume without a report: its middle slices as a picture, also during a run, or the volume in napari."""
+"""Shows a volume without a report: its middle slices as a PNG, which a run can also renew as it goes, or the whole volume
+in napari."""
 
 import logging
 import math

@@ -122,7 +122,8 @@ def _caches() -> Path:
 
 
 def _fault_of(folder: Path) -> str | None:
-    """Returns "written" or "executed" if that cannot be done with files in a folder; None for a folder that works.
+    """Returns what cannot be done with files in a folder, "written" or "executed"; None if both work. Creates the folder if
+    there is none.
 
     On a mount with noexec the operating system refuses to map a page of a file as executable."""
     try:

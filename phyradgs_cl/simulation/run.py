@@ -249,7 +249,8 @@ def simulate(
     share = shutter.readout.spread(shutter.lit_share(lines))
     recorded = _recorded(frames, options, np.where(share > 0, share, 1.0), rng)
     return Scan(
-        projections=recorded if np.all(share > 0) else recorded * (share > 0),  # a line without light has no measurement
+        # a line without light measures nothing: its line integrals are set to 0
+        projections=recorded if np.all(share > 0) else recorded * (share > 0),
         geometry=geometry, trajectory=trajectory, shutter=shutter, frame_start_s=start_s, grid=grid, title=title,
         is_fly=protocol.is_fly, detector_model=options.detector_model, lag=options.lag,
         reference=None if reference is None else (reference * factor).astype(np.float32),

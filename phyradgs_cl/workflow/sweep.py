@@ -207,8 +207,9 @@ def _begin(device: str | None, dask_worker: Any) -> None:
 
 
 def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: str | None = None) -> Line:
-    """Makes a run and returns its line of results. If scan, options or a lack of memory are at fault, the line has the
-    error. Raises all other errors, after which another try may succeed, and KeyboardInterrupt for an incomplete run."""
+    """Makes one run of the sweep and returns its line of results, which has the error if scan, options, numbers that are not
+    finite, or a lack of memory are at fault. Raises all other errors, after which another try may succeed, and
+    KeyboardInterrupt for an interrupted run."""
     try:
         rt = runtime_of_process(device)
         result, metrics = resume_or_restart(run.plan, run.scan, run.output, lambda: rt, report, run.checkpoint_every_s)

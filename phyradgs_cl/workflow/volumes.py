@@ -33,7 +33,9 @@ from phyradgs_cl.workflow.files import check_picture, load_reference, load_resul
 
 log = logging.getLogger(__name__)
 _LITTLE = 0.5 - 1e-6  # boxes that share less than this fraction of either often have a wrong size or offset
-_ALIKE = 0.65  # little overlap warns below this correlation: wrong sizes had at most 0.6, right ones 0.55 to 0.9
+# Volumes that overlap little get a warning if they correlate less than this: with wrong sizes 0.6 at most, with right ones
+# 0.55 to 0.9.
+_ALIKE = 0.65
 
 
 @np.errstate(all="ignore")

@@ -172,7 +172,7 @@ class Hdf5Source:
         if os.path.isabs(name) and not place.exists():  # HDF5 then looks for the name next to the linking file
             place = own.parent / place.name
         self._check_place(address, place)
-        if "%" in name:  # a pattern of numbered files, of which HDF5 reads all that exist
+        if "%" in name:  # a pattern of numbered files, as part_%b.h5: HDF5 itself finds which exist, so none is opened here
             return
         try:
             with open_hdf5(place) as other:
@@ -181,8 +181,8 @@ class Hdf5Source:
             raise self.error(address, f"a link to {inside} of {name} ({error})", "data there", error.remedy) from error
 
     def _check_stored(self, address: str, dataset: h5py.Dataset) -> None:
-        """Raises InputError for data that HDF5 would return as zeros, or not at all: a virtual dataset with missing parts,
-        data outside HDF5, and data compressed by an unknown filter."""
+        """Raises InputError for data that HDF5 would return as zeros, or not at all: an empty dataset, data in external
+        files that are not HDF5, data compressed by an unknown filter, and a virtual dataset with missing parts."""
         if dataset.shape is None:
             raise self.error(address, "an empty dataset", "a value")
         if dataset.external:

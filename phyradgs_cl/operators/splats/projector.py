@@ -35,10 +35,10 @@ def items_by_gaussian(rt: Runtime, count: int) -> tuple[tuple[int, int], tuple[i
 def path_limits(time_error: float) -> tuple[float, float, float]:
     """Returns how far a splat may move during a line's exposure, in widths of the splat, for 1, 2 and 3 sample times.
 
-    The exposure is integrated by Gauss–Legendre rules. For exp(−x²/2), whose 2nd, 4th and 6th derivatives are at most 1, 3
-    and 15, their errors are path²/24, path⁴/1440 and path⁶/134400 of the peak. An error of 2 ``time_error`` in the worst
-    pixel means a relative RMS error of about ``time_error``. Longer paths are integrated in closed form, which loses digits
-    for paths below 0.7."""
+    The exposure is integrated by Gauss–Legendre rules. Their errors are at most path²/24, path⁴/1440 and path⁶/134400 of
+    the peak, because the 2nd, 4th and 6th derivatives of exp(−x²/2) are at most 1, 3 and 15. An error of 2 ``time_error``
+    in the worst pixel means a relative RMS error of about ``time_error``. Longer paths are integrated in closed form, which
+    loses digits for paths below 0.7."""
     worst = 2 * time_error
     one, two, three = (24 * worst) ** (1 / 2), (1440 * worst) ** (1 / 4), (134400 * worst) ** (1 / 6)
     return one, two, max(three, 0.7)

@@ -262,8 +262,9 @@ def moved_rows(rows: np.ndarray, deformation: Deformation, weights: np.ndarray) 
 def deformed_frame(
     rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], deformation: Deformation, affine: bool = False
 ) -> np.ndarray:
-    """Returns the merged frame (nv, nu) of an object that moves, whose reference has parameter rows (11, G). Each cell sees
-    the object as it is at the cell's time."""
+    """Returns the frame (nv, nu) of an object that moves, summed over all time cells. rows (11, G): its Gaussians in the
+    reference state. A cell projects them as they are at its time; a moving cell takes their centres at both of its ends
+    too."""
 
     def cloud_at(time_s: float) -> np.ndarray:
         return moved_rows(rows, deformation, deformation.weights_at(time_s)[0])

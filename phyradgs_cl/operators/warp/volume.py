@@ -111,8 +111,8 @@ class VolumeWarp:
         )  # fmt: skip
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:
-        """Writes the volume (nz, ny, nx) of the coefficients ``total``, filtered and without padding, to ``result``.
-        Destroys ``total``."""
+        """Filters the coefficients ``total`` that ``adjoint`` has summed (F), removes the padding (Eᵀ), and writes the
+        volume (nz, ny, nx) to ``result``. Destroys ``total``."""
         self._filter(total)
         move(self.rt, (total, self._strides), (result, Strides.plain(self.shape)), self.shape)
 

@@ -138,7 +138,7 @@ def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
 
 
 def short_scan_weight(progress_rad: float, angle_rad: np.ndarray, coverage_rad: float) -> np.ndarray:
-    """Returns Parker's weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc of
+    """Returns twice Parker's weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc of
     ``coverage_rad``.
 
     The weights of a ray and its opposite add up to 2. A ray without an opposite in the arc counts 2."""

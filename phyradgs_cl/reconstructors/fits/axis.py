@@ -1,5 +1,6 @@
-"""Finds where the panel sees the axis of rotation. In any scan: by the shift of the panel under which a coarse scan fits
-best. In a parallel beam: by views half a turn apart, which see mirror images."""
+"""Finds the shift of the panel that puts the axis of rotation in its right place. In any scan: the shift with which a
+coarse reconstruction explains the frames best. In a parallel beam at right angles to the axis also: by views half a turn
+apart, which are mirror images."""
 
 import math
 from dataclasses import dataclass

@@ -45,7 +45,8 @@ class FlatErrors:
         return math.prod(self.frames_shape[1:]) + self.frames_shape[0]
 
     def add_to(self, frames: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Returns frames (F, rows, columns) plus the effect B b of unknowns b (count,)."""
+        """Returns frames (F, rows, columns) plus the effect of the unknowns ``values`` (count,) on them, which is B b in
+        ``AugmentedOperator``."""
         pattern, level = self.parts(values)
         return frames + pattern + level[:, None, None]
 

@@ -33,7 +33,7 @@ _SUPPORT = 4  # a cubic spline in time extends over this many intervals between 
 @dataclass(frozen=True, eq=False)
 class MotionField:
     """A displacement field during its search. control_mm: control vectors (R, cz, cy, cx, 3) of R fields, as in
-    ``Deformation``. temporal (count, R): spline coefficients, in time, of the fields' weights."""
+    ``Deformation``. temporal (count, R): coefficients of the fields' weights in the ``count`` splines of time."""
 
     control_mm: np.ndarray
     origin_mm: tuple[float, float, float]

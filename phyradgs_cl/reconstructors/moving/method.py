@@ -61,7 +61,8 @@ _STORED = ("field_control", "field_place", "field_times", "field_weights", "fiel
 
 
 def coarse_scan(scan: Scan, most_frames: int = _MOST_FRAMES) -> Scan:
-    """Returns the scan with binned pixels, fewer voxels in the same box, and at most ``most_frames`` frames."""
+    """Returns a smaller scan for the search: binned pixels, smoothed before, fewer voxels in the same box, and at most
+    ``most_frames`` frames."""
     block = math.ceil(max(scan.geometry.detector_shape) / _MOST_COLUMNS)
     small = binned(smooth(fewer_frames(scan, most_frames), SMOOTHING * block if block > 1 else 0.0), block)
     least_mm = max(max(scan.grid.size_mm) / _MOST_VOXELS, min(scan.grid.voxel_size_mm))
@@ -229,7 +230,8 @@ class MovingOptions(FistaOptions):
         return ceil_div(self.iterations, _ITERATIONS_PER_ROUND)
 
     def of_passes(self) -> FistaOptions:
-        """Returns the options of ``fista`` after the search."""
+        """Returns the options of the ``fista`` passes after the search: this method's own, with the iterations that the
+        search leaves."""
         own = {one.name: getattr(self, one.name) for one in fields(FistaOptions)}
         return FistaOptions(**{**own, "iterations": self.iterations - self.rounds})
 

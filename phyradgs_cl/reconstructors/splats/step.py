@@ -26,7 +26,9 @@ from phyradgs_cl.runtime.layout import pad_rows
 _PEAK_PERCENTILE = 99.9  # this percentile of the line integrals is their peak, because their maximum is noise
 _ROWS = 11  # parameters of a Gaussian, which are rows of dL/d(parameters)
 _STATISTICS = 2  # numbers for density control: sum of gradient norms, and number of frames
-_DERIVED = 13  # rows of ``cloud.gradients``: dL/d(parameters), then dL/d(centre on the detector), (u, v)
+# Rows of ``cloud.gradients``: dL/d(parameters), then dL/d(projected centre) along and across a line, per half of the image's
+# size.
+_DERIVED = 13
 Corner = tuple[int, int, int]
 """First voxel (z, y, x) of the random sub-volume whose total variation enters the loss."""
 
@@ -143,8 +145,9 @@ def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[floa
 
 @dataclass(frozen=True)
 class Batch:
-    """The frames of one step by number, a corner of a sub-volume for each (None if total variation has no weight), and
-    ``late``: whether the density term applies."""
+    """The frames of one step by number. For each, the first voxel of the sub-volume whose total variation counts (None if
+    that has no weight). ``late``: whether the iteration has reached ``parameter_terms_from``, from which the density term
+    applies."""
 
     frames: list[int]
     corners: list[Corner | None]

@@ -257,7 +257,8 @@ class Fista(Accelerated):
 
 
 def fista(scan: Scan, options: FistaOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the regularised volume of a scan in 1/mm. ``arguments``: as in ``MethodRun``; no seed is used."""
+    """Reconstructs a scan by the method ``fista``, in 1/mm. ``arguments``: further fields of ``MethodRun``; its seed has no
+    effect."""
     run = MethodRun(scan, options, rt, **arguments)
     return run.result("fista", Stages(fista_stages(run, lambda: run), run))
 
