@@ -13,9 +13,9 @@ from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames, is_paral
 
 _SAME_TIME = 1e-6  # times that differ by less than this fraction of a cell's duration are equal
 _NOTHING = 1e-9  # a smaller fraction of a line's exposure in a cell is a rounding error, and set to 0
-_INSTANT = 1e-9  # an exposure of a line shorter than this fraction of the frame's is treated as a single time
+_INSTANT = 1e-9  # an exposure of a line shorter than this fraction of the frame's lit span is treated as a single time
 _OVERHANG = 0.1  # a line skips a segment of time of which its exposure covers at most this fraction
-_TURN_SAMPLES = 32  # the gantry's highest speed in a frame is sought in this many equal intervals
+_TURN_SAMPLES = 32  # the gantry's highest speed in a frame is the highest mean speed of this many equal intervals
 _TURN_FACTOR = 0.32  # measured relative RMS error of a frame, per squared radian that the gantry turns in a segment
 _HARMLESS_PEAK = 4.0  # largest line integral up to which averaging intensities needs no more segments
 _MOST_SEGMENTS = 1000  # most segments that ``segments_for`` chooses for a frame
@@ -44,8 +44,8 @@ def micro_view_cells(
 ) -> TimeCells:
     """Divides the lines into M ``strips`` and the exposure into N ``sub_intervals``, and returns a cell for each pair.
 
-    Its time is t_f + (j+½)/M·T_ro + (k+½)/N·T_exp (paper, Eq. 2). With a pulsed beam the sub-intervals divide the part of
-    the exposure with light. Strips without a line have no cells."""
+    Strip j in sub-interval k of a frame that starts at t_f has the time t_f + (j+½)/M·T_ro + (k+½)/N·T_exp (paper, Eq. 2).
+    With a pulsed beam the sub-intervals divide the part of the exposure with light. Strips without a line have no cells."""
     share = (np.arange(sub_intervals) + 0.5) / sub_intervals
     ranges = np.array(shutter.strip_ranges(lines, strips))
     strip = np.flatnonzero(ranges[:, 1] > ranges[:, 0])
@@ -90,9 +90,9 @@ def common_time_cells(
     the paper's strip concatenation with fractional strips.
 
     frame_start_s (F,): the starts of all frames in s. In a scan without gaps, frames overlap in time because of the
-    readout. They share poses there if they start a whole number of cells after frame 0. With an exposure of 0 s, or cells
-    shorter than the readout of a line, sharing is useless: the result is ``per_line_cells``. With a pulsed beam, the
-    exposure counts as the longest time that a line receives light."""
+    readout. In the overlap they share poses if they start a whole number of cells after frame 0. With an exposure of 0 s,
+    or cells shorter than the readout of a line, sharing is useless: the result is ``per_line_cells``. With a pulsed beam,
+    the exposure counts as the longest time that a line receives light."""
     start_s = float(frame_start_s[frame])
     windows_s = shutter.line_windows_s(lines)
     length_s = float(np.ptp(windows_s, axis=1).max())
@@ -182,7 +182,8 @@ def exact_cells(
 def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     """Returns ``TimeCells.line_times`` (K, 3, lines), for windows (lines, 2) in s and edges (K + 1,) in s of equal segments.
 
-    Where a window covers at most ``_OVERHANG`` of a segment, that part counts to the next, to project fewer Gaussians."""
+    A window that covers at most ``_OVERHANG`` of the segment at its end counts as outside of it, so that fewer Gaussians
+    are projected."""
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
     opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in lengths of a segment after the frame's first light
@@ -212,13 +213,13 @@ def segments_for(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, time_error: float,
     intensity_peak: float = 0.0
 ) -> int:
-    """Returns how many segments keep a frame's relative RMS error below ``time_error``.
+    """Returns how many segments, at most 1000, keep a frame's relative RMS error below ``time_error``.
 
     In a segment, Gaussians move along straight lines and keep their shape. The error grows with the square of the gantry's
     turn in a segment. The factor was measured (benchmarks/time_exact.py) for Gaussians of 0.5 to 4 % of the half-width.
-    intensity_peak: the largest line integral if the detector averages intensities, else 0. Then half the variance of the
-    line integrals in a segment is a further error. Up to a peak of 4 it is the smaller one; above, it takes more
-    segments."""
+    intensity_peak: the largest line integral if the detector averages intensities, else 0. Averaging intensities adds an
+    error of half the variance of the line integrals in a segment. Up to a peak of 4 this error is the smaller one; above,
+    more segments are needed."""
     first_s, last_s = shutter.lit_span_s
     pose = trajectory.pose(frame, start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1))
     fastest_rad = float(np.max(_turns_rad(pose))) * _TURN_SAMPLES

@@ -16,7 +16,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
 POSE_LENGTH = 12
-# Largest distance of the source from the axis, in voxels. Here float32 displaces rays by 6 % of a voxel, at 1e7 by half.
+# Largest distance of the source from the axis, in voxels. At this distance float32 displaces rays by 6 % of a voxel, at 1e7
+# voxels by half a voxel.
 _MOST_VOXELS_AWAY = 1e6
 _STEEP = 1e-2  # least squared sine of a ray's angle to z: the height at which a steeper ray passes the axis is too uncertain
 
@@ -96,7 +97,7 @@ class ParallelGeometry:
         return replace(self, **_scaled_panel(self, factor))
 
     def finer(self, factor: int) -> "ParallelGeometry":
-        """Returns the geometry with every pixel cut into ``factor`` by ``factor``."""
+        """Returns the geometry with every pixel divided into ``factor`` by ``factor``."""
         return replace(self, **_finer_panel(self, factor))
 
     @property
@@ -209,9 +210,9 @@ def field_of_view_mm(geometry: Geometry) -> tuple[float, float, float]:
 def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
     """Returns the grid of a full turn's field of view: a cube, or lower if the panel sees less along z.
 
-    Voxels are as large as pixels at the axis: the pitch of rows along z, the pitch of columns along y and x. In a parallel
-    beam the grid is as high as the panel. If ``poses`` (F, 12) travel along z, as in a helix, the grid is longer by that
-    travel."""
+    Voxels are as large as a pixel's image at the axis: the pitch of rows along z, the pitch of columns along y and x. In a
+    parallel beam the grid is as high as the panel. If ``poses`` (F, 12) travel along z, as in a helix, the grid is longer
+    by that travel."""
     half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
     high_mm, wide_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     wide = max(1, math.ceil(2 * radius_mm / wide_mm))
@@ -282,8 +283,8 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_par
 
 
 def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
-    """Returns how far the panel of a pose (12,) is behind the middle of ``grid``, in mm. Below half the grid's width the
-    panel stands inside the grid, and rays end there."""
+    """Returns how far the panel of a pose (12,) is behind the middle of ``grid``, in mm. If this is less than half the
+    grid's width, the panel stands inside the grid, and rays end there."""
     source, first, step_u, step_v = pose.reshape(4, 3)
     away = np.cross(step_u, step_v)
     away = away * np.sign(away @ (first - source)) / np.linalg.norm(away)

@@ -25,9 +25,9 @@ RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator that a model may suit: projectors of voxels, of Gaussians, and filtered backprojection."""
 _USUAL_TIMES = 6  # ``PerRow`` samples an exposure at no more times than this, unless motion is fast
 _MOST_TIMES = 100  # ``PerRow`` samples an exposure at no more times than this, however fast the motion
-_FINE_STEP_VOXELS = 0.3  # travel of the volume's rim from one time of ``PerRow`` to the next
-_OBJECT_STEP_VOXELS = 0.7  # travel of an object's fastest part from one time to the next; its other parts travel less
-_COARSE_STEP_VOXELS = 3.6  # travel of rim or object from one time to the next where _USUAL_TIMES are too few
+_FINE_STEP_VOXELS = 0.3  # most travel of the volume's rim from one time of ``PerRow`` to the next
+_OBJECT_STEP_VOXELS = 0.7  # most travel of an object's fastest part from one time to the next; other parts travel less
+_COARSE_STEP_VOXELS = 3.6  # most travel of rim or object from one time to the next where _USUAL_TIMES are too few
 _SUB_INTERVALS = "Sub-intervals N of an exposure; for phyradgs means micro-views."
 _WEIGHT_TOLERANCE = 1e-3  # largest difference from 1 of the sum of a line's weights in a user-defined model
 
@@ -41,8 +41,8 @@ class Motion(Protocol):
 def rim_travel_voxels(scan: Scan) -> float:
     """Returns how far the grid's rim moves, relative to the panel, during a line's exposure, in voxels of a slice (y, x).
 
-    The rim is represented by the middles of the grid's four sides around the axis. On a circular orbit they move by r Δθ.
-    The largest travel in the first, middle and last frame counts. For a gantry at rest it is 0."""
+    The middles of the grid's four sides around the axis stand for the rim. On a circular orbit they move by about r Δθ, for
+    a radius r and an arc Δθ. The largest travel in the first, middle and last frame counts. For a gantry at rest it is 0."""
     if not scan.is_fly:
         return 0.0
     half_x_mm, half_y_mm = scan.grid.size_mm[2] / 2, scan.grid.size_mm[1] / 2
@@ -159,9 +159,9 @@ class PerRow(_Model):
         """Returns the model with as many times as the scan needs. A stated number stays. object_mm_per_s: the speed of the
         object's fastest part.
 
-        In an exposure it takes one time per 0.3 voxels that the rim moves, or per 0.7 voxels that the object moves, but at
-        most 6. These suffice up to 22 voxels. Longer travel takes one time per 3.6 voxels (measured in
-        docs/results/settings.md)."""
+        An exposure has one time per 0.3 voxels that the rim moves, or per 0.7 voxels that the object moves, whichever are
+        more, but at most 6. These suffice up to 22 voxels. Longer travel needs one time per 3.6 voxels, at most 100
+        (measured in docs/results/settings.md)."""
         if self.sub_intervals:
             return self
         rim_voxels = rim_travel_voxels(scan)
@@ -212,8 +212,8 @@ class Exact(_Model):
     """Gaussians move on the panel during a frame, which is divided into ``segments`` of time. Every line integrates over
     its own exposure.
 
-    0 segments takes as many as keep a frame's error below ``time_error``, relative to its RMS. ``time_error`` also limits
-    the error of the numerical integration over time. Raises InputError for numbers out of range."""
+    With ``segments`` = 0 a frame has as many as keep its relative RMS error below ``time_error``. ``time_error`` also
+    limits the error of the numerical integration over time. Raises InputError for numbers out of range."""
 
     poses: ClassVar = "integrals over time, of splats"
     operators: ClassVar = (SPLATS,)
@@ -273,7 +273,7 @@ def motion_in_words(facts: Mapping[str, object]) -> str:
 
 def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
     """Returns the model from the result of ``motion_facts``, or None for a user-defined one. Raises InputError or TypeError
-    for values out of range."""
+    for values out of range or of a wrong type."""
     for model in MODELS:
         keys = [f.name for f in fields(model) if f.init]
         if model.name == facts.get("name") and all(key in facts for key in keys):

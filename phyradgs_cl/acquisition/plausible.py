@@ -21,7 +21,7 @@ _WIDEST_DEG = 120.0  # a fan or cone angle above this is refused: dental scanner
 _LARGEST_PITCH_MM = 5.0  # pixels larger than this are not real, so they are named as the cause of too wide a fan
 _LEAST_DISTANCE_MM = 10.0  # a panel nearer to the source than this is not real, so distances are named as the cause
 _WRONG_UNIT = 100.0  # a readout of more frame times than this is refused: ms given as s make it some hundreds
-_SHORT_READOUT_S = 0.5e-3  # a shorter readout causes a warning, for panels of _MANY_LINES: real ones take some ms
+_SHORT_READOUT_S = 0.5e-3  # a shorter readout of at least _MANY_LINES causes a warning: real panels take some ms
 _MANY_LINES = 100
 _SLOW_FPS = 2.0  # a lower frame rate causes a warning if the gantry turns more than _LARGE_STEP_DEG between frames
 _LARGE_STEP_DEG = 10.0
@@ -158,8 +158,8 @@ def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> 
 
 
 def _check_opaque(scan: "Scan", subject: str) -> None:
-    """Raises InputError if most line integrals are larger than a panel can measure: they are counts then, which are large
-    in air. Warns if more than a few are."""
+    """Raises InputError if most line integrals are larger than a panel can measure: such values are counts, which are large
+    in air. Warns if more than 1 % of the pixels have such values."""
     pairs = zip(scan.projections, scan.valid, strict=True)
     counts = [(np.count_nonzero(frame[valid] > OPAQUE), np.count_nonzero(valid)) for frame, valid in pairs]
     opaque, valid_pixels = np.sum(counts, axis=0).tolist()
@@ -184,8 +184,8 @@ def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:
 
 
 def _check_panel(geometry: Geometry, named: Named) -> None:
-    """Raises InputError for too wide a fan or cone. The message blames the distances if they are too short and the pixels
-    are not too large, else the pixels."""
+    """Raises InputError for too wide a fan or cone. The message names the distances if the panel is too near and the pixels
+    are not too large; else it names the pixels."""
     widest_deg = max(_cone_deg(geometry))
     if isinstance(geometry, ParallelGeometry) or widest_deg <= _WIDEST_DEG:
         return

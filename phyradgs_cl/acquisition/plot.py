@@ -19,7 +19,8 @@ _MOST_CORNERS = 129  # most points on either side of an outline: a panel may hav
 
 
 def plot_frame(scan: "Scan", frame: int = 0) -> "Figure":
-    """Draws one frame's line integrals (rows, columns), with the panel's size in mm, and the times in s of its lines.
+    """Draws one frame's line integrals (rows, columns) with the panel's size in mm, and beside them when each line is
+    exposed, in s.
 
     Raises InputError for a frame number out of range."""
     checks.whole("frame", frame, 0, scan.frames - 1)

@@ -56,9 +56,10 @@ class Protocol:
         return 360.0 * self.turns / self.views
 
     def at_rate(self, fps: float, readout_ms: float | None = None, named: Named = str) -> "Protocol":
-        """Returns the protocol with the exposure time that gives ``fps`` frames per second, and with a readout in ms.
+        """Returns the protocol with the exposure time that gives ``fps`` frames per second. readout_ms: the readout in ms;
+        None keeps its ratio to the exposure.
 
-        Raises InputError for an arc of 0, and for a readout longer than a frame."""
+        Raises InputError for a rate not above 0, an arc of 0, and a readout longer than a frame."""
         checks.positive(named("fps"), fps)
         if self.exposure_deg == 0:
             raise InputError(named("fps"), f"{fps:g} with an exposure arc of 0°", "a gantry that turns", "leave fps out")
@@ -76,8 +77,8 @@ class Protocol:
         return Shutter(self.exposure_s, self.readout_ratio * self.exposure_s, axis, direction, pulse_s)
 
     def frame_start_s(self) -> np.ndarray:
-        """Returns when the frames open, (F,) in s. They are as far apart as the gantry takes for a step; with an arc of 0
-        they follow each other directly."""
+        """Returns when the frames open, (F,) in s. From one to the next the gantry turns by ``step_deg``; with an arc of 0
+        each opens as the one before it closes."""
         if self.exposure_deg == 0:
             return np.arange(self.views) * self.shutter().span_s
         return np.arange(self.views) * abs(self.step_deg) / self.exposure_deg * self.exposure_s

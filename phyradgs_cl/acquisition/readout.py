@@ -18,9 +18,9 @@ Named = Callable[[str], str]
 
 @dataclass(frozen=True)
 class Readout:
-    """The ``axis`` of readout: whether a line that is read at a time is one of the "rows" or "columns" of the panel.
+    """The ``axis`` of readout: whether the panel reads "rows" or "columns" one after the other.
 
-    Operators need frames and poses as (lines, width); this converts them from (rows, columns) and back."""
+    Operators need frames and poses in the order (lines, width). The methods convert them from (rows, columns) and back."""
 
     axis: str
 

@@ -53,12 +53,12 @@ class Scan:
     """One scan of a cone or a parallel beam, in line integrals.
 
     - projections (F, nv, nu) float32: −ln(I/I0), dimensionless. Row 0 is the lowest.
-    - geometry and grid in mm, shutter in s. Some programs state a panel scaled to the axis: it is moved behind the object.
+    - geometry and grid in mm, shutter in s. A panel at the axis, as some programs state it, is moved behind the object.
     - trajectory: anything with ``pose(frame, time_s)``, also a user-defined class.
     - frame_start_s (F,): when each frame's first line opens, in s.
     - is_fly: False if the gantry stops for every frame (stop-and-shoot), whatever the exposure time.
     - detector_model: what the detector averages over an exposure, "log" (line integrals) or "intensity".
-    - pixel_mask (nv, nu) or (F, nv, nu): non-zero for pixels not to be used. Lines that a pulsed beam misses are added.
+    - pixel_mask (nv, nu) or (F, nv, nu): non-zero for pixels not to be used. Lines that a pulsed beam misses become so too.
     - reference (nz, ny, nx): the true volume in 1/mm on ``grid``. moving_truth: true volumes and motion of a simulated
       object that moves.
     - gating: a signal or phase of a moving object, recorded with the frames.
@@ -182,7 +182,8 @@ class Scan:
         return self.shutter.lines(self.geometry.detector_shape)
 
     def on_grid(self, grid: Grid) -> "Scan":
-        """Returns the scan with another grid. The true volume is cut to it if the old grid contains it, else dropped."""
+        """Returns the scan with another grid. True volumes are cut to the new grid if it is a part of the old one, else
+        dropped."""
         if grid == self.grid:
             return self
         part = grid.slices_in(self.grid)
@@ -196,7 +197,8 @@ class Scan:
         return replace(self, grid=grid, reference=reference, moving_truth=moving)
 
     def with_grid(self, choice: GridChoice) -> "Scan":
-        """Returns the scan with the grid of ``choice``. Raises InputError for a grid outside an orbit's field of view."""
+        """Returns the scan with the grid of ``choice``. Raises InputError for a region of interest outside a circular
+        orbit's field of view."""
         grid = choice.of(self.grid)
         if choice.roi_mm is not None and isinstance(self.trajectory, CircularOrbit) and misses(grid, self.geometry):
             half_mm = ", ".join(f"±{half:.4g}" for half in field_of_view_mm(self.geometry))
@@ -213,7 +215,7 @@ class Scan:
             checked_poses(self.trajectory, frame, np.array([start_s, start_s + last_s]))
 
     def warn_of_near_panel(self) -> None:
-        """Warns if the panel stands inside the grid as the first frame opens: no ray sees the part behind the panel."""
+        """Warns if the panel of a cone beam stands inside the grid as the first frame opens: no ray sees the part behind."""
         if self.is_parallel:  # parallel rays are not taken to end at the panel
             return
         (pose,) = checked_poses(self.trajectory, 0, np.array(self.frame_start_s[:1]))

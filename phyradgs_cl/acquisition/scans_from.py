@@ -132,7 +132,8 @@ def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = N
 
 
 def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as ``line_integrals`` does, but refuses what looks like counts, since nobody stated the quantity."""
+    """Returns frames as ``line_integrals`` does. Raises InputError also for what looks like counts, because nobody stated
+    the quantity."""
     values = checks.real_array("frames", frames)
     check_not_counts(values, "give −ln(counts / flats)", mask)
     return line_integrals(values, mask)

@@ -10,7 +10,7 @@ from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")
 _STEPS = 1000  # least number of float64 steps in an exposure: its parts are then exact to a thousandth
-_DARK = 1e-9  # a line exposed for less than this fraction of the longest exposure is missed by the pulsed beam
+_DARK = 1e-9  # a line lit for less than this fraction of the longest lit time counts as missed by the pulsed beam
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,8 @@ class Shutter:
         return np.where(seen_s > _DARK * longest_s, seen_s / longest_s, 0.0)
 
     def strip_ranges(self, lines: int, strips: int) -> list[tuple[int, int]]:
-        """Divides lines into ``strips``; returns each one's lines [start, stop), in reading order. Strips may be empty."""
+        """Divides lines into ``strips``, and returns the lines [start, stop) of each, in reading order. Strips may be
+        empty."""
         edges = [checks.ceil_div(strip * lines, strips) for strip in range(strips + 1)]
         ranges = list(zip(edges[:-1], edges[1:], strict=True))
         if self.direction < 0:

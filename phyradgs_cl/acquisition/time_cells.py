@@ -26,8 +26,8 @@ class TimeCells:
       lies in the cell. None means 1.
     - end_poses (C, 2, 12) in mm, end_times_s (C, 2) in s: at both ends of moving cells, whose ``weight`` is 1; None for
       still cells. The times are needed if the object moves.
-    - line_times (C, 3, lines): for moving cells, the part of each line's exposure in the cell: its middle (from the cell's
-      mid-time) and half its length, both over the cell's length, then the fraction of the exposure that it is.
+    - line_times (C, 3, lines): for moving cells, the part of each line's exposure in the cell. Its middle, counted from the
+      cell's mid-time, and half its length, both over the cell's length; then its fraction of the exposure.
     - is_parallel: poses begin with the direction of parallel rays.
     - conic_pose (12,): for Gaussians only. Cells then move only the Gaussians' centres on the panel; their shapes and
       densities there are computed for this pose.
@@ -85,7 +85,7 @@ class TimeCells:
 
     @property
     def averages(self) -> bool:
-        """Whether any line averages over several cells."""
+        """Whether any line averages over several cells, which then are in different layers."""
         return bool(self.layer_numbers.any())
 
     def scaled(self, factor: float) -> "TimeCells":

@@ -85,8 +85,8 @@ class SpeedRamp(ConstantSpeed):
 class EncoderTable:
     """Measured θ(t): ``angle_rad_table`` (T,) in rad at ``time_s`` (T,) in s, linear in between.
 
-    Jumps by a whole turn, as an encoder makes at 360°, are removed if the other steps between samples are small. Raises
-    InputError for times that do not increase, and for times beyond the table."""
+    Jumps by a whole turn, as an encoder makes at 360°, are removed, unless most steps between samples exceed a quarter
+    turn. Raises InputError for times that do not increase, and for times beyond the table."""
 
     time_s: np.ndarray
     angle_rad_table: "NDArray[np.float64]"
@@ -143,7 +143,8 @@ class FrameSweeps:
 
 
 def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
-    """Extends an orbit's encoder table by ``by_s`` at either end, at the speed there. Other trajectories stay the same."""
+    """Extends a circular orbit's encoder table by ``by_s`` at either end, with the speed at that end. Returns other
+    trajectories unchanged."""
     if not (isinstance(trajectory, CircularOrbit) and isinstance(trajectory.kinematics, EncoderTable)):
         return trajectory
     table = trajectory.kinematics
@@ -158,8 +159,8 @@ def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
 
 
 def _is_without_jumps(steps_rad: np.ndarray) -> bool:
-    """Returns whether steps (N,) of angles are no jumps by a turn: none exceeds half a turn, or most exceed a quarter
-    turn."""
+    """Returns whether no step (N,) of angles counts as a jump by a turn: none exceeds half a turn, or at least half of them
+    exceed a quarter turn."""
     size_rad = np.abs(steps_rad)
     return bool(size_rad.max(initial=0) <= np.pi or np.median(size_rad) >= np.pi / 2)
 
@@ -275,7 +276,7 @@ def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarr
 def behind_axis(geometry: Geometry, trajectory: Trajectory) -> tuple[Geometry, Trajectory]:
     """Returns geometry and trajectory with a panel at the axis moved away from the source, enlarged to see the same rays.
 
-    Some programs state a panel scaled to the axis. Rays end at the panel, so there they would end within the object.
+    Some programs state a panel scaled to the axis. Rays end at the panel, so they would end within the object.
     User-defined trajectories and panels elsewhere stay as they are."""
     if not isinstance(geometry, ConeGeometry):
         return geometry, trajectory

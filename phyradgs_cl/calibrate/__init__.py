@@ -1,4 +1,5 @@
-"""Estimates a scan's true geometry and timing from its own frames, with deviations, and says what they cannot determine."""
+"""Estimates a scan's true geometry and timing from its own frames, with standard deviations, and says which parameters the
+frames cannot determine."""
 
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, Calibration, ParameterEstimate
 from phyradgs_cl.calibrate.run import calibrate

@@ -1,4 +1,5 @@
-"""Calibrates with a phantom of known shape: its placement, its density and a background replace the unknown volume.
+"""Calibrates with a phantom of known shape. The phantom's placement and density, and a smooth background of the frames,
+are the unknowns in place of a volume.
 
 ``BeadOperator`` computes the expected frames in closed form, with each line at its own times."""
 
@@ -28,12 +29,13 @@ _MARGIN = 1.2  # largest factor by which an oblique panel widens a bead's shadow
 _FEWEST_TIMES, _MOST_TIMES = 6, 24
 _FEWEST_RAYS = 2  # fewest rays along each side of a pixel, and along a bead's radius: sharp edges need several
 _MOST_RAYS = 6  # rays along each side of a pixel, at most: the time grows with their square
-# Blur of compared frames, in pixels: without it, differences of sharp edges would show single rays, half a pixel apart.
+# Standard deviation, in pixels, of the blur of compared frames: without blur, differences of sharp edges would show single
+# rays, half a pixel apart.
 _BLUR_PX = 0.8
 _LEAST_ZEROS = 0.2  # if at least this fraction of the pixels is 0, the noise of air was clipped at 0
 _ZEROS_PX = 5  # the noise of clipped air follows from means of blocks with this many pixels a side
 _BACKGROUND = 4  # cosines along each side of a frame: together they describe holder, scatter and drift of the tube
-_STEP_PX = 0.25  # step of central differences to each side, as the pixels by which it moves the frame's edge
+_STEP_PX = 0.25  # a central difference moves the frame's edge by this many pixels to each side
 _MOST_PX = 1.5  # most pixels by which one step of the placement moves a frame: beyond, its effect is not linear
 _SETTLED_PX = 0.01  # the search ends when a step moves the frame by less than this
 _LINEAR_PX = 0.3  # derivatives are computed again after a step that moves the frame by more than this
@@ -43,7 +45,8 @@ _LINEAR_PX = 0.3  # derivatives are computed again after a step that moves the f
 class BeadOperator:
     """Computes the frames (F, rows, columns) of a phantom along the lines of ``tables``, for a detector of ``model``.
 
-    samples: rays along each side of a pixel. clipped_noise: standard deviation of noise clipped at 0; 0: unclipped."""
+    samples: rays along each side of a pixel. clipped_noise: standard deviation of the noise, if line integrals below 0 were
+    set to 0; else 0."""
 
     phantom: EllipsoidPhantom
     tables: Sequence[TimeCells]
@@ -79,7 +82,7 @@ class BeadOperator:
 
 
 def _mean_of_clipped(p: np.ndarray, sigma: float) -> np.ndarray:
-    """Returns the mean of max(p + noise, 0) for normal noise of deviation ``sigma``. Clipping raises air most."""
+    """Returns the mean of max(p + noise, 0) for normal noise of deviation ``sigma``. Clipping raises the mean most in air."""
     ratio = p / sigma
     return p * scipy.special.ndtr(ratio) + sigma * np.exp(-(ratio**2) / 2) / math.sqrt(2 * math.pi)
 
@@ -114,7 +117,7 @@ class _PanelLines:
     is_parallel: bool
 
     def integrals(self, phantom: EllipsoidPhantom, samples: int) -> Iterator[np.ndarray]:
-        """Yields the line integrals (N, pixels), float32, at each of samples² points of the pixels' area in turn."""
+        """Yields the line integrals (N, pixels), float32, at each of samples² points of a pixel's area in turn."""
         shadows = [(body, *self._shadow(np.array(body.ends_mm), body.reach_mm)) for body in phantom.ellipsoids]
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
         for across, along in itertools.product(offsets, offsets):
@@ -136,11 +139,10 @@ class _PanelLines:
 
     @cached_property
     def _panel_axes(self) -> tuple[tuple[np.ndarray, ...], ...]:
-        """Three vectors (N, 3). Their inner products with a point in mm give its distance from the source over that of the
-        panel, and the line and pixel of its image. Each comes with its products with the source and with the first pixel
-        (N,), and its length (N,).
+        """Three vectors (N, 3), each with its inner products (N,) with the source and the first pixel, and its length (N,).
 
-        In a parallel beam the distance is 1, and lines and pixels are those that a ray through the point meets."""
+        The first measures a point's distance from the source, over that of the panel. The others measure line and pixel of
+        the point's image. In a parallel beam the distance is 1, and the ray through the point makes the image."""
         normal = np.cross(self.line_step, self.pixel_step)
         to_panel = self.source if self.is_parallel else self.first - self.source
         vectors = [normal / np.sum(normal * to_panel, -1, keepdims=True)]
@@ -153,8 +155,8 @@ class _PanelLines:
         return tuple((v, *both, np.linalg.norm(v, axis=-1)) for v, both in zip(vectors, products, strict=True))
 
     def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:
-        """Returns the lines (n,) that may see a body, its shadow's first pixel (n,) on each, and a width in pixels for
-        all."""
+        """Returns the lines (n,) that may see a body, the first pixel (n,) of its shadow on each, and the width in pixels of
+        the widest shadow."""
         (depth, depth_of_source, *_), *axes = self._panel_axes
         lowest, highest = [], []
         for end_mm in ends_mm:
@@ -226,7 +228,8 @@ class BeadProblem(CoarseFrames):
         return float(1 - residual @ residual / max(float(whole @ whole), 1e-30)) if placement[DENSITY] > 0 else 0.0
 
     def reconstruct(self, operator: BeadOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
-        """Returns the placement (7,) that fits best, by Gauss–Newton from ``start``."""
+        """Returns the placement (7,) that fits best, by at most ``iterations`` Gauss–Newton steps from ``start`` (None: the
+        problem's own)."""
         placement = self.start if start is None else start
         inverse = None
         for _ in range(iterations):
@@ -245,19 +248,21 @@ class BeadProblem(CoarseFrames):
     def beyond_object(
         self, operator: BeadOperator, placement: np.ndarray, images: Sequence[np.ndarray], iterations: int
     ) -> list[np.ndarray]:
-        """Returns the part of each image (F, rows, columns) outside the Jacobian's range: no placement explains it."""
+        """Returns the part of each image (F, rows, columns) that no change of the placement explains: the part outside the
+        Jacobian's range at ``placement``. ``iterations`` has no effect."""
         basis, _ = np.linalg.qr(self._signals(operator, placement).T)
         compared = np.array([self.compared(image) for image in images])
         beyond = compared - compared @ basis @ basis.T
         return list(beyond.reshape(len(images), *self.measured.shape))
 
     def compared(self, frames: np.ndarray) -> np.ndarray:
-        """Returns the values (F · pixels,) float64 of frames to compare: background removed, blurred to hide single rays."""
+        """Returns the values (F · pixels,) float64 by which frames are compared: without background, blurred to hide single
+        rays."""
         blurred = gaussian_filter(self._without_background(frames), (0, _BLUR_PX, _BLUR_PX), output=np.float64)
         return blurred.ravel()
 
     def _units(self) -> np.ndarray:
-        """Returns steps (7,) of a placement: each moves a frame's edge by a pixel, the last doubles the density."""
+        """Returns steps (7,) of a placement: each moves a frame's edge by a pixel; the last adds 1 to the density factor."""
         scan = self.scans[0]
         pixel_mm = self.block * min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
         return np.array([pixel_mm / (max(scan.grid.size_mm) / 2)] * 3 + [pixel_mm] * 3 + [1.0])
@@ -287,8 +292,8 @@ class BeadProblem(CoarseFrames):
 
 
 def _clipped_noise(scans: Sequence[Scan]) -> float:
-    """Returns the standard deviation of noise in air that was clipped at 0, from means of small blocks. It is 0 if few
-    pixels are 0, or some are below: then nothing was clipped."""
+    """Returns the standard deviation of noise in air whose values below 0 were set to 0, from means of small blocks. It is
+    0 if few pixels are 0 or some are below 0, because nothing was clipped then."""
     values = np.concatenate([np.asarray(scan.projections, np.float32) for scan in scans])
     valid = np.concatenate([scan.valid for scan in scans])
     if np.mean(values[valid] == 0) < _LEAST_ZEROS or values[valid].min() < 0:
@@ -298,8 +303,9 @@ def _clipped_noise(scans: Sequence[Scan]) -> float:
 
 
 def _with_spread_of(scan: Scan, times: int) -> Scan:
-    """Returns the scan with longer exposures about the same middle, so that ``times`` moments spread as widely as the whole
-    exposure (standard deviation). Otherwise few moments would look like a shorter exposure. Pulsed scans stay unchanged."""
+    """Returns the scan with longer exposures about the same middle, so that the ``times`` moments of a line have the
+    standard deviation of its whole exposure. Without this, few moments would look like a shorter exposure. Pulsed scans
+    stay unchanged."""
     if scan.shutter.pulse_s is not None:
         return scan
     exposure_s = scan.shutter.exposure_s / math.sqrt(1 - times**-2)

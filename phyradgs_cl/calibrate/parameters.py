@@ -17,7 +17,8 @@ _STEP_PX = 0.25  # a central difference moves the image's edge by this many pixe
 _TIMING_STEP = 0.1  # a time is changed by at most this fraction of itself in a central difference
 _LARGEST_CUT = 0.7  # the search shortens a time by at most this fraction, so that it stays above 0
 _MOST_TILT_RAD = math.radians(2.0)  # an angle is changed by at most this in a central difference
-_SMALL_MISMATCH = 1.3  # mismatch of effects that change sign after half a turn: voxels' errors do not, so they disturb less
+# ``Parameter.mismatch`` of effects that change sign after half a turn: errors of voxels do not, so they disturb these less.
+_SMALL_MISMATCH = 1.3
 # An angle with a larger standard deviation counts as undetermined, because its sine is not linear over such a range.
 _LEAST_KNOWN_RAD = math.radians(10.0)
 _DEGREES = math.degrees(1.0)
@@ -25,12 +26,13 @@ _DEGREES = math.degrees(1.0)
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter that can be calibrated. field: which field of ``GeometryCorrection`` it changes.
+    """A parameter that can be calibrated. field: the field of ``GeometryCorrection`` that it changes.
 
     - scale: displayed units per unit of the field.
     - object_instead: another object that explains the frames as well, if they do not determine the parameter.
     - pixels: how many pixels a unit of the field moves the image at its edge.
-    - mismatch: measured errors (docs/calibrate.md) over errors by noise alone, as voxels do not represent objects exactly.
+    - mismatch: measured errors (docs/calibrate.md) over errors by noise alone. Voxels, which do not represent objects
+      exactly, add the rest.
     - is_axial: the parameter moves the image along the axis, like ``LIFT``. The others move it across, like ``TURN``."""
 
     name: str
@@ -45,7 +47,7 @@ class Parameter:
     is_axial: bool = False
 
     def step(self, scan: Scan) -> float:
-        """Returns the step of central differences to each side, in the field's unit."""
+        """Returns how far a central difference goes to each side, in the field's unit."""
         step = _STEP_PX / self.pixels(scan)
         if self.unit == "deg":
             return min(step, _MOST_TILT_RAD)
@@ -71,13 +73,13 @@ def _pitch_mm(scan: Scan) -> float:
 
 
 def _edge_pixels(scan: Scan, factor: float = 1.0) -> float:
-    """Returns by how many pixels a radian of roll moves the panel's further edge, times ``factor``."""
+    """Returns by how many pixels a radian of roll moves the edge farther from the panel's middle, times ``factor``."""
     return factor * max(_half_mm(scan, 0), _half_mm(scan, 1)) / _pitch_mm(scan)
 
 
 def _tilt_pixels(axis: int) -> Callable[[Scan], float]:
     """Returns a function of the scan: by how many pixels a radian of tilt moves the panel's edge. A tilt magnifies one side,
-    so points move by the square of their distance from its axis."""
+    so points move in proportion to the square of their distance from the tilt's axis."""
     return lambda scan: _half_mm(scan, axis) ** 2 / _cone(scan).source_to_detector_mm / _pitch_mm(scan)
 
 
@@ -139,7 +141,7 @@ OFFSET_U = "offset-u"
 TURN = Parameter("all angles", "turn_rad", "deg", _TURN, lambda s: 0.0, _edge_pixels, _DEGREES)
 LIFT = Parameter("all heights", "lift_mm", "mm", "a lower object", lambda s: 0.0, lambda s: 1 / _pitch_mm(s), is_axial=True)
 GAUGES = (TURN, LIFT)
-"""Parameters that no frame determines. A volume leaves parts of their signals only by errors of the voxels."""
+"""Parameters that no frame determines. What a volume leaves of their signals is due to errors of voxels alone."""
 PARAMETER_GROUPS = {
     "offset": (OFFSET_U, "offset-v"),
     "tilt": ("tilt-v", "tilt-u"),
@@ -172,7 +174,7 @@ def requested(what: str | None, scan: Scan, knows_shape: bool = False) -> Reques
     for an object of known shape. A parallel beam has neither tilt nor distances.
 
     Raises InputError for an unknown name, distances and tilts of a parallel beam, wobble together with motion, the timing of
-    a gantry that stands still, and a readout of 0 s."""
+    a gantry that stands still, and readout or direction where the stated readout is 0 s."""
     if what is None:
         is_rolling = _turns(scan) and scan.shutter.readout_s > 0
         what = "offset,roll" if scan.is_parallel else "offset,roll,tilt"
@@ -209,13 +211,14 @@ def _turns(scan: Scan) -> bool:
 
 
 def correction_of(values: Mapping[str, float]) -> GeometryCorrection:
-    """Returns the correction with these values, by parameter name, in the fields' units."""
+    """Returns the correction with ``values`` by the parameters' names, in the fields' units."""
     fields = {**PARAMETERS, **{gauge.name: gauge for gauge in GAUGES}}
     return GeometryCorrection(**{fields[name].field: float(value) for name, value in values.items()})
 
 
 def in_words(weights: Mapping[str, float]) -> str:
-    """Returns a combination of parameters (weights by name) in words: the largest weight first, none below 0.3 of it."""
+    """Returns a combination of parameters (weights by name) in words: the one of largest weight first, and only those of at
+    least 0.3 of that weight."""
     order = sorted(weights, key=lambda name: -abs(weights[name]))
     largest = abs(weights[order[0]])
     main, *others = [name for name in order if abs(weights[name]) > 0.3 * largest]

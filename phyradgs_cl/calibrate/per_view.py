@@ -24,10 +24,11 @@ from phyradgs_cl.runtime import Runtime
 
 SPLINES = 7  # default number of splines; each is about a seventh of the scan wide
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
-_STEP_PX = 0.25  # step of central differences to each side, as the pixels by which it moves a frame
+_STEP_PX = 0.25  # a central difference moves a frame by this many coarse pixels to each side
 _LEAST_NORM = 0.1  # a signal's norm counts as at least this fraction of its kind's largest, which limits how it is scaled
 _DEG = float(np.rad2deg(1.0))
-# This fraction of the change since a grid half as fine counts as error: 1 suits errors ∝ voxel, 1/3 errors ∝ voxel².
+# This fraction of a value's change since the next coarser grid counts as its discretisation error. With voxels half as
+# large, 1 suits errors ∝ voxel size, and 1/3 suits errors ∝ its square.
 DISCRETISATION = 0.5
 _STEPS = 3  # Gauss–Newton steps on each grid; the next grid continues from there
 _ITERATIONS = 20  # iterations of CGLS for each step and each standard deviation
@@ -48,8 +49,8 @@ class PerViewParameters(ABC):
     """Parameters of views: ``values`` (n, K) of K kinds. View f has (``basis`` @ ``values``)[f], (K,), with basis (F, n).
 
     - units (K,): the value of each kind that moves a frame's edge by a pixel.
-    - circle (n, 2): values that vary as cosine and sine of the angle, as far as the basis can.
-    - MISMATCH: measured errors (docs/calibrate.md) over errors by noise alone, as voxels do not represent objects exactly.
+    - circle (n, 2): values that vary as cosine and sine of the angle, as far as the basis allows.
+    - MISMATCH: measured errors (docs/calibrate.md) over errors by noise alone, because voxels are not exact.
     - RESTARTED: kinds that start from 0 on each grid."""
 
     values: np.ndarray
@@ -67,7 +68,7 @@ class PerViewParameters(ABC):
 
     @abstractmethod
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """Returns values (n, K) without the part that a moved object would explain exactly."""
+        """Returns values (n, K) without the part that another object would explain exactly."""
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
         """Returns the indices of the kinds to estimate in stage ``number`` of ``count``. A subclass may leave some out."""
@@ -183,7 +184,7 @@ def view_step(
     norms = _norms(parameters.basis, signals)
     scale = _strength(operator) / np.maximum(norms, _LEAST_NORM * norms.max(0))
     if not np.array_equal(parameters.basis, np.eye(len(signals))):
-        # several splines act on a view, whose derivative has a single scale: so all splines share one
+        # several splines act on a view, but its derivative can have only one scale: so all splines share one
         scale = np.broadcast_to(scale.mean(0), scale.shape)
     per_view = parameters.basis @ scale / parameters.basis.sum(1, keepdims=True)
     scaled = (signals * per_view[:, :, None, None]).astype(np.float32)
@@ -244,8 +245,8 @@ def _signal(
 def _share(
     problem: CoarseProblem, operator: RayOperator, basis: np.ndarray, signals: np.ndarray, iterations: int
 ) -> float:
-    """Returns the fraction, 0 to 1, of signals (F, rows, columns) that no object explains, if each view's signal has a
-    random sign."""
+    """Returns the fraction, 0 to 1, of signals (F, rows, columns) that no object explains, if each coefficient of the basis
+    is 1 or −1 by chance."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], basis.shape[1]).astype(np.float32)
     probe = signals * (basis @ signs).astype(np.float32)[:, None, None]
     (rest,) = problem.beyond_object(operator, np.zeros(operator.volume_shape, np.float32), [probe], iterations)
@@ -273,9 +274,10 @@ def estimate_views(
     rt: Runtime, scan: Scan, parameters: PerViewParameters, stages: Sequence[Stage],
     correction: GeometryCorrection, passes: PassCounter,
 ) -> ViewsEstimate:
-    """Estimates ``parameters`` of a scan that ``correction`` has changed, by some Gauss–Newton steps on ever finer grids.
+    """Estimates ``parameters`` of a scan after ``correction``, by three Gauss–Newton steps on each grid, from coarse to fine.
 
-    A deviation combines noise and discretisation error, which is half the change since the coarser grid."""
+    A deviation combines noise and discretisation error. The latter is half the change since the coarser grid, or 0 for a
+    kind that the coarser grid did not estimate."""
     for number, stage in enumerate(stages):
         problem = CoarseProblem.of(rt, [scan], stage, scan.frames)
         problem = replace(problem, count_pass=passes.counter(pass_cost([scan], stage.columns, scan.frames)))

@@ -10,11 +10,11 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
-FEWEST_BEADS = 4  # three beads have a placement, a fourth confirms it
+FEWEST_BEADS = 4  # three beads determine a placement, a fourth confirms it
 WRONG_PHANTOM = "is it the right phantom, all of it in view, in mm? Does the gantry turn as stated ('phyradgs check')?"
 _LEAST_SHARE = 0.75  # at least this fraction of the beads must lie in bright spots of the volume
-_SMOOTH = 0.5  # smoothing (std) in radii of a bead: a bead of many voxels then has one maximum
-_PEAKS_PER_BEAD = 2.0  # this many bright spots per bead are compared with the beads, because some are no beads
+_SMOOTH = 0.5  # standard deviation of the smoothing, in radii of a bead: a bead of many voxels then has one maximum
+_PEAKS_PER_BEAD = 2.0  # this many bright spots per bead are compared with the beads, because some spots are no beads
 _TOLERANCE_VOXELS = 1.5  # a bead lies at most this far from its bright spot, in voxels
 _TRIANGLES = 40  # this many random triangles of beads are looked for among the spots: one that fits gives a placement
 _APART = 0.05  # placements whose turns differ by less, in rad, are the same
@@ -36,7 +36,8 @@ def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> lis
     """Returns up to 6 placements (6,), the best first, that take most of the known beads to bright spots of ``volume`` (nz,
     ny, nx).
 
-    A placement is a turn (rotation vector, rad) and a shift (mm). Raises InputError if none fits 3/4 of the beads."""
+    A placement is a turn (rotation vector, rad) and a shift (mm). Raises InputError if none takes 3/4 of the beads, at
+    least three, to bright spots."""
     beads_mm = bead_centres_mm(phantom)
     radius_mm = np.median([body.reach_mm for body in phantom.ellipsoids if isinstance(body, Ellipsoid)])
     smooth = gaussian_filter(volume, _SMOOTH * radius_mm / np.array(grid.voxel_size_mm))
@@ -87,7 +88,8 @@ def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
 def _matching_triangles(
     beads_mm: np.ndarray, spots_mm: np.ndarray, within_mm: float
 ) -> Iterator[tuple[tuple[int, int, int], list[int]]]:
-    """Yields triangles of beads (n, 3) and spots (m, 3), as indices, whose sides differ by less than ``within_mm``."""
+    """Yields indices of three beads and of three spots whose triangles have the same sides within ``within_mm``. The beads
+    (n, 3) are chosen at random; triangles with a short side are left out. spots_mm: (m, 3)."""
     rng = np.random.default_rng(0)
     apart = np.linalg.norm(spots_mm[:, None] - spots_mm, axis=-1)
     for _ in range(_TRIANGLES):

@@ -29,7 +29,7 @@ _VOXELS_PER_TIME = 2.0  # an exposure is sampled so often that the volume's rim 
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
-_LEAST_SHARE = 0.1  # in progress reports, a phase's remaining passes cost at least this fraction of their full cost
+_LEAST_SHARE = 0.1  # progress counts a phase's remaining passes at no less than this fraction of their full cost
 Passes = tuple[int, float]
 """How many passes may still come at most, and their expected total cost."""
 
@@ -57,15 +57,15 @@ class Stage:
 
 
 def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:
-    """Returns the cost of a pass through the scans with at most ``columns`` blocks: about rays × voxels along each."""
+    """Returns the cost of a pass through the scans with at most ``columns`` blocks: rays × voxels along a ray."""
     shape = scans[0].geometry.detector_shape
     rows, across = (ceil_div(n, ceil_div(max(shape), columns)) for n in shape)
     return float(sum(min(scan.frames, most_frames) for scan in scans) * rows * across * max(rows, across))
 
 
 class PassCounter:
-    """Counts passes and reports them. plan: number and cost of the passes of each phase, in order. Passes that turn out to
-    be unnecessary are taken out, so the total falls."""
+    """Counts passes and reports them. plan: number and cost of the passes of each phase, in order. Phases that turn out to
+    be unnecessary leave the plan, so the total falls."""
 
     def __init__(self, report: Report, plan: Mapping[str, Passes]) -> None:
         self.plan = dict(plan)
@@ -155,7 +155,8 @@ class CoarseProblem(CoarseFrames):
     def operator(self, correction: GeometryCorrection, views: Views | Sway | None = None) -> RayOperator:
         """Returns the projector A to the coarse frames of all scans, in the geometry after ``correction`` and ``views``.
 
-        Each line integrates over 2 to 8 times of its exposure. views: changes of single views or of the object's pose."""
+        In a fly-scan each line averages over 2 to 8 times of its exposure. views: changes of single views or of the
+        object's pose."""
         tables = []
         for scan in self.scans:
             small = coarse.binned(perturb(scan, correction, views), self.block)
@@ -165,14 +166,14 @@ class CoarseProblem(CoarseFrames):
         return RayOperator(self.rt, self.grid, small.geometry.detector_shape, tables, fewest_lines=FEWEST_LINES)
 
     def line_integrals(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
-        """Returns the measurement as mean line integrals. A detector that averages intensity measures less at edges: the
-        difference at ``volume`` is added."""
+        """Returns the measurement as mean line integrals. A detector that averages intensity measures less at edges; the
+        difference, computed for ``volume``, is added."""
         if self.scans[0].detector_model != "intensity":
             return self.measured
         return self.measured + self.masked(operator.forward(volume) - self._expected(operator, volume))
 
     def _expected(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
-        """Returns a volume's frames (F, rows, columns), averages of line integrals or intensities, as the detector's."""
+        """Returns a volume's frames (F, rows, columns). They average line integrals or intensities, as the detector does."""
         if self.scans[0].detector_model != "intensity":
             return operator.forward(volume)
         return IntensityOperator(self.rt, self.grid, operator.detector_shape, operator.tables).expected(volume)
@@ -198,7 +199,8 @@ class CoarseProblem(CoarseFrames):
         return self.measured - self.masked(self._expected(operator, volume))
 
     def noise(self, residual: np.ndarray) -> float:
-        """Returns a pixel's noise (std), from the measurement: the volume has fitted some of the noise of ``residual``."""
+        """Returns the standard deviation of a pixel's noise, from the measurement. ``residual`` would give too little,
+        because the volume has fitted some of the noise."""
         return noise_level(self.measured, self.valid)
 
     def beyond_object(
@@ -218,9 +220,9 @@ class CoarseProblem(CoarseFrames):
 
 
 def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:
-    """Returns the smoothing across (rows, columns), in pixels, before binning. Rows read one after the other are not
-    smoothed: they see the object at other angles, so smoothing would look like a shorter readout. Columns read one after the
-    other shear the image, which smoothing does not change."""
+    """Returns the standard deviations (v, u), in pixels, of the smoothing before binning. Rows that are read one after the
+    other are not smoothed together: they see the object at different angles, so smoothing would look like a shorter
+    readout. Columns that are read one after the other shear the image, which smoothing does not change."""
     if block == 1:
         return 0.0
     is_rolling = scan.shutter.readout_s > 0 and scan.shutter.axis == "rows"

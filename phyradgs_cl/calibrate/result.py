@@ -1,4 +1,5 @@
-"""The result of a calibration: an estimate per parameter, combinations that no frame distinguishes, the corrected scan."""
+"""The result of a calibration: an estimate per parameter, combinations that the frames do not determine, and the corrected
+scan."""
 
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
@@ -50,10 +51,10 @@ class Calibration:
     """The corrected ``scan``, in which everything else is unchanged, and how it was found.
 
     - parameters: an estimate of each. alike: combinations of parameters, in words, that no frame tells from another object.
-    - residual_rms: RMS residual before and after, in line integrals, on the finest grid. before, after: these residuals (F,
-      rows, columns).
-    - views: corrections per view, or the object's motion, if significant. The table has the root mean square of each kind,
-      with the deviation of a single view.
+    - residual_rms: RMS residual before and after correction, in line integrals, on the finest grid. before, after: these
+      residuals (F, rows, columns).
+    - views: corrections per view, or the object's motion; None if not significant. ``parameters`` has the root mean square
+      of each kind, with the deviation of a single view.
 
     Lengths are in mm, angles in degrees, times in s. ``calibrate`` returns a Calibration, or raises InputError."""
 
@@ -103,7 +104,7 @@ class Calibration:
         return {name: values for name, values in curves.items() if values.any()}  # only kinds that were corrected
 
     def plot(self) -> "Figure":
-        """Returns a figure of the residuals of four frames, before on the left and after on the right, on one scale.
+        """Returns a figure of the residuals of up to four frames, before on the left and after on the right, on one scale.
 
         Below are the corrections per view, if any. Red: the frame has more than the volume explains; blue: less."""
         frames = np.unique(np.linspace(0, len(self.before) - 1, _FRAMES).round().astype(int))

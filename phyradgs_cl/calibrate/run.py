@@ -3,7 +3,7 @@
 The start is the axis that fits best and, for a known phantom, the place where its beads are seen. On request the readout's
 direction is tested, and single views or a motion are corrected first. The search (``search``) then estimates what is common
 to all views, from coarse to fine grids. After that, views or the motion are estimated again. Significant corrections enter
-the scan and its provenance. Unless views were corrected, they do so only if they lower the residual."""
+the scan and its provenance. If no views were corrected, corrections that raise the residual are dropped."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -65,7 +65,7 @@ _FEWEST_SPLINES = 4  # a cubic spline of a wobble needs four
 _LEAST_EXPLAINED = 0.3
 _ORDER_ERRORS = 4.0  # least difference of the readout directions' squared residuals in standard errors, as in ``check``
 _ORDER_RATIO = 1.04  # least ratio of the readout directions' squared residuals, as in ``check``
-_BEYOND = 1e6  # an encoder table is continued by this many frame times: first steps of the search may go far beyond it
+_BEYOND = 1e6  # an encoder table is continued by this many frame times: first steps of the search may ask for such times
 # Progress expects stages to cost this fraction of their most: few parameters are determined, and few steps are needed.
 _EXPECTED_SHARE = 0.25
 
@@ -83,7 +83,8 @@ def calibrate(
     - splines: a wobble's number of splines of time; 0: each view has parameters of its own.
     - note: takes a line with the estimates so far after each grid.
 
-    Raises InputError for unknown parameters, a scan too small, others that do not fit the first, and a phantom not seen."""
+    Raises InputError for what ``requested`` refuses, options that exclude each other, a scan too small, ``others`` that do
+    not fit ``scan``, and a phantom that the frames do not show."""
     request = requested(what, scan, phantom is not None)
     ready = [
         without_lag(replace(one, trajectory=continued(one.trajectory, _BEYOND * one.shutter.span_s)))
@@ -178,7 +179,8 @@ class _Calibrator:
             self.search.fallback = {OFFSET_U: Fallback(shift.pixels * pitch_mm, shift.deviation * pitch_mm, is_significant)}
 
     def _search_common(self) -> None:
-        """Searches the parameters that all views share. Corrects single views first: their errors would look like a roll."""
+        """Searches for the parameters that all views share. Corrects single views first, because their errors would look
+        like a roll."""
         steady = self.ready
         if self.per_view is not None:
             self.passes.begin("views before", "views, before the rest")
@@ -194,8 +196,8 @@ class _Calibrator:
             self.passes.plan |= self._plan_of_stages(len(self.search.determined), number + 1)
 
     def _with_steady_views(self, scan: Scan) -> Scan:
-        """Returns the scan with its single views corrected. If the panel's offset is to be estimated, the mean of their
-        shifts along u counts as offset."""
+        """Returns the scan with its single views corrected. If the panel's offset along u is to be estimated, the mean shift
+        of the views along u counts to the offset."""
         views = self._estimate_views(correction_of(self.search.at)).views
         if isinstance(views, Views) and OFFSET_U in self.search.at:
             common_mm = float(views.shift_mm[:, 1].mean())
@@ -221,8 +223,8 @@ class _Calibrator:
         return replace(problem, count_pass=self.passes.counter(pass_cost(scans, stage.columns, most_frames)))
 
     def _place(self, phantom: EllipsoidPhantom) -> np.ndarray:
-        """Returns a first placement (7,) of the phantom. Of the placements where its beads are seen, it fits the frames
-        best."""
+        """Returns a first placement (7,) of the phantom: of those that take its beads to bright spots of a volume, the one
+        that fits the frames best. Raises InputError if none fits well."""
         bead_centres_mm(phantom)
         correction = correction_of(self.search.at)
         voxels = CoarseProblem.of(self.rt, self.ready, STAGES[-1])

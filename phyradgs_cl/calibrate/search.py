@@ -31,7 +31,8 @@ LEAST_SHARE = 0.2
 LEAST_SHARE_OF_BEADS = 0.02
 _TINY = 1e-9  # added to the diagonal of a matrix before its inverse, because signals may be linearly dependent
 _GAUGE_FACTOR = 2.0  # least share over that of a turn or lift (``GAUGES``), which errors of voxels alone leave
-_MOST_GAUGE = 0.2  # a turn's or lift's share counts as at most this: in a wrong geometry it grows, and would refuse all
+# A turn's or lift's share counts as at most this: in a wrong geometry it grows, and no parameter would count as determined.
+_MOST_GAUGE = 0.2
 DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
 _MOST_PX = 2.0  # a step moves the image by at most this many coarse pixels at its edge: beyond, its effect is not linear
 _SETTLED = 0.1  # the steps on a grid end when all are smaller than this many standard deviations
@@ -65,7 +66,8 @@ class Reduced:
         )
 
     def relative_to_stated(self, at: Mapping[str, float]) -> "Reduced":
-        """Returns the problem, linearised at values ``at`` (by name), with steps that count from the stated values."""
+        """Returns the problem, which was linearised at values ``at`` (by name), with steps that count from the stated
+        values."""
         back = np.array([at.get(name, 0.0) for name in self.names]) @ self.jacobian
         return replace(self, residual=self.residual + back)
 
@@ -96,10 +98,10 @@ class Reduced:
         return np.linalg.solve(self.gram, self.unit @ self.residual) / self.sizes
 
     def deviations(self) -> np.ndarray:
-        """Returns the standard deviations (K,) of the step, by a sandwich estimator whose samples are the frames.
+        """Returns the standard deviations (K,) of the step, in the fields' units, by a sandwich estimator.
 
-        So noise may be correlated within a frame. Deviations are at least those of white noise. The fit removes some noise
-        from the residual, which is added back."""
+        Its samples are the frames, so noise may be correlated within a frame. Deviations are at least those of white noise.
+        A factor makes up for the noise that the fit has removed from the residual."""
         unit = self.unit
         residual = self.residual - self.step() @ self.jacobian
         by_frame = (unit * residual).reshape(len(self.names), self.frames, -1).sum(-1)
@@ -151,7 +153,7 @@ def least_shares(problem: Reduced) -> dict[str, float]:
 
     No frame distinguishes a turn of all views from a turned object. Voxels do not follow such an object exactly, though:
     they leave some of the turn's signal unexplained, and as much of any other signal. So a parameter's share must be at
-    least twice that of the turn, or of a lift if the parameter moves the image along the axis."""
+    least 0.2, and twice that of the turn, or of a lift if the parameter moves the image along the axis."""
     remaining = {gauge.is_axial: float(problem.only([gauge.name]).shares[0]) for gauge in GAUGES}
     names = [name for name in problem.names if name in PARAMETERS]
     gauge_shares = {name: min(remaining[PARAMETERS[name].is_axial], _MOST_GAUGE) for name in names}
@@ -159,8 +161,8 @@ def least_shares(problem: Reduced) -> dict[str, float]:
 
 
 def indistinguishable(problem: Reduced, least: Mapping[str, float]) -> list[dict[str, float]]:
-    """Returns combinations of parameters, as weights by name, that an object explains almost wholly: what it leaves is less
-    than ``least`` of the parameter with the largest weight."""
+    """Returns combinations of parameters, as weights by name, that an object explains almost wholly: it leaves a smaller
+    share of their signal than ``least`` has for the parameter with the largest weight."""
     values, vectors = scipy.linalg.eigh(problem.gram, problem.whole_gram + _TINY * np.eye(len(problem.names)))
     limits = np.array([least[problem.names[k]] for k in np.abs(vectors).argmax(0)])
     return [dict(zip(problem.names, map(float, weights), strict=True)) for weights in vectors[:, values < limits**2].T]
@@ -268,10 +270,11 @@ class Search:
         return values, resemblance * np.hypot(noise, DISCRETISATION * change)
 
     def corrections(self) -> dict[str, float]:
-        """Returns the values, by name, of the parameters that differ from their stated values by three deviations.
+        """Returns, by name, the values of the parameters that differ from their stated values by more than three deviations,
+        and of significant fallbacks in use.
 
-        All other parameters go back to their stated values. That changes the remaining values, so the test repeats until all
-        differ."""
+        All other parameters go back to their stated values. This changes the remaining values, so the test repeats until
+        all that remain differ."""
         values, deviations = self.estimates()
         deviation = dict(zip(self.determined or (), deviations, strict=True))
         names = self.determined or ()

@@ -8,12 +8,13 @@ _ACROSS = 1e-3  # a ray is perpendicular to the axis if the cosine of their angl
 
 
 def azimuth_rad(pose: np.ndarray) -> np.ndarray:
-    """Returns the angles (...) about +z, in (-π, π], of the source, or of the rays' direction, in poses (..., 12)."""
+    """Returns the angles (...) about +z, −π to π, of the source in poses (..., 12); in a parallel beam, of the rays'
+    direction."""
     return np.asarray(np.arctan2(pose[..., 1], pose[..., 0]))
 
 
 def start_azimuths_rad(scan: Scan) -> np.ndarray:
-    """Returns the source's angles (F,) about +z, as ``azimuth_rad``, when each frame's first line opens."""
+    """Returns the ``azimuth_rad`` (F,) of each frame's pose at the moment its first line opens."""
     starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
     return azimuth_rad(np.concatenate(starts))
 
@@ -30,7 +31,8 @@ def has_opposite_views(scan: Scan) -> bool:
 
 
 def exposure_arc_rad(scan: Scan) -> float:
-    """Returns the angle in rad, without sign, that the gantry turns in one line's exposure in the scan's middle frame."""
+    """Returns the angle in rad, 0 to π, that the gantry turns in one line's exposure in the scan's middle frame; 0 for a
+    gantry at rest."""
     if not scan.is_fly:
         return 0.0
     frame = scan.frames // 2

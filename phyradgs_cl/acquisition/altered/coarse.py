@@ -15,10 +15,10 @@ from phyradgs_cl.fields import Grid
 MOST_FRAMES = 60
 QUICK_COLUMNS = 20  # most blocks of pixels along the panel's longer side, for quick searches of a parameter
 FINE_COLUMNS = 32  # most blocks of pixels along the panel's longer side, for fine searches of a parameter
-SMOOTHING = 0.8  # standard deviation of the Gaussian that smooths frames before pixels are averaged, in blocks
+SMOOTHING = 0.8  # standard deviation, in blocks, of the Gaussian that smooths frames before pixels are averaged
 _LEAST_VALID = 0.5  # a block with a smaller fraction of valid pixels is masked
 _MOST_VOXELS = 64  # most voxels along the grid's longest side, without the margin
-_MARGIN = 1  # voxels added on each side: with an object as large as the grid, too small a pixel size would fit better
+_MARGIN = 1  # voxels of air added on each side: with an object as large as the grid, too small a pixel size would fit better
 _OBJECT_SHARE = 0.02  # a column shows the object if its largest line integral is above this fraction of the scan's largest
 _LEAST_COLUMNS = 12  # least number of blocks from left to right, if the panel has as many columns
 _NARROW = 3  # on a panel lower than two blocks, the blocks' side is divided by this: one row of blocks tells little
@@ -61,7 +61,7 @@ def fewer_frames(scan: Scan, most: int) -> Scan:
 
 
 def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
-    """Returns the scan with only the frames of the given indices. Its trajectory still knows their original numbers."""
+    """Returns the scan with only the frames of the given indices. The trajectory looks up poses by original numbers."""
     trajectory = altered_trajectory(scan)
     mask = scan.pixel_mask
     return replace(
@@ -74,10 +74,10 @@ def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
 
 
 def binned(scan: Scan, block: int) -> Scan:
-    """Returns the scan with blocks of ``block`` × ``block`` pixels averaged to one, and without its reference.
+    """Returns the scan with blocks of ``block`` × ``block`` pixels averaged to one, and without true volumes.
 
     Only valid pixels are averaged. A block is masked if fewer than half of its pixels are valid. Last rows and columns that
-    fill no block are dropped. A block of lines opens at the mean of its lines' times."""
+    fill no block are dropped. A block of lines opens at the mean of its lines' opening times."""
     if block == 1:
         return replace(scan, reference=None, moving_truth=None)
     height, width = blocks = tuple(min(block, count) for count in scan.geometry.detector_shape)
@@ -111,11 +111,11 @@ def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
 
 
 def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
-    """Returns a coarse scan whose grid is cut to the object that the frames show, about the axis.
+    """Returns a coarse scan whose grid is cut, in y and x, to the object that the frames show.
 
-    The grid of a panel has much air. With few frames, voxels of air let a wrong geometry fit better than the right one.
-    spare_columns: pixels added to the object's radius, as the axis may be off by as many. A scan whose grid is off the axis,
-    or whose frames show nothing, is returned unchanged."""
+    A grid of the whole field of view has much air. With few frames, voxels of air let a wrong geometry fit better than the
+    right one. spare_columns: pixels added to the object's radius, because the axis may be off by as many. A scan whose grid
+    is off the axis, or whose frames show nothing, is returned unchanged."""
     geometry, grid = scan.geometry, scan.grid
     columns = np.where(scan.valid, scan.projections, 0).max((0, 1))
     shown = np.flatnonzero(columns > _OBJECT_SHARE * columns.max())
@@ -152,7 +152,7 @@ def _binned_shutter(scan: Scan, block: int) -> tuple[Shutter, float]:
     line_s = shutter.readout_s / max(lines - 1, 1)
     blocks = lines // block
     dropped = lines - blocks * block if shutter.direction < 0 else 0  # dropped lines at the far end are read first
-    # a block of lines opens at the mean of its lines
+    # a block of lines opens at the mean of its lines' opening times
     later_s = (dropped + (block - 1) / 2) * line_s
     pulse_s = shutter.pulse_s and (shutter.pulse_s[0] - later_s, shutter.pulse_s[1])
     return replace(shutter, readout_s=(blocks - 1) * block * line_s, pulse_s=pulse_s), later_s

@@ -75,8 +75,8 @@ def splines(fraction: np.ndarray, count: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class PerturbedTrajectory:
-    """Poses of ``base`` changed by ``correction``, for a panel of ``shape`` (rows, columns). ``views`` further corrects
-    single views, or lets the object move."""
+    """Poses of ``base`` changed by ``correction``, for a panel of ``shape`` (rows, columns). ``views`` adds corrections of
+    single views (``Views``) or a motion of the object (``Sway``)."""
 
     base: Trajectory
     shape: tuple[int, int]
@@ -141,8 +141,8 @@ def _seen_by(motion: np.ndarray, vectors: list[np.ndarray], places: int) -> list
 def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | None = None) -> Scan:
     """Returns the scan with its geometry and timing changed by ``correction``, and the same frames.
 
-    A circular orbit stays one if only offsets, distances and times change. Other corrections make the trajectory a
-    ``PerturbedTrajectory``."""
+    A circular orbit stays one if only offsets, distances and times change. Any other change of poses, or ``views``, makes
+    the trajectory a ``PerturbedTrajectory``."""
     shutter, geometry, trajectory = scan.shutter, scan.geometry, scan.trajectory
     source_mm = correction.source_distance_mm
     offset_v_mm, offset_u_mm = geometry.detector_offset_mm
@@ -165,6 +165,6 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
 
 
 def scan_course(scan: Scan) -> np.ndarray:
-    """Returns when each frame begins, (F,), as a fraction of the scan: −1/2 for the first frame, 1/2 for the last."""
+    """Returns when each frame begins, (F,), from −1/2 for the first frame to 1/2 for the last."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     return np.asarray((starts_s - starts_s.min()) / max(np.ptp(starts_s), 1e-30) - 0.5)

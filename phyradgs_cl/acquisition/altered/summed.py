@@ -1,4 +1,5 @@
-"""Makes a fly-scan from a scan with many projections: a panel that integrates while the gantry turns records their sum."""
+"""Makes a fly-scan from a scan with many projections: a panel that integrates while the gantry turns records the sum of
+their intensities."""
 
 import logging
 from dataclasses import replace
@@ -27,13 +28,13 @@ def sum_frames(
 ) -> Scan:
     """Makes a fly-scan without gaps, in which each frame sums the intensities of ``count`` successive projections.
 
-    scan: F projections (F, rows, columns); each stands for the interval in s until the next, in which the gantry turns
-    evenly. count: the projections in an exposure. readout_ratio, readout, readout_direction: how the new panel is read, as
-    in ``fly_scan``. A line whose exposure begins within a projection takes a fraction of it. Frames that would need further
-    projections are left out. Photons, detector and object are the given scan's, so the result is a real test of a motion
-    model. For this the object must move by less than a pixel from projection to projection.
+    scan: F projections (F, rows, columns). Each stands for an interval about its middle, as long as from frame to frame, in
+    which the gantry turns evenly. count: the projections in an exposure. readout_ratio, readout, readout_direction: how the
+    new panel is read, as in ``fly_scan``. A line whose exposure begins within a projection takes a fraction of it. Frames
+    that would need further projections are left out. Photons, detector and object are the given scan's, so the result tests
+    a motion model on real data. For this the object must move by less than a pixel from projection to projection.
 
-    Raises InputError for a count that no frame can have, a rolling shutter or lag in ``scan``, and uneven intervals."""
+    Raises InputError for too few projections for one frame, a rolling shutter or lag in ``scan``, and uneven intervals."""
     if not isinstance(scan, Scan):
         raise InputError("scan", checks.short_repr(scan), "a Scan")
     checks.whole("count", count, 1, scan.frames)
@@ -61,7 +62,7 @@ def sum_frames(
 
 def _interval_s(scan: Scan) -> tuple[float, float]:
     """Returns the interval between projections, and when the first projection's interval begins, both in s. Raises
-    InputError for a rolling shutter, lag and uneven intervals."""
+    InputError for a rolling shutter, lag, uneven intervals and a single projection."""
     remedy = "give a scan whose frames are short, or of a gantry at rest"
     if scan.is_fly and scan.shutter.readout_s > 0:
         raise InputError("scan", f"a readout of {scan.shutter.readout_s:g} s", "a global shutter", remedy)
@@ -75,8 +76,8 @@ def _interval_s(scan: Scan) -> tuple[float, float]:
 
 
 def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, int]:
-    """Returns a continuous trajectory through the projections' poses, and how many projections at either end it does not
-    cover for their whole interval."""
+    """Returns a continuous trajectory through the projections' poses, and how many projections at either end have intervals
+    that it does not wholly cover."""
     middle_s = first_s + (np.arange(scan.frames) + 0.5) * step_s
     own_s = scan.frame_start_s + scan.shutter.middle_s
     if isinstance(scan.trajectory, CircularOrbit):
@@ -103,8 +104,8 @@ def _shares(delay: np.ndarray, count: int) -> np.ndarray:
 
 
 def _sum(scan: Scan, start: int, share: np.ndarray, readout: Readout) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a frame's line integrals (rows, columns) and masked pixels. It sums intensities from projection ``start`` on,
-    times the fractions ``share``. A pixel is masked if any of these projections masks it."""
+    """Returns a frame's line integrals (rows, columns) and masked pixels. The frame sums the intensities of projections
+    from ``start`` on, times the fractions ``share`` (projections, lines). A pixel is masked if any of them masks it."""
     total, is_masked = np.zeros(scan.projections.shape[1:]), np.zeros(scan.projections.shape[1:], bool)
     for number, lines in enumerate(share, start):
         of_lines = np.broadcast_to(readout.spread(lines), total.shape)

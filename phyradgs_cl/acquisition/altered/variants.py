@@ -24,10 +24,10 @@ _STEPS = _ROW_STEP, _COLUMN_STEP  # the step along axis 0 (v), then along axis 1
 class AlteredTrajectory:
     """Poses of ``base`` for a ``panel`` (rows, columns), altered by the following fields in their order.
 
-    - is_reversed: the gantry turns the other way. Poses are mirrored at y = 0, then columns are reversed again; the offset
-      ``offset_u_mm`` of the panel keeps its sign.
+    - is_reversed: the gantry turns the other way. Poses are mirrored at y = 0, then the order of columns is reversed, so
+      that frames are not mirrored. The panel's offset ``offset_u_mm`` keeps its sign.
     - shift_px: a shift of the panel along u, in columns.
-    - images: changes poses (..., 12) to suit frames that are mirrored, say. None leaves the frames as stated.
+    - images: a function that changes poses (..., 12), for example to suit mirrored frames. None changes nothing.
     - blocks: the (rows, columns) of pixels that are averaged to one.
     - frames (F,): the numbers of the frames of ``base`` that are used. None takes all."""
 
@@ -110,8 +110,8 @@ def reversed_readout(scan: Scan) -> Scan:
 
 
 def shifted(scan: Scan, pixels: float) -> Scan:
-    """Returns the scan with its panel moved along u by ``pixels`` columns. Columns of the recorded scan count, even if
-    blocks of them are averaged."""
+    """Returns the scan with its panel moved along u by ``pixels`` columns of the recorded scan, even if ``scan`` averages
+    blocks of them."""
     return with_trajectory(scan, shift_px=pixels)
 
 
