@@ -82,7 +82,7 @@ class BeadOperator:
 
 
 def _mean_of_clipped(p: np.ndarray, sigma: float) -> np.ndarray:
-    """Returns the mean of max(p + noise, 0) for normal noise of deviation ``sigma``. Clipping raises the mean most in air."""
+    """Returns the mean of max(p + noise, 0) for normal noise of deviation ``sigma``. Clipping raises it most in air."""
     ratio = p / sigma
     return p * scipy.special.ndtr(ratio) + sigma * np.exp(-(ratio**2) / 2) / math.sqrt(2 * math.pi)
 

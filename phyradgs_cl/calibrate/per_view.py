@@ -274,7 +274,7 @@ def estimate_views(
     rt: Runtime, scan: Scan, parameters: PerViewParameters, stages: Sequence[Stage],
     correction: GeometryCorrection, passes: PassCounter,
 ) -> ViewsEstimate:
-    """Estimates ``parameters`` of a scan after ``correction``, by three Gauss–Newton steps on each grid, from coarse to fine.
+    """Estimates ``parameters`` of a scan after ``correction``, by three Gauss–Newton steps on each grid, coarse to fine.
 
     A deviation combines noise and discretisation error. The latter is half the change since the coarser grid, or 0 for a
     kind that the coarser grid did not estimate."""

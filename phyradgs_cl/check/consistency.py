@@ -1,9 +1,9 @@
-"""Do the frames fit together under the stated order, angles and geometry?
+"""Checks whether the frames fit together under the stated order, angles and geometry.
 
 A coarse reconstruction of consistent frames leaves a far smaller residual than one of the same frames in a random order.
-Where it does not, or where another hypothesis leaves at most half the squared residual, something stated is wrong. The
-steps: remove odd frames; choose the sense of rotation and the panel's shift (``orbit.py`` reports them); remove outliers;
-compare with random orders; try hypotheses."""
+If not, or if another hypothesis leaves less than half the squared residual, something stated is wrong. The steps: remove
+odd frames; choose the sense of rotation and the panel's shift (``orbit.py`` reports them); remove outliers; compare with
+random orders; try hypotheses."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -56,8 +56,8 @@ _EXCHANGED = 0.5  # two frames were exchanged if the opposite order leaves less 
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """Whether frames fit together: the ``finding``. frames (n,): indices of those that do. is_sound: whether further
-    questions make sense. sees_angles: whether the object looks different from different angles."""
+    """The ``finding`` about whether frames fit together. frames (n,): indices of the frames that do. is_sound: whether
+    further questions make sense. sees_angles: whether the object looks different from different angles."""
 
     finding: Finding
     frames: np.ndarray
@@ -128,8 +128,8 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
 
 
 def _unseen(scan: Scan, as_stated: Scan) -> float:
-    """Returns the residual in a random order below which the frames of a coarse ``scan`` tell nothing about their angles."""
-    # The smaller estimate counts: edges raise the one from coarse pixels, uneven noise the one from full pixels.
+    """Returns an RMS residual. If frames in a random order leave less, those of a coarse ``scan`` show no angles."""
+    # The smaller estimate of noise counts: edges raise that from coarse pixels, uneven noise that from full pixels.
     levels = [noise_level(one.projections, np.broadcast_to(one.valid, one.projections.shape)) for one in (scan, as_stated)]
     noise = min(levels[0], levels[1] / float(np.prod(altered_trajectory(scan).blocks)) ** 0.5)
     return max(_SAME * float(np.asarray(scan.projections, np.float64).std()), _NOISY * noise)
@@ -148,7 +148,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     turned = best = scan
     least = _CLEAR * fit_squares(rt, scan).sum()
     for sense, rough, limits in zip(senses, roughs, limits_px, strict=True):
-        if rough.squares.mean() > _NEARLY * least_rough:  # a larger residual; in a narrow fan both senses fit alike
+        if rough.squares.mean() > _NEARLY * least_rough:  # this sense fits clearly worse
             continue
         shift = axis.refined_shift(rt, sense, rough, limits)
         if not shift.is_found:
@@ -184,9 +184,9 @@ def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -
 
 
 def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:
-    """Returns the best two hypotheses about the whole scan, with the panel shifted to fit best.
+    """Returns up to two hypotheses about the whole scan, the best ones, with the panel shifted to fit best.
 
-    most: rough fits with more than 1.5 times this mean squared residual are left out. They get that factor because an offset
+    most: rough fits with more than 1.5 times this mean squared residual are left out. The factor is not 1 because an offset
     between two coarse pixels hides other differences. Large shifts count against a hypothesis. Of several hypotheses with
     the same factor of sizes, the best counts."""
     tried: list[tuple[Hypothesis, Scan, axis.AxisShift]] = []
@@ -247,9 +247,9 @@ def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
 
 
 def repeated_frames(scan: Scan) -> list[int]:
-    """Returns the indices of frames that repeat their predecessor although the gantry has turned: they differ by less than
-    0.15 of what frames nearby do. In an order that jumps, such as the golden angle, distant views of a round object may look
-    the same. So there a repeated frame must also differ from the next view in angle."""
+    """Returns the indices of frames that repeat their predecessor although the gantry has turned: they differ from it by
+    less than 0.15 of the least change between frames nearby. In an order that jumps, such as the golden angle, distant views
+    of a round object may look the same. In such an order a repeated frame must also differ from the next view in angle."""
     p = scan.projections
     if len(p) < _FEWEST_FRAMES:
         return []
@@ -315,7 +315,8 @@ def _ends_alike(residual: np.ndarray, random: float) -> np.ndarray:
     """Returns which first and last frames, bool (F,), fit about equally badly, as correct frames of an open arc do.
 
     Frames at an end have neighbours on one side only, so a few iterations fit them less well, and a slow drift shows in
-    them. Were they removed, the frames next to them would follow. random: the residual in a random order."""
+    them. If they were removed, the frames next to them would be outliers. residual (F,): RMS of each frame. random: RMS
+    residual in a random order."""
     is_apart = residual >= _OUTLIER * np.median(residual)
     at_an_end = np.logical_and.accumulate(is_apart) | np.logical_and.accumulate(is_apart[::-1])[::-1]
     return at_an_end & (residual < _ALIKE * residual[::-1]) & (residual < _AT_BOTH_ENDS * random)

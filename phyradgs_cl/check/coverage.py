@@ -1,4 +1,4 @@
-"""Does the panel see the whole object, and are its values line integrals?"""
+"""Checks that the panel sees the whole object, and that the scan's values are line integrals."""
 
 import math
 
@@ -23,7 +23,7 @@ _COVERED = 0.1  # a column shows the object if more than this fraction of its ro
 # A unit is wrong if the grid's width over that of the panel's view, or the object's over the grid's, exceeds this.
 _ANOTHER_SIZE = 5.0
 _NOISE_FRAMES, _NEAR = 16, 5  # frames in which noise is sought, and the side in pixels of a square of neighbours
-_MOST_NOISE, _NO_OBJECT_FROM = 0.4, 4.0  # noise over mean line integral: dominant noise; noise without any object
+_MOST_NOISE, _NO_OBJECT_FROM = 0.4, 4.0  # noise over mean line integral, above which noise dominates, or is all there is
 NOISE = "noise"
 NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # findings with these units end the check
 CUT_OFF = "line integral at the border"  # a finding with this unit says that the object reaches beyond the panel
@@ -38,7 +38,8 @@ def check_coverage(scan: Scan) -> Finding:
     panel may cut the object on its short side. The top and bottom are not checked.
 
     Other findings: no object above the noise, inverted values, line integrals beyond 30, and pixels brighter than the flats.
-    A size is wrong if the grid is over 5 times as wide as the panel's view, or the object as the grid."""
+    A size is wrong if the grid is over 5 times as wide as the panel's view, or the object over 5 times as wide as the
+    grid."""
     p = np.asarray(scan.projections)
     if p.shape[2] < FEWEST_COLUMNS:
         return too_narrow(_QUESTION, "line integral")

@@ -1,4 +1,4 @@
-"""Is the detector sound? Are there saturated areas or dead pixels, and does the gain drift over the scan?"""
+"""Checks the detector: saturated areas, dead pixels, and drift of the gain over the scan."""
 
 import math
 from dataclasses import dataclass
@@ -50,7 +50,8 @@ class CountReader:
 
 
 def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
-    """Finds areas of pixels at one extreme value, suspicious above 0.1 % of the pixels. counts: what read the scan's file.
+    """Finds areas of pixels at one extreme value, suspicious above 0.1 % of the pixels. counts: the reader of the scan's
+    file, if it is known.
 
     Only pixels whose neighbours have the same value count: saturation covers areas, noise clipped at 0 hits single pixels.
     Areas of exactly 0 may be air, so they get the answer "cannot tell"."""
@@ -94,8 +95,8 @@ def _clipped(saturation: Saturation, remedy: str) -> Finding:
 
 
 def _jumps(p: np.ndarray, masked: np.ndarray) -> float:
-    """Returns the fraction of pixels (F, v, u) whose transmission differs from a neighbour's by most of the range. Single
-    dead pixels are filtered out first."""
+    """Returns the fraction of pixels whose transmission differs from the next one's in the row by 3/4 of the brightest: the
+    median over the frames of line integrals p (F, v, u). Single dead pixels are filtered out first."""
     if p.shape[2] < 2:
         return 0.0
     transmission = np.where(masked, 1.0, np.exp(-np.clip(p, -20, 20))).astype(np.float32)
@@ -108,7 +109,7 @@ def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
     """Returns the fraction of pixels (F, v, u) that repeat their own least value: their counts were clipped before the
     division by the flats.
 
-    Pixels that never change are dead, and line integrals of 0 are air in scans without noise. Neither counts."""
+    Two kinds do not count: pixels that never change, which are dead, and line integrals of 0, which are noiseless air."""
     least = p.min(0)
     at = (p == least) & ~masked & (np.abs(least) > _ZERO) & (p.max(0) > least)
     return clustered_share(at & (at.sum(0) >= _REPEATS))
@@ -137,10 +138,10 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
 
 
 def check_gain(rt: Runtime, scan: Scan) -> Finding:
-    """Finds drifts and jumps of the detector's gain, from the levels of the frames of a coarse ``scan``.
+    """Finds drifts and jumps of the detector's gain, from the mean residuals ("levels") of a coarse ``scan``'s frames.
 
-    It fits a ramp, and a step at each frame. A change is suspicious above 1.5 % and five standard deviations. Levels may
-    also vary with the sine of the angle, which is no drift."""
+    It fits a ramp, and in turn a step at each frame; the best of these fits counts. A change is suspicious above 1.5 % and
+    five standard deviations. Variation with sine and cosine of the angle is no drift."""
     if scan.frames < _FEWEST_FRAMES:
         return Finding(GAIN, CANNOT_TELL, 0.0, _LARGEST_DRIFT, "share", f"fewer than {_FEWEST_FRAMES} frames")
     level = fit(rt, scan).level

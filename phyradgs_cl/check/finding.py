@@ -12,8 +12,8 @@ FEWEST_COLUMNS = 8  # panels with fewer columns cannot be judged: four gave fals
 class Finding:
     """The answer to one ``question``, with the ``verdict`` "ok", "suspicious" or "cannot tell".
 
-    value: the measured number, in ``unit``. uncertainty: the standard deviation of an estimated value. threshold: the value
-    from which on it is suspicious. text: what was found. advice: what to do about it."""
+    value: the measured number, in ``unit``. uncertainty: the standard deviation of an estimated value. threshold: the limit
+    with which the value is compared. text: what was found. advice: what to do about it."""
 
     question: str
     verdict: str

@@ -19,7 +19,7 @@ SIZE_FACTORS = (10.0, 0.1, 1e3, 1e-3)
 LEAST_REDUNDANCY = 0.5  # frames fit any pixel size if a smaller fraction of columns has rays that are measured twice
 _UNITS = {10.0: " (in cm, read as mm?)", 1e3: " (in m, read as mm?)", 1e-3: " (in µm, read as mm?)"}
 _FANS = (0.02, 3.0)  # real scanners have a panel's width over its distance from the source in this range
-_GRID_FACTOR = 3.0  # a grid this many times wider or narrower than the panel's view is as wrong as the sizes: replaced
+_GRID_FACTOR = 3.0  # a grid this many times wider or narrower than the panel's view is replaced: it is as wrong as the sizes
 _SAME_PLACE = 1.0  # shifts of the panel that differ by less, in coarse pixels, look the same
 _ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)  # changes of the angle between views, in percent, that are tried
 _GAPS = 15  # a missing or repeated frame is looked for at this many frames, evenly spread
@@ -75,8 +75,8 @@ def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
 
 
 def _other_units(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses of sizes or distances in other units. The fan angle depends on their ratio alone. The panel's offset
-    may decide which of the two is wrong."""
+    """Yields hypotheses of pixel sizes or distances in other units. The fan angle depends on the ratio of the two alone. The
+    panel's offset may decide which of the two is wrong."""
     geometry = stated.geometry
     if isinstance(geometry, ParallelGeometry):
         return  # in a parallel beam, other sizes only scale the object
@@ -118,8 +118,8 @@ def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Sc
 
 
 def _matching_grid(stated: Scan, panel_grid: Grid) -> Grid:
-    """Returns ``panel_grid`` if the stated grid was derived from the panel or differs in width 3 times; else the stated
-    one."""
+    """Returns ``panel_grid`` if the stated grid was derived from the panel, or if the longest sides of the two differ by a
+    factor of 3 or more; else the stated grid."""
     ratio = max(stated.grid.size_mm) / max(panel_grid.size_mm)
     is_derived = stated.grid == default_grid(stated.geometry)
     return panel_grid if is_derived or not 1 / _GRID_FACTOR < ratio < _GRID_FACTOR else stated.grid
@@ -146,7 +146,8 @@ def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hy
 
 
 def _azimuths(scan: Scan) -> np.ndarray:
-    """Returns each frame's angle (F,) in rad from the first frame's. Whole turns stay if the trajectory states angles."""
+    """Returns each frame's angle (F,) in rad from the first frame's. Whole turns between frames are kept only if the
+    trajectory states angles."""
     trajectory = variants.altered_trajectory(scan)
     angle_rad = getattr(trajectory.base, "angle_rad", None)
     if angle_rad is None:

@@ -1,4 +1,4 @@
-"""Does the gantry turn as the angles say, is its axis where it is stated, and do the distances fit?"""
+"""Checks that the gantry turns as the angles say, that its axis is where it is stated, and that the distances fit."""
 
 import math
 from dataclasses import dataclass, replace
@@ -136,9 +136,9 @@ def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisS
     """Returns the panel's shift along u and the finding about it. ``shift`` was found with blocks of ``block`` pixels.
 
     Coarse pixels cause an error that the bootstrap over frames does not include: it is added to the standard deviation. This
-    error is larger where ``scan`` measures fewer rays twice. Opposite views give a shift too, from pixels of full size; the
-    shift with the smaller deviation counts. If less than half of the rays are measured twice, only opposite views may
-    decide: any shift that leaves fewer such rays would fit better."""
+    error is larger where ``scan`` measures fewer rays twice. Opposite views of parallel rays give a shift too, from pixels
+    of full size; the shift with the smaller deviation counts. If the panel sees the axis but measures fewer than half of the
+    rays twice, ``shift_by_rays_seen_twice`` decides: in a fit, any shift with fewer such rays would leave less residual."""
     pitch_mm = scan.geometry.pixel_size_mm[1]
     if has_axis_near_edge(scan):
         shift = shift_by_rays_seen_twice(scan)

@@ -1,4 +1,5 @@
-"""Asks all questions, in an order in which each may rely on earlier answers. Errors found are corrected for later ones."""
+"""Asks all questions, in an order in which each may rely on earlier answers. Errors found are corrected for later
+questions."""
 
 import math
 from collections.abc import Callable
@@ -33,7 +34,8 @@ class CheckResult:
     """The findings of a check, in order.
 
     offset_mm: the shift of the panel along u that explains the frames best; ``offset_spread_mm``: its standard deviation.
-    Both are NaN where no shift does, or where something else has to be corrected first: then ``is_consistent`` is False."""
+    Both are NaN if no shift fits best, or if something else has to be corrected first. In the latter case ``is_consistent``
+    is False."""
 
     findings: list[Finding]
     offset_mm: float = math.nan
@@ -76,8 +78,8 @@ def check(
     scan: Scan, rt: Runtime, counts: detector.CountReader | None = None,
     report: Report = lambda done, total, question: None,
 ) -> CheckResult:
-    """Returns what is wrong or suspicious in a scan. counts: what read the scan's file, if it remembers counts. report: is
-    called with the questions answered, their number, and the next question.
+    """Returns what is wrong or suspicious in a scan. counts: the reader of the scan's file, if it is known. report: is
+    called with how many questions are answered, how many there are, and the next one.
 
     Raises InputError where every pixel is masked, and for NaN or infinity at other pixels."""
     scan = without_lag(_finite(scan))
@@ -142,8 +144,8 @@ def check(
 def quick_scan(scan: Scan) -> Scan:
     """Returns the coarse scan for the questions about angles and the axis.
 
-    If the axis is near the panel's edge, the grid is cut to the object: with many voxels around it, the few frames of a
-    coarse scan would fit under wrong angles too."""
+    If the axis is near the panel's edge, the grid is cut to the object: with many voxels of air, the few frames of a coarse
+    scan would fit under wrong angles too."""
     quick = coarse(scan, QUICK_COLUMNS)
     return around_object(quick, _SPARE_COLUMNS) if has_axis_near_edge(scan) else quick
 

@@ -1,4 +1,4 @@
-"""Are lines read in the stated order, axis and time, and is the exposure as long as stated?"""
+"""Checks that lines are read in the stated order, axis and time, and that the exposure is as long as stated."""
 
 import math
 from contextlib import suppress

@@ -1,4 +1,4 @@
-"""Do exposure, readout, frame times and angles agree with each other, and do the views cover the turn?"""
+"""Checks that exposure, readout, frame times and angles agree with each other, and that the views cover the turn."""
 
 import math
 
@@ -36,8 +36,8 @@ _TOLERATED_DEG = 1.0  # coverage may be less by this than half a turn plus fan: 
 def check_timing(scan: Scan) -> Finding:
     """Compares exposure, readout and table times with the frame times, and the angles with the speed.
 
-    A line cannot open while it is open, a frame cannot be read while the one before is, and a gantry has one angle at a
-    time. The value is the worst of three numbers: exposure and readout over the shortest frame period (at most 1); 1 + the
+    A line cannot open while it is open, a frame cannot be read while the one before is read, and a gantry has one angle at
+    a time. The value is the worst of three numbers: exposure and readout over the shortest frame period (at most 1); 1 + the
     relative difference between the angle steps and the speed within the frames; a table's duration over the scan's."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     if scan.frames < 2:
@@ -53,7 +53,7 @@ def check_timing(scan: Scan) -> Finding:
         _share("exposure", "a line would open again while it is open", scan.shutter.exposure_s / period_s),
         _share("readout", "a frame would be read while the last one is", scan.shutter.readout_s / period_s),
     ]
-    # other trajectories compute the steps and the speed from one function of time: there they always agree
+    # other trajectories compute the angle steps and the speed from one function of time, so the two always agree
     if isinstance(scan.trajectory, CircularOrbit) and isinstance(scan.trajectory.kinematics, FrameSweeps):
         findings.append(_speed(scan, starts_s))
     findings += _table(scan)

@@ -37,7 +37,7 @@ def counts_to_attenuation(
     """Converts the projections of a scan, data (F, v, u), to line integrals (P, v, u) float32, always finite.
 
     quantity: "counts": the transmission is (I − dark) / (flat − dark), with the mean flat and the mean dark (0 without
-    darks). "transmission": data are the transmission. "attenuation": data are returned unchanged. image_key (F,): 0
+    darks). "transmission": data are the transmission. "attenuation": data are line integrals already. image_key (F,): 0
     projection, 1 flat, 2 dark, 3 invalid.
 
     The second result (P, v, u) is True where a value must not be used: it is not finite, the flat is not brighter than the
@@ -84,7 +84,7 @@ def frames_to_attenuation(
 
 
 def mean_dark(darks: NDArray[np.generic] | None, panel: tuple[int, ...]) -> NDArray[np.float64]:
-    """Returns the mean (v, u) of dark frames (n, v, u), or 0 without any. A NaN spoils its own pixel only."""
+    """Returns the mean (v, u) of dark frames (n, v, u), or zeros without any. A NaN spoils only its own pixel."""
     if darks is None or len(darks) == 0:
         return np.zeros(panel)
     return np.asarray(darks.mean(axis=0, dtype=np.float64))

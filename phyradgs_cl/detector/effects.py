@@ -24,7 +24,7 @@ Array = NDArray[np.floating]
 NORMAL_FROM = 1e9
 COUNT_FLOOR = 0.5  # counts of 0 and less have no logarithm: this is less than any detector records
 _LARGEST_EXPONENT = 700.0  # largest exponent: float64 overflows at very negative line integrals, which ringing may cause
-_SPARK_HEIGHT = (0.3, 2.0)  # light that a spark adds, relative to the light without object
+_SPARK_HEIGHT = (0.3, 2.0)  # least and most light that a spark adds, relative to the light without object
 _SCATTER_REACH = 6.0  # the scatter kernel decays over the panel's longer side divided by this
 _SCATTER_POWERS = (0.8, 1.5)  # scattered light is the product of these powers of the primary light and the line integral
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
@@ -102,8 +102,8 @@ def lagged(line_integrals: ArrayLike, lag: float) -> NDArray[np.float64]:
 def without_lag(scan: Scan) -> Scan:
     """Returns the scan as a panel without lag would have recorded it. A scan whose lag is 0 is returned itself.
 
-    Values at or below ``TRANSMISSION_FLOOR`` are masked, and values computed from a masked pixel of this frame or the one
-    before. Photon noise returns to its level without lag. Noise added after the panel grows by √(1 + λ²)/(1 − λ)."""
+    Transmissions at or below ``TRANSMISSION_FLOOR`` are masked, and values computed from a masked pixel of this frame or the
+    one before. Photon noise returns to its level without lag. Noise added after the panel grows by √(1 + λ²)/(1 − λ)."""
     if scan.lag == 0:
         return scan
     projections = np.empty(scan.projections.shape, np.float32)

@@ -86,9 +86,9 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
 def noise_map(residual: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Returns the standard deviation of each pixel's noise (v, u), from the 9 × 9 pixels of a residual (v, u) around it.
 
-    It comes from the mean root of |second differences along rows and then along columns|. They vanish for smooth structure,
-    which the volume does not explain but is no noise, and roots give edges little weight. An axis shorter than three pixels
-    is left out. Without ``valid`` (v, u) pixels nearby the noise is 0."""
+    It comes from the mean root of |second differences along rows and then along columns|. The differences vanish for smooth
+    structure, which is no noise though the volume does not explain it. Roots give edges little weight. An axis shorter than
+    three pixels is left out. Without ``valid`` (v, u) pixels nearby the noise is 0."""
     differences, usable, axes = residual.astype(np.float64), valid, [axis for axis in (0, 1) if residual.shape[axis] >= 3]
     for axis in axes:
         differences = scipy.ndimage.correlate1d(differences, (-0.5, 1, -0.5), axis, mode="mirror")
@@ -160,7 +160,7 @@ def clustered_share(extreme: Iterable[NDArray[np.bool_]]) -> float:
 
 
 def _flat_differs(frames: NDArray[np.generic], flat: NDArray[np.floating], level: float) -> bool:
-    """Returns whether the clipped pixels differ in brightness from the same pixels of the flats: then they are not air."""
+    """Returns whether the clipped pixels differ in brightness from the same pixels of the flats, so they are not air."""
     hit = np.zeros(frames.shape[1:], bool)
     for frame in frames:
         hit |= frame == level
@@ -168,8 +168,8 @@ def _flat_differs(frames: NDArray[np.generic], flat: NDArray[np.floating], level
 
 
 def _shows_noise(frames: NDArray[np.generic], level: float) -> bool:
-    """Returns whether unclipped pixels are noisy, by their second differences along both axes. These must exceed what
-    rounding causes, and half of the differences along rows alone: structure causes smaller ones."""
+    """Returns whether unclipped pixels are noisy, by their second differences along both axes. The noise that these give
+    must exceed what rounding causes, and half of the noise by differences along rows alone: structure gives less."""
     along_rows, along_both = [], []
     top, left = (max(0, n - _LONGEST_EDGE) // 2 for n in frames.shape[1:])
     middle = np.s_[top : top + _LONGEST_EDGE, left : left + _LONGEST_EDGE]

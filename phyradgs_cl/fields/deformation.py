@@ -62,8 +62,8 @@ class Deformation:
         """Returns the deformation closest to displacements w, as image registration gives them at every voxel.
 
         displacements_mm: (T, nz, ny, nx, 3) in mm, x y z, at the voxel centres of ``grid`` and times_s (T,). A singular
-        value decomposition makes them ``rank`` fields or fewer, on control points ``spacing_mm`` apart. The largest weight
-        of each is 1. Raises InputError for other shapes, values that are not finite, and times that do not rise."""
+        value decomposition makes them ``rank`` fields or fewer, on control points ``spacing_mm`` apart. The largest absolute
+        weight of each is 1. Raises InputError for other shapes, values that are not finite, and times that do not rise."""
         times_s = checks.numbers("times_s", times_s, (None,))
         dense_mm = checks.numbers("displacements_mm", displacements_mm, (len(times_s), *grid.shape, 3))
         checks.whole("rank", rank, 1, 1000)
@@ -164,7 +164,7 @@ class Deformation:
         deformation folds matter over itself.
 
         Without a grid, points half a control spacing apart are tested. To save time, weights are rounded to a 16th of each
-        field's largest weight, and slopes below 1e-4 count as 0."""
+        field's largest weight, and a point whose slopes stay below 1e-4 counts as 1."""
         grid = grid or self._half_spacing_grid()
         slopes = np.stack([self._slopes(grid, control_mm) for control_mm in self.control_mm])  # of each field, (R, 3, 3, n)
         largest = np.abs(self.weights).max(axis=0)

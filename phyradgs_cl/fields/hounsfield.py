@@ -19,7 +19,7 @@ HOUNSFIELD = "hounsfield"
 Box = tuple[float, ...]
 """A box in world coordinates: Z0, Z1, Y0, Y1, X0, X1 in mm."""
 Window = tuple[float, float, int]
-"""A peak of a histogram: where it falls to half its height below and above, in 1/mm, and the voxels in between."""
+"""A peak of a histogram: the two attenuations in 1/mm at half of its rise, and the number of voxels in between."""
 _FEWEST = 100  # least number of voxels of air and of water: the noise of their mean is then a tenth of a voxel's
 # Water's attenuation in 1/mm is 0.0097 at 500 keV and 0.53 at 10 keV. Outside these limits a warning is logged.
 _WATER_PER_MM = (0.009, 0.6)
@@ -28,9 +28,10 @@ _ONE_MATERIAL = 0.4  # a box whose standard deviation is more than this times wa
 _BINS = 512
 _SMOOTH_BINS = 2.0  # standard deviation of the Gaussian that smooths the histogram, in bins
 _PROMINENT = 0.1  # a peak must rise above its surroundings by this fraction of its smoothed count
-_CERTAIN = 3.0  # a peak must also rise by this times the root of its count, which is eight times the noise after smoothing
+# A peak must also rise by this times the root of its smoothed count: three roots are eight times the noise after smoothing.
+_CERTAIN = 3.0
 _ZOOM = 2.5  # the last histogram ends at this times the upper end of water's peak, so that peaks span many bins
-_SHORTENED = 5  # the histogram's range is cut to a quarter so often at most: metal may be 1000 times denser than water
+_SHORTENED = 5  # most times that the histogram's range is cut to a quarter: metal may be 1000 times denser than water
 _NUMBER = r"-?\d+\.?\d*(?:e[-+]\d+)?"
 _NOTE = re.compile(rf"values in HU(?:, water ({_NUMBER}), air ({_NUMBER}) 1/mm)?")
 

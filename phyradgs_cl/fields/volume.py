@@ -106,7 +106,7 @@ class Grid:
         return Grid(shape, self.voxel_size_mm, triple(first + (s + (n - 1) / 2) * d for first, s, n, d in sides))
 
     def slices_in(self, whole: "Grid") -> tuple[slice, slice, slice] | None:
-        """Returns the slices (z, y, x) of ``whole`` that are this grid, or None if it is no part of ``whole``."""
+        """Returns the slices (z, y, x) of ``whole`` that this grid occupies, or None if it is no part of ``whole``."""
         if not np.allclose(self.voxel_size_mm, whole.voxel_size_mm, rtol=1e-5):
             return None
         exact = np.subtract(self.first_centre_mm, whole.first_centre_mm) / whole.voxel_size_mm

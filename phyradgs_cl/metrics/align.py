@@ -57,7 +57,8 @@ def overlap(one: Grid, other: Grid) -> tuple[float, float]:
 
 
 def reference_on(grid: Grid, reference: Values, reference_grid: Grid) -> Values | None:
-    """Returns the reference (nz, ny, nx) on ``grid`` by the rule of ``aligned``; None if it resamples the volume."""
+    """Returns the reference (nz, ny, nx) on ``grid`` by the rule of ``aligned``; None where ``aligned`` would resample the
+    volume."""
     if grid.is_close(reference_grid):
         return reference
     blocks = _blocks(grid, reference_grid)
@@ -81,7 +82,8 @@ def in_words(grid: Grid) -> str:
 
 
 def _blocks(grid: Grid, finer: Grid) -> tuple[tuple[int, int, int], tuple[slice, slice, slice]] | None:
-    """Returns how many voxels (z, y, x) of ``finer`` fill one of ``grid``, and which fill all; None if some would be cut."""
+    """Returns how many voxels (z, y, x) of ``finer`` fill one of ``grid``, and the slices of ``finer`` that fill ``grid``;
+    None if a voxel would be cut or is outside of ``finer``."""
     factors = triple(max(1, round(d / f)) for d, f in zip(grid.voxel_size_mm, finer.voxel_size_mm, strict=True))
     counts = triple(n * factor for n, factor in zip(grid.shape, factors, strict=True))
     if any(n > most for n, most in zip(counts, finer.shape, strict=True)):

@@ -34,8 +34,9 @@ def coverage(sigma: Array, volume: Array, truth: Array, multiple_95: float) -> d
 
 
 def reliability_png(path: str | Path, sigma: Array, volume: Array, truth: Array, multiple_95: float) -> None:
-    """Draws the size of errors over σ: the object's voxels are divided into tenths by σ, and percentiles of each tenth's
-    errors drawn over its mean σ. Right bars lie on the dashed line."""
+    """Draws the size of errors over σ. The object's voxels are divided into tenths by σ; for each tenth, the 68th and 95th
+    percentiles of its errors, divided by 1 and ``multiple_95``, are drawn over its mean σ. For right error bars the points
+    lie on the dashed line."""
     inside = object_voxels(truth)
     size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)
     tenths = [part for part in np.array_split(np.argsort(bar, kind="stable"), 10) if part.size]

@@ -108,7 +108,7 @@ def ssim(result: ArrayLike, reference: ArrayLike, data_range: float | None = Non
     """Returns the mean structural similarity, at most 1, of two volumes (z, y, x). Slices with an empty truth do not count.
 
     ``data_range``: L in C1 = (0.01 L)², C2 = (0.03 L)², by default the reference's maximum. Raises InputError for arrays
-    that are not 3D, shapes that differ, NaN or infinity, and a range that is not positive."""
+    that are not 3D, shapes that differ, NaN or infinity, an empty reference, and a range that is not positive."""
     a, b, peak = checked_pair(result, reference, data_range)
     checks.shape("reference", b, (None, None, None))
     return float(np.mean([_along_axis(a, b, peak, axis) for axis in range(3)]))
@@ -160,7 +160,7 @@ def edge_points_mm(volume: np.ndarray, grid: Grid) -> np.ndarray:
 def displaced_mm(deformation: Deformation, points_mm: np.ndarray, times_s: np.ndarray) -> np.ndarray:
     """Returns the displacement (K − 1, n, 3) in mm of matter at points (n, 3), from the first of K times to each other time.
 
-    It does not depend on the moment that the reference volume shows: two descriptions of one motion give the same result."""
+    The result does not depend on the moment that the reference volume shows, so two descriptions of one motion agree."""
     weights = deformation.weights_at(times_s)
     reference_mm = points_mm + deformation.displacement_mm(points_mm, weights[0])
     return np.stack([reference_mm + deformation.inverse_mm(reference_mm, other) - points_mm for other in weights[1:]])

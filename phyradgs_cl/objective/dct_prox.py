@@ -40,8 +40,8 @@ class DctProx:
     def __call__(
         self, volume: SameArray, threshold: float, turn: int, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Returns the shrunk volume (nz, ny, nx) float32. threshold: of the soft threshold T, for coefficients of the
-        orthonormal transform.
+        """Returns the shrunk volume (nz, ny, nx) float32. threshold: by how much T shrinks coefficients of the orthonormal
+        transform, in the volume's unit.
 
         turn: 0 to 3, chooses a quarter of the shifts. nonnegative: clips the result at 0. A device array gives a device
         array (``out``, if given)."""

@@ -1,11 +1,11 @@
-"""Two ways to lower the isotropic total variation (TV) of a volume: a proximal map, and steepest descent.
+"""Lowers the isotropic total variation (TV) of a volume in two ways: by a proximal map, and by steepest descent.
 
 ``TvProx`` maps a volume b to argmin_x ½‖x − b‖² + weight · TV(x), with x ≥ 0 if asked, by fast gradient projection on the
 dual (Beck and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weights scale the differences where voxels are not
 cubes. For an object that changes, the sum of |differences| between successive states is added.
 
 ``TvDescent`` takes steps of a fixed length, as ASD-POCS does (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777), with TIGRE's
-backward differences. A number far below the volume's values is added to lengths of differences: none is then 0."""
+backward differences. A number far below the volume's values is added to lengths of differences, so that none is 0."""
 
 import math
 from collections.abc import Callable
@@ -123,7 +123,7 @@ def _primal_of(
 def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
     """Returns the steps of the dual in space and in time: one over the Lipschitz constant of the differences.
 
-    For states, each step is half as long as alone. So a large weight in time does not shorten the step in space."""
+    For states, each step is half as long as it would be alone, so a large weight in time does not shorten that in space."""
     *time, z, y, x = axis_weights
     in_space = 1 / (4 * (z * z + y * y + x * x))
     return (in_space / 2, 1 / (8 * time[0] ** 2)) if any(time) else (in_space, 0.0)

@@ -75,7 +75,7 @@ class DeviceAdam:
         self._step = rt.kernel("adam", "adam_step")
 
     def activate(self, raw: DeviceArray, parameters: DeviceArray, count: int, stride: int) -> None:
-        """Computes parameter rows (11, stride) from raw rows. The first ``count`` columns are Gaussians."""
+        """Computes parameter rows (11, stride) from raw rows. The first ``count`` columns are Gaussians, others padding."""
         self.rt.launch(
             self._activate, stride // self.rt.lanes, raw, count, stride,
             np.float32(self.activation.scale_min), np.float32(self.activation.scale_max), parameters,

@@ -87,9 +87,9 @@ def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
 class MovingBody:
     """A body that moves forth and back along a line at constant speed.
 
-    body: its place at the middle of the line. swing_mm: (x, y, z) from the middle to one end. It starts at the other end,
-    and reaches this one after half a period. period_s: the time forth and back. Raises InputError for a period that is not
-    positive."""
+    body: the body at the middle of the line. swing_mm: (x, y, z) from the middle to one end. The body starts at the other
+    end, and reaches this one after half a period. period_s: the time forth and back. Raises InputError for a period that is
+    not positive."""
 
     body: Body
     swing_mm: Triple
@@ -144,7 +144,7 @@ class MovingPhantom:
 
     @property
     def fastest_mm_per_s(self) -> float:
-        """The speed of the fastest body."""
+        """The speed of the fastest body in mm/s."""
         return max(4 * float(np.linalg.norm(body.swing_mm)) / body.period_s for body in self.moving)
 
     def at(self, time_s: float) -> EllipsoidPhantom:

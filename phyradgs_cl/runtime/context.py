@@ -39,7 +39,7 @@ class Runtime:
     - ranks: the MPI processes that work on the same scan, each with its own Runtime. On a machine with several devices,
       each rank takes another one."""
 
-    # Most samples of rays in one GPU launch: a display driver kills launches of seconds; this takes 0.1 s on a slow GPU.
+    # Most samples of rays in one GPU launch: a display driver kills launches of seconds, and these take 0.1 s on a slow GPU.
     most_samples = 2**29
 
     def __init__(
@@ -67,7 +67,7 @@ class Runtime:
         self.pixel_items = self.device.kind != "cpu" if pixel_items is None else pixel_items
         if self.pixel_items and self.lanes != 1:
             raise DeviceError("lanes", str(self.lanes), "1 where work-items are pixels")
-        # Else a CPU's driver may allocate at a buffer's first use, and end the process if memory is short by then.
+        # Without this flag a CPU's driver may allocate at a buffer's first use, and end the process if memory is short then.
         at_once = cl.mem_flags.ALLOC_HOST_PTR if self.device.kind == "cpu" else 0
         self._memory_flags = cl.mem_flags.READ_WRITE | at_once
         self.profile = profile
@@ -336,8 +336,8 @@ def default_lanes(device: DeviceInfo) -> int:
 
 
 def _parts(items: Sides, group: Sides, pieces: int) -> Iterator[tuple[Sides | None, Sides]]:
-    """Divides a launch of ``items`` into ``pieces`` or more, each of whole work-groups. Yields, per axis, the first item
-    and the number of items of each piece; the first item is None for an undivided launch."""
+    """Divides a launch of ``items`` into ``pieces`` or more, each of whole work-groups; into fewer if there are too few
+    groups. Yields, per axis, the first item and the number of items of each piece; None as first item if undivided."""
     if pieces <= 1:
         yield None, items
         return

@@ -128,8 +128,8 @@ class MemoryLedger:
             self.reserved_bytes -= nbytes
 
     def room(self, largest_bytes: int) -> Room:
-        """Returns what operators may use of the memory that is left: nine tenths, in buffers of at most ``largest_bytes``.
-        It is six tenths if a GPU's driver does not report its free memory and the user has set no limit."""
+        """Returns what operators may use of the memory that is left, in buffers of at most ``largest_bytes``: nine tenths,
+        or six tenths if a GPU's driver does not report its free memory and the user has set no limit."""
         free_bytes = max(self.limit_bytes - self.held_bytes - self.reserved_bytes, 0)
         return Room(int(self.planned * free_bytes), min(largest_bytes, self.limit_bytes))
 

@@ -101,7 +101,8 @@ def _check_threads(wish: str | None) -> None:
 
 
 def unusable_cache() -> Path | None:
-    """Returns the user's kernel cache if it cannot be used and ``warn_of_cache`` has not yet warned; else None."""
+    """Returns the kernel cache that PoCL was to have, if it cannot be used and ``warn_of_cache`` has not yet warned; else
+    None."""
     return _unusable and _unusable[0]
 
 

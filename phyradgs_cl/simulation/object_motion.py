@@ -100,7 +100,8 @@ class ObjectMotion(checks.Checked):
         return [_vectors(z=(np.hypot(x, y) < self.radius).astype(float))]
 
     def _cycles_s(self, first_s: float, last_s: float) -> Array:
-        """Returns when each cycle that the scan meets begins, in s. The first begins at first light."""
+        """Returns when each cycle that the scan meets begins, and when the last one ends, in s. The first begins at first
+        light."""
         count = int(np.ceil((last_s - first_s) / self.period_s)) + 1
         if count > _MOST_CYCLES:
             expected = f"at most {_MOST_CYCLES} cycles in the scan's {last_s - first_s:.4g} s"

@@ -52,8 +52,8 @@ _DATA_SHEET = ("first", "fps", "readout_ms")
 class SimulationOptions:
     """Options of a simulation. ``peak`` > 0 scales attenuation so that the largest line integral is ``peak``.
 
-    - time_samples: at how many times a line's exposure is sampled, in the middles of equal parts. 0: between two times, the
-      volume's edge and a moving object move at most half a voxel of ``grid`` (docs/mathematics.md).
+    - time_samples: at how many times a line's exposure is sampled, in the middles of equal parts. 0: as many, from 8 to 128,
+      as keep the way of the volume's edge, and of a moving object, below half a voxel of ``grid`` (docs/mathematics.md).
     - dose: photons of a pixel without object, on a line that sees the whole pulse.
     - lag (λ), rings, sparks, drift, scatter: effects of panel and tube (detector/effects.py); 0 is without.
     - kvp: tube voltage in kV, of a beam that hardens; 0 is a beam of one energy.
@@ -206,7 +206,7 @@ def simulate(
     reference: np.ndarray | None = None, title: str = "simulated scan",
     report: Callable[[int, int], None] = lambda done, total: None, bone: FrameSource | None = None
 ) -> Scan:
-    """Returns a scan of the object that ``source`` projects, with noise.
+    """Returns a scan of the object that ``source`` projects, with the noise and effects that ``options`` ask for.
 
     reference (nz, ny, nx): the truth in 1/mm, which ``peak`` scales too. bone: projects the bone alone, for a beam of many
     energies."""
@@ -267,8 +267,8 @@ def _gating(scan: Scan, scene: Scene) -> Gating:
 
 
 def default_time_samples(protocol: Protocol, grid: Grid, fastest_mm_per_s: float = 0.0) -> int:
-    """Returns the number of time samples per line, 8 to 128, between which the volume's edge, and the fastest part of a
-    moving object, go at most half a voxel."""
+    """Returns the number of time samples per line, limited to 8 to 128, between which the volume's edge, and the fastest
+    part of a moving object, go at most half a voxel."""
     path_mm = np.deg2rad(protocol.exposure_deg) * max(grid.size_mm[1:]) / 2
     path_mm = max(path_mm, fastest_mm_per_s * protocol.exposure_s)
     return int(np.clip(np.ceil(2 * path_mm / min(grid.voxel_size_mm)), 8, 128))

@@ -155,7 +155,7 @@ def _voxel_scene(
 
 def bone_from(volume: np.ndarray) -> float:
     """Returns the attenuation in 1/mm from which voxels (nz, ny, nx) count as bone: half the largest value, or, if that
-    would cut a material in two, the upper end of the material."""
+    would cut a material in two, the upper end of the material. It is infinite if that material has no upper end."""
     largest = float(volume.max())
     counts, edges = np.histogram(volume, 64, (0.1 * largest, max(largest, 1e-20)))
     is_rare = (edges[1:] > _DENSE * largest) & (counts < _RARE * counts.max())

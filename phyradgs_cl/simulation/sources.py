@@ -126,9 +126,9 @@ def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:
 def on_panel(geometry: Geometry, grid: Grid, pixel_samples: int, make: Callable[[Geometry], FrameSource]) -> FrameSource:
     """Returns the source that ``make`` builds for the panel. With several samples per pixel it averages a finer panel.
 
-    pixel_samples: samples along each side of a pixel, at most 32. 0 takes one where a pixel, projected to the axis, has at
-    most ``WIDEST_RAY`` voxels of the grid, else one per voxel: rays through the middles of wide pixels would miss parts of
-    the object. Raises InputError for a number out of range."""
+    pixel_samples: samples along each side of a pixel, at most 32. 0 takes one where a pixel, projected to the axis, is at
+    most ``WIDEST_RAY`` voxels of the grid wide, else one per voxel: rays through the middles of wide pixels would miss parts
+    of the object. Raises InputError for a number out of range."""
     checks.within("--pixel-samples", pixel_samples, 0, _MOST_SAMPLES)
     if pixel_samples == 0:
         voxels = max(geometry.pixel_size_mm) / geometry.magnification / min(grid.voxel_size_mm)
@@ -142,8 +142,8 @@ class DeformedSource(FrameSource):
     """Projects a deforming volume (nz, ny, nx) in 1/mm on ``grid``.
 
     A state of the object is a set of the fields' weights φ_r, for which the volume is deformed once. Weights are rounded so
-    that many time cells, also of other frames, share a state. Rounding displaces no point by more than ``NEAREST`` of
-    ``voxel_mm``. A frame at a single time is not rounded. make: returns the source of a volume at rest."""
+    that many time cells, also of other frames, share a state. Rounding displaces no point by more than ``NEAREST`` times
+    ``voxel_mm``. Weights of a frame at a single time are not rounded. make: returns the source of a volume at rest."""
 
     def __init__(
         self, rt: Runtime, volume: np.ndarray, grid: Grid, deformation: Deformation, voxel_mm: float,
@@ -182,7 +182,7 @@ class DeformedSource(FrameSource):
         return lambda k: volume if warp.is_still(k) else np.maximum(self._rt.download(warp.forward(k, source)), least)
 
     def _rounded_weights(self, cells: TimeCells) -> np.ndarray:
-        """Returns the weights (C, R) at the cells' times. They are rounded, unless all cells have the same."""
+        """Returns the weights (C, R) at the cells' times, rounded unless they are the same in all cells."""
         weights = self._deformation.weights_at(cells.time_s)
         return np.round(weights / self._step) * self._step if np.ptp(weights, axis=0).any() else weights
 
@@ -214,7 +214,7 @@ class _Average:
 def part_of(cells: TimeCells, members: np.ndarray) -> tuple[TimeCells, np.ndarray]:
     """Returns a table of the cells ``members``, bool (C,), and which fraction (lines,) of each line's weight they have.
 
-    Weights are rescaled: in the new table a line's weights sum to 1, or are all 0. The cells must have fixed poses."""
+    Weights are rescaled: in the new table a line's weights sum to 1, or are all 0. The cells must be still."""
     part = some_cells(cells, np.flatnonzero(members))
     share = part.line_weights()
     factors = np.divide(1.0, share, out=np.zeros_like(share), where=share > 0)
