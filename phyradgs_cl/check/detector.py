@@ -138,7 +138,8 @@ def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
 
 
 def check_gain(rt: Runtime, scan: Scan) -> Finding:
-    """Finds drifts and jumps of the detector's gain, from the mean residuals ("levels") of a coarse ``scan``'s frames.
+    """Finds drifts and jumps of the detector's gain, from the constants ("levels") that ``fit`` adds to the frames of a
+    coarse ``scan``.
 
     It fits a ramp, and in turn a step at each frame; the best of these fits counts. A change is suspicious above 1.5 % and
     five standard deviations. Variation with sine and cosine of the angle is no drift."""

@@ -58,9 +58,9 @@ def backproject_lines(
     """Backprojects frames (F, rows, columns) in which every line along ``axis`` has its own pose: pose (F, lines, 12) mm.
 
     A voxel reads the line onto which that line's pose projects it, interpolated between neighbouring lines. The value is
-    divided by the rate at which the voxel crosses lines: once because the angular step changes, and once more because the
-    ramp filter's scale changes if it ran across lines (``axis`` columns). See docs/mathematics.md. power: as in
-    ``backproject``; 1 means frames that were not filtered."""
+    divided by the rate at which the voxel crosses lines, because this rate changes the angular step. If a ramp filter ran
+    across lines (``axis`` columns), it is divided once more, because the filter's scale changes too. See
+    docs/mathematics.md. power: as in ``backproject``; 1 means frames that were not filtered."""
     pose = Readout(axis).poses(pose)
     matrices = voxel_matrices(pose.reshape(-1, 12), grid, is_parallel).reshape(len(pose), -1)
     views = Views(frames, axis == "columns", matrices, weight)
@@ -69,7 +69,7 @@ def backproject_lines(
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """The views to backproject: frames (F, rows, columns) and FDK's weight (F,).
+    """The views to backproject: frames (F, rows, columns) and FDK's weight (F,), or (F, 2) in a ``MovingBackprojector``.
 
     is_turned: kernels get the frames transposed. matrices (F, 12 · poses): the ``voxel_matrices`` of each frame's poses."""
 
@@ -118,8 +118,8 @@ _Launch = Callable[[Arguments, Brick, DeviceArray], None]
 
 
 def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch) -> Array:
-    """Returns a volume (nz, ny, nx), which ``launch`` fills for some views and one brick at a time. If it fits, the whole
-    volume is one brick; else sides along z are multiples of ``step``. Raises OutOfMemoryError if no brick fits."""
+    """Returns a volume (nz, ny, nx), which ``launch`` fills for some views and one brick at a time. The whole volume is one
+    brick if it fits; else bricks' sides along z are multiples of ``step``. Raises OutOfMemoryError if no brick fits."""
     is_resident = isinstance(views.frames, DeviceArray)
     volume: Array = rt.empty(grid.shape) if is_resident else np.empty(grid.shape, np.float32)
 

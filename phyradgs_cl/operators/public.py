@@ -25,15 +25,15 @@ def to_user_array(rt: Runtime, values: Values) -> Any:
 
 
 def moved_to(rt: Runtime, values: Values, on_device: bool) -> Any:
-    """Returns values on the device (``on_device``) or on the host. Copies them only from the one to the other."""
+    """Returns values on the device (``on_device``) or on the host. Copies them only if they are not there yet."""
     if isinstance(values, DeviceArray):
         return values if on_device else rt.download(values)
     return rt.upload(values) if on_device else values
 
 
 def computed(rt: Runtime, on_device: bool, function: Callable[[Any], Values], values: Values) -> Any:
-    """Applies a function that needs its argument on the device (``on_device``) or the host. Its result goes where ``values``
-    are."""
+    """Applies a function that needs its argument on the device (``on_device``) or the host. Returns the result on the side
+    where ``values`` are."""
     return moved_to(rt, function(moved_to(rt, values, on_device)), isinstance(values, DeviceArray))
 
 

@@ -93,7 +93,8 @@ class IntensityOperator:
         return cast(SameArray, self._given(total, out))
 
     def subset(self, frames: Sequence[int]) -> "IntensityOperator":
-        """Returns the operator to some of the frames, in the order given. Its J is at x = 0 before its own ``expected``."""
+        """Returns the operator to some of the frames, in the order given. Its J is at x = 0 until its own ``expected`` is
+        called."""
         chosen = list(frames)
         part = copy(self)
         part.frames_shape = (len(chosen), *self.frames_shape[1:])

@@ -43,8 +43,8 @@ class RayLayout:
     ) -> "RayLayout":
         """Returns the layout of the complete grid. Frames are stored line by line, as the panel is read along ``axis``.
 
-        detector_shape: (rows, columns). A CPU's vectors run along a line. In a panel with very few rows, vectors along
-        columns would be mostly empty. So its lines are always rows, even if it is read column by column."""
+        detector_shape: (rows, columns). A CPU's vectors run along a line. On a panel with fewer rows than a vector has
+        lanes, vectors along columns would be partly empty. So its lines are rows, even if it is read column by column."""
         (rows, columns), (along_v, along_u) = detector_shape, subrays
         shape = rows * along_v, columns * along_u
         is_across = axis == "columns" and not rt.pixel_items and shape[0] < rt.lanes
@@ -169,8 +169,8 @@ class RayCells:
 
 
 def matrix_table(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> tuple[np.ndarray, int]:
-    """Returns ``voxel_matrices`` of poses (C, 12), transposed to (12, stride), and the stride. It is larger than C, because
-    vectors read beyond the last pose."""
+    """Returns ``voxel_matrices`` of poses (C, 12), transposed to (12, stride), and the stride. The stride is larger than C,
+    because vectors read beyond the last pose."""
     stride = len(pose) + _WIDEST
     matrices = np.zeros((12, stride))
     matrices[:, : len(pose)] = voxel_matrices(pose, grid, is_parallel).T
@@ -242,7 +242,7 @@ def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np
 
 
 def some_cells(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
-    """Returns a table of the time cells with the numbers ``cells`` alone. Each must have a fixed pose."""
+    """Returns a table of only the time cells with the numbers ``cells``, which must be still."""
     names = ["pose", "time_s", "line_start", "line_stop", "weight"]
     names += [] if table.line_share is None else ["line_share"]
     return replace(table, **{name: getattr(table, name)[cells] for name in names})

@@ -21,7 +21,8 @@ _MOST_SLOT_FLOATS = 2**26  # most floats of all slots at a time: more was not fa
 
 
 class RayMemory:
-    """Buffers for a volume and frames of ``layout``. Their sizes are chosen at the first use, by the memory free then.
+    """Buffers for a volume and frames of ``layout``. Their sizes are chosen at the first use, by the memory that is free
+    then.
 
     A volume that does not fit is cut into bricks, as large as fit together with some frames. slot_floats: the floats of
     one frame's slots, 0 without slots. With slots the volume is also stored transposed, with z along rows, if both fit.
@@ -211,7 +212,7 @@ class RayMemory:
         return on_device
 
     def read_frames(self, on_device: DeviceArray, result: Array, part: slice, axis: str) -> None:
-        """Copies padded frames to the frames ``part`` of ``result`` (F, rows, columns). Inverts ``write_frames``."""
+        """Copies padded frames to the frames ``part`` of ``result`` (F, rows, columns). Each pixel gets its sub-rays' mean."""
         shape, subrays = self.layout.frames_shape(part.stop - part.start), self.layout.subrays
         if subrays != SINGLE and isinstance(result, DeviceArray):
             launch_means(self.rt, on_device, self.layout.pixel_strides(axis), subrays, result, part)

@@ -25,8 +25,8 @@ _MOST = 8  # most sub-rays of a pixel along an axis: enough where single rays ar
 
 
 def subrays_of(grid: Grid, tables: Sequence[TimeCells], *, is_dense: bool = False) -> tuple[int, int]:
-    """Returns how many rays (along v, along u) a pixel needs. It is (1, 1) unless voxels would lie between rays; then so
-    many that rays in the grid's middle are at most ``_WIDEST`` voxels apart, in the median over frames.
+    """Returns how many rays (along v, along u) a pixel needs. Along an axis it is 1 unless voxels would lie between rays;
+    then so many, up to 8, that rays in the grid's middle are at most ``_WIDEST`` voxels apart, in the median over frames.
 
     is_dense: the method begins with a volume of the object's density. Then rays must meet every voxel only where the grid
     is nearest to the source. Further away they pass at other heights in other views, which fills the gaps."""

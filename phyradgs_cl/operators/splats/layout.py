@@ -90,7 +90,7 @@ class DeviceCells:
         cls, rt: Runtime, table: TimeCells, states: tuple[np.ndarray, np.ndarray] | None = None
     ) -> "DeviceCells":
         """Uploads a frame's cells. states: what ``states_of`` returns for an object that moves. Raises InputError for cells
-        that have another weight in each line."""
+        with a weight of their own for each line (``line_share``)."""
         shares, cell_states = (np.zeros(1), np.zeros(1)) if states is None else states
         if table.line_share is not None:
             raise InputError("--motion", "cells with a weight for each line", "cells with one weight", "take micro-views")

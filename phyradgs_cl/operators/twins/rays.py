@@ -1,5 +1,5 @@
-"""Float64 twins in NumPy of the ray-driven projector, its transpose, and the voxel-driven backprojections. For objects that
-move, also of the warps of volumes and of the displacement of Gaussians.
+"""Float64 twins in NumPy of the ray-driven projector, its transpose, and the voxel-driven backprojections; for objects that
+move, also of the warps of volumes and the displacement of Gaussians.
 
 The projector sums Joseph's samples ray by ray. The backprojections compute the ray of every voxel. With one pose per line
 they search all lines for the one onto which the voxel is projected."""
@@ -185,8 +185,8 @@ def detector_position(
 def _seen(
     frame: np.ndarray, u: np.ndarray, ahead: np.ndarray, depth: np.ndarray, power: int, speed_power: int
 ) -> float:
-    """Returns the contribution of a frame to one voxel. For the pose of each line: u (lines,) is the voxel's pixel along the
-    line, ahead (lines,) its line minus the pose's line, depth (lines,) its depth."""
+    """Returns the contribution of a frame to one voxel. u, ahead, depth (lines,), by the pose of each line: the voxel's
+    pixel along the line, the line onto which it is projected minus the pose's own line, and its depth."""
     crossing = np.flatnonzero((ahead[:-1] >= 0) & (ahead[1:] <= 0))
     if crossing.size == 0 or depth.min() <= 0:
         return 0.0

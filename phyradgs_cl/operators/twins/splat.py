@@ -5,9 +5,9 @@ the precision A = Σ⁻¹, a = nᵀAn, b = nᵀA(μ−s), c = (μ−s)ᵀA(μ−
 of the source. The kernel works in detector coordinates and shares no formula with this (docs/mathematics.md).
 
 In motion, the definition is integrated over time numerically. In a segment a splat keeps the conic, amplitude and
-perspective factor Q of the middle time, while its centre moves on the panel along a straight line at constant speed. From
-end to end it moves as the mean μ projected by the two end poses. Its mid-time centre is the average of the parabola through
-both ends and the middle. Conic and Q come from the difference C − b bᵀ. This difference loses digits, of which float32 has
+perspective factor Q of the middle time, while its centre moves on the panel along a straight line at constant speed. The
+length and direction of this line come from the mean μ projected by the two end poses. The centre at mid-time is the average
+of the parabola through the projections at both ends and in the middle. Conic and Q come from the difference C − b bᵀ. This difference loses digits, of which float32 has
 too few."""
 
 from collections.abc import Callable

@@ -81,8 +81,8 @@ class MovingBackprojector:
         return cast(np.ndarray, in_bricks(rt, Views(frames, turned, matrices, weights), grid, 1, launch))
 
     def _push_of(self, state: int) -> DeviceArray:
-        """Returns how far the matter of each voxel of the reference has moved in a state, (3, nz, ny, nx) in voxels, x, y,
-        z. Raises InputError if the field has no inverse."""
+        """Returns how far the matter of each voxel of the reference has moved in a state: (3, nz, ny, nx) in voxels, x, y,
+        z, then GUARD zeros. Raises InputError if the field has no inverse."""
         rt, grid = self.rt, self.states.grid
         pull_mm, wide, margin = self._wide_pull_mm(state)
         spacing_mm = np.array(grid.voxel_size_mm[::-1])
@@ -108,7 +108,8 @@ class MovingBackprojector:
         return self.states.deformation.on_grid_mm(wide, weights), wide, (z, y, x)
 
     def _check_inverse(self, state: int, push_mm: np.ndarray) -> None:
-        """Raises InputError if the displacements push_mm (voxels, 3) do not invert the deformation at some voxels."""
+        """Raises InputError if the displacements push_mm (voxels, 3) do not invert the deformation at one of the voxels that
+        are tested, at most 500."""
         grid = self.states.grid
         probed = np.linspace(0, len(push_mm) - 1, min(_PROBED, len(push_mm))).astype(int)
         z, y, x = (axis[i] for axis, i in zip(grid.axes_mm(), np.unravel_index(probed, grid.shape), strict=True))

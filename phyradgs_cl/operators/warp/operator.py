@@ -7,7 +7,9 @@ the result to the time cells for which the state stands (``states.py``). A cell 
 coefficients d_r of the fields U_r. B maps coefficients to voxels. w_k is the field in state k, and ∇v the gradient of the
 cubic spline through the volume:
 
-    J d = Σ_k P_k (∇v(y + w_k) · Σ_r φ_r,k B d_r),    Jᵀ y = Bᵀ Σ_k φ_r,k ∇v(y + w_k) P_kᵀ y"""
+    J d = Σ_k P_k (∇v(y + w_k) · Σ_r φ_r,k B d_r),    (Jᵀ p)_r = Bᵀ Σ_k φ_r,k ∇v(y + w_k) P_kᵀ p
+
+y: the voxel centres. p: frames."""
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy

@@ -36,7 +36,7 @@ class MotionStates:
         most: int = MOST_STATES,
     ) -> "MotionStates":  # fmt: skip
         """Chooses at most ``most`` states for times (T,) in s. The next state is always the object at the time at which it
-        differs most from all states so far.
+        differs most from all states so far, until at all times a state is near enough.
 
         least_voxels: a change of a weight by 1 counts as at least this displacement, so that fields of zeros get several
         states too."""

@@ -10,7 +10,8 @@ from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
 
-_BORDER = 4  # width in voxels around the volume in which coefficients are kept, as in cl/warp.cl: further ones are < 3e-3
+# Width in voxels around the volume in which coefficients are kept, as in cl/warp.cl: beyond, they are below 3e-3 of a voxel.
+_BORDER = 4
 _MOST_OWNED = 8  # most slices that a CPU's work-item sums; two work-items compute the voxels near the ends of such a block
 _ITEMS_PER_UNIT = 4  # wanted work-items per compute unit, so that none waits long for the last
 _HEADROOM = 64  # largest sum of weights that a voxel may receive: 4³, where a field contracts by 4 along each axis
@@ -185,7 +186,7 @@ class StateStack:
         self.stack = FrameStack(rt, rt.kernel("warp", "add_frames", RANK=1))
 
     def is_still(self, state: int) -> bool:
-        """Returns False, because every state is copied from the stack."""
+        """Returns False, because every state, moved or not, is copied from the stack."""
         return False
 
     def source(self, stack: DeviceArray) -> DeviceArray:
