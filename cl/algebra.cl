@@ -130,7 +130,8 @@ static inline float share_of(const float2 step, const sum_t squares)
 }
 #endif
 
-/* Combines the results `own` of a work-group's items in pairs, in a fixed order. Item 0 gets the result. */
+/* Combines the results `own` of a work-group's items in pairs, in a fixed order. Item 0 gets the result. The group's size
+   must be a power of 2. */
 #define TREE(scratch, own, combined)                                                       \
     if (get_local_size(0) > 1) {                                                           \
         const int item = (int)get_local_id(0);                                             \

@@ -5,7 +5,7 @@
      backproject_upright  detector columns parallel to the volume's z; a work-item takes a column of voxels
      backproject_leaning  columns that lean a little against z, as on every calibrated panel
      backproject_lines    every line of a frame has its own pose (rolling shutter); a work-item takes
-                          LANES voxels along x */
+                          LANES voxels along x, or along z with ALONG_Z */
 #include "common/lanes.h"
 #include "common/line_backprojection.h"
 
@@ -16,8 +16,8 @@
 #define BY_DISTANCE(weight, inv) (weight) * (inv) * (inv)
 #endif
 
-/* Interpolates linearly at LANES places of a line in memory: by lookup in two vectors if these contain all places (`fits`),
-   else by gathers. */
+/* Interpolates linearly at LANES places of a line in memory, with the share wv of the next element. `fits`: two vectors from
+   `least` on contain all places; if so, elements are looked up in them, else gathered. */
 #ifdef V_LOOKUP
 #define COLUMN_SAMPLES(column, least, place, wv, fits)                                                       \
     ((fits) ? lerp_lookup(V_LOAD((column) + (least)), V_LOAD((column) + (least) + LANES), (place) - (least), wv) \
@@ -74,7 +74,7 @@ __kernel void backproject(
 
 #ifdef COLUMN_ROWS
 /* Along z, a column of voxels keeps its detector column and depth, and v is linear. So two detector columns are blended
-   once for LANES voxels, or for all voxels if LANES voxels project to more rows than two vectors contain. Images are
+   once for LANES voxels; or once for all voxels, if LANES voxels project to more rows than two vectors contain. Images are
    transposed: (columns, pitch), v along a row. The host chooses `block` such that its voxels project to at most COLUMN_ROWS
    rows. */
 __kernel void backproject_upright(

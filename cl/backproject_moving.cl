@@ -1,6 +1,6 @@
 /* FDK's backprojection of an object that moves. At the time of a view, matter from voxel x of the reference is at x + u(x).
-   u is interpolated between the displacements of two states; weights.y is the second state's fraction. Otherwise the
-   kernels are those of backproject.cl. Twins: operators/twins/rays.py.
+   u is interpolated between the displacements of two states; weights.y is the second state's fraction. Apart from u, the
+   kernels do what those of backproject.cl do. Twins: operators/twins/rays.py.
      push_displacement       solves u(x) = -w(x + u(x)) for one state; a work-item takes LANES voxels along x
      backproject_moving      any pose; a work-item takes LANES voxels along x and loops over the views
      backproject_lines_moving  every line of a frame has its own pose; a work-item takes one voxel */

@@ -48,7 +48,7 @@ __kernel void bin_within(const int total, const int chunks, __global int *counts
     tile_offsets[t + 1] = sum;
 }
 
-/* Sums the lengths of lists to offsets. Beyond INT_MAX entries these stay at INT_MAX, and the host raises an error. */
+/* Sums the lengths of lists to offsets. Offsets above INT_MAX are set to INT_MAX, and the host raises an error. */
 __kernel void bin_starts(const int total, __global int *tile_offsets)
 {
     if (get_global_id(0) > 0)

@@ -41,8 +41,8 @@ __kernel void ssim_moments(
     V_STORE(xy, moments + 4 * image + row);
 }
 
-/* Pass along columns, which completes the means: SSIM's derivatives by mean(x), mean(xx) and mean(xy), and the sums over a
-   work-group's pixels. */
+/* Pass along columns, which completes the means. Writes SSIM's derivatives by mean(x), mean(xx) and mean(xy), and the sums
+   over a work-group's pixels. */
 __kernel void ssim_map(
     __global const float *moments, __global const float *rendered, __global const float *measured,
     __global const float *mask, __constant float *window,

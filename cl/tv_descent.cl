@@ -16,7 +16,7 @@ static inline float inverse_length(const float3 d, const float least)
     return 1.0f / (sqrt(d.x * d.x + d.y * d.y + d.z * d.z) + least);
 }
 
-/* least: added to the length of differences, by which the gradient divides; it is 0 in flat regions. */
+/* least: added to the length of differences, because the gradient divides by this length, which is 0 in flat regions. */
 __kernel void tv_gradient(__global const float *volume, const int4 shape, const float least, __global float *gradient)
 {
     const int x = (int)get_global_id(0), y = (int)get_global_id(1), z = (int)get_global_id(2);

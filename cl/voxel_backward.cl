@@ -1,6 +1,6 @@
 /* Adjoint of voxel_forward.cl. voxel_backward sums moments of value · dL/d(volume) over a Gaussian's voxels, and
-   voxel_chain makes gradients of them. On CPUs a work-item takes a Gaussian, with vectors along rows. On GPUs a work-group
-   of GROUP items does, ACROSS of them along a row. */
+   voxel_chain computes gradients from these sums. In voxel_backward, a CPU's work-item takes a Gaussian, with vectors along
+   rows; a GPU's work-group of GROUP items takes one, with ACROSS items along a row. */
 #include "common/gradient.h"
 #include "common/group_sums.h"
 #include "common/voxel.h"
@@ -16,7 +16,7 @@
 #define PLACE_IN_ROW 0
 #endif
 
-/* The voxels of a row to visit: of the bounding box on a CPU; only within the cutoff on a GPU, where each takes time. */
+/* The voxels of a row to visit: all in the bounding box on a CPU; on a GPU only those within the cutoff, which saves time. */
 ALWAYS_INLINE int2 voxel_span(const voxel_row r, const int lo, const int hi, const float limit)
 {
 #if GROUP > 1

@@ -75,7 +75,7 @@ static inline int first_tap(const float at)
 
 /* The coefficients along one axis that LANES voxels need, with their weights: `count` coefficients from `first` on. Along x,
    `first` is one more in each lane. at: the displaced positions. is_far: whether a lane needs other coefficients.
-   is_outside: whether it is more than REACH outside the volume, where the value is 0. */
+   is_outside: whether its position is more than REACH outside the volume, where the value is 0. */
 typedef struct {
     vf at;
     vi is_far, is_outside;

@@ -1,13 +1,13 @@
 /* Gradients (13, stride): dL/d(the 11 parameters), then dL/d(centre on the detector) (u, v), which density control reads.
-   By a rotation, L is first differentiated as a torque: dL/d(small rotation about the Gaussian's own axes). The torque is
-   stored as a gradient by the unit quaternion, 2 q (0, torque). */
+   The gradient by rotation is first computed as a torque, dL/d(small rotation about the Gaussian's own axes). It is stored
+   as a gradient by the unit quaternion, 2 q (0, torque). */
 #include "common/gaussian.h"
 
 #define ROW_STATISTIC 11 /* first of the two rows dL/d(centre on the detector) */
 #define ROUND 4e-6f      /* scales whose difference over their sum is below this may differ by rounding only */
 
-/* The factor s3 / s2 - s2 / s3 in the torque about an axis across scales s2 and s3. It is 0 if they differ by rounding only.
-   Else the torque would be rounding too, and Adam would make a step of full length of it. */
+/* The factor s3 / s2 - s2 / s3 in the torque about an axis across scales s2 and s3. It is set to 0 if the scales differ by
+   rounding only: the torque would be a rounding error, of which Adam would make a step of full length. */
 static inline vf out_of_round(const vf s2, const vf s3, const vf inv2, const vf inv3)
 {
     const vf more = s3 - s2, both = s3 + s2;

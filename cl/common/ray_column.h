@@ -65,8 +65,8 @@ RAY_INLINE vf column_steps_mm(__global const float *cell, column_rays_t d, const
     return sqrt(lx * lx + ly * ly + lz * lz) / max(fabs(d.x), fabs(d.y));
 }
 
-/* The first and last of `count` planes along the main axis that are between source and detector. If LEAN, all are:
-   operators/rays/upright.py ensures this. */
+/* The first and last of `count` planes along the main axis that are between source and detector. If LEAN, all are, which
+   operators/rays/upright.py ensures. In a parallel beam all count. */
 RAY_INLINE int2 planes_between(__global const float *cell, const int u, const int along_x, const int first, const int count)
 {
 #if LEAN || RAY_PARALLEL

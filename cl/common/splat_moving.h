@@ -152,7 +152,7 @@ ALWAYS_INLINE void moving_add(moving_means *m, const moving_line s, const moving
 }
 
 /* The closed form. With E = e0 and e1 at both ends, int E z = Q (e1 - e0)/speed and
-   int E z^2 = Q (int E + (z1 e1 - z0 e0)/speed). No large numbers are subtracted, so no digits are lost. */
+   int E z^2 = Q (int E + (z1 e1 - z0 e0)/speed). The rule CLOSED has only long paths, for which differences keep digits. */
 ALWAYS_INLINE moving_means moving_closed(const moving_line s, const moving_pixel p, const float speed)
 {
     moving_means m;

@@ -2,7 +2,7 @@
    from SUMS on, which is no longer needed then. The indices of the sums: */
 #define SUM_W 0          /* gradient x value: dL/d(log amplitude) */
 #define SUM_IK 1         /* dL/d(1/kappa) */
-#define SUM_B 7          /* dL/dB with B = 1 + b.D; then dL/dB times u and v */
+#define SUM_B 7          /* dL/dB with B = 1 + b.D; then dL/dB times D.u and times D.v */
 #define SUM_BU 8
 #define SUM_BV 9
 #if MOVING

@@ -212,7 +212,8 @@ class RayMemory:
         return on_device
 
     def read_frames(self, on_device: DeviceArray, result: Array, part: slice, axis: str) -> None:
-        """Copies padded frames to the frames ``part`` of ``result`` (F, rows, columns). Each pixel gets its sub-rays' mean."""
+        """Copies padded frames to the frames ``part`` of ``result`` (F, rows, columns), as means of each pixel's
+        sub-rays."""
         shape, subrays = self.layout.frames_shape(part.stop - part.start), self.layout.subrays
         if subrays != SINGLE and isinstance(result, DeviceArray):
             launch_means(self.rt, on_device, self.layout.pixel_strides(axis), subrays, result, part)

@@ -7,8 +7,8 @@ of the source. The kernel works in detector coordinates and shares no formula wi
 In motion, the definition is integrated over time numerically. In a segment a splat keeps the conic, amplitude and
 perspective factor Q of the middle time, while its centre moves on the panel along a straight line at constant speed. The
 length and direction of this line come from the mean μ projected by the two end poses. The centre at mid-time is the average
-of the parabola through the projections at both ends and in the middle. Conic and Q come from the difference C − b bᵀ. This difference loses digits, of which float32 has
-too few."""
+of the parabola through the projections at both ends and in the middle. Conic and Q come from the difference C − b bᵀ, which
+loses digits: float32 has too few for it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
