@@ -7,7 +7,7 @@
    slopes and knots.
 
    To save memory only RING slices of all channels are kept between kernels: (RING, channels, ny, pitch), slice z at
-   z % RING, with zeros after a row. A work-item takes a row in vectors on a CPU, a voxel on a GPU. Twin: objective/ridge.py. */
+   z % RING, with zeros after a row. A work-item takes a row on a CPU, a voxel on a GPU. Twin: objective/ridge.py. */
 #include "common/lanes.h"
 
 #define CHANNELS 4

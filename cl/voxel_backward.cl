@@ -16,7 +16,7 @@
 #define PLACE_IN_ROW 0
 #endif
 
-/* The voxels of a row to visit: all in the bounding box on a CPU; on a GPU only those within the cutoff, which saves time. */
+/* The voxels of a row to visit: all in the bounding box on a CPU; on a GPU only those within the cutoff, to save time. */
 ALWAYS_INLINE int2 voxel_span(const voxel_row r, const int lo, const int hi, const float limit)
 {
 #if GROUP > 1

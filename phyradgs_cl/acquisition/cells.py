@@ -26,15 +26,15 @@ Served = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
-    """Returns one cell of all lines, midway between the frame's first and last light. No single pose fits a frame better."""
+    """Returns one cell of all lines, midway between the frame's first and last light: the best time for a single pose."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.middle_s, lines)
 
 
 def static_start_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int
 ) -> TimeCells:
-    """Returns one cell of all lines, at the frame's first light. The volume is then rotated by half of the arc that the
-    gantry turns between first and last light."""
+    """Returns one cell of all lines, at the frame's first light. A volume reconstructed with it is rotated by half of the
+    arc that the gantry turns between first and last light."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.lit_span_s[0], lines)
 
 
@@ -122,7 +122,7 @@ def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _served_lines(served: np.ndarray) -> Served:
-    """Returns which cells serve any line, and their first and last lines (``Served``). served: bool (K, lines)."""
+    """Returns ``Served``: the cells that serve any line, their lines and their order. served: bool (K, lines)."""
     used = np.flatnonzero(served.any(axis=1))
     line_start = served[used].argmax(axis=1)
     line_stop = served.shape[1] - served[used, ::-1].argmax(axis=1)

@@ -19,7 +19,8 @@ POSE_LENGTH = 12
 # Largest distance of the source from the axis, in voxels. At this distance float32 displaces rays by 6 % of a voxel, at 1e7
 # voxels by half a voxel.
 _MOST_VOXELS_AWAY = 1e6
-_STEEP = 1e-2  # least squared sine of a ray's angle to z: the height at which a steeper ray passes the axis is too uncertain
+# A central ray counts as having at least this sin² of its angle to z: where a steeper one passes the axis is too uncertain.
+_STEEP = 1e-2
 
 
 @dataclass(frozen=True)
@@ -292,7 +293,8 @@ def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
 
 
 def cuts(grid: Grid, whole: Grid, geometry: Geometry) -> bool:
-    """Returns whether ``grid`` misses more than a voxel of the part of ``whole`` in the field of view, on any side."""
+    """Returns whether ``grid`` leaves out, on any side, more than the width of its voxels of that part of ``whole`` which
+    lies in the field of view."""
     half_mm = np.array(field_of_view_mm(geometry))
     low_mm, high_mm = np.clip(whole.box_mm.T, -half_mm, half_mm)
     begin_mm, end_mm = grid.box_mm.T

@@ -33,7 +33,7 @@ _WEIGHT_TOLERANCE = 1e-3  # largest difference from 1 of the sum of a line's wei
 
 
 class Motion(Protocol):
-    """The interface of a motion model. A result's provenance lists its ``name``, if any, and its dataclass fields."""
+    """The interface of a motion model. A result's provenance lists the model's ``name``, if any, and dataclass fields."""
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """Returns the time cells of one frame. The weights of every line sum to 1."""
 

@@ -41,8 +41,8 @@ def blur_facts(scan: "Scan") -> dict[str, float]:
     """Returns ``blur_at_rim_px`` and ``blur_at_half_radius_px`` of a fly-scan, in columns; {} for a gantry at rest.
 
     The blur is Δθ times the radius on the panel, in columns. Δθ is the arc of an exposure. A point at radius r moves by
-    r·Δθ, and its image by M·r·Δθ where it moves at right angles to the ray, with the magnification M. M·r is its largest
-    distance from the axis on the panel. This is the first order in r/R, with R from source to axis: a point nearer to the
+    r·Δθ. Where it moves at right angles to the ray, its image moves by M·r·Δθ, with the magnification M. M·r is the image's
+    largest distance from the axis. This is the first order in r/R, with R from source to axis: a point nearer to the
     source blurs up to R/(R − r) times as much, one nearer to the panel down to R/(R + r) times.
 
     Δθ is the median over the frames, while a line is open and the beam on. The rim is the largest radius that every view

@@ -254,7 +254,7 @@ class Scan:
             log.warning(text, total / np.count_nonzero(self.valid))
 
     def check_sight(self) -> None:
-        """Raises InputError for a grid that no ray meets at the start of any frame, as its volume would be 0.
+        """Raises InputError for a grid that no ray meets at the start of any frame, because the volume would be 0.
 
         Warns of a panel inside the grid."""
         self.warn_of_near_panel()

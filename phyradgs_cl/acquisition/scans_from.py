@@ -2,8 +2,9 @@
 
 ASTRA's ``cone_vec`` (F, 12) is source, centre of the panel, step to the next column, step to the next row, x y z each.
 ``parallel3d_vec`` begins with the direction of the rays. TIGRE's cone beam has our conventions: the source is at
-(DSO cos α, DSO sin α, 0), columns rise in the direction of the turn, row 0 is the lowest. Its pairs are (v, u), its triples
-(z, y, x). ``COR`` shifts source and panel in the direction of the columns. In both packages the rotation axis is z."""
+(DSO cos α, DSO sin α, 0), columns rise in the direction of the turn, row 0 is the lowest. TIGRE's pairs are (v, u), its
+triples (z, y, x). ``COR`` shifts source and panel in the direction of the columns. In both packages the rotation axis is
+z."""
 
 import logging
 from collections.abc import Iterable
@@ -168,8 +169,8 @@ def _to_middle(pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
 def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[int, int], Grid]:
     """Returns poses (F, 12), the panel (rows, columns) and the grid of a TIGRE geometry.
 
-    angles_rad: (F,), or Euler angles (F, 3). Raises InputError for features that scans here lack: a turned panel, a second
-    or third Euler angle, a volume that moves. Raises it also for attributes that are missing or no numbers."""
+    angles_rad: (F,), or Euler angles (F, 3). Raises InputError for attributes that are missing or no numbers, and for
+    features that a ``Scan`` lacks: a turned panel, a second or third Euler angle, a volume that moves."""
     if getattr(geo, "mode", None) not in (None, "cone", "parallel"):
         raise InputError("geo.mode", checks.short_repr(geo.mode), "'cone' or 'parallel'")
     angles = np.asarray(angles_rad)

@@ -19,7 +19,8 @@ from phyradgs_cl.errors import InputError
 class TimeCells:
     """The time cells of one frame, sorted by line_start.
 
-    - pose (C, 12) in mm, for the detector's own rows and columns, whatever the readout axis. time_s (C,) in s.
+    - pose (C, 12) in mm, for the detector's own rows and columns, whatever the readout axis. time_s (C,) in s. Moving cells
+      have both in their middle.
     - line_start, line_stop (C,): the lines of a cell, counted along the readout ``axis``. The panel has ``lines`` lines.
       weight (C,).
     - line_share (C, lines): for still cells, a further factor of the weight: the fraction of each line's exposure that
@@ -116,7 +117,7 @@ class TimeCells:
         return self
 
     def line_poses(self) -> np.ndarray:
-        """Returns one pose per line, (lines, 12), from the cell nearest to its mid-exposure. A single cell gives (1, 12).
+        """Returns one pose per line, (lines, 12), of the cell nearest to the line's mid-exposure; (1, 12) for a single cell.
 
         Raises InputError for a line without a cell."""
         if self.count == 1:
@@ -136,8 +137,8 @@ class TimeCells:
         return self.pose[cell[nearest[first]]]
 
     def line_cells(self) -> np.ndarray:
-        """Returns a range [first, stop) of cells for each line, (lines, 2). It has all cells that serve the line, and maybe
-        others."""
+        """Returns a range [first, stop) of cells for each line, (lines, 2), in which are all cells that serve the line, and
+        maybe others."""
         line = np.arange(self.lines)
         first = np.searchsorted(np.maximum.accumulate(self.line_stop), line, side="right")
         return np.stack([first, np.searchsorted(self.line_start, line, side="right")], -1)

@@ -24,7 +24,7 @@ _LEAST_SPAN_S = 1e-6  # ``sampled`` needs two different times in a frame, also i
 _MOST_SAMPLES = 1024  # ``sampled`` raises an error when more samples per frame than this are not close enough
 _LEAST_INCIDENCE = 1e-6  # least sine of the angle between rays and panel
 _AT_AXIS = 1e-6  # a panel within this fraction of the source-to-axis distance is at the axis
-_AWAY = 2.0  # factor on the size of a panel at the axis, and on its distance from the source, to move it away
+_AWAY = 2.0  # a panel at the axis is moved so that its distance from the source and its size grow by this factor
 _SAME_PLACE = 1e-9  # poses that differ by less, relative to their largest number, are equal: float64 rounds by less
 
 

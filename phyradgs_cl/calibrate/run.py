@@ -65,7 +65,9 @@ _FEWEST_SPLINES = 4  # a cubic spline of a wobble needs four
 _LEAST_EXPLAINED = 0.3
 _ORDER_ERRORS = 4.0  # least difference of the readout directions' squared residuals in standard errors, as in ``check``
 _ORDER_RATIO = 1.04  # least ratio of the readout directions' squared residuals, as in ``check``
-_BEYOND = 1e6  # an encoder table is continued by this many frame times: first steps of the search may ask for such times
+# An encoder table is continued by this many times a frame's exposure and readout: first steps of the search may ask for
+# times far beyond the table.
+_BEYOND = 1e6
 # Progress expects stages to cost this fraction of their most: few parameters are determined, and few steps are needed.
 _EXPECTED_SHARE = 0.25
 
@@ -97,7 +99,8 @@ def calibrate(
 
 @dataclass(eq=False)
 class _Calibrator:
-    """One calibration: its inputs, its grids, and the progress of its phases. ``ready``: the scans with lag removed."""
+    """One calibration: its inputs, its grids, and the progress of its phases. ``ready``: the scans with lag removed and
+    encoder tables continued."""
 
     rt: Runtime
     scan: Scan
@@ -165,8 +168,8 @@ class _Calibrator:
         """Starts from the offset that ``check`` finds, because steps reach it from a distance of a few pixels only.
 
         In half a turn of nearly parallel rays, a volume explains most of what an offset changes. The search cannot determine
-        the offset there, so ``check``'s answer stands. It stands too if the panel sees few rays twice: a shift under which
-        fewer are seen twice fits better, whatever the truth."""
+        the offset there, so ``check``'s answer stands. Its answer also stands if the panel sees few rays twice: a shift
+        under which even fewer rays are seen twice fits better, whatever the truth."""
         if self.phantom is None and has_axis_near_edge(self.ready[0]):
             self.search.held = (OFFSET_U,)
         quick, pitch_mm = coarse(self.ready[0], QUICK_COLUMNS), self.scan.geometry.pixel_size_mm[1]

@@ -30,7 +30,8 @@ LEAST_SHARE = 0.2
 # For a known object (beads) a smaller share is enough: there are no voxels that explain signals by accident.
 LEAST_SHARE_OF_BEADS = 0.02
 _TINY = 1e-9  # added to the diagonal of a matrix before its inverse, because signals may be linearly dependent
-_GAUGE_FACTOR = 2.0  # least share over that of a turn or lift (``GAUGES``), which errors of voxels alone leave
+# A determined parameter has at least this many times the share of a turn or lift (``GAUGES``), which errors of voxels leave.
+_GAUGE_FACTOR = 2.0
 # A turn's or lift's share counts as at most this: in a wrong geometry it grows, and no parameter would count as determined.
 _MOST_GAUGE = 0.2
 DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations

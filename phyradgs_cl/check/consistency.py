@@ -27,7 +27,7 @@ from phyradgs_cl.runtime import Runtime
 CONSISTENCY = "consistency"
 # Consistent frames leave less than this fraction of their residual in a random order: correct scans have 0.02 to 0.23.
 _LARGEST = 0.35
-_DOUBTFUL = 0.1  # above this fraction of the residual in a random order, exchanged, missing and repeated frames are tried
+_DOUBTFUL = 0.1  # above this fraction of the residual in a random order, missing and repeated frames are tried
 _RANDOM_ORDERS = 2  # the residual in a random order is averaged over this many orders
 _FEWEST_FRAMES = 5  # fewer frames cannot tell one order from another
 _FEWEST_PIXELS = 32  # fewer valid coarse pixels per frame cannot tell one order from another
@@ -68,8 +68,8 @@ class Consistency:
 @dataclass(frozen=True, eq=False)
 class _CoarseFit:
     """The coarse scan with its best sense of rotation (``turned``), and with the best panel shift too (``best``). fitted:
-    the fit of ``best``. random_total: sum of the squared residuals of its frames in a random order. rough_mean_square: mean
-    squared residual of the best rough fit."""
+    the fit of ``best``. random_total: mean squared residuals of its frames in a random order, summed over the frames.
+    rough_mean_square: mean squared residual of the best rough fit."""
 
     turned: Scan
     best: Scan
@@ -160,7 +160,8 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
 
 
 def _random_order(rt: Runtime, scan: Scan) -> float:
-    """Returns the sum of squared residuals of the scan's frames in a random order, averaged over a few orders."""
+    """Returns the mean squared residuals of the scan's frames in a random order, summed over the frames and averaged over
+    two orders."""
     rng = np.random.default_rng(0)
     orders = [rng.permutation(scan.frames) for _ in range(_RANDOM_ORDERS)]
     return float(np.mean([fit_squares(rt, replace(scan, projections=scan.projections[order])).sum() for order in orders]))

@@ -51,9 +51,9 @@ def check_coverage(scan: Scan) -> Finding:
 
 
 def find_noise(scan: Scan) -> Finding | None:
-    """Returns a finding if noise dominates: if that of a pixel behind the object, by ``noise_rms``, exceeds 40 % of the
-    mean line integral there. Pixels lie behind the object where the mean over their neighbours is above a tenth of its
-    largest value. Scans of 1000 photons had at most 0.29, of 30 at least 0.85; above 4 there is no object."""
+    """Returns a finding if noise dominates: if the noise of a pixel behind the object, by ``noise_rms``, exceeds 40 % of
+    the mean line integral there; else None. Pixels lie behind the object where the mean over their neighbours is above a
+    tenth of its largest value. Scans of 1000 photons had at most 0.29, of 30 at least 0.85. Above 4 there is no object."""
     some = slice(None, None, ceil_div(scan.frames, _NOISE_FRAMES))
     p, valid = np.asarray(scan.projections[some]), scan.valid[some]
     mean = scipy.ndimage.uniform_filter(np.where(valid, p, 0), (1, _NEAR, _NEAR))

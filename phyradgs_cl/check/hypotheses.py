@@ -54,7 +54,7 @@ def shifts_for_sense_px(scan: Scan) -> tuple[float, float]:
     """Returns how far the panel may be shifted, (lowest, highest) in pixels of the recorded scan, to compare senses of
     rotation.
 
-    If the axis is near the panel's edge, the panel may only move towards it. If it moved away from the axis, fewer rays
+    If the axis is near the panel's edge, the panel's middle may only move towards the axis. If it moved away, fewer rays
     would be measured twice, and any angles would fit."""
     offset_mm, pitch_mm = scan.geometry.detector_offset_mm[1], scan.geometry.pixel_size_mm[1]
     if not has_axis_near_edge(scan):

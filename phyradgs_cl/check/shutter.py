@@ -15,10 +15,11 @@ from phyradgs_cl.runtime import Runtime
 
 READOUT, EXPOSURE = "sign of readout", "exposure"
 _ERRORS = 4.0  # two hypotheses must differ by this many standard errors
-# Least squared residual of the wrong readout order over that of the right one: small, as both have as many unknowns.
+# The wrong readout order leaves at least this many times the squared residual of the right one. The factor may be small,
+# because both have as many unknowns.
 _ORDER_RATIO = 1.04
-_OTHER_RATIO = 1.5  # least squared residual of the stated readout axis or time, over that of one that fits better
-# The same ratio for a gantry at rest: a model without blur always fits better, above all with few views.
+_OTHER_RATIO = 1.5  # the same factor for another readout axis or time in place of the stated one
+# The same factor for a gantry at rest: a model without blur always fits better, above all with few views.
 _REST_RATIO = 2.0
 _AS_GOOD = 1.15  # readouts that leave up to this many times the best one's squared residual are named too
 _READOUT_SHARE = 0.86  # if no readout time is stated, this fraction of the time between frames is tried

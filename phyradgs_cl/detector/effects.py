@@ -62,8 +62,9 @@ def tigre_noise(
     """Returns noisy line integrals −ln(counts/dose) · m, (F, v, u) float32, after TIGRE's scaling. Negatives become 0.
 
     line_integrals (F, v, u): all projections of the scan, whose maximum is m. ``dose``: counts of an unattenuated pixel.
-    ``electronic_noise``: standard deviation in counts. The published scans have 1e4 and 10. ``light``: fraction of the dose
-    for each pixel, above 0, broadcast to (F, v, u). It is below 1 where a pulse misses part of a line's window."""
+    ``electronic_noise``: standard deviation in counts. The published scans have a dose of 1e4 and an electronic noise of 10.
+    ``light``: fraction of the dose for each pixel, above 0, broadcast to (F, v, u). It is below 1 where a pulse misses part
+    of a line's window."""
     expected, scale = tigre_counts(line_integrals, dose)
     share = np.asarray(light, dtype=np.float64)
     p = _log_ratio(sample_counts(expected * share, electronic_noise, rng), dose * share) * scale

@@ -219,7 +219,7 @@ def control_points(
 ) -> tuple[tuple[float, float, float], tuple[int, int, int]]:
     """Returns origin x, y, z in mm and counts (nz, ny, nx) of control points that cover a grid and ``margin_mm`` around it.
 
-    They extend one spacing or more beyond, since a spline at a point needs the nearest four control points per axis."""
+    The control points extend one spacing or more beyond, since a spline at a point needs the nearest four per axis."""
     counts = [int(np.ceil((side_mm + 2 * margin_mm) / spacing_mm)) + 3 for side_mm in grid.size_mm]
     first_mm = [middle - (n - 1) / 2 * spacing_mm for middle, n in zip(grid.offset_mm, counts, strict=True)]
     return (first_mm[2], first_mm[1], first_mm[0]), (counts[0], counts[1], counts[2])

@@ -62,7 +62,7 @@ class Gaussians:
     def of_covariance(cls, mean: np.ndarray, covariance: np.ndarray, density: np.ndarray) -> "Gaussians":
         """Makes a cloud from means (G, 3), covariances (G, 3, 3) and densities (G,)."""
         variance, axes = np.linalg.eigh(covariance)
-        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # else eigenvectors may form a reflection
+        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # makes a rotation of eigenvectors that form a reflection
         x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(axes).as_quat().T
         return cls(mean, np.sqrt(variance), np.stack([w, x, y, z], -1), density)
 

@@ -68,9 +68,9 @@ class GridChoice:
     def of(self, grid: Grid) -> Grid:
         """Returns the chosen grid in place of ``grid``, or ``grid`` itself if nothing is chosen.
 
-        With ``roi_mm`` alone, it has the voxels of ``grid`` (continued outside it) that overlap the box by more than a
-        hundredth of a voxel. ``size`` alone keeps the box of ``grid``. ``voxel_mm`` alone also keeps it, with its sides
-        rounded up to whole voxels. Raises InputError for too many voxels."""
+        With ``roi_mm`` alone, the chosen grid has the voxels of ``grid``, continued outside it, that overlap the box by more
+        than a hundredth of a voxel. ``size`` alone keeps the box of ``grid``. ``voxel_mm`` alone keeps that box too, with
+        its sides rounded up to whole voxels. Raises InputError for too many voxels."""
         box_mm = self._box_mm(grid)
         sides_mm = box_mm[:, 1] - box_mm[:, 0]
         if self.size is not None:

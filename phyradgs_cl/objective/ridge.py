@@ -4,8 +4,8 @@ anatomy.
 Goujon, Neumayer and Unser, "Learning weakly convex regularizers for convergent image-reconstruction algorithms", SIAM J.
 Imaging Sci. 17 (2024) 91, in 3D. The sums run over filters i and voxels p. A filter W_i of 5³ voxels is a chain: 4
 correlations with 3³ voxels, then 16 with their results. Only windows inside the volume count. ψ_i' is a difference of two
-clamps, with knots in units of the noise σ. It may fall beyond a knot, so R is only weakly convex: ½‖x − v‖² + step R(x) is
-convex for step ≤ 1."""
+clamps, with knots in units of the noise σ. Beyond a knot ψ_i' may fall, so R is only weakly convex: ½‖x − v‖² + step R(x)
+is convex for step ≤ 1."""
 
 import json
 from dataclasses import dataclass

@@ -20,7 +20,8 @@ from phyradgs_cl.runtime.layout import beside, brought_to
 class TvProx:
     """The proximal map of TV for volumes of a fixed ``shape``: (nz, ny, nx), or (K, nz, ny, nx) for K states.
 
-    Each call starts from the dual where the last one ended. axis_weights: factors of differences along each axis."""
+    Each call starts from the dual where the last one ended. axis_weights: factors of differences along z, y, x; for states,
+    the factor in time comes first."""
 
     def __init__(
         self, rt: Runtime, shape: tuple[int, ...], axis_weights: tuple[float, ...] = (1.0, 1.0, 1.0)
@@ -49,8 +50,8 @@ class TvProx:
     def __call__(
         self, volume: SameArray, weight: float, iterations: int, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Returns the map of a volume of ``shape``, float32, after ``iterations`` from the last dual. weight: in the
-        volume's unit.
+        """Returns the proximal map of a volume of ``shape``, float32, after ``iterations`` from the last dual. weight: in
+        the volume's unit.
 
         nonnegative: maps to x ≥ 0. A device array gives a device array (``out``, if given)."""
         observed, result = beside(self.rt, volume, out)

@@ -81,7 +81,7 @@ class Ellipsoid:
         dd = np.einsum("ij,ij->i", d, d)
         dd[dd == 0] = 1.0  # avoids a division by 0; a segment without length has line integral 0
         nearest = -np.einsum("ij,ij->i", o, d) / dd
-        # From the point of the ray nearest to the centre: the quadratic formula would lose digits for far sources.
+        # Computed from the ray's point nearest to the centre: the quadratic formula would lose digits for far sources.
         foot = o + nearest[:, None] * d
         half = np.sqrt(np.maximum(1.0 - np.einsum("ij,ij->i", foot, foot), 0.0) / dd)
         return np.clip(nearest + half, 0.0, 1.0) - np.clip(nearest - half, 0.0, 1.0)

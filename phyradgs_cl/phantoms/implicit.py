@@ -79,12 +79,13 @@ def capsule_distance(capsule: Capsule, x: Field, y: Field, z: Field) -> Field:
 
 
 def ellipsoid_distance(centre: Point, semi_axes: Point, x: Field, y: Field, z: Field) -> Field:
-    """Returns the signed distance to an axis-aligned ellipsoid, to first order: it is exact near the surface."""
+    """Returns the signed distance to an axis-aligned ellipsoid, to first order in the distance."""
     return ratio_distance([(p - c) for p, c in zip((x, y, z), centre, strict=True)], semi_axes)
 
 
 def ratio_distance(offsets: Sequence[Field], semi_axes: Sequence[ArrayLike]) -> Field:
-    """Returns the signed distance, to first order, to the surface Σ (offset / semi-axis)² = 1. Semi-axes may be arrays."""
+    """Returns the signed distance to the surface Σ (offset / semi-axis)² = 1, to first order in the distance. Semi-axes may
+    be arrays."""
     scaled = sum((o / np.asarray(s, np.float32)) ** 2 for o, s in zip(offsets, semi_axes, strict=True))
     slopes = sum((o / np.asarray(s, np.float32) ** 2) ** 2 for o, s in zip(offsets, semi_axes, strict=True))
     radius = np.sqrt(scaled)

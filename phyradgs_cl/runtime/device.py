@@ -44,7 +44,8 @@ class DeviceInfo:
 
     @property
     def rank(self) -> tuple[int, int, int, int, int]:
-        """Orders devices, the best one largest: may be chosen unnamed, GPU before CPU, own memory, wider vectors, units."""
+        """Numbers that are largest for the best device: whether it may be chosen unnamed, GPU before CPU, whether it has
+        memory of its own, the width of its vectors, its compute units."""
         kind = {"gpu": 2, "cpu": 1}.get(self.kind, 0)
         unified = bool(self.handle.host_unified_memory)
         return (int(self.by_default), kind, int(not unified), self.vector_width, self.compute_units)

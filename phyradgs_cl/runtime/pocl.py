@@ -58,12 +58,13 @@ _kept_alive: list[ctypes.Array[ctypes.c_char]] = []
 
 
 def prepare_environment() -> None:
-    """Chooses a kernel cache that works, unless the user has chosen one. Call it before pyopencl loads.
+    """Sets PoCL's kernel cache, to the user's choice or to a folder of this program. Call it before pyopencl loads.
 
     PoCL names its own cache after LLVM's target, so two unknown processors would share binaries. If the cache cannot be
-    written, PoCL finds no device. If it is on a mount with noexec, PoCL ends the process. In both cases the temporary folder
-    is used instead. pyopencl's cache is switched off where it cannot be written. Raises InputError for a number of threads
-    that PoCL would crash on or ignore."""
+    written, PoCL finds no device. If it is on a mount with noexec, PoCL ends the process. In both cases a temporary folder
+    is used instead. pyopencl's cache is switched off where it cannot be written. Limits the threads where several ranks
+    share a machine. Raises InputError for a number of threads that PoCL would crash on or ignore, and for a cache on a mount
+    with noexec if no temporary folder works."""
     global _unusable
     if platform.system() != "Linux":
         return

@@ -43,7 +43,7 @@ _LARGEST_PEAK = 1e4  # limit of --peak, a line integral
 _LARGEST_NOISE = 1e9  # limit of --electronic-noise, in counts
 _SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12  # limits of --dose, in photons per pixel
 _LARGEST_DETECTOR = 32_000  # limit of --detector, in pixels along a side of the panel
-_SLACK = 1.001  # an exposure longer than this many steps from frame to frame is no rounding
+_SLACK = 1.001  # an exposure whose arc exceeds this many steps from frame to frame overlaps the next by more than rounding
 _TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse", "turns")
 _DATA_SHEET = ("first", "fps", "readout_ms")
 

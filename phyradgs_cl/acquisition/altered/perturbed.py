@@ -35,7 +35,8 @@ class GeometryCorrection:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Corrections of single views: rotations (F,) about the axis, and shifts (F, 2) of the panel along v and u."""
+    """Corrections of single views: rotations (F,) about the axis in rad, and shifts (F, 2) of the panel along v and u in
+    mm."""
 
     turn_rad: np.ndarray
     shift_mm: np.ndarray

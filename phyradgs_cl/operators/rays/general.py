@@ -80,8 +80,8 @@ def brick_of(rt: Runtime) -> tuple[int, int, int]:
 
 
 def owner_steps(rt: Runtime) -> tuple[int, int]:
-    """Returns the height and width (z, y) of the box of voxels for which one work-item or work-group sums. A volume cut
-    into multiples of it gets the same bits as the whole volume."""
+    """Returns the sides (z, y) of the box of voxels for which one work-item or work-group sums. A volume cut into multiples
+    of these sides gets the same bits as the whole volume."""
     x, y, z = brick_of(rt)
     return (_BLOCK, _BLOCK) if rt.pixel_items else (z, y)
 

@@ -299,8 +299,8 @@ def _check_rows(rows: np.ndarray) -> None:
 def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, float]:
     """Returns dL/d(gantry angle about z) per rad, and dL/d(panel shift) along and across a line.
 
-    The units of shifts are half of the detector's width and half of its lines. rows (11, G): parameters in the kernels'
-    layout. gradients (13, G): dL/d(rows), and two rows of dL/d(projected centre)."""
+    The unit of a shift along a line is half of the detector's width, across a line half of the number of lines. rows (11,
+    G): parameters in the kernels' layout. gradients (13, G): dL/d(rows), and two rows of dL/d(projected centre)."""
     values, by = rows.astype(np.float64), gradients.astype(np.float64)
     (x, y, _), (by_x, by_y, _) = values[MEAN], by[MEAN]
     w, i, j, k = values[QUATERNION]
