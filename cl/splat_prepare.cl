@@ -180,8 +180,8 @@ ALWAYS_INLINE void times_of_lines(__global const float *times, const int pitch, 
     *late = V_LOAD(to);
 }
 
-/* The squared cutoff distance from the path, in widths of the splat. It is `slack` times cutoff2, because Q changes along the
-   path: 0.75 is the longest time from the middle, 1.1 and 1.2 are margins. */
+/* The squared cutoff distance from the path, in widths of the splat. It is `slack` times cutoff2, because Q changes along
+   the path: 0.75 is the longest time from the middle, 1.1 and 1.2 are margins. */
 ALWAYS_INLINE vf reach2_of(const splat_view s, const cutoff_ellipse e, const centre_path path, const vf speed, const float cutoff2)
 {
     const vf tilt = fabs(s.b1) * (fabs(e.u) + e.half_u + 0.75f * fabs(path.u))

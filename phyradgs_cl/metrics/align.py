@@ -106,8 +106,8 @@ def shared_slices(onto: Grid, grid: Grid) -> tuple[slice, slice, slice] | None:
 
 
 def resampled(volume: NDArray[np.floating], grid: Grid, onto: Grid) -> tuple[NDArray[np.float32], float]:
-    """Samples a volume (nz, ny, nx) on ``grid`` trilinearly at the voxel centres of ``onto``. Outside the box of ``grid`` the
-    result is 0.
+    """Samples a volume (nz, ny, nx) on ``grid`` trilinearly at the voxel centres of ``onto``. Outside the box of ``grid``
+    the result is 0.
 
     Between the outermost centres and the faces the value is constant. Also returns the fraction of the voxels of ``onto``
     that lie in that box."""

@@ -25,9 +25,10 @@ _WIDEST = 16  # width of the widest vector, which may read beyond the last cell 
 class RayLayout:
     """Layout of volumes (nz, ny, nx) and of stacks of frames with ``lines`` × ``width`` pixels in device memory.
 
-    brick: the part of the grid that the volume holds. The volume has a border of zeros, so that the frames of all bricks add
-    up to the frames of the grid. subrays: the rays of a pixel along (v, u); ``lines`` and ``width`` count rays. axis: whether
-    lines are "rows" or "columns" of the detector. is_across: lines are rows although the panel is read column by column."""
+    brick: the part of the grid that the volume holds. The volume has a border of zeros, so that the frames of all bricks
+    add up to the frames of the grid. subrays: the rays of a pixel along (v, u); ``lines`` and ``width`` count rays. axis:
+    whether lines are "rows" or "columns" of the detector. is_across: lines are rows although the panel is read column by
+    column."""
 
     grid: Grid
     lines: int

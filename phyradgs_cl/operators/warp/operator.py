@@ -152,8 +152,8 @@ def projector_of(
 ) -> Callable[..., RayOperator | WarpedOperator]:
     """Returns a function that makes projectors from the arguments of ``RayOperator``: for an object at rest ``RayOperator``.
 
-    deformation: how the object moves. Or state_times_s (K,): times in s of the volumes of an object that changes. Each time
-    cell of ``tables`` takes the nearest state. A blend of two states would blur, and every cell would be projected twice."""
+    deformation: how the object moves. state_times_s (K,): for an object that changes instead, the times in s of its volumes.
+    Each time cell of ``tables`` takes the nearest state. A blend of two states would blur and project most cells twice."""
     if state_times_s is not None:
         return partial(WarpedOperator, warp=StateStack(rt, grid.shape, TimeStates(state_times_s)))
     if deformation is None:

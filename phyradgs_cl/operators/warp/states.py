@@ -11,7 +11,7 @@ from phyradgs_cl.fields import Deformation, Grid
 
 MOST_STATES = 12
 _SPACING = 0.6  # largest distance of a time from a state if states are blended: RMS displacement of moving voxels, in voxels
-_SPACING_OF_NEAREST = 0.3  # largest such distance if each time takes the nearest state, without a blend
+_SPACING_OF_NEAREST = 0.3  # the same if each time takes the nearest state, without a blend
 _MOVES = 0.1  # a voxel counts as moving if its squared displacement is at least this fraction of the largest one
 
 
