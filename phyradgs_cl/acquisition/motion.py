@@ -212,8 +212,8 @@ class Exact(_Model):
     """Gaussians move on the panel during a frame, which is divided into ``segments`` of time. Every line integrates over
     its own exposure.
 
-    With ``segments`` = 0 a frame has as many as keep its relative RMS error below ``time_error``. ``time_error`` also
-    limits the error of the numerical integration over time. Raises InputError for numbers out of range."""
+    With ``segments`` = 0 a frame has as many as keep its relative RMS error (dimensionless) below ``time_error``, which
+    also limits the error of the numerical integration over time. Raises InputError for numbers out of range."""
 
     poses: ClassVar = "integrals over time, of splats"
     operators: ClassVar = (SPLATS,)
