@@ -19,22 +19,18 @@ from phyradgs_cl.io.attenuation import attenuation_of
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture
-def large() -> Volume:
-    """Three levels, with odd counts and unequal sides; in every direction longer than a chunk."""
-    grid = Grid((131, 70, 300), (2.0, 1.5, 0.25), (10.0, -4.0, 3.0))
-    return Volume(np.random.default_rng(5).uniform(0, 0.03, grid.shape).astype(np.float32), grid)
-
-
 def write_image(*given, **named) -> None:
     from ome_zarr import writer  # takes seconds, in every process that collects tests
 
     writer.write_image(*given, **named)
 
 
-def test_every_level_has_the_means_and_places_of_the_one_before(large, tmp_path) -> None:
+def test_every_level_has_the_means_and_places_of_the_one_before(tmp_path) -> None:
+    """Three levels, with odd counts and unequal sides; in every direction longer than a chunk."""
     from ome_zarr_models import open_ome_zarr
 
+    grid = Grid((131, 70, 300), (2.0, 1.5, 0.25), (10.0, -4.0, 3.0))
+    large = Volume(np.random.default_rng(5).uniform(0, 0.03, grid.shape).astype(np.float32), grid)
     write_zarr(tmp_path / "v.ome.zarr", large, None)
     image = open_ome_zarr(zarr.open_group(str(tmp_path / "v.ome.zarr"), mode="r"))
     assert image.ome_attributes.version == "0.5"
@@ -49,10 +45,10 @@ def test_every_level_has_the_means_and_places_of_the_one_before(large, tmp_path)
         scale, translation = level.coordinateTransformations
         assert scale.scale == pytest.approx(np.array((2.0, 1.5, 0.25)) * 2**n)
         corner_mm = np.array(translation.translation) - np.array(scale.scale) / 2
-        assert corner_mm == pytest.approx(large.grid.box_mm[:, 0])
+        assert corner_mm == pytest.approx(grid.box_mm[:, 0])
     again = load_volume(tmp_path / "v.ome.zarr")
     np.testing.assert_array_equal(again.values, large.values)
-    assert again.grid.is_close(large.grid)
+    assert again.grid.is_close(grid)
 
 
 @pytest.mark.parametrize("scale", [None, Hounsfield(0.02, 0.001)])
@@ -66,7 +62,8 @@ def test_no_second_copy_of_the_volume_is_made(tmp_path, scale) -> None:
     assert peak_bytes < 0.4 * values.nbytes, peak_bytes
 
 
-def test_other_programs_versions_units_axes_and_types(tmp_path) -> None:
+def test_other_programs_versions_units_axes_and_types(tmp_path, caplog) -> None:
+    """A folder without units has no scale."""
     from ome_zarr.format import FormatV04
 
     counts = np.random.default_rng(1).integers(-1000, 3000, (1, 1, 6, 5, 4)).astype(np.int16)
@@ -85,9 +82,6 @@ def test_other_programs_versions_units_axes_and_types(tmp_path) -> None:
         axis["name"] = name
     group.attrs["ome"] = facts
     np.testing.assert_array_equal(load_volume(tmp_path / "xyz.zarr").values, counts[0, 0].astype(np.float16))
-
-
-def test_a_folder_without_units_has_no_scale(tmp_path, caplog) -> None:
     write_image(np.ones((4, 5, 6), np.float32), str(tmp_path / "bare.zarr"), axes="zyx")
     assert load_volume(tmp_path / "bare.zarr").grid is None and "no sizes in a unit of length" in caplog.text
 

@@ -77,8 +77,7 @@ def test_a_bigtiff_has_the_same_grid(exported, stored, monkeypatch) -> None:
     assert_same(path, stored)
 
 
-TURNED = [("t.mhd", "PIR"), ("t.nii", "SAL"), ("t.nii.gz", "ARS"), ("t.nrrd", "PIR"), ("t.nrrd", "SAL")]
-TURNED += [("t.mha", order) for order in ("RAS", "LPI", "PIR", "SAL", "ARS")]
+TURNED = [("t.mhd", "PIR"), ("t.nii", "SAL"), ("t.nii.gz", "ARS"), ("t.nrrd", "PIR"), ("t.mha", "RAS"), ("t.mha", "LPI")]
 
 
 @pytest.mark.parametrize(("name", "order"), TURNED)
@@ -154,7 +153,7 @@ def test_a_wrong_file_is_one_line(exported, name) -> None:
 def test_a_grid_beside_an_array_must_be_its_own(exported) -> None:
     path = exported("v.npy")
     good = json.loads(path.with_suffix(".json").read_text())
-    for key, value in (("shape", [1, 2, 3]), ("voxel_size_mm", [1, 2, "x"]), ("first_centre_mm", 5)):
+    for key, value in (("shape", [1, 2, 3]), ("voxel_size_mm", [1, 2, "x"])):
         path.with_suffix(".json").write_text(json.dumps({**good, key: value}))
-        with pytest.raises(InputError, match=rf"json.*{'shape' if key == 'shape' else key}"):
+        with pytest.raises(InputError, match=f"json.*{key}"):
             load_volume(path)
