@@ -51,10 +51,15 @@ def test_what_was_written_is_read(path) -> None:
         rewrite(path, {"volume.npy": npy(np.asfortranarray(ARRAYS["volume"]))})
 
 
-def test_none_or_another_versions(path) -> None:
+def test_none_another_versions_or_one_that_cannot_be_opened(path, monkeypatch) -> None:
+    def closed(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
     refused(path.with_name("none.npz"), "no checkpoint")
     rewrite(path, {"format.npy": npy(np.array(1))})
     refused(path, "a checkpoint of another version")
+    monkeypatch.setattr(zipfile, "ZipFile", closed)
+    refused(path, r"a damaged checkpoint \(Permission denied\)")
 
 
 class Bomb:
@@ -92,11 +97,3 @@ def test_a_changed_byte_is_noticed(path) -> None:
         content[at] ^= 0x11
         path.write_bytes(content)
         refused(path, "a damaged checkpoint")
-
-
-def test_one_that_cannot_be_opened_says_why(path, monkeypatch) -> None:
-    def closed(*_: object, **__: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(zipfile, "ZipFile", closed)
-    refused(path, r"a damaged checkpoint \(Permission denied\)")

@@ -44,15 +44,12 @@ def _folded(file: h5py.File, address: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "damage", "subject", "found"), [
-    ("control", removed, "/control", "nothing there"), ("weights", removed, "/weights", "nothing there"),
-    ("control", value(np.zeros((2, 3, 4, 5))), "/control", "shape"),
-    ("origin", value(np.zeros(2)), "/origin", "shape"),
+    ("weights", removed, "/weights", "nothing there"), ("control", value(np.zeros((2, 3, 4, 5))), "/control", "shape"),
     ("spacing", value(np.array([4.0, 0.0, 6.0])), "deformation", "spacing_mm"),
     ("times", value(np.array([0.0, 3.0, 1.0])), "deformation", "times_s"),
     ("weights", value(np.zeros((2, 2))), "/weights", "shape"),
     ("weights", value(np.full((3, 2), np.nan)), "/weights", "NaN"),
-    ("times", attribute("units", "mm"), "/times @units", "'mm'"),
-    ("control", _folded, "deformation", "folds"),
+    ("times", attribute("units", "mm"), "/times @units", "'mm'"), ("control", _folded, "deformation", "folds"),
 ])  # fmt: skip
 def test_damage_is_named_in_one_line(path: Path, name: str, damage: Change, subject: str, found: str) -> None:
     on(f"{GROUP}/{name}", damage)(path)
@@ -86,7 +83,6 @@ def test_a_scan_holds_states_and_how_they_came_about(tmp_path: Path, make_scan: 
 @pytest.mark.parametrize(("name", "damage"), [
     ("states", removed), ("state_times", removed), ("deformation/control", removed),
     ("states", value(np.ones((3, 2, 3, 4)))), ("states", value(np.zeros((2, 2, 3, 4)))),
-    ("state_times", value(np.full(2, np.nan))),
 ])  # fmt: skip
 def test_damaged_states_are_named(tmp_path, make_scan, name, damage) -> None:
     path = tmp_path / "scan.h5"

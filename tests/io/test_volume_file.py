@@ -1,14 +1,16 @@
-"""Volume files: what is written comes back, viewers find their axes, damage is named."""
+"""Volume files: what is written comes back, viewers find their axes, damage is named; and bare arrays."""
 
 import hashlib
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from damage import on, removed, value
+from damage import attribute, on, removed, value
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gaussians, Grid, States
+from phyradgs_cl.importers import load_attenuation, load_volume
 from phyradgs_cl.io import read_states, read_volume, sha256_of, volume_summary, write_volume
 
 GRID = Grid((2, 3, 4), (1.5, 1.25, 1.0), (0.1, -0.2, 0.3))
@@ -55,15 +57,6 @@ def test_viewers_find_signal_axes_and_plain_facts(stored) -> None:
         assert facts["method"] == "fdk" and facts["seed"] == 7
 
 
-def test_the_axes_alone_give_the_grid(stored) -> None:
-    path, _, _ = stored
-    with h5py.File(path, "r+") as file:
-        del file["entry/grid"]
-    grid = read_volume(path).grid
-    np.testing.assert_allclose(grid.voxel_size_mm, GRID.voxel_size_mm)
-    np.testing.assert_allclose(grid.offset_mm, GRID.offset_mm)
-
-
 def test_volumes_that_do_not_fit_are_refused(tmp_path) -> None:
     for wrong in (np.zeros((2, 3, 5)), np.full(GRID.shape, np.nan), np.zeros(3)):
         with pytest.raises(InputError, match="^volume: "):
@@ -93,3 +86,67 @@ def test_damage_is_named(stored) -> None:
             with pytest.raises(InputError) as caught:
                 read(path)
             assert caught.value.subject == f"{path}:/{address}"
+
+
+# --- volumes as other programs write them -------------------------------------------------------------------------------
+
+
+def _write(path: Path, data: object) -> Path:
+    with h5py.File(path, "w") as file:
+        file["volume"] = data
+    return path
+
+
+def test_integers_are_divided_by_their_types_maximum(tmp_path: Path) -> None:
+    for dtype, top in (("u1", 255), ("u2", 65535), ("i2", 32767)):
+        data = np.zeros((2, 3, 4), dtype)
+        data[1, 2, 3], data[0, 0, 0] = top, top // 2
+        loaded = load_volume(_write(tmp_path / "v.h5", data))
+        volume = loaded.values
+        assert loaded.grid is None and volume.dtype == np.float32
+        assert volume[1, 2, 3] == 1 and volume[0, 0, 0] == pytest.approx((top // 2) / top, rel=1e-6), dtype
+    data = np.random.default_rng(0).normal(size=(3, 4, 5))
+    assert np.array_equal(load_volume(_write(tmp_path / "v.h5", data)).values, data.astype(np.float32))
+
+
+def test_the_axes_alone_give_the_grid_if_they_exist_are_even_and_have_units(stored) -> None:
+    path, axis = stored[0], "entry/reconstruction/y"
+    on("entry/grid", removed)(path)
+    found = load_volume(path).grid
+    np.testing.assert_allclose((found.voxel_size_mm, found.offset_mm), (GRID.voxel_size_mm, GRID.offset_mm))
+    content = path.read_bytes()
+    on(axis, attribute("units", "cm"))(path)
+    assert load_volume(path).grid.voxel_size_mm == pytest.approx((1.5, 12.5, 1.0))
+    wrong = map(value, ([0.0, 1.0], [0, 1, 3], [4, 3, 2], [0, np.nan, 3]))
+    for damage in (removed, attribute("units", "inch"), *wrong):
+        path.write_bytes(content)
+        on(axis, damage)(path)
+        with pytest.raises(InputError, match=f"volume.h5:/{axis}"):
+            load_volume(path)
+
+
+def test_what_does_not_attenuate_cannot_be_scanned(tmp_path: Path) -> None:
+    for level in (0.0, -0.5):
+        path = _write(tmp_path / "v.h5", np.full((2, 3, 4), level, np.float32))
+        with pytest.raises(InputError, match=r"v.h5: found values from .*; expected attenuation: 0 in air"):
+            load_attenuation(path)
+        assert load_volume(path).values.min() == level
+
+
+def test_hounsfield_units_are_refused_or_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    air_around = np.full((4, 4, 4), -1000.0, np.float32)
+    air_around[1:3, 1:3, 1:3] = 40.0
+    with pytest.raises(InputError, match="found values from -1000 to 40;.*Hounsfield"):
+        load_attenuation(_write(tmp_path / "head.h5", air_around))
+    mostly_bone = np.full((4, 4, 4), 900.0, np.float32)
+    mostly_bone[0] = -1000.0
+    path = _write(tmp_path / "bone.h5", mostly_bone)
+    load_attenuation(path, warn=False)
+    assert not caplog.records
+    load_attenuation(path)
+    assert "bone.h5: values from -1000 to 900, 37 % as much below 0 as above" in caplog.text
+    caplog.clear()  # noise about nothing is no reason to warn
+    volume = np.random.default_rng(0).normal(0, 0.03, (8, 8, 8))
+    volume[2:6, 2:6, 2:6] += 1
+    assert load_attenuation(_write(tmp_path / "v.h5", volume)).values.min() < 0
+    assert not caplog.records
