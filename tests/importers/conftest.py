@@ -27,7 +27,7 @@ from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 collect_ignore = [] if importlib.util.find_spec("itk") else ["test_rtk_projections.py"]
 # With import-mode importlib nothing in this folder has a name of its own: tests import the helpers by these.
 sys.modules["conftest_of_importers"] = sys.modules[__name__]
-for _helper in ("laboratory", "toolkits", "makers", "writers"):
+for _helper in ("laboratory", "writers"):
     _file = Path(__file__).with_name(f"{_helper}.py")
     _spec = importlib.util.spec_from_file_location(f"{_helper}_of_importers", _file)
     sys.modules[_spec.name] = importlib.util.module_from_spec(_spec)

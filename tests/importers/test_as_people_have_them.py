@@ -1,7 +1,6 @@
 """Folders and descriptions as scanners and people leave them: names, flats, angles, texts, packed images."""
 
 import struct
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,6 @@ import laboratory_of_importers as lab
 import numpy as np
 import pytest
 import tifffile
-import writers_of_importers as w
 from PIL import Image
 
 from phyradgs_cl.acquisition import ConeGeometry
@@ -171,18 +169,6 @@ def test_files_of_angles(tmp_path) -> None:
         (tmp_path / "a.txt").write_text(text)
         with pytest.raises(InputError, match=said):
             read_angles_rad(tmp_path / "a.txt", 3)
-
-
-def test_one_angle_for_most_views_is_refused_by_every_door(tmp_path, make_truth) -> None:
-    truth = make_truth()
-    still = replace(truth, angle_rad=np.where(np.arange(6) < 4, truth.angle_rad[0], truth.angle_rad))
-    cone = ImportOptions(source_to_axis_mm=500.0, source_to_detector_mm=800.0)
-    doors = {"r2": w.write_r2, "x.pickle": w.write_naf, "rtk": w.write_rtk, "dx.h5": w.write_data_exchange}
-    doors["tiff"] = w.write_tiff
-    for form, write in doors.items():
-        path, options = write(tmp_path / form, still), cone if form == "dx.h5" else ImportOptions()
-        with pytest.raises(InputError, match="views at one angle"):
-            import_scan(path, options)
 
 
 def test_numbers_in_texts() -> None:

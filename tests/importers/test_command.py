@@ -1,4 +1,4 @@
-"""phyradgs import, as the command line runs it."""
+"""phyradgs import: options and a data sheet's words, at each door in the words of that door; and the TOML to fill in."""
 
 import os
 import re
@@ -8,32 +8,31 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import typer
 import writers_of_importers as w
-from typer.testing import CliRunner
 
 from phyradgs_cl.acquisition import Shutter
-from phyradgs_cl.commands.import_scan import EXAMPLES, import_command
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers import import_scan
+from phyradgs_cl.importers import ImportOptions, import_scan
 from phyradgs_cl.io import read_scan
 
 pytestmark = pytest.mark.slow
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "import.md"
+CONE = ("--source-to-axis-mm", "500", "--source-to-detector-mm", "800")
+SHEET = {"first": "left", "fps": 0.8, "readout_ms": 300.0}
+SHEET_TOML = '[timing]\nexposure_s = 0.4\n[readout]\nfirst = "left"\nfps = 0.8\nreadout_ms = 300.0'
+SHEET_WORDS = ("--exposure-ms", "400", "--first", "left", "--fps", "0.8", "--readout-ms", "300")
 
 
 @pytest.fixture
-def run(tmp_path):
-    """(input, words...) → what the command did; its scan.h5 is in tmp_path where none other is named."""
-    app = typer.Typer(rich_markup_mode=None)
-    app.command("import", epilog=EXAMPLES["import"])(import_command)
+def run(cli, capsys, tmp_path):
+    """(words...) → (status, standard output, standard error) of `phyradgs import` to scan.h5."""
 
-    def command(path: Path, *words: object, out: Path = tmp_path / "scan.h5", ok: bool = True):
-        done = CliRunner().invoke(app, [str(a) for a in (path, "-o", out, *words)])
-        assert done.exit_code == 0 or not ok, (done.output, done.exception)
-        return done
+    def command(*words: object, out: tuple[str, ...] = ("-o", str(tmp_path / "scan.h5"))) -> tuple[int, str, str]:
+        status = cli.run(["import", *map(str, words), *out])
+        captured = capsys.readouterr()
+        return status, captured.out, captured.err
 
     return command
 
@@ -43,9 +42,107 @@ def imported(tmp_path):
     return lambda: read_scan(tmp_path / "scan.h5", counts_to_attenuation)
 
 
+def test_three_doors_take_a_data_sheet(run, imported, tmp_path, make_truth) -> None:
+    truth, model = make_truth(fly=True, axis="columns"), {"detector_model": "intensity"}
+    toml = SHEET_TOML.replace("[readout]", 'detector_model = "intensity"\n[readout]')
+    plain, stated = w.write_tiff(tmp_path / "a", truth), w.write_tiff(tmp_path / "b", truth, toml)
+    assert run(plain, *SHEET_WORDS, "--detector-model", "intensity")[0] == 0
+    for scan in (imported(), import_scan(plain, ImportOptions(exposure_s=0.4, **SHEET, **model)), import_scan(stated)):
+        assert scan.shutter == Shutter(0.4, 0.3, "columns", 1) and scan.detector_model == "intensity"
+        np.testing.assert_allclose(scan.frame_start_s, 1.25 * np.arange(6))
+    assert import_scan(stated, ImportOptions(detector_model="log")).detector_model == "log"
+    bad = w.write_tiff(tmp_path / "c", truth, toml.replace("intensity", "intensty"))
+    assert "[timing] detector_model: found 'intensty'" in run(bad)[2]
+
+
+def test_import_prints_what_it_took_and_what_it_assumed(run, tmp_path, make_truth) -> None:
+    stated = w.write_tiff(tmp_path / "s", make_truth(fly=True), SHEET_TOML)
+    order = "columns read in 300 ms, left first; 0.8 fps; exposure 8° in 400 ms"
+    assumed = "angles as each frame opens (assumed); averages line integrals (assumed)"
+    assert f"timing: {order}; {assumed}\n" in run(stated)[1]
+    _, out, _ = run(stated, "--angle-at", "start", "--detector-model", "intensity")
+    assert f"timing: {order}; averages intensity\n" in out and "\nblur at the rim: " in out
+    assert re.search(r"^sizes: field of view .* mm \(z, y, x\), fan .*°, cone .*°, voxels .* mm, largest", out, re.M)
+    assert "timing: every frame at rest\n" in run(w.write_r2(tmp_path / "r", make_truth()))[1]
+
+
+def test_contradictions_are_refused_in_the_words_of_the_door(run, tmp_path, make_truth) -> None:
+    """The TOML's keys where there is one; an option that the user gave is named as an option; Python by its arguments."""
+    truth = make_truth()
+    path = w.write_rtk(tmp_path / "rtk", truth)
+    with pytest.raises(InputError, match=r"^exposure_s: .* say frame_time_s or fps$"):
+        import_scan(path, ImportOptions(exposure_s=0.4))
+    for words, said in {("--fps", "15"): "say --exposure-ms", ("--readout-ms", "62"): "--readout-ms: found no time"}.items():
+        status, _, error = run(path, *words)
+        assert status == 2 and error.count("\n") == 1 and said in error, (words, error)
+    for number, (lines, said) in enumerate({
+        '[readout]\nfirst = "left"\naxis = "rows"': "[readout] first: found 'left' with",
+        "[timing]\nexposure_s = 0.1\nstart_s = [0, 1, 2, 3, 4, 5]\n[readout]\nfps = 15": "[readout] fps: found 15 with",
+        "[timing]\nexposure_s = 0.1\nreadout_s = 2.0\n[readout]\nreadout_ms = 62": "[readout] readout_ms: found 62 with",
+        "[readout]\nreadout_ms = 62": "[readout] readout_ms: found no time",
+    }.items()):  # fmt: skip
+        status, _, error = run(w.write_tiff(tmp_path / f"t{number}", truth, lines))
+        assert status == 2 and error.count("\n") == 1 and said in error and "--" not in error, (lines, error)
+    error = run(w.write_tiff(tmp_path / "tiff", truth), "--angle-at", "middle")[2]
+    assert "--angle-at: found no time" in error and "say [timing] frame_time_s or [readout] fps" in error
+
+
+def test_import_says_which_flats_and_darks_it_applied_and_warns_of_none(run, tmp_path, make_truth, caplog) -> None:
+    folder = w.write_tiff(tmp_path / "tiff", make_truth())
+    assert "6 frames of 10×14, 2 flats and 3 darks applied, at rest, 0 pixels masked" in run(folder)[1]
+    assert not caplog.messages
+    assert "0 flats and 3 darks applied" in run(folder, "--flat-value", "5e4")[1]
+    run(folder, "--quantity", "transmission")
+    assert "2 flats and 3 darks are left out, because the projections hold transmission" in caplog.text
+    text = (folder / "scan.toml").read_text()
+    (folder / "scan.toml").write_text(text.replace('darks = "dark_*.tif"', ""))
+    assert "2 flats and 0 darks applied" in run(folder)[1]
+    assert "scan.toml: counts without darks: an offset of the panel stays" in caplog.text
+    assert "applied" not in run(w.write_r2(tmp_path / "r", make_truth()))[1]
+
+
+def filled_in(text: str, **values: object) -> str:
+    """The template with values for some of its keys, where they stand or after the # is removed."""
+    for key, value in values.items():
+        text, count = re.subn(rf"^(# )?{key} = [^#]*", f"{key} = {value} ", text, flags=re.M)
+        assert count == 1, key
+    return text
+
+
+def test_a_template_that_is_filled_in_is_the_same_scan(run, tmp_path, make_truth, assert_same) -> None:
+    truth = make_truth(fly=True, axis="columns")
+    folder = w.write_tiff(tmp_path / "tiffs", truth)
+    (folder / "scan.toml").unlink()
+    assert f"phyradgs import {folder} --template" in run(folder)[2]
+    np.savetxt(folder / "angles.txt", np.rad2deg(truth.angle_rad))
+    status, text, error = run(folder, "--template", out=())
+    assert (status, error) == (0, "") and not (tmp_path / "scan.h5").exists()
+    stored = {"flats": '"flat_*.tif"', "darks": '"dark_*.tif"', "file": '"angles.txt"'}
+    (folder / "scan.toml").write_text(filled_in(text, **stored), encoding="utf-8")
+    assert "[source] to_axis_mm: found 0" in run(folder)[2]
+    cone = {"to_axis_mm": 500, "to_detector_mm": 800, "pixel_size_v_mm": 3.0, "pixel_size_u_mm": 2.5}
+    moved = {"offset_v_mm": 4.0, "offset_u_mm": -6.0, "exposure_s": 0.4, **SHEET, "first": '"left"'}
+    (folder / "scan.toml").write_text(filled_in(text, **cone, **moved, **stored), encoding="utf-8")
+    assert_same(import_scan(folder), truth, grid=False)
+
+
+SAID = {"exposure_s": 0.4, "readout_s": 0.3, "angle_at": "middle", "readout_axis": "rows", "readout_direction": -1}
+SAID |= {"first": "left", "readout_ms": 300.0}
+
+
+def test_a_turn_without_a_frame_time_is_refused(tmp_path, make_truth) -> None:
+    """An exposure that replaces the file's count_time says no more than that."""
+    path, timed = w.write("rtk", tmp_path, make_truth), w.write("nxtomo", tmp_path, make_truth)
+    assert not import_scan(timed, ImportOptions(exposure_s=0.4)).is_fly
+    for name, value in SAID.items():
+        with pytest.raises(InputError, match=f"^{name}: .*time from frame to frame.*say .*frame_time_s or .*fps"):
+            import_scan(path, ImportOptions(**{name: value}))
+        assert import_scan(path, ImportOptions(frame_time_s=1.25, **{"exposure_s": 0.4, name: value})).is_fly
+
+
 def test_a_folder_becomes_a_scan(run, imported, tmp_path, make_truth) -> None:
     path = w.write_r2(tmp_path / "r2", make_truth())
-    assert "r2, 6 frames of 10×14, at rest" in run(path, "--part", "all", "--unit-mm", "2").output
+    assert "r2, 6 frames of 10×14, at rest" in run(path, "--part", "all", "--unit-mm", "2")[1]
     assert imported().geometry.source_to_axis_mm == pytest.approx(1000)
     assert imported().provenance["imported_from"] == str(path)
 
@@ -55,19 +152,21 @@ def test_the_grid_by_options(run, imported, tmp_path, make_truth) -> None:
     rtk, r2 = w.write_rtk(tmp_path / "rtk", make_truth()), w.write_r2(tmp_path / "r2", make_truth())
     run(rtk, "--size", "6,7,8")
     assert imported().grid.shape == (6, 7, 8) and imported().reference is None
-    assert "is on another grid and is left out" in run(r2, "--size", "9", "--voxel-mm", "0.5").output
+    assert "is on another grid and is left out" in "".join(run(r2, "--size", "9", "--voxel-mm", "0.5")[1:])
     assert imported().grid.voxel_size_mm == (0.5, 0.5, 0.5) and imported().reference is None
-    assert "left out" not in run(r2).output and imported().reference is not None
+    assert "left out" not in "".join(run(r2)[1:]) and imported().reference is not None
 
 
 def test_timing_and_geometry_by_options(run, imported, tmp_path, make_truth) -> None:
     timing = ["--exposure-ms", "400", "--readout-ms", "300", "--fps", "0.8", "--first", "right"]
-    done = run(w.write_rtk(tmp_path / "rtk", make_truth()), *timing)
-    assert "fly-scan" in done.output and imported().shutter == Shutter(0.4, 0.3, "columns", -1)
+    assert "fly-scan" in run(w.write_rtk(tmp_path / "rtk", make_truth()), *timing)[1]
+    assert imported().shutter == Shutter(0.4, 0.3, "columns", -1)
     path = w.write_data_exchange(tmp_path / "dx.h5", make_truth())
-    cone = ["--source-to-axis-mm", "500", "--source-to-detector-mm", "800", "--detector-offset", "4,-6"]
-    run(path, *cone, "--pixel-size-mm", "3,2.5", "--rotates", "sample", "--row-0", "top")
+    told = ("--detector-offset", "4,-6", "--pixel-size-mm", "3,2.5", "--rotates", "sample", "--row-0", "top")
+    assert run(path, *CONE, *told)[0] == 0
     np.testing.assert_allclose(imported().projections, make_truth().scan.projections, atol=1e-5)
+    assert run(path, *CONE, "--pixel-size-mm", "2.5")[0] == 0 and imported().geometry.pixel_size_mm == (2.5, 2.5)
+    assert "one for square pixels; write for example 0.148" in run(path, *CONE, "--pixel-size-mm", "2.5,")[2]
 
 
 def test_the_documentation_s_example_runs(tmp_path, make_truth, monkeypatch) -> None:
@@ -89,11 +188,11 @@ def test_nothing_that_is_read_is_overwritten(run, tmp_path, make_truth) -> None:
     before = {path: path.read_bytes() for path in folder.iterdir()}
     assert len(before) >= 2
     for victim in before:
-        done = run(folder, out=victim, ok=False)
-        assert isinstance(done.exception, InputError) and done.exception.subject == "--output"
+        status, _, error = run(folder, out=("-o", str(victim)))
+        assert status == 2 and error.startswith("phyradgs: --output: ")
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
     for _ in range(2):
-        run(folder, out=folder / "scan.h5")
+        assert run(folder, out=("-o", str(folder / "scan.h5")))[0] == 0
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="file systems that take any bytes")
@@ -103,7 +202,7 @@ def test_a_title_with_a_nul_and_a_folder_whose_name_is_no_text(run, imported, tm
     text = description.read_text()
     for title in (r'title = "a\u0000b\u001b"', ""):
         description.write_text(text.replace('title = "tiff"', title))
-        run(folder)
+        assert run(folder)[0] == 0
         assert imported().title == ("a\ufffdb\ufffd" if title else "bad\ufffd")
         assert imported().provenance["imported_from"] == str(folder)
 
@@ -116,7 +215,6 @@ def test_frames_without_a_pixel_are_named_and_do_not_count(run, tmp_path) -> Non
         file["exchange/data"], file["exchange/theta"] = counts, np.array([0.0, 120.0, 240.0])
         file["exchange/data_white"] = np.full((2, 4, 5), 1000.0, np.float32)
         file["exchange/data_dark"] = np.zeros((1, 4, 5), np.float32)
-    where = ("--source-to-axis-mm", "500", "--source-to-detector-mm", "800", "--pixel-size-mm", "1,1")
-    done = run(tmp_path / "dx.h5", *where)
-    assert all(text in done.output for text in ("20 pixels masked", "largest line integral 0.693"))
-    assert "no pixel can be used in 1 frames (from 0): 1" in done.output
+    said = "".join(run(tmp_path / "dx.h5", *CONE, "--pixel-size-mm", "1,1")[1:])
+    for text in ("20 pixels masked", "largest line integral 0.693", "no pixel can be used in 1 frames (from 0): 1"):
+        assert text in said

@@ -1,5 +1,9 @@
-"""Raw projections of makers, read by the package itk-rtk, where that is installed (conftest.py)."""
+"""Raw projections of makers, read by the package itk-rtk, where that is installed (conftest.py).
 
+They are written here as Elekta, Varian and medPhoton write them, in the layouts that RTK's readers state. ``AIR`` are the
+counts that RTK takes for air."""
+
+import struct
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -7,11 +11,157 @@ from typing import Any
 
 import numpy as np
 import pytest
-from makers_of_importers import AIR, write_elekta, write_obi, write_ora, write_probeam
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
+
+RIM = 4  # pixels that RTK cuts off each side of Elekta's images
+AIR = {"his": 65536, "hnd": 139000, "hnc": 65535, "xim": 139000}
+TABLE_CM, ALONG_CM = -2.0, 1.5  # where medPhoton's ring stood: RTK takes them from the places
+
+
+def frames_of(truth: Any) -> list[tuple[float, np.ndarray]]:
+    """The gantry's angle in degrees and line integrals (v, u), frame by frame."""
+    angles_deg = np.rad2deg(truth.angle_rad).round(9).tolist()
+    return list(zip(angles_deg, truth.scan.projections.astype(np.float64), strict=True))
+
+
+def counts(integrals: np.ndarray, air: float) -> np.ndarray:
+    return np.round(air * np.exp(-integrals)).astype(np.int64)
+
+
+def write_elekta(folder: Path, truth: Any) -> Path:
+    """_Frames.xml with the panel's places, and .HIS images: 100 bytes of header, 65536 less the counts in 16 bits."""
+    folder.mkdir()
+    off_v, off_u = truth.scan.geometry.detector_offset_mm
+    frames = []
+    for i, (angle_deg, integrals) in enumerate(frames_of(truth), start=1):
+        place = f"<GantryAngle>{angle_deg}</GantryAngle><UCentre>{-off_u}</UCentre><VCentre>{-off_v}</VCentre>"
+        frames.append(f"<Frame><Seq>{i}</Seq>{place}</Frame>")
+        rows, columns = (count + 2 * RIM for count in integrals.shape)
+        header = bytearray(68)
+        header[:4] = bytes([0, 112, 68, 0])
+        struct.pack_into("<HHHHHH", header, 10, 32, 1, 1, rows, columns, 1)
+        struct.pack_into("<H", header, 32, 4)
+        image = np.zeros((rows, columns), np.uint16)
+        image[RIM:-RIM, RIM:-RIM] = AIR["his"] - counts(integrals, AIR["his"])
+        (folder / f"{i:05d}.his").write_bytes(bytes(header) + bytes(32) + image.astype("<u2").tobytes())
+    text = f"<?xml version='1.0'?><ImageFrames><Frames>{''.join(frames)}</Frames></ImageFrames>"
+    (folder / "_Frames.xml").write_text(text)
+    return folder
+
+
+def differences(image: np.ndarray) -> tuple[bytes, bytes]:
+    """Varian's packing of an image (v, u): which of 1, 2 or 4 bytes each difference has, two bits for each; and the first
+    row and a pixel in 4 bytes, then what each pixel differs by from left + below − below left."""
+    flat, columns = image.astype(np.int64).ravel(), image.shape[1]
+    i = np.arange(columns + 1, flat.size)
+    steps = flat[i] - (flat[i - 1] + flat[i - columns] - flat[i - columns - 1])
+    sizes = np.where(np.abs(steps) < 128, 0, np.where(np.abs(steps) < 32768, 1, 2))
+    codes = np.zeros(4 * ((len(steps) + 3) // 4), np.uint8)
+    codes[: len(sizes)] = sizes
+    table = (codes.reshape(-1, 4) << np.array([0, 2, 4, 6], np.uint8)).sum(1).astype(np.uint8)
+    pairs = zip(steps.tolist(), sizes.tolist(), strict=True)
+    packed = b"".join(step.to_bytes(1 << size, "little", signed=True) for step, size in pairs)
+    return table.tobytes(), flat[: columns + 1].astype("<u4").tobytes() + packed
+
+
+def obi_header(shape: tuple[int, int], pitch_mm: tuple[float, float], angle_deg: float) -> bytes:
+    """The header of .hnd and .hnc: words and numbers in a fixed order, of which RTK reads size, pitch and angle."""
+    text = struct.pack(
+        "<32sI4sI8s8s16sI16sI16sI", b"VARIAN_VA_INTERNAL_HNC_1.0", 0, b"", 0, b"", b"", b"", 0, b"", 0, b"", 0
+    )
+    text += struct.pack("<IId16sIII4s", shape[1], shape[0], 0.0, b"RTIMAGE", 0, 0, 0, b"")
+    numbers = np.zeros(40)
+    numbers[[23, 24]] = pitch_mm[::-1]  # dIDUResolutionX, -Y
+    numbers[33] = angle_deg  # dCTProjectionAngle
+    return text + numbers.astype("<f8").tobytes()
+
+
+def write_obi(folder: Path, truth: Any, suffix: str, fan: str = "HalfFan") -> Path:
+    """ProjectionInfo.xml, and .hnd of packed differences or .hnc of 16 bits. The panel's place across is the sum of two in
+    HalfFan, and the first of them alone in FullFan."""
+    folder.mkdir()
+    g = truth.scan.geometry
+    off_v, off_u = g.detector_offset_mm
+    lateral_mm = 40.0
+    values = {
+        "CalibratedSAD": g.source_to_axis_mm, "CalibratedSID": g.source_to_detector_mm, "FanType": fan,
+        "CalibratedDetectorOffsetX": off_u - lateral_mm * (fan == "HalfFan"), "CalibratedDetectorOffsetY": off_v,
+        "DetectorPosLat": lateral_mm, "DetectorSizeX": 400, "DetectorSizeY": 300, "GantryRtnSpeed": 6,
+    }  # fmt: skip
+    inner = "".join(f"<{name}>{value}</{name}>" for name, value in values.items())
+    (folder / "ProjectionInfo.xml").write_text(f"<?xml version='1.0'?><ProjectionInfo>{inner}</ProjectionInfo>")
+    for i, (angle_deg, integrals) in enumerate(frames_of(truth)):
+        image, header = counts(integrals, AIR[suffix]), obi_header(integrals.shape, g.pixel_size_mm, angle_deg)
+        if suffix == "hnc":
+            body = header.ljust(512, b"\0") + image.astype("<u2").tobytes()
+        else:
+            body = header.ljust(1024, b"\0") + b"".join(differences(image))
+        (folder / f"Proj_{i:05d}.{suffix}").write_bytes(body)
+    return folder
+
+
+def write_probeam(folder: Path, truth: Any) -> Path:
+    """Scan.xml, and .xim of packed differences in Acquisitions/NUMBER/, each with the panel's place in cm and the source's
+    angle, which turns against the gantry's."""
+    images = folder / "Acquisitions" / "733061622"
+    images.mkdir(parents=True)
+    g = truth.scan.geometry
+    distances = f"<SAD>{g.source_to_axis_mm}</SAD><SID>{g.source_to_detector_mm}</SID>"
+    (folder / "Scan.xml").write_text(f"<?xml version='1.0'?><Scan><Acquisitions>{distances}</Acquisitions></Scan>")
+    off_v, off_u = g.detector_offset_mm
+    for i, (angle_deg, integrals) in enumerate(frames_of(truth)):
+        table, body = differences(counts(integrals, AIR["xim"]))
+        rows, columns = integrals.shape
+        facts = {
+            "KVSourceRtn": 180.0 - angle_deg, "KVDetectorLat": off_u / 10, "KVDetectorLng": off_v / 10,
+            "PixelHeight": g.pixel_size_mm[0] / 10, "PixelWidth": g.pixel_size_mm[1] / 10,
+        }  # fmt: skip
+        words = [struct.pack("<8sIIIIII", b"VMS.XI", 1, columns, rows, 32, 4, 1)]
+        words += [struct.pack("<I", len(table)), table, struct.pack("<I", len(body)), body]
+        words += [struct.pack("<III", 4 * rows * columns, 0, len(facts))]
+        for name, value in facts.items():
+            words.append(struct.pack(f"<I{len(name)}sId", len(name), name.encode(), 1, value))
+        (images / f"Proj_{i:05d}.xim").write_bytes(b"".join(words))
+    return folder
+
+
+def write_ora(folder: Path, truth: Any) -> Path:
+    """An .ora.xml for each MetaImage: places of source and panel, directions along rows and columns, and the transmission
+    as slope × pixel + intercept. RTK's y is the axis of rotation, and z the source's direction at 0°."""
+    folder.mkdir()
+    g = truth.scan.geometry
+    off_v, off_u = g.detector_offset_mm
+    slope, intercept = 1 / 60000, 1e-3
+    for i, (angle_deg, integrals) in enumerate(frames_of(truth)):
+        angle_rad = np.deg2rad(angle_deg)
+        right = np.array([np.cos(angle_rad), 0, -np.sin(angle_rad)])
+        up, back = np.array([0.0, 1, 0]), np.array([np.sin(angle_rad), 0, np.cos(angle_rad)])
+        shift = np.array([0, 10 * ALONG_CM, 10 * TABLE_CM])
+        source = back * g.source_to_axis_mm
+        panel = source - back * g.source_to_detector_mm + right * off_u + up * off_v
+        values = {
+            "SourcePosition": " ".join(map(repr, (source + shift).tolist())),
+            "Origin": " ".join(map(repr, (panel + shift).tolist())),
+            "Direction": " ".join(map(repr, np.stack([right, up, back]).ravel().tolist())),
+            "table_axis_distance_cm": TABLE_CM, "longitudinalposition_cm": ALONG_CM,
+            "rescale_slope": slope, "rescale_intercept": intercept, "MHD_File": f"{i:05d}.mhd",
+        }  # fmt: skip
+        inner = "".join(f"<{name}>{value}</{name}>" for name, value in values.items())
+        (folder / f"{i:05d}.ora.xml").write_text(f"<?xml version='1.0'?><ora>{inner}</ora>")
+        pixels = np.round((np.exp(-integrals) - intercept) / slope).astype("<u2")
+        pitch_v, pitch_u = g.pixel_size_mm
+        rows, columns = integrals.shape
+        (folder / f"{i:05d}.mhd").write_text(
+            f"ObjectType = Image\nNDims = 3\nDimSize = {columns} {rows} 1\nElementSpacing = {pitch_u} {pitch_v} 1\n"
+            f"Offset = {-(columns - 1) / 2 * pitch_u} {-(rows - 1) / 2 * pitch_v} 0\nBinaryData = True\n"
+            f"ElementByteOrderMSB = False\nElementType = MET_USHORT\nElementDataFile = {i:05d}.raw\n"
+        )
+        (folder / f"{i:05d}.raw").write_bytes(pixels.tobytes())
+    return folder
+
 
 # RTK takes Elekta's panel for 409.6 mm, and .hnd to have a multiple of four columns
 GEOMETRIES = {
@@ -88,10 +238,6 @@ def test_what_rtk_does_not_read_is_one_error_of_one_line(make_files) -> None:
     (path / "00003.his").unlink()
     with pytest.raises(InputError, match="found 5 frames, 6 projections in _Frames.xml"):
         import_scan(path)
-
-
-def test_a_description_alone_is_not_taken(make_files) -> None:
-    path, _ = make_files("elekta")
     for file in path.glob("*.his"):
         file.unlink()
     with pytest.raises(InputError, match="found no description with projections"):

@@ -1,6 +1,5 @@
 """A scan in every foreign format, imported, is the scan itself: pixels, geometry, timing, grid and truth."""
 
-import pickle
 from dataclasses import replace
 
 import h5py
@@ -31,9 +30,9 @@ SAME = {
     "phyradgs by columns": ("phyradgs", {}, MOVING | {"direction": 1}, ImportOptions(exposure_s=0.4)),
     "phyradgs by rows": ("phyradgs", {}, MOVING | {"axis": "rows"}, ROWS),
     **{f"naf in {dtype}": ("naf", {"dtype": np.dtype(dtype)}, {}, ALL) for dtype in ("f8", ">f4")},
-    "naf, protocol 2": ("naf", {"protocol": 2}, {}, ALL),
+    "naf, protocol 2": ("naf", {"protocol": 2}, {}, ALL), "naf of NumPy's numbers": ("naf", {"numbers": True}, {}, ALL),
     "rtk flipped and packed": ("rtk", {"flip": True, "compressed": True}, {}, None),
-    "rtk packed": ("rtk", {"compressed": True}, {}, None), "rtk": ("rtk", {}, {}, None),
+    "rtk": ("rtk", {}, {}, None),
     "rtk with a header of its own": ("rtk", {"flip": True, "name": "projections.mhd"}, {}, None),
     "rtk, moving": ("rtk", {}, MOVING, FLY),
     "data-exchange, moving": ("data-exchange", {}, MOVING, replace(FLY, **CONE)),
@@ -46,28 +45,13 @@ SAME = {
 
 SAID = ": a parallel beam"
 OFFSET = {"detector_offset_mm": (4.0, -6.0)}
-# (format, motion, options, whether a line says that no distance is a parallel beam)
 PARALLEL = {
-    "r2": ("r2", {}, ALL, False), "naf": ("naf", {}, ALL, False), "phyradgs": ("phyradgs", {"axis": "rows"}, ROWS, False),
-    "data-exchange": ("data-exchange", {}, ImportOptions(**OFFSET), True),
-    "data-exchange, moving": ("data-exchange", MOVING, replace(FLY, **OFFSET), True),
-    "nxtomo": ("nxtomo", {}, ImportOptions(row_0="bottom"), True),
-    "rtk": ("rtk", {}, None, True), "rtk, moving": ("rtk", MOVING, FLY, True),
-    "tiff": ("tiff", {}, None, False), "tiff, moving": ("tiff", MOVING, FLY, False),
+    "r2": ("r2", {}, {}, ALL), "naf": ("naf", {}, {}, ALL), "phyradgs": ("phyradgs", {}, MOVING | {"axis": "rows"}, ROWS),
+    "data-exchange": ("data-exchange", {}, {}, ImportOptions(**OFFSET)),
+    "data-exchange, moving": ("data-exchange", {}, MOVING, replace(FLY, **OFFSET)),
+    "nxtomo": ("nxtomo", {}, {}, ImportOptions(row_0="bottom")),
+    "rtk": ("rtk", {}, {}, None), "rtk, moving": ("rtk", {}, MOVING, FLY), "tiff, moving": ("tiff", {}, MOVING, FLY),
 }  # fmt: skip
-
-
-@pytest.mark.parametrize("case", PARALLEL)
-def test_the_same_scan_of_a_parallel_beam(tmp_path, make_truth, assert_same, caplog, case) -> None:
-    """An axis off the panel's middle, in mm or in the columns of nxtomo, is the detector's offset."""
-    form, motion, options, is_said = PARALLEL[case]
-    fly = {"fly": True, "direction": -1, **motion} if form == "phyradgs" else motion
-    offset = (0.0, -6.0) if form == "nxtomo" else (4.0, -6.0)
-    truth = make_truth(**fly, geometry=ParallelGeometry((10, 14), (3.0, 2.5), offset))
-    writer, name = w.WRITERS[form]
-    scan = import_scan(writer(tmp_path / name, truth), options)
-    assert_same(scan, truth, grid=form in ("r2", "phyradgs", "naf"), timing=form != "nxtomo")
-    assert caplog.text.count(SAID) == is_said
 
 
 def test_distances_make_a_cone_of_a_file_that_states_none(tmp_path, make_truth, caplog) -> None:
@@ -89,21 +73,26 @@ def test_distances_make_a_cone_of_a_file_that_states_none(tmp_path, make_truth, 
         import_scan(tmp_path / "dx.h5")
 
 
-@pytest.mark.parametrize("case", SAME)
-def test_the_same_scan(tmp_path, make_truth, assert_same, case) -> None:
-    form, how, motion, options = SAME[case]
+@pytest.mark.parametrize(("case", "is_parallel"), [*((case, False) for case in SAME), *((case, True) for case in PARALLEL)])
+def test_the_same_scan(tmp_path, make_truth, assert_same, caplog, case, is_parallel) -> None:
+    """Of a parallel beam an axis off the panel's middle, in mm or in the columns of nxtomo, is the detector's offset, and a
+    line says so where no distance is stated."""
+    form, how, motion, options = (PARALLEL if is_parallel else SAME)[case]
+    flat = {"geometry": ParallelGeometry((10, 14), (3.0, 2.5), (0.0 if form == "nxtomo" else 4.0, -6.0))}
+    truth = make_truth(**motion, **(flat if is_parallel else {}))
     writer, name = w.WRITERS[form]
-    truth = make_truth(**motion)
     path = writer(tmp_path / name, truth, **how)
     assert recognise(path) == form
-    assert_same(import_scan(path, options), truth, grid=form in ("r2", "phyradgs", "naf"))
+    assert_same(import_scan(path, options), truth, grid=form in ("r2", "phyradgs", "naf"), timing=case != "nxtomo")
+    assert caplog.text.count(SAID) == (is_parallel and form in ("data-exchange", "nxtomo", "rtk"))
 
 
 def test_r2_gaussian(tmp_path, make_truth, assert_same) -> None:
     truth = make_truth()
     path = w.write_r2(tmp_path / "r2", truth)
     assert recognise(path) == "r2"
-    assert import_scan(path).frames == truth.scan.frames - 2
+    for one in (path, w.write_naf(tmp_path / "chest.pickle", truth)):
+        assert import_scan(one).frames == truth.scan.frames - 2
     assert import_scan(path, ImportOptions(part="test")).frames == 2
     assert_same(import_scan(path, ALL), truth)
     path = w.write_phyradgs(tmp_path / "phyradgs", make_truth(fly=True))
@@ -119,22 +108,8 @@ def test_a_slow_frame_rate_is_warned_of_where_a_time_was_stated(tmp_path, make_t
     assert "0.8 fps and 25° from frame to frame" in caplog.text
 
 
-def test_naf_with_numpy_s_own_numbers(tmp_path, make_truth, assert_same) -> None:
-    """Scalars and small arrays of NumPy, lists of them, and arrays in Fortran order."""
-    content = w.naf_dict(make_truth())
-    for key in ("DSD", "DSO"):
-        content[key] = np.float64(content[key])
-    for key in ("nDetector", "dDetector", "nVoxel", "dVoxel", "offOrigin", "offDetector"):
-        content[key] = np.array(content[key])
-    for part in ("train", "val"):
-        content[part]["angles"] = list(content[part]["angles"])
-        content[part]["projections"] = np.asfortranarray(content[part]["projections"])
-    (tmp_path / "chest.pickle").write_bytes(pickle.dumps(content))
-    assert_same(import_scan(tmp_path / "chest.pickle", ALL), make_truth())
-    assert import_scan(tmp_path / "chest.pickle").frames == make_truth().scan.frames - 2
-
-
 def test_data_exchange(tmp_path, make_truth, assert_same) -> None:
+    """Some beamlines store one mean image (v, u) of flats and darks, without an axis of frames."""
     truth = make_truth()
     path = w.write_data_exchange(tmp_path / "scan.h5", truth, dead=(2, 11))
     assert recognise(path) == "data-exchange"
@@ -142,20 +117,15 @@ def test_data_exchange(tmp_path, make_truth, assert_same) -> None:
     assert_same(scan, truth, grid=False)
     assert scan.pixel_mask.shape == truth.scan.geometry.detector_shape
     assert list(zip(*np.nonzero(scan.pixel_mask), strict=True)) == [(2, 11)]
-
-
-def test_data_exchange_with_mean_flats_and_darks(tmp_path, make_truth, assert_same) -> None:
-    """Some beamlines store one mean image (v, u), without an axis of frames."""
-    path = w.write_data_exchange(tmp_path / "scan.h5", make_truth())
     with h5py.File(path, "r+") as file:
         for name in ("data_white", "data_dark"):
             mean = file[f"exchange/{name}"][()].mean(axis=0)
             del file[f"exchange/{name}"]
             file[f"exchange/{name}"] = mean
-    assert_same(import_scan(path, ImportOptions(**CONE)), make_truth(), grid=False)
+    assert_same(import_scan(path, ImportOptions(**CONE)), truth, grid=False)
 
 
-@pytest.mark.parametrize("flips", [(False, False), (True, False), (False, True), (True, True)])
+@pytest.mark.parametrize("flips", [(True, False), (False, True)])
 def test_nxtomo(tmp_path, make_truth, assert_same, caplog, flips) -> None:
     """What the format does not say, the option does, after the flips that the file declares; a line says what is assumed."""
     truth = make_truth(geometry=replace(make_truth().scan.geometry, detector_offset_mm=(0.0, -6.0)))
@@ -174,10 +144,9 @@ def test_nxtomo(tmp_path, make_truth, assert_same, caplog, flips) -> None:
     assert "row 0" not in caplog.text
 
 
-@pytest.mark.parametrize("compression", [None, "zlib"])
-def test_tiff(tmp_path, make_truth, assert_same, compression) -> None:
+def test_tiff(tmp_path, make_truth, assert_same) -> None:
     truth = make_truth()
-    path = w.write_tiff(tmp_path / "tiff", truth, dead=(7, 3), compression=compression)
+    path = w.write_tiff(tmp_path / "tiff", truth, dead=(7, 3))
     assert recognise(path) == "tiff"
     scan = import_scan(path)
     truth = replace(truth, scan=replace(truth.scan, reference=None))
@@ -201,14 +170,11 @@ def test_tiff_of_many_pages(tmp_path, make_truth, assert_same, way) -> None:
     assert_same(import_scan(path), replace(truth, scan=replace(truth.scan, reference=None)), grid=False, pixels=1e-5)
 
 
-@pytest.mark.parametrize("unit", ["deg", "rad"])
-def test_tiff_with_a_file_of_angles(tmp_path, make_truth, assert_same, unit) -> None:
+def test_tiff_with_a_file_of_angles(tmp_path, make_truth, assert_same) -> None:
     """Given one by one, angles may go with frames whose numbering has holes."""
     truth = make_truth()
-    angles = f"file = 'angles.txt'\nunit = '{unit}'"
-    path = w.write_tiff(tmp_path / "tiff", truth, angles=angles)
-    values = truth.angle_rad if unit == "rad" else np.rad2deg(truth.angle_rad)
-    lines = [f"{value!r}  # frame {i}" for i, value in enumerate(values.tolist())]
+    path = w.write_tiff(tmp_path / "tiff", truth, angles="file = 'angles.txt'\nunit = 'rad'")
+    lines = [f"{value!r}  # frame {i}" for i, value in enumerate(truth.angle_rad.tolist())]
     (path / "angles.txt").write_text("# of the gantry\n\n" + "\n".join(lines) + "\n")
     (path / "proj_5.tif").rename(path / "proj_11.tif")
     assert_same(import_scan(path), truth, grid=False)

@@ -1,38 +1,30 @@
-"""Geometries of TIGRE and LEAP: each against its own formula, and reconstructions to the bit."""
+"""Geometries of TIGRE and LEAP: each against its own formula."""
 
 import sys
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
-import toolkits_of_importers as kits
+import writers_of_importers as w
 from conftest_of_importers import GEOMETRY, WORLD_POINTS, pose_at, projected
 
 from phyradgs_cl.acquisition import CircularOrbit, ParallelGeometry, PoseTable
-from phyradgs_cl.api import reconstruct
-from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
-from phyradgs_cl.io import read_scan, write_scan
 
 pytestmark = pytest.mark.slow
 
 SQUARE = replace(GEOMETRY, detector_offset_mm=(3.0, -5.0))  # whole and half pixels, which text keeps to the bit
-WRITERS: dict[str, tuple[Callable[..., Path], str]] = {
-    "leap": (kits.write_leap, "leap"), "tigre": (kits.write_tigre, "scan.pickle"),
-}  # fmt: skip
 FLAT = ParallelGeometry((10, 14), (3.0, 2.5), (3.0, -5.0))
 
 
 @pytest.mark.parametrize("geometry", [SQUARE, FLAT], ids=["cone", "parallel"])
-@pytest.mark.parametrize("form", WRITERS)
+@pytest.mark.parametrize("form", ["leap", "tigre"])
 def test_pixels_and_geometry_are_those_of_the_scan_that_was_written(
     tmp_path, make_truth, assert_same, form, geometry
 ) -> None:
-    writer, name = WRITERS[form]
+    writer, name = w.WRITERS[form]
     truth = make_truth(geometry=geometry)
     truth = replace(truth, scan=replace(truth.scan, grid=replace(truth.scan.grid, voxel_size_mm=(2.0, 1.5, 1.5))))
     path = writer(tmp_path / name, truth)
@@ -40,10 +32,6 @@ def test_pixels_and_geometry_are_those_of_the_scan_that_was_written(
     scan = import_scan(path)
     assert isinstance(scan.trajectory, CircularOrbit) and scan.geometry == geometry and scan.grid == truth.scan.grid
     assert_same(scan, truth, grid=False, pixels=0)
-    write_scan(tmp_path / "ours.h5", replace(truth.scan, reference=None))
-    ours = read_scan(tmp_path / "ours.h5", counts_to_attenuation)
-    volumes = [reconstruct(one, "cgls", iterations=2).volume for one in (scan, ours)]
-    np.testing.assert_array_equal(*volumes)
 
 
 def leap_pixels(points: np.ndarray, phi_deg: float, values: dict[str, float]) -> np.ndarray:
@@ -59,14 +47,14 @@ def leap_pixels(points: np.ndarray, phi_deg: float, values: dict[str, float]) ->
 def test_leap_s_formula_sees_points_where_our_poses_do(tmp_path, make_truth, caplog) -> None:
     """τ above 0 moves source and panel against the columns; equal steps begin at 0°; frames may be TIFFs."""
     truth = make_truth()
-    path = kits.write_leap(tmp_path / "a", truth, tau=2.5, phis=None, angularRange=-300.0)
-    values = {**kits.leap_values(truth), "tau": 2.5}
+    path = w.write_leap(tmp_path / "a", truth, tau=2.5, phis=None, angularRange=-300.0)
+    values = {**w.leap_values(truth), "tau": 2.5}
     scan = import_scan(path / "params.txt")
     for frame in range(6):
         expected = leap_pixels(WORLD_POINTS, -50.0 * frame, values)
         np.testing.assert_allclose(projected(pose_at(scan, frame, 0.5), WORLD_POINTS), expected, atol=1e-6)
     assert "no phis (angularRange in equal steps from 0°)" in caplog.text
-    kits.write_leap(tmp_path / "b", truth)
+    w.write_leap(tmp_path / "b", truth)
     (tmp_path / "b" / "g.npy").unlink()
     for i, image in enumerate(truth.scan.projections):
         tifffile.imwrite(tmp_path / "b" / f"g_{i}.tif", image)
@@ -81,7 +69,7 @@ def test_leap_s_modular_beam_is_a_table_of_views(tmp_path, make_truth, assert_sa
     centre = first + 6.5 * step_u + 4.5 * step_v
     vectors = {"sourcePositions": source, "moduleCenters": centre, "rowVectors": step_v / 3.0, "colVectors": step_u / 2.5}
     lines = {name: ", ".join(map(repr, table.ravel().tolist())) for name, table in vectors.items()}
-    path = kits.write_leap(tmp_path / "a", truth, **{**lines, "geometry": "modular", "phis": None})
+    path = w.write_leap(tmp_path / "a", truth, **{**lines, "geometry": "modular", "phis": None})
     scan = import_scan(path)
     assert isinstance(scan.trajectory, PoseTable)
     assert_same(scan, truth, grid=False)
@@ -92,7 +80,7 @@ def test_leap_s_modular_beam_is_a_table_of_views(tmp_path, make_truth, assert_sa
 def test_tigre_s_centre_of_rotation_and_values_per_frame(tmp_path, make_truth) -> None:
     truth = make_truth(geometry=SQUARE)
     offsets = np.tile([3.0, -5.0], (6, 1)) + np.arange(6)[:, None] * [0.5, 0.25]
-    scan = import_scan(kits.write_tigre(tmp_path / "a.pkl", truth, COR=1.5, offDetector=offsets))
+    scan = import_scan(w.write_tigre(tmp_path / "a.pkl", truth, COR=1.5, offDetector=offsets))
     assert isinstance(scan.trajectory, PoseTable)
     for frame in range(6):
         geometry = replace(SQUARE, detector_offset_mm=tuple(offsets[frame].tolist()))

@@ -2,6 +2,8 @@
 
 import json
 import pickle
+import sys
+import types
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,6 @@ import laboratory_of_importers as lab
 import numpy as np
 import SimpleITK as sitk
 import tifffile
-import toolkits_of_importers as kits
 
 AIR, DARK = 50000.0, 300.0
 
@@ -90,8 +91,14 @@ def naf_dict(truth: Any, dtype: type = np.float32) -> dict[str, object]:
     }
 
 
-def write_naf(path: Path, truth: Any, protocol: int = 4, dtype: type = np.float32) -> Path:
-    path.write_bytes(pickle.dumps(naf_dict(truth, dtype), protocol))
+def write_naf(path: Path, truth: Any, protocol: int = 4, dtype: type = np.float32, numbers: bool = False) -> Path:
+    """``numbers``: NumPy's own scalars and small arrays, lists of them, and arrays in Fortran order."""
+    content: dict[str, Any] = naf_dict(truth, dtype)
+    if numbers:
+        content = {key: one if isinstance(one, dict) else np.asarray(one)[()] for key, one in content.items()}
+        for part in (content["train"], content["val"]):
+            part["angles"], part["projections"] = list(part["angles"]), np.asfortranarray(part["projections"])
+    path.write_bytes(pickle.dumps(content, protocol))
     return path
 
 
@@ -247,14 +254,14 @@ def write_pages(path: Path, stack: np.ndarray, way: str) -> None:
     tifffile.imwrite(path, stack, **options[way])
 
 
-def write_tiff(folder: Path, truth: Any, timing: str = "", angles: str | None = None, **options: Any) -> Path:
+def write_tiff(folder: Path, truth: Any, timing: str = "", angles: str | None = None, **dead: tuple[int, int]) -> Path:
     """A folder of float TIFFs, flats and darks by tifffile, and scan.toml."""
     folder.mkdir()
-    frames, flats, darks = counts(truth, options.get("dead"))
+    frames, flats, darks = counts(truth, **dead)
     for name, stack in (("proj", frames), ("flat", flats), ("dark", darks)):
         for i, image in enumerate(stack):
             file = folder / f"{name}_{i}.tif"
-            tifffile.imwrite(file, image[::-1].astype(np.float64), compression=options.get("compression"))
+            tifffile.imwrite(file, image[::-1].astype(np.float64))
     g, grid = truth.scan.geometry, truth.scan.grid
     distances = f"to_axis_mm = {g.source_to_axis_mm}\nto_detector_mm = {g.source_to_detector_mm}" if is_cone(truth) else ""
     angles = angles or f"values_deg = {np.rad2deg(truth.angle_rad).tolist()}"
@@ -283,6 +290,61 @@ offset_mm = {list(grid.offset_mm)}
     return folder
 
 
+def leap_values(truth: Any) -> dict[str, object]:
+    """The parameters of LEAP's save_parameters: φ is a quarter turn ahead of the source's angle."""
+    g, grid = truth.scan.geometry, truth.scan.grid
+    sides = zip(g.detector_shape, g.detector_offset_mm, g.pixel_size_mm, strict=True)
+    centre = [(count - 1) / 2 - offset / pitch for count, offset, pitch in sides]
+    distances = {"sod": g.source_to_axis_mm, "sdd": g.source_to_detector_mm} if is_cone(truth) else {"sod": 0, "sdd": 0}
+    return {
+        **{f"num{axis}": n for axis, n in zip("ZYX", grid.shape, strict=True)},
+        "voxelWidth": grid.voxel_size_mm[1], "voxelHeight": grid.voxel_size_mm[0],
+        **{f"offset{axis}": mm for axis, mm in zip("ZYX", grid.offset_mm, strict=True)},
+        "geometry": "cone" if is_cone(truth) else "parallel", "numAngles": truth.scan.frames,
+        "numRows": g.detector_shape[0], "numCols": g.detector_shape[1], "pixelHeight": g.pixel_size_mm[0],
+        "pixelWidth": g.pixel_size_mm[1], "centerRow": centre[0], "centerCol": centre[1],
+        "phis": ", ".join(map(repr, (np.rad2deg(truth.angle_rad).round(9) + 90).tolist())), **distances,
+        "tau": 0.0, "tiltAngle": 0.0, "helicalPitch": 0.0,
+    }  # fmt: skip
+
+
+def write_leap(folder: Path, truth: Any, **values: object) -> Path:
+    """LEAP's parameters with the line integrals as an array."""
+    folder.mkdir()
+    text = [f"{name} = {value}\n" for name, value in {**leap_values(truth), **values}.items() if value is not None]
+    (folder / "params.txt").write_text("# CT geometry parameters\n" + "".join(text))
+    np.save(folder / "g.npy", truth.scan.projections)
+    return folder
+
+
+def tigre_geometry(truth: Any, **attributes: object) -> Any:
+    """An object of a class by the name of TIGRE's, which is not installed."""
+    names = ("tigre", "tigre.utilities", "tigre.utilities.geometry")
+    for name in names:
+        sys.modules.setdefault(name, types.ModuleType(name))
+    module = sys.modules[names[-1]]
+    if not hasattr(module, "Geometry"):
+        module.Geometry = type("Geometry", (), {"__module__": names[-1]})
+    geo, g, grid = module.Geometry(), truth.scan.geometry, truth.scan.grid
+    values = {
+        "mode": "cone" if is_cone(truth) else "parallel", "accuracy": 0.5, "filter": None,
+        **({"DSO": g.source_to_axis_mm, "DSD": g.source_to_detector_mm} if is_cone(truth) else {}),
+        "nDetector": np.array(g.detector_shape), "dDetector": np.array(g.pixel_size_mm),
+        "offDetector": np.array(g.detector_offset_mm), "rotDetector": np.zeros(3), "nVoxel": np.array(grid.shape),
+        "dVoxel": np.array(grid.voxel_size_mm), "offOrigin": np.array(grid.offset_mm), "COR": 0, **attributes,
+    }  # fmt: skip
+    for name, value in values.items():
+        setattr(geo, name, value)
+    return geo
+
+
+def write_tigre(path: Path, truth: Any, **attributes: object) -> Path:
+    """A pickle of what TIGRE's loaders return."""
+    content = (truth.scan.projections, tigre_geometry(truth, **attributes), truth.angle_rad)
+    path.write_bytes(pickle.dumps(content))
+    return path
+
+
 # format: (what writes a good one, under which name)
 WRITERS = {
     "r2": (write_r2, "r2"), "phyradgs": (write_phyradgs, "phyradgs"),
@@ -292,7 +354,7 @@ WRITERS = {
     "nxtomo": (write_nxtomo, "nx.h5"), "tiff": (write_tiff, "tiff"),
     "nikon": (lab.write_nikon, "nikon"), "skyscan": (lab.write_skyscan, "skyscan"),
     "flexray": (lab.write_flexray, "flexray"), "zeiss": (lab.write_zeiss, "sample.txrm"),
-    "leap": (kits.write_leap, "leap"), "tigre": (kits.write_tigre, "tigre.pickle"),
+    "leap": (write_leap, "leap"), "tigre": (write_tigre, "tigre.pickle"),
 }  # fmt: skip
 
 
