@@ -78,9 +78,7 @@ def make_truth() -> Callable[..., Truth]:
     return truth
 
 
-def truth(
-    fly: bool = False, axis: str = "rows", direction: int = 1, geometry: Geometry = GEOMETRY
-) -> Truth:
+def truth(fly: bool = False, axis: str = "rows", direction: int = 1, geometry: Geometry = GEOMETRY) -> Truth:
     """A scan; ``fly`` turns the gantry on during the exposures (frames show its opening pose)."""
     angle_rad = np.deg2rad(10.0 + 25.0 * np.arange(FRAMES))
     frames = np.stack([image(geometry, a) for a in angle_rad]).astype(np.float32)
@@ -103,9 +101,7 @@ def assert_same(tmp_path) -> Callable[..., None]:
         write_scan(tmp_path / name, scan)
         return read_scan(tmp_path / name, counts_to_attenuation)
 
-    def compare(
-        found: Scan, truth: Truth, *, grid: bool = True, timing: bool = True, pixels: float = RTOL
-    ) -> None:
+    def compare(found: Scan, truth: Truth, *, grid: bool = True, timing: bool = True, pixels: float = RTOL) -> None:
         ours, native = stored(found, "imported.h5"), stored(truth.scan, "native.h5")
         assert ours.projections.shape == native.projections.shape
         valid = np.ones(native.projections.shape, bool)

@@ -131,7 +131,10 @@ AT = ("projections=/entry/data/data", "flats=flat.h5:/data", "darks=dark.h5:/dat
 def test_bare_arrays_in_several_files_by_options(tmp_path) -> None:
     bare(tmp_path)
     same(tmp_path / "p.hdf", ImportOptions(at=AT, pixel_size_mm=(0.1, 0.1)))
-    for wrong, words in (((*AT, "flat=x"), "NAME=FILE:/ADDRESS"), ((*AT[:-1], "axes=z,y,x"), "frame, v and u")):
+    for wrong, words in (
+        ((*AT, "flat=x"), "NAME=FILE:/ADDRESS"), ((*AT[:-1], "axes=z,y,x"), "frame, v and u"),
+        ((*AT[1:], "projections=/no"), "/no"),
+    ):  # fmt: skip
         with pytest.raises(InputError, match=words):
             import_scan(tmp_path / "p.hdf", ImportOptions(at=wrong, pixel_size_mm=(0.1, 0.1)))
 

@@ -87,9 +87,7 @@ def test_nikon_s_frames_may_lie_in_a_folder_of_their_own(tmp_path, make_truth) -
         import_scan(path)
 
 
-def test_skyscan_s_log_has_pixels_that_are_not_square_and_a_sample_that_turns_the_other_way(
-    tmp_path, make_truth, caplog
-) -> None:
+def test_skyscan_s_pixels_are_not_square_and_its_sample_turns_either_way(tmp_path, make_truth, caplog) -> None:
     geometry = ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5), (4.0, 0.0))
     truth = make_truth(geometry=geometry)
     lines = {"Image Rotation": 0.17, "Reference Intensity": None, "Random Movement": "OFF (30)"}

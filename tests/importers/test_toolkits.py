@@ -21,9 +21,7 @@ FLAT = ParallelGeometry((10, 14), (3.0, 2.5), (3.0, -5.0))
 
 @pytest.mark.parametrize("geometry", [SQUARE, FLAT], ids=["cone", "parallel"])
 @pytest.mark.parametrize("form", ["leap", "tigre"])
-def test_pixels_and_geometry_are_those_of_the_scan_that_was_written(
-    tmp_path, make_truth, assert_same, form, geometry
-) -> None:
+def test_pixels_and_geometry_are_those_of_the_scan(tmp_path, make_truth, assert_same, form, geometry) -> None:
     writer, name = w.WRITERS[form]
     truth = make_truth(geometry=geometry)
     truth = replace(truth, scan=replace(truth.scan, grid=replace(truth.scan.grid, voxel_size_mm=(2.0, 1.5, 1.5))))

@@ -152,9 +152,7 @@ def test_a_spoilt_chunk_is_named(good) -> None:
 def test_damage_is_found_before_the_pixels_are_read(good) -> None:
     with h5py.File(good, "r+") as file:
         replaced("linear")(file, f"{EXTRA}/detector_model")
-    for read in (
-        lambda: read_scan(good, lambda *_: pytest.fail("pixels of a bad file")), lambda: scan_summary(good),
-    ):
+    for read in (lambda: read_scan(good, lambda *_: pytest.fail("pixels of a bad file")), lambda: scan_summary(good)):
         with pytest.raises(InputError, match="detector_model"):
             read()
 

@@ -94,6 +94,7 @@ WRONG = {  # by the place that a message names: what is there in a good file, an
     "[detector] pixel_size_v_mm": [("pixel_size_v_mm = 2.0", f"pixel_size_v_mm = {size}") for size in (-2.0, "inf")],
     "[detector] lag": [("lag = 0.03", "lag = 1.0")],
     "[volume] shape": [("shape = [10, 20, 40]", f"shape = {shape}") for shape in ([10, 20], 10, [10, 0, 40])],
+    "[volume] size_mm": [("[10.0, 20.0, 80.0]", "[10.0, 0, 80.0]")],
     "[readout] axis": [('axis = "columns"', 'axis = "cols"')], "[readout] direction": [("direction = -1", "direction = 0")],
     "[readout] first": [("direction = -1", 'first = "top"')],
     "[readout] readout_ms": [("direction = -1", "readout_ms = 62")],
