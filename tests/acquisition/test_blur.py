@@ -31,10 +31,15 @@ def scan_of(offset_mm: float = 0.0, pulse_s: tuple[float, float] | None = None, 
 
 
 def test_an_arc_of_a_degree_on_two_hundred_columns() -> None:
-    """π/180 · 100 columns = 1.745."""
+    """π/180 · 100 columns = 1.745; in a parallel beam as much, in a pulse its share."""
     assert blur_facts(scan_of()) == pytest.approx({"blur_at_rim_px": 1.7453, "blur_at_half_radius_px": 0.8727}, rel=1e-4)
     assert blur_line(scan_of()) == "blur at the rim: 1.7 px, at half radius 0.87 px"
     assert blur_facts(scan_of(is_fly=False)) == {} and blur_line(scan_of(is_fly=False)) == ""
+    geometry = ParallelGeometry((4, COLUMNS), PITCH_MM)
+    parallel = replace(scan_of(), geometry=geometry, trajectory=CircularOrbit(geometry, scan_of().trajectory.kinematics))
+    assert blur_facts(parallel) == pytest.approx(blur_facts(scan_of()), rel=1e-9)
+    # of the lines' windows 0 to 0.1 s, ..., 0.05 to 0.15 s the beam lights 20 ms: a fifth
+    assert blur_facts(scan_of(pulse_s=(0.06, 0.02)))["blur_at_rim_px"] == pytest.approx(1.7453 / 5, rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -43,16 +48,3 @@ def test_an_arc_of_a_degree_on_two_hundred_columns() -> None:
 def test_a_panel_off_centre(offset_mm, radius_px) -> None:
     """By accident, up to 20 columns: the nearer side is the rim. On purpose: the farther one."""
     assert blur_facts(scan_of(offset_mm))["blur_at_rim_px"] == pytest.approx(radius_px * np.pi / 180, rel=1e-6)
-
-
-def test_a_parallel_beam_blurs_as_much() -> None:
-    cone = scan_of()
-    geometry = ParallelGeometry((4, COLUMNS), PITCH_MM)
-    orbit = CircularOrbit(geometry, cone.trajectory.kinematics)
-    parallel = replace(cone, geometry=geometry, trajectory=orbit)
-    assert blur_facts(parallel) == pytest.approx(blur_facts(cone), rel=1e-9)
-
-
-def test_a_pulse_shortens_the_blur() -> None:
-    """Of the lines' windows 0 to 0.1 s, ..., 0.05 to 0.15 s the beam lights 20 ms: a fifth."""
-    assert blur_facts(scan_of(pulse_s=(0.06, 0.02)))["blur_at_rim_px"] == pytest.approx(1.7453 / 5, rel=1e-4)

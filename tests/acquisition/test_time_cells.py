@@ -22,14 +22,7 @@ from phyradgs_cl.acquisition import (
     Static,
     StaticStart,
 )
-from phyradgs_cl.acquisition.cells import (
-    exact_cells,
-    micro_view_cells,
-    per_line_cells,
-    segments_for,
-    static_cells,
-    static_start_cells,
-)
+from phyradgs_cl.acquisition.cells import exact_cells, micro_view_cells, per_line_cells, segments_for
 from phyradgs_cl.acquisition.motion import (
     LINE_POSES,
     MODELS,
@@ -92,16 +85,6 @@ def test_per_line_cells_sample_each_lines_own_exposure(axis, direction) -> None:
             middles_s = opens_s + 0.8 * (np.arange(samples) + 0.5) / samples
             found_s = cells.time_s[cells.line_start == line]
             np.testing.assert_allclose(found_s, middles_s, atol=TIME_TOLERANCE_S)
-
-
-def test_static_cells_stand_mid_window_and_at_the_start() -> None:
-    shutter = Shutter(0.8, 0.3)
-    middle = static_cells(ORBIT, shutter, 0, START_S, 7)
-    start = static_start_cells(ORBIT, shutter, 0, START_S, 7)
-    for cells, time_s in ((middle, START_S + 0.55), (start, START_S)):
-        assert cells.count == 1 and cells.time_s[0] == pytest.approx(time_s, abs=TIME_TOLERANCE_S)
-        assert (cells.line_start[0], cells.line_stop[0], cells.weight[0]) == (0, 7, 1)
-        np.testing.assert_allclose(cells.pose[0], GEOMETRY.pose(0.1 + SPEED_RAD_PER_S * time_s), atol=1e-12)
 
 
 def scan(is_fly: bool) -> Scan:

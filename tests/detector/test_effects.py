@@ -24,15 +24,11 @@ BOTH = [tigre_noise, beer_lambert_noise]
 
 def test_counts_have_poisson_mean_and_variance_plus_the_electronic_variance() -> None:
     for expected in (3.0, 400.0, 1e6, 3e9, 1e15):
-        counts, variance = (
-            sample_counts(np.full(200_000, expected), 10.0, np.random.default_rng(1)), expected + 100,
-        )
+        counts, variance = sample_counts(np.full(200_000, expected), 10.0, np.random.default_rng(1)), expected + 100
         # Five standard errors of a mean and of a variance of 200,000 draws.
         assert counts.mean() == pytest.approx(expected, abs=5 * np.sqrt(variance / 2e5))
         assert counts.var() == pytest.approx(variance, rel=5 * np.sqrt(2 / 2e5) + 0.01)
-    whole = sample_counts(
-        np.array([0.0, 2.5, 1e5, 5e9]), 0.0, np.random.default_rng(0)
-    )  # without electronics
+    whole = sample_counts(np.array([0.0, 2.5, 1e5, 5e9]), 0.0, np.random.default_rng(0))  # without electronics
     assert np.array_equal(whole, np.rint(whole)) and whole[0] == 0
 
 
@@ -79,14 +75,9 @@ def test_finite_at_any_dose_and_any_line_integral(noise) -> None:
     p = np.array([[[0.0, 1e-9, 5.0], [50.0, 1e4, -3.0]]])
     for dose, electronic in product([1e-3, 1.0, 1e4, 1e9, 1e15, 1e19, 1e300], (0.0, 10.0, 1e3)):
         assert np.isfinite(noise(p, dose, electronic, np.random.default_rng(0))).all(), (dose, electronic)
-
-
-@pytest.mark.parametrize("noise", BOTH)
-def test_empty_scans_stay_close_to_zero(noise) -> None:
-    for p in (np.zeros((2, 3, 4)), np.full((1, 2, 2), -0.1)):
-        noisy = noise(p, 1e8, 0.0, np.random.default_rng(0))
-        assert np.isfinite(noisy).all() and np.abs(noisy).max() < 0.11
-    assert noise(np.zeros((0, 3, 4)), 1e4, 10.0, np.random.default_rng(0)).shape == (0, 3, 4)
+    for empty in (np.zeros((2, 3, 4)), np.full((1, 2, 2), -0.1), np.zeros((0, 3, 4))):
+        noisy = noise(empty, 1e8, 0.0, np.random.default_rng(0))
+        assert noisy.shape == empty.shape and (np.abs(noisy) < 0.11).all()
 
 
 SHAPE = (6, 8)
@@ -151,12 +142,7 @@ def test_electronic_noise_grows_and_photon_noise_does_not() -> None:
         assert counts[1:].std() == pytest.approx(deviation, rel=0.03)
 
 
-def test_noise_without_lag_is_the_noise_it_was_and_less_light_is_more() -> None:
-    p = frames()
-    plain, zero = (
-        beer_lambert_noise(p, 1e4, 10.0, np.random.default_rng(1), **m) for m in ({}, {"lag": 0.0})
-    )
-    np.testing.assert_array_equal(plain, zero)
+def test_less_light_is_more_noise() -> None:
     light = np.where(np.arange(200)[:, None] < 100, 1.0, 0.25)
     noisy = beer_lambert_noise(np.zeros((1, 200, 200)), 1e4, 0.0, np.random.default_rng(1), light)[0]
     assert noisy[100:].std() == pytest.approx(2 * noisy[:100].std(), rel=0.05)

@@ -74,21 +74,11 @@ def test_laws_and_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     assert ssim(result, truth) == pytest.approx(whole, rel=1e-13)
 
 
-def _frames() -> np.ndarray:
-    return np.random.default_rng(0).uniform(0, 3, (4, 12, 14))
-
-
-def test_compare_uses_the_references_maximum_and_says_so() -> None:
-    truth = _frames()
+def test_compare_uses_the_references_maximum_and_metrics_are_printed_with_their_units() -> None:
+    truth = np.random.default_rng(0).uniform(0, 3, (4, 12, 14))
     found = compare(truth + 0.1, truth)
-    assert found == {
-        "psnr_db": psnr(truth + 0.1, truth, truth.max()), "ssim": ssim(truth + 0.1, truth, truth.max()),
-        "data_range": truth.max(),
-    }
-
-
-def test_every_metric_is_printed_with_its_unit() -> None:
-    truth = _frames()
-    assert compare(truth + 0.1, truth).keys() == {*METRICS, "data_range"}
+    peak = truth.max()
+    assert found == {"psnr_db": psnr(truth + 0.1, truth, peak), "ssim": ssim(truth + 0.1, truth, peak), "data_range": peak}
+    assert found.keys() == {*METRICS, "data_range"}
     assert list(printed({"psnr_db": 22.126, "ssim": 1.0})) == [("PSNR", "22.13 dB"), ("SSIM", "1.0000")]
     assert list(printed({"psnr_db": "x", "ssim": None})) == []

@@ -50,9 +50,7 @@ def test_bricks_are_the_volume_once(shape) -> None:
             count[brick.box] += 1
         assert (count == 1).all(), (steps, floats)
         assert (len(bricks) == 1) == (4 * np.prod(shape) <= 4 * floats), (steps, floats)
-    assert (
-        len(cut((8, 1, 4), (1, 1), lambda s: (s[0],), Room(10**6, 4))) == 2
-    )  # the largest buffer counts too
+    assert len(cut((8, 1, 4), (1, 1), lambda s: (s[0],), Room(10**6, 4))) == 2  # the largest buffer counts too
 
 
 @pytest.mark.parametrize(
@@ -95,38 +93,26 @@ def test_indices_of_64_bits_change_nothing_in_bricks(two_rt, monkeypatch) -> Non
 
 
 @pytest.mark.parametrize(
-    ("pixels", "tilt"), [((13, 18), 0.0), ((13, 18), 0.05), ((700, 7), 0.0)],
-    ids=["upright", "tilted", "blocks along z"],
+    ("pixels", "tilt", "axis"),
+    [((13, 18), 0.0, ""), ((13, 18), 0.05, ""), ((700, 7), 0.0, ""), ((13, 18), 0.0, "rows"), ((13, 18), 0.0, "columns")],
+    ids=["upright", "tilted", "blocks along z", "rows", "columns"],
 )
-def test_backprojection_of_frames(two_rt, make_geometry, pixels, tilt) -> None:
-    grid = Grid((11, 9, 19), (0.12, 0.2, 0.1))
-    rng = np.random.default_rng(94)
-    views, weight = rng.uniform(-1, 1, (67, *pixels)).astype(np.float32), rng.uniform(0.5, 1, 67)
-    pose = make_geometry(*pixels, offset=(0.1, 0.2)).pose(rng.uniform(0, 6, 67))
-    pose[:, 9:12] += tilt * pose[:, 6:9]
-    expected = backproject(two_rt, views, pose, weight, grid)
-    assert np.count_nonzero(expected) > 100
+def test_backprojection(two_rt, make_geometry, pixels, tilt, axis) -> None:
+    """Of frames, and of lines that have poses of their own."""
+    grid, rng, count = Grid((11, 9, 19), (0.12, 0.2, 0.1)), np.random.default_rng(94), 9 if axis else 67
+    views, weight = rng.uniform(-1, 1, (count, *pixels)).astype(np.float32), rng.uniform(0.5, 1, count)
+    angles = rng.uniform(0, 6, (count, 1)) + np.linspace(-0.1, 0.1, pixels[axis == "columns"])
+    poses = make_geometry(*pixels, offset=(0.1, 0.2)).pose(angles.ravel()).reshape(*angles.shape, 12)
+    poses[..., 9:12] += tilt * poses[..., 6:9]
     image_bytes = 4 * (pixels[0] + 32) * 64 if pixels[0] < 100 else 4 * 32 * 800
-    for nbytes in (12_000 + image_bytes, 9_000 + 4 * image_bytes):
-        with room_for(two_rt, nbytes):
-            np.testing.assert_array_equal(backproject(two_rt, views, pose, weight, grid), expected)
-
-
-@pytest.mark.parametrize("axis", ["rows", "columns"])
-def test_backprojection_of_lines(two_rt, make_geometry, axis) -> None:
-    grid, pixels = Grid((11, 9, 19), (0.12, 0.2, 0.1)), (13, 18)
-    rng = np.random.default_rng(95)
-    views, weight = rng.uniform(-1, 1, (9, *pixels)).astype(np.float32), rng.uniform(0.5, 1, 9)
-    lines = pixels[axis == "columns"]
-    angles = rng.uniform(0, 6, (9, 1)) + np.linspace(-0.1, 0.1, lines)
-    pose = make_geometry(*pixels).pose(angles.ravel()).reshape(9, lines, 12)
-    expected = backproject_lines(two_rt, views, pose, weight, grid, axis)
+    room = (9_000, 14_000) if axis else (12_000 + image_bytes, 9_000 + 4 * image_bytes)
+    seen = (poses, weight, grid, axis) if axis else (poses[:, 0], weight, grid)
+    project = backproject_lines if axis else backproject
+    expected = project(two_rt, views, *seen)
     assert np.count_nonzero(expected) > 100
-    for nbytes in (9_000, 14_000):
+    for nbytes in room:
         with room_for(two_rt, nbytes):
-            np.testing.assert_array_equal(
-                backproject_lines(two_rt, views, pose, weight, grid, axis), expected
-            )
+            np.testing.assert_array_equal(project(two_rt, views, *seen), expected)
 
 
 def test_what_does_not_fit_at_all_is_said(rt, make_cloud) -> None:
@@ -166,7 +152,6 @@ def test_a_refused_buffer_is_asked_for_once_more_in_bricks(
             found = call()
         assert warned(caplog) == 1
         assert_near(found, expected, BRICKS)
-    for call in calls.values():
         with room_for(rt, 2_000_000), monkeypatch.context() as patch:
             refuse_large(patch, rt, 500, times=9)
             with pytest.raises(OutOfMemoryError, match="memory of a test"):

@@ -1,10 +1,10 @@
 """A scan's projector and its adjoint in one launch each: twins, subsets, repeatable bits."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
+from kernel_kit import launches
 from ray_tables import SHAPE, noise, tables
 from remembered import remembered
 from tolerances import FLOAT32, RAYS, RAYS_BACK
@@ -14,7 +14,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import IntensityOperator, RayOperator
 from phyradgs_cl.operators.rays import general as rays
 from phyradgs_cl.operators.twins.rays import ray_frame, ray_volume
-from phyradgs_cl.runtime import Runtime, context
+from phyradgs_cl.runtime import Runtime
 
 ray_frame, ray_volume = remembered(ray_frame), remembered(ray_volume)
 GRID = Grid((9, 14, 11), (0.21, 0.13, 0.16), (0.1, -0.05, 0.2))
@@ -117,13 +117,7 @@ def test_a_gpus_launches_of_bounded_length_have_the_bits_of_one(monkeypatch) -> 
     """Drivers of screens end long ones; a CPU's has no such limit. All cells of a line count."""
     x, y, cells = noise(GRID.shape, 90), noise((4, *SHAPE), 91), tables("micro-views", frames=4)
     per_line = max(int(np.ptp(table.line_cells(), axis=1).max()) for table in cells)
-    launched, launch = [], context.cl.enqueue_nd_range_kernel
-
-    def noted(queue: object, kernel: Any, *given: object) -> object:
-        launched.append(kernel.function_name)
-        return launch(queue, kernel, *given)
-
-    monkeypatch.setattr(context.cl, "enqueue_nd_range_kernel", noted)
+    launched = launches(monkeypatch)
     for shape, frames_of_launch in (({"lanes": 1, "pixel_items": True}, 2), ({"pixel_items": False}, 4)):
         operator = RayOperator(Runtime(**shape), GRID, SHAPE, cells)
         forward, adjoint = operator.forward(x), operator.adjoint(y)
@@ -133,25 +127,18 @@ def test_a_gpus_launches_of_bounded_length_have_the_bits_of_one(monkeypatch) -> 
             np.testing.assert_array_equal(operator.adjoint(y), adjoint)
             patch.setattr(Runtime, "most_samples", 2 * per_line * y[0].size * max(GRID.shape))
             np.testing.assert_array_equal(operator.forward(x), forward)
-        found = [name for name in launched if name.startswith("rays_")]
+        found = [name for name, *_ in launched if name.startswith("rays_")]
         assert found == ["rays_adjoint"] * (4 // frames_of_launch) + ["rays_forward"] * (4 // frames_of_launch)
 
 
-def test_one_launch_is_the_frames_one_by_one_and_bits_repeat(two_rt) -> None:
-    cells, x = tables("micro-views", frames=4), noise(GRID.shape, 78)
-    operator = RayOperator(two_rt, GRID, SHAPE, cells)
-    y = noise(operator.frames_shape, 80)
-    singles = np.concatenate([RayOperator(two_rt, GRID, SHAPE, [table]).forward(x) for table in cells])
-    for _ in range(2):
-        np.testing.assert_array_equal(operator.forward(x), singles)
-    np.testing.assert_array_equal(operator.adjoint(y), operator.adjoint(y))
-
-
 @pytest.mark.parametrize("axis", ["rows", "columns"])
-def test_subsets_are_rows_of_the_operator(rt, axis) -> None:
-    operator = RayOperator(rt, GRID, SHAPE, tables("micro-views", axis=axis, frames=4))
+def test_subsets_are_rows_of_the_operator_and_bits_repeat(two_rt, axis) -> None:
+    operator = RayOperator(two_rt, GRID, SHAPE, tables("micro-views", axis=axis, frames=4))
     x, y = noise(GRID.shape, 81), noise(operator.frames_shape, 82)
     frames = operator.forward(x)
+    singles = [RayOperator(two_rt, GRID, SHAPE, [table]).forward(x)[0] for table in operator.tables]
+    np.testing.assert_array_equal(frames, singles)
+    np.testing.assert_array_equal(operator.adjoint(y), operator.adjoint(y))
     part = operator.subset([3, 0])
     assert part.frames_shape == (2, *SHAPE) and part.volume_shape == GRID.shape
     np.testing.assert_array_equal(part.forward(x), frames[[3, 0]])
@@ -172,16 +159,6 @@ def test_stacks_larger_than_an_allocation(rt, monkeypatch) -> None:
     assert 1 < len(list(parts.memory.batches(17))) < 17
     np.testing.assert_array_equal(parts.forward(x), expected[0])
     np.testing.assert_array_equal(parts.adjoint(y), expected[1])
-
-
-def test_indices_of_64_bits(two_rt, monkeypatch) -> None:
-    """What volumes of 2^31 floats need; bit for bit the same on a small one."""
-    operator = RayOperator(two_rt, GRID, SHAPE, tables("micro-views"))
-    x, y = noise(GRID.shape, 85), noise(operator.frames_shape, 86)
-    short = operator.forward(x), operator.adjoint(y)
-    monkeypatch.setattr(rays, "_LONG_FROM", 0)
-    np.testing.assert_allclose(operator.forward(x), short[0], rtol=FLOAT32)
-    np.testing.assert_allclose(operator.adjoint(y), short[1], rtol=FLOAT32, atol=1e-6)
 
 
 def test_bricks_for_little_local_memory(rt, monkeypatch) -> None:

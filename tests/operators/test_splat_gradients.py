@@ -52,22 +52,13 @@ def expected_gradients(finite_differences, rows, table, h, affine: bool = False)
 
 
 @MODELS
-@pytest.mark.parametrize("motion", ["static", "micro-views"])
-def test_every_class_of_parameters(rt, make_cloud, make_table, finite_differences, motion, affine) -> None:
-    rows, table, h = make_cloud(3, 21, scale=(0.05, 0.3)), make_table(motion), random_weights(SHAPE)
-    found = device_gradients(rt, rows, table, h, affine=affine, cutoff_sigma=0.0)
+@pytest.mark.parametrize(("motion", "readout"), [*zip(2 * ["static", "micro-views"], READOUTS, strict=True)], ids=str)
+def test_every_class_of_parameters(any_rt, make_cloud, make_geometry, finite_differences, motion, readout, affine):
+    """In every way to build the kernels."""
+    table = frame_cells(motion, make_geometry(*SHAPE, offset=(0.15, -0.25)), shutter=Shutter(0.8, 0.6, *readout))
+    rows, h = make_cloud(3, 21, scale=(0.05, 0.3)), random_weights(SHAPE)
+    found = device_gradients(any_rt, rows, table, h, affine=affine, cutoff_sigma=0.0)
     assert_classes(found, expected_gradients(finite_differences, rows, table, h, affine), GRADIENT)
-
-
-@MODELS
-def test_every_way_to_build_the_kernels(
-    any_rt, make_cloud, make_geometry, finite_differences, affine
-) -> None:
-    rows, h = make_cloud(3, 22, scale=(0.05, 0.3)), random_weights(SHAPE)
-    for motion in ("static", "micro-views"):
-        table = frame_cells(motion, make_geometry(*SHAPE))
-        found = device_gradients(any_rt, rows, table, h, affine=affine, cutoff_sigma=0.0)
-        assert_classes(found, expected_gradients(finite_differences, rows, table, h, affine), GRADIENT)
 
 
 def test_quaternion_gradient_is_tangent(rt, make_cloud, make_table) -> None:

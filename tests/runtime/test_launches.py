@@ -15,7 +15,6 @@ from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.splats import binning
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.runtime import context as runtime_context
 
 GPU = {"lanes": 1, "pixel_items": True}
 
@@ -45,18 +44,6 @@ def test_a_gpu_group_fills_other_axes_where_the_first_is_short(parts, shape, sid
     rt.launch(rt.kernel("rates", "multiply_add"), shape, 3, 0.5, rt.zeros(64), group=(64,))
     assert [group for *_, group, _ in parts] == [sides, (64, *([1] * (len(shape) - 1)))]
     assert all(count % size == 0 for _, items, group, _ in parts for count, size in zip(items, group, strict=True))
-
-
-def test_parts_hold_every_item_once() -> None:
-    for items, group in (((64,), (16,)), ((32, 7), (16, 1)), ((48, 10, 3), (16, 2, 1))):
-        for pieces in (1, 2, 3, 5, 1000):
-            found, cut = np.zeros(items, int), list(runtime_context._parts(items, group, pieces))
-            for first, count in cut:
-                first = first or (0,) * len(items)
-                found[tuple(slice(f, f + n) for f, n in zip(first, count, strict=True))] += 1
-                assert not any(f % g or n % g for f, n, g in zip(first, count, group, strict=True))
-            assert (found == 1).all()
-            assert len(cut) >= min(pieces, math.prod(items) // math.prod(group))
 
 
 @pytest.mark.parametrize("most_samples", [10**4, 10])

@@ -1,7 +1,8 @@
-"""The processor that PoCL builds kernels for: on a device record made for the test."""
+"""The processor that PoCL builds kernels for, on a device record made for the test, and its name in results files."""
 
 import ctypes
 import os
+import platform
 import struct
 
 import pytest
@@ -112,3 +113,14 @@ def test_a_cache_whose_files_may_not_be_executed_is_replaced(tmp_path, monkeypat
     assert not os.environ[pocl.CACHE_VARIABLE].startswith(str(tmp_path))
     pocl.warn_of_cache()
     assert f"kernel cache {tmp_path}/phyradgs-cl/pocl-haswell cannot be executed: kernels are kept in" in caplog.text
+
+
+def test_a_processor_is_named_with_what_tells_generations_apart(tmp_path) -> None:
+    """The first of several; where nothing describes it, the name is Python's."""
+    one, other = "cpu family\t: 25\nmodel\t\t: 17\nmodel name\t: AMD EPYC\nflags\t\t: fpu vme\n", "cpu family\t: 99\n"
+    (tmp_path / "cpuinfo").write_text(f"processor\t: 0\n{one}\nprocessor\t: 1\n{other}")
+    facts = pocl.cpu_facts(tmp_path / "cpuinfo")
+    assert facts["flags"].split() == ["fpu", "vme"] and pocl.cpu_name(facts) == "AMD EPYC, family 25 model 17"
+    assert pocl.cpu_facts(tmp_path / "no such file") == {}
+    assert pocl.cpu_name({}) == (platform.processor() or platform.machine())
+    assert pocl.cpu_name({"model name": "Cortex"}) == pocl.cpu_name({"model name": "Cortex", "model": "1"}) == "Cortex"

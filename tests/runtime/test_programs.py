@@ -20,26 +20,20 @@ from phyradgs_cl.runtime.opencl import kernel_source
 PROGRAMS = sorted(path.stem for path in resource("cl").glob("*.cl"))
 
 
-def test_a_kernel_is_built_once(rt) -> None:
-    first, other = rt.kernel("adam", "adam_step"), rt.kernel("adam", "activate")
-    assert rt.kernel("adam", "adam_step") is first is not other
-    assert rt.compile(other).program == rt.compile(first).program
-    exact, affine = (rt.kernel("splat_prepare", "splat_prepare", AFFINE=a, IMAGE_GUARD=16) for a in (0, 1))
-    assert exact is not affine  # defines are told apart
-    assert rt.kernel("splat_prepare", "splat_prepare", IMAGE_GUARD=16, AFFINE=0) is exact
-
-
-def test_programs_are_built_once_for_all_their_kernels(rt, monkeypatch) -> None:
+def test_programs_are_built_once_for_all_their_kernels(monkeypatch) -> None:
+    """And again for other defines."""
     built: list[str] = []
     build = Runtime._build
     monkeypatch.setattr(Runtime, "_build", lambda rt, name, how: built.append(name) or build(rt, name, how))
-    runtime = Runtime()
-    for _ in range(3):
-        for name in ("bin_count", "bin_within", "bin_starts", "bin_fill"):
-            kernel = runtime.kernel("binning", name)
-            assert kernel.built is None or built, "a declaration alone builds nothing"
-            runtime.compile(kernel)
+    rt = Runtime()
+    for name in 3 * ("bin_count", "bin_within", "bin_starts", "bin_fill"):
+        kernel = rt.kernel("binning", name)
+        assert kernel.built is None or built, "a declaration alone builds nothing"
+        assert rt.compile(kernel) and rt.kernel("binning", name) is kernel
     assert built == ["binning"]
+    exact, affine = (rt.kernel("splat_prepare", "splat_prepare", AFFINE=a, IMAGE_GUARD=16) for a in (0, 1))
+    assert exact is not affine
+    assert rt.kernel("splat_prepare", "splat_prepare", IMAGE_GUARD=16, AFFINE=0) is exact
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
