@@ -58,11 +58,6 @@ def test_a_pixel_is_masked_where_a_projection_in_its_exposure_is() -> None:
     assert masked[0, 2, 1] == (7 < 4 + 2) and masked.sum() == 2
 
 
-def test_one_projection_a_frame_gives_the_projections_back() -> None:
-    scan = dense()
-    np.testing.assert_allclose(sum_frames(scan, 1).projections, scan.projections, rtol=1e-5)
-
-
 def test_poses_of_no_circle_lose_a_projection_at_either_end() -> None:
     scan, orbit = dense(), dense().trajectory
     middle_s = scan.frame_start_s

@@ -52,39 +52,25 @@ DIRECTIONS = pytest.mark.parametrize("direction", [1, -1])
 
 @AXES
 @DIRECTIONS
-def test_micro_views_have_the_times_of_eq_2_on_every_line(axis, direction) -> None:
+def test_cells_have_the_times_of_eq_2_on_every_line(axis, direction) -> None:
+    """Micro-views those of its strip, cells of one line (here: no strips) those of its own exposure."""
     shutter = Shutter(0.8, 0.3, axis, direction)
     lines = shutter.lines(SHAPE)
-    for strips, sub_intervals in product([1, 2, 3, 7, 8, 10, 25], [1, 3, 5]):
-        cells = micro_view_cells(ORBIT, shutter, 0, START_S, lines, strips, sub_intervals)
+    where = (ORBIT, shutter, 0, START_S, lines)
+    for strips, times in [*product([1, 2, 3, 7, 8, 10, 25], [1, 3, 5]), (None, 1), (None, 4)]:
+        cells = per_line_cells(*where, times) if strips is None else micro_view_cells(*where, strips, times)
         assert cells.axis == axis and cells.lines == lines
-        assert cells.count == min(strips, lines) * sub_intervals  # none for strips without a line
+        assert cells.count == min(strips or lines, lines) * times  # none for strips without a line
         assert np.all(np.diff(cells.line_start) >= 0)  # cells of a line are neighbours
+        assert strips or np.all(cells.line_stop - cells.line_start == 1)
         np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
         for line in range(lines):
-            reading_order = line if direction > 0 else lines - 1 - line
-            opens_s = START_S + (reading_order * strips // lines + 0.5) / strips * 0.3
-            expected_s = opens_s + (np.arange(sub_intervals) + 0.5) / sub_intervals * 0.8
+            order = line if direction > 0 else lines - 1 - line
+            opens = (order * strips // lines + 0.5) / strips if strips else order / (lines - 1)
+            expected_s = START_S + 0.3 * opens + (np.arange(times) + 0.5) / times * 0.8
             serving = (cells.line_start <= line) & (line < cells.line_stop)
             np.testing.assert_allclose(np.sort(cells.time_s[serving]), expected_s, atol=TIME_TOLERANCE_S)
-            np.testing.assert_allclose(cells.weight[serving], 1 / sub_intervals)
-
-
-@AXES
-@DIRECTIONS
-def test_per_line_cells_sample_each_lines_own_exposure(axis, direction) -> None:
-    shutter = Shutter(0.8, 0.3, axis, direction)
-    lines = shutter.lines(SHAPE)
-    for samples in (1, 4):
-        cells = per_line_cells(ORBIT, shutter, 0, START_S, lines, samples)
-        np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
-        np.testing.assert_array_equal(cells.line_stop - cells.line_start, 1)
-        for line in range(lines):
-            reading_order = line if direction > 0 else lines - 1 - line
-            opens_s = START_S + reading_order / (lines - 1) * 0.3
-            middles_s = opens_s + 0.8 * (np.arange(samples) + 0.5) / samples
-            found_s = cells.time_s[cells.line_start == line]
-            np.testing.assert_allclose(found_s, middles_s, atol=TIME_TOLERANCE_S)
+            np.testing.assert_allclose(cells.weight[serving], 1 / times)
 
 
 def scan(is_fly: bool) -> Scan:

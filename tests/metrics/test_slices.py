@@ -8,23 +8,13 @@ import pytest
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.metrics import slices_png
 
-PNG = b"\x89PNG\r\n\x1a\n"
 
-
-def _size(path: Path) -> tuple[int, int]:
-    head = path.read_bytes()[:24]
-    assert head.startswith(PNG)
-    return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
-
-
-def test_the_picture_has_three_columns_also_of_nothing(tmp_path: Path) -> None:
-    volume = np.random.default_rng(0).uniform(size=(6, 8, 10)).astype(np.float32)
-    slices_png(tmp_path / "with.png", volume + 0.1, volume, "title")
-    assert _size(tmp_path / "with.png")[0] > 600
-    slices_png(tmp_path / "empty.png", np.zeros((3, 3, 3)), np.zeros((3, 3, 3)), "nothing")
-    assert min(_size(tmp_path / "empty.png")) > 0
-
-
-def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+def test_the_picture_has_three_columns_also_of_nothing_and_a_missing_folder_is_named(tmp_path: Path) -> None:
+    volume, nothing = np.random.default_rng(0).uniform(size=(6, 8, 10)).astype(np.float32), np.zeros((3, 3, 3))
+    for result, truth, least in ((volume + 0.1, volume, 600), (nothing, nothing, 1)):
+        slices_png(tmp_path / "a.png", result, truth, "title")
+        head = (tmp_path / "a.png").read_bytes()[:24]
+        assert head.startswith(b"\x89PNG\r\n\x1a\n")
+        assert int.from_bytes(head[16:20], "big") >= least and int.from_bytes(head[20:24], "big") > 0
     with pytest.raises(OutputError, match="missing"):
-        slices_png(tmp_path / "missing" / "a.png", np.ones((3, 3, 3)), np.ones((3, 3, 3)), "title")
+        slices_png(tmp_path / "missing" / "a.png", nothing, nothing, "title")

@@ -162,15 +162,12 @@ def test_the_field_starts_at_its_share_of_the_bound() -> None:
     assert float(leaky(positions).detach().min()) > -1
 
 
-def test_the_same_seed_draws_the_same_field_and_leaves_others_draws_alone() -> None:
+def test_a_field_leaves_others_draws_alone() -> None:
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)
-    one, two, other = (first_field(LineOptions(), 16, seed) for seed in (1, 1, 2))
+    first_field(LineOptions(), 16, 1)
     assert torch.equal(torch.rand(3), expected)
-    pairs = list(zip(one.parameters(), two.parameters(), other.parameters(), strict=True))
-    assert all(torch.equal(a, b) for a, b, _ in pairs)
-    assert not all(torch.equal(a, c) for a, _, c in pairs)
 
 
 def test_pixels_and_times_are_drawn_evenly_and_each_once() -> None:

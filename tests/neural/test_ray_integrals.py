@@ -98,13 +98,6 @@ def test_smooth_fields_and_their_means_over_an_exposure(rays) -> None:
         assert np.abs(found - mean).max() <= RAY_SAMPLES * mean.max()
 
 
-def test_a_gaussian_with_one_shift_per_sample_is_noisier_and_right_on_average(rays) -> None:
-    few = thinned(rays)
-    expected, draws = through_gaussian(few), many_draws(gaussian, few, "sample")
-    assert np.abs(draws[0] - expected).max() > RAY_SAMPLES * expected.max()
-    assert np.linalg.norm(draws.mean(0) - expected) <= RAY_SAMPLES * np.linalg.norm(expected)
-
-
 @pytest.mark.parametrize("jitter", ["ray", "sample"])
 def test_an_ellipsoid_with_a_sharp_edge(rays, jitter) -> None:
     """A step costs a share of a sample in one draw; the average over draws has no such error."""
@@ -151,19 +144,21 @@ def test_the_way_through_the_box() -> None:
     assert np.allclose(length.tolist(), [2, 0, 0, 0.5, 0], atol=FLOAT32)
 
 
+def assert_shadowed(exposure: ExposureRays, half: np.ndarray, shape: tuple[int, int]) -> None:
+    """The shadow of a box is less than half of the panel, and holds every pixel with a ray that meets the box."""
+    pixels = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 2)
+    rays = exposure(pixels, np.tile(np.arange(exposure.times), (len(pixels), 1)))
+    spans = box_span(*(torch.tensor(a.reshape(-1, 3)) for a in rays), torch.tensor(half))
+    meets = np.array(spans[1].tolist()).reshape(len(pixels), -1).any(axis=1).reshape(shape)
+    inside = np.zeros(shape, bool)
+    inside[exposure.shadow(half, shape)] = True
+    assert meets.any() and not np.any(meets & ~inside) and inside.sum() < 0.5 * inside.size
+
+
 def test_the_shadow_of_the_volume_holds_every_ray_that_meets_it(scan) -> None:
     exposure = ExposureRays.of_cells(OwnTimes().cells(scan, 2), scan.grid)
     shape = scan.geometry.detector_shape
-    half = np.array([0.6, 0.5, 0.3])
-    rows, columns = exposure.shadow(half, shape)
-    pixels = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 2)
-    source, direction = exposure(pixels, np.tile(np.arange(exposure.times), (len(pixels), 1)))
-    spans = box_span(*(torch.tensor(a.reshape(-1, 3)) for a in (source, direction)), torch.tensor(half))
-    meets = np.array(spans[1].tolist()).reshape(len(pixels), -1).any(axis=1).reshape(shape)
-    inside = np.zeros(shape, bool)
-    inside[rows, columns] = True
-    assert meets.any() and not np.any(meets & ~inside)
-    assert inside.sum() < 0.5 * inside.size
+    assert_shadowed(exposure, np.array([0.6, 0.5, 0.3]), shape)
     assert exposure.shadow([10.0, 10.0, 10.0], shape) == (slice(0, shape[0]), slice(0, shape[1]))
 
 
@@ -185,9 +180,4 @@ def test_parallel_rays_are_those_of_the_projector(rt, make) -> None:
     found = half * integrals(gaussian, (source, direction), "none")
     assert np.abs(found - projected).max() <= 0.02 * projected.max()  # the projector interpolates voxels
     assert np.abs(half * through_gaussian((source, direction)) - found).max() <= RAY_SAMPLES * found.max()
-    box = torch.tensor([0.45, 0.4, 0.25])
-    rows, columns = exposure.shadow(box.numpy(), (SIDE, SIDE))
-    meets = (box_span(torch.tensor(source), torch.tensor(direction), box)[1] > 0).numpy().reshape(SIDE, SIDE)
-    inside = np.zeros((SIDE, SIDE), bool)
-    inside[rows, columns] = True
-    assert meets.any() and not np.any(meets & ~inside) and inside.sum() < 0.5 * inside.size
+    assert_shadowed(exposure, np.array([0.45, 0.4, 0.25]), (SIDE, SIDE))

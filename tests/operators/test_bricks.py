@@ -1,7 +1,6 @@
 """Volumes that do not fit the device are taken in bricks: the same result, within the limit, in every direction of a cut."""
 
 import logging
-from itertools import product
 
 import numpy as np
 import pytest
@@ -20,37 +19,14 @@ from phyradgs_cl.operators import (
     backproject_lines,
     voxelise,
 )
-from phyradgs_cl.operators.bricks import cut
 from phyradgs_cl.operators.rays import general as rays
 from phyradgs_cl.operators.splats import binning
-from phyradgs_cl.runtime import Room
 
 pytestmark = pytest.mark.slow
 
 SHAPE = (7, 37)
 TALL = Grid((21, 70, 37), (0.09, 0.03, 0.05), (0.05, 0.1, -0.1))
 Z_ONLY, Z_AND_Y = 320_000, 130_000  # bytes of room for TALL: cuts along z, and along both
-
-
-@pytest.mark.parametrize("shape", [(1, 1, 1), (5, 7, 3), (33, 65, 9), (8, 32, 4)])
-def test_bricks_are_the_volume_once(shape) -> None:
-    def needs(brick: tuple[int, int, int]) -> tuple[int, int]:
-        return 3 * int(np.prod(brick)), int(np.prod(brick))
-
-    for steps, floats in product([(1, 1), (4, 4), (8, 32)], [10**9, 2000, 320]):
-        if min(steps[0], shape[0]) * min(steps[1], shape[1]) * shape[2] * 4 > 4 * floats:
-            with pytest.raises(OutOfMemoryError, match="smallest part"):
-                cut(shape, steps, needs, Room(4 * floats, 4 * floats))
-            continue
-        bricks = cut(shape, steps, needs, Room(4 * floats, 4 * floats))
-        count = np.zeros(shape, int)
-        for brick in bricks:
-            assert sum(needs(brick.shape)) <= 4 * floats
-            assert brick.start[0] % steps[0] == 0 and brick.start[1] % steps[1] == 0
-            count[brick.box] += 1
-        assert (count == 1).all(), (steps, floats)
-        assert (len(bricks) == 1) == (4 * np.prod(shape) <= 4 * floats), (steps, floats)
-    assert len(cut((8, 1, 4), (1, 1), lambda s: (s[0],), Room(10**6, 4))) == 2  # the largest buffer counts too
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from tolerances import FLOAT32, RAYS, RAYS_BACK
 
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.operators import IntensityOperator, RayOperator
+from phyradgs_cl.operators import IntensityOperator
 from phyradgs_cl.operators.twins.rays import intensity_volume, ray_frame
 
 intensity_volume, ray_frame = map(remembered, (intensity_volume, ray_frame))
@@ -59,15 +59,6 @@ def test_derivative_and_transpose_are_the_twins(two_rt, motion, axis) -> None:
     assert_near(operator.forward(d), expected, 3 * RAYS)
     back = sum(intensity_volume(frame, x, GRID, table) for frame, table in zip(y, cells, strict=True))
     assert_near(operator.adjoint(y), back, 3 * RAYS_BACK)
-
-
-def test_before_any_volume_it_is_the_linear_operator(rt) -> None:
-    cells, x = tables("micro-views"), noise(GRID.shape, 10)
-    linear = RayOperator(rt, GRID, SHAPE, cells).forward(x)
-    operator = IntensityOperator(rt, GRID, SHAPE, cells)
-    np.testing.assert_allclose(operator.forward(x), linear, rtol=FLOAT32, atol=1e-6)
-    operator.expected(np.zeros(GRID.shape, np.float32))
-    np.testing.assert_allclose(operator.forward(x), linear, rtol=FLOAT32, atol=1e-6)
 
 
 def test_very_opaque_volumes_stay_finite(rt) -> None:

@@ -8,13 +8,7 @@ from kernel_kit import assert_near
 from ray_tables import noise
 from tolerances import RAYS, RAYS_BACK, SPLAT_AFFINE, SPLAT_MOVING
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConstantSpeed,
-    ParallelGeometry,
-    Shutter,
-    pixel_centres,
-)
+from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, ParallelGeometry, Shutter, pixel_centres
 from phyradgs_cl.acquisition.cells import (
     common_time_cells,
     exact_cells,

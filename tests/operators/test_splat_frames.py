@@ -3,20 +3,10 @@
 import numpy as np
 import pytest
 from kernel_kit import assert_near, note_launches, splat
-from tolerances import (
-    BRUTE_FORCE,
-    MICRO_VIEWS_FINE,
-    MICRO_VIEWS_ORDER,
-    STANDING_PICTURE,
-)
+from tolerances import BRUTE_FORCE, MICRO_VIEWS_FINE, MICRO_VIEWS_ORDER, STANDING_PICTURE
 
 from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, Shutter
-from phyradgs_cl.acquisition.cells import (
-    exact_cells,
-    micro_view_cells,
-    per_line_cells,
-    static_cells,
-)
+from phyradgs_cl.acquisition.cells import exact_cells, micro_view_cells, per_line_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.operators import DeviceCells, SplatProjector
 from phyradgs_cl.operators.twins.splat import splat_image

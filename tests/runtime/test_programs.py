@@ -55,12 +55,10 @@ def test_headers_are_pasted_once_with_line_marks(program) -> None:
         number += 1
 
 
-@pytest.fixture
-def broken_folder(tmp_path, monkeypatch):
-    """A ``cl`` folder (with a space in its path) whose header has an error on its third line."""
-    folder = tmp_path / "with space" / "cl"
+def test_a_build_error_names_file_and_line(rt, tmp_path, monkeypatch) -> None:
+    """In a folder with a space in its path; of a header too."""
+    folder, nothing = tmp_path / "with space" / "cl", "__kernel void nothing(__global float *x) { x[0] = %s; }\n"
     (folder / "common").mkdir(parents=True)
-    nothing = "__kernel void nothing(__global float *x) { x[0] = %s; }\n"
     for name, text in {
         "common/broken.h": "inline float good(float x) { return x; }\n\nthis is not C;\n",
         "uses_broken.cl": f'/* a comment */\n#include "common/broken.h"\n{nothing % "good(x[0])"}',
@@ -69,9 +67,6 @@ def broken_folder(tmp_path, monkeypatch):
     }.items():
         (folder / name).write_text(text)
     monkeypatch.setattr(sources, "resource", lambda name: folder)
-
-
-def test_a_build_error_names_file_and_line(rt, broken_folder) -> None:
     for program, place in {"uses_broken": "common/broken.h:3", "breaks_later": "breaks_later.cl:2"}.items():
         with pytest.raises(DeviceError) as raised:
             rt.launch(rt.kernel(program, "nothing"), 1, rt.zeros(1))
