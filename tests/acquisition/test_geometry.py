@@ -61,8 +61,7 @@ def test_lists_and_arrays_make_the_same_geometry() -> None:
         same = ConeGeometry(785.0, 1200.0, kind(shape), kind(pixels), kind(offsets))
         assert same == GEOMETRY and hash(same) == hash(GEOMETRY)
     for side in (0.5, np.float32(0.5), 1):  # one number is a square pixel
-        square = ConeGeometry(785.0, 1200.0, (7, 10), side)
-        assert square == ConeGeometry(785.0, 1200.0, (7, 10), (side, side)) and square.pixel_size_mm == (side, side)
+        assert ConeGeometry(785.0, 1200.0, (7, 10), side).pixel_size_mm == (side, side)
 
 
 WIDE = ConeGeometry(400.0, 800.0, (20, 30), (2.0, 40.0))  # half width 600: sin = 3/5

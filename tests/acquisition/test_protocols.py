@@ -99,11 +99,6 @@ def test_the_gantry_wanders_in_straight_lines_between_one_knot_per_frame() -> No
     assert (encoder.time_s[0], encoder.time_s[-1]) == (0.0, end_s)
 
 
-def test_options_replace() -> None:
-    assert Protocol() == Protocol(25, 14.4, 0.86, 0.0, 1.0, True, None) == make_protocol("rapid")
-    assert make_protocol("rapid", views=30, exposure_deg=None) == Protocol(views=30)
-
-
 def scan(**changes) -> Scan:
     protocol = Protocol(views=3)
     fields = {

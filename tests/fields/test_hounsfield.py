@@ -68,13 +68,6 @@ def test_what_is_no_scale_is_refused() -> None:
         fitted(flat, GRID)
 
 
-def test_units_of_length_that_are_no_millimetres_are_warned_of(caplog) -> None:
-    fitted(10 * phantom(), GRID)
-    assert not caplog.records
-    fitted(100 * phantom(), GRID)
-    assert "check that lengths are in mm" in caplog.text
-
-
 def test_a_scale_comes_back_from_its_note_and_facts_and_its_values_once() -> None:
     scale, values = Hounsfield(WATER, AIR, "said"), phantom(0.001)
     again = of_note(f"\0\0{scale.note}\0padding")
@@ -86,9 +79,11 @@ def test_a_scale_comes_back_from_its_note_and_facts_and_its_values_once() -> Non
         of_facts({"hounsfield": {"water": 1}})
 
 
-def test_a_box_of_two_materials_is_warned_of(caplog) -> None:
-    half_in_air = box(slice(0, 8), slice(15, 19), slice(8, 24))
+def test_other_units_of_length_and_a_box_of_two_materials_are_warned_of(caplog) -> None:
+    fitted(10 * phantom(), GRID)
     fitted(phantom(0.002), GRID, AIR_BOX, WATER_BOX)
     assert not caplog.records
-    fitted(phantom(0.002), GRID, AIR_BOX, half_in_air)
+    fitted(100 * phantom(), GRID)
+    assert "check that lengths are in mm" in caplog.text
+    fitted(phantom(0.002), GRID, AIR_BOX, box(slice(0, 8), slice(15, 19), slice(8, 24)))  # half of it in air
     assert "--water-mm: found water" in caplog.text and "one material" in caplog.text

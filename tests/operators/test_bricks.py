@@ -42,6 +42,7 @@ def test_rays(two_rt, motion, axis, nbytes) -> None:
     seen = IntensityOperator(two_rt, TALL, SHAPE, cells).expected(x)
     parts = RayOperator(two_rt, TALL, SHAPE, cells)
     part = parts.subset([3, 1])
+    volume, frames, summed = two_rt.upload(x), two_rt.upload(y), two_rt.empty(x.shape)
     with room_for(two_rt, nbytes):
         bricks = parts.memory.plan()
         assert len({b.start[0] for b in bricks}) > 1
@@ -49,6 +50,9 @@ def test_rays(two_rt, motion, axis, nbytes) -> None:
         np.testing.assert_array_equal(parts.adjoint(y), back)
         assert np.abs(parts.forward(x) - expected).max() <= BRICKS * expected.max()
         few = part.forward(x)
+        if nbytes == Z_ONLY:  # arrays that are on the device are cut there
+            assert np.abs(two_rt.download(parts.forward(volume)) - expected).max() <= BRICKS * expected.max()
+            np.testing.assert_array_equal(two_rt.download(parts.adjoint(frames, summed)), back)
     assert np.abs(few - expected[[3, 1]]).max() <= BRICKS * expected.max()
     if motion == "per line":  # layers bring tables of their own
         with room_for(two_rt, nbytes + 120_000):

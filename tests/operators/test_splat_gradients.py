@@ -70,8 +70,6 @@ def test_quaternion_gradient_is_tangent(rt, make_cloud, make_table) -> None:
 
 
 ROUNDING = 1 + 3e-6 * np.array([[1.0], [0.0], [-1.0]])  # what three equal steps of Adam may leave
-
-
 ROUNDED = [("static", {}), ("micro-views", {"affine": True}), ("exact", {}), ("exact", {"affine": True})]
 
 

@@ -20,8 +20,6 @@ pytestmark = pytest.mark.slow
 
 SHAPE = (13, 18)
 UNIT = 2.5  # line integrals up to 6
-MOTIONS = pytest.mark.parametrize("motion", ["static", "micro-views", "exact", "per-row"])
-READOUTS = pytest.mark.parametrize(("axis", "direction"), [("rows", 1), ("columns", -1)])
 MakeTable = Callable[..., TimeCells]
 
 
@@ -60,16 +58,17 @@ def projector(rt: Runtime, table: TimeCells, **options: object) -> SplatProjecto
     return SplatProjector(rt, *table.readout.shape(SHAPE), **options)
 
 
-@MOTIONS
-@READOUTS
+@pytest.mark.parametrize(
+    ("motion", "axis", "direction"),
+    [
+        ("static", "rows", 1), ("micro-views", "columns", -1), ("exact", "rows", 1), ("exact", "columns", -1),
+        ("per-row", "rows", 1),
+    ],
+)  # fmt: skip
 def test_frames_are_the_twins(two_rt, make_cloud, make_table, motion, axis, direction) -> None:
     rows, table = make_cloud(5, 61, scale=(0.05, 0.2)), make_table(motion, axis, direction)
-    found, mean = (
-        table.readout.frames(
-            projector(two_rt, table, **unit).project(rows, DeviceCells.upload(two_rt, table))
-        )
-        for unit in ({}, {"intensity_unit": None})
-    )
+    cells, units = DeviceCells.upload(two_rt, table), ({}, {"intensity_unit": None})
+    found, mean = (table.readout.frames(projector(two_rt, table, **unit).project(rows, cells)) for unit in units)
     expected = twin(rows, table)
     assert_near(found, expected, INTENSITY_FRAME)
     gap = mean - expected
