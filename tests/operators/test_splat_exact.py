@@ -1,9 +1,10 @@
-"""The splat kernels against their float64 twin: one Gaussian at a time on 512², then clouds and odd cases."""
+"""The splat kernels against their float64 twin: one Gaussian at a time on 512², clouds, odd cases; the twin itself."""
 
 import numpy as np
 import pytest
 from kernel_kit import assert_between, assert_near
 from kernel_kit import splat as render
+from scipy.spatial.transform import Rotation
 from tolerances import (
     CUTOFF_EDGE_NEEDLE,
     CUTOFF_EDGE_SIGMA,
@@ -11,9 +12,10 @@ from tolerances import (
     SPLAT_CLOUD,
     SPLAT_COMPACT,
     SPLAT_NEEDLE,
+    TWIN_QUADRATURE,
 )
 
-from phyradgs_cl.acquisition import ConeGeometry
+from phyradgs_cl.acquisition import ConeGeometry, pixel_centres
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, SplatProjector
 from phyradgs_cl.operators.splats.layout import projection_matrices
 from phyradgs_cl.operators.twins.splat import splat_image
@@ -22,6 +24,7 @@ from phyradgs_cl.runtime.layout import unpad_rows
 SIDE = 512
 CROP = 32
 LARGE = ConeGeometry(5.0, 7.5, (SIDE, SIDE), (3.9 / SIDE, 4.1 / SIDE))
+PANELS, ORDER, REACH_SIGMA = 400, 10, 12.0  # of the integrals along rays that know no closed form
 PIXEL_AT_AXIS = LARGE.pixel_size_mm[0] / LARGE.magnification
 
 
@@ -186,3 +189,36 @@ def test_padding_stays_zero(two_rt, one_cell, make_cloud, make_geometry) -> None
     flat = two_rt.download(projector.image)
     assert np.count_nonzero(flat) == np.count_nonzero(image) > 0
     np.testing.assert_array_equal(unpad_rows(flat, shape), image)
+
+
+def density_at(row: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """The field (n,) of one Gaussian (11,) at points (n, 3), from the definition."""
+    w, x, y, z = row[6:10] / np.linalg.norm(row[6:10])
+    local = Rotation.from_quat([x, y, z, w]).inv().apply(points - row[:3]) / row[3:6]
+    return row[10] * np.exp(-0.5 * (local**2).sum(-1))
+
+
+def integrate(row: np.ndarray, source: np.ndarray, target: np.ndarray) -> float:
+    """The field along the line through source and target, by Gauss–Legendre in panels."""
+    direction = (target - source) / np.linalg.norm(target - source)
+    middle = direction @ (row[:3] - source)
+    reach = REACH_SIGMA * row[3:6].max()
+    edges = np.linspace(middle - reach, middle + reach, PANELS + 1)
+    node, weight = np.polynomial.legendre.leggauss(ORDER)
+    half = np.diff(edges)[:, None] / 2
+    at = (edges[:-1, None] + half * (1 + node)).ravel()
+    return float((half * weight).ravel() @ density_at(row, source + at[:, None] * direction))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_twin_is_the_line_integral(make_cloud, make_geometry, seed) -> None:
+    rows = make_cloud(1, seed, scale=(0.06, 0.3))
+    geometry = make_geometry(24, 28, offset=(0.2, -0.3))
+    pose = geometry.pose(0.7 * seed)
+    image = splat_image(rows, pose, (24, 28))
+    pixels = pixel_centres(pose, (24, 28))
+    chosen = [(v, u) for v in range(1, 24, 4) for u in range(2, 28, 4)]
+    chosen.append(tuple(np.unravel_index(image.argmax(), image.shape)))
+    expected = [integrate(rows[:, 0], pose[:3], pixels[at]) for at in chosen]
+    found = [image[at] for at in chosen]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=TWIN_QUADRATURE * image.max())

@@ -1,8 +1,10 @@
-"""Splats that move through the segments of a frame, against quadrature in time and against hundreds of poses."""
+"""Splats that move through the segments of a frame, whole or by their centres: quadrature in time, hundreds of poses."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from kernel_kit import MODELS, READOUTS, assert_between, assert_classes, assert_near, by_gaussian
+from kernel_kit import MODELS, READOUTS, assert_between, assert_classes, assert_near, by_gaussian, frame_cells
 from kernel_kit import random_weights as weights
 from kernel_kit import splat as render
 from kernel_kit import splat_gradients as gradients
@@ -10,6 +12,7 @@ from remembered import remembered
 from tolerances import (
     CUTOFF_EDGE_MOVING,
     EXACT_OVER_MICRO_VIEWS,
+    GRADIENT,
     MOVING_GRADIENT,
     SEGMENTS_ORDER,
     SPLAT_MOVING,
@@ -20,6 +23,7 @@ from tolerances import (
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, Shutter
 from phyradgs_cl.acquisition.cells import exact_cells, micro_view_cells, per_line_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA, DeviceCells, SplatProjector
 from phyradgs_cl.operators.twins.splat import moving_frame
 
@@ -188,3 +192,42 @@ def test_behind_the_source_at_any_time_nothing_is_seen(two_rt, make_cloud, make_
     np.testing.assert_array_equal(render(two_rt, rows, table, SHAPE), alone)
     found = gradients(two_rt, rows, table, weights(SHAPE))
     assert np.all(np.isfinite(found)) and not np.any(found[:, 1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("readout", "affine"), [(("rows", 1), False), (("columns", -1), False), (("rows", -1), True)])
+def test_splats_of_which_only_the_centres_move(two_rt, make_cloud, make_geometry, finite_differences, readout, affine):
+    """A cutoff at six sigmas leaves gradients as they are."""
+    shutter = Shutter(0.8, 0.6, *readout)
+    table = frame_cells("centres", make_geometry(*SHAPE, offset=(0.15, -0.25)), 3, 2, shutter=shutter)
+    rows, h, options = make_cloud(2, 21, scale=(0.05, 0.3)), weights(SHAPE), {"affine": affine, "cutoff_sigma": 0.0}
+    assert_near(render(two_rt, rows, table, SHAPE, **options), moving_frame(rows, table, SHAPE, affine=affine), SPLAT_MOVING)
+    expected = by_gaussian(finite_differences, lambda r: (h * moving_frame(r, table, SHAPE, affine=affine)).sum(), rows)
+    whole = gradients(two_rt, rows, table, h, **options)
+    assert_classes(whole, expected, GRADIENT)
+    assert_classes(gradients(two_rt, rows, table, h, affine=affine, cutoff_sigma=6.0), whole, 1e-4)
+
+
+@pytest.mark.slow
+def test_only_the_centre_follows_the_gantry(rt, make_cloud, make_geometry) -> None:
+    """A round Gaussian on the axis looks alike from everywhere: nothing is lost. A long one is wrong, more than by poses."""
+    geometry, (round_one, long_one) = make_geometry(*SHAPE), (make_cloud(1, 23) for _ in range(2))
+    for rows, scale in ((round_one, 0.2), (long_one, [[0.5], [0.1], [0.1]])):
+        rows[:3], rows[3:6], rows[6:10] = 0.0, scale, [[1.0], [0.0], [0.0], [0.0]]
+    tables = [frame_cells(motion, geometry, speed=0.8) for motion in ("centres", "micro-views", "static")]
+    assert_near(*(render(rt, round_one, table, SHAPE) for table in tables[:2]), SPLAT_MOVING)
+    moved, right, still = (render(rt, long_one, table, SHAPE) for table in tables)
+    assert_near(moved, still, SPLAT_MOVING)  # the centre does not move on the panel
+    assert np.abs(moved - right).max() > 0.01 * right.max()
+
+
+@pytest.mark.slow
+def test_a_gantry_at_rest_gives_a_static_frame(rt, make_cloud, make_geometry) -> None:
+    still = frame_cells("static", make_geometry(*SHAPE), speed=0.0)
+    moved, rows = frame_cells("centres", make_geometry(*SHAPE), speed=0.0), make_cloud(3, 24)
+    assert_near(render(rt, rows, moved, SHAPE), render(rt, rows, still, SHAPE), SPLAT_MOVING)
+    table = frame_cells("centres", make_geometry(*SHAPE), 2, 2)
+    np.testing.assert_array_equal(table.scaled(50.0).conic_pose, 50.0 * table.conic_pose)
+    with pytest.raises(InputError, match="conic pose"):
+        table.still()
+    assert replace(table, conic_pose=None).still().count == 4

@@ -1,4 +1,4 @@
-"""Warps of a volume and projectors of a moving object: twins, transposes, and the same bits where nothing moves."""
+"""Warps of a volume and projectors of a moving object: twins, transposes, derivatives, and the same bits at rest."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ from phyradgs_cl.operators.bricks import whole
 from phyradgs_cl.operators.rays.memory import RayMemory
 from phyradgs_cl.operators.twins.rays import backprojection, warp_adjoint, warp_forward
 from phyradgs_cl.operators.warp.backproject import MovingBackprojector
-from phyradgs_cl.operators.warp.operator import WarpedOperator, projector_of
+from phyradgs_cl.operators.warp.operator import FieldDerivative, WarpedOperator, projector_of, warp_slopes
 from phyradgs_cl.operators.warp.states import MOST_STATES, MotionStates
 from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.runtime import Runtime
@@ -28,6 +28,7 @@ GRID = Grid((11, 9, 21), (0.2, 0.25, 0.1), (0.1, -0.05, 0.0))
 SHAPE = (12, 16)
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (0.35, 0.3))
 TIMES_S = np.linspace(0.0, 6.0, 25)
+STEP = 1e-5  # of differences: voxels, or of a unit of weight
 
 
 def deformation(size_mm: float, rank: int = 2, seed: int = 0) -> Deformation:
@@ -219,3 +220,66 @@ def test_a_volume_in_bricks_is_refused(rt, monkeypatch) -> None:
     monkeypatch.setattr(RayMemory, "plan", lambda self, share=1.0: [whole(GRID.shape)] * 2)
     with pytest.raises(OutOfMemoryError, match="2 bricks"):
         operator.forward(noise(GRID.shape))
+
+
+def in_voxels(fields_mm: np.ndarray) -> np.ndarray:
+    return fields_mm / GRID.voxel_size_mm[::-1]
+
+
+def difference(volume: np.ndarray, displacement: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """The change of the float64 warp for a change of the displacement, by central differences."""
+    ahead, behind = (warp_forward(volume, displacement + sign * STEP * change) for sign in (1, -1))
+    return (ahead - behind) / (2 * STEP)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.4, 30.0])  # voxels; at rest, far outside of the volume
+def test_slopes_are_those_of_the_cubic_volume(size) -> None:
+    rng, volume = np.random.default_rng(0), noise(GRID.shape)
+    displacement, direction = rng.normal(scale=size, size=(*GRID.shape, 3)), rng.normal(size=(*GRID.shape, 3))
+    along = (warp_slopes(volume, displacement) * direction).sum(-1)
+    assert_near(along, difference(volume, displacement, direction), 1e-4)
+
+
+@pytest.fixture(scope="module")
+def operator(rt) -> WarpedOperator:
+    return WarpedOperator(rt, GRID, SHAPE, tables(3), warp=VolumeWarp(rt, states_of(deformation(0.1))))
+
+
+def projected(operator, changes: dict[int, np.ndarray]) -> np.ndarray:
+    rt = operator.rt
+    frames = rt.empty(operator.frames_shape)
+    operator.project(lambda k: rt.upload(changes[k], np.float32), frames)
+    return rt.download(frames)
+
+
+def test_derivatives_are_differences(operator) -> None:
+    volume, states = noise(GRID.shape), operator.warp.states
+    derivative = FieldDerivative(operator, volume)
+    change_mm = np.random.default_rng(3).normal(size=states.deformation.control_mm.shape)
+    origin, spacing = states.deformation.origin_mm, states.deformation.spacing_mm
+    changed = type(states.deformation)(change_mm, origin, spacing, np.zeros(1), np.ones((1, len(change_mm))))
+    fields = np.stack([changed.on_grid_mm(GRID, unit) for unit in np.eye(len(change_mm))])
+    at = {k: in_voxels(np.tensordot(states.weights[k], states.fields_mm, 1)) for k in operator.states}
+
+    by_control = {k: difference(volume, at[k], in_voxels(np.tensordot(states.weights[k], fields, 1))) for k in at}
+    assert_near(derivative.forward(change_mm), projected(operator, by_control), 2 * RAYS)
+    for r, frames in enumerate(derivative.by_weights()):
+        by_weight = {k: difference(volume, at[k], in_voxels(states.fields_mm[r])) for k in at}
+        assert_near(frames, projected(operator, by_weight), 2 * RAYS)
+
+
+def test_derivatives_have_their_transpose(operator) -> None:
+    derivative = FieldDerivative(operator, noise(GRID.shape))
+    change_mm = np.random.default_rng(4).normal(size=operator.warp.states.deformation.control_mm.shape)
+    frames = noise(operator.frames_shape, 5) - np.float32(0.5)
+    forward = derivative.forward(change_mm).astype(np.float64)
+    size = np.linalg.norm(forward) * np.linalg.norm(frames)
+    assert abs(np.vdot(forward, frames) - np.vdot(change_mm, derivative.adjoint(frames))) <= ADJOINT * size
+
+
+def test_a_field_of_zeros_has_states_to_be_moved_from() -> None:
+    at_rest = deformation(0.0)
+    assert MotionStates.of_times(at_rest, GRID, at_rest.times_s).count == 1
+    states = MotionStates.of_times(at_rest, GRID, at_rest.times_s, least_voxels=1.0)
+    assert states.count > 3
+    np.testing.assert_allclose(states.shares(at_rest.times_s).sum(1), 1)
