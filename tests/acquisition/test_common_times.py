@@ -26,9 +26,8 @@ SHUTTERS = {
 }  # fmt: skip
 
 
-def cells(shutter: Shutter, samples: int = 5, frame: int = 1, start_s: tuple[float, ...] = (0.0, 1.0, 2.0)) -> TimeCells:
-    lines = shutter.lines(GEOMETRY.detector_shape)
-    return common_time_cells(ORBIT, shutter, frame, np.array(start_s), lines, samples)
+def cells(shutter: Shutter, samples: int = 5) -> TimeCells:
+    return common_time_cells(ORBIT, shutter, 1, np.arange(3.0), shutter.lines(GEOMETRY.detector_shape), samples)
 
 
 @pytest.mark.parametrize("name", SHUTTERS)
@@ -66,14 +65,6 @@ def test_frames_are_those_of_many_times_of_each_line(rt: Runtime, name, model) -
     scale = np.sqrt(np.mean(exact**2))
     error, its_error = (np.sqrt(np.mean((frames - exact) ** 2)) / scale for frames in (common, own))
     assert error <= COMMON_TIMES and error <= 1.34 * its_error
-
-
-def test_frames_without_gaps_have_the_same_poses() -> None:
-    first, second = (cells(SHUTTERS["rows"], frame=frame, start_s=(0.2, 1.2, 2.2)) for frame in (0, 1))
-    shared = set(map(bytes, first.pose)) & set(map(bytes, second.pose))
-    assert len(shared) == 5
-    apart = cells(SHUTTERS["rows"], frame=1, start_s=(0.2, 1.25, 2.2))
-    assert not set(map(bytes, first.pose)) & set(map(bytes, apart.pose))
 
 
 def test_no_time_is_beyond_the_scan() -> None:

@@ -180,8 +180,7 @@ ADJOINTS = {
 @pytest.mark.parametrize("case", ADJOINTS)
 def test_the_adjoint_is_the_twins(cpu_rt, monkeypatch, case) -> None:
     grid, shape, source = ADJOINTS[case]
-    cells = tables("static", shape, **source)
-    y = noise((3, *shape), 108)
+    cells, y = tables("static", shape, frames=2, **source), noise((2, *shape), 108)
     with monkeypatch.context() as patch:
         launched = note_launches(patch)
         found = RayOperator(cpu_rt, grid, shape, cells).adjoint(y)
