@@ -1,6 +1,6 @@
 /* Copies plain arrays (nz, ny, nx) into the padded layouts of operators and back. Element (z, y, x) of an array is
-   strides.s0 + y strides.s1 + z strides.s2 + x floats after its start. Twins: NumPy's slices and swapaxes
-   (tests/runtime/test_layout.py). */
+   strides.s0 + y strides.s1 + z strides.s2 + x floats after its start. Twins: NumPy's slices and swapaxes,
+   in the tests of the operators. */
 #include "common/lanes.h"
 
 static inline size_t row_of(const long4 strides, const int y, const int z)
