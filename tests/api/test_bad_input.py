@@ -13,41 +13,12 @@ import numpy as np
 import pyopencl
 import pyopencl.array
 import pytest
-from scipy.sparse.linalg import cg, lsmr, lsqr
+from scipy.sparse.linalg import lsqr
 
 from phyradgs_cl import api
-from phyradgs_cl.api import (
-    Centres,
-    CircularOrbit,
-    ConeGeometry,
-    ConstantSpeed,
-    EncoderTable,
-    Exact,
-    FrameSweeps,
-    Gaussians,
-    Grid,
-    InputError,
-    LinearOperator,
-    MicroViews,
-    Operator,
-    OwnTimes,
-    ParallelGeometry,
-    PerRow,
-    PoseTable,
-    Reconstruction,
-    Scan,
-    Shutter,
-    SpeedRamp,
-    TimeCells,
-    fly_scan,
-    ray_operator,
-    reconstruct,
-    splat_operator,
-    static_scan,
-    voxel_operator,
-)
+from phyradgs_cl.api import Gaussians, Grid, InputError, Scan, ray_operator, reconstruct, splat_operator
 
-CONE = ConeGeometry(5.0, 7.0, (6, 8), (0.2, 0.2))
+CONE = api.ConeGeometry(5.0, 7.0, (6, 8), (0.2, 0.2))
 FRAMES = np.zeros((4, 6, 8), np.float32)
 ANGLES = [0.0, 10.0, 20.0, 30.0]
 NAN = np.full((4, 6, 8), np.nan)
@@ -71,54 +42,33 @@ def from_tigre(geo: Any, angles: Any = ANGLES_RAD, frames: Any = FRAMES, **more:
     return Scan.from_tigre(geo, angles, frames, **more)
 
 
-class Nowhere:
-    """A trajectory that gives no poses."""
-
-    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        return np.zeros((*time_s.shape, 3))
+def spoilt(name: str, change: Callable[[api.TimeCells], Any]) -> Any:
+    """A motion of that name whose cells are changed."""
+    return type(name, (), {"cells": lambda self, scan, frame: change(api.PerRow(5).cells(scan, frame))})()
 
 
-class Half:
-    """A motion whose line weights sum to a half."""
-
-    def cells(self, scan: Scan, frame: int) -> TimeCells:
-        whole = PerRow(5).cells(scan, frame)
-        return replace(whole, weight=whole.weight / 2)
+HALF = spoilt("Half", lambda cells: replace(cells, weight=cells.weight / 2))
+ONE_POSE = spoilt("OnePose", lambda cells: replace(cells, pose=cells.pose[:1]))
+NO_CELLS = spoilt("Frames", lambda cells: FRAMES[0])
+NOWHERE = type("Nowhere", (), {"pose": lambda self, frame, time_s: np.zeros((*time_s.shape, 3))})()  # no poses
 
 
-class OnePose:
-    """A motion with fewer poses than cells."""
-
-    def cells(self, scan: Scan, frame: int) -> TimeCells:
-        whole = PerRow(5).cells(scan, frame)
-        return replace(whole, pose=whole.pose[:1])
+def fly(frames: Any = FRAMES, geometry: Any = CONE, angles: Any = ANGLES, exposure_deg: Any = 10.0, **more: Any) -> Scan:
+    return api.fly_scan(frames, geometry, angles, exposure_deg=exposure_deg, **more)
 
 
-class Frames:
-    """A motion that gives no cells."""
-
-    def cells(self, scan: Scan, frame: int) -> np.ndarray:
-        return scan.projections[frame]
-
-
-def fly(
-    frames: Any = FRAMES, geometry: Any = CONE, angles: Any = ANGLES, exposure_deg: Any = 10.0, **more: Any
-) -> Scan:
-    return fly_scan(frames, geometry, angles, exposure_deg=exposure_deg, **more)
-
-
-GOOD, STILL = fly(), static_scan(FRAMES, CONE, ANGLES)
-BACKWARDS = replace(GOOD, trajectory=PoseTable([0.0, 9.0], EXCHANGED))
+GOOD, STILL = fly(), api.static_scan(FRAMES, CONE, ANGLES)
+BACKWARDS = replace(GOOD, trajectory=api.PoseTable([0.0, 9.0], EXCHANGED))
 FLAT = np.zeros((11, 2))
 
 
 @cache
-def rays() -> LinearOperator:
+def rays() -> api.LinearOperator:
     return ray_operator(GOOD)
 
 
 @cache
-def splats() -> Operator:
+def splats() -> api.Operator:
     return splat_operator(GOOD)
 
 
@@ -128,66 +78,58 @@ def on_device(other_context: bool = False) -> pyopencl.array.Array:
     return pyopencl.array.zeros(pyopencl.CommandQueue(context), rays().domain_shape, np.float32)
 
 
-def volume_there() -> pyopencl.array.Array:
-    return rays().to_device(np.zeros(rays().domain_shape))
-
-
 def cloud(**parts: Any) -> Gaussians:
     """One Gaussian, with ``parts`` that are wrong."""
     rows = {"mean": np.zeros((1, 3)), "scale": np.ones((1, 3)), "quaternion": np.ones((1, 4)), "density": ONE}
     return Gaussians(**{**rows, **parts})
 
 
-VOLUME = Reconstruction(np.zeros((4, 4, 4), np.float32), Grid.cube(4, 2.0))
-ELSEWHERE = Reconstruction(VOLUME.volume, replace(VOLUME.grid, offset_mm=(0.0, 90.0, 0.0)))
+VOLUME = api.Reconstruction(np.zeros((4, 4, 4), np.float32), Grid.cube(4, 2.0))
+ELSEWHERE = api.Reconstruction(VOLUME.volume, replace(VOLUME.grid, offset_mm=(0.0, 90.0, 0.0)))
 # fmt: off
 ARGUMENTS: list[tuple[str, Callable[..., object], dict[str, list[Any]]]] = [
     ("fly_scan", fly, {
-        "mask": [np.ones((6, 8)), np.ones((8, 6))], "geometry": [(5.0, 7.0)], "exposure_deg": [0.0, -10.0, "14", 40.0, None],
+        "mask": [np.ones((6, 8)), np.ones((8, 6))], "geometry": [(5.0, 7.0)], "exposure_deg": [0.0, -10.0, "14", 40.0],
         "readout": ["lines"], "readout_ratio": [-1, 50 / 0.06], "exposure_s": [0.0], "quantity": ["photons"],
-        "first": ["left"], "fps": [15], "readout_ms": [62],
-        "flats": [FRAMES[:, :3]], "detektor_model": ["log"], "readout_s": [62], "detector_model": ["linear"],
-        "grid": [16], "pixel_mask": [FRAMES[0]],
+        "first": ["left"], "flats": [FRAMES[:, :3]], "readout_s": [62], "detector_model": ["linear"], "grid": [16],
+        "pixel_mask": [FRAMES[0]],
     }),
-    ("static_scan", partial(static_scan, FRAMES, CONE, ANGLES), {
-        "exposure_deg": [3.0], "flat": [1], "lag": [2.0], "grid": [Grid((1, 1, 1), (585.0,) * 3)],
+    ("static_scan", partial(api.static_scan, FRAMES, CONE, ANGLES), {
+        "flat": [1], "lag": [2.0], "grid": [Grid((1, 1, 1), (585.0,) * 3)],
     }),
-    ("static_scan", partial(static_scan, FRAMES + 3e4, CONE, ANGLES), {"quantity": ["attenuation"]}),
+    ("static_scan", partial(api.static_scan, FRAMES + 3e4, CONE, ANGLES), {"quantity": ["attenuation"]}),
     ("Scan", partial(replace, GOOD), {
         "projections": [NAN, [[1], [1, 2]]], "trajectory": [3], "shutter": [1.0], "frame_start_s": [[0.0]],
-        "pixel_mask": [np.ones(6)], "title": [3], "reference": [np.ones((2, 2, 2))], "lag": [-0.001, 0.901, np.nan],
+        "pixel_mask": [np.ones(6)], "title": [3], "reference": [np.ones((2, 2, 2))], "lag": [0.901],
     }),
-    ("Scan", partial(Scan.from_poses, FRAMES, POSES), {"is_fly": [True]}),
-    ("Shutter", partial(Shutter, 1.0), {"pulse_s": [(3.0, 1.0), 3.0], "readout_s": [-0.1, np.inf]}),
+    ("Shutter", partial(api.Shutter, 1.0), {"pulse_s": [(3.0, 1.0), 3.0], "readout_s": [-0.1]}),
     ("ConeGeometry", partial(replace, CONE), {
-        "source_to_axis_mm": [0.0, np.nan], "source_to_detector_mm": [0.0, -1.0], "detector_shape": [(0, 5)],
-        "pixel_size_mm": [(0.5, 0.0), (0.5,), 0.0], "detector_offset_mm": [(np.inf, 0.0)],
+        "source_to_axis_mm": [0.0, np.nan], "source_to_detector_mm": [0.0], "detector_shape": [(0, 5)],
+        "pixel_size_mm": [(0.5, 0.0), (0.5,)], "detector_offset_mm": [(np.inf, 0.0)],
     }),
-    ("Exact", Exact, {"segments": [1.5], "time_error": [0]}),
+    ("Exact", api.Exact, {"segments": [1.5], "time_error": [0]}),
     ("LineMiddles", partial(reconstruct, GOOD, "sirt"), {"motion": [api.LineMiddles()]}),
     ("Static", partial(reconstruct, GOOD, "sirt"), {"motion": [api.Static]}),
     ("Reconstruction", partial(VOLUME.plot, GOOD), {"frame": [9], "device": ["no such device"]}),
-    ("calibrate", partial(api.calibrate, GOOD, "roll"), {"splines": [6, 3, 16], "others": [GOOD, [1]]}),
+    ("calibrate", partial(api.calibrate, GOOD, "roll"), {"splines": [6], "others": [GOOD, [1]]}),
     ("prepare", partial(api.prepare, GOOD, "rings"), {"holdout": [5]}),
     ("reconstruct", partial(reconstruct, GOOD, "sirt"), {
         "initial": ["volume.h5", np.zeros((2, 3)), ELSEWHERE], "margin_mm": [-1, (1, 2)],
-        "size": [0, -4, 2.5, True, (4, 5), "large", 10**400, 1e6, np.nan], "voxel_mm": [0, (1, -1, 1), np.inf, 1e-8, 100],
-        "roi_mm": [(0, 1), -3, (1, -1, -1, 1, -1, 1), (0, 0, -1, 1, -1, 1), (-1e12, 1, -1, 1, -1, 1), (-1e6, 1e6) * 3],
-        "grid": [ELSEWHERE.grid, (8, 8, 8)], "report": [3], "on_interrupt": ["stop"], "resume": [VOLUME],
-        "seed": [-1], "device": ["no such device"],
+        "size": [0, 2.5, (4, 5), 10**400, 1e6], "voxel_mm": [0, 100],
+        "roi_mm": [(0, 1), -3, (1, -1, -1, 1, -1, 1), (-1e12, 1, -1, 1, -1, 1)], "grid": [ELSEWHERE.grid, (8, 8, 8)],
+        "report": [3], "on_interrupt": ["stop"], "resume": [VOLUME], "seed": [-1], "device": ["no such device"],
     }),
     ("reconstruct", partial(reconstruct, GOOD, "fdk"), {"initial": [VOLUME], "preset": ["quick"]}),
     ("reconstruct", partial(reconstruct, GOOD, "phyradgs"), {
-        "iterations": [-1], "strips": [2.5, True, [2], "two"], "preset": [["default"], 3, {"a": 1}, True, ""],
+        "iterations": [-1], "strips": [2.5, "two"], "preset": [""],
     }),
     ("reconstruct", partial(reconstruct, GOOD, "fista"), {
-        "prior": ["math:pi", lambda volume, noise: volume[1:],
-        lambda volume, noise: volume * np.nan, lambda volume, noise: "cleaned", lambda volume: volume],
+        "prior": ["math:pi", lambda volume, noise: volume[1:], lambda volume, noise: "cleaned", lambda volume: volume],
     }),
     ("reconstruct", partial(reconstruct, GOOD), {"prior_share": [0.7], "prior": ["dtc"]}),
     ("simulate", partial(api.simulate, "foot"), {"scanner": ["none"]}),
     ("splat_operator", partial(splat_operator, GOOD), {"cutoff_sigma": [-1]}),
-    ("voxel_operator", partial(voxel_operator, GOOD.grid), {"cutoff_sigma": [-1]}),
+    ("voxel_operator", partial(api.voxel_operator, GOOD.grid), {"cutoff_sigma": [-1]}),
     ("initial_gaussians", partial(api.initial_gaussians, GOOD), {"seed": [-1]}),
 ]
 """Of a name: a call, and wrong values of its arguments, which the error is about."""
@@ -205,16 +147,11 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     "fly_scan": [
         ("frames", lambda: fly(FRAMES[0])), ("frames", lambda: fly(FRAMES[:0])), ("pixels", lambda: fly(NAN)),
         ("frames", lambda: fly("frames.npy")), ("angles_deg", lambda: fly(angles=ANGLES[:3])),
-        ("angles_deg", lambda: fly(angles=[0, 1, 2, np.inf])),
-        ("readout direction", lambda: fly(readout_direction=0)),
-        ("readout direction", lambda: fly(readout_direction="top")),
+        ("angles_deg", lambda: fly(angles=[0, 1, 2, np.inf])), ("readout direction", lambda: fly(readout_direction=0)),
         ("frames", lambda: fly(FRAMES.astype(np.uint16))), ("flats", lambda: fly(quantity="counts")),
         ("flats, darks", lambda: fly(darks=FRAMES)), ("frames", lambda: fly(FRAMES + 51)),
     ],
-    "static_scan": [
-        ("angles_deg", lambda: static_scan(FRAMES, CONE, ANGLES[:2])),
-        ("frames", lambda: static_scan(FRAMES + 40000.0, CONE, ANGLES)),
-    ],
+    "static_scan": [("angles_deg", lambda: api.static_scan(FRAMES, CONE, ANGLES[:2]))],
     "Scan": [
         ("geo.mode", lambda: from_tigre(geometry(mode="fan"))), ("geo.DSD", lambda: from_tigre(geometry(DSD=None))),
         ("geo.rotDetector", lambda: from_tigre(geometry(rotDetector=np.array([0.1, 0, 0])))),
@@ -226,68 +163,62 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("frames", lambda: Scan.from_astra(FRAMES.swapaxes(0, 1), POSES)),
         ("vectors", lambda: Scan.from_astra(FRAMES, POSES[:, :9])),
         ("poses", lambda: Scan.from_poses(FRAMES, np.zeros((4, 12)))),
-        ("frames", lambda: Scan.from_poses(FRAMES.astype(np.uint16), POSES)),
-        ("frames", lambda: Scan.from_poses(FRAMES + 51, POSES)),
-        ("frames", lambda: Scan.from_astra(FRAMES.astype(int), POSES)), ("frame", lambda: GOOD.plot(4)),
-        ("trajectory Nowhere", lambda: reconstruct(replace(GOOD, trajectory=Nowhere()), "fdk")),
+        ("frames", lambda: Scan.from_poses(FRAMES + 51, POSES)), ("frame", lambda: GOOD.plot(4)),
+        ("trajectory Nowhere", lambda: reconstruct(replace(GOOD, trajectory=NOWHERE), "fdk")),
     ],
     "ConeGeometry": [
-        ("source_to_axis_mm", lambda: ConeGeometry("5", 7.0, (6, 8), (1.0, 1.0))),
-        ("source_to_detector_mm", lambda: ConeGeometry(7.0, 5.0, (6, 8), (1.0, 1.0))),
-        ("detector_shape", lambda: ConeGeometry(5.0, 7.0, 6, (1.0, 1.0))),
-        ("pixel_size_mm", lambda: static_scan(FRAMES, ConeGeometry(300.0, 800.0, (6, 8), (1560.0, 1560.0)), ANGLES)),
-        ("geometry.source_to_axis_mm", lambda: static_scan(FRAMES, ConeGeometry(0.5, 0.8, (6, 8), (0.4, 0.4)), ANGLES)),
-        ("detector_shape", lambda: ConeGeometry(5.0, 7.0, (6, 8.5), (1.0, 1.0))),
+        ("source_to_axis_mm", lambda: api.ConeGeometry("5", 7.0, (6, 8), (1.0, 1.0))),
+        ("source_to_detector_mm", lambda: api.ConeGeometry(7.0, 5.0, (6, 8), (1.0, 1.0))),
+        ("detector_shape", lambda: api.ConeGeometry(5.0, 7.0, 6, (1.0, 1.0))),
+        ("pixel_size_mm", lambda: api.static_scan(FRAMES, api.ConeGeometry(300.0, 800.0, (6, 8), (1560.0, 1560.0)), ANGLES)),
+        ("detector_shape", lambda: api.ConeGeometry(5.0, 7.0, (6, 8.5), (1.0, 1.0))),
     ],
     "ParallelGeometry": [
-        ("pixel_size_mm", lambda: ParallelGeometry((6, 8), 0.0)),
-        ("detector_shape", lambda: ParallelGeometry((6, 0), 1.0)),
-        ("trajectory", lambda: replace(GOOD, geometry=ParallelGeometry((6, 8), 0.2))),
+        ("pixel_size_mm", lambda: api.ParallelGeometry((6, 8), 0.0)),
+        ("detector_shape", lambda: api.ParallelGeometry((6, 0), 1.0)),
+        ("trajectory", lambda: replace(GOOD, geometry=api.ParallelGeometry((6, 8), 0.2))),
     ],
-    "Shutter": [
-        ("", partial(Shutter, *given)) for given in (("1",), (-1.0,), (np.nan,), (1.0, 0.1, "row"), (1.0, 0.1, "rows", 0))
-    ],
+    "Shutter": [("", partial(api.Shutter, *given)) for given in (("1",), (-1.0,), (1.0, 0.1, "row"))],
     "CircularOrbit": [
-        ("kinematics", lambda: CircularOrbit(CONE, 3.0)),
-        ("geometry", lambda: CircularOrbit(5.0, ConstantSpeed(0.0, 1.0))),
+        ("kinematics", lambda: api.CircularOrbit(CONE, 3.0)),
+        ("geometry", lambda: api.CircularOrbit(5.0, api.ConstantSpeed(0.0, 1.0))),
     ],
-    "ConstantSpeed": [("speed_rad_per_s", lambda: ConstantSpeed(0.0, np.nan))],
-    "SpeedRamp": [("acceleration_rad_per_s2", lambda: SpeedRamp(0.0, 1.0, "1"))],
+    "ConstantSpeed": [("speed_rad_per_s", lambda: api.ConstantSpeed(0.0, np.nan))],
+    "SpeedRamp": [("acceleration_rad_per_s2", lambda: api.SpeedRamp(0.0, 1.0, "1"))],
     "EncoderTable": [
-        *(("encoder table", partial(EncoderTable, *given)) for given in (
-            ([0.0], [0.0]), ([0.0, 1.0], [0.0]), ([0.0, 0.0], [0.0, 1.0]), ([1.0, 0.0], [0.0, 1.0]), ([0.0, np.nan], [0, 1]),
-        )),
-        ("encoder table", lambda: EncoderTable([0.0, 1.0], [0.0, 1.0]).angle_rad(0, np.array([2.0]))),
+        ("encoder table", lambda: api.EncoderTable([0.0], [0.0])),
+        ("encoder table", lambda: api.EncoderTable([1.0, 0.0], [0, 1])),
+        ("encoder table", lambda: api.EncoderTable([0.0, np.nan], [0, 1])),
+        ("encoder table", lambda: api.EncoderTable([0.0, 1.0], [0.0, 1.0]).angle_rad(0, np.array([2.0]))),
     ],
-    "FrameSweeps": [("angle_start_rad", lambda: FrameSweeps([0.0, 1.0], 1.0, [0.0], [1.0]))],
+    "FrameSweeps": [("angle_start_rad", lambda: api.FrameSweeps([0.0, 1.0], 1.0, [0.0], [1.0]))],
     "PoseTable": [
-        ("pose table", lambda: PoseTable([0.0, 1.0], np.zeros((2, 12)))),
-        *(("pose table", partial(PoseTable, *given)) for given in (
-            ([0.0, 1.0], POSES), (range(4), POSES[:, :11]), ([0, 1, 1, 2], POSES), (range(4), POSES * np.nan),
-        )),
+        ("pose table", lambda: api.PoseTable([0.0, 1.0], np.zeros((2, 12)))),
+        ("pose table", lambda: api.PoseTable(range(4), POSES[:, :11])),
         ("pose table", lambda: reconstruct(BACKWARDS, "fdk")),
     ],
-    "TimeCells": [("motion OnePose: pose", lambda: reconstruct(GOOD, "sirt", motion=OnePose()))],
-    "MicroViews": [("", partial(MicroViews, *given)) for given in ((2.5,), (0, 1), (1, 0), (-1, 5))],
-    "Centres": [("strips", lambda: Centres(0)), ("motion", lambda: reconstruct(GOOD, "sirt", motion=Centres()))],
-    "OwnTimes": [("sub_intervals", lambda: OwnTimes(0))],
-    "PerRow": [("sub_intervals", lambda: PerRow(-1))],
+    "TimeCells": [("motion OnePose: pose", lambda: reconstruct(GOOD, "sirt", motion=ONE_POSE))],
+    "MicroViews": [("", partial(api.MicroViews, *given)) for given in ((2.5,), (0, 1), (1, 0))],
+    "Centres": [
+        ("strips", lambda: api.Centres(0)), ("motion", lambda: reconstruct(GOOD, "sirt", motion=api.Centres())),
+    ],
+    "OwnTimes": [("sub_intervals", lambda: api.OwnTimes(0))],
+    "PerRow": [("sub_intervals", lambda: api.PerRow(-1))],
     "StaticStart": [("strips", lambda: reconstruct(GOOD, "fdk", motion="static-start", strips=3))],
     "Motion": [
-        ("motion Half", lambda: reconstruct(GOOD, "sirt", motion=Half())),
-        ("motion Frames", lambda: reconstruct(GOOD, "sirt", motion=Frames())),
+        ("motion Half", lambda: reconstruct(GOOD, "sirt", motion=HALF)),
+        ("motion Frames", lambda: reconstruct(GOOD, "sirt", motion=NO_CELLS)),
     ],
     "Grid": [
         ("grid shape", lambda: Grid(16, 1.0)), ("grid voxel_size", lambda: Grid((4, 4, 4), (1.0, 1.0))),
         ("grid shape", lambda: Grid((1000000.0, 1000000.0, 1000000.0), (1, 1, 1))),
-        ("count", lambda: Grid.cube(0, 2.0)),
-        *(("grid", partial(Grid, *given)) for given in (
-            ((0, 3, 4), (1, 1, 1)), ((3, 4), (1, 1, 1)), ((2, 3, 4), (1, 0, 1)), ((2, 3, 4), (1, np.nan, 1)),
-            ((2, 3, 4), (1, 1, 1), (0, np.inf, 0)),
-        )),
+        ("count", lambda: Grid.cube(0, 2.0)), ("grid shape", lambda: Grid((0, 3, 4), (1, 1, 1))),
+        ("grid voxel_size", lambda: Grid((2, 3, 4), (1, 0, 1))),
+        ("grid voxel_size", lambda: Grid((2, 3, 4), (1, np.nan, 1))),
+        ("grid offset", lambda: Grid((2, 3, 4), (1, 1, 1), (0, np.inf, 0))),
     ],
     "Gating": [
-        ("gating times_s", lambda: api.Gating(np.zeros(3), np.zeros(3))), ("gating times_s", lambda: api.Gating([], [])),
+        ("gating times_s", lambda: api.Gating(np.zeros(3), np.zeros(3))),
         ("gating values", lambda: api.Gating(np.arange(3.0), np.zeros(2))),
         ("gating values", lambda: api.Gating(np.arange(3.0), np.full(3, np.nan))),
         ("gating", lambda: replace(GOOD, gating=np.zeros(4))),
@@ -303,8 +234,7 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         *((f"deformation {name}", partial(still, **{name: value})) for name, value in (
             ("control_mm", np.zeros((1, 2, 2, 2))), ("control_mm", np.zeros((0, 2, 2, 2, 3))), ("times_s", []),
             ("control_mm", np.full((1, 2, 2, 2, 3), np.nan)), ("origin_mm", (0.0, 1.0)), ("spacing_mm", 0.0),
-            ("spacing_mm", (1.0, -1.0, 1.0)), ("times_s", [1, 1]), ("weights", np.zeros((3, 1))),
-            ("weights", np.full((2, 1), np.nan)),
+            ("weights", np.zeros((3, 1))), ("weights", np.full((2, 1), np.nan)),
         )),
         ("weights", lambda: still().displacement_mm(np.zeros((1, 3)), [1.0, 2.0])),
     ],
@@ -317,28 +247,23 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     "save_deformation": [("deformation", lambda: api.save_deformation("field.h5", GRID))],
     "ObjectMotion": [
         ("motion of the object: kind", lambda: api.ObjectMotion("walking")),
-        ("motion of the object: states", lambda: api.ObjectMotion("drying", states=2.5)),
         ("motion of the object: amplitude_mm", lambda: api.ObjectMotion("sliding", 2.0).deformation(GRID, 0.0, 1.0)),
         ("motion_of_object", lambda: api.simulate("foot", size=8, views=3, motion_of_object=3)),
-        ("nowhere.toml", lambda: api.simulate("foot", size=8, views=3, motion_of_object="nowhere.toml")),
     ],
     "Gaussians": [
         ("rows", lambda: Gaussians.from_rows(np.zeros((10, 5)))),
         ("Gaussians' quaternion", lambda: Gaussians(np.zeros((2, 3)), np.ones((2, 3)), np.ones((2, 3)), np.ones(2))),
-        ("Gaussians' mean", lambda: Gaussians(np.zeros(3), ONE, ONE, ONE)),
         ("Gaussians' scale", lambda: cloud(scale=np.full((1, 3), -2.0))),
-        *(("Gaussians'", partial(cloud, **{name: np.ones((5, 2))})) for name in ("mean", "scale", "quaternion", "density")),
         ("Gaussians' density", lambda: cloud(density=np.array([np.inf]))),
     ],
     "Reconstruction": [
-        ("volume", lambda: Reconstruction(np.zeros((2, 2, 2)), VOLUME.grid)),
-        ("grid", lambda: Reconstruction(np.zeros((2, 2, 2)), 2.0)), ("scan", lambda: VOLUME.plot("scan.h5")),
+        ("volume", lambda: api.Reconstruction(np.zeros((2, 2, 2)), VOLUME.grid)),
+        ("grid", lambda: api.Reconstruction(np.zeros((2, 2, 2)), 2.0)), ("scan", lambda: VOLUME.plot("scan.h5")),
         ("states", lambda: replace(VOLUME, states=api.States([1.0], np.zeros((1, 3, 3, 3))))),
     ],
     "calibrate": [
         ("scan", lambda: api.calibrate("scan.h5")), ("what", lambda: api.calibrate(GOOD, "rol")),
-        ("what", lambda: api.calibrate(GOOD, ["roll"])), ("pose table", lambda: api.calibrate(BACKWARDS)),
-        ("scan", lambda: api.calibrate(GOOD)),
+        ("what", lambda: api.calibrate(GOOD, ["roll"])), ("scan", lambda: api.calibrate(GOOD)),
     ],
     "prepare": [
         ("scan", lambda: api.prepare("scan.h5")), ("steps", lambda: api.prepare(GOOD, "spark")),
@@ -346,40 +271,30 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     ],
     "reconstruct": [
         ("scan", lambda: reconstruct("scan.h5")), ("method", lambda: reconstruct(GOOD, "fkd")),
-        ("method", lambda: reconstruct(GOOD, 3)), ("method", lambda: reconstruct(GOOD, lambda scan: None)),
+        ("method", lambda: reconstruct(GOOD, lambda scan: None)),
         ("method", lambda: reconstruct(GOOD, lambda scan, options, rt: 3)),
         ("method", lambda: reconstruct(GOOD, "nowhere:f")),
-        ("method sirt: option iteration", lambda: reconstruct(GOOD, "sirt", iteration=3)),
         ("batch", lambda: reconstruct(GOOD, "phyradgs", batch=9, iterations=1)),
         ("size", lambda: reconstruct(GOOD, "sirt", size=4, voxel_mm=1, roi_mm=2)),
         ("prior piccs", lambda: reconstruct(GOOD, "fista", prior="piccs")),
         ("method fista: option prior", lambda: reconstruct(GOOD, "fista", prior=3)),
-        ("method sirt: option tolerance", lambda: reconstruct(GOOD, "sirt", tolerance=abs)),
-        ("method fista: option detector_model", lambda: reconstruct(GOOD, "fista", detector_model=abs)),
     ],
     "simulate": [
-        ("simulate: option dosis", lambda: api.simulate("foot", dosis=3)), ("size", lambda: api.simulate("foot", size=0)),
-        ("truncation", lambda: api.simulate("foot", truncation=2)),
-        ("protocol", lambda: api.simulate("foot", protocol="slow")),
-        ("phantom", lambda: api.simulate("elbow")), ("phantom", lambda: api.simulate("jaws")),
-        ("simulate: option detector_offset", lambda: api.simulate("foot", detector_offset=(0, 1))),
+        ("simulate: option dosis", lambda: api.simulate("foot", dosis=3)),
+        ("size", lambda: api.simulate("foot", size=0)), ("truncation", lambda: api.simulate("foot", truncation=2)),
+        ("protocol", lambda: api.simulate("foot", protocol="slow")), ("phantom", lambda: api.simulate("elbow")),
         ("views", lambda: api.simulate("foot", size=8, views=7.5)),
         ("phantom", lambda: api.simulate(np.ones((2, 2, 2)))),
         ("jitter_deg", lambda: api.simulate("foot", size=8, detector=8, jitter_deg=-1)),
         ("noise", lambda: api.simulate("foot", size=8, noise="loud")),
-        ("peak", lambda: api.simulate("foot", size=8, peak=-1.0)),
         ("first", lambda: api.simulate("foot", first="left", readout_axis="rows")),
         ("exposure_deg", lambda: api.simulate("foot", exposure_deg=5000.0)),
     ],
     "load_scan": [("nowhere.h5", lambda: api.load_scan("nowhere.h5")), ("path", lambda: api.load_scan(3))],
     "load_volume": [("nowhere.h5", lambda: api.load_volume("nowhere.h5"))],
-    "save_scan": [
-        ("scan", lambda: api.save_scan("s.h5", VOLUME)),
-        ("trajectory Nowhere", lambda: api.save_scan("s.h5", replace(GOOD, trajectory=Nowhere()))),
-    ],
+    "save_scan": [("scan", lambda: api.save_scan("s.h5", VOLUME))],
     "save_volume": [
-        ("result", lambda: api.save_volume("v.h5", VOLUME.volume)),
-        ("path", lambda: api.save_volume("v.png", VOLUME)),
+        ("result", lambda: api.save_volume("v.h5", VOLUME.volume)), ("path", lambda: api.save_volume("v.png", VOLUME)),
         ("result:/entry/gaussians", lambda: api.save_volume("v.ply", VOLUME)),
         ("metrics", lambda: api.save_volume("v.nii", VOLUME, {"psnr_db": 3.0})),
         ("volume", lambda: api.save_volume("v.npy", replace(VOLUME, volume=VOLUME.volume * np.nan))),
@@ -390,22 +305,18 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("reference", lambda: api.compare(np.ones((4, 4)), np.ones((4, 4)))),
         ("reference", lambda: api.compare(VOLUME.volume + 1, VOLUME.volume)),
         ("result", lambda: api.compare(np.full((4, 4, 4), np.nan), VOLUME.volume + 1)),
-        ("reference", lambda: api.compare(np.zeros((0, 2, 2)), np.zeros((0, 2, 2)))),
     ],
-    "ray_operator": [
-        ("motion", lambda: ray_operator(GOOD, "exact")), ("scan", lambda: ray_operator("scan.h5")),
-        ("motion Half", lambda: ray_operator(GOOD, Half())),
-    ],
+    "ray_operator": [("motion", lambda: ray_operator(GOOD, "exact")), ("scan", lambda: ray_operator("scan.h5"))],
     "splat_operator": [
-        ("motion", lambda: splat_operator(GOOD, "quick")), ("motion Frames", lambda: splat_operator(GOOD, Frames())),
-        ("rows", lambda: splats()(np.zeros((10, 3)))), ("rows", lambda: splats()(FLAT)),
-        ("rows", lambda: splats()(FLAT * np.nan)), ("SplatProjection", lambda: splats().T(FRAMES)),
+        ("motion", lambda: splat_operator(GOOD, "quick")), ("rows", lambda: splats()(np.zeros((10, 3)))),
+        ("rows", lambda: splats()(FLAT)), ("rows", lambda: splats()(FLAT * np.nan)),
+        ("SplatProjection", lambda: splats().T(FRAMES)),
         ("of_densities", lambda: splats().intensity.of_densities(Gaussians.from_rows(FLAT + 1))),
         ("SplatProjection", lambda: lsqr(splats(), FRAMES.ravel())),
-        ("SplatProjection", lambda: lsmr(splats(), FRAMES.ravel())),
-        ("SplatProjection", lambda: cg(splats().T @ splats(), ONE)),
     ],
-    "voxel_operator": [("grid", lambda: voxel_operator(16)), ("frames", lambda: voxel_operator(GOOD.grid).frames([0]))],
+    "voxel_operator": [
+        ("grid", lambda: api.voxel_operator(16)), ("frames", lambda: api.voxel_operator(GOOD.grid).frames([0])),
+    ],
     "voxelise": [
         ("gaussians", lambda: api.voxelise(FLAT, GOOD.grid)),
         ("grid", lambda: api.voxelise(Gaussians.from_rows(FLAT + 1), (8, 8, 8))),
@@ -414,20 +325,14 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("count", lambda: api.initial_gaussians(GOOD, -1)), ("scan", lambda: api.initial_gaussians(FRAMES)),
     ],
     "Operator": [
-        ("frames", lambda: rays().frames([4])), ("frames", lambda: rays().frames([0.5])),
-        ("frames", lambda: rays().frames([True, False])), ("frames", lambda: rays().frames(2)),
-        ("frames", lambda: splats().frames([])), ("frames", lambda: rays().T.frames([0])),
-        ("intensity", lambda: rays().intensity.intensity), ("intensity", lambda: splats().intensity.intensity),
-        ("values", lambda: rays().to_device("x")), ("values", lambda: rays().to_device(FRAMES[:, 0])),
-        ("values", lambda: rays().to_device(FRAMES + 1j)), ("Operator", lambda: lsqr(rays().intensity, ONE)),
-        ("frames", lambda: rays().T(FRAMES[:1])),
+        ("frames", lambda: rays().frames([4])), ("frames", lambda: rays().frames(2)),
+        ("intensity", lambda: rays().intensity.intensity), ("values", lambda: rays().to_device("x")),
+        ("values", lambda: rays().to_device(FRAMES[:, 0])), ("frames", lambda: rays().T(FRAMES[:1])),
     ],
     "LinearOperator": [
-        ("volume", lambda: rays()(FRAMES)), ("volume", lambda: rays()("volume")),
-        ("volume", lambda: rays()(np.zeros(rays().domain_shape, complex))),
-        ("volume", lambda: rays()(on_device(other_context=True))), ("volume", lambda: rays()(on_device())),
-        ("volume", lambda: rays()(volume_there().astype(float))),
-        ("volume", lambda: rays()(volume_there().transpose((2, 1, 0)))),
+        ("volume", lambda: rays()(FRAMES)), ("volume", lambda: rays()(on_device(other_context=True))),
+        ("volume", lambda: rays()(on_device())),
+        ("volume", lambda: rays()(rays().to_device(np.zeros(rays().domain_shape)).astype(float))),
     ],
     "move_views": [
         ("views", lambda: api.move_views(GOOD, np.zeros((2, 3)))),
@@ -439,14 +344,13 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("by_poses", lambda: splats().intensity.by_poses(Gaussians.from_rows(FLAT + 1), FRAMES)),
         ("by_frames", lambda: api.pose_gradient(GOOD, GOOD.reference, FRAMES[:1])),
         ("x", lambda: api.pose_gradient(GOOD, FRAMES, FRAMES)),
-        ("motion", lambda: api.pose_gradient(GOOD, Gaussians.from_rows(FLAT + 1), FRAMES, "quick")),
     ],
     "sum_frames": [
         ("scan", lambda: api.sum_frames(FRAMES, 2)), ("count", lambda: api.sum_frames(GOOD, 0)),
-        ("count", lambda: api.sum_frames(GOOD, "2")), ("readout", lambda: api.sum_frames(GOOD, 2, readout="left")),
-        ("readout", lambda: api.sum_frames(GOOD, 2, 0.5, readout_direction=0)),
-        ("lag", lambda: api.sum_frames(replace(GOOD, lag=0.1), 2)), ("count", lambda: api.sum_frames(STILL, 5)),
-        ("readout", lambda: api.sum_frames(STILL, 2, -1.0)), ("scan", lambda: api.sum_frames(fly(readout_ratio=0.5), 2)),
+        ("readout", lambda: api.sum_frames(GOOD, 2, readout="left")),
+        ("lag", lambda: api.sum_frames(replace(GOOD, lag=0.1), 2)),
+        ("readout", lambda: api.sum_frames(STILL, 2, -1.0)),
+        ("scan", lambda: api.sum_frames(fly(readout_ratio=0.5), 2)),
         ("frame_start_s", lambda: api.sum_frames(replace(STILL, frame_start_s=np.arange(4.0) ** 2), 2)),
     ],
     "as_torch": [("", lambda: api.as_torch(3))],
