@@ -16,9 +16,7 @@ def scan(rt) -> Scan:
 
 @pytest.fixture(scope="session")
 def columns_scan(rt) -> Scan:
-    return simulate(
-        "jaw", size=12, detector=20, views=6, exposure_deg=30.0, readout_axis="columns", device=rt
-    )
+    return simulate("jaw", size=12, detector=20, views=6, exposure_deg=30.0, readout_axis="columns", device=rt)
 
 
 @pytest.fixture(scope="session")

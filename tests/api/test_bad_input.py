@@ -89,10 +89,11 @@ ELSEWHERE = api.Reconstruction(VOLUME.volume, replace(VOLUME.grid, offset_mm=(0.
 # fmt: off
 ARGUMENTS: list[tuple[str, Callable[..., object], dict[str, list[Any]]]] = [
     ("fly_scan", fly, {
-        "mask": [np.ones((6, 8)), np.ones((8, 6))], "geometry": [(5.0, 7.0)], "exposure_deg": [0.0, -10.0, "14", 40.0],
-        "readout": ["lines"], "readout_ratio": [-1, 50 / 0.06], "exposure_s": [0.0], "quantity": ["photons"],
-        "first": ["left"], "flats": [FRAMES[:, :3]], "readout_s": [62], "detector_model": ["linear"], "grid": [16],
-        "pixel_mask": [FRAMES[0]],
+        "frames": [FRAMES[0], FRAMES[:0], "frames.npy", FRAMES.astype(np.uint16), FRAMES + 51],
+        "angles": [ANGLES[:3], [0, 1, 2, np.inf]], "mask": [np.ones((6, 8)), np.ones((8, 6))], "geometry": [(5.0, 7.0)],
+        "exposure_deg": [0.0, -10.0, "14", 40.0], "readout": ["lines"], "readout_ratio": [-1, 50 / 0.06],
+        "exposure_s": [0.0], "quantity": ["photons"], "first": ["left"], "flats": [FRAMES[:, :3]], "readout_s": [62],
+        "detector_model": ["linear"], "grid": [16], "pixel_mask": [FRAMES[0]],
     }),
     ("static_scan", partial(api.static_scan, FRAMES, CONE, ANGLES), {
         "flat": [1], "lag": [2.0], "grid": [Grid((1, 1, 1), (585.0,) * 3)],
@@ -104,8 +105,8 @@ ARGUMENTS: list[tuple[str, Callable[..., object], dict[str, list[Any]]]] = [
     }),
     ("Shutter", partial(api.Shutter, 1.0), {"pulse_s": [(3.0, 1.0), 3.0], "readout_s": [-0.1]}),
     ("ConeGeometry", partial(replace, CONE), {
-        "source_to_axis_mm": [0.0, np.nan], "source_to_detector_mm": [0.0], "detector_shape": [(0, 5)],
-        "pixel_size_mm": [(0.5, 0.0), (0.5,)], "detector_offset_mm": [(np.inf, 0.0)],
+        "source_to_axis_mm": ["5", 0.0, np.nan], "source_to_detector_mm": [0.0, 4.0], "pixel_size_mm": [(0.5, 0.0), (0.5,)],
+        "detector_shape": [(0, 5), 6, (6, 8.5)], "detector_offset_mm": [(np.inf, 0.0)],
     }),
     ("Exact", api.Exact, {"segments": [1.5], "time_error": [0]}),
     ("LineMiddles", partial(reconstruct, GOOD, "sirt"), {"motion": [api.LineMiddles()]}),
@@ -127,7 +128,10 @@ ARGUMENTS: list[tuple[str, Callable[..., object], dict[str, list[Any]]]] = [
         "prior": ["math:pi", lambda volume, noise: volume[1:], lambda volume, noise: "cleaned", lambda volume: volume],
     }),
     ("reconstruct", partial(reconstruct, GOOD), {"prior_share": [0.7], "prior": ["dtc"]}),
-    ("simulate", partial(api.simulate, "foot"), {"scanner": ["none"]}),
+    ("simulate", partial(api.simulate, "foot"), {
+        "scanner": ["none"], "size": [0], "truncation": [2], "protocol": ["slow"], "views": [7.5], "jitter_deg": [-1],
+        "noise": ["loud"], "exposure_deg": [5000.0], "motion_of_object": [3],
+    }),
     ("splat_operator", partial(splat_operator, GOOD), {"cutoff_sigma": [-1]}),
     ("voxel_operator", partial(api.voxel_operator, GOOD.grid), {"cutoff_sigma": [-1]}),
     ("initial_gaussians", partial(api.initial_gaussians, GOOD), {"seed": [-1]}),
@@ -145,11 +149,8 @@ def still(**changes: Any) -> api.Deformation:
 
 CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     "fly_scan": [
-        ("frames", lambda: fly(FRAMES[0])), ("frames", lambda: fly(FRAMES[:0])), ("pixels", lambda: fly(NAN)),
-        ("frames", lambda: fly("frames.npy")), ("angles_deg", lambda: fly(angles=ANGLES[:3])),
-        ("angles_deg", lambda: fly(angles=[0, 1, 2, np.inf])), ("readout direction", lambda: fly(readout_direction=0)),
-        ("frames", lambda: fly(FRAMES.astype(np.uint16))), ("flats", lambda: fly(quantity="counts")),
-        ("flats, darks", lambda: fly(darks=FRAMES)), ("frames", lambda: fly(FRAMES + 51)),
+        ("pixels", lambda: fly(NAN)), ("readout direction", lambda: fly(readout_direction=0)),
+        ("flats", lambda: fly(quantity="counts")), ("flats, darks", lambda: fly(darks=FRAMES)),
     ],
     "static_scan": [("angles_deg", lambda: api.static_scan(FRAMES, CONE, ANGLES[:2]))],
     "Scan": [
@@ -167,11 +168,7 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("trajectory Nowhere", lambda: reconstruct(replace(GOOD, trajectory=NOWHERE), "fdk")),
     ],
     "ConeGeometry": [
-        ("source_to_axis_mm", lambda: api.ConeGeometry("5", 7.0, (6, 8), (1.0, 1.0))),
-        ("source_to_detector_mm", lambda: api.ConeGeometry(7.0, 5.0, (6, 8), (1.0, 1.0))),
-        ("detector_shape", lambda: api.ConeGeometry(5.0, 7.0, 6, (1.0, 1.0))),
         ("pixel_size_mm", lambda: api.static_scan(FRAMES, api.ConeGeometry(300.0, 800.0, (6, 8), (1560.0, 1560.0)), ANGLES)),
-        ("detector_shape", lambda: api.ConeGeometry(5.0, 7.0, (6, 8.5), (1.0, 1.0))),
     ],
     "ParallelGeometry": [
         ("pixel_size_mm", lambda: api.ParallelGeometry((6, 8), 0.0)),
@@ -186,10 +183,8 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     "ConstantSpeed": [("speed_rad_per_s", lambda: api.ConstantSpeed(0.0, np.nan))],
     "SpeedRamp": [("acceleration_rad_per_s2", lambda: api.SpeedRamp(0.0, 1.0, "1"))],
     "EncoderTable": [
-        ("encoder table", lambda: api.EncoderTable([0.0], [0.0])),
-        ("encoder table", lambda: api.EncoderTable([1.0, 0.0], [0, 1])),
-        ("encoder table", lambda: api.EncoderTable([0.0, np.nan], [0, 1])),
         ("encoder table", lambda: api.EncoderTable([0.0, 1.0], [0.0, 1.0]).angle_rad(0, np.array([2.0]))),
+        *(("encoder table", partial(api.EncoderTable, times, [0, 1])) for times in ([0.0], [1.0, 0.0], [0.0, np.nan])),
     ],
     "FrameSweeps": [("angle_start_rad", lambda: api.FrameSweeps([0.0, 1.0], 1.0, [0.0], [1.0]))],
     "PoseTable": [
@@ -210,18 +205,13 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("motion Frames", lambda: reconstruct(GOOD, "sirt", motion=NO_CELLS)),
     ],
     "Grid": [
-        ("grid shape", lambda: Grid(16, 1.0)), ("grid voxel_size", lambda: Grid((4, 4, 4), (1.0, 1.0))),
-        ("grid shape", lambda: Grid((1000000.0, 1000000.0, 1000000.0), (1, 1, 1))),
-        ("count", lambda: Grid.cube(0, 2.0)), ("grid shape", lambda: Grid((0, 3, 4), (1, 1, 1))),
-        ("grid voxel_size", lambda: Grid((2, 3, 4), (1, 0, 1))),
-        ("grid voxel_size", lambda: Grid((2, 3, 4), (1, np.nan, 1))),
-        ("grid offset", lambda: Grid((2, 3, 4), (1, 1, 1), (0, np.inf, 0))),
+        ("count", lambda: Grid.cube(0, 2.0)), ("grid offset", lambda: Grid((2, 3, 4), (1, 1, 1), (0, np.inf, 0))),
+        *(("grid shape", partial(Grid, shape, (1, 1, 1))) for shape in (16, (1e6, 1e6, 1e6), (0, 3, 4))),
+        *(("grid voxel_size", partial(Grid, (2, 3, 4), size)) for size in ((1.0, 1.0), (1, 0, 1), (1, np.nan, 1))),
     ],
     "Gating": [
-        ("gating times_s", lambda: api.Gating(np.zeros(3), np.zeros(3))),
-        ("gating values", lambda: api.Gating(np.arange(3.0), np.zeros(2))),
-        ("gating values", lambda: api.Gating(np.arange(3.0), np.full(3, np.nan))),
-        ("gating", lambda: replace(GOOD, gating=np.zeros(4))),
+        ("gating", lambda: replace(GOOD, gating=np.zeros(4))), ("gating times_s", lambda: api.Gating([0, 0], [0, 0])),
+        *(("gating values", partial(api.Gating, np.arange(3.0), wrong)) for wrong in (np.zeros(2), np.full(3, np.nan))),
     ],
     "States": [
         ("times of states", lambda: api.States([2.0, 1.0], np.zeros((2, 3, 3, 3)))),
@@ -248,7 +238,6 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     "ObjectMotion": [
         ("motion of the object: kind", lambda: api.ObjectMotion("walking")),
         ("motion of the object: amplitude_mm", lambda: api.ObjectMotion("sliding", 2.0).deformation(GRID, 0.0, 1.0)),
-        ("motion_of_object", lambda: api.simulate("foot", size=8, views=3, motion_of_object=3)),
     ],
     "Gaussians": [
         ("rows", lambda: Gaussians.from_rows(np.zeros((10, 5)))),
@@ -270,25 +259,19 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("reconstruct: option rings: option windo", lambda: api.prepare(GOOD, "rings", rings={"windo": 3})),
     ],
     "reconstruct": [
-        ("scan", lambda: reconstruct("scan.h5")), ("method", lambda: reconstruct(GOOD, "fkd")),
-        ("method", lambda: reconstruct(GOOD, lambda scan: None)),
-        ("method", lambda: reconstruct(GOOD, lambda scan, options, rt: 3)),
-        ("method", lambda: reconstruct(GOOD, "nowhere:f")),
+        ("scan", lambda: reconstruct("scan.h5")),
+        *(("method", partial(reconstruct, GOOD, method)) for method in (
+            "fkd", lambda scan: None, lambda scan, options, rt: 3, "nowhere:f",
+        )),
         ("batch", lambda: reconstruct(GOOD, "phyradgs", batch=9, iterations=1)),
         ("size", lambda: reconstruct(GOOD, "sirt", size=4, voxel_mm=1, roi_mm=2)),
         ("prior piccs", lambda: reconstruct(GOOD, "fista", prior="piccs")),
         ("method fista: option prior", lambda: reconstruct(GOOD, "fista", prior=3)),
     ],
     "simulate": [
-        ("simulate: option dosis", lambda: api.simulate("foot", dosis=3)),
-        ("size", lambda: api.simulate("foot", size=0)), ("truncation", lambda: api.simulate("foot", truncation=2)),
-        ("protocol", lambda: api.simulate("foot", protocol="slow")), ("phantom", lambda: api.simulate("elbow")),
-        ("views", lambda: api.simulate("foot", size=8, views=7.5)),
+        ("simulate: option dosis", lambda: api.simulate("foot", dosis=3)), ("phantom", lambda: api.simulate("elbow")),
         ("phantom", lambda: api.simulate(np.ones((2, 2, 2)))),
-        ("jitter_deg", lambda: api.simulate("foot", size=8, detector=8, jitter_deg=-1)),
-        ("noise", lambda: api.simulate("foot", size=8, noise="loud")),
         ("first", lambda: api.simulate("foot", first="left", readout_axis="rows")),
-        ("exposure_deg", lambda: api.simulate("foot", exposure_deg=5000.0)),
     ],
     "load_scan": [("nowhere.h5", lambda: api.load_scan("nowhere.h5")), ("path", lambda: api.load_scan(3))],
     "load_volume": [("nowhere.h5", lambda: api.load_volume("nowhere.h5"))],
@@ -301,10 +284,9 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     ],
     "compare": [
         ("result", lambda: api.compare(np.ones((2, 2, 2)), np.ones((3, 3, 3)))),
-        ("reference", lambda: api.compare(VOLUME.volume, GOOD)),
-        ("reference", lambda: api.compare(np.ones((4, 4)), np.ones((4, 4)))),
-        ("reference", lambda: api.compare(VOLUME.volume + 1, VOLUME.volume)),
         ("result", lambda: api.compare(np.full((4, 4, 4), np.nan), VOLUME.volume + 1)),
+        *(("reference", partial(api.compare, VOLUME.volume, other)) for other in (GOOD, VOLUME.volume)),
+        ("reference", lambda: api.compare(np.ones((4, 4)), np.ones((4, 4)))),
     ],
     "ray_operator": [("motion", lambda: ray_operator(GOOD, "exact")), ("scan", lambda: ray_operator("scan.h5"))],
     "splat_operator": [
@@ -347,9 +329,8 @@ CASES: dict[str, list[tuple[str, Callable[[], object]]]] = {
     ],
     "sum_frames": [
         ("scan", lambda: api.sum_frames(FRAMES, 2)), ("count", lambda: api.sum_frames(GOOD, 0)),
-        ("readout", lambda: api.sum_frames(GOOD, 2, readout="left")),
         ("lag", lambda: api.sum_frames(replace(GOOD, lag=0.1), 2)),
-        ("readout", lambda: api.sum_frames(STILL, 2, -1.0)),
+        *(("readout", partial(api.sum_frames, STILL, 2, **how)) for how in ({"readout": "left"}, {"readout_ratio": -1.0})),
         ("scan", lambda: api.sum_frames(fly(readout_ratio=0.5), 2)),
         ("frame_start_s", lambda: api.sum_frames(replace(STILL, frame_start_s=np.arange(4.0) ** 2), 2)),
     ],

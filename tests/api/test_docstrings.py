@@ -10,9 +10,7 @@ import pytest
 from phyradgs_cl import api
 
 SHAPE = re.compile(r"\((?:[A-Z]\w*|\.\.\.|n?[zvyxu]|n|rows|lines|\d+)(?:,|\))")
-UNIT = re.compile(
-    r"\b(?:mm|1/mm|s|rad|radians|degrees|deg|dB|dimensionless|line integrals?|counts|1/s)\b|_(?:mm|s|rad|deg)\b"
-)
+UNIT = re.compile(r"\b(?:mm|1/mm|s|radians|degrees|rad|deg|dB|dimensionless|line integrals?|counts|1/s)\b|_(mm|s|rad|deg)\b")
 ERROR = re.compile(r"\b[A-Z]\w*Error\b|\bKeyboardInterrupt\b")
 ARRAYS = ("ndarray", "NDArray", "ArrayLike", "Gaussians", "Scan")
 
@@ -25,9 +23,7 @@ def said(name: str) -> str:
 
 def parameters(thing: Any) -> list[inspect.Parameter]:
     """The parameters of a function or a constructor that users give."""
-    if inspect.isclass(thing) and (
-        issubclass(thing, Exception | BaseException) or getattr(thing, "_is_protocol", False)
-    ):
+    if inspect.isclass(thing) and (issubclass(thing, BaseException) or getattr(thing, "_is_protocol", False)):
         return []
     found = inspect.signature(thing).parameters.values()
     return [p for p in found if p.name not in ("self", "subject") and not p.name.startswith("_")]
@@ -38,9 +34,7 @@ def members(name: str) -> Iterator[tuple[str, Any]]:
     thing = getattr(api, name)
     if inspect.isclass(thing) and thing.__module__.startswith("phyradgs_cl"):
         for member, value in vars(thing).items():
-            if not member.startswith("_") and (
-                inspect.isroutine(value) or isinstance(value, property | classmethod)
-            ):
+            if not member.startswith("_") and (inspect.isroutine(value) or isinstance(value, property | classmethod)):
                 yield member, value.__func__ if isinstance(value, classmethod | staticmethod) else value
 
 

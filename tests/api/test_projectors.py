@@ -2,6 +2,7 @@
 
 import gc
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pyopencl
@@ -117,9 +118,8 @@ def test_gaussians_and_their_voxels_make_the_same_frames(rt, cloud, which) -> No
 def test_splats_are_the_twin_in_millimetres(rt, scan, cloud) -> None:
     motion = MicroViews()
     frames = splat_operator(scan, motion, cutoff_sigma=0.0, device=rt).frames([4, 1])(cloud)
-    expected = np.stack(
-        [splat_frame(cloud.rows(), motion.cells(scan, f), scan.geometry.detector_shape) for f in (4, 1)]
-    )
+    shape = scan.geometry.detector_shape
+    expected = np.stack([splat_frame(cloud.rows(), motion.cells(scan, f), shape) for f in (4, 1)])
     assert np.abs(frames - expected).max() <= FLOAT32 * expected.max()
 
 
@@ -127,9 +127,7 @@ def test_a_gradient_renders_nothing_again(rt, scan, cloud, monkeypatch) -> None:
     calls: list[str] = []
     for name in ("draw", "prepare"):
         whole = getattr(SplatProjector, name)
-        monkeypatch.setattr(
-            SplatProjector, name, lambda *a, whole=whole, name=name: (calls.append(name), whole(*a))[1]
-        )
+        monkeypatch.setattr(SplatProjector, name, lambda *a, whole=whole, name=name: (calls.append(name), whole(*a))[1])
     splats = splat_operator(scan, device=rt)
     for operator, prepared in ((splats.frames([2]), 0), (splats.frames([0, 3]), 2), (splats.intensity.frames([1]), 0)):
         misfit, pull = operator.vjp(cloud)
@@ -156,22 +154,10 @@ def test_linear_operators_keep_scipys_law(rt, scan, cloud, kind) -> None:
     assert np.allclose((matrix.T @ matrix) @ x, matrix.T @ forward, rtol=1e-5)
 
 
-class _Foreign:
-    """An array of another library, known by DLPack alone."""
-
-    def __init__(self, values: np.ndarray) -> None:
-        self.values = values
-
-    def __dlpack__(self, **options: object) -> object:
-        return self.values.__dlpack__(**options)
-
-    def __dlpack_device__(self) -> tuple[int, int]:
-        return self.values.__dlpack_device__()
-
-
 def test_arrays_of_others_come_by_dlpack_without_a_copy(rt, scan, monkeypatch) -> None:
     operator = ray_operator(scan, device=rt)
     volume = np.random.default_rng(0).random(scan.grid.shape).astype(np.float32)
+    foreign = SimpleNamespace(__dlpack__=volume.__dlpack__, __dlpack_device__=volume.__dlpack_device__)
     expected, seen = operator(volume), []
     entered = np.from_dlpack
 
@@ -180,7 +166,7 @@ def test_arrays_of_others_come_by_dlpack_without_a_copy(rt, scan, monkeypatch) -
         return seen[-1]
 
     monkeypatch.setattr(np, "from_dlpack", noted)
-    assert np.array_equal(operator(_Foreign(volume)), expected)
+    assert np.array_equal(operator(foreign), expected)
     assert len(seen) == 1 and np.shares_memory(seen[0], volume)
 
 

@@ -83,17 +83,6 @@ def test_xarray_has_the_places_of_voxels_in_mm(monkeypatch) -> None:
         result.to_xarray()
 
 
-def test_options_reach_the_method_and_the_frames(rt, scan) -> None:
-    result = api.reconstruct(
-        scan, "sart", motion="per-row", sub_intervals=3, iterations=1, holdout=3, device=rt
-    )
-    plain = api.reconstruct(scan, "sart", motion="per-row", sub_intervals=3, iterations=1, device=rt)
-    assert result.facts["options"]["motion"]["sub_intervals"] == 3
-    assert not np.array_equal(result.volume, plain.volume)
-    nested = api.reconstruct(scan, "phyradgs", iterations=1, control={"every": 7}, device=rt)
-    assert nested.facts["options"]["control"]["every"] == 7
-
-
 def softened(volume: np.ndarray, noise: float, share: float = 0.9) -> np.ndarray:
     return share * volume
 
@@ -153,10 +142,3 @@ def test_the_command_and_python_make_the_same_scan(rt, tmp_path) -> None:
     assert ours.projections.shape == (2, 10, 6)
     assert np.array_equal(ours.projections, theirs.projections) and ours.shutter == theirs.shutter
     assert ours.provenance == theirs.provenance and ours.provenance["simulated"] == "phantom jaw"
-
-
-def test_a_volume_file_can_be_scanned(rt, scan, tmp_path) -> None:
-    result = api.Reconstruction(scan.reference, scan.grid)
-    api.save_volume(tmp_path / "v.h5", result)
-    again = api.simulate(tmp_path / "v.h5", size=6, detector=10, views=2, device=rt)
-    assert again.grid.shape == (6, 6, 6) and again.projections.max() > 0

@@ -5,18 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from phyradgs_cl import api
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable
-from phyradgs_cl.api import (
-    ConeGeometry,
-    Gaussians,
-    ParallelGeometry,
-    Scan,
-    load_scan,
-    reconstruct,
-    save_scan,
-    splat_operator,
-    static_scan,
-)
+from phyradgs_cl.api import ConeGeometry, Gaussians, Grid, ParallelGeometry, Scan, splat_operator
 from phyradgs_cl.errors import InputError
 
 pytestmark = pytest.mark.slow
@@ -60,29 +51,22 @@ def drawn_pixels(scan: Scan, rt) -> np.ndarray:
     return np.stack(found, 1)
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {},
-        {"COR": 3.0},
-        {
-            "DSO": np.array([400.0, 410.0, 395.0, 402.0]),
-            "offDetector": np.array([[5.0, -4.0], [2, 1], [0, 3], [-1, 6]]),
-        },
-    ],
-    ids=["circular", "centre of rotation", "of every frame its own"],
-)
+CHANGES = {
+    "circular": {}, "centre of rotation": {"COR": 3.0},
+    "of every frame its own": {
+        "DSO": np.array([400.0, 410.0, 395.0, 402.0]), "offDetector": np.array([[5.0, -4.0], [2, 1], [0, 3], [-1, 6]]),
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("changes", CHANGES.values(), ids=CHANGES)
 def test_points_fall_where_tigre_puts_them(rt, changes) -> None:
     geo = tigre(**changes)
     scan = Scan.from_tigre(geo, ANGLES, FRAMES)
     expected = np.stack([tigre_pixels(geo, i) for i in range(4)])
     assert np.abs(drawn_pixels(scan, rt) - expected).max() < PIXEL
     assert isinstance(scan.trajectory, CircularOrbit if len(changes) == 0 else (PoseTable, CircularOrbit))
-    assert (
-        scan.grid.shape == (8, 10, 12)
-        and scan.grid.voxel_size_mm == (5.0, 4.5, 4.0)
-        and scan.grid.offset_mm == (1, -2, 3)
-    )
+    assert scan.grid == Grid((8, 10, 12), (5.0, 4.5, 4.0), (1, -2, 3))
 
 
 def test_masked_pixels_may_hold_anything_whoever_says_the_geometry() -> None:
@@ -95,7 +79,7 @@ def test_masked_pixels_may_hold_anything_whoever_says_the_geometry() -> None:
         "from_poses": lambda values: Scan.from_poses(values, cone.pose(ANGLES), pixel_mask=mask),
         "from_astra": lambda values: Scan.from_astra(values, astra_vectors(), pixel_mask=mask),
         "from_tigre": lambda values: Scan.from_tigre(tigre(), ANGLES, values, pixel_mask=mask),
-        "static_scan": lambda values: static_scan(values, cone, np.rad2deg(ANGLES), mask=mask),
+        "static_scan": lambda values: api.static_scan(values, cone, np.rad2deg(ANGLES), mask=mask),
     }
     for name, make in makers.items():
         scan = make(frames)
@@ -143,8 +127,8 @@ def test_points_fall_where_astra_puts_them_and_the_vectors_come_back(rt, tmp_pat
     if is_parallel:
         vectors[:, :3] /= np.linalg.norm(vectors[:, :3], axis=1, keepdims=True)
     np.testing.assert_allclose(scan.astra_vectors(), vectors, atol=1e-9)
-    save_scan(tmp_path / "s.h5", scan)
-    stored = load_scan(tmp_path / "s.h5")
+    api.save_scan(tmp_path / "s.h5", scan)
+    stored = api.load_scan(tmp_path / "s.h5")
     np.testing.assert_allclose(stored.astra_vectors(), vectors, atol=1e-6)
     assert stored.is_parallel == is_parallel
 
@@ -162,8 +146,8 @@ def test_tigre_s_parallel_mode_is_astra_s_parallel_geometry(rt, tmp_path) -> Non
         assert np.abs(drawn_pixels(scan, rt)[i] - expected).max() < PIXEL
     back = Scan.from_astra(FRAMES, scan.astra_vectors(), scan.grid, is_parallel=True)
     assert back.geometry.pixel_size_mm == pytest.approx((4.0, 3.5)) and isinstance(back.trajectory, CircularOrbit)
-    save_scan(tmp_path / "s.h5", back)
-    np.testing.assert_allclose(load_scan(tmp_path / "s.h5").astra_vectors(), scan.astra_vectors(), atol=1e-9)
+    api.save_scan(tmp_path / "s.h5", back)
+    np.testing.assert_allclose(api.load_scan(tmp_path / "s.h5").astra_vectors(), scan.astra_vectors(), atol=1e-9)
 
 
 def test_rows_may_run_down(rt, scan) -> None:
@@ -173,5 +157,5 @@ def test_rows_may_run_down(rt, scan) -> None:
     vectors[:, 9:12] *= -1
     down = Scan.from_astra(scan.projections[:, ::-1], vectors, scan.grid)
     for method in ({"method": "fdk"}, {"method": "sirt", "iterations": 3}):
-        up, turned = (reconstruct(s, device=rt, **method).volume for s in (still, down))
+        up, turned = (api.reconstruct(s, device=rt, **method).volume for s in (still, down))
         assert np.abs(up - turned).max() < 1e-4 * up.max(), method

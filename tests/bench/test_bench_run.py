@@ -8,17 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from tables import (
-    KINDS,
-    RESULTS,
-    BenchJob,
-    BenchSize,
-    plan_runs,
-    remake_tables,
-    rows_of,
-    run_bench,
-    sizes,
-)
+from tables import KINDS, RESULTS, BenchJob, BenchSize, plan_runs, remake_tables, rows_of, run_bench, sizes
 from tables.__main__ import run
 from tables.case import FLY, STILL
 from tables.published import TABLE1, TABLE2
@@ -100,9 +90,7 @@ def test_the_sphere_phantom_study_runs_and_says_shape(tmp_path: Path, rt: Runtim
     run_bench(job, lambda: rt)
     lines = {(x["label"], x["acquisition"]): x["metrics"] for x in read_lines(job.output / RESULTS)}
     references = {("truth", "reference"), ("pseudo-truth", "reference")}
-    assert set(lines) == references | {
-        ("FDK", FLY), ("PhyRadGS", FLY), ("FDK", STILL), ("PhyRadGS w/o ST", STILL)
-    }  # fmt: skip
+    assert set(lines) == references | {("FDK", FLY), ("PhyRadGS", FLY), ("FDK", STILL), ("PhyRadGS w/o ST", STILL)}
     scores = {"psnr_db", "psnr_db_pseudo", "psnr_2d_db", "roundness", "edge_rise_mm"}
     assert lines["PhyRadGS", FLY].keys() >= scores
     assert "| pseudo-truth |" in (job.output / "phantom_T.md").read_text()

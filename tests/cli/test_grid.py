@@ -1,7 +1,5 @@
 """The grid of a volume, chosen on the command line: what is in the file, said, scored and refused."""
 
-import os
-
 import h5py
 import numpy as np
 import pytest
@@ -86,21 +84,3 @@ def test_a_box_inside_of_what_is_seen_is_said_where_it_matters(cli, scan, tmp_pa
     assert found.grid == alone.grid and found.metrics["psnr_db"] > alone.metrics["psnr_db"] + 3
     assert found.provenance["input"]["margin_mm"] == [0.5] * 3
     assert "margin around the box is discarded" in load_run(tmp_path / "v.h5", scan).notes[-1]
-
-
-def test_a_run_does_not_go_on_with_another_grid(cli, refused, scan, tmp_path, monkeypatch) -> None:
-    output, kept = tmp_path / "v.h5", tmp_path / "kept"
-    command = ["reconstruct", str(scan), "-o", str(output), *SIRT]
-
-    def keep(checkpoints, progress) -> None:
-        """Leaves the checkpoint of the first iteration."""
-        if progress.iteration == 1:
-            checkpoints.write(progress.state(), 1)
-            os.replace(checkpoints.path, kept)
-
-    monkeypatch.setattr("phyradgs_cl.workflow.reconstruct._Checkpoints.__call__", keep)
-    assert cli.run([*command, "--size", "6"]) == 0
-    os.replace(kept, f"{output}.checkpoint.npz")
-    refused([*command, "--size", "7", "--resume"], "a run with other input.size (6, now 7)")
-    refused([*command, "--size", "6", "--margin-mm", "0.1", "--resume"], "a run with other input.margin_mm")
-    assert cli.run([*command, "--size", "6", "--resume"]) == 0

@@ -39,14 +39,6 @@ def test_a_reader_says_where_the_run_was_interrupted(cli, stored, caplog, capsys
         assert (facts["interrupted_at"], facts["iterations_asked"]) == (812, 3000)
 
 
-def test_of_a_run_that_ended_nothing_is_said(cli, stored, caplog) -> None:
-    for at in (None, "812", True, [812]):
-        grid = Grid.cube(6, 2.0)
-        write_volume(stored, np.ones(grid.shape, np.float32), grid, {"interrupted_at": at, "options": 7})
-        assert cli.run(["info", str(stored)]) == 0
-        assert "interrupted at" not in caplog.text, at
-
-
 def test_a_partial_volume_has_a_name_of_its_own_where_no_scan_lies(refused, tmp_path) -> None:
     for name in ("volume.h5", "v.partial.h5", "volume", ".hidden", "a.b.h5"):
         path = partial_path(tmp_path / name)

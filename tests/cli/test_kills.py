@@ -81,19 +81,6 @@ def test_killed_runs_end_with_the_bits_of_one_that_was_not(cli, scan, tmp_path, 
     assert not checkpoint_path(killed).exists() and not lock_path(killed).exists()
 
 
-def test_two_runs_on_one_output_refuse_each_other(refused, scan, tmp_path) -> None:
-    output, quiet = tmp_path / "volume.h5", {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    first = subprocess.Popen(command(scan, output, ["--iterations", "100000"]), **quiet)
-    try:
-        deadline = time.monotonic() + 60
-        while not checkpoint_path(output).exists() and time.monotonic() < deadline:
-            time.sleep(0.02)
-        refused(words_of(scan, output, ["--method", "fdk"]), "volume.h5: found another run at work on it", status=4)
-    finally:
-        first.kill()
-        first.wait()
-
-
 def test_a_checkpoint_is_neither_needed_nor_lost(cli, scan, tmp_path, caplog) -> None:
     """It is a warning that none can be written, and a run that forgets one sets it aside."""
     output, short = tmp_path / "volume.h5", ["--method", "sirt", "--iterations", "3"]

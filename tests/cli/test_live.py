@@ -1,8 +1,8 @@
 """--live: a page of the run under way, which changes nothing about the run, ends as its report, and survives a kill."""
 
-
 import numpy as np
 import pytest
+from skimage.io import imread
 
 from phyradgs_cl.io import partial_path, read_volume
 from phyradgs_cl.progress import Ticker
@@ -10,14 +10,15 @@ from phyradgs_cl.progress import Ticker
 pytestmark = pytest.mark.slow
 
 
-def test_a_run_with_a_page_is_the_same_run_and_ends_as_its_report(cli, scan, tmp_path) -> None:
-    page, seen, plain = tmp_path / "run.html", tmp_path / "seen.h5", tmp_path / "plain.h5"
-    for output, more in ((seen, ["--live", str(page)]), (plain, [])):
+def test_a_run_with_a_page_and_pictures_is_the_same_run_and_ends_as_its_report(cli, scan, tmp_path) -> None:
+    page, picture, seen, plain = (tmp_path / name for name in ("run.html", "now.png", "seen.h5", "plain.h5"))
+    for output, more in ((seen, ["--live", str(page), "--preview", str(picture)]), (plain, [])):
         assert cli.run(["reconstruct", str(scan), "-o", str(output), "--method", "sirt", "--iterations", "3", *more]) == 0
     np.testing.assert_array_equal(read_volume(seen).values, read_volume(plain).values)
     text = page.read_text(encoding="utf-8")
     assert 'id="provenance"' in text and 'id="projections"' in text and "live-data" not in text
-    assert {path.name for path in tmp_path.iterdir()} == {"run.html", "seen.h5", "plain.h5"}
+    assert imread(picture).max() > 0
+    assert {path.name for path in tmp_path.iterdir()} == {"run.html", "now.png", "seen.h5", "plain.h5"}
 
 
 def test_an_error_of_the_run_stands_on_its_page(cli, scan, tmp_path) -> None:

@@ -46,24 +46,21 @@ def test_evaluate_has_one_answer_for_all_formats(cli, files, tmp_path, capsys) -
     assert json.loads(capsys.readouterr().out)["ssim"] == 1
 
 
-def test_evaluate_converts_a_reference_in_hounsfield_units_or_refuses_it(cli, files, tmp_path, capsys) -> None:
+def test_evaluate_converts_a_reference_in_hounsfield_units_or_refuses_it(cli, refused, files, tmp_path, capsys) -> None:
     _, volume, values, grid = files
-    truth, water_per_mm = values - 0.01, 0.019
+    truth, water_per_mm, answers = values - 0.01, 0.019, []
     write_volume(tmp_path / "truth.h5", truth, grid, {})
     write_volume(tmp_path / "hu.h5", 1000 * (truth / water_per_mm - 1), grid, {})
     words = ["evaluate", str(volume), "--json", "--reference"]
-    assert cli.run([*words, str(tmp_path / "truth.h5")]) == 0
-    plain = json.loads(capsys.readouterr().out)
-    assert cli.run([*words, str(tmp_path / "hu.h5"), "--mu-water-per-mm", str(water_per_mm)]) == 0
-    converted = json.loads(capsys.readouterr().out)
-    assert converted["psnr_db"] == pytest.approx(plain["psnr_db"], abs=1e-3)
-    assert converted["ssim"] == pytest.approx(plain["ssim"], abs=1e-4)
-    assert cli.run([*words, str(tmp_path / "hu.h5")]) == 2
-    assert "hu.h5: found values from -1000 to" in (error := capsys.readouterr().err) and "--mu-water-per-mm" in error
-    assert cli.run([*words, str(tmp_path / "hu.h5"), "--mu-water-per-mm", "0"]) == 2
-    assert "--mu-water-per-mm: found 0" in capsys.readouterr().err
-    assert cli.run([*words, str(tmp_path / "truth.h5"), "--mu-water-per-mm", "0.019"]) == 2
-    assert "expected a volume in Hounsfield units that does not state its scale" in capsys.readouterr().err
+    for more in (["truth.h5"], ["hu.h5", "--mu-water-per-mm", str(water_per_mm)]):
+        assert cli.run([*words, str(tmp_path / more[0]), *more[1:]]) == 0
+        answers.append(json.loads(capsys.readouterr().out))
+    assert answers[1]["psnr_db"] == pytest.approx(answers[0]["psnr_db"], abs=1e-3)
+    assert answers[1]["ssim"] == pytest.approx(answers[0]["ssim"], abs=1e-4)
+    refused([*words, tmp_path / "hu.h5"], "hu.h5: found values from -1000 to", "--mu-water-per-mm")
+    refused([*words, tmp_path / "hu.h5", "--mu-water-per-mm", "0"], "--mu-water-per-mm: found 0")
+    wanted = "expected a volume in Hounsfield units that does not state its scale"
+    refused([*words, tmp_path / "truth.h5", "--mu-water-per-mm", "0.019"], wanted)
 
 
 def test_a_result_in_hounsfield_units_is_converted_once(cli, refused, files, tmp_path, capfd) -> None:
@@ -132,41 +129,27 @@ def test_boxes_with_little_in_common_are_warned_of(cli, files, tmp_path, caplog)
     assert "of the first box" not in caplog.text
 
 
-def test_how_another_grid_is_compared_is_said_in_the_line_and_the_json(cli, files, tmp_path, capsys) -> None:
-    def said(name: str) -> str:
-        assert cli.run(["evaluate", str(tmp_path / name), "--reference", str(scan)]) == 0
-        told = capsys.readouterr()
-        assert told.out.count("\n") == 1 and not told.err
-        return told.out
-
-    def facts_of(name: str) -> dict:
-        assert cli.run(["evaluate", str(tmp_path / name), "--reference", str(scan), "--json"]) == 0
-        return json.loads(capsys.readouterr().out)
-
+def test_how_another_grid_is_compared_is_said_in_the_line_and_the_json(cli, refused, files, tmp_path, capsys) -> None:
     scan, _, volume, grid = files
     dz, dy, dx = grid.voxel_size_mm
-    fine = Grid((24, 24, 24), (dz / 2, dy / 2, dx / 2), grid.offset_mm)
-    write_volume(tmp_path / "fine.h5", np.kron(volume, np.ones((2, 2, 2))), fine, {})
-    line, facts = said("fine.h5"), facts_of("fine.h5")
-    assert "24×24×24 voxels" in line and "12×12×12 voxels" in line and "about (0, 0, 0) mm" in line
-    assert facts["share_of_reference_covered"] == 1 and "24×24×24" in facts["compared"]
-    assert facts_of("v.h5")["psnr_db"] == pytest.approx(facts["psnr_db"], abs=1e-3)
-
     half = Grid((6, 12, 12), grid.voxel_size_mm, (grid.offset_mm[0] - 3 * dz, *grid.offset_mm[1:]))
-    write_volume(tmp_path / "half.h5", volume[:6], half, {})
-    facts = facts_of("half.h5")
-    assert "voxel by voxel, on 50 % of the reference" in said("half.h5") and facts["share_of_reference_covered"] == 0.5
+    for name, values, other, share, words in (
+        ("fine.h5", np.kron(volume, np.ones((2, 2, 2))), Grid((24, 24, 24), (dz / 2, dy / 2, dx / 2), grid.offset_mm), 1,
+         "24×24×24 voxels"),
+        ("half.h5", volume[:6], half, 0.5, "voxel by voxel, on 50 % of the reference"),
+    ):  # fmt: skip
+        write_volume(tmp_path / name, values, other, {})
+        command = ["evaluate", str(tmp_path / name), "--reference", str(scan)]
+        assert cli.run(command) == 0 and words in (line := capsys.readouterr().out) and line.count("\n") == 1
+        assert cli.run([*command, "--json"]) == 0
+        facts = json.loads(capsys.readouterr().out)
+        assert facts["share_of_reference_covered"] == share and words.split()[0] in facts["compared"]
     truth = load_scan(scan).reference
-    assert facts["psnr_db"] == pytest.approx(compare(volume[:6], truth[:6])["psnr_db"])
+    assert truth[0, 0, 0] == 0 and facts["psnr_db"] == pytest.approx(compare(volume[:6], truth[:6])["psnr_db"])
     write_volume(tmp_path / "air.h5", volume[:1, :1, :1], grid.part((0, 0, 0), (1, 1, 1)), {})
-    assert truth[0, 0, 0] == 0 and cli.run(["evaluate", str(tmp_path / "air.h5"), "--reference", str(scan)]) == 2
-    assert "nothing in the 0.0579 % of it that lie in" in capsys.readouterr().err
-
-    away = replace(grid, offset_mm=(0.0, 0.0, 1e3))
-    write_volume(tmp_path / "away.h5", volume, away, {})
-    assert cli.run(["evaluate", str(tmp_path / "away.h5"), "--reference", str(scan)]) == 2
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1 and "no voxel of the reference" in told and "(1000, 0, 0)" in told
+    refused(["evaluate", tmp_path / "air.h5", "--reference", scan], "nothing in the 0.0579 % of it that lie in")
+    write_volume(tmp_path / "away.h5", volume, replace(grid, offset_mm=(0.0, 0.0, 1e3)), {})
+    refused(["evaluate", tmp_path / "away.h5", "--reference", scan], "no voxel of the reference", "(1000, 0, 0)")
     assert not (tmp_path / "away.evaluated.png").exists()
 
 

@@ -6,22 +6,12 @@ from skimage.io import imread
 
 from phyradgs_cl.errors import OutputError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import read_volume
 from phyradgs_cl.reconstructors.result import Progress
 from phyradgs_cl.report import Preview
 
 pytestmark = pytest.mark.slow
 
 GRID = Grid.cube(4, 2.0)
-
-
-def test_a_run_with_pictures_is_the_same_run(cli, scan, tmp_path) -> None:
-    picture, seen, plain = tmp_path / "now.png", tmp_path / "seen.h5", tmp_path / "plain.h5"
-    for output, more in ((seen, ["--preview", str(picture)]), (plain, [])):
-        words = ["reconstruct", str(scan), "-o", str(output), "--method", "phyradgs", "--iterations", "60", *more]
-        assert cli.run(words) == 0
-    np.testing.assert_array_equal(read_volume(seen).values, read_volume(plain).values)
-    assert imread(picture).max() > 0 and not (tmp_path / "now.partial.png").exists()
 
 
 def test_the_picture_is_of_the_present_volume(tmp_path) -> None:

@@ -51,27 +51,19 @@ def test_a_named_option_wins_over_set_and_set_over_the_file(config: Path) -> Non
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        *((f"iterations = {value}", "iterations: ") for value in ("'many'", "inf", "nan", f"0x{'f' * 5000}")),
-        *((f"strips = {value}", "strips: ") for value in ("2.5", "true")),
-        *((f"motion = {value}", "motion: ") for value in ("'wobble'", "['static']", "3")),
-        *((f"method = {value}", "method: ") for value in ("'magic'", "['fdk']", "3")),
-        *((f"seed = {value}", "seed: ") for value in ("1.5", "true", "1e300", "2024-01-01")),
-        *((f"device = {value}", "device: ") for value in ("-1", "[0]", "''", "true")),
-        *((f"voxel_mm = {value}", "voxel_mm: ") for value in ("[1, 2]", "-1")),
-        ("preset = ['default']", "preset: "),
-        ("size = '4,4,4'", "size: "),
-        ("roi_mm = [-inf, inf, 0, 1, 0, 1]", "roi_mm: "),
-        ("holdout = 60", "holdout: "),
+        *((f"iterations = {value}", "iterations: ") for value in ("'many'", "nan", f"0x{'f' * 5000}")),
+        ("strips = true", "strips: "), ("motion = 'wobble'", "motion: "), ("method = ['fdk']", "method: "),
+        *((f"seed = {value}", "seed: ") for value in ("1e300", "2024-01-01")), ("device = [0]", "device: "),
+        ("voxel_mm = [1, 2]", "voxel_mm: "), ("preset = ['default']", "preset: "), ("size = '4,4,4'", "size: "),
+        ("roi_mm = [-inf, inf, 0, 1, 0, 1]", "roi_mm: "), ("holdout = 60", "holdout: "),
         ("method = 'phyradgs'\nrates = 3", "rates: "),
-        *((f"method = 'phyradgs'\n[rates]\nposition = {value}", "rates.position: ") for value in ("[nan, 1e-4]", "3")),
+        ("method = 'phyradgs'\n[rates]\nposition = [nan, 1e-4]", "rates.position: "),
         ("method = 'phyradgs'\n[control]\nthreshold = -1", "control.threshold: "),
         ("method = 'phyradgs'\n[control]\nevry = 3", "control.evry: found no such option of --method phyradgs"),
-        ("method = 'fdk'\nwindow = 'round'", "window: "),
         ("method = 'fdk'\nstrips = 3", "strips: found --motion per-row for --method fdk"),
-        (f"iterations = {'9' * 5000}", ""),
-        ("a = " + "[" * 20_000, ""),
+        (f"iterations = {'9' * 5000}", ""), ("a = " + "[" * 20_000, ""),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_value_of_a_file_is_named_by_its_line(config: Path, text: str, error: str) -> None:
     config.write_text(text)
     with pytest.raises(InputError, match=re.escape(f"config {config}: {error}" if error else str(config))):

@@ -62,19 +62,18 @@ def test_failing_copies_and_memory_that_is_missed(run, scan, tmp_path, capfd, la
     assert kit.names(tmp_path) == []
 
 
-@pytest.mark.parametrize("name", ["sirt", "phyradgs"])
-def test_memory_that_is_missed_late_leaves_the_checkpoint(run, scan, tmp_path, capfd, copies, name) -> None:
+def test_memory_that_is_missed_late_leaves_the_checkpoint(run, scan, tmp_path, capfd, copies) -> None:
     """The launch went well, and whatever waits for it next is told."""
-    whole, output = tmp_path / "whole.h5", tmp_path / "v.h5"
-    assert run(*command(scan, whole, RUNS[name])) == 0
+    whole, output, options = tmp_path / "whole.h5", tmp_path / "v.h5", RUNS["phyradgs"]
+    assert run(*command(scan, whole, options)) == 0
     copies.arm(int(0.95 * copies.calls), -5)
     capfd.readouterr()
-    assert run(*command(scan, output, RUNS[name])) == 6
+    assert run(*command(scan, output, options)) == 6
     line = capfd.readouterr().err.splitlines()[-1]
     assert line.startswith("phyradgs: memory of ") and "--resume continues from iteration" in line
     assert checkpoint_path(output).exists() and not output.exists()
     copies.arm(None)
-    assert run(*command(scan, output, RUNS[name]), "--resume") == 0
+    assert run(*command(scan, output, options), "--resume") == 0
     kit.same_bits(output, whole)
 
 
@@ -107,7 +106,7 @@ def test_a_memory_that_is_too_small(run, scan, tmp_path, capfd, monkeypatch) -> 
         return real(context, flags, size)
 
     monkeypatch.setattr(context.cl, "Buffer", small)
-    for method in ("fdk", "sirt", "cgls", "fista-tv", "phyradgs"):
+    for method in ("fdk", "sirt", "phyradgs"):
         held.clear()
         assert run("reconstruct", scan, "-o", tmp_path / "v.h5", "--method", method) == 6
         line = capfd.readouterr().err.splitlines()[-1]

@@ -112,7 +112,7 @@ printf '%s|%s|%s\\n' "$status" "$(ls -A "$folder" | tr '\\n' ' ')" "$content"
 
 @pytest.mark.slow
 @pytest.mark.skipif(not can_mount(), reason="a mount needs the superuser")
-@pytest.mark.parametrize("size_kib", [8, 24, 1024])
+@pytest.mark.parametrize("size_kib", [8, 1024])
 def test_a_disk_that_is_full(scan, tmp_path, size_kib) -> None:
     """The real thing: HDF5 and the checkpoints run into it by themselves."""
     script = tmp_path / "on_a_disk.sh"

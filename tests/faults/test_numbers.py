@@ -79,7 +79,7 @@ def test_gaussians_at_the_source_behind_it_and_in_its_plane(rt, make_cloud, affi
         expect_finite(rt, rows, cells, affine=affine, cutoff_sigma=cutoff_sigma)
 
 
-@pytest.mark.parametrize("distance", [1e-3, 0.25, 0.5, 0.999, 1.0])
+@pytest.mark.parametrize("distance", [1e-3, 0.5, 1.0])
 def test_a_source_inside_the_volume(rt, make_cloud, distance) -> None:
     geometry = ConeGeometry(distance, distance + 3.0, SHAPE, (0.6, 0.6))
     cells = one_cell(geometry)
@@ -110,11 +110,10 @@ def test_any_dose(run, tmp_path) -> None:
         integrals, bad = counts_to_attenuation(data, np.array([1, 0, 0, 0, 0]), "counts")
         assert np.isfinite(integrals).all()
         assert light.any() or (bad is not None and bad.all())
-    for noise in ("tigre", "beer"):
-        for dose in ("1e-3", "1", "1e12"):
-            words = ["simulate", *kit.TINY, "--noise", noise, "--dose", dose, "--electronic-noise", "20"]
-            assert run(*words, "-o", tmp_path / "scan.h5") == 0
-            assert np.isfinite(load_scan(tmp_path / "scan.h5").projections).all(), (noise, dose)
+    for how in (["tigre", "--dose", "1e-3"], ["beer", "--dose", "1e-3"], ["beer", "--dose", "1e12"]):
+        words = ["simulate", *kit.TINY, "--noise", *how, "--electronic-noise", "20"]
+        assert run(*words, "-o", tmp_path / "scan.h5") == 0
+        assert np.isfinite(load_scan(tmp_path / "scan.h5").projections).all(), how
 
 
 @pytest.mark.parametrize("method", [name for name in METHODS if name not in ("naf", "sax-nerf")])
@@ -130,13 +129,9 @@ def test_any_finite_scan(rt, scan, method) -> None:
         changes = {"iterations": 6, "gaussians": 20}
     options = method_options(method, None, changes)
     for values, frames in {
-        "zero": 0 * index,
-        "tiny": 0 * index + 1e-30,
-        "huge": 0 * index + 1e6,
-        "negative": 0 * index - 1,
-        "one pixel": np.where(index == 70, 50.0, 0.0),
-        "alternating": np.where(index % 2, 1e5, -1e5),
-    }.items():
+        "zero": 0 * index, "huge": 0 * index + 1e6, "negative": 0 * index - 1,
+        "one pixel": np.where(index == 70, 50.0, 0.0), "alternating": np.where(index % 2, 1e5, -1e5),
+    }.items():  # fmt: skip
         measured = replace(loaded, projections=frames.astype(np.float32))
         with np.errstate(all="ignore"):
             try:

@@ -14,9 +14,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
 CONTROL = DensityControl(every=6, start_iteration=5, threshold=1e-6)
-OPTIONS = SplatOptions(
-    motion=MicroViews(4, 2), iterations=21, gaussians=300, tv_edge=8, batch=4, control=CONTROL
-)
+OPTIONS = SplatOptions(motion=MicroViews(4, 2), iterations=21, gaussians=300, tv_edge=8, batch=4, control=CONTROL)
 
 
 def small_scan() -> Scan:

@@ -24,7 +24,6 @@ LAUNCHERS = {
     "Open MPI": ({f"OMPI_COMM_WORLD_{name}": value for name, value in OPEN_MPI.items()}, (5, 6, 2, 3)),
     "srun, PMI-2": ({"PMI_RANK": "3", "PMI_SIZE": "4", "SLURM_LOCALID": "1", **TASKS}, (3, 4, 1, 2)),
     "srun, PMIx": ({"PMIX_RANK": "2", "SLURM_STEP_NUM_TASKS": "4", **FIRST}, (2, 4, 0, 2)),
-    "one rank": ({"PMI_RANK": "0", "PMI_SIZE": "1"}, (0, 1, 0, 1)),
     "a job of four tasks, no step": ({"SLURM_NTASKS": "4", "SLURM_PROCID": "0"}, (0, 1, 0, 1)),
     "nobody": ({}, (0, 1, 0, 1)),
 }
@@ -42,23 +41,18 @@ def test_runs_cover_all_and_differ_by_one_at_most() -> None:
         assert max(map(len, runs)) - min(map(len, runs)) <= 1
 
 
-def _device(index: int, name: str, rank: int) -> SimpleNamespace:
-    return SimpleNamespace(index=index, name=name, platform="P", kind="gpu", by_default=True, rank=(rank,))
-
-
 def test_ranks_of_a_machine_take_devices_in_turns(monkeypatch) -> None:
-    kinds = [("small", 1), ("large", 2), ("small", 1), ("large", 2)]
-    found = [_device(index, *kind) for index, kind in enumerate(kinds)]
+    found = [
+        SimpleNamespace(index=index, name=name, platform="P", kind="gpu", by_default=True, rank=(rank,))
+        for index, (name, rank) in enumerate(2 * [("small", 1), ("large", 2)])
+    ]
     monkeypatch.setattr(devices, "list_devices", lambda: found)
     monkeypatch.delenv(devices.DEVICE_VARIABLE, raising=False)
     for wish, expected in {
-        None: [1, 3, 1, 3],  # the best two are alike, the CPU is not taken
-        "gpu": [1, 3, 1, 3],
-        "0,3": [0, 3, 0, 3],
-        "3,1,0": [3, 1, 0, 3],
-        "3": [3, 3, 3, 3],  # what is named by its index is meant
+        None: [1, 3, 1, 3], "gpu": [1, 3, 1, 3],  # the best two are alike, the CPU is not taken
+        "3,1,0": [3, 1, 0, 3], "3": [3, 3, 3, 3],  # what is named by its index is meant
         "small": [0, 2, 0, 2],
-    }.items():
+    }.items():  # fmt: skip
         assert [devices.choose_device(wish, turn)[0].index for turn in range(4)] == expected, wish
 
 

@@ -38,17 +38,13 @@ def stated(scan: Scan, frames: np.ndarray | None = None, turns: float = 1.0, **g
 
 
 RIGHT = {
-    "25 views, fly": lambda scan: scan,
     "1000 photons": lambda scan: of_photons(scan, 1000),
-    "30 photons": lambda scan: of_photons(scan, 30),
     "truncated": lambda scan: stated(scan, scan.projections[:, :, 12:36], detector_shape=(48, 24)),
 }
 WRONG = {
     "axis off by 10 pixels": lambda scan: stated(scan, detector_offset_mm=(0.0, 10 * 4 / 48)),
     "no flats": lambda scan: stated(scan, scan.projections - np.log(2e4)),
-    "flats of a tenth of the time": lambda scan: stated(scan, scan.projections - np.log(10)),
     "angles reversed": lambda scan: stated(scan, turns=-1.0),
-    "angles in radians": lambda scan: stated(scan, turns=np.pi / 180),
 }
 
 

@@ -7,15 +7,8 @@ import numpy as np
 import pytest
 from tolerances import FLOAT32
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConstantSpeed,
-    LineMiddles,
-    ParallelGeometry,
-    PerRow,
-    Scan,
-    Shutter,
-)
+from phyradgs_cl import api
+from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, ParallelGeometry, PerRow, Scan, Shutter
 from phyradgs_cl.acquisition.slabs import slab, slices_of
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -65,7 +58,7 @@ def test_slabs_share_the_slices_out() -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "options", "limit"), [("fbp", {"motion": LineMiddles()}, FLOAT32), ("fista", {"iterations": 6}, 0.03)]
+    ("method", "options", "limit"), [("fbp", {"motion": api.LineMiddles()}, FLOAT32), ("fista", {"iterations": 6}, 0.03)]
 )
 def test_slabs_make_up_the_volume_of_the_whole_scan(rt, path: Path, tmp_path: Path, method, options, limit) -> None:
     """FBP: the same. ``fista``: the prior's weight and the subsets' order follow the noise of the rows that are read."""
