@@ -95,13 +95,10 @@ def test_another_run_is_not_gone_on_with(rt, scan) -> None:
     mask = np.zeros(scan.projections.shape[1:], bool)
     mask[3] = True
     for given, changes, words in [
-        (replace(scan, projections=scan.projections[::-1]), {}, "scan"),
-        (replace(scan, pixel_mask=mask), {}, "scan"),
-        (scan, {"seed": 1}, "seed"),
-        (scan, {"holdout": 3}, "input.holdout"),
-        (scan, {"initial": partial}, "initial"),
+        (replace(scan, projections=scan.projections[::-1]), {}, "scan"), (replace(scan, pixel_mask=mask), {}, "scan"),
+        (scan, {"seed": 1}, "seed"), (scan, {"holdout": 3}, "input.holdout"), (scan, {"initial": partial}, "initial"),
         (scan, {"grid": wider}, "grid"),
-    ]:
+    ]:  # fmt: skip
         with pytest.raises(api.InputError, match=f"resume: found a run with other .*{words}"):
             reconstruct(given, **options, **changes, resume=partial)
     again = reconstruct(scan, **options, resume=partial, report=pressing_at(3), on_interrupt="return")

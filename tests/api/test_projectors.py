@@ -11,19 +11,8 @@ import pytest
 from scipy.sparse.linalg import LinearOperator as ScipyOperator
 from tolerances import FLOAT32
 
-from phyradgs_cl.api import (
-    LinearOperator,
-    MicroViews,
-    Operator,
-    OwnTimes,
-    PerRow,
-    as_torch,
-    ray_operator,
-    simulate,
-    splat_operator,
-    voxel_operator,
-    voxelise,
-)
+from phyradgs_cl import api
+from phyradgs_cl.api import LinearOperator, MicroViews, Operator, ray_operator, splat_operator, voxelise
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import SplatProjector
@@ -42,10 +31,10 @@ def operator_and_x(rt, scan, cloud, request) -> tuple[Operator, np.ndarray]:
     volume = np.random.default_rng(0).random(scan.grid.shape).astype(np.float32)
     rows, kind = cloud.rows().astype(np.float32), request.param
     if "ray" in kind:
-        rays = ray_operator(scan, PerRow(2), device=rt)
+        rays = ray_operator(scan, api.PerRow(2), device=rt)
         return (rays.intensity if "intensity" in kind else rays), volume
     if kind == "voxels":
-        return voxel_operator(scan.grid, cutoff_sigma=0, device=rt), rows
+        return api.voxel_operator(scan.grid, cutoff_sigma=0, device=rt), rows
     splats = splat_operator(scan, MicroViews(2, 2), cutoff_sigma=0, device=rt)  # differentiable
     if kind == "densities":
         return splats.of_densities(cloud), rows[10]
@@ -105,8 +94,9 @@ def test_frames_are_rows_of_the_whole(operator_and_x) -> None:
 @pytest.mark.parametrize("which", ["rows", "columns"])
 def test_gaussians_and_their_voxels_make_the_same_frames(rt, cloud, which) -> None:
     """Of a panel as fine as the voxels: rays and splats are both at the pixels' centres."""
-    scan = simulate("jaw", size=8, detector=128, views=3, exposure_deg=30.0, readout_axis=which, time_samples=1, device=rt)
-    motion, grid = OwnTimes(sub_intervals=4), Grid.cube(120, 2.4)
+    how = {"exposure_deg": 30.0, "readout_axis": which, "time_samples": 1, "device": rt}
+    scan = api.simulate("jaw", size=8, detector=128, views=3, **how)
+    motion, grid = api.OwnTimes(sub_intervals=4), Grid.cube(120, 2.4)
     volume = voxelise(cloud, grid, cutoff_sigma=0.0, device=rt)
     rays = ray_operator(scan, motion, grid=grid, device=rt)
     splats = splat_operator(scan, motion, cutoff_sigma=0.0, device=rt)
@@ -186,4 +176,4 @@ def test_arrays_of_the_device_may_be_parts_and_are_counted(rt, scan) -> None:
 def test_without_pytorch_its_installation_is_named(rt, scan, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(InputError, match="pip install 'torch'"):
-        as_torch(ray_operator(scan, device=rt))
+        api.as_torch(ray_operator(scan, device=rt))

@@ -84,10 +84,9 @@ def test_a_method_that_ends_by_itself_says_when_and_why(scan, reconstructed, cap
 
 def test_columns_intensity_jitter_pulse_and_lag_are_simulated(cli, reconstructed, tmp_path, caplog):
     path, volumes = tmp_path / "scan.h5", []
-    options = ["--first", "right", "--detector-model", "intensity", "--jitter-deg", "0.2"]
-    options += ["--noise", "beer", "--peak", "3", "--detector-offset", "0.1,-0.2", "--pulse", "0.86,0.14"]
-    options += ["--lag", "0.1"]
-    assert cli.run([*SIMULATE, *options, "-o", str(path)]) == 0
+    options = "--first right --detector-model intensity --jitter-deg 0.2 --noise beer --peak 3 --lag 0.1"
+    options += " --detector-offset 0.1,-0.2 --pulse 0.86,0.14"
+    assert cli.run([*SIMULATE, *options.split(), "-o", str(path)]) == 0
     with h5py.File(path) as file:
         own = file["entry/phyradgs"]
         words = [own[name][()].decode() for name in ("readout_axis", "detector_model")]
@@ -102,9 +101,8 @@ def test_columns_intensity_jitter_pulse_and_lag_are_simulated(cli, reconstructed
         assert facts["input"]["ignore_lag"] == ("ignore_lag=true" in words)
     assert np.abs(volumes[0] - volumes[1]).max() > 0 and np.abs(volumes[0] - volumes[2]).max() > 0
     np.testing.assert_array_equal(volumes[2], volumes[3])
-    micro_views, sart = ["--motion", "micro-views"], ["--method", "sart"]
-    for words in (micro_views, [*sart, *micro_views], [*sart, "--detector-model", "log"]):
-        reconstructed(path, *words, "--iterations", "1")
+    for words in ("--motion micro-views", "--method sart --motion micro-views", "--method sart --detector-model log"):
+        reconstructed(path, *words.split(), "--iterations", "1")
     assert "averages intensity" not in caplog.text  # none of these merges poses without a model of intensity
 
 

@@ -13,12 +13,10 @@ pytestmark = pytest.mark.slow
 
 SAID = "interrupted at iteration 812 of 3000"
 READERS = {
-    "evaluate": ["evaluate", "{volume}", "--reference", "{volume}", "--json"],
-    "info": ["info", "{volume}", "--json"],
-    "report": ["report", "{volume}", "-o", "{folder}/page.html"],
-    "export": ["export", "{volume}", "--to", "npy"],
+    "evaluate": ["evaluate", "{volume}", "--reference", "{volume}", "--json"], "info": ["info", "{volume}", "--json"],
+    "report": ["report", "{volume}", "-o", "{folder}/page.html"], "export": ["export", "{volume}", "--to", "npy"],
     "simulate": ["simulate", "--volume", "{volume}", "--detector", "8", "--views", "2", "-o", "{folder}/scan.h5"],
-}
+}  # fmt: skip
 
 
 @pytest.fixture

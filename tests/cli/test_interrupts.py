@@ -191,8 +191,7 @@ def test_a_run_that_is_interrupted_in_its_last_iteration_is_told_in_full(cli, sc
 
 def test_ctrl_c_that_ends_the_compiler_of_a_kernel_is_no_failure_of_the_device(scan, tmp_path):
     command = ["reconstruct", str(scan), "--method", "sirt", "-o", str(tmp_path / "volume.h5")]
-    pressed = "signal.raise_signal(signal.SIGINT)"
-    for first, status, said in ((pressed, 130, NOTHING), ("pass", 5, "linker command failed")):
+    for first, status, said in (("press()", 130, NOTHING), ("pass", 5, "linker command failed")):
         body = f"""
             import phyradgs_cl.reconstructors.voxels.run as i
             from phyradgs_cl.errors import DeviceError
@@ -202,8 +201,7 @@ def test_ctrl_c_that_ends_the_compiler_of_a_kernel_is_no_failure_of_the_device(s
             i.Iterations.step = iterate
         """
         done = run_process(command, body)
-        assert done.returncode == status and said in done.stderr
-        assert done.stderr.count("\n") == 1
+        assert done.returncode == status and said in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_a_signal_after_the_last_line_changes_nothing(scan):

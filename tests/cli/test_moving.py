@@ -99,7 +99,6 @@ def test_an_object_that_changes_from_the_scan_to_its_states(cli, capsys, folder,
     assert "\nstates of the object: 3, " in capsys.readouterr().out
     stored = read_volume(own)
     assert stored.states.volumes.shape == (3, *stored.values.shape)
-    np.testing.assert_array_equal(stored.states.volumes, load_volume(own).states.volumes)
     facts = facts_of(cli, capsys, f"info {own} --json")
     assert (facts["states"], facts["states_from_s"]) == (3, stored.states.times_s[0])
     compared = facts_of(cli, capsys, f"evaluate {own} --reference {scan} --json")["states"]
@@ -109,8 +108,6 @@ def test_an_object_that_changes_from_the_scan_to_its_states(cli, capsys, folder,
     assert cli.run(f"export {own} --states 2 -o {tmp_path}/state.npy".split()) == 0
     first_s, last_s = stored.states.span_s
     np.testing.assert_allclose(np.load(tmp_path / "state_02.npy"), stored.at(first_s + 0.75 * (last_s - first_s)), atol=1e-7)
-    assert cli.run(f"export {own} --states 3 -o {tmp_path}/own.npy".split()) == 0  # the stored ones
-    np.testing.assert_allclose(np.load(tmp_path / "own_03.npy"), stored.states.volumes[2], atol=1e-6)
     assert cli.run(f"export {own} --states 4 -o {tmp_path}/all.nii.gz".split()) == 0
     assert sitk.ReadImage(str(tmp_path / "all.nii.gz")).GetSize()[3] == 4
     assert cli.run(f"report {own} --views 1 -o {tmp_path}/page.html".split()) == 0
@@ -120,10 +117,7 @@ def test_an_object_that_changes_from_the_scan_to_its_states(cli, capsys, folder,
     np.testing.assert_array_equal(read_volume(tmp_path / "again.h5").states.volumes, stored.states.volumes)
     capsys.readouterr()
     motion = f"--object-motion {folder}/field.h5"
-    for line in (
-        f"reconstruct {scan} -o {tmp_path}/no.h5 --method changing {motion}", f"evaluate {own} --reference {scan} {motion}",
-        f"export {own} -o {tmp_path}/no.nii {motion}",
-    ):
+    for line in (f"evaluate {own} --reference {scan} {motion}", f"export {own} -o {tmp_path}/no.nii {motion}"):
         assert cli.run(line.split()) == 2 and "--object-motion" in capsys.readouterr().err
     line = f"reconstruct {scan} -o {tmp_path}/no.h5 --method changing --memory 40KiB"
     assert cli.run(line.split()) == 6 and "--set states=N" in capsys.readouterr().err
@@ -143,15 +137,15 @@ def test_states_go_into_one_nifti_of_four_dimensions_which_info_describes(cli, c
     assert cli.run(line.split()) == 0
     image, field = sitk.ReadImage(str(folder / "states.nii")), read_deformation(folder / "field.h5")
     volume = read_volume(folder / "volume.h5")
+    states = sitk.GetArrayFromImage(image)
     assert image.GetDimension() == 4 and image.GetSpacing() == pytest.approx((*volume.grid.voxel_size_mm, 1.0))
-    for values, time_s in zip(sitk.GetArrayFromImage(image), (1.5, 2.5, 3.5, 4.5), strict=True):
-        expected = deformed(volume.values, volume.grid, field, field.weights_at(time_s)[0])
-        np.testing.assert_array_equal(values, expected)
-    assert np.ptp(sitk.GetArrayFromImage(image), axis=0).max() > 0.1
+    for values, time_s in zip(states, (1.5, 2.5, 3.5, 4.5), strict=True):
+        np.testing.assert_array_equal(values, deformed(volume.values, volume.grid, field, field.weights_at(time_s)[0]))
+    assert np.ptp(states, axis=0).max() > 0.1
     facts = facts_of(cli, capsys, f"info {folder}/states.nii --json")
     assert "moves (NIfTI)" in facts["kind"] and facts["shape"] == list(volume.grid.shape)
     assert (facts["states"], facts["first_s"], facts["last_s"]) == (4, 1.5, pytest.approx(4.5))
-    assert facts["maximum"] == pytest.approx(float(sitk.GetArrayFromImage(image).max()))
+    assert facts["maximum"] == pytest.approx(float(states.max()))
 
 
 @pytest.mark.parametrize(("options", "subject"), [

@@ -102,7 +102,6 @@ def test_export_fits_hounsfield_units_and_says_so(cli, refused, files, tmp_path,
     assert "air 0.001 ± " in told and "(1512 voxels of the lowest peak), water 0.02 ± " in told and "(216 voxels" in told
     hu = sitk.GetArrayFromImage(sitk.ReadImage(str(tmp_path / "box.nii")))
     np.testing.assert_allclose([hu.min(), hu.max()], [-1000, 0], atol=0.01)
-    refused([*words, tmp_path / "x.ply"], "--hu: given with --to ply")
     refused([*words, tmp_path / "x.nii", "--mu-water-per-mm", "0.02"], "one of the two")
     refused(["export", volume, "-o", tmp_path / "x.ply", "--insert-hu", "40"], "--hu: given with --to ply")
     refused([*words, tmp_path / "x.nii", "--air-mm", "1,2"], "--air-mm: found shape (2,)")
@@ -178,11 +177,9 @@ def test_a_reference_without_a_scale_is_placed_or_refused(cli, refused, files, t
     scan, volume_file, volume, grid = files
     truth, side_mm = load_scan(scan).reference, grid.voxel_size_mm[0]
     write_volume(tmp_path / "inner.h5", volume[3:9, 3:9, 3:9], grid.part((3, 3, 3), (6, 6, 6)), {})
-    with h5py.File(tmp_path / "bare.h5", "w") as file:
-        file["volume"] = truth
-    with h5py.File(tmp_path / "same_count.h5", "w") as file:
-        file["volume"] = truth[::2, ::2, ::2]
-
+    for name, values in (("bare.h5", truth), ("same_count.h5", truth[::2, ::2, ::2])):
+        with h5py.File(tmp_path / name, "w") as file:
+            file["volume"] = values
     command = ["evaluate", tmp_path / "inner.h5", "--reference"]
     refused([*command, tmp_path / "same_count.h5"], "same_count.h5: found voxels without a scale", "--reference-voxel-mm")
     sides = ["--reference-voxel-mm", f"{side_mm!r}"]
@@ -191,9 +188,7 @@ def test_a_reference_without_a_scale_is_placed_or_refused(cli, refused, files, t
     assert cli.run([str(word) for word in [*command, scan, "--json"]]) == 0
     assert found["psnr_db"] == pytest.approx(json.loads(capfd.readouterr().out)["psnr_db"], abs=1e-6)
     refused([*command, scan, *sides], "--reference-voxel-mm", "expected a reference without a scale")
-    for wrong in ("-1", "1,2", "fine"):
-        refused([*command, tmp_path / "bare.h5", "--reference-voxel-mm", wrong], "--reference-voxel-mm: found")
-
+    refused([*command, tmp_path / "bare.h5", "--reference-voxel-mm", "-1"], "--reference-voxel-mm: found")
     export_volume(volume_file, "npy", tmp_path / "plain.npy")
     (tmp_path / "plain.json").unlink()
     assert cli.run(["evaluate", str(tmp_path / "plain.npy"), "--reference", str(scan)]) == 0

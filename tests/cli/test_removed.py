@@ -6,36 +6,29 @@ from phyradgs_cl.removed import REMOVED
 
 pytestmark = pytest.mark.slow
 
-FLAGS = [("reconstruct", flag) for flag in ("--tune", "--median-filter")]
-FLAGS += [("simulate", flag) for flag in ("--readout", "--readout-direction", "--readout-ratio")]
-FLAGS += [("import", flag) for flag in ("--readout", "--readout-direction", "--readout-s", "--frame-time-s")]
-FLAGS += [("sweep", "--scheduler")]
+RUN = "reconstruct scan.h5 -o volume.h5"
+# a word of each kind, and what a user of an earlier version writes
+WORDS = {
+    "phyradgs splat": ("splat", "splat scan.h5 -o volume.h5", "splat --help"), "--method fused": (f"{RUN} --method fused",),
+    "--method asd-pocs: option prior_share": (f"{RUN} --method asd-pocs --set prior_share=1",),
+    "--what lag": ("calibrate scan.h5 --what lag -o c.h5",), "--batch": (f"{RUN} --batch 3",),
+    "--motion own-times": (f"{RUN} --motion own-times",), "--preset released": (f"{RUN} --preset released",),
+    "tune": (f"{RUN} --tune 3", f"{RUN} --set tune=1"), "scheduler": ("sweep grid.toml -o out --scheduler 3",),
+    "readout": ("simulate -o s.h5 --readout 3", "import scan.h5 -o s.h5 --readout 3"),
+    "rings.method": (f"{RUN} --set rings.method=1",),
+}  # fmt: skip
 
 
-def commands(word: str) -> list[list[str]]:
-    """What a user of an earlier version writes."""
-    if word.startswith("phyradgs "):
-        return [[word.split()[1], *more] for more in ([], ["scan.h5", "-o", "volume.h5"], ["--help"])]
-    if word.startswith("--what "):
-        return [["calibrate", "scan.h5", *word.split(), "-o", "c.h5"]]
-    value, _, option = word.rpartition(": option ")
-    told = word.split() if word.startswith("--") and not value else [*value.split(), "--set", f"{option}=1"]
-    flags = [one for one in FLAGS if one[1][2:].replace("-", "_") == word]
-    words = [[command, "scan.h5", "-o", "volume.h5", flag, "3"] for command, flag in flags]
-    return words if word == "scheduler" else [*words, ["reconstruct", "scan.h5", "-o", "volume.h5", *told]]
-
-
-@pytest.mark.parametrize("word", [word for word in REMOVED if not word.startswith("fly_scan.")])
+@pytest.mark.parametrize("word", WORDS)
 def test_a_word_that_left_names_its_replacement(cli, scan, capsys, word) -> None:
-    for words in commands(word):
-        assert cli.run([str(scan) if word == "scan.h5" else word for word in words]) == 2, words
+    for line in WORDS[word]:
+        assert cli.run([str(scan) if part == "scan.h5" else part for part in line.split()]) == 2, line
         error = capsys.readouterr().err
         assert error.count("\n") == 1 and error.endswith(f"{REMOVED[word]}\n"), error
 
 
-@pytest.mark.parametrize("name", ["own-times", "static-start"])
-def test_a_motion_that_left_is_named_in_a_file_too(cli, capsys, tmp_path, name) -> None:
-    (tmp_path / "run.toml").write_text(f"motion = '{name}'\n")
+def test_a_motion_that_left_is_named_in_a_file_too(cli, capsys, tmp_path) -> None:
+    (tmp_path / "run.toml").write_text("motion = 'static-start'\n")
     assert cli.run(["reconstruct", "scan.h5", "-o", "volume.h5", "--config", str(tmp_path / "run.toml")]) == 2
     error = capsys.readouterr().err
-    assert "run.toml: motion" in error and error.endswith(f"{REMOVED[f'--motion {name}']}\n")
+    assert "run.toml: motion" in error and error.endswith(f"{REMOVED['--motion static-start']}\n")

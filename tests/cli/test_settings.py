@@ -78,14 +78,6 @@ def test_a_wrong_option_of_the_command_line_is_not_the_files(config: Path) -> No
         plan_of(None, {"method": "fdk"}, ["iterations=5"])
 
 
-def test_a_grid_and_a_method_in_any_case(config: Path) -> None:
-    config.write_text("method = 'FISTA-TV'\nsize = [8, 9, 10]\n")
-    found = plan_of(config, {"size": None, "voxel_mm": (0.5, 0.5, 0.5)})
-    assert (found.method, found.preprocessing.size, found.preprocessing.voxel_mm) == ("fista-tv", (8, 9, 10), (0.5,) * 3)
-    found = plan_of(config, {"size": 7.0, "method": "Sirt"})
-    assert (found.method, found.preprocessing.size) == ("sirt", 7)
-
-
 def test_a_prior_is_for_methods_that_have_one() -> None:
     assert plan_of(None, {"prior": "tv"}, ["prior=dct"]).options.prior == "tv"
     with pytest.raises(InputError, match="^--prior: found no such option of --method sirt.*fista or moving has it$"):

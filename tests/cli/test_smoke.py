@@ -14,23 +14,18 @@ CONE = "--source-to-axis-mm 500 --source-to-detector-mm 800 --pixel-size-mm 3,3"
 GRID = 'scans = ["scan.h5"]\n[[runs]]\nmethod = "fdk"\n'
 # (command line, what it leaves)
 COMMANDS = (
-    ("devices", ""),
-    (f"simulate {SCAN} -o scan.h5", "scan.h5"),
-    ("info scan.h5", ""),
-    ("check scan.h5", ""),
+    ("devices", ""), (f"simulate {SCAN} -o scan.h5", "scan.h5"), ("info scan.h5", ""), ("check scan.h5", ""),
     (f"simulate {SCAN} --views 8 -o eight.h5", "eight.h5"),
     (f"simulate {SCAN} --turns 2 --motion-of-object breathing.toml -o moving.h5", "moving.h5"),
     ("calibrate eight.h5 --what offset -o calibrated.h5", "calibrated.png"),
-    ("prepare scan.h5 -o clean.h5", "clean.h5"),
-    ("estimate scan.h5 --method sirt", ""),
+    ("prepare scan.h5 -o clean.h5", "clean.h5"), ("estimate scan.h5 --method sirt", ""),
     ("reconstruct scan.h5 --iterations 2 -o volume.h5", "volume.h5"),
     ("evaluate volume.h5 --reference scan.h5 --json", "volume.evaluated.png"),
-    ("report volume.h5 --scan scan.h5 --views 2 -o page.html", "page.html"),
-    ("view volume.h5", ""),
+    ("report volume.h5 --scan scan.h5 --views 2 -o page.html", "page.html"), ("view volume.h5", ""),
     ("export volume.h5 --to nrrd -o volume.nrrd", "volume.nrrd"),
     (f"import foreign.h5 --format data-exchange {CONE} -o imported.h5", "imported.h5"),
     ("sweep grid.toml -o swept", "swept/results.md"),
-)
+)  # fmt: skip
 
 
 def write_foreign(path: Path) -> None:

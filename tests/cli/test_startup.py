@@ -24,11 +24,9 @@ sys.exit(status)
 @pytest.mark.parametrize(
     ("words", "status", "never"),
     [
-        ("nonsense", 2, {"h5py"}),
-        ("reconstruct --help", 0, set()),
-        ("info v.h5", 0, REGISTRY),
+        ("nonsense", 2, {"h5py"}), ("reconstruct --help", 0, set()), ("info v.h5", 0, REGISTRY),
         ("export v.h5 --to npy", 0, REGISTRY),
-    ],
+    ],  # fmt: skip
 )
 def test_nothing_is_loaded_that_the_answer_does_not_need(tmp_path: Path, words, status, never) -> None:
     grid = Grid.cube(4, 2.0)

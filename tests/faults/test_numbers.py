@@ -2,14 +2,12 @@
 
 from dataclasses import replace
 
-import faults_kit as kit
 import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, ParallelGeometry, Shutter
 from phyradgs_cl.acquisition.cells import static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, SCALE
@@ -100,20 +98,6 @@ def test_rays_through_vertices_and_along_faces(rt, turn, shape) -> None:
     if shape == (1, 1):
         assert frame.item() == pytest.approx(2 / max(abs(np.cos(turn)), abs(np.sin(turn))), rel=0.26)
     assert np.isfinite(operator.adjoint(np.ones((1, *shape), np.float32))).all()
-
-
-def test_any_dose(run, tmp_path) -> None:
-    """Line integrals are finite wherever the mask says that they may be used; no light is said."""
-    rng, shape = np.random.default_rng(0), (4, 6, 7)
-    for light in (np.zeros(shape), rng.binomial(1, 0.05, shape), np.full(shape, 65535)):
-        data = np.concatenate([np.full((1, 6, 7), 100), light]).astype(np.uint16)
-        integrals, bad = counts_to_attenuation(data, np.array([1, 0, 0, 0, 0]), "counts")
-        assert np.isfinite(integrals).all()
-        assert light.any() or (bad is not None and bad.all())
-    for how in (["tigre", "--dose", "1e-3"], ["beer", "--dose", "1e-3"], ["beer", "--dose", "1e12"]):
-        words = ["simulate", *kit.TINY, "--noise", *how, "--electronic-noise", "20"]
-        assert run(*words, "-o", tmp_path / "scan.h5") == 0
-        assert np.isfinite(load_scan(tmp_path / "scan.h5").projections).all(), how
 
 
 @pytest.mark.parametrize("method", [name for name in METHODS if name not in ("naf", "sax-nerf")])

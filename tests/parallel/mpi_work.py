@@ -19,11 +19,9 @@ from phyradgs_cl.runtime import Runtime  # noqa: E402
 
 SPLATS = {"micro-views": OPTIONS, "exact": replace(OPTIONS, motion=Exact())}
 VOXELS = {
-    "sirt": {"iterations": 5, "motion": "per-row"},
-    "os-sart": {"iterations": 3, "frames_per_subset": 4},
-    "fista-tv": {"iterations": 5, "tv_iterations": 3},
-    "asd-pocs": {"iterations": 3},
-}
+    "sirt": {"iterations": 5, "motion": "per-row"}, "os-sart": {"iterations": 3, "frames_per_subset": 4},
+    "fista-tv": {"iterations": 5, "tv_iterations": 3}, "asd-pocs": {"iterations": 3},
+}  # fmt: skip
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from phyradgs_cl.commands import console as commands
 from phyradgs_cl.errors import InputError, OutputError
-from phyradgs_cl.parallel import Launch, launched, span
+from phyradgs_cl.parallel import Launch, launched
 from phyradgs_cl.runtime import device as devices
 
 pytestmark = pytest.mark.slow
@@ -32,13 +32,6 @@ LAUNCHERS = {
 def test_launchers() -> None:
     for name, (environment, expected) in LAUNCHERS.items():
         assert launched(environment) == Launch(*expected), name
-
-
-def test_runs_cover_all_and_differ_by_one_at_most() -> None:
-    for count, parts in ((0, 3), (1, 4), (7, 3), (12, 4), (5, 5)):
-        runs = [span(count, parts, part) for part in range(parts)]
-        assert [i for run in runs for i in run] == list(range(count))
-        assert max(map(len, runs)) - min(map(len, runs)) <= 1
 
 
 def test_ranks_of_a_machine_take_devices_in_turns(monkeypatch) -> None:

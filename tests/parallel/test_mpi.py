@@ -180,12 +180,6 @@ def test_what_is_wrong_is_said_once(scan_file, tmp_path) -> None:
         assert done.returncode == status and found.startswith(f"phyradgs: {line}")
 
 
-def test_other_commands_are_done_once(scan_file) -> None:
-    alone = run([*PHYRADGS, "info", str(scan_file)])
-    several = run([MPIEXEC, "-n", "2", *PHYRADGS, "info", str(scan_file)])
-    assert several.returncode == 0 and several.stdout == alone.stdout
-
-
 def test_the_program_of_the_docs_works_with_mpiexec_and_without(scan_file, tmp_path) -> None:
     text = (Path(__file__).parents[2] / "docs" / "cluster.md").read_text(encoding="utf-8")
     program = next(b for b in re.findall(r"```python\n(.*?)```", text, re.S) if "launched_ranks" in b)

@@ -9,7 +9,7 @@ from tolerances import FLOAT32
 
 from phyradgs_cl import api
 from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, ParallelGeometry, PerRow, Scan, Shutter
-from phyradgs_cl.acquisition.slabs import slab, slices_of
+from phyradgs_cl.acquisition.slabs import slab
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_volume, write_scan
@@ -36,25 +36,6 @@ def path(rt, tmp_path_factory: pytest.TempPathFactory) -> Path:
     frames = RayOperator(rt, GRID, (ROWS, SIDE), tables).forward(shepp_logan(0.9).voxelise(GRID))
     write_scan(path, Scan(frames, geometry, orbit, shutter, start_s, GRID))
     return path
-
-
-def test_a_slab_has_the_windows_and_poses_of_its_rows(path: Path) -> None:
-    whole = load_scan(path)
-    part = load_scan(path, rows=(5, 13))
-    np.testing.assert_array_equal(part.projections, whole.projections[:, 5:13])
-    windows = [s.frame_start_s[3] + s.shutter.line_windows_s(s.lines) for s in (whole, part)]
-    np.testing.assert_allclose(windows[1], windows[0][5:13], rtol=0, atol=1e-12)
-    poses = [s.trajectory.pose(3, np.array(3.3)) for s in (whole, part)]
-    np.testing.assert_allclose(poses[1][3:6], poses[0][3:6] + 5 * poses[0][9:12], rtol=0, atol=1e-12)
-
-
-def test_slabs_share_the_slices_out() -> None:
-    geometry = ParallelGeometry((ROWS, SIDE), 0.08, (0.03, 0.01))
-    orbit = CircularOrbit(geometry, ConstantSpeed(0.2, 0.1))
-    scan = Scan(np.zeros((1, ROWS, SIDE), np.float32), geometry, orbit, Shutter(0.0), np.zeros(1), GRID, False)
-    parts = [slices_of(scan, a, b) for a, b in ((0, 7), (7, 8), (8, ROWS))]
-    assert [part.start for part in parts[1:]] == [part.stop for part in parts[:-1]]
-    assert (parts[0].start, parts[-1].stop) == (0, 24)
 
 
 @pytest.mark.parametrize(
