@@ -10,7 +10,6 @@ import pytest
 from phyradgs_cl import api
 
 pytestmark = pytest.mark.slow
-
 TEXT = (Path(__file__).resolve().parents[2] / "docs" / "api.md").read_text(encoding="utf-8")
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, re.S)

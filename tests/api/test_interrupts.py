@@ -15,7 +15,6 @@ from phyradgs_cl import api
 from phyradgs_cl.api import Progress, reconstruct
 
 pytestmark = pytest.mark.slow
-
 SCRIPT = """
 import sys
 import phyradgs_cl.api as api
@@ -76,10 +75,6 @@ def test_the_partial_result_goes_on_to_the_bits_of_the_whole(rt, scan, tmp_path)
     for so_far in (partial, api.load_volume(tmp_path / "partial.h5")):
         went_on = reconstruct(scan, **options, resume=so_far, report=False)
         np.testing.assert_array_equal(went_on.volume, whole.volume)
-    with h5py.File(tmp_path / "partial.h5", "a") as file:
-        file["entry/state/iteration"][...] = -1
-    with pytest.raises(api.InputError, match="checkpoint: found arrays that do not match"):
-        reconstruct(scan, **options, resume=api.load_volume(tmp_path / "partial.h5"))
     with h5py.File(tmp_path / "partial.h5", "a") as file:
         del file["entry/state/iteration"]
         file.create_group("entry/state/iteration")

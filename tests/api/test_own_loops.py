@@ -14,7 +14,6 @@ from phyradgs_cl.api import Scan, compare, load_volume, ray_operator, reconstruc
 from phyradgs_cl.runtime import Runtime
 
 pytestmark = pytest.mark.slow
-
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 

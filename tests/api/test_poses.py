@@ -8,7 +8,6 @@ from phyradgs_cl import api
 from phyradgs_cl.api import Exact, MicroViews, move_views, pose_gradient, ray_operator, splat_operator
 
 pytestmark = pytest.mark.slow
-
 FINE = Exact(time_error=1e-4)
 STEPS = (1e-3, 1e-2, 1e-2)  # rad, mm, mm
 

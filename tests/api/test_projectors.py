@@ -20,7 +20,6 @@ from phyradgs_cl.operators.twins.splat import splat_frame
 from phyradgs_cl.runtime import Runtime
 
 pytestmark = pytest.mark.slow
-
 VOXELS = 5e-3  # of the peak: linear between voxels of a quarter σ and less: 0.3 % measured
 ADJOINT = 1e-4  # float32 sums in two orders
 

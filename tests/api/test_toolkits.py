@@ -11,7 +11,6 @@ from phyradgs_cl.api import ConeGeometry, Gaussians, Grid, ParallelGeometry, Sca
 from phyradgs_cl.errors import InputError
 
 pytestmark = pytest.mark.slow
-
 RNG = np.random.default_rng(5)
 POINTS = RNG.uniform(-18, 18, (4, 3))  # x y z, mm
 PANEL, ANGLES = (23, 29), np.array([0.3, 1.7, 2.9, 4.4])
@@ -60,9 +59,12 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("changes", CHANGES.values(), ids=CHANGES)
-def test_points_fall_where_tigre_puts_them(rt, changes) -> None:
+def test_points_fall_where_tigre_puts_them(rt, changes, caplog) -> None:
     geo = tigre(**changes)
     scan = Scan.from_tigre(geo, ANGLES, FRAMES)
+    assert "degrees" not in caplog.text
+    Scan.from_tigre(geo, np.rad2deg(ANGLES), FRAMES)
+    assert "4 frames over 234.9 rad: are they degrees?" in caplog.text
     expected = np.stack([tigre_pixels(geo, i) for i in range(4)])
     assert np.abs(drawn_pixels(scan, rt) - expected).max() < PIXEL
     assert isinstance(scan.trajectory, CircularOrbit if len(changes) == 0 else (PoseTable, CircularOrbit))
@@ -99,13 +101,6 @@ def astra_vectors() -> np.ndarray:
         vectors[i, 6:9] = 3.5 * along + [0, 0, 0.05 * i]
         vectors[i, 9:12] = [0.1, -0.05 * i, 4.0]
     return vectors
-
-
-def test_tigre_angles_that_look_like_degrees_are_said(caplog) -> None:
-    for angles, is_said in ((ANGLES, False), (np.rad2deg(ANGLES), True)):
-        caplog.clear()
-        Scan.from_tigre(tigre(), angles, FRAMES)
-        assert is_said == ("4 frames over 234.9 rad: are they degrees?" in caplog.text)
 
 
 @pytest.mark.parametrize("is_parallel", [False, True])

@@ -12,7 +12,6 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 
 pytestmark = pytest.mark.slow
-
 GRID = Grid.cube(64, 32.0)  # half a millimetre per voxel
 CENTRE = (0.3, -0.2, 0.4)
 

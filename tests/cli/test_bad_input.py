@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 pytestmark = pytest.mark.slow
-
 OLD = b"an older result"
 DIGITS = "9" * 400
 SMALL = "--size 8 --detector 8"

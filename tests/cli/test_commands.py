@@ -14,7 +14,6 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import write_volume
 
 pytestmark = pytest.mark.slow
-
 SIMULATE = ["simulate", "--phantom", "jaw", "--size", "16", "--detector", "24", "--views", "6", "--time-samples", "4"]
 
 

@@ -10,12 +10,10 @@ import pytest
 from phyradgs_cl import estimate as room
 from phyradgs_cl.estimate import duration, estimate, shortened
 from phyradgs_cl.reconstructors import RunPlan, method_options, plan_run
-from phyradgs_cl.reconstructors.result import Reconstruction
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.workflow import load_scan
 
 pytestmark = pytest.mark.slow
-
 SIMULATE = ["simulate", "--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4"]
 
 
@@ -24,36 +22,25 @@ def scan(simulated) -> Path:
     return simulated(*SIMULATE[1:], "--time-samples", "2")
 
 
-class Clock:
-    """A clock that only reconstructions move: ``start`` seconds each, ``each`` per iteration, ``control`` a round of density
-    control."""
+@pytest.fixture
+def clock(monkeypatch) -> SimpleNamespace:
+    """A clock that only reconstructions move: 2 s each, ``each`` an iteration, ``control`` a round of density control."""
+    made = SimpleNamespace(now=0.0, each=0.25, control=0.0, iterations=[])
+    made.perf_counter = lambda: made.now
 
-    def __init__(self) -> None:
-        self.now, self.start, self.each, self.control = 0.0, 2.0, 0.25, 0.0
-        self.iterations: list[int] = []
-
-    def perf_counter(self) -> float:
-        return self.now
-
-    def reconstruct(self, scan, plan, rt) -> Reconstruction:
-        options = plan.options
-        iterations = getattr(options, "iterations", 1)
-        self.iterations.append(iterations)
-        rounds = 0
+    def run(scan, plan, rt) -> SimpleNamespace:
+        options, iterations, rounds = plan.options, getattr(plan.options, "iterations", 1), 0
+        made.iterations.append(iterations)
         if isinstance(options, SplatOptions):
             rounds = sum(options.control.is_due(i, iterations) for i in range(1, iterations + 1))
-        self.now += self.start + iterations * self.each + rounds * self.control
-        facts = {"density_control_rounds": rounds, "density_control_seconds": rounds * self.control}
+        made.now += 2.0 + iterations * made.each + rounds * made.control
+        facts = {"density_control_rounds": rounds, "density_control_seconds": rounds * made.control}
         result = SimpleNamespace(facts=facts)
         result.complete = lambda: result
         return result
 
-
-@pytest.fixture
-def clock(monkeypatch) -> Clock:
-    made = Clock()
     monkeypatch.setattr(room, "time", made)
-    monkeypatch.setattr(room, "reconstruct", made.reconstruct)
+    monkeypatch.setattr(room, "reconstruct", run)
     return made
 
 

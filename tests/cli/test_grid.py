@@ -11,7 +11,6 @@ from phyradgs_cl.report.run import load_run
 from phyradgs_cl.workflow import load_scan
 
 pytestmark = pytest.mark.slow
-
 INSIDE = "-0.5,0.5,-0.5,0.75,-0.75,0.5"  # of a box of ±1 mm in voxels of 0.25 mm
 SIRT = ["--method", "sirt", "--iterations", "2"]
 

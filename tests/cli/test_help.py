@@ -62,12 +62,10 @@ def test_the_tab_key_in_bash(cli, monkeypatch, capsys) -> None:
     monkeypatch.setenv("_PHYRADGS_COMPLETE", "complete_bash")
     monkeypatch.setattr(cli, "give_up_stdout", lambda: None)
     for words, expected in {
-        "phyradgs re": {"reconstruct", "report"},
-        "phyradgs export v.h5 --to n": {"nii", "nrrd", "npy", "npz"},
-        "phyradgs check --fi": {"--fix-offset"},
+        "phyradgs re": {"reconstruct", "report"}, "phyradgs export v.h5 --to n": {"nii", "nrrd", "npy", "npz"},
         "phyradgs reconstruct s.h5 --motion ": {*MOTIONS} - {"own-times", "static-start"},
-        "phyradgs simulate --phantom ": {*PHANTOMS},
-    }.items():
+        "phyradgs simulate --phantom ": {*PHANTOMS}, "phyradgs check --fi": {"--fix-offset"},
+    }.items():  # fmt: skip
         monkeypatch.setenv("COMP_WORDS", words)
         monkeypatch.setenv("COMP_CWORD", str(words.count(" ")))
         capsys.readouterr()

@@ -19,7 +19,6 @@ from phyradgs_cl.simulation import run as simulation_run
 from phyradgs_cl.workflow import reconstruct, scans, volumes
 
 pytestmark = pytest.mark.slow
-
 NOTHING = "phyradgs: interrupted, nothing written\n"
 COMPLETE = "phyradgs: interrupted, the output is complete\n"
 

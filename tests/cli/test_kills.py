@@ -14,7 +14,6 @@ from phyradgs_cl.io import checkpoint_path, read_volume
 from phyradgs_cl.io.output import lock_path
 
 pytestmark = pytest.mark.slow
-
 TINY = ["--phantom", "jaw", "--size", "12", "--detector", "16", "--views", "4", "--time-samples", "2"]
 # every other method goes on from its state in tests/reconstructors (test_iterative, test_changing, test_object_motion)
 RUNS = {

@@ -21,18 +21,14 @@ def test_a_run_with_a_page_and_pictures_is_the_same_run_and_ends_as_its_report(c
     assert {path.name for path in tmp_path.iterdir()} == {"run.html", "now.png", "seen.h5", "plain.h5"}
 
 
-def test_an_error_of_the_run_stands_on_its_page(cli, scan, tmp_path) -> None:
-    page = tmp_path / "run.html"
-    command = ["reconstruct", str(scan), "-o", str(tmp_path / "v.h5"), "--method", "fdk", "--resume", "--live", str(page)]
+def test_an_error_of_the_run_stands_on_its_page_and_leaves_an_earlier_one_alone(cli, refused, scan, tmp_path) -> None:
+    page, output = tmp_path / "run.html", tmp_path / "v.h5"
+    command = ["reconstruct", str(scan), "-o", str(output), "--method", "fdk", "--resume", "--live", str(page)]
     assert cli.run(command) == 2
     text = page.read_text(encoding="utf-8")
     assert "Stopped by an error: --resume" in text and "stopped – v.h5" in text
-
-
-def test_a_run_that_is_refused_leaves_an_earlier_page_alone(refused, scan, tmp_path) -> None:
-    page, output = tmp_path / "run.html", tmp_path / "v.h5"
     page.write_text("an earlier report", encoding="utf-8")
-    refused(["reconstruct", scan, "-o", output, "--method", "fdk", "--resume", "--live", page], "--resume")
+    refused(command, "--resume")
     refused(["reconstruct", scan, "-o", output, "--size", "100000", "--live", page], "100000")
     assert page.read_text(encoding="utf-8") == "an earlier report"
 

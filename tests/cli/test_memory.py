@@ -12,7 +12,6 @@ from phyradgs_cl.runtime import MEMORY_VARIABLE, context
 from phyradgs_cl.workflow import load_scan
 
 pytestmark = pytest.mark.slow
-
 VOLUME = ["--phantom", "jaw", "--size", "24", "--detector", "20", "--views", "4", "--time-samples", "2"]
 
 

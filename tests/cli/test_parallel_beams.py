@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 pytestmark = pytest.mark.slow
-
 FLY = "--scanner parallel --phantom jaw --size 16 --detector 24 --views 20 --exposure-deg 12 --time-samples 4"
 
 

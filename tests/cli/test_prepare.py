@@ -11,7 +11,6 @@ from phyradgs_cl.io import read_volume
 from phyradgs_cl.workflow import load_scan
 
 pytestmark = pytest.mark.slow
-
 SPOILT = (
     "--phantom", "jaw", "--size", "12", "--detector", "20", "--views", "8", "--time-samples", "2",
     "--noise", "beer", "--rings", "0.02", "--sparks", "0.005", "--seed", "3",

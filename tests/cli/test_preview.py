@@ -10,7 +10,6 @@ from phyradgs_cl.reconstructors.result import Progress
 from phyradgs_cl.report import Preview
 
 pytestmark = pytest.mark.slow
-
 GRID = Grid.cube(4, 2.0)
 
 

@@ -26,19 +26,16 @@ def test_a_loss_comes_with_its_gaussians_and_a_residual_without(capsys) -> None:
 
 
 def test_rate_and_time_left_count_from_the_first_report(capsys, now) -> None:
-    ticker = Ticker("frame")
-    for now[0], done in ((20.0, 10), (40.0, 30)):
-        ticker.show(done, 100)
-    assert capsys.readouterr().err == "frame 10/100\nframe 30/100  1.0/s  ETA 1:10\n"
+    """By the share of the work that is done, where later passes take longer."""
+    for ticker, reports, said in (
+        (Ticker("frame"), ((20.0, 10, None), (40.0, 30, None)), "frame 10/100\nframe 30/100  1.0/s  ETA 1:10\n"),
+        (Ticker("pass"), ((0.0, 0, 0.0), (20.0, 80, 0.25)), "pass 80/100  4.0/s  ETA 1:00\n"),
+    ):
+        for now[0], done, share in reports:
+            ticker.show(done, 100, share=share)
+        assert capsys.readouterr().err == said
     times = {0.2: "0:00", 59.6: "1:00", 125: "2:05", 3600: "1:00:00"}
     assert {seconds: clock(seconds) for seconds in times} == times
-
-
-def test_time_left_follows_the_work_where_later_passes_take_longer(capsys, now) -> None:
-    ticker = Ticker("pass")
-    for now[0], done, share in ((0.0, 0, 0.0), (20.0, 80, 0.25)):
-        ticker.show(done, 100, share=share)
-    assert capsys.readouterr().err.splitlines()[-1] == "pass 80/100  4.0/s  ETA 1:00"
 
 
 def test_on_a_terminal_there_is_a_line_before_there_is_a_count(capsys, monkeypatch) -> None:

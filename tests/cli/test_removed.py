@@ -5,7 +5,6 @@ import pytest
 from phyradgs_cl.removed import REMOVED
 
 pytestmark = pytest.mark.slow
-
 RUN = "reconstruct scan.h5 -o volume.h5"
 # a word of each kind, and what a user of an earlier version writes
 WORDS = {

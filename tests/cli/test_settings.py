@@ -3,16 +3,13 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import pytest
-import typer
-from typer.testing import CliRunner
 
-from phyradgs_cl.commands.options import with_run_options
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import RunPlan
-from phyradgs_cl.settings import Settings, read_settings
+from phyradgs_cl.settings import read_settings
 
 
 def plan_of(config: Path | None, given: dict[str, Any], assignments: Sequence[str] = ()) -> RunPlan:
@@ -82,44 +79,3 @@ def test_a_prior_is_for_methods_that_have_one() -> None:
     assert plan_of(None, {"prior": "tv"}, ["prior=dct"]).options.prior == "tv"
     with pytest.raises(InputError, match="^--prior: found no such option of --method sirt.*fista or moving has it$"):
         plan_of(None, {"prior": "tv", "method": "sirt"})
-
-
-# --- the options of a reconstruction, as commands get them -------------------------------------------------------------
-
-
-@pytest.fixture
-def asked() -> tuple[typer.Typer, list[object]]:
-    seen: list[object] = []
-    app = typer.Typer()
-
-    @app.command()
-    @with_run_options("seed", "preset")
-    def command(scan: str, settings: Settings, often: Annotated[float, typer.Option()] = 2.0) -> None:
-        """What it does."""
-        seen.extend([scan, settings, often])
-
-    return app, seen
-
-
-def test_a_command_gets_what_was_given_and_none_for_the_rest(asked, tmp_path: Path) -> None:
-    app, seen = asked
-    config = tmp_path / "options.toml"
-    words = ["s.h5", "--method", "sirt", "--motion", "per-row", "--often", "3", "--doubt"]
-    config.write_text("iterations = 7\nseed = 5\n", encoding="utf-8")
-    words += ["--set", "relaxation=0.5", "--set", "iterations=3", "--config", str(config), "--memory", "1GiB"]
-    result = CliRunner().invoke(app, words)
-    assert result.exit_code == 0, result.output
-    scan, settings, often = seen
-    assert (scan, often, settings.config, settings.memory) == ("s.h5", 3.0, config, 2**30)
-    words = {"method": "sirt", "motion": "per-row", "doubt": True}
-    assert settings.values == {**words, "relaxation": 0.5, "iterations": 3, "seed": 5}
-    plan = settings.plan()
-    assert (plan.method, plan.seed, plan.options.iterations, plan.options.relaxation) == ("sirt", 5, 3, 0.5)
-
-
-def test_nothing_given_is_nothing_given_and_what_is_left_out_is_no_option(asked) -> None:
-    app, seen = asked
-    for option in ("--seed", "--preset"):
-        assert CliRunner().invoke(app, ["s.h5", option, "1"]).exit_code == 2 and seen == []
-    assert CliRunner().invoke(app, ["s.h5"]).exit_code == 0
-    assert seen[1] == Settings({}, {})

@@ -87,22 +87,16 @@ def test_a_sweep_goes_on_at_a_new_scheduler(sweep_folder, start, tmp_path) -> No
     rng, log, port = np.random.default_rng(1), tmp_path / "log.txt", free_port()
     address = f"tcp://127.0.0.1:{port}"
 
-    def scheduler() -> subprocess.Popen:
-        options = ["--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
-        return start("-m", "dask", "scheduler", *options, log=tmp_path / "scheduler.txt")
+    def servers() -> list[subprocess.Popen]:
+        """A scheduler and two workers."""
+        scheduler = f"-m dask scheduler --host 127.0.0.1 --port {port} --no-dashboard".split()
+        crew = f"-m dask worker {address} --nworkers 2 --nthreads 1 --no-dashboard".split()
+        more = {"log": tmp_path / "dask.txt", "env": {**os.environ, "PHYRADGS_DEVICE": "cpu"}, "cwd": tmp_path}
+        return [start(*words, **more) for words in (scheduler, crew)]
 
-    def workers() -> subprocess.Popen:
-        options = ["--nworkers", "2", "--nthreads", "1", "--no-dashboard"]
-        environment = {**os.environ, "PHYRADGS_DEVICE": "cpu"}
-        dask = ["-m", "dask", "worker", address, *options]
-        return start(*dask, log=tmp_path / "workers.txt", env=environment, cwd=tmp_path)
-
-    first, crew = scheduler(), workers()
+    first, crew = servers()
     sweep = start(*command(sweep_folder, "--workers", address), log=log)
-
-    def said() -> str:
-        return log.read_text()
-
+    said = log.read_text
     wait_until(lambda: len(lines_of(sweep_folder)) > 5, 600, said)
     assert kill_a_worker(crew, rng)
     wait_until(lambda: len(lines_of(sweep_folder)) > 15, 600, said)
@@ -110,7 +104,7 @@ def test_a_sweep_goes_on_at_a_new_scheduler(sweep_folder, start, tmp_path) -> No
     stop(crew)
     wait_until(lambda: sweep.poll() is not None, 60, said)
     assert sweep.returncode == 2 and "no answer" in said() and "repeat the command" in said()
-    scheduler(), workers()
+    servers()
     again = start(*command(sweep_folder, "--workers", address), log=log)
     wait_until(lambda: again.poll() is not None, 900, said)
     assert again.returncode == 0, said()

@@ -52,20 +52,22 @@ class FailingCall:
         return self.function(*arguments, **options)
 
 
+def failing(monkeypatch, name: str) -> FailingCall:
+    call = FailingCall(getattr(cl, name))
+    monkeypatch.setattr(cl, name, call)
+    return call
+
+
 @pytest.fixture
 def launches(monkeypatch) -> FailingCall:
     """All launches of kernels of all runtimes."""
-    call = FailingCall(cl.enqueue_nd_range_kernel)
-    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", call)
-    return call
+    return failing(monkeypatch, "enqueue_nd_range_kernel")
 
 
 @pytest.fixture
 def copies(monkeypatch) -> FailingCall:
     """All blocking copies: what waits for the kernels before them, and is told late of what went wrong."""
-    call = FailingCall(cl.enqueue_copy)
-    monkeypatch.setattr(cl, "enqueue_copy", call)
-    return call
+    return failing(monkeypatch, "enqueue_copy")
 
 
 def same_bits(one: Path, other: Path) -> None:

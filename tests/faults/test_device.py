@@ -10,7 +10,6 @@ from phyradgs_cl.io import checkpoint_path
 from phyradgs_cl.runtime import context
 
 pytestmark = pytest.mark.slow
-
 # STRESS=50 is what `make stress` sets: there a hundred launches all over a run fail once each, or all where it has fewer
 MOST = 2 * int(os.environ.get("STRESS", "1"))
 RUNS = {

@@ -7,11 +7,7 @@ import faults_kit as kit
 import h5py
 import pytest
 
-from phyradgs_cl.errors import OutOfMemoryError
-from phyradgs_cl.reconstructors.voxels import sart
-
 pytestmark = pytest.mark.slow
-
 # In a process of its own that may map no more than so many MiB beyond what it has at the start.
 LIMITED = """
 import resource, sys
@@ -46,27 +42,3 @@ def test_a_machine_without_memory_is_said(scan, tmp_path, source) -> None:
     assert (done.returncode, len(lines)) == (6, 1), done.stderr
     assert lines[0].startswith("phyradgs: memory of ") and "Traceback" not in done.stderr
     assert output.read_bytes() == kit.OLD and set(kit.names(tmp_path)) <= {"large.h5", "v.h5"}
-
-
-def test_memory_that_runs_out_leaves_the_checkpoint(run, scan, tmp_path, capfd, monkeypatch) -> None:
-    whole, output = tmp_path / "whole.h5", tmp_path / "v.h5"
-    words = ["--method", "sirt", "--iterations", "6", "--checkpoint-every", "1e-6"]
-    assert run("reconstruct", scan, "-o", whole, *words) == 0
-    steps: list[int] = []
-    step = sart.Sirt.step
-
-    def failing(self: sart.Sirt) -> float:
-        steps.append(1)
-        if len(steps) == 4:
-            raise MemoryError("Unable to allocate 9.0 GiB")
-        return step(self)
-
-    monkeypatch.setattr(sart.Sirt, "step", failing)
-    capfd.readouterr()
-    assert run("reconstruct", scan, "-o", output, *words) == OutOfMemoryError.exit_code
-    line = capfd.readouterr().err.splitlines()[-1]
-    assert line.startswith("phyradgs: memory of this machine: found too little (Unable to allocate 9.0 GiB)")
-    assert line.endswith("--resume continues from iteration 3")
-    monkeypatch.setattr(sart.Sirt, "step", step)
-    assert run("reconstruct", scan, "-o", output, *words, "--resume") == 0
-    kit.same_bits(output, whole)

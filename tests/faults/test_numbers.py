@@ -19,7 +19,6 @@ from phyradgs_cl.runtime.layout import pad_rows
 from phyradgs_cl.workflow.files import load_scan
 
 pytestmark = pytest.mark.slow
-
 SHAPE = (6, 7)
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (0.6, 0.6))
 GRID = Grid.cube(8, 2.0)

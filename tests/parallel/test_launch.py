@@ -13,7 +13,6 @@ from phyradgs_cl.parallel import Launch, launched
 from phyradgs_cl.runtime import device as devices
 
 pytestmark = pytest.mark.slow
-
 OPEN_MPI = dict(zip(("RANK", "SIZE", "LOCAL_RANK", "LOCAL_SIZE"), "5623", strict=True))
 LOCAL = {"MPI_LOCALRANKID": "1", "MPI_LOCALNRANKS": "2"}
 TASKS = {"SLURM_STEP_TASKS_PER_NODE": "2(x2)"}

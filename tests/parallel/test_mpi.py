@@ -161,11 +161,9 @@ def test_a_signal_to_mpiexec_keeps_what_there_is(scan_file, whole, tmp_path, num
 def test_one_rank_that_fails_ends_all_with_its_line(scan_file, tmp_path) -> None:
     output = tmp_path / "volume.h5"
     alone = command(1, scan_file, output)
-    second = [":", "-n", "1", "-env", "PHYRADGS_MEMORY", "100K", *alone[3:]]
-    done = run([*alone, *second])
-    assert done.returncode == 6
+    done = run([*alone, ":", "-n", "1", "-env", "PHYRADGS_MEMORY", "100K", *alone[3:]])
     (line,) = said(done.stderr)
-    assert line.startswith("phyradgs: rank 1: ") and "PHYRADGS_MEMORY" in line
+    assert done.returncode == 6 and line.startswith("phyradgs: rank 1: ") and "PHYRADGS_MEMORY" in line
     assert not output.exists()
 
 

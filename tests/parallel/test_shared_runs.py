@@ -13,7 +13,6 @@ from phyradgs_cl.reconstructors import Progress, RunPlan, loop, method_options, 
 from phyradgs_cl.runtime import Runtime
 
 pytestmark = pytest.mark.slow
-
 DIVIDED = {
     "four frames per step": OPTIONS,
     "exact in time": replace(OPTIONS, motion=Exact()),

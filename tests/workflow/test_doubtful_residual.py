@@ -11,7 +11,6 @@ from phyradgs_cl.io import write_scan
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
 pytestmark = pytest.mark.slow
-
 LINE = "the volume does not explain"
 
 

@@ -9,7 +9,6 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.workflow.sweep import SweepRun, plan_sweep
 
 pytestmark = pytest.mark.slow
-
 GRID = 'scans = ["*.h5"]\n'
 
 
@@ -27,12 +26,9 @@ def plan(tmp_path: Path, tiny_scan: Path):
 
 
 def test_lists_are_multiplied_and_runs_taken_as_they_are(plan) -> None:
-    runs = plan(
-        GRID
-        + """
+    runs = plan(GRID + """
         seeds = [0, 3, 0]
-        [options]
-        holdout = 3
+        options.holdout = 3
         [[grid]]
         method = ["sirt", "cgls"]
         motion = ["static", "per-row"]
@@ -43,10 +39,8 @@ def test_lists_are_multiplied_and_runs_taken_as_they_are(plan) -> None:
         rates.position = [[2e-4, 2e-5]]
         [[runs]]
         method = "FDK"
-        preset = "hann"
         size = [4, 5, 6]
-        """
-    )
+    """)  # fmt: skip
     settings = 8 + 2 + 1
     assert len(runs) == 2 * settings * 2 and [run.scan.name for run in runs[:: len(runs) // 2]] == ["a.h5", "b.h5"]
     assert [run.plan.seed for run in runs[:4]] == [0, 3, 0, 3]

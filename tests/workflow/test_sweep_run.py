@@ -15,7 +15,6 @@ from phyradgs_cl.workflow import sweep as sweep_run
 from phyradgs_cl.workflow.sweep import RESULTS, markdown, plan_sweep, read_lines, run_sweep
 
 pytestmark = pytest.mark.slow
-
 TEXT = """
 scans = ["*.h5"]
 seeds = [0, 1]
