@@ -1,4 +1,4 @@
-"""Gradients by the poses of single views: against differences of moved views."""
+"""Gradients by the poses of single views: against differences of moved views, and volumes against clouds."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ from scipy.ndimage import gaussian_filter
 
 from phyradgs_cl import api
 from phyradgs_cl.api import Exact, MicroViews, move_views, pose_gradient, ray_operator, splat_operator
+from phyradgs_cl.fields import GridChoice
 
 pytestmark = pytest.mark.slow
 FINE = Exact(time_error=1e-4)
@@ -48,6 +49,14 @@ def test_a_clouds_gradient_is_that_of_moved_views(rt, request, cloud, axis, opti
     assert_close(found, differences(scan, lambda of: operator(of)(cloud), by_frames), 2e-3)
     some = operator(scan).frames([4, 1]).by_poses(cloud, by_frames[[4, 1]]) / np.array([1.0, *pitch_mm])
     assert np.allclose(some, found[[4, 1]], rtol=1e-6)
+
+
+def test_volumes_and_clouds_meet(rt, scan, cloud) -> None:
+    """A cloud and its voxels, on a grid that is finer than it: the same object by two ways."""
+    by_frames, fine = weights(scan), scan.with_grid(GridChoice(size=30))
+    of_cloud = pose_gradient(fine, cloud, by_frames, device=rt)
+    of_voxels = pose_gradient(fine, api.voxelise(cloud, fine.grid, device=rt), by_frames, device=rt)
+    assert_close(of_voxels, of_cloud, 0.05)
 
 
 def test_a_volumes_gradient_is_that_of_moved_views(rt, scan) -> None:

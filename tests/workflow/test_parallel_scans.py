@@ -5,6 +5,7 @@ import pytest
 from parallel_kit import BODIES, laminography_scan, parallel_scan
 
 from phyradgs_cl.acquisition import Shutter
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import write_scan
 from phyradgs_cl.reconstructors import plan_run, reconstruct
 from phyradgs_cl.report import write_report
@@ -31,3 +32,8 @@ def test_laminography_is_reconstructed(rt, method: str) -> None:
     result = reconstruct(scan, plan_run(method, {"iterations": iterations}), rt)
     truth = BODIES.voxelise(scan.grid, 2)
     assert np.linalg.norm(result.volume - truth) < 0.4 * np.linalg.norm(truth)
+
+
+def test_laminography_by_filtered_backprojection_is_refused(rt) -> None:
+    with pytest.raises(InputError, match="laminography"):
+        reconstruct(laminography_scan(8), plan_run("fbp", {}), rt)

@@ -1,17 +1,21 @@
-"""Sweeps in one process: resumed, failures noted and tried again, results and the table, and a message without Dask."""
+"""Sweeps in one process: resumed from their own checkpoints, failures noted and tried again, results and the table."""
 
 import json
 import os
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from phyradgs_cl.errors import DeviceError, InputError, OutputError
-from phyradgs_cl.io import only_run, read_volume
+from phyradgs_cl.io import checkpoint_path, only_run, read_volume
 from phyradgs_cl.io.output import BusyError
+from phyradgs_cl.reconstructors import Progress, plan_run
 from phyradgs_cl.workflow import sweep as sweep_run
+from phyradgs_cl.workflow.reconstruct import resume_or_restart
 from phyradgs_cl.workflow.sweep import RESULTS, markdown, plan_sweep, read_lines, run_sweep
 
 pytestmark = pytest.mark.slow
@@ -154,3 +158,54 @@ def test_lines_are_json_without_nan(sweep, monkeypatch) -> None:
     rows = (sweep.folder / RESULTS).read_text().splitlines()
     lines = [json.loads(row, parse_constant=pytest.fail) for row in rows]
     assert {line["metrics"]["psnr_db"] for line in lines} == {None}
+
+
+PLAN = plan_run("sirt", {"iterations": 6})
+
+
+@pytest.fixture
+def checkpoint(tmp_path) -> Path:
+    return checkpoint_path(tmp_path / "volume.h5")
+
+
+@pytest.fixture
+def again(rt, tiny_scan, tmp_path):
+    """A run that may be stopped at an iteration → its result, and the iterations that it reported."""
+
+    def go(stop_at=None, plan=PLAN, scan=tiny_scan, name="volume.h5"):
+        seen = []
+
+        def report(progress: Progress) -> None:
+            seen.append(progress.iteration)
+            if progress.iteration == stop_at:
+                raise KeyboardInterrupt
+
+        return resume_or_restart(plan, scan, tmp_path / name, lambda: rt, report)[0], seen
+
+    return go
+
+
+def test_a_stopped_run_goes_on_to_the_same_bits(again, checkpoint) -> None:
+    assert again(stop_at=3)[0].interrupted_at
+    result, seen = again()
+    assert not result.interrupted_at and min(seen) > 3 and not checkpoint.exists()
+    np.testing.assert_array_equal(result.volume, again(name="alone.h5")[0].volume)
+
+
+@pytest.mark.parametrize("what", ["damaged", "of another seed"])
+def test_a_checkpoint_that_does_not_fit_is_set_aside(again, checkpoint, what) -> None:
+    again(stop_at=3)
+    content = checkpoint.read_bytes()
+    if what == "damaged":
+        content = content[: len(content) // 2]
+        checkpoint.write_bytes(content)
+    result, seen = again(plan=PLAN if what == "damaged" else replace(PLAN, seed=1))
+    assert not result.interrupted_at and min(seen) <= 3
+    assert Path(f"{checkpoint}.bak").read_bytes() == content
+
+
+def test_a_checkpoint_outlives_a_missing_scan_and_no_other_method_takes_it(again, checkpoint) -> None:
+    again(stop_at=3)
+    with pytest.raises(InputError, match="none.h5"):
+        again(scan=checkpoint.with_name("none.h5"))
+    assert checkpoint.exists() and not again(plan=plan_run("fdk"))[0].interrupted_at
