@@ -1,12 +1,16 @@
-"""Every command once, each on what the ones before it have made."""
+"""Every command once, each on what the ones before it have made, and what a command imports before it answers."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 import typer
 
-from phyradgs_cl.io import read_volume
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.io import read_volume, write_volume
 from phyradgs_cl.workflow import load_scan
 
 SCAN = "--phantom jaw --size 10 --detector 12 --views 4 --time-samples 2"
@@ -54,3 +58,30 @@ def test_every_command_does_its_work(cli, tmp_path, monkeypatch, capsys) -> None
 def test_no_command_is_left_out(cli) -> None:
     known = set(typer.main.get_command(cli.app).commands)
     assert {line.split()[0] for line, _ in COMMANDS} == known
+
+
+HEAVY = {"matplotlib", "pyopencl", "scipy.fft", "scipy.ndimage", "scipy.spatial", "scipy.special", "skimage", "torch"}
+REGISTRY = {"phyradgs_cl.reconstructors.method"}
+IMPORTS = """
+import sys
+from phyradgs_cl.__main__ import load_cli
+status = load_cli().run(sys.argv[2:])
+open(sys.argv[1], "w").write(" ".join(sys.modules))
+sys.exit(status)
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "never"),
+    [
+        ("nonsense", 2, {"h5py"}), ("reconstruct --help", 0, set()), ("info v.h5", 0, REGISTRY),
+        ("export v.h5 --to npy", 0, REGISTRY),
+    ],  # fmt: skip
+)
+def test_nothing_is_loaded_that_the_answer_does_not_need(tmp_path: Path, words, status, never) -> None:
+    grid = Grid.cube(4, 2.0)
+    write_volume(tmp_path / "v.h5", np.ones(grid.shape, np.float32), grid, {})
+    command = [sys.executable, "-c", IMPORTS, "modules.txt", *words.split()]
+    assert subprocess.run(command, cwd=tmp_path, capture_output=True, check=False).returncode == status
+    modules = set((tmp_path / "modules.txt").read_text().split())
+    assert "phyradgs_cl.signals" in modules and not modules & (HEAVY | never)

@@ -1,4 +1,4 @@
-"""A device that fails at any launch, and memory that runs out: one line, older outputs kept, runs that go on to the same bits."""
+"""A device that fails at any launch, memory that runs out: one line, older outputs kept, resumed runs of the same bits."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Sweeps in one process: resumed from their own checkpoints, failures noted and tried again, results and the table."""
+"""Sweeps in one process: a sweep's file and its errors, runs that go on, failures tried again, results and the table."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from phyradgs_cl.io.output import BusyError
 from phyradgs_cl.reconstructors import Progress, plan_run
 from phyradgs_cl.workflow import sweep as sweep_run
 from phyradgs_cl.workflow.reconstruct import resume_or_restart
-from phyradgs_cl.workflow.sweep import RESULTS, markdown, plan_sweep, read_lines, run_sweep
+from phyradgs_cl.workflow.sweep import RESULTS, SweepRun, markdown, plan_sweep, read_lines, run_sweep
 
 pytestmark = pytest.mark.slow
 TEXT = """
@@ -209,3 +209,80 @@ def test_a_checkpoint_outlives_a_missing_scan_and_no_other_method_takes_it(again
     with pytest.raises(InputError, match="none.h5"):
         again(scan=checkpoint.with_name("none.h5"))
     assert checkpoint.exists() and not again(plan=plan_run("fdk"))[0].interrupted_at
+
+
+SCANS = 'scans = ["*.h5"]\n'
+
+
+@pytest.fixture
+def plan(sweep):
+    """A function that writes grid.toml next to two scans and plans its runs."""
+
+    def planned(text: str) -> list[SweepRun]:
+        sweep.grid.write_text(text)
+        return plan_sweep(sweep.grid, sweep.folder)
+
+    return planned
+
+
+def test_lists_are_multiplied_and_runs_taken_as_they_are(plan) -> None:
+    runs = plan(SCANS + """
+        seeds = [0, 3, 0]
+        options.holdout = 3
+        [[grid]]
+        method = ["sirt", "cgls"]
+        motion = ["static", "per-row"]
+        iterations = [5, 20]
+        [[grid]]
+        method = "phyradgs"
+        control.every = [50, 100]
+        rates.position = [[2e-4, 2e-5]]
+        [[runs]]
+        method = "FDK"
+        size = [4, 5, 6]
+    """)  # fmt: skip
+    settings = 8 + 2 + 1
+    assert len(runs) == 2 * settings * 2 and [run.scan.name for run in runs[:: len(runs) // 2]] == ["a.h5", "b.h5"]
+    assert [run.plan.seed for run in runs[:4]] == [0, 3, 0, 3]
+    first, splats, fdk = runs[0], runs[16], runs[20]
+    assert first.facts["label"] == "sirt holdout=3 motion=static iterations=5"
+    assert (first.plan.options.iterations, first.plan.options.motion.name) == (5, "static")
+    assert first.plan.preprocessing.holdout == 3
+    assert splats.plan.options.control.every == 50 and splats.plan.options.rates.position == (2e-4, 2e-5)
+    assert (fdk.facts["method"], fdk.plan.preprocessing.size) == ("fdk", (4, 5, 6))
+
+
+def test_what_is_asked_for_twice_is_run_once_and_names_differ(plan, tmp_path) -> None:
+    sirt = 'method = "sirt"\niterations ='
+    text = SCANS + f"[[grid]]\n{sirt} [5, 6, 5]\n[[runs]]\n{sirt} 6\n"
+    names = [run.facts["run"] for run in plan(text)]
+    assert len(names) == 4 == len(set(names)) and names == [run.facts["run"] for run in plan(text)]
+    shutil.copy(tmp_path / "b.h5", tmp_path / "a.h5")  # another time: another scan
+    assert len({*names, *(run.facts["run"] for run in plan(text))}) == 6
+
+
+def test_what_is_wrong_is_named_at_once(plan) -> None:
+    for text, message in (
+        ('scnas = ["*.h5"]\n', "scnas: found a key that is not known.*did you mean 'scans'"),
+        ("[[runs]]\n", "scans: found None; expected a list"),
+        (SCANS, r"neither \[\[grid\]\] nor \[\[runs\]\]"), (SCANS + "grid = 3\n", "grid: found 3"),
+        (SCANS + "options = 3\n[[runs]]\n", r"options: found \[3\]"), (SCANS + "seeds = [-1]\n[[runs]]\n", "--seed: found"),
+        (SCANS + "seeds = [true]\n[[runs]]\n", "seeds: found"), ('scans = ["none/*.h5"]\n[[runs]]\n', "no file for 'none/"),
+        ('scans = ["grid.toml"]\n[[runs]]\n', "grid.toml: found a file that is not HDF5"),
+        (SCANS + '[[grid]]\nmethod = ["sirt", "sitr"]\n', r"grid.toml \(method='sitr'\): --method"),
+        (SCANS + "[[grid]]\niterations = []\n", "found an empty list"),
+        (SCANS + "[[runs]]\n[options]\niteratoins = 5\n", "iteratoins.*did you mean 'iterations'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            plan(text)
+
+
+def test_patterns_meet_regular_files_at_any_depth(plan, tmp_path) -> None:
+    (tmp_path / "below/deep").mkdir(parents=True)
+    shutil.copy(tmp_path / "a.h5", tmp_path / "below/deep/c.h5")
+    (tmp_path / "below/folder.h5").mkdir()
+    runs = plan('scans = ["**/*.h5", "./b*/d?ep/[c].h5", "a.h5"]\n[[runs]]\n')
+    assert [run.scan.name for run in runs] == ["a.h5", "b.h5", "c.h5"]
+    assert [run.scan for run in plan(f'scans = ["{tmp_path}/*/*/c.h5"]\n[[runs]]\n')] == [runs[2].scan]
+    with pytest.raises(InputError, match="no file for"):
+        plan('scans = ["below/*.h5"]\n[[runs]]\n')
