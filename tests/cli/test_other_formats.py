@@ -46,7 +46,7 @@ def test_evaluate_has_one_answer_for_all_formats(cli, files, tmp_path, capsys) -
     assert json.loads(capsys.readouterr().out)["ssim"] == 1
 
 
-def test_evaluate_converts_a_reference_in_hounsfield_units_or_refuses_it(cli, refused, files, tmp_path, capsys) -> None:
+def test_evaluate_converts_a_reference_in_hounsfield_units_or_refuses_it(cli, refused, files, tmp_path, capfd) -> None:
     _, volume, values, grid = files
     truth, water_per_mm, answers = values - 0.01, 0.019, []
     write_volume(tmp_path / "truth.h5", truth, grid, {})
@@ -54,7 +54,7 @@ def test_evaluate_converts_a_reference_in_hounsfield_units_or_refuses_it(cli, re
     words = ["evaluate", str(volume), "--json", "--reference"]
     for more in (["truth.h5"], ["hu.h5", "--mu-water-per-mm", str(water_per_mm)]):
         assert cli.run([*words, str(tmp_path / more[0]), *more[1:]]) == 0
-        answers.append(json.loads(capsys.readouterr().out))
+        answers.append(json.loads(capfd.readouterr().out))
     assert answers[1]["psnr_db"] == pytest.approx(answers[0]["psnr_db"], abs=1e-3)
     assert answers[1]["ssim"] == pytest.approx(answers[0]["ssim"], abs=1e-4)
     refused([*words, tmp_path / "hu.h5"], "hu.h5: found values from -1000 to", "--mu-water-per-mm")
@@ -128,7 +128,7 @@ def test_boxes_with_little_in_common_are_warned_of(cli, files, tmp_path, caplog)
     assert "of the first box" not in caplog.text
 
 
-def test_how_another_grid_is_compared_is_said_in_the_line_and_the_json(cli, refused, files, tmp_path, capsys) -> None:
+def test_how_another_grid_is_compared_is_said_in_the_line_and_the_json(cli, refused, files, tmp_path, capfd) -> None:
     scan, _, volume, grid = files
     dz, dy, dx = grid.voxel_size_mm
     half = Grid((6, 12, 12), grid.voxel_size_mm, (grid.offset_mm[0] - 3 * dz, *grid.offset_mm[1:]))
@@ -139,9 +139,9 @@ def test_how_another_grid_is_compared_is_said_in_the_line_and_the_json(cli, refu
     ):  # fmt: skip
         write_volume(tmp_path / name, values, other, {})
         command = ["evaluate", str(tmp_path / name), "--reference", str(scan)]
-        assert cli.run(command) == 0 and words in (line := capsys.readouterr().out) and line.count("\n") == 1
+        assert cli.run(command) == 0 and words in (line := capfd.readouterr().out) and line.count("\n") == 1
         assert cli.run([*command, "--json"]) == 0
-        facts = json.loads(capsys.readouterr().out)
+        facts = json.loads(capfd.readouterr().out)
         assert facts["share_of_reference_covered"] == share and words.split()[0] in facts["compared"]
     truth = load_scan(scan).reference
     assert truth[0, 0, 0] == 0 and facts["psnr_db"] == pytest.approx(compare(volume[:6], truth[:6])["psnr_db"])
