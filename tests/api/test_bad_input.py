@@ -53,8 +53,8 @@ NO_CELLS = spoilt("Frames", lambda cells: FRAMES[0])
 NOWHERE = type("Nowhere", (), {"pose": lambda self, frame, time_s: np.zeros((*time_s.shape, 3))})()  # no poses
 
 
-def fly(frames: Any = FRAMES, geometry: Any = CONE, angles: Any = ANGLES, exposure_deg: Any = 10.0, **more: Any) -> Scan:
-    return api.fly_scan(frames, geometry, angles, exposure_deg=exposure_deg, **more)
+def fly(frames: Any = FRAMES, geometry: Any = CONE, angles: Any = ANGLES, **more: Any) -> Scan:
+    return api.fly_scan(frames, geometry, angles, **{"exposure_deg": 10.0, **more})
 
 
 GOOD, STILL = fly(), api.static_scan(FRAMES, CONE, ANGLES)
@@ -105,7 +105,7 @@ ARGUMENTS: list[tuple[str, Callable[..., object], dict[str, list[Any]]]] = [
     }),
     ("Shutter", partial(api.Shutter, 1.0), {"pulse_s": [(3.0, 1.0), 3.0], "readout_s": [-0.1]}),
     ("ConeGeometry", partial(replace, CONE), {
-        "source_to_axis_mm": ["5", 0.0, np.nan], "source_to_detector_mm": [0.0, 4.0], "pixel_size_mm": [(0.5, 0.0), (0.5,)],
+        "source_to_axis_mm": ["5", 0, np.nan], "source_to_detector_mm": [0, 4], "pixel_size_mm": [(0.5, 0.0), (0.5,)],
         "detector_shape": [(0, 5), 6, (6, 8.5)], "detector_offset_mm": [(np.inf, 0.0)],
     }),
     ("Exact", api.Exact, {"segments": [1.5], "time_error": [0]}),
@@ -162,7 +162,7 @@ CASES: list[tuple[str, str, Callable[[], object]]] = [
     ("Scan", "vectors", lambda: Scan.from_astra(FRAMES, POSES[:, :9])),
     ("Scan", "poses", lambda: Scan.from_poses(FRAMES, np.zeros((4, 12)))), ("Scan", "frame", lambda: GOOD.plot(4)),
     ("Scan", "trajectory Nowhere", lambda: reconstruct(replace(GOOD, trajectory=NOWHERE), "fdk")),
-    ("ConeGeometry", "pixel_size_mm", lambda: api.static_scan(FRAMES, api.ConeGeometry(300, 800, (6, 8), 1560.0), ANGLES)),
+    ("ConeGeometry", "pixel_size_mm", lambda: api.static_scan(FRAMES, api.ConeGeometry(3, 8, (6, 8), 15.6), ANGLES)),
     ("ParallelGeometry", "pixel_size_mm", lambda: api.ParallelGeometry((6, 8), 0.0)),
     ("ParallelGeometry", "detector_shape", lambda: api.ParallelGeometry((6, 0), 1.0)),
     ("ParallelGeometry", "trajectory", lambda: replace(GOOD, geometry=api.ParallelGeometry((6, 8), 0.2))),
@@ -172,7 +172,7 @@ CASES: list[tuple[str, str, Callable[[], object]]] = [
     ("ConstantSpeed", "speed_rad_per_s", lambda: api.ConstantSpeed(0.0, np.nan)),
     ("SpeedRamp", "acceleration_rad_per_s2", lambda: api.SpeedRamp(0.0, 1.0, "1")),
     ("EncoderTable", "encoder table", lambda: api.EncoderTable([0.0, 1.0], [0.0, 1.0]).angle_rad(0, np.array([2.0]))),
-    *(("EncoderTable", "encoder table", partial(api.EncoderTable, times, [0, 1])) for times in ([0], [1, 0], [0, np.nan])),
+    *(("EncoderTable", "encoder", partial(api.EncoderTable, times, [0, 1])) for times in ([0], [1, 0], [0, np.nan])),
     ("FrameSweeps", "angle_start_rad", lambda: api.FrameSweeps([0.0, 1.0], 1.0, [0.0], [1.0])),
     ("PoseTable", "pose table", lambda: api.PoseTable([0.0, 1.0], np.zeros((2, 12)))),
     ("PoseTable", "pose table", lambda: api.PoseTable(range(4), POSES[:, :11])),
@@ -207,7 +207,7 @@ CASES: list[tuple[str, str, Callable[[], object]]] = [
     ("load_deformation", "nowhere.h5", lambda: api.load_deformation("nowhere.h5")),
     ("save_deformation", "deformation", lambda: api.save_deformation("field.h5", GRID)),
     ("ObjectMotion", "motion of the object: kind", lambda: api.ObjectMotion("walking")),
-    ("ObjectMotion", "motion of the object: amplitude_mm", lambda: api.ObjectMotion("sliding", 2.0).deformation(GRID, 0, 1)),
+    ("ObjectMotion", "motion of the object: amplitude", lambda: api.ObjectMotion("sliding", 2).deformation(GRID, 0, 1)),
     ("Gaussians", "rows", lambda: Gaussians.from_rows(np.zeros((10, 5)))),
     ("Gaussians", "Gaussians' quaternion", lambda: cloud(quaternion=np.ones((1, 3)))),
     ("Gaussians", "Gaussians' scale", lambda: cloud(scale=np.full((1, 3), -2.0))),

@@ -1,4 +1,4 @@
-"""Operators from Python: two routes to one number, transposes, gradients, scipy, arrays of host and device, users' loops."""
+"""Operators from Python: two routes to one number, transposes, gradients, scipy, arrays of the device, users' loops."""
 
 import gc
 import importlib.util
@@ -226,7 +226,7 @@ def test_a_loop_over_arrays_of_the_device_moves_scalars_alone(rt: Runtime, scan:
 
 
 @pytest.mark.parametrize("example", ["own_sirt", "train_own"])
-def test_an_example_comes_near_the_method(rt: Runtime, scan: api.Scan, tmp_path: Path, monkeypatch, capsys, example) -> None:
+def test_an_example_comes_near_the_method(rt, scan, tmp_path, monkeypatch, capsys, example) -> None:
     if example == "train_own" and not importlib.util.find_spec("torch"):
         return
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""Ctrl-C at every stage: one line, status 130, outputs whole or as they were, and volumes of which everybody says so."""
+"""Ctrl-C at every stage: one line, status 130, outputs whole or as they were; volumes of which all readers say so."""
 
 import json
 import signal
@@ -46,7 +46,8 @@ STAGES = [
     ("reconstruct", reconstruct, "hashing"), ("fdk", Runtime, "launch"),
 ]  # fmt: skip
 FINISHED = [
-    ("simulate", scans, "write_scan"), ("reconstruct", reconstruct, "write_volume"), ("evaluate", volumes, "slices_png"),
+    ("simulate", scans, "write_scan"), ("reconstruct", reconstruct, "write_volume"),
+    ("evaluate", volumes, "slices_png"),
 ]  # fmt: skip
 
 

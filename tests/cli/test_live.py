@@ -1,4 +1,4 @@
-"""What is said on the way: lines of progress, --live, a page of the run, and --preview, a picture. They change no run."""
+"""What is said on the way, and changes no run: lines of progress, --live, a page, and --preview, a picture."""
 
 import numpy as np
 import pytest

@@ -114,7 +114,8 @@ def test_an_object_that_changes_from_the_scan_to_its_states(cli, refused, capfd,
     motion = f"--object-motion {folder}/field.h5"
     for line in (f"evaluate {own} --reference {scan} {motion}", f"export {own} -o {tmp_path}/no.nii {motion}"):
         refused(line.split(), "--object-motion")
-    refused(f"reconstruct {scan} -o {tmp_path}/no.h5 --method changing --memory 40KiB".split(), "--set states=N", status=6)
+    line = f"reconstruct {scan} -o {tmp_path}/no.h5 --method changing --memory 40KiB"
+    refused(line.split(), "--set states=N", status=6)
 
 
 def test_evaluate_names_the_field_that_a_volume_was_reconstructed_with(cli, caplog, folder, tmp_path) -> None:

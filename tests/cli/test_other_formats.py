@@ -131,12 +131,12 @@ def test_boxes_with_little_in_common_are_warned_of(cli, files, tmp_path, caplog)
 def test_how_another_grid_is_compared_is_said_in_the_line_and_the_json(cli, refused, files, tmp_path, capfd) -> None:
     scan, _, volume, grid = files
     dz, dy, dx = grid.voxel_size_mm
+    fine = Grid((24, 24, 24), (dz / 2, dy / 2, dx / 2), grid.offset_mm)
     half = Grid((6, 12, 12), grid.voxel_size_mm, (grid.offset_mm[0] - 3 * dz, *grid.offset_mm[1:]))
     for name, values, other, share, words in (
-        ("fine.h5", np.kron(volume, np.ones((2, 2, 2))), Grid((24, 24, 24), (dz / 2, dy / 2, dx / 2), grid.offset_mm), 1,
-         "24×24×24 voxels"),
+        ("fine.h5", np.kron(volume, np.ones((2, 2, 2))), fine, 1, "24×24×24 voxels"),
         ("half.h5", volume[:6], half, 0.5, "voxel by voxel, on 50 % of the reference"),
-    ):  # fmt: skip
+    ):
         write_volume(tmp_path / name, values, other, {})
         command = ["evaluate", str(tmp_path / name), "--reference", str(scan)]
         assert cli.run(command) == 0 and words in (line := capfd.readouterr().out) and line.count("\n") == 1

@@ -48,7 +48,7 @@ def along_the_panel(file: h5py.Group) -> None:
 # what the file has wrong, words of the line
 FILES: dict[str, tuple[Callable[[h5py.Group], object], str]] = {
     "a source distance": (lambda file: stated(file, 5.0), "source/distance: found a distance; expected no source distance"),
-    "a distance of 0": (lambda file: stated(file, 0.0, beam=False), "source/distance: found 0; expected a length other"),
+    "a distance of 0": (lambda file: stated(file, 0.0, beam=False), "source/distance: found 0; expected a length"),
     "neither": (lambda file: file.pop("phyradgs/beam"), "source/distance"),
     "another beam": (lambda file: file["phyradgs/beam"].write_direct(np.array(b"fan", object)), "beam: found 'fan'"),
     "rays along the panel": (along_the_panel, "rays that cross the panel"),

@@ -1,4 +1,4 @@
-"""A device that fails at any launch, memory that runs out: one line, older outputs kept, resumed runs of the same bits."""
+"""A device that fails at any launch, memory that runs out: one line, outputs as they were, resumed runs as if whole."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""Sums over ranks are exact, and runs on several ranks, which are threads here, have the bits and the gradient of one."""
+"""Sums over ranks are exact, and runs on ranks, which are threads here, have the bits and the gradient of one."""
 
 from dataclasses import replace
 

@@ -39,7 +39,8 @@ def path(rt, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("method", "options", "limit"), [("fbp", {"motion": api.LineMiddles()}, FLOAT32), ("fista", {"iterations": 6}, 0.03)]
+    ("method", "options", "limit"),
+    [("fbp", {"motion": api.LineMiddles()}, FLOAT32), ("fista", {"iterations": 6}, 0.03)],
 )
 def test_slabs_make_up_the_volume_of_the_whole_scan(rt, path: Path, tmp_path: Path, method, options, limit) -> None:
     """FBP: the same. ``fista``: the prior's weight and the subsets' order follow the noise of the rows that are read."""

@@ -1,4 +1,4 @@
-"""Sweeps in one process: a sweep's file and its errors, runs that go on, failures tried again, results and the table."""
+"""Sweeps in one process: a sweep's file and its errors, runs that go on, failures tried again, and the table."""
 
 import json
 import os
@@ -110,7 +110,8 @@ def test_failures_are_noted_and_tried_again(cli, sweep, monkeypatch, capsys) -> 
 
     monkeypatch.setattr(sweep_run, "resume_or_restart", failing)
     monkeypatch.setattr(sweep_run, "_BUSY_S", 0.0)
-    assert cli.run(["sweep", str(sweep.grid), "-o", str(sweep.folder)]) == 2 and "4 runs failed" in capsys.readouterr().err
+    assert cli.run(["sweep", str(sweep.grid), "-o", str(sweep.folder)]) == 2
+    assert "4 runs failed" in capsys.readouterr().err
     noted = sorted(line["error"] for line in sweep.lines() if "error" in line)
     assert noted[:2] == ["ZeroDivisionError: a defect", "device: found lost"]
     assert noted[2:] == ["scan: found no good | at all", "volume: found busy"]
@@ -266,8 +267,8 @@ def test_what_is_wrong_is_named_at_once(plan) -> None:
         ('scnas = ["*.h5"]\n', "scnas: found a key that is not known.*did you mean 'scans'"),
         ("[[runs]]\n", "scans: found None; expected a list"),
         (SCANS, r"neither \[\[grid\]\] nor \[\[runs\]\]"), (SCANS + "grid = 3\n", "grid: found 3"),
-        (SCANS + "options = 3\n[[runs]]\n", r"options: found \[3\]"), (SCANS + "seeds = [-1]\n[[runs]]\n", "--seed: found"),
-        (SCANS + "seeds = [true]\n[[runs]]\n", "seeds: found"), ('scans = ["none/*.h5"]\n[[runs]]\n', "no file for 'none/"),
+        (SCANS + "options = 3\n[[runs]]\n", r"options: found \[3\]"), (SCANS + "seeds = [-1]\n[[runs]]\n", "--seed: "),
+        (SCANS + "seeds = [true]\n[[runs]]\n", "seeds: "), ('scans = ["none/*.h5"]\n[[runs]]\n', "no file for 'none/"),
         ('scans = ["grid.toml"]\n[[runs]]\n', "grid.toml: found a file that is not HDF5"),
         (SCANS + '[[grid]]\nmethod = ["sirt", "sitr"]\n', r"grid.toml \(method='sitr'\): --method"),
         (SCANS + "[[grid]]\niterations = []\n", "found an empty list"),
