@@ -17,13 +17,9 @@ REPOSITORY = Path(__file__).resolve().parent.parent
 MOST_BYTES = 1_000_000  # kernels, code, the page's script and small files of numbers; nothing measured or rendered
 
 
-def tracked(folder: str, pattern: str) -> set[str]:
-    """Names below a folder of the repository that match, as the wheel must have them."""
-    root = REPOSITORY / folder
-    return {f"{folder}/{path.relative_to(root).as_posix()}" for path in root.rglob(pattern)}
-
-
-NEEDED = tracked("cl", "*.cl") | tracked("cl", "*.h") | tracked("data", "*.*") | {"cli.py"}
+PATTERNS = ("cl", "*.cl"), ("cl", "*.h"), ("data", "*.*")
+FOUND = (path for folder, pattern in PATTERNS for path in (REPOSITORY / folder).rglob(pattern))
+NEEDED = {"cli.py", *(path.relative_to(REPOSITORY).as_posix() for path in FOUND)}
 
 
 def build(target: str, folder: Path) -> Path:
@@ -41,8 +37,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_this_installation_finds_its_resources() -> None:
-    assert len(tracked("cl", "*.cl")) > 10
-    for name in (*NEEDED, "cl/splat_forward.cl", "data/demo.toml"):
+    assert {"cl/splat_forward.cl", "data/demo.toml"} < NEEDED and len(NEEDED) > 15
+    for name in NEEDED:
         folder, _, rest = name.partition("/")
         assert (resource(folder) / rest).is_file(), name
     with pytest.raises(FileNotFoundError, match="nothing-here is missing"):
@@ -56,9 +52,8 @@ def test_the_wheel_holds_what_the_package_reads(wheel: Path) -> None:
         assert "phyradgs = phyradgs_cl.__main__:main" in archive.read(by_name["entry_points.txt"]).decode()
         assert "Apache License" in archive.read(by_name["LICENSE"]).decode()
     assert {f"phyradgs_cl/{name}" for name in NEEDED} <= names
-    for kind in ("*.py", "*.pyi", "py.typed"):
-        modules = {p.relative_to(REPOSITORY).as_posix() for p in (REPOSITORY / "phyradgs_cl").rglob(kind)}
-        assert modules and modules <= names
+    files = (path for path in (REPOSITORY / "phyradgs_cl").rglob("*") if path.suffix in (".py", ".pyi", ".typed"))
+    assert {path.relative_to(REPOSITORY).as_posix() for path in files} <= names
     assert all(name.startswith(("phyradgs_cl/", "phyradgs_cl-")) for name in names), "more than one package"
     assert not [name for name in names if "__pycache__" in name]
     assert wheel.stat().st_size < MOST_BYTES
@@ -83,5 +78,4 @@ def test_the_wheel_runs_outside_the_repository(wheel: Path, tmp_path: Path) -> N
 def test_the_sdist_can_build_the_wheel(tmp_path: Path) -> None:
     with tarfile.open(build("sdist", tmp_path)) as archive:
         names = {name.split("/", 1)[1] for name in archive.getnames() if "/" in name}
-    needed = NEEDED | {"pyproject.toml", "LICENSE", "README.md", "phyradgs_cl/__init__.py"}
-    assert needed <= names
+    assert NEEDED | {"pyproject.toml", "LICENSE", "README.md", "phyradgs_cl/__init__.py"} <= names

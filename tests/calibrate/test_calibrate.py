@@ -101,13 +101,8 @@ def test_what_differs_by_less_than_three_deviations_is_not_corrected_along(tilt,
 def test_a_panel_of_one_row_tells_its_offset_and_no_turn(rt, right, monkeypatch, caplog) -> None:
     """And what explains the frames worse than what is stated corrects nothing."""
     geometry = replace(right.geometry, detector_shape=(1, 32))
-    row = replace(
-        right,
-        projections=right.projections[:, 16:17],
-        geometry=geometry,
-        trajectory=CircularOrbit(geometry, right.trajectory.kinematics),
-        shutter=replace(right.shutter, readout_s=0.0),
-    )
+    orbit, shutter = CircularOrbit(geometry, right.trajectory.kinematics), replace(right.shutter, readout_s=0.0)
+    row = replace(right, projections=right.projections[:, 16:17], geometry=geometry, trajectory=orbit, shutter=shutter)
     found = by_name(calibrate(perturb(row, GeometryCorrection(offset_u_mm=-OFFSET_MM)), rt, "offset-u,roll,tilt-u"))
     assert abs(found["offset-u"].found) < 0.03 and found["offset-u"].verdict == CORRECTED
     assert {found[name].verdict for name in ("roll", "tilt-u")} == {CANNOT_TELL}
@@ -156,27 +151,20 @@ def test_a_detector_that_adds_photons(rt, turned) -> None:
     assert abs(found.found) < 3 * found.deviation < 0.03 and found.verdict == CORRECTED
 
 
-def few(scan):
-    return replace(scan, projections=scan.projections[:5], frame_start_s=scan.frame_start_s[:5])
-
-
-@pytest.mark.parametrize(
-    ("what", "change", "others", "said"),
-    [
-        ("rol", lambda s: s, (), "did you mean 'roll'?"),
-        ("", lambda s: s, (), "--what: found ''"),
-        ("readout", lambda s: replace(s, is_fly=False), (), "stands still"),
-        ("roll", few, (), "found 5 frames"),
-        ("wobble", lambda s: s, (lambda s: s,), "one scan"),
-        ("motion", lambda s: s, (lambda s: s,), "one scan"),
-        ("wobble,motion", lambda s: s, (), "one of the two"),
-        ("roll", lambda s: s, (lambda s: perturb(s, GeometryCorrection(offset_u_mm=1.0)),), "--with: geometry"),
-    ],
-)
-def test_what_cannot_be_asked_is_refused(rt, right, what, change, others, said) -> None:
-    with pytest.raises(InputError) as refused:
-        calibrate(change(right), rt, what, [other(right) for other in others])
-    assert said in str(refused.value)
+def test_what_cannot_be_asked_is_refused(rt, right) -> None:
+    """A step of a readout below 0 had ended the run with an error about a value that nobody had given."""
+    few = replace(right, projections=right.projections[:5], frame_start_s=right.frame_start_s[:5])
+    at_once = replace(right, shutter=replace(right.shutter, readout_s=0.0))
+    moved = perturb(right, GeometryCorrection(offset_u_mm=1.0))
+    for scan, what, others, said in (
+        (right, "rol", [], "did you mean 'roll'?"), (right, "", [], "--what: found ''"), (few, "roll", [], "found 5 frames"),
+        (replace(right, is_fly=False), "readout", [], "stands still"), (right, "wobble,motion", [], "one of the two"),
+        (right, "wobble", [right], "one scan"), (right, "roll", [moved], "--with: geometry"),
+        *((at_once, what, [], "found a readout of 0 s") for what in ("readout", "timing", "direction")),
+    ):  # fmt: skip
+        with pytest.raises(InputError) as refused:
+            calibrate(scan, rt, what, others)
+        assert said in str(refused.value), what
 
 
 def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tmp_path) -> None:
@@ -186,8 +174,7 @@ def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tm
     refused(["calibrate", path, "--what", "offset, drift", "-o", tmp_path / "out.h5"], REMOVED["--what drift"])
     refused(["calibrate", path, "-o", path], "reads or writes")
     refused(["calibrate", path, "-o", tmp_path / "out.png"], "the suffix .png of another format")
-    for picture in ("out.h5", "out.jpg", "out"):
-        refused(["calibrate", path, "-o", tmp_path / "out.h5", "--picture", tmp_path / picture], "ends in .png")
+    refused(["calibrate", path, "-o", tmp_path / "out.h5", "--picture", tmp_path / "out.jpg"], "ends in .png")
     assert not (tmp_path / "out.h5").exists()
 
 
@@ -206,10 +193,13 @@ def test_the_end_that_is_read_first_is_told_where_it_bends_the_object(cli, turne
         assert one["found"] is None if verdict == CANNOT_TELL else 0 < one["deviation"] <= 0.5
 
 
-def test_the_readout_of_a_global_shutter_is_refused(rt) -> None:
-    """A step below 0 had ended the run with an error about a value that nobody had given."""
-    scan = simulate("foot", size=8, detector=16, readout_ratio=0.0, device=rt)
-    for what in ("readout", "timing", "direction"):
-        with pytest.raises(InputError) as refused:
-            calibrate(scan, rt, what)
-        assert refused.value.found == "a readout of 0 s", what
+@pytest.mark.parametrize(("what", "protocol"), [("offset-u,direction", "rapid"), ("wobble", "static")])
+def test_a_calibration_ends_where_it_said_that_it_would(rt, what, protocol) -> None:
+    """Every pass is counted, none twice, and there were no more than planned."""
+    scan = simulate("foot", size=12, detector=16, views=12, protocol=protocol, device=rt)
+    told = []
+    calibrate(scan, rt, what, report=lambda *report: told.append(report))
+    done, totals, words, shares = zip(*told, strict=True)
+    assert list(done) == sorted(done) and list(shares) == sorted(shares) and done[-1] > 20
+    assert done[-1] == totals[-1] <= totals[0] and shares[-1] == pytest.approx(1.0)
+    assert words[0] == "where the axis is" and words[-1] == "residuals"

@@ -1,4 +1,4 @@
-"""Parallel beams: offset and roll by the same projection, no distance or tilt, views and motion, beads in closed form."""
+"""Parallel beams: offset and roll by the same projection, no distance or tilt, beads in closed form."""
 
 import itertools
 from dataclasses import replace
@@ -51,7 +51,7 @@ def test_tilts_and_distances_are_refused_and_not_asked_for() -> None:
             requested(f"roll,{word}", scan)
 
 
-def test_an_offset_and_a_roll_are_found_in_half_a_turn(rt) -> None:
+def test_an_offset_and_a_roll_are_found_in_half_a_turn_and_a_right_scan_is_left_alone(rt) -> None:
     scan = parallel_scan(30, 180.0, 1.5)
     rolled = perturb(scan, GeometryCorrection(offset_u_mm=0.15, roll_rad=np.deg2rad(1.5)))
     result = calibrate(replace(scan, projections=seen_by(rolled)), rt)
@@ -60,32 +60,8 @@ def test_an_offset_and_a_roll_are_found_in_half_a_turn(rt) -> None:
     assert found["roll"].verdict == CORRECTED and abs(found["roll"].found - 1.5) < 0.2
     assert found["offset-v"].verdict == CANNOT_TELL  # an object further along the axis
     assert result.residual_rms[1] < 0.5 * result.residual_rms[0]
-
-
-def test_a_right_scan_is_left_alone(rt) -> None:
-    result = calibrate(parallel_scan(), rt)
-    assert result.corrected == [] and result.parameters[0].verdict == AGREES
-
-
-def test_shifts_of_single_views_are_found(rt) -> None:
-    scan = parallel_scan(40, 360.0)
-    shifts_mm = np.random.default_rng(2).normal(0, 0.1, (scan.frames, 2))
-    truth = perturb(scan, GeometryCorrection(), Views(np.zeros(scan.frames), shifts_mm))
-    result = calibrate(replace(scan, projections=seen_by(truth)), rt, "wobble")
-    found = result.views.shift_mm - result.views.shift_mm.mean(0)
-    assert np.std(found[:, 0] - shifts_mm[:, 0]) < 0.25 * np.std(shifts_mm[:, 0])
-    assert result.residual_rms[1] < 0.5 * result.residual_rms[0]
-
-
-def test_a_motion_of_the_object_lowers_the_residual(rt) -> None:
-    scan = parallel_scan(40, 360.0)
-    course = np.linspace(-0.3, 0.3, 7)
-    truth = replace(Sway.none(scan, 7), coefficients=np.outer(course, [0, 0, 0, 0.3, -0.5, 1.0]))
-    moved = perturb(scan, GeometryCorrection(), truth)
-    result = calibrate(replace(scan, projections=seen_by(moved)), rt, "motion")
-    assert result.residual_rms[1] < 0.4 * result.residual_rms[0]
-    along = result.views.coefficients[:, 5]
-    assert abs(np.ptp(along) - 0.6) < 0.1
+    right = calibrate(parallel_scan(), rt)
+    assert right.corrected == [] and right.parameters[0].verdict == AGREES
 
 
 def test_frames_of_beads_are_the_closed_form() -> None:

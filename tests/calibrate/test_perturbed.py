@@ -30,11 +30,13 @@ def poses(scan):
     return np.concatenate([PerRow(3).cells(scan, frame).pose for frame in range(scan.frames)])
 
 
-def test_numbers_of_the_geometry_move_poses_as_that_does(right) -> None:
+def test_numbers_of_the_geometry_move_poses_as_that_does_and_a_lift_raises_source_and_panel(right) -> None:
     by_geometry = perturb(right, NUMBERS)
     assert isinstance(by_geometry.trajectory, CircularOrbit)
     by_poses = replace(right, trajectory=PerturbedTrajectory(right.trajectory, right.geometry.detector_shape, NUMBERS))
     np.testing.assert_allclose(poses(by_poses), poses(by_geometry), atol=1e-12)
+    expected = poses(right) + np.array([0, 0, 0.3, 0, 0, 0.3, *[0] * 6])
+    np.testing.assert_allclose(poses(perturb(right, GeometryCorrection(lift_mm=0.3))), expected, atol=1e-12)
 
 
 def test_turns_leave_the_middle_of_the_panel_where_it_is(right) -> None:
@@ -45,13 +47,6 @@ def test_turns_leave_the_middle_of_the_panel_where_it_is(right) -> None:
         assert np.allclose(np.diff(shift, axis=along), 0), change  # along the axis of the tilt it moves as one
         assert np.abs(shift).max() > 0.1, change
     np.testing.assert_allclose(np.linalg.norm(turned[0, 1] - turned[0, 0]), 0.125)
-
-
-def test_a_lift_raises_source_and_panel(right) -> None:
-    time_s = right.frame_start_s[3:4]
-    lifted = perturb(right, GeometryCorrection(lift_mm=0.3)).trajectory.pose(3, time_s)
-    expected = right.trajectory.pose(3, time_s) + np.array([0, 0, 0.3, 0, 0, 0.3, 0, 0, 0, 0, 0, 0])
-    np.testing.assert_allclose(lifted, expected, atol=1e-12)
 
 
 def test_views_move_by_themselves(right) -> None:

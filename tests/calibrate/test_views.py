@@ -96,13 +96,12 @@ def test_a_wobble_does_not_pass_for_a_roll(rt, monkeypatch) -> None:
     assert abs(lines["offset-u"].found) < 0.02
     np.testing.assert_allclose(found.per_view()["shift_v_mm"], planted[:, 1], atol=0.01)
     asked: list[GeometryCorrection] = []
-    counted = "phyradgs_cl.calibrate.run.estimate_views"
 
     def coarse(rt, scan, of, stages, correction, *more):
         asked.append(correction)
         return estimate_views(rt, scan, of, stages[:1], correction, *more)
 
-    monkeypatch.setattr(counted, coarse)
+    monkeypatch.setattr("phyradgs_cl.calibrate.run.estimate_views", coarse)
     again = calibrate(found.scan, rt, "roll,wobble", splines=6)
     assert by_name(again)["roll"].verdict == AGREES
     now = again.scan.provenance
@@ -119,12 +118,8 @@ def test_a_figure_has_a_curve_for_each_number_of_a_view(right) -> None:
     shifted = replace(alone, views=Views(np.zeros(15), np.ones((15, 2))))
     left = replace(alone, views=Views(np.zeros(15), np.zeros((15, 2))))
     count = [len(found.plot().axes) for found in (alone, shifted, moving, left)]
-    assert alone.per_view() == {} and alone.facts()["views"] == {}
-    assert repr(alone) == "Calibration(; residual 1, then 0.5)"
+    assert alone.per_view() == {} and alone.facts()["views"] == {} and "residual 1, then 0.5" in repr(alone)
     assert count[1] == count[0] + 1 and count[2] == count[0] + 2 and count[3] == count[0]  # a kind that is 0 was left alone
-    assert list(shifted.per_view()) == ["shift_v_mm", "shift_u_mm"]
-    last = moving.plot().axes[-1]
-    assert [line.get_label() for line in last.get_lines()] == ["shift x", "shift y", "shift z"]
 
 
 def test_an_object_that_moves_is_followed_and_the_file_has_its_poses(cli, rt, right, tmp_path, capsys) -> None:
@@ -157,7 +152,8 @@ def test_a_still_object_stays_still(rt, right) -> None:
     assert np.abs(shifts_mm).max() < 0.02
 
 
-def test_gauges_of_a_motion_are_an_object_elsewhere_and_a_larger_one(right) -> None:
+def test_gauges_are_what_an_object_elsewhere_or_a_larger_one_looks_like(right) -> None:
+    """Of a motion, and of a wobble, in which the panel's offset shows."""
     parameters = MotionParameters.of(right)
     angle = np.deg2rad(24 * np.arange(15))
     towards = np.linalg.lstsq(parameters.basis, np.stack([np.cos(angle), np.sin(angle)], -1), rcond=None)[0]
@@ -166,12 +162,7 @@ def test_gauges_of_a_motion_are_an_object_elsewhere_and_a_larger_one(right) -> N
     np.testing.assert_allclose(parameters.without_gauges(gauges), 0, atol=1e-9)
     once = parameters.without_gauges(np.random.default_rng(0).normal(size=(SPLINES, 6)))
     np.testing.assert_allclose(parameters.without_gauges(once), once, atol=1e-12)
-
-
-def test_gauges_of_views_are_what_another_object_looks_like(right) -> None:
-    angle = np.deg2rad(24 * np.arange(15))
+    views, offset = WobbleParameters.of(right), np.tile([0.0, 0.0, 0.2], (15, 1))
     gauges = np.stack([np.full(15, 0.1), np.full(15, 0.2), 0.3 * np.cos(angle) - 0.1 * np.sin(angle)], -1)
-    np.testing.assert_allclose(WobbleParameters.of(right).without_gauges(gauges), 0, atol=1e-12)
-    offset = np.zeros((15, 3))
-    offset[:, 2] = 0.2  # the panel's, which shows
-    np.testing.assert_allclose(WobbleParameters.of(right).without_gauges(offset), offset, atol=1e-12)
+    np.testing.assert_allclose(views.without_gauges(gauges), 0, atol=1e-12)
+    np.testing.assert_allclose(views.without_gauges(offset), offset, atol=1e-12)

@@ -19,9 +19,7 @@ def scan_of(rt) -> Callable[..., Scan]:
         **protocol: object,
     ) -> Scan:
         scene = phantom_scene(rt, phantom, geometry, Grid.cube(size, 2.0), size, axis, 0)
-        options = SimulationOptions(
-            make_protocol("rapid", **protocol), axis, noise="tigre", dose=1e6, time_samples=8
-        )
+        options = SimulationOptions(make_protocol("rapid", **protocol), axis, noise="tigre", dose=1e6, time_samples=8)
         return simulate(scene.source, geometry, scene.grid, options)
 
     return make

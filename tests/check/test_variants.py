@@ -7,7 +7,7 @@ import pytest
 from check_kit import cropped, negative, stated
 
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Shutter, pixel_centres
-from phyradgs_cl.acquisition.altered.coarse import FINE_COLUMNS, binned, coarse, fewer_frames
+from phyradgs_cl.acquisition.altered.coarse import FINE_COLUMNS, binned, coarse
 from phyradgs_cl.acquisition.altered.variants import reversed_readout, reversed_rotation, shifted
 from phyradgs_cl.reconstructors.fits.residuals import residual_ratio, t_statistic, vertex
 
@@ -23,12 +23,20 @@ def displaced(scan, u_mm):
     return stated(scan, detector_offset_mm=(0.3, u_mm))
 
 
-def test_what_hypotheses_change(clean) -> None:
+def test_what_hypotheses_change_and_where_a_panel_of_blocks_stands(clean) -> None:
+    """The panel of blocks as stated is where its orbit has it."""
     scan = displaced(clean, 0.4)
     np.testing.assert_allclose(poses(reversed_rotation(scan)), poses(negative(scan)), **CLOSE)
     moved = displaced(clean, 0.4 + 2.5 * clean.geometry.pixel_size_mm[1])
     np.testing.assert_allclose(poses(shifted(displaced(clean, 0.4), 2.5)), poses(moved), **CLOSE)
     assert reversed_readout(clean).shutter.direction == -1
+    small = binned(scan, 3)
+    orbit = CircularOrbit(small.geometry, clean.trajectory.kinematics)
+    np.testing.assert_allclose(poses(small), poses(replace(small, trajectory=orbit)), **CLOSE)
+    time_s = np.linspace(-1, 30, 400)
+    table = replace(clean, trajectory=PoseTable(time_s, clean.geometry.pose(np.deg2rad(24 * time_s))))
+    for changed in (reversed_rotation, lambda one: shifted(one, 2.0)):
+        np.testing.assert_allclose(poses(changed(table)), poses(changed(clean)), atol=1e-6)
 
 
 def of_rows(scan, rows):
@@ -46,21 +54,12 @@ def test_blocks_stand_in_the_middle_of_their_pixels(clean, rows, block, high) ->
     assert (rows, columns) == (scan.geometry.detector_shape[0] // high, 32 // block)
     fine = pixel_centres(poses(scan), scan.geometry.detector_shape)[:, :, : rows * high, : columns * block]
     middle = fine.reshape(*fine.shape[:2], rows, high, columns, block, 3).mean((3, 5))
-    at = small.frame_start_s - scan.frame_start_s
-    again = np.stack(
-        [small.trajectory.pose(f, np.array([s, s + 0.7]) - at[f]) for f, s in enumerate(small.frame_start_s)]
-    )
+    asked = zip(small.frame_start_s, small.frame_start_s - scan.frame_start_s, strict=True)
+    again = np.stack([small.trajectory.pose(f, np.array([s, s + 0.7]) - later) for f, (s, later) in enumerate(asked)])
     np.testing.assert_allclose(pixel_centres(again, small.geometry.detector_shape), middle, **CLOSE)
 
 
-def test_the_stated_panel_of_blocks_is_where_its_orbit_has_it(clean) -> None:
-    small = binned(displaced(clean, 0.4), 3)
-    orbit = CircularOrbit(small.geometry, clean.trajectory.kinematics)
-    np.testing.assert_allclose(poses(small), poses(replace(small, trajectory=orbit)), **CLOSE)
-
-
-@pytest.mark.parametrize("direction", [1, -1])
-@pytest.mark.parametrize("block", [2, 3])
+@pytest.mark.parametrize(("direction", "block"), [(1, 2), (-1, 3)])
 def test_blocks_of_lines_open_when_their_lines_do_on_average(clean, direction, block) -> None:
     scan = replace(clean, shutter=Shutter(1.0, 0.5, "rows", direction, None))
     small = binned(scan, block)
@@ -82,15 +81,6 @@ def test_masked_pixels_are_left_out_of_their_block(clean) -> None:
     assert np.argwhere(small.pixel_mask[0]).tolist() == [[4, 4]]
 
 
-def test_fewer_frames_keep_their_poses_and_times(clean) -> None:
-    few = fewer_frames(clean, 5)
-    chosen = [0, 4, 7, 10, 14]
-    assert few.frames == 5 and np.array_equal(few.projections, clean.projections[chosen])
-    np.testing.assert_allclose(poses(few), poses(clean)[chosen], **CLOSE)
-    ours, theirs = poses(binned(few, 2)), poses(binned(clean, 2))[chosen]
-    np.testing.assert_allclose(ours[:, :, :3], theirs[:, :, :3], **CLOSE)
-
-
 def test_levels_bound_pixels_and_voxels(clean) -> None:
     assert coarse(clean, FINE_COLUMNS).projections.shape == clean.projections.shape
     small = coarse(replace(clean, projections=clean.projections), 16)
@@ -99,14 +89,6 @@ def test_levels_bound_pixels_and_voxels(clean) -> None:
     assert coarse(of_rows(clean, 3), 16).projections.shape[1:] == (3, 32)  # not one row of 16 blocks
     around = 2 * np.array(small.grid.voxel_size_mm)
     assert max(small.grid.shape) <= 26 and small.grid.size_mm - around == pytest.approx(clean.grid.size_mm)
-
-
-def test_a_table_of_poses_can_be_asked_too(clean) -> None:
-    time_s = np.linspace(-1, 30, 400)
-    table = PoseTable(time_s, clean.geometry.pose(np.deg2rad(24 * time_s)))
-    scan = replace(clean, trajectory=table)
-    np.testing.assert_allclose(poses(reversed_rotation(scan)), poses(reversed_rotation(clean)), atol=1e-6)
-    np.testing.assert_allclose(poses(shifted(scan, 2.0)), poses(shifted(clean, 2.0)), atol=1e-6)
 
 
 def test_vertices_of_parabolas_and_the_standing_of_hypotheses() -> None:

@@ -96,13 +96,3 @@ def test_the_page_of_a_run_that_has_ended_stays(page, file) -> None:
     page.evaluate("window.same = true")
     page.wait_for_timeout(3000 * EVERY_S)
     assert page.evaluate("window.same")
-
-
-def test_without_scripts_it_reloads_too(browser, file) -> None:
-    context = browser.new_context(java_script_enabled=False)
-    page = context.new_page()
-    page.goto(file.as_uri())
-    write(file, 10)
-    page.wait_for_timeout(2500)
-    assert "10 of 20" in page.locator(".tiles").inner_text() and not page.locator("#pause").is_visible()
-    context.close()

@@ -153,26 +153,6 @@ def test_keys_mouse_and_the_window_of_the_slices_change_the_picture(page) -> Non
     assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
 
 
-def test_one_finger_turns_and_leaves_the_page_to_scroll(browser, address) -> None:
-    context = browser.new_context(viewport={"width": 390, "height": 844}, has_touch=True)
-    page = context.new_page()
-    page.goto(address)
-    page.wait_for_selector("#space[data-drawn]")
-    canvas = page.locator("#space")
-    canvas.scroll_into_view_if_needed()
-    assert canvas.evaluate("canvas => getComputedStyle(canvas).touchAction") == "pan-y"
-    box = canvas.bounding_box()
-    at = {"x": box["x"] + 100, "y": box["y"] + 100}
-    session = context.new_cdp_session(page)
-    session.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [at]})
-    for step in (20, 60, 100):
-        session.send("Input.dispatchTouchEvent", {"type": "touchMove", "touchPoints": [{**at, "x": at["x"] + step}]})
-    session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
-    assert page.locator("#turn").input_value() != "325" and page.locator("#tilt").input_value() == "20"
-    assert page.evaluate("document.documentElement.scrollWidth") == 390
-    context.close()
-
-
 @pytest.fixture(scope="module")
 def field() -> Deformation:
     """All matter goes to +x and −z by up to two voxels, and turns a little."""

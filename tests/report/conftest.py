@@ -15,8 +15,7 @@ from phyradgs_cl.reconstructors import plan_run
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 from phyradgs_cl.workflow import run_reconstruction
 
-collect_ignore = [] if importlib.util.find_spec("napari") else ["test_napari.py"]
-collect_ignore += [] if importlib.util.find_spec("napari_ome_zarr") else ["test_napari_zarr.py"]
+collect_ignore = [] if importlib.util.find_spec("napari_ome_zarr") else ["test_napari.py"]
 VOID = {"br", "img", "input", "link", "meta"}
 
 

@@ -83,7 +83,3 @@ def test_the_first_threshold_divides_air_from_matter(parse) -> None:
     page = parse(space(volume, Grid.cube(8, 2.0), Window.of(0.0, 1.0, volume), None))
     step = next(int(control["value"]) for control in page.all("input") if control["id"] == "threshold")
     assert step / 255 == pytest.approx(0.5, abs=0.01)  # in the middle of the gap
-
-
-def test_a_volume_of_one_layer_has_no_third_dimension() -> None:
-    assert space(np.ones((1, 8, 8)), Grid((1, 8, 8), (1.0, 1.0, 1.0)), Window.of(0.0, 1.0, np.ones(1)), None) is None

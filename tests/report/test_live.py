@@ -160,5 +160,3 @@ def test_a_report_that_fails_says_how_to_make_it(tmp_path, caplog) -> None:
     with LivePage(tmp_path / "p.html", "v.h5", SETTINGS) as live:
         live.become(lambda path: path.write_text("the report", encoding="utf-8"))
     assert (tmp_path / "p.html").read_text(encoding="utf-8") == "the report"
-
-

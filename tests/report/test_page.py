@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 from skimage import io
 
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Shutter
-from phyradgs_cl.errors import InputError, OutputError
+from phyradgs_cl.errors import OutputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import Volume, read_volume, write_scan, write_volume
 from phyradgs_cl.prepare.rings import RingOptions
@@ -180,15 +181,21 @@ def test_what_version_0_2_did_to_the_frames_is_done_again(any_volume, tmp_path) 
     assert load_run(tmp_path / "v.h5").preprocessing == Preprocessing(ignore_lag=True, steps="rings", rings=RingOptions(5))
 
 
-def test_a_run_without_its_scan_still_shows_the_volume(files, tmp_path, parse, caplog) -> None:
+def test_a_run_without_its_scan_still_shows_the_volume_and_a_bare_result_its_picture(
+    files, any_volume, tmp_path, parse, caplog
+) -> None:
     volume, stored = tmp_path / "alone.h5", read_volume(files[1])
-    facts = {**stored.provenance, "scan": "gone.h5"}
-    write_volume(volume, stored.values, stored.grid, facts, None, stored.metrics)
+    write_volume(volume, stored.values, stored.grid, {**stored.provenance, "scan": "gone.h5"}, None, stored.metrics)
     run = write_report(volume, tmp_path / "p.html", no_runtime)
     assert run.scan is None and "--scan" in run.notes[0] and "gone.h5" in caplog.text
     page = parse((tmp_path / "p.html").read_text(encoding="utf-8"))
     assert set(page.ids) & ALL == {"slices", "volume", "metrics", "convergence", "provenance"}
     assert not [i for i in page.ids if i.startswith("layer-")]
+    write_volume(tmp_path / "v.h5", *any_volume, {})
+    page = parse(report_page(load_run(tmp_path / "v.h5")))
+    assert set(page.ids) & ALL == {"slices", "volume", "provenance"}
+    sizes = {image["style"] for image in page.all("img")}
+    assert len(sizes) == 3 and "aspect-ratio: 0.8 / 1.2" in sizes
 
 
 def test_a_scan_that_stops_has_no_times(rt, files, small_scan, tmp_path, parse) -> None:
@@ -215,28 +222,17 @@ def test_a_scan_that_has_changed_is_not_taken_for_the_run_scan(files, small_scan
     assert set(page.ids) & ALL == ALL - {"projections", "metrics"}
 
 
-def test_a_bare_result_is_a_picture_of_the_volume(any_volume, tmp_path, parse) -> None:
-    volume, grid = any_volume
-    write_volume(tmp_path / "v.h5", volume, grid, {})
-    page = parse(report_page(load_run(tmp_path / "v.h5")))
-    assert set(page.ids) & ALL == {"slices", "volume", "provenance"}
-    sizes = {image["style"] for image in page.all("img")}
-    assert len(sizes) == 3 and "aspect-ratio: 0.8 / 1.2" in sizes
-
-
 def test_files_of_another_kind_are_named_and_inputs_never_replaced(files, tmp_path) -> None:
     scan, volume = files
     page = tmp_path / "p.html"
-    for arguments, error, said in (
-        ((scan, page), InputError, "found a scan"),
-        ((volume, page, volume), InputError, "--scan.*found a volume"),
-        ((volume, tmp_path / "nowhere" / "p.html"), OutputError, "nowhere"),
-        ((volume, volume), InputError, "reads or writes"),
-        ((volume, scan), InputError, "reads or writes"),
-        ((volume, tmp_path / "page.pdf"), InputError, r"^-o: found the suffix \.pdf; expected an HTML page"),
-    ):
-        with pytest.raises(error, match=said):
-            write_report(*arguments[:2], no_runtime, scan=arguments[2] if len(arguments) > 2 else None)
+    assert_refused({
+        "found a scan": lambda: write_report(scan, page, no_runtime),
+        "--scan.*found a volume": lambda: write_report(volume, page, no_runtime, scan=volume),
+        "reads or writes": lambda: write_report(volume, scan, no_runtime),
+        r"^-o: found the suffix \.pdf": lambda: write_report(volume, tmp_path / "page.pdf", no_runtime),
+    })
+    with pytest.raises(OutputError, match="nowhere"):
+        write_report(volume, tmp_path / "nowhere" / "p.html", no_runtime)
     assert not list(tmp_path.iterdir())
 
 
