@@ -21,14 +21,10 @@ from phyradgs_cl.runtime.opencl import kernel_source
 pytestmark = pytest.mark.slow
 
 KERNELS = Path(__file__).resolve().parent.parent / "cl"
-GPU_ONLY = {"splat_forward_pixels", "splat_backward_group"}
-GPU_ONLY |= {"bin_count_group", "bin_within_group", "bin_starts_group", "bin_fill_group"}
-GPU_ONLY |= {"warp_adjoint_fixed", "warp_adjoint_sum"}
-GPU = {"lanes": 1, "pixel_items": True}
-# GPUs with doubles: the test of small limits below. CPUs with lanes 1: the tests of kernels whose code differs then.
-SHAPES = {"CPU": ({"pixel_items": False}, GPU_ONLY), "GPU without doubles": ({**GPU, "fp64": False}, CPU_ONLY)}
-
-
+GPU_ONLY = {
+    "splat_forward_pixels", "splat_backward_group", "bin_count_group", "bin_within_group", "bin_starts_group",
+    "bin_fill_group", "warp_adjoint_fixed", "warp_adjoint_sum",
+}  # fmt: skip
 TWINS = ("splat_frame", "moving_frame", "splat_image", "deformed_frame", "voxel_field")
 LONG = {  # kernels that may take long
     "rays_forward", "rays_adjoint", "backproject", "backproject_lines", "backproject_moving", "backproject_lines_moving",
@@ -51,19 +47,19 @@ def known_kernels() -> set[str]:
     return {name for text in sources for name in re.findall(r"__kernel\s+void\s+(\w+)", text)}
 
 
-@pytest.mark.parametrize(("launch_shape", "others"), SHAPES.values(), ids=SHAPES)
-def test_every_kernel_is_asked(twins_once, launch_shape, others) -> None:
-    verdict = check_device(**launch_shape)
-    assert verdict.failures == () and known_kernels() - verdict.agreeing == others
+def test_every_kernel_is_asked(twins_once) -> None:
+    verdict = check_device(pixel_items=False)
+    assert verdict.failures == () and known_kernels() - verdict.agreeing == GPU_ONLY
     assert str(verdict).endswith(f"can be trusted: all {len(verdict.agreeing)} kernels agree with float64")
 
 
 def test_groups_and_launches_keep_to_small_limits(twins_once, monkeypatch) -> None:
-    """A kernel with many registers may allow fewer items than its device. Here all do, and no launch may be long."""
+    """A kernel with many registers may allow fewer items than its device. Here all do, and no launch may be long, on a GPU
+    without doubles. With doubles, and in other shapes: the tests of kernels."""
     parts = launches(monkeypatch)
     monkeypatch.setattr(Runtime, "_asked", lambda *_: 32)
     monkeypatch.setattr(Runtime, "most_samples", 50)
-    verdict = check_device(**GPU)
+    verdict = check_device(lanes=1, pixel_items=True, fp64=False)
     assert verdict.failures == () and known_kernels() - verdict.agreeing == CPU_ONLY
     assert max(math.prod(group) for _, _, group, _ in parts) == 32
     assert {name for name, _, _, first in parts if first is not None} >= LONG
@@ -80,32 +76,23 @@ WRONG = [
 @pytest.mark.parametrize(("check", "program", "right", "wrong", "named"), WRONG)
 def test_a_wrong_kernel_is_named(monkeypatch, cli, capfd, check, program, right, wrong, named) -> None:
     def planted(name: str) -> str:
-        source = kernel_source(name)
-        if name != program:
-            return source
-        assert right in source
-        return source.replace(right, wrong)
+        return kernel_source(name).replace(right, wrong) if name == program else kernel_source(name)
 
+    assert right in kernel_source(program)
     monkeypatch.setattr(context, "kernel_source", planted)
     monkeypatch.setattr(device_check, "CHECKS", (getattr(device_check, check),))
     assert cli.run(["devices", "--check"]) == 5
     line, *probes = capfd.readouterr().out.splitlines()
     assert "cannot be trusted: " in line and named in line
-    # only GPUs are asked for the longest launch
-    assert [word for probe in probes if (word := probe.partition(":")[0].split()[0]) != "longest"] == TOLD
-
-
-TOLD = ["driver", "pairs", "whole", "subnormal", "work-items", "times"]
-
-
-def told(**launch_shape) -> list[str]:
-    return list(probe_lines(None, {"wide": 256, "narrow": 64}, 1.5, **launch_shape))
+    told = [word for probe in probes if (word := probe.partition(":")[0].split()[0]) != "longest"]  # asked of GPUs
+    assert told == ["driver", "pairs", "whole", "subnormal", "work-items", "times"]
 
 
 def test_what_a_device_does_with_numbers_is_told(monkeypatch) -> None:
     """A build that may reorder sums stands for a driver that contracts pairs."""
     monkeypatch.setattr(device_probes, "LASTING_S", (0.01,))
-    right = told(lanes=1, pixel_items=True, fp64=False)
+    asked = None, {"wide": 256, "narrow": 64}, 1.5
+    right = list(probe_lines(*asked, lanes=1, pixel_items=True, fp64=False))
     assert "which stand for float64 here: kept" in right[1] and "kept, as floats kept" in right[2]
     assert "of narrow at most 64" in right[4] and "compared in 1.5 s" in right[5]
     assert re.search(r"longest launch that lived: [\d.e-]+ s or more", right[6])
@@ -113,7 +100,7 @@ def test_what_a_device_does_with_numbers_is_told(monkeypatch) -> None:
     monkeypatch.setattr(Runtime, "_allowed", staticmethod(lambda *given: [*allowed(*given), "-cl-fast-relaxed-math"]))
     if "rusticl" in right[0]:  # which ignores the option
         return
-    assert "pairs of floats: contracted, relative error 5.9e-08" in told()[1]
+    assert "pairs of floats: contracted, relative error 5.9e-08" in list(probe_lines(*asked))[1]
     monkeypatch.setattr(device_check, "CHECKS", (device_check._numbers,))
     assert "probe_pairs (off by" in check_device(fp64=False).failures[0] and not check_device().failures
 
@@ -144,8 +131,8 @@ def test_a_driver_that_is_known_to_be_wrong_is_named(monkeypatch, cli, rt, capfd
 
     old = replace(rt.device, platform="rusticl", handle=Old())
     assert "install Mesa 25 or newer" in known_fault(old)
-    warn_of_fault(old)
-    warn_of_fault(old)
+    for _ in range(2):
+        warn_of_fault(old)
     assert caplog.text.count("rusticl of Mesa 22.3.6 computes wrong sums") == 1
     Old.driver_version = "25.0.7-2"
     assert known_fault(old) is None

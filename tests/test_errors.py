@@ -14,11 +14,9 @@ def test_message_names_subject_found_expected_and_remedy_on_one_line() -> None:
     assert str(error) == "scan.h5:/entry/data: found shape (3, 4); expected three axes; store (F, v, u)"
     for arguments, text in (
         (("dose",), "dose"),
-        (("dose", "-1"), "dose: found -1"),
         (("dose", "", "a number"), "dose: expected a number"),
         (("dose", "", "", "give one"), "dose: give one"),
         (("--dose", "given with --noise none"), "--dose: given with --noise none"),  # a state, which is not found
-        (("napari", "not installed"), "napari: not installed"),
     ):
         assert str(PhyradgsError(*arguments)) == text  # missing parts leave no trace
 
@@ -34,7 +32,6 @@ def test_in_python_errors_name_arguments_for_options() -> None:
     """But in commands and values, which are in quotes."""
     for text, told in (
         ("--time-error", "time_error"),
-        ("--set prior=piccs", "prior=piccs"),
         ("--with: readout axis", "others: readout axis"),
         ("the scan's --size or one's --roi-mm", "the scan's size or one's roi_mm"),
         ("'--no-option', see 'phyradgs check --fix-offset'", "'--no-option', see 'phyradgs check --fix-offset'"),

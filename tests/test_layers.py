@@ -161,10 +161,7 @@ def test_the_page_is_read_as_it_is_meant_and_the_rules_see_what_they_forbid() ->
     assert sorted(set(FLOOR_OF.values())) == list(range(11))
     found = {room_of(path) for path in modules()}
     assert set(FLOOR_OF) <= found, f"no such room: {set(FLOOR_OF) - found}"
-    assert forbidden("phantoms", "io") and forbidden("errors", "checks") and not forbidden("checks", "errors")
-    tree = ast.parse("from a.b import c\nif TYPE_CHECKING:\n    import torch\ndef f():\n    import h5py\nfrom . import d")
-    assert {name for _, name in imported_names(ast.walk(tree))} == {"a.b.c", "torch", "h5py", ".d"}
-    assert {name for _, name in imported_names(that_run(tree))} == {"a.b.c", "h5py", ".d"}
+    assert forbidden("errors", "checks") and not forbidden("checks", "errors")
     assert [complaint("fields", name)[:7] for name in ("numpy", ".a", f"{NAME}.x.y", f"{NAME}.io")] == [
         "", "write t", "imports", "fields "
     ]  # fmt: skip

@@ -21,9 +21,12 @@ from phyradgs_cl.workflow.files import load_scan
 pytestmark = pytest.mark.slow
 
 
-def seen_by(scan):
-    """The frames of the bodies that a scan's poses see."""
-    poses = [scan.trajectory.pose(f, np.array(t)) for f, t in enumerate(scan.frame_start_s)]
+def poses_of(scan):
+    return np.stack([scan.trajectory.pose(f, np.array(t)) for f, t in enumerate(scan.frame_start_s)])
+
+
+def seen_by(poses):
+    """The frames of the bodies that poses see."""
     return np.stack([line_integrals(BODIES, pose, (SIDE, SIDE)) for pose in poses]).astype(np.float32)
 
 
@@ -34,7 +37,7 @@ def test_directions_turn_and_never_shift() -> None:
     sway = replace(Sway.none(scan, 7), coefficients=np.random.default_rng(1).normal(0, 0.3, (7, 6)))
     for changed in (perturb(scan, correction), perturb(scan, correction, views), perturb(scan, correction, sway)):
         assert changed.is_parallel
-        poses = np.stack([changed.trajectory.pose(f, np.array(t)) for f, t in enumerate(scan.frame_start_s)])
+        poses = poses_of(changed)
         np.testing.assert_allclose(np.linalg.norm(poses[:, :3], axis=1), 1, rtol=1e-12)
         np.testing.assert_allclose(np.einsum("fi,fi->f", poses[:, :3], poses[:, 6:9]), 0, atol=1e-12)
     moved = perturb(scan, GeometryCorrection(), replace(sway, coefficients=np.tile([0, 0, 0, 0.2, -0.1, 0.3], (7, 1))))
@@ -54,7 +57,7 @@ def test_tilts_and_distances_are_refused_and_not_asked_for() -> None:
 def test_an_offset_and_a_roll_are_found_in_half_a_turn_and_a_right_scan_is_left_alone(rt) -> None:
     scan = parallel_scan(30, 180.0, 1.5)
     rolled = perturb(scan, GeometryCorrection(offset_u_mm=0.15, roll_rad=np.deg2rad(1.5)))
-    result = calibrate(replace(scan, projections=seen_by(rolled)), rt)
+    result = calibrate(replace(scan, projections=seen_by(poses_of(rolled))), rt)
     found = {one.name: one for one in result.parameters}
     assert found["offset-u"].verdict == CORRECTED and abs(found["offset-u"].found - 0.15) < 0.01
     assert found["roll"].verdict == CORRECTED and abs(found["roll"].found - 1.5) < 0.2
@@ -70,13 +73,12 @@ def test_frames_of_beads_are_the_closed_form() -> None:
     for scan in (parallel_scan(8), laminography_scan(8)):
         operator = BeadProblem.of(BODIES, np.zeros(7), [scan], Stage(SIDE, 8, 4), 8).operator(GeometryCorrection())
         moved = perturb(scan, GeometryCorrection(), replace(Sway.none(scan, 7), coefficients=np.tile(place, (7, 1))))
-        poses = np.stack([moved.trajectory.pose(f, np.array(t)) for f, t in enumerate(scan.frame_start_s)])
         offsets = (np.arange(operator.samples) + 0.5) / operator.samples - 0.5
         expected = np.zeros(scan.projections.shape)
         for v, u in itertools.product(offsets, offsets):
-            points = poses.copy()
-            points[:, 3:6] += u * poses[:, 6:9] + v * poses[:, 9:12]
-            expected += np.stack([line_integrals(BODIES, pose, (SIDE, SIDE)) for pose in points]) / len(offsets) ** 2
+            points = poses_of(moved)
+            points[:, 3:6] += u * points[:, 6:9] + v * points[:, 9:12]
+            expected += seen_by(points) / len(offsets) ** 2
         np.testing.assert_allclose(operator.forward(np.array([*place, 1.0])), expected, rtol=0, atol=1e-5)
 
 

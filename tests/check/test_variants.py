@@ -7,7 +7,7 @@ import pytest
 from check_kit import cropped, negative, stated
 
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Shutter, pixel_centres
-from phyradgs_cl.acquisition.altered.coarse import FINE_COLUMNS, binned, coarse
+from phyradgs_cl.acquisition.altered.coarse import binned
 from phyradgs_cl.acquisition.altered.variants import reversed_readout, reversed_rotation, shifted
 from phyradgs_cl.reconstructors.fits.residuals import residual_ratio, t_statistic, vertex
 
@@ -79,16 +79,6 @@ def test_masked_pixels_are_left_out_of_their_block(clean) -> None:
     expected = (p[:, 4, 7] + p[:, 5, 6] + p[:, 5, 7]) / 3
     np.testing.assert_allclose(small.projections[:, 2, 3], expected, rtol=1e-6)
     assert np.argwhere(small.pixel_mask[0]).tolist() == [[4, 4]]
-
-
-def test_levels_bound_pixels_and_voxels(clean) -> None:
-    assert coarse(clean, FINE_COLUMNS).projections.shape == clean.projections.shape
-    small = coarse(replace(clean, projections=clean.projections), 16)
-    assert small.geometry.detector_shape == (16, 16)
-    assert coarse(of_rows(clean, 1), 16).projections.shape[1:] == (1, 32)
-    assert coarse(of_rows(clean, 3), 16).projections.shape[1:] == (3, 32)  # not one row of 16 blocks
-    around = 2 * np.array(small.grid.voxel_size_mm)
-    assert max(small.grid.shape) <= 26 and small.grid.size_mm - around == pytest.approx(clean.grid.size_mm)
 
 
 def test_vertices_of_parabolas_and_the_standing_of_hypotheses() -> None:

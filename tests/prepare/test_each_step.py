@@ -7,9 +7,8 @@ import pytest
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.api import compare, prepare, reconstruct
-from phyradgs_cl.detector import tube_spectrum
 from phyradgs_cl.detector.effects import add_scatter, beer_lambert_noise, drifting_light
-from phyradgs_cl.prepare import DEFAULT_STEPS, PREPARED_KEY, find_dead, water_polynomial
+from phyradgs_cl.prepare import DEFAULT_STEPS, PREPARED_KEY, find_dead
 
 CONE, PARALLEL = (5.0, 7.0), (500.0, 501.0)  # source to axis and to panel in mm
 SLOW = pytest.mark.slow
@@ -80,17 +79,6 @@ def test_air(rt, clean) -> None:
     prepared = prepare(drifting, "air", device=rt)
     assert rms(prepared.projections - clean.projections) < 0.1 * rms(drifting.projections - clean.projections)
     assert prepared.provenance[PREPARED_KEY][0]["light"] == pytest.approx([light.min(), light.max()], rel=0.003)
-
-
-@SLOW
-def test_hardening(rt, few) -> None:
-    """No correction explains a straight scan better than none; a wedge's polynomial straightens water."""
-    assert prepare(few, "hardening", hardening={"kvp": 100.0}, device=rt).projections is few.projections
-    bent = with_frames(few, tube_spectrum(100.0).hardened(few.projections))
-    wedge = {"polynomial": water_polynomial(100.0)}
-    prepared = prepare(bent, "hardening", hardening=wedge, device=rt)
-    error = rms(bent.projections - few.projections)
-    assert rms(prepared.projections - few.projections) < 0.05 * error
 
 
 @SLOW

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from check_kit import some_frames
 from refusals import assert_refused
 
 from phyradgs_cl.acquisition import Scan
@@ -80,7 +81,7 @@ def test_columns_of_the_same_values_in_another_order_are_exact() -> None:
         assert replaced.all() if ratio == 0 else np.flatnonzero(replaced).tolist() == [12]
 
 
-def test_the_step_counts_and_refuses(planted, clean) -> None:
+def test_the_step_counts_and_refuses(clean) -> None:
     frames = planted_in(clean.projections, "fluctuating")
     result = prepare(replace(clean, projections=frames), "stripes")
     facts = result.provenance[PREPARED_KEY][0]
@@ -88,7 +89,7 @@ def test_the_step_counts_and_refuses(planted, clean) -> None:
     flat = replace(clean, projections=np.full_like(frames, 0.5), reference=None)
     assert prepare(flat, "stripes").projections is flat.projections
     assert_refused({
-        "50 views": lambda: prepare(planted(), "stripes"),
+        "50 views": lambda: prepare(some_frames(clean, slice(50)), "stripes"),
         "stripes.width: found 49": lambda: prepare(clean, "stripes", stripes={"width": 49}),
         "stripes.width: found 2": lambda: preprocessing_of({"steps": "stripes", "stripes": {"width": 2}}),
         "stripes.ratio: found -1": lambda: preprocessing_of({"steps": "stripes", "stripes": {"ratio": -1}}),

@@ -168,15 +168,6 @@ def test_tab_reaches_every_control(page) -> None:
     assert sliders | others <= set(reached)
 
 
-def test_without_script_the_middle_slices_stay(browser, address) -> None:
-    page = browser.new_context(java_script_enabled=False).new_page()
-    page.goto(address)
-    assert page.locator("#plane-axial img").is_visible()
-    assert not page.locator("#slider-axial").is_visible() and not page.locator(".tools").first.is_visible()
-    assert page.locator("#plane-axial .bar").is_visible() and "Black is 0, white" in reading(page)
-    page.close()
-
-
 def test_pictures_for_the_documentation(browser, address, tmp_path: Path) -> None:
     """The first screens and whole pages, at both widths, for a look."""
     folder = Path(os.environ.get("PHYRADGS_PICTURES") or tmp_path)

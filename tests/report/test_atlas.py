@@ -58,7 +58,7 @@ def test_larger_volumes_are_means_over_blocks(parse) -> None:
     assert np.array_equal(voxels_of(data)[0, 0], np.rint(np.arange(MOST_EDGE) * 2 + 0.5))
 
 
-def test_centres_are_places_in_the_box_and_densities(parse) -> None:
+def test_centres_are_places_in_the_box_and_densities_and_many_are_thinned(parse) -> None:
     grid = Grid((4, 4, 4), (0.5, 0.5, 0.5), (1.0, 0.0, -1.0))  # z, y, x
     means = np.array([[-1.0, 0.0, 1.0], [-1.9, 0.5, 0.25], [5.0, 0.0, 1.0]])
     data = data_of(parse, np.ones((4, 4, 4)), grid, Window.of(0.0, 1.0, np.ones(1)), cloud(means, np.array([1.0, 0.5, 9.0])))
@@ -66,15 +66,10 @@ def test_centres_are_places_in_the_box_and_densities(parse) -> None:
     assert places == pytest.approx(np.array([[0.5, 0.5, 0.5], [0.05, 0.75, 0.125]]), abs=1e-4)  # the third is outside
     densities = np.frombuffer(base64.b64decode(data["centres"]["densities"]), np.uint8)
     assert densities[0] >= 254 and abs(int(densities[1]) - 128) <= 1
-
-
-def test_many_centres_are_thinned_and_the_page_says_so(parse) -> None:
-    count = 3 * MOST_CENTRES
-    means = np.random.default_rng(2).uniform(-1, 1, (count, 3))
-    markup = space(np.ones((4, 4, 4)), Grid.cube(4, 2.0), Window.of(0.0, 1.0, np.ones(1)), cloud(means, np.ones(count)))
-    assert f"of {count})" in markup
-    data = json.loads(parse(markup).texts["script"][0])
-    assert len(base64.b64decode(data["centres"]["places"])) == 6 * MOST_CENTRES
+    many = cloud(np.random.default_rng(2).uniform(-1, 1, (3 * MOST_CENTRES, 3)), np.ones(3 * MOST_CENTRES))
+    markup = space(np.ones((4, 4, 4)), Grid.cube(4, 2.0), Window.of(0.0, 1.0, np.ones(1)), many)
+    places = json.loads(parse(markup).texts["script"][0])["centres"]["places"]
+    assert f"of {3 * MOST_CENTRES})" in markup and len(base64.b64decode(places)) == 6 * MOST_CENTRES
 
 
 def test_the_first_threshold_divides_air_from_matter(parse) -> None:

@@ -14,7 +14,6 @@ from parallel_kit import SIDE, laminography_scan, parallel_scan
 from phyradgs_cl.acquisition import MicroViews, PoseTable, Shutter, make_protocol
 from phyradgs_cl.acquisition.altered.angles import middle_poses
 from phyradgs_cl.acquisition.motion import MODELS
-from phyradgs_cl.drawing import SAMPLE
 from phyradgs_cl.report import charts, scan_charts
 
 pytestmark = pytest.mark.slow
@@ -76,14 +75,6 @@ def test_the_window_of_a_frame_is_a_parallelogram_from_opening_to_closing(kinds,
     assert highest[:, 0].max() - lowest[:, 0].min() == pytest.approx(shutter.span_s)
     opened, lit = outlines(drawn(scan_charts.draw_shutter, kinds["pulsed"], None))
     assert np.ptp(lit[:, 0]) < 0.2 * np.ptp(opened[:, 0])
-
-
-def test_samples_lie_at_the_times_of_the_cells(small_scan) -> None:
-    motion = MicroViews(strips=4, sub_intervals=3)
-    lines = drawn(scan_charts.draw_shutter, small_scan, motion).lines
-    (dots,) = [line.get_xydata() for line in lines if line.get_color() == SAMPLE]
-    expected = motion.cells(small_scan, 0).time_s - small_scan.frame_start_s[0]
-    assert len(dots) == 12 and np.allclose(dots[:, 0], expected)
 
 
 def test_the_orbit_is_that_of_the_scan_and_the_panel_ends_half_a_pixel_beyond_its_pixels(small_scan) -> None:
