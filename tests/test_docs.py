@@ -84,3 +84,9 @@ def test_the_site_builds_without_a_broken_link(tmp_path) -> None:
     assert page.count("<math") > 150 and "$$" not in page
     options = (tmp_path / "site" / "cli" / "index.html").read_text(encoding="utf-8")
     assert "<code>--noise none|tigre|beer</code>" in options  # written with \\| in the Markdown
+
+
+def test_tables_of_the_results_are_those_of_the_recorded_runs() -> None:
+    command = [sys.executable, str(DOCS / "make_results.py"), "--check"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, f"run docs/make_results.py: {done.stdout}{done.stderr}"

@@ -8,9 +8,7 @@ from check_kit import some_frames, stated
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, pixel_centres
 from phyradgs_cl.api import static_scan
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
-from phyradgs_cl.calibrate.parameters import PARAMETERS
-from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
-from phyradgs_cl.calibrate.search import LEAST_SHARE, Fallback, Search
+from phyradgs_cl.calibrate.search import Fallback, Search
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
@@ -50,16 +48,6 @@ def test_the_offset_of_half_a_turn_is_found_where_check_finds_it(rt, half_turn) 
         assert found.alike == [] and lines[0].startswith("so far, 24 columns: offset-u ")
         before, after = found.residual_rms
         assert after < 0.5 * before if verdict == CORRECTED else after == before
-
-
-def test_without_an_answer_from_the_axis_the_frames_do_not_determine_the_offset(rt, half_turn) -> None:
-    scan, stage = half_turn(0.0), Stage(16, first=20, again=10, steps=1)
-    problem = CoarseProblem.of(rt, [scan], stage)
-    alone = Search([PARAMETERS["offset-u"]])
-    alone.descend(problem, stage)
-    assert alone.determined == () and alone.shares["offset-u"] < 2 * LEAST_SHARE
-    assert alone.alike == ["offset-u: looks like an object beside the axis"]
-    assert alone.table(scan, {})[0].verdict == CANNOT_TELL
 
 
 def test_an_axis_beside_which_others_are_searched_stays_where_it_is(rt, half_turn) -> None:

@@ -19,11 +19,6 @@ def clean(closed_form) -> Scan:
     return closed_form("skull", panel=32, dose=1e5, noise=beer_lambert_noise)
 
 
-@pytest.fixture(scope="module")
-def few(closed_form) -> Scan:
-    return closed_form("skull", panel=32, dose=1e5, noise=beer_lambert_noise, views=60)
-
-
 def with_frames(scan: Scan, frames: np.ndarray) -> Scan:
     return replace(scan, projections=frames.astype(np.float32))
 
@@ -56,8 +51,9 @@ def test_dead_pixels(rt, clean) -> None:
 
 
 @SLOW
-def test_scatter(rt, few) -> None:
+def test_scatter(rt, closed_form) -> None:
     """Of a clean scan the fit takes less than the noise of a pixel; of scatter most goes."""
+    few = closed_form("skull", panel=32, dose=1e5, noise=beer_lambert_noise, views=60)
     unchanged = prepare(few, "scatter", device=rt).projections
     noise = rms(np.diff(few.projections[:, :3, :3], axis=0)) / np.sqrt(2)
     assert rms(unchanged - few.projections) < noise
