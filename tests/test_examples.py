@@ -36,7 +36,7 @@ SAID = {
 }
 FEWER = {
     "own_poses": {"views=30, exposure_deg=6.0": "views=18, exposure_deg=10.0"},
-    "own_arrays": {"iterations=30": "iterations=12"},
+    "own_arrays": {"iterations=30": "iterations=15"},
     "own_sirt": {"size=32, detector=48": "size=16, detector=24", "else 50": "else 10"},
     "sweep_in_python": {'"iterations": 40': '"iterations": 15', '"iterations": 30': '"iterations": 12'},
 }

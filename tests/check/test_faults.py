@@ -166,15 +166,20 @@ def test_the_offset_goes_into_a_copy(cli, clean, tmp_path, capsys, kind) -> None
     np.testing.assert_allclose(pose[:, 3:5], expected[:, 3:5], atol=0.15 * pitch_mm)
 
 
-def test_raw_counts_stay_raw_in_the_copy_and_the_status_is_of_what_is_not_corrected(cli, clean, tmp_path) -> None:
-    """Here of a gain that drifts."""
-    path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
-    drift = np.linspace(0, 0.05, clean.frames)[:, None, None]
-    light = np.concatenate([np.zeros((1, 32, 32)), clean.projections - drift])
-    data = (60000 * np.exp(-light)).astype(np.uint16)
+def test_an_offset_is_corrected_and_the_status_stays_where_something_else_is_suspicious(cli, clean, tmp_path) -> None:
+    gain = np.linspace(0, 0.05, clean.frames, dtype=np.float32)
     wrong = stated(clean, detector_offset_mm=(0.0, 3 * clean.geometry.pixel_size_mm[1]))
-    write_scan(path, wrong, data=data, image_key=np.r_[1, np.zeros(clean.frames, int)], quantity="counts")
-    assert cli.run(["check", str(path), "--fix-offset", "-o", str(fixed)]) == SUSPICIOUS_STATUS
+    path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
+    write_scan(path, replace(wrong, projections=clean.projections - gain[:, None, None]))
+    assert cli.run(["check", str(path), "--fix-offset", "-o", str(fixed)]) == SUSPICIOUS_STATUS and fixed.exists()
+
+
+def test_raw_counts_stay_raw_in_the_copy(cli, clean, tmp_path) -> None:
+    path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
+    light = np.concatenate([np.zeros((1, 32, 32)), clean.projections])
+    data = (60000 * np.exp(-light)).astype(np.uint16)
+    write_scan(path, clean, data=data, image_key=np.r_[1, np.zeros(clean.frames, int)], quantity="counts")
+    cli.run(["check", str(path), "--fix-offset", "-o", str(fixed)])
     held = []
     read_scan(fixed, lambda frames, keys, quantity: held.append((frames, quantity)) or (clean.projections, None))
     assert held[0][1] == "counts" and np.array_equal(held[0][0], data)
