@@ -20,7 +20,7 @@ GRID = Grid((32, 32, 32), (3.75, 3.75, 3.75))
 IRON = ((30, 8.176), (40, 3.629), (50, 1.958), (60, 1.205), (80, 0.5952), (100, 0.3717), (150, 0.1964))  # cm²/g, NIST
 BODY = [Ellipsoid((0, 0, 0), (45, 36, 48), 1.0), Ellipsoid((-12, -14, 4), (9, 9, 9), -0.4)]
 BALL = "{centre_mm = [0.0, 0.0, 0.0], radius_mm = 0.9, attenuation_per_mm = 0.2}"
-BALL_OF_STEEL = "{centre_mm = [0.6, 0.1, 0.1], radius_mm = 0.15, attenuation_per_mm = 4.0}"
+BALL_OF_STEEL = "{{centre_mm = [{}, 0.1, 0.1], radius_mm = 0.15, attenuation_per_mm = 4.0}}"
 STEEL = [Ellipsoid((24, -4, 0), (5, 5, 5), 1.0), Ellipsoid((-20, 10, 2), (5, 5, 5), 1.0)]
 
 
@@ -103,7 +103,7 @@ def test_a_scan_without_metal_stays_bit_for_bit(rt, beads, planted, closed_form)
 def test_every_time_of_an_exposure_is_in_the_shadow(rt, tmp_path) -> None:
     """A bead far from the axis moves over several pixels while a frame is open: all that it darkens is masked."""
     scans = []
-    for name, bodies in {"body.toml": BALL, "bead.toml": f"{BALL}, {BALL_OF_STEEL}"}.items():
+    for name, bodies in {"body.toml": BALL, "bead.toml": f"{BALL}, {BALL_OF_STEEL.format(0.6)}"}.items():
         (tmp_path / name).write_text(f"bead = [{bodies}]\n")
         scans.append(api.simulate(tmp_path / name, size=24, detector=36, views=60, exposure_deg=12.0, device=rt))
     mended = api.prepare(scans[1], "metal", metal={"above_per_mm": 1.3}, device=rt)
@@ -126,7 +126,7 @@ def test_a_threshold_is_believed_or_refused(rt, beads) -> None:
 @pytest.mark.parametrize("method", ["fista", "phyradgs", "changing", "moving"])
 def test_what_fills_the_shadow_does_not_reach_iterative_methods_and_they_resume(rt, tmp_path, caplog, method) -> None:
     """Splats too, whose first cloud is of FDK: here both start from one volume."""
-    (tmp_path / "bead.toml").write_text(f"bead = [{BALL}, {BALL_OF_STEEL}]\n")
+    (tmp_path / "bead.toml").write_text(f"bead = [{BALL}, {BALL_OF_STEEL.format(0.5)}]\n")
     scan = api.simulate(tmp_path / "bead.toml", size=16, detector=24, views=30, exposure_deg=6.0, device=rt)
     mended = api.prepare(scan, "metal", device=rt)
     refilled = np.where(mended.valid, mended.projections, mended.projections + np.float32(0.5))
