@@ -17,16 +17,11 @@ def test_the_kernel_is_its_twin(two_rt, shape) -> None:
     for turn in range(4):
         found, nonnegative = two_rt.empty(shape), turn % 2 == 0
         assert prox(on_device, 0.4, turn, nonnegative=nonnegative, out=found) is found
-        np.testing.assert_allclose(
-            two_rt.download(found), dct_prox(volume, 0.4, turn, nonnegative=nonnegative), rtol=0, atol=FLOAT32
-        )
+        expected = dct_prox(volume, 0.4, turn, nonnegative=nonnegative)
+        np.testing.assert_allclose(two_rt.download(found), expected, rtol=0, atol=FLOAT32)
     np.testing.assert_array_equal(prox(volume, 0.4, turn, nonnegative=nonnegative), two_rt.download(found))
     prox(on_device, 0.4, turn, nonnegative=nonnegative, out=on_device)  # in place, the same bits
     np.testing.assert_array_equal(two_rt.download(on_device), two_rt.download(found))
-
-
-def mean_of_turns(volume: np.ndarray, threshold: float) -> np.ndarray:
-    return np.mean([dct_prox(volume, threshold, turn, nonnegative=False) for turn in range(4)], 0)
 
 
 def test_four_turns_are_the_mean_over_all_blocks() -> None:
@@ -39,4 +34,5 @@ def test_four_turns_are_the_mean_over_all_blocks() -> None:
         less[0, 0, 0] = values[0, 0, 0]
         shrunk[at] += scipy.fft.idctn(less, norm="ortho")
         count[at] += 1
-    np.testing.assert_allclose(mean_of_turns(volume, 0.7), shrunk / count, atol=FLOAT64)
+    mean_of_turns = np.mean([dct_prox(volume, 0.7, turn, nonnegative=False) for turn in range(4)], 0)
+    np.testing.assert_allclose(mean_of_turns, shrunk / count, atol=FLOAT64)
