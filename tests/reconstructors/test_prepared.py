@@ -12,7 +12,7 @@ from phyradgs_cl.detector.effects import lagged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors import Preprocessing, RunPlan, method_options, preprocessing_of, reconstruct
+from phyradgs_cl.reconstructors import Preprocessing, plan_run, preprocessing_of, reconstruct
 from phyradgs_cl.reconstructors.checkpoint import RUN, with_identity
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
@@ -33,10 +33,9 @@ def scan() -> Scan:
 def test_a_grid_that_is_chosen_is_the_scans_for_every_method(rt, scan, method) -> None:
     """Bit for bit, and the volume has it; methods are named in any case."""
     few = {} if method == "FDK" else {"iterations": 2}
-    options = method_options(method, None, few)
-    chosen = Preprocessing(size=(8, 9, 10), roi_mm=(-0.8, 0.7, -0.9, 0.9, -1.0, 0.9))
-    found = reconstruct(scan, RunPlan(method, options, preprocessing=chosen), rt)
-    other = reconstruct(replace(scan, grid=chosen.of(scan.grid)), RunPlan(method, options), rt)
+    chosen = {"size": (8, 9, 10), "roi_mm": (-0.8, 0.7, -0.9, 0.9, -1.0, 0.9)}
+    found = reconstruct(scan, plan_run(method, few | chosen), rt)
+    other = reconstruct(replace(scan, grid=Preprocessing(**chosen).of(scan.grid)), plan_run(method, few), rt)
     assert found.grid == other.grid and found.grid.shape == found.volume.shape == (8, 9, 10)
     np.testing.assert_array_equal(found.volume, other.volume)
 
@@ -47,7 +46,7 @@ def test_lag_is_undone_unless_it_is_to_be_ignored(rt, scan) -> None:
     undone = prepared(slow, Preprocessing()).projections
     np.testing.assert_allclose(undone, scan.projections, atol=FLOAT32 * np.exp(3.0))
     cases = (scan, Preprocessing()), (slow, Preprocessing()), (slow, Preprocessing(ignore_lag=True))
-    volumes = [reconstruct(s, RunPlan("fdk", method_options("fdk"), preprocessing=before), rt).volume for s, before in cases]
+    volumes = [reconstruct(s, replace(plan_run("fdk"), preprocessing=before), rt).volume for s, before in cases]
     undone, ignored = (np.abs(volume - volumes[0]).max() for volume in volumes[1:])
     assert undone < 1e-3 * np.abs(volumes[0]).max() < ignored
 
@@ -72,8 +71,7 @@ def test_a_checkpoint_from_before_an_option_is_taken_where_the_option_has_its_de
     def stop(progress) -> None:
         raise KeyboardInterrupt
 
-    steps = {"steps": "rings", "rings": {"window": 5}}
-    plan = RunPlan("sirt", method_options("sirt", None, {"iterations": 3}), preprocessing=preprocessing_of(steps))
+    plan = plan_run("sirt", {"iterations": 3, "steps": "rings", "rings": {"window": 5}})
     state = dict(reconstruct(scan, plan, rt, report=stop).state)
     identity = json.loads(str(state.pop(RUN)))
     identity["input"]["rings"] = {}
