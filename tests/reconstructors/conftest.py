@@ -1,12 +1,16 @@
-"""Two scans of which a method must make the same."""
+"""Two scans of which a method must make the same; makes ``balls`` importable wherever pytest starts."""
 
+import sys
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import Scan
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 
 @pytest.fixture(scope="session")

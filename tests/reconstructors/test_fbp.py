@@ -2,17 +2,10 @@
 
 import numpy as np
 import pytest
+from balls import frames_of
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConstantSpeed,
-    LineMiddles,
-    ParallelGeometry,
-    Scan,
-    Shutter,
-    Static,
-    pixel_centres,
-)
+from phyradgs_cl import acquisition
+from phyradgs_cl.acquisition import CircularOrbit, LineMiddles, ParallelGeometry, Scan, Shutter, Static
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
@@ -23,27 +16,20 @@ GRID = Grid((3, SIDE, SIDE), (1.0, 1.0, 1.0))
 DISC = EllipsoidPhantom((Ellipsoid((6.0, -4.0, 0.0), (14.0, 14.0, 1000.0), 0.02),), "disc")
 
 
-def scan_of(
-    views: int, turn_deg: float, offset_mm: float = 0.0, columns: int = SIDE, shutter: Shutter | None = None
-) -> Scan:
+def scan_of(views: int, turn_deg: float, offset_mm: float = 0.0, columns: int = SIDE, shutter: Shutter | None = None):
     """A parallel scan of the disc, every line exact at its own time where a shutter is given."""
     geometry = ParallelGeometry((ROWS, columns), 1.0, (0.0, offset_mm))
-    orbit, start_s = CircularOrbit(geometry, ConstantSpeed(0.3, np.deg2rad(turn_deg) / views)), np.arange(float(views))
-    frames = np.empty((views, ROWS, columns), np.float32)
-    middles_s = (shutter or Shutter(0.0)).line_windows_s(ROWS).mean(1)
-    for line, middle_s in enumerate(middles_s):
-        pose = orbit.pose(0, start_s + middle_s)
-        pixels, along_mm = pixel_centres(pose, (ROWS, columns))[:, line], 200 * pose[:, None, :3]
-        frames[:, line] = DISC.line_integrals(pixels - along_mm, pixels + along_mm)
+    speed, start_s = acquisition.ConstantSpeed(0.3, np.deg2rad(turn_deg) / views), np.arange(float(views))
+    orbit = CircularOrbit(geometry, speed)
+    poses = [orbit.pose(0, start_s + middle_s) for middle_s in (shutter or Shutter(0.0)).line_windows_s(ROWS).mean(1)]
+    frames = frames_of(DISC, np.stack(poses, 1), (ROWS, columns), is_parallel=True)
     return Scan(frames, geometry, orbit, shutter or Shutter(0.0), start_s, GRID, shutter is not None)
 
 
-@pytest.mark.parametrize(
-    ("views", "turn_deg", "offset_mm", "columns"),
-    [(90, 180, 0.0, SIDE), (180, 360, 0.0, SIDE), (110, 220, 0.0, SIDE), (180, 360, 0.25, SIDE), (180, 360, 14.0, 40)],
-    ids=["half", "full", "more than half", "a quarter pixel off", "half-acquisition"],
-)
-def test_a_disc_comes_out_with_its_density(rt, views: int, turn_deg: float, offset_mm: float, columns: int) -> None:
+@pytest.mark.parametrize(("views", "turn_deg", "offset_mm", "columns"), [
+    (90, 180, 0.0, SIDE), (180, 360, 0.0, SIDE), (110, 220, 0.0, SIDE), (180, 360, 0.25, SIDE), (180, 360, 14.0, 40),
+], ids=["half", "full", "more than half", "a quarter pixel off", "half-acquisition"])  # fmt: skip
+def test_a_disc_comes_out_with_its_density(rt, views, turn_deg, offset_mm, columns) -> None:
     """RMS over the disc's density, inside the largest circle and off the disc's edge."""
     volume = fdk(scan_of(views, turn_deg, offset_mm, columns), FbpOptions(), rt).volume
     z, y, x = np.meshgrid(*GRID.axes_mm(), indexing="ij")
@@ -52,14 +38,10 @@ def test_a_disc_comes_out_with_its_density(rt, views: int, turn_deg: float, offs
     assert np.sqrt(np.mean((volume - DISC.density(x, y, z))[where] ** 2)) < 0.03 * 0.02
 
 
-@pytest.mark.parametrize(
-    ("views", "turn_deg", "offset_mm", "columns", "radius_mm"),
-    [(90, 180, 0.0, 48, 24.0), (180, 360, 0.0, 48, 24.0), (180, 360, 10.0, 40, 30.0)],
-    ids=["half", "full", "half-acquisition"],
-)
-def test_the_volume_ends_at_the_circle_of_the_field_of_view(
-    rt, views: int, turn_deg: float, offset_mm: float, columns: int, radius_mm: float
-) -> None:
+@pytest.mark.parametrize(("views", "turn_deg", "offset_mm", "columns", "radius_mm"), [
+    (90, 180, 0.0, 48, 24.0), (180, 360, 0.0, 48, 24.0), (180, 360, 10.0, 40, 30.0),
+], ids=["half", "full", "half-acquisition"])  # fmt: skip
+def test_the_volume_ends_at_the_circle_of_the_field_of_view(rt, views, turn_deg, offset_mm, columns, radius_mm) -> None:
     """Half-acquisition keeps the wider circle, which a full turn measures; rows that are continued keep the corners."""
     scan, (_, y, x) = scan_of(views, turn_deg, offset_mm, columns), np.meshgrid(*GRID.axes_mm(), indexing="ij")
     cut, whole = (fdk(scan, FbpOptions(circle=circle), rt).volume for circle in (True, False))
@@ -86,15 +68,12 @@ def test_lines_are_backprojected_at_their_own_angles(rt) -> None:
 def test_deblurring_along_the_angle_undoes_an_exposure(rt, views: int, turn_deg: float) -> None:
     """Frames averaged over 41 times of an arc of 6 degrees, 3 pixels at the rim: the volume of a gantry that stops."""
     speed, still = np.deg2rad(turn_deg) / views, scan_of(views, turn_deg)
-    fine = scan_of(20 * views, turn_deg)
-    arc_steps = round(np.deg2rad(6) / (speed / 20))
-    frames = [np.roll(fine.projections, -k, axis=0) for k in range(-(arc_steps // 2), arc_steps // 2 + 1)]
-    if turn_deg == 180:  # behind half a turn the rays come back mirrored
-        both = np.concatenate([fine.projections, fine.projections[..., ::-1]])
-        frames = [np.roll(both, -k, axis=0)[: 20 * views] for k in range(-(arc_steps // 2), arc_steps // 2 + 1)]
+    fine, arc_steps = scan_of(20 * views, turn_deg), round(np.deg2rad(6) / (speed / 20))
+    both = fine.projections[..., :: 1 if turn_deg == 360 else -1]  # behind half a turn the rays come back mirrored
+    both = np.concatenate([fine.projections, both])
+    frames = [np.roll(both, -k, axis=0)[: 20 * views] for k in range(-(arc_steps // 2), arc_steps // 2 + 1)]
     blurred = np.mean(frames, axis=0, dtype=np.float64)[::20].astype(np.float32)
-    exposure_s = np.deg2rad(6) / speed
-    start_s = np.arange(float(views)) - exposure_s / 2
+    start_s = np.arange(float(views)) - (exposure_s := np.deg2rad(6) / speed) / 2
     moving = Scan(blurred, still.geometry, still.trajectory, Shutter(exposure_s), start_s, GRID)
     plain, sharp = (fdk(moving, FbpOptions(deblur=noise), rt).volume for noise in (0.0, 1e-4))
     target = fdk(still, FbpOptions(), rt).volume

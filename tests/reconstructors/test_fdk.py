@@ -4,19 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from balls import frames_of
 from scipy.spatial.transform import Rotation
 from tolerances import FDK_MEAN, FLOAT32
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConeGeometry,
-    FrameSweeps,
-    Scan,
-    Shutter,
-    Static,
-    StaticStart,
-    pixel_centres,
-)
+from phyradgs_cl import acquisition
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan, Shutter, Static
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
@@ -24,11 +17,6 @@ from phyradgs_cl.prepare.step import fill_masked
 from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume, static_fdk
 
 VIEWS, PIXELS, VOXELS = 90, 48, 32
-
-
-def projections(phantom: EllipsoidPhantom, pose: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    targets = pixel_centres(pose, shape)
-    return phantom.line_integrals(pose[:, None, None, :3], targets).astype(np.float32)
 
 
 def sphere(half_size_mm: float) -> EllipsoidPhantom:
@@ -39,11 +27,6 @@ def sphere(half_size_mm: float) -> EllipsoidPhantom:
 def cone(half_size_mm: float) -> ConeGeometry:
     pitch = 3.6 * half_size_mm / PIXELS
     return ConeGeometry(6 * half_size_mm, 9 * half_size_mm, (PIXELS, PIXELS), (pitch, pitch))
-
-
-def reconstruct(rt, phantom: EllipsoidPhantom, half_size_mm: float, angles: np.ndarray) -> np.ndarray:
-    grid, pose = Grid.cube(VOXELS, 2 * half_size_mm), cone(half_size_mm).pose(angles)
-    return fdk_volume(rt, projections(phantom, pose, (PIXELS, PIXELS)), pose, grid)
 
 
 FULL_TURN = np.arange(VIEWS) * 2 * np.pi / VIEWS + 0.2
@@ -57,7 +40,8 @@ def test_a_sphere_has_its_attenuation_in_1_per_mm(rt) -> None:
     distance = np.hypot(np.hypot(x - 0.1, y + 0.15), z - 0.05)
     outside = (distance > 0.75) & (np.hypot(x, y) < 0.9)
     for half_size_mm, angles in [(1.0, FULL_TURN), (80.0, FULL_TURN), (1.0, uneven)]:
-        volume = reconstruct(rt, sphere(half_size_mm), half_size_mm, angles) * half_size_mm / 0.8
+        frames = frames_of(sphere(half_size_mm), pose := cone(half_size_mm).pose(angles), (PIXELS, PIXELS))
+        volume = fdk_volume(rt, frames, pose, Grid.cube(VOXELS, 2 * half_size_mm)) * half_size_mm / 0.8
         assert abs(volume[distance < 0.5].mean() - 1) <= FDK_MEAN, half_size_mm
         assert abs(volume[outside].mean()) <= 2 * FDK_MEAN or angles is uneven
 
@@ -69,19 +53,16 @@ def test_scan_and_volume_agree(rt) -> None:
     start_s, first = np.arange(5.0), np.arange(5) * 2 * np.pi / 5
     sweeps = FrameSweeps(start_s, 0.5, first, first + 0.1)
     scan = Scan(frames, geometry, CircularOrbit(geometry, sweeps), Shutter(0.5, 0.25), start_s, grid)
-    middle = geometry.pose(first + 0.1 * 1.5 / 2)
-    result = fdk(scan, FdkOptions(motion=Static()), rt)
-    np.testing.assert_allclose(result.volume, fdk_volume(rt, frames, middle, grid), rtol=0, atol=FLOAT32)
-    begun = fdk(scan, FdkOptions(motion=StaticStart()), rt)
-    expected = fdk_volume(rt, frames, geometry.pose(first), grid)
-    np.testing.assert_allclose(begun.volume, expected, rtol=0, atol=FLOAT32)
-    assert np.abs(begun.volume - result.volume).max() > 1e-3
+    middle, begun = (fdk(scan, FdkOptions(motion=motion), rt).volume for motion in (Static(), acquisition.StaticStart()))
+    for volume, angles in ((middle, first + 0.1 * 1.5 / 2), (begun, first)):
+        np.testing.assert_allclose(volume, fdk_volume(rt, frames, geometry.pose(angles), grid), rtol=0, atol=FLOAT32)
+    assert np.abs(begun - middle).max() > 1e-3
 
 
 def test_frames_that_are_masked_whole_are_as_if_they_were_not_there(rt) -> None:
     """Their neighbours stand for them: the body keeps its level, here and where other methods begin."""
     geometry, grid = cone(1.0), Grid.cube(VOXELS, 2.0)
-    frames, start_s = projections(sphere(1.0), geometry.pose(FULL_TURN), (PIXELS, PIXELS)), np.arange(float(VIEWS))
+    frames, start_s = frames_of(sphere(1.0), geometry.pose(FULL_TURN), (PIXELS, PIXELS)), np.arange(float(VIEWS))
     sweeps = FrameSweeps(start_s, 0.0, FULL_TURN, FULL_TURN)
     scan = Scan(frames, geometry, CircularOrbit(geometry, sweeps), Shutter(0.0), start_s, grid, is_fly=False)
     lost = np.zeros(scan.projections.shape, bool)
@@ -95,12 +76,10 @@ def test_frames_that_are_masked_whole_are_as_if_they_were_not_there(rt) -> None:
 
 
 def test_masked_pixels_are_filled_along_their_row() -> None:
-    frames = np.tile(np.arange(6, dtype=np.float32), (2, 3, 1))
-    mask = np.zeros((2, 3, 6), bool)
+    frames, mask = np.tile(np.arange(6, dtype=np.float32), (2, 3, 1)), np.zeros((2, 3, 6), bool)
     mask[0, 1, 2:4] = mask[1, 2, 0] = mask[1, 0, :] = True
     spoiled = np.where(mask, np.float32(1e6), frames)
-    filled = fill_masked(spoiled, mask)
-    expected = frames.copy()
+    filled, expected = fill_masked(spoiled, mask), frames.copy()
     expected[1, 2, 0] = 1.0  # rows without a pixel: from those beside them
     np.testing.assert_array_equal(filled, expected)
     assert spoiled.max() == 1e6  # the caller's frames are left alone

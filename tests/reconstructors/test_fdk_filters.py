@@ -8,20 +8,16 @@ from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import fdk_volume, ramp_filter, ramp_spectrum
 
-FROM_SHARP_TO_SMOOTH = ["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]
-
 
 @pytest.mark.parametrize("width", [1, 2, 17, 64])
 def test_ramp_filter_is_a_convolution(width) -> None:
     """Kak and Slaney's kernel h(0) = 1/4τ², h(odd n) = −1/(πnτ)², times τ, without wrapping around."""
-    spacing_mm, n = 0.37, np.arange(-(width - 1), width)
-    kernel = np.zeros(2 * width - 1)
+    spacing_mm, n, kernel = 0.37, np.arange(-(width - 1), width), np.zeros(2 * width - 1)
     kernel[n % 2 != 0] = -1 / (np.pi * n[n % 2 != 0] * spacing_mm) ** 2
     kernel[n == 0] = 1 / (4 * spacing_mm**2)
     for dtype in (np.float32, np.float64):
         rows = np.random.default_rng(63).normal(size=(3, width)).astype(dtype)
-        full = [np.convolve(row, kernel) for row in rows]
-        expected = np.stack(full)[:, width - 1 : 2 * width - 1] * spacing_mm
+        expected = np.stack([np.convolve(row, kernel) for row in rows])[:, width - 1 : 2 * width - 1] * spacing_mm
         found = ramp_filter(rows, spacing_mm)
         assert found.dtype == np.float32
         np.testing.assert_allclose(found, expected, rtol=0, atol=RAMP * np.abs(expected).max())
@@ -30,10 +26,7 @@ def test_ramp_filter_is_a_convolution(width) -> None:
 def test_spectra_of_the_ramp_and_its_windows() -> None:
     """And a row of odd length, which has no sample at that frequency."""
     sinc = np.sin(np.pi / 4) / (np.pi / 4)
-    at = {
-        "ram-lak": (1, 1), "shepp-logan": (sinc, 2 / np.pi), "cosine": (np.sqrt(0.5), 0),
-        "hamming": (0.54, 0.08),
-    }
+    at = {"ram-lak": (1, 1), "shepp-logan": (sinc, 2 / np.pi), "cosine": (np.sqrt(0.5), 0), "hamming": (0.54, 0.08)}
     for window, (quarter, nyquist) in {**at, "hann": (0.5, 0)}.items():
         ratio = ramp_spectrum(256, window) / ramp_spectrum(256)
         assert ratio[[0, 64, 128]] == pytest.approx([1, quarter, nyquist], rel=FLOAT64, abs=FLOAT64), window
@@ -49,5 +42,6 @@ def test_noise_falls_from_window_to_window(rt) -> None:
     pose = geometry.pose(np.arange(40) * 2 * np.pi / 40)
     frames = np.random.default_rng(66).normal(size=(40, 8, 48)).astype(np.float32)
     grid = Grid((2, 24, 24), (0.05, 0.06, 0.06))
-    noise = [fdk_volume(rt, frames, pose, grid, window=window).std() for window in FROM_SHARP_TO_SMOOTH]
+    windows = ["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]
+    noise = [fdk_volume(rt, frames, pose, grid, window=window).std() for window in windows]
     assert all(after < 0.97 * before for before, after in zip(noise[:-1], noise[1:], strict=True))
