@@ -6,42 +6,15 @@ import numpy as np
 import pytest
 from tolerances import RAYS
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConstantSpeed,
-    Motion,
-    ParallelGeometry,
-    PerRow,
-    Scan,
-    Shutter,
-    Static,
-)
-from phyradgs_cl.api import simulate
+from phyradgs_cl.acquisition import Motion, ParallelGeometry, PerRow, Scan, Static
+from phyradgs_cl.api import simulate, static_scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics import psnr
-from phyradgs_cl.reconstructors import (
-    METHODS,
-    InitialVolume,
-    Progress,
-    RunPlan,
-    method_options,
-    plan_run,
-    reconstruct,
-)
+from phyradgs_cl.reconstructors import METHODS, InitialVolume, plan_run, reconstruct
+from phyradgs_cl.reconstructors.voxels import priors
 from phyradgs_cl.reconstructors.voxels.fista import Fista, FistaOptions, fista
-from phyradgs_cl.reconstructors.voxels.priors import (
-    FrameError,
-    OwnPrior,
-    Prior,
-    PriorInputs,
-    PriorWeight,
-    ThenRidge,
-    adjoint_response,
-    frame_error,
-    prior_of,
-    subvoxel_share,
-)
+from phyradgs_cl.reconstructors.voxels.priors import FrameError, OwnPrior, Prior, PriorWeight, prior_of
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import DeviceSpace, Runtime
 
@@ -53,42 +26,51 @@ def scan(rt) -> Scan:
     return simulate("jaw", size=24, detector=32, views=20, exposure_deg=18.0, noise="tigre", device=rt)
 
 
-def run(rt, scan: Scan, method: str, **changes: object):
-    return reconstruct(scan, plan_run(method, {"iterations": 12, **changes}), rt)
+@pytest.fixture(scope="module")
+def system(rt, scan) -> System:
+    return System.of_scan(rt, scan, PerRow())
+
+
+def run(rt, scan: Scan, method: str, initial: InitialVolume | None = None, **changes: object):
+    return reconstruct(scan, plan_run(method, {"iterations": 12, **changes}, initial=initial), rt)
 
 
 def quality(scan: Scan, volume: np.ndarray) -> float:
     return psnr(volume, scan.reference, float(scan.reference.max()))
 
 
+def maps(prior: Prior, rt, shape: tuple[int, int, int], count: int = 1) -> list[np.ndarray]:
+    """What a prior makes of one volume at each of so many calls."""
+    volume, space = np.random.default_rng(0).uniform(size=shape).astype(np.float32), DeviceSpace(rt)
+    return [space.numpy(prior(space, space.array(volume), 0.01, nonnegative=True)) for _ in range(count)]
+
+
 def test_each_prior_is_better_than_none_and_subsets_are_quicker(rt, scan) -> None:
-    found = {
-        prior: quality(scan, run(rt, scan, "fista", motion="per-row", iterations=20, prior=prior).volume)
-        for prior in ("none", "tv", "dct", "ridge")
-    }
-    without = found.pop("none")
-    assert min(found.values()) > without + 0.5, (found, without)
-    few, whole = (
-        run(rt, scan, "fista", iterations=3, subsets=count).record[-1]["residual"] for count in (4, 1)
-    )
+    names = ("none", "tv", "dct", "ridge")
+    runs = (run(rt, scan, "fista", motion="per-row", iterations=20, prior=prior) for prior in names)
+    without, *found = (quality(scan, one.volume) for one in runs)
+    assert min(found) > without + 0.5, (found, without)
+    few, whole = (run(rt, scan, "fista", iterations=3, subsets=count).record[-1]["residual"] for count in (4, 1))
     assert few < 0.8 * whole
 
 
-def test_subsets_that_pull_apart_are_joined(rt, scan) -> None:
-    """One frame a subset, with momentum, diverges; joined it ends near the whole scan's residual."""
-    prior = prior_of("tv", PriorInputs(rt, scan.grid, 5))
-    system = System.of_scan(rt, scan, PerRow())
-    weight = PriorWeight(system, FrameError(0.01), 0.42)
-    algorithm = Fista(system, prior, weight, subsets=1000, nonnegative=True)
+def test_subsets_that_pull_apart_at_once_or_slowly_are_joined(rt, scan, system) -> None:
+    """One frame a subset, with momentum, diverges; joined it ends near the whole scan's residual. The others' residual grows
+    by less than a fifth from pass to pass: if none were joined, or those of a jump alone, the last would be more than twice
+    the least."""
+    prior = prior_of("tv", priors.PriorInputs(rt, scan.grid, 5))
+    algorithm = Fista(system, prior, PriorWeight(system, FrameError(0.01), 0.42), subsets=1000, nonnegative=True)
     assert len(algorithm.subsets) == scan.frames
-    residuals = [algorithm.step() for _ in range(30)]
+    residuals = [algorithm.step() for _ in range(12)]
     assert 1 <= len(algorithm.subsets) <= scan.frames // 2
     assert residuals[-1] < residuals[0]
+    slow = simulate("jaw", device=rt, size=24, detector=36, views=90, exposure_deg=4.0, peak=3.0, noise="tigre")
+    residuals = [line["residual"] for line in run(rt, slow, "fista", motion="per-row", iterations=20, subsets=22).record]
+    assert residuals[-1] < 1.5 * min(residuals)
 
 
-def test_pogm_is_as_published_needs_fewer_passes_and_resumes(rt, scan) -> None:
+def test_pogm_is_as_published_needs_fewer_passes_and_resumes(scan, system) -> None:
     """Without a prior, five steps are those of Kim and Fessler (2018), written out with NumPy; w₀ = z₀ = x₀ = 0."""
-    system = System.of_scan(rt, scan, PerRow())
 
     def method(optimised: int) -> Fista:
         weight = PriorWeight(system, FrameError(0.01), 0.0)
@@ -114,29 +96,16 @@ def test_pogm_is_as_published_needs_fewer_passes_and_resumes(rt, scan) -> None:
 
 def test_a_prior_image_helps_where_it_is_right_and_costs_little_where_it_is_wrong(rt, scan) -> None:
     """The truth but for a part that has changed since, from a third of the views; then an object that is another."""
-    few = Scan(
-        scan.projections[::3], scan.geometry, scan.trajectory, scan.shutter, scan.frame_start_s[::3], scan.grid,
-        reference=scan.reference,
-    )  # fmt: skip
+    few = replace(scan, projections=scan.projections[::3], frame_start_s=scan.frame_start_s[::3])
     changed = scan.reference.copy()
     changed[8:14, 4:10, 8:14] = 0
     usual = {"motion": "per-row", "iterations": 20}
     plain = quality(few, run(rt, few, "fista", prior="tv", **usual).volume)
-
-    def with_prior(image: np.ndarray, share: float = 0.5) -> float:
-        options = method_options("fista", None, {**usual, "prior": "piccs", "prior_share": share})
-        return quality(few, reconstruct(few, RunPlan("fista", options, initial=InitialVolume(image, few.grid)), rt).volume)
-
-    assert with_prior(changed) > plain + 1 and with_prior(changed) > quality(few, changed) + 1
-    assert with_prior(scan.reference[:, ::-1].copy(), 0.3) > plain - 1
-
-
-def test_subsets_that_pull_apart_slowly_are_joined_too(rt) -> None:
-    """Their residual grows by less than a fifth from pass to pass: if none were joined, or those of a jump alone, the last
-    would be more than twice the least."""
-    scan = simulate("jaw", device=rt, size=24, detector=36, views=90, exposure_deg=4.0, peak=3.0, noise="tigre")
-    residuals = [line["residual"] for line in run(rt, scan, "fista", motion="per-row", iterations=20, subsets=22).record]
-    assert residuals[-1] < 1.5 * min(residuals)
+    images = InitialVolume(changed, few.grid), InitialVolume(scan.reference[:, ::-1].copy(), few.grid)
+    pairs = zip(images, (0.5, 0.3), strict=True)
+    runs = (run(rt, few, "fista", image, prior="piccs", prior_share=share, **usual) for image, share in pairs)
+    right, wrong = (quality(few, one.volume) for one in runs)
+    assert right > max(plain, quality(few, changed)) + 1 and wrong > plain - 1
 
 
 def test_the_weight_follows_what_comes_back_of_noise_and_edges(rt, scan) -> None:
@@ -157,22 +126,22 @@ def test_the_weight_follows_what_comes_back_of_noise_and_edges(rt, scan) -> None
 def test_rays_that_are_wrong_alike_add_up_and_noise_averages(rt, scan) -> None:
     """Of half the frames half as much of the first comes back, and √½ of the second."""
     half = replace(scan, projections=scan.projections[::2], frame_start_s=scan.frame_start_s[::2])
-    whole, fewer = (adjoint_response(System.of_scan(rt, one, Static())) for one in (scan, half))
+    whole, fewer = (priors.adjoint_response(System.of_scan(rt, one, Static())) for one in (scan, half))
     assert fewer[1] == pytest.approx(whole[1] / 2, rel=0.01)
     assert fewer[0] == pytest.approx(whole[0] / np.sqrt(2), rel=0.1)
 
 
 def test_voxels_miss_more_the_larger_they_are_and_less_behind_a_blur(scan) -> None:
     grids = (replace(scan, grid=Grid.cube(n, 2.0), reference=None) for n in (12, 24))
-    coarse, fine = (frame_error(one, Static()) for one in grids)
+    coarse, fine = (priors.frame_error(one, Static()) for one in grids)
     assert coarse.noise == fine.noise and coarse.edges_mm == pytest.approx(2 * fine.edges_mm)
     smeared = 4 / 5 * np.deg2rad(18.0) * (2.0 / 4) / (2.0 / 24)  # voxels, half-way from the axis to the side
-    blurred = frame_error(replace(scan, grid=Grid.cube(24, 2.0), reference=None), PerRow(5))
+    blurred = priors.frame_error(replace(scan, grid=Grid.cube(24, 2.0), reference=None), PerRow(5))
     assert blurred.noise == fine.noise
     assert blurred.edges_mm == pytest.approx(fine.edges_mm / np.sqrt(1 + smeared), rel=0.02)
 
 
-def test_the_ridge_step_follows_the_noise_in_the_weight_and_no_edges(rt, scan) -> None:
+def test_the_ridge_step_follows_the_noise_in_the_weight_and_no_edges(scan, system) -> None:
     sigmas: list[float] = []
 
     def ridge(volume: np.ndarray, *, sigma: float, **_: object) -> np.ndarray:
@@ -180,116 +149,87 @@ def test_the_ridge_step_follows_the_noise_in_the_weight_and_no_edges(rt, scan) -
         return volume
 
     ridge.shape = scan.grid.shape
-    system = System.of_scan(rt, scan, PerRow())
     errors = FrameError(0.01), FrameError(0.01, 0.02), FrameError(0.03)
     weights = [PriorWeight(system, error, 0.42) for error in errors]
     for weight in weights:
-        algorithm = Fista(system, ThenRidge(Prior(), ridge, 17.0), weight, subsets=1, nonnegative=True)
+        algorithm = Fista(system, priors.ThenRidge(Prior(), ridge, 17.0), weight, subsets=1, nonnegative=True)
         for _ in range(4):  # maps before a step
             algorithm.step()
     assert weights[1].noise_share(weights[1].at(algorithm.volume)) < 0.9
     assert sigmas[1] == pytest.approx(sigmas[0], rel=1e-6) and sigmas[2] == pytest.approx(3 * sigmas[0], rel=1e-6)
 
 
-def test_a_denoiser_of_ones_own_is_the_prior(rt, scan) -> None:
+@pytest.mark.parametrize(("subsets", "shares"), [(5, [3, 2]), (6, [3, 3]), (1, [1])])
+def test_a_map_of_a_prior_of_ones_own_stands_for_several_steps_in_sparing_passes(system, subsets, shares) -> None:
+    """A pass has the weight of all of its steps, and ends with a map. The next pass has all maps."""
     seen: list[float] = []
 
     def half(volume: np.ndarray, noise: float) -> np.ndarray:
         seen.append(noise)
         return volume / 2
 
-    system = System.of_scan(rt, scan, PerRow())
     weight = PriorWeight(system, FrameError(0.01), 0.42)
-    algorithm, plain = (
-        Fista(system, prior, weight, subsets=1, nonnegative=True) for prior in (OwnPrior(half), Prior())
-    )
-    algorithm.step()
-    plain.step()
-    np.testing.assert_allclose(algorithm.volume, plain.volume / 2, rtol=1e-6)
-    assert seen == [weight.at(algorithm.volume) / algorithm.curvature]
-
-
-@pytest.mark.parametrize(("subsets", "shares"), [(5, [3, 2]), (6, [3, 3]), (1, [1])])
-def test_a_map_of_the_prior_stands_for_several_steps_in_sparing_passes(rt, scan, subsets, shares) -> None:
-    """A pass has the weight of all of its steps, and ends with a map. The next pass has all maps."""
-    seen: list[float] = []
-
-    def noted(volume: np.ndarray, noise: float) -> np.ndarray:
-        seen.append(noise)
-        return volume
-
-    system = System.of_scan(rt, scan, PerRow())
-    weight = PriorWeight(system, FrameError(0.01), 0.42)
-    algorithm = Fista(system, OwnPrior(noted), weight, subsets=subsets, nonnegative=True, sparing=1)
+    usual = {"subsets": subsets, "nonnegative": True, "sparing": 1}
+    algorithm, plain = (Fista(system, prior, weight, **usual) for prior in (OwnPrior(half), Prior()))
     least = weight.at(algorithm.volume) / algorithm.curvature
     algorithm.step()
     np.testing.assert_allclose(seen, [share * least for share in shares], rtol=1e-6)
+    if subsets == 1:
+        plain.step()
+        np.testing.assert_allclose(algorithm.volume, plain.volume / 2, rtol=1e-6)
     algorithm.step()
-    np.testing.assert_allclose(seen[len(shares) :], [least] * subsets, rtol=1e-6)
+    assert len(seen) == len(shares) + subsets
 
 
 @pytest.mark.parametrize("method", [name for name, one in METHODS.items() if one.takes_initial])
 def test_a_first_volume_is_where_the_run_starts(rt, scan, method) -> None:
     """From the truth a few iterations are nearer to it than from nothing, on another grid too; FDK starts from none."""
-    few = {"iterations": 40} if method in ("phyradgs", "r2") else {"iterations": 2}
-    options = method_options(method, None, few)
-    begun = quality(scan, reconstruct(scan, RunPlan(method, options), rt).volume)
-    from_truth = reconstruct(scan, RunPlan(method, options, initial=InitialVolume(scan.reference, scan.grid)), rt).volume
-    assert quality(scan, from_truth) > begun + (0.1 if method in ("phyradgs", "r2") else 1)
+    few, gain_db = (40, 0.1) if method in ("phyradgs", "r2") else (2, 1)
+    starts = None, InitialVolume(scan.reference, scan.grid)
+    begun, from_truth = (quality(scan, run(rt, scan, method, start, iterations=few).volume) for start in starts)
+    assert from_truth > begun + gain_db
 
 
 @pytest.mark.parametrize(("at", "prior"), [(1, "dct"), (5, "ridge"), (2, "tv")])
 def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) -> None:
-    options = method_options("fista", None, {"iterations": 7, "subvoxels": 2, "prior": prior})
+    plan = plan_run("fista", {"iterations": 7, "subvoxels": 2, "prior": prior})
 
-    def stop(progress: Progress) -> None:
+    def stop(progress) -> None:
         assert progress.iterations == 7
         if progress.iteration >= at:
             raise KeyboardInterrupt
 
-    whole = reconstruct(scan, RunPlan("fista", options), rt)
-    part = reconstruct(scan, RunPlan("fista", options), rt, report=stop)
+    whole, part = reconstruct(scan, plan, rt), reconstruct(scan, plan, rt, report=stop)
     assert part.facts["interrupted_at"] == at and part.volume.shape == scan.grid.shape
-    rest = reconstruct(scan, RunPlan("fista", options), rt, resume=part.state)
+    rest = reconstruct(scan, plan, rt, resume=part.state)
     np.testing.assert_array_equal(rest.volume, whole.volume)
     assert [line["iteration"] for line in rest.record] == [line["iteration"] for line in whole.record] == list(range(1, 8))
 
 
 def test_a_ridge_step_follows_every_fourth_map_and_resumes_between_them(rt, scan) -> None:
-    volume, space = np.random.default_rng(0).uniform(size=scan.grid.shape).astype(np.float32), DeviceSpace(rt)
-    first, resumed, other = (prior_of("ridge", PriorInputs(rt, scan.grid, 5)) for _ in range(3))
-
-    def maps(prior: Prior, count: int) -> list[np.ndarray]:
-        arrays = [prior(space, space.array(volume), 0.01, nonnegative=True) for _ in range(count)]
-        return [space.numpy(array) for array in arrays]
-
-    results, expected = maps(first, 4), maps(other.before, 4)
-    assert [np.array_equal(*pair) for pair in zip(results, expected, strict=True)] == [True] * 3 + [False]
-    maps(first, 2)
+    first, resumed, other = (prior_of("ridge", priors.PriorInputs(rt, scan.grid, 5)) for _ in range(3))
+    pairs = zip(*(maps(prior, rt, scan.grid.shape, 4) for prior in (first, other.before)), strict=True)
+    assert [np.array_equal(*pair) for pair in pairs] == [True] * 3 + [False]
+    maps(first, rt, scan.grid.shape, 2)
     resumed.restore(first.state())
-    for continued, again in zip(maps(first, 3), maps(resumed, 3), strict=True):
-        np.testing.assert_array_equal(continued, again)
+    np.testing.assert_array_equal(*(maps(prior, rt, scan.grid.shape, 3) for prior in (first, resumed)))
 
 
 def test_ridge_is_dct_in_a_volume_thinner_than_its_filters(rt) -> None:
-    volume, space = np.random.default_rng(0).uniform(size=(4, 12, 12)).astype(np.float32), DeviceSpace(rt)
-    inputs = PriorInputs(rt, Grid(volume.shape, (0.1, 0.1, 0.1)), 5)
-    dct, ridge = (prior_of(name, inputs) for name in ("dct", "ridge"))
-    for _ in range(4):
-        maps = [space.numpy(prior(space, space.array(volume), 0.01, nonnegative=True)) for prior in (dct, ridge)]
-        np.testing.assert_array_equal(*maps)
-    assert subvoxel_share("ridge", (4, 12, 12)) == subvoxel_share("dct", (12, 12, 12)) < subvoxel_share("ridge", (5, 12, 12))
+    inputs = priors.PriorInputs(rt, Grid((4, 12, 12), (0.1, 0.1, 0.1)), 5)
+    np.testing.assert_array_equal(*(maps(prior_of(name, inputs), rt, (4, 12, 12), 4) for name in ("dct", "ridge")))
+    share = priors.subvoxel_share
+    assert share("ridge", (4, 12, 12)) == share("dct", (12, 12, 12)) < share("ridge", (5, 12, 12))
 
 
 def test_ridge_follows_the_maps_of_dct_on_a_fly_scan_and_less_total_variation_at_rest(rt, scan) -> None:
-    volume, space = np.random.default_rng(0).uniform(size=scan.grid.shape).astype(np.float32), DeviceSpace(rt)
-    inputs = PriorInputs(rt, scan.grid, 5)
-    priors = prior_of("dct", inputs), prior_of("ridge", replace(inputs, is_fly=True)), prior_of("ridge", inputs)
-    dct, fly, still = (space.numpy(prior(space, space.array(volume), 0.01, nonnegative=True)) for prior in priors)
+    inputs = priors.PriorInputs(rt, scan.grid, 5)
+    three = prior_of("dct", inputs), prior_of("ridge", replace(inputs, is_fly=True)), prior_of("ridge", inputs)
+    dct, fly, still = (maps(prior, rt, scan.grid.shape)[0] for prior in three)
     np.testing.assert_array_equal(dct, fly)
     assert still.std() > 1.001 * dct.std(), (still.std(), dct.std())
     noises = [prior_of("ridge", replace(inputs, noise=noise)) for noise in (0.001, 0.01, 0.1)]
-    stds = [space.numpy(prior(space, space.array(volume), 0.01, nonnegative=True)).std() for prior in noises]
+    stds = [maps(prior, rt, scan.grid.shape)[0].std() for prior in noises]
     assert stds[0] > stds[1] > stds[2] > dct.std(), (stds, dct.std())
     scans = scan, replace(scan, is_fly=False)
     turned, at_rest = (run(rt, scan, "fista", motion="static", iterations=4, prior="ridge").volume for scan in scans)
@@ -312,8 +252,7 @@ def test_operators_leave_the_device_s_memory_to_the_prior(volumes, prior) -> Non
     """13 volumes are a slab of 1024² × 40 voxels in 2 GiB: the prior's arrays, with bricks beside them."""
     panel, grid = ParallelGeometry((40, 64), 1.0), Grid((40, 64, 64), (1.0, 1.0, 1.0))
     frames = np.random.default_rng(0).uniform(0, 1, (16, *panel.detector_shape)).astype(np.float32)
-    orbit = CircularOrbit(panel, ConstantSpeed(0.0, np.pi / 16))
-    scan = Scan(frames, panel, orbit, Shutter(0.0), np.arange(16.0), grid, False)
+    scan = static_scan(frames, panel, np.arange(16) * 180 / 16, grid=grid)
     options, limit = FistaOptions(iterations=1, subvoxels=1, prior=prior), int(volumes * 4 * 40 * 64 * 64)
     small, large = Runtime(memory=limit), Runtime()
     result, expected = (fista(scan, options, rt).volume for rt in (small, large))
