@@ -5,56 +5,19 @@ import pytest
 from refusals import assert_refused
 
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.phantoms import PHANTOMS, foot, jaw, make_phantom, shepp_logan, sphere_phantom
+from phyradgs_cl.phantoms import PHANTOMS, foot, jaw, make_phantom, shepp_logan
 
 
 def test_shepp_logan_grey_levels_and_ventricles() -> None:
-    for variant, skull, brain, ventricle in [("toft", 1.0, 0.2, 0.0), ("kak-slaney", 2.0, 1.02, 1.0)]:
-        phantom = shepp_logan(80.0, variant)
-        grey = phantom.density(0, np.array([0.9, -0.3, 0.0]) * 80, 0.0) * 80
-        assert np.allclose(grey[:2], [skull, brain])
-        left = phantom.density(-0.22 * 80, 0, -0.25 * 80) * 80  # centre of the third ellipsoid
-        assert left == pytest.approx(ventricle)
+    for variant, levels in [("toft", [1.0, 0.2, 0.0]), ("kak-slaney", [2.0, 1.02, 1.0])]:
+        x, y, z = 80 * np.array([[0, 0, -0.22], [0.9, -0.3, 0], [0, 0, -0.25]])  # skull, brain, the left ventricle's centre
+        assert np.allclose(shepp_logan(80.0, variant).density(x, y, z) * 80, levels)
     # of grey level one may be given
     assert shepp_logan(80.0, "toft", 0.02).density(0, 72, 0) == pytest.approx(0.02)
     # At 108 degrees the left ellipsoid's long axis runs from the middle at -y outwards to +y.
     phantom = shepp_logan(1.0)
     dx, dy = 0.38 * np.cos(np.deg2rad(108)), 0.38 * np.sin(np.deg2rad(108))
-    assert phantom.density(-0.22 - dx, -dy, -0.25) == pytest.approx(0.0, abs=1e-12)
-    assert phantom.density(-0.22 + dx, -dy, -0.25) == pytest.approx(0.2)
-
-
-@pytest.mark.parametrize("variant", ["toft", "kak-slaney"])
-def test_shepp_logan_mass_from_volumes_equals_mass_from_projections(variant: str) -> None:
-    phantom = shepp_logan(10.0, variant)
-    mass = sum(e.attenuation_per_mm * 4 / 3 * np.pi * np.prod(e.semi_axes_mm) for e in phantom.ellipsoids)
-    side = np.linspace(-10, 10, 401)
-    x, y = np.meshgrid(side, side)
-    along_z = phantom.line_integrals(np.stack([x, y, x * 0 - 20], -1), np.stack([x, y, x * 0 + 20], -1))
-    assert along_z.sum() * (side[1] - side[0]) ** 2 == pytest.approx(mass, rel=2e-3)
-
-
-def test_line_integrals_do_not_depend_on_the_size() -> None:
-    for make in (shepp_logan, sphere_phantom):
-        p = np.array([0.3, 0.2, -0.2]), np.array([-0.9, -0.4, 0.1])
-        small = make(1.0).line_integrals(5 * p[0], 5 * p[1])
-        large = make(75.0).line_integrals(375 * p[0], 375 * p[1])
-        assert small == pytest.approx(large, rel=1e-12) and small > 0
-
-
-def test_spheres_stay_apart_inside_the_holder_in_two_layers() -> None:
-    holder, *beads = sphere_phantom(50.0).ellipsoids
-    centres = np.array([b.centre_mm for b in beads])
-    radii = np.array([b.semi_axes_mm[0] for b in beads])
-    distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1) + np.eye(len(beads)) * 1e3
-    assert (distance > radii[:, None] + radii[None]).all()
-    assert len(np.unique(centres[:, 2])) == 2 and len(np.unique(radii)) >= 3
-    rng = np.random.default_rng(0)
-    way = rng.standard_normal((500, 3))
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
-    surface = centres[:, None] + radii[:, None, None] * way
-    assert (np.sum((surface / np.array(holder.semi_axes_mm)) ** 2, axis=-1) < 1).all()
-    assert max(holder.semi_axes_mm) < 50
+    assert phantom.density(-0.22 + dx * np.array([-1, 1]), -dy, -0.25) == pytest.approx([0.0, 0.2], abs=1e-12)
 
 
 @pytest.mark.parametrize("draw", [foot, jaw])

@@ -1,15 +1,14 @@
 """The simulator: each line over its own window, sampled finely enough, with scaling, noise and refusals."""
 
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from itertools import product
 
 import numpy as np
 import pytest
 from kernel_kit import assert_near
 from tolerances import ANALYTIC_FRAME, FLOAT32, TIME_SAMPLING, VOXEL_SOURCE
 
-from phyradgs_cl import api
+from phyradgs_cl import api, simulation
 from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Protocol, make_protocol, pixel_centres
 from phyradgs_cl.acquisition.cells import per_line_cells
 from phyradgs_cl.detector import average
@@ -20,11 +19,10 @@ from phyradgs_cl.simulation import (
     AnalyticSource,
     SimulationOptions,
     VolumeSource,
-    default_time_samples,
     phantom_scene,
+    scenes,
     simulate,
 )
-from phyradgs_cl.simulation.scenes import bone_from
 
 SHAPE = (14, 18)
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 14, 3.9 / 18))
@@ -43,26 +41,16 @@ def integrals(angle_rad: float) -> np.ndarray:
     return PHANTOM.line_integrals(pose[:3], pixel_centres(pose, SHAPE))
 
 
-def times_of_lines(axis: str, direction: int, frame: int, samples: int) -> Iterator[tuple[Any, np.ndarray]]:
-    """Where each line lies in a frame, and the angles (samples,) in rad that it averages over."""
-    lines = SHAPE[0] if axis == "rows" else SHAPE[1]
-    for line in range(lines):
-        order = line if direction > 0 else lines - 1 - line
-        delay_deg = order / (lines - 1) * 0.5 * 12.0
-        angles = np.deg2rad(frame * 120.0 + delay_deg + (np.arange(samples) + 0.5) / samples * 12.0)
-        yield ((line, slice(None)) if axis == "rows" else (slice(None), line)), angles
-
-
 @pytest.mark.parametrize(("axis", "direction"), [("rows", 1), ("columns", -1)])
 @pytest.mark.parametrize("model", ["log", "intensity"])
 def test_every_line_averages_over_its_own_window(axis, direction, model) -> None:
     """Angles written out: line r opens r/(H−1) of the readout late, and sees 12° from there on."""
-    samples, frame = 5, 1
-    options = SimulationOptions(FLY, axis, direction, model, time_samples=samples)
-    found = run(options).projections[frame]
-    expected = np.zeros(SHAPE)
-    for where, angles in times_of_lines(axis, direction, frame, samples):
-        stack = np.stack([integrals(a) for a in angles])
+    found = run(SimulationOptions(FLY, axis, direction, model, time_samples=5)).projections[1]
+    expected, lines = np.zeros(SHAPE), SHAPE[axis == "columns"]
+    for line in range(lines):
+        where = (line, slice(None)) if axis == "rows" else (slice(None), line)
+        delay_deg = (line if direction > 0 else lines - 1 - line) / (lines - 1) * 0.5 * 12.0
+        stack = np.stack([integrals(a) for a in np.deg2rad(120.0 + delay_deg + (np.arange(5) + 0.5) / 5 * 12.0)])
         mean = stack.mean(axis=0) if model == "log" else -np.log(np.exp(-stack).mean(axis=0))
         expected[where] = mean[where]
     assert_near(found, expected, ANALYTIC_FRAME)
@@ -73,26 +61,20 @@ def test_every_line_averages_over_its_own_window(axis, direction, model) -> None
 def test_default_time_samples_are_enough(rt, protocol, source) -> None:
     """Four times the samples change a frame by less than the stated share (relative L2)."""
     fly = replace(make_protocol(protocol), views=2)
-    if source == "analytic":
-        frames = AnalyticSource(PHANTOM, GEOMETRY)
-    else:
-        frames = VolumeSource(rt, PHANTOM.voxelise(GRID), GRID, GEOMETRY, "rows")
-    samples = default_time_samples(fly, GRID)
-    coarse, fine = (
-        simulate(frames, GEOMETRY, GRID, SimulationOptions(fly, time_samples=n)).projections
-        for n in (samples, 4 * samples)
-    )
-    error = np.linalg.norm(coarse - fine) / np.linalg.norm(fine)
-    assert 0 < error <= TIME_SAMPLING
+    voxels = VolumeSource(rt, PHANTOM.voxelise(GRID), GRID, GEOMETRY, "rows")
+    frames = AnalyticSource(PHANTOM, GEOMETRY) if source == "analytic" else voxels
+    counts = simulation.default_time_samples(fly, GRID) * np.array([1, 4])
+    scans = (simulate(frames, GEOMETRY, GRID, SimulationOptions(fly, time_samples=int(n))) for n in counts)
+    coarse, fine = (scan.projections for scan in scans)
+    assert 0 < np.linalg.norm(coarse - fine) / np.linalg.norm(fine) <= TIME_SAMPLING
 
 
 def test_default_time_samples_follow_arc_and_voxels() -> None:
-    fine = Grid.cube(256, 2.0)
-    rapid, standard = (default_time_samples(make_protocol(name), fine) for name in ("rapid", "standard"))
+    fine, samples = Grid.cube(256, 2.0), simulation.default_time_samples
+    rapid, standard = (samples(make_protocol(name), fine) for name in ("rapid", "standard"))
     arc_voxels = np.deg2rad(14.4) * 128
     assert rapid == int(np.ceil(2 * arc_voxels)) and standard == int(np.ceil(arc_voxels))
-    assert default_time_samples(make_protocol("rapid"), GRID) == 8
-    assert default_time_samples(Protocol(exposure_deg=300.0), fine) == 128
+    assert samples(make_protocol("rapid"), GRID) == 8 and samples(Protocol(exposure_deg=300.0), fine) == 128
     assert run(SimulationOptions(FLY)).provenance["time_samples"] == 8
 
 
@@ -110,10 +92,9 @@ def test_no_material_is_half_bone() -> None:
     """Half the largest attenuation, but above what it would divide; an object of one material is all bone."""
     volume = np.random.default_rng(2).normal(0.3, 0.02, (20, 20, 20))
     volume[:5], volume[5:8] = 0.0, 1.0
-    assert bone_from(volume) == 0.5
+    assert scenes.bone_from(volume) == 0.5 and scenes.bone_from(np.full((4, 4, 4), 0.2)) == 0.1
     volume[10:] += 0.22
-    assert np.mean(volume[10:] >= bone_from(volume)) < 0.1
-    assert bone_from(np.full((4, 4, 4), 0.2)) == 0.1
+    assert np.mean(volume[10:] >= scenes.bone_from(volume)) < 0.1
 
 
 def test_peak_scales_frames_and_reference_alike() -> None:
@@ -166,9 +147,8 @@ def test_lag_leaves_a_ghost_of_the_frame_before(noise) -> None:
 @pytest.mark.parametrize("noise", ["tigre", "beer"])
 def test_noise_has_a_seed_and_a_dose(noise) -> None:
     clean = run(SimulationOptions(FLY)).projections
-    one, same, other = (
-        run(SimulationOptions(FLY, noise=noise, dose=1e4, seed=seed)).projections for seed in (1, 1, 2)
-    )
+    noisy = SimulationOptions(FLY, noise=noise, dose=1e4)
+    one, same, other = (run(replace(noisy, seed=seed)).projections for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, same)
     assert np.any(one != other)
     faint = run(SimulationOptions(FLY, noise=noise, dose=1e2, electronic_noise=0.0, seed=1)).projections
@@ -218,26 +198,20 @@ def test_wide_pixels_average_by_themselves(rt) -> None:
 @pytest.mark.parametrize("axis", ["rows", "columns"])
 def test_pixels_with_an_area_average_over_it(rt, axis, model) -> None:
     """Every fine ray written out, its pixel's line integrated at that line's times."""
-    n, samples = 3, 4
+    n = 3
     scene = phantom_scene(rt, "shepp-logan", GEOMETRY, GRID, 16, axis, 0, pixel_samples=n)
-    options = SimulationOptions(FLY, axis, 1, model, time_samples=samples, peak=6.0)
+    options = SimulationOptions(FLY, axis, 1, model, time_samples=4, peak=6.0)
     scan = simulate(scene.source, GEOMETRY, GRID, options)
     factor, shutter = scan.provenance["attenuation_factor"], scan.shutter
-    steps = (np.arange(n) - (n - 1) / 2) / n
     lines = shutter.lines(SHAPE)
-    table = per_line_cells(scan.trajectory, shutter, 1, float(scan.frame_start_s[1]), lines, samples)
-    line = lines // 2
-    rays = []
-    for pose in table.pose[table.line_start == line]:
-        for dy in steps:
-            for dx in steps:
-                target = pixel_centres(pose, SHAPE) + dy * pose[9:12] + dx * pose[6:9]
-                p = factor * PHANTOM.line_integrals(pose[:3], target)
-                rays.append(p[line] if axis == "rows" else p[:, line])
-    expected = average(np.stack(rays), np.full(len(rays), 1 / len(rays)), model)
-    frame = scan.projections[1]
-    found = frame[line] if axis == "rows" else frame[:, line]
-    np.testing.assert_allclose(found, expected, rtol=0, atol=ANALYTIC_FRAME * 6)
+    table = per_line_cells(scan.trajectory, shutter, 1, float(scan.frame_start_s[1]), lines, 4)
+    where, rays = (lines // 2, slice(None))[:: 1 if axis == "rows" else -1], []
+    for pose in table.pose[table.line_start == lines // 2]:
+        for dy, dx in product((np.arange(n) - (n - 1) / 2) / n, repeat=2):
+            target = pixel_centres(pose, SHAPE) + dy * pose[9:12] + dx * pose[6:9]
+            rays.append(factor * PHANTOM.line_integrals(pose[:3], target)[where])
+    expected, frame = average(np.stack(rays), np.full(len(rays), 1 / len(rays)), model), scan.projections[1]
+    np.testing.assert_allclose(frame[where], expected, rtol=0, atol=ANALYTIC_FRAME * 6)
     points = phantom_scene(rt, "shepp-logan", GEOMETRY, GRID, 16, axis, 0, pixel_samples=1)
     other = simulate(points.source, GEOMETRY, GRID, options).projections[1]
     assert np.abs(other - frame).max() > 0.1
