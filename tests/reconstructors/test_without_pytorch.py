@@ -1,7 +1,5 @@
 """The neural methods where PyTorch is not installed: known, checked, and refused with what to install."""
 
-import importlib.util
-
 import pytest
 
 from phyradgs_cl import neural
@@ -10,27 +8,15 @@ from phyradgs_cl.api import save_scan, simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import plan_run, reconstruct
 
-NEURAL = ("naf", "sax-nerf")
 
-
-@pytest.fixture
-def without_pytorch(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("method", ["naf", "sax-nerf"])
+def test_a_run_says_in_one_line_what_to_install(rt, method, tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setattr(neural, "has_torch", lambda: False)
-
-
-@pytest.mark.usefixtures("without_pytorch")
-@pytest.mark.parametrize("method", NEURAL)
-def test_a_run_says_in_one_line_what_to_install(rt, method, tmp_path, capsys) -> None:
     scan = simulate("jaw", size=8, detector=12, views=3, device=rt)
     with pytest.raises(InputError, match=f"--method {method}: found no PyTorch"):
         reconstruct(scan, plan_run(method), rt)
     save_scan(tmp_path / "scan.h5", scan)
     command = ["reconstruct", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "out.h5"), "--method", method]
-    assert load_cli().run(command) == 2
-    said = [line for line in capsys.readouterr().err.splitlines() if "PyTorch" in line]
-    assert len(said) == 1 and 'pip install "phyradgs-cl[neural]"' in said[0]
-    assert not (tmp_path / "out.h5").exists()
-
-
-def test_pytorch_is_there_where_it_is_found() -> None:
-    assert neural.has_torch() == (importlib.util.find_spec("torch") is not None)
+    assert load_cli().run(command) == 2 and not (tmp_path / "out.h5").exists()
+    (said,) = (line for line in capsys.readouterr().err.splitlines() if "PyTorch" in line)
+    assert 'pip install "phyradgs-cl[neural]"' in said
