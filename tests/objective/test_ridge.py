@@ -8,15 +8,8 @@ import scipy.ndimage
 from tolerances import FLOAT32, FLOAT64
 
 from phyradgs_cl import resource
-from phyradgs_cl.objective.ridge import (
-    Ridge,
-    RidgeStep,
-    correlated,
-    correlated_back,
-    learned_ridge,
-    ridge_gradient,
-    ridge_step,
-)
+from phyradgs_cl.objective import ridge as module
+from phyradgs_cl.objective.ridge import Ridge, RidgeStep, correlated, ridge_step
 
 SHAPES = [(5, 6, 7), (17, 5, 33), (9, 11, 16), (7, 5, 20), (3, 8, 8), (6, 4, 9), (1, 1, 1)]
 SIGMA = 0.4  # of volumes of normal noise: responses before, between and beyond the knots
@@ -45,8 +38,7 @@ def constants(ridge: Ridge, size: int = 32) -> tuple[float, float]:
 
 def value(volume: np.ndarray, sigma: float, ridge: Ridge) -> float:
     """R of a volume: integrals of the clamps."""
-    responses = correlated(correlated(volume[None], ridge.first[:, None]), ridge.second)
-    total = 0.0
+    responses, total = correlated(correlated(volume[None], ridge.first[:, None]), ridge.second), 0.0
     for slope, knot in ((ridge.slope_up, ridge.knot_up), (-ridge.slope_down, ridge.knot_down)):
         inner = np.minimum(abs(responses), sigma * knot[:, None, None, None].astype(np.float64))
         total += float((slope[:, None, None, None] * inner * (abs(responses) - inner / 2)).sum())
@@ -85,13 +77,13 @@ def test_correlations_are_scipy_s_and_transposes_are_theirs() -> None:
     ]
     np.testing.assert_allclose(responses, np.array(expected)[:, 1:-1, 1:-1, 1:-1], atol=FLOAT64)
     other = noise(responses.shape, 4)
-    back = correlated_back(other, ridge.second)
+    back = module.correlated_back(other, ridge.second)
     assert np.vdot(responses, other) == pytest.approx(np.vdot(channels, back), rel=FLOAT64)
 
 
 def test_the_step_goes_along_the_gradient_of_the_regulariser() -> None:
     volume, ridge, size = noise((6, 7, 8), 5), any_ridge(), 1e-6
-    gradient = ridge_gradient(volume, SIGMA, ridge)
+    gradient = module.ridge_gradient(volume, SIGMA, ridge)
     for seed in range(5):
         along = noise(volume.shape, 10 + seed)
         ends = [value(volume + sign * size * along, SIGMA, ridge) for sign in (1, -1)]
@@ -115,7 +107,7 @@ def test_a_step_descends_the_objective_and_spreads_volumes_by_its_convexity_at_m
 
 
 def test_the_learned_regulariser_is_weakly_convex() -> None:
-    stored, ridge = json.loads((resource("data") / "ridge.json").read_text(encoding="utf-8")), learned_ridge()
+    stored, ridge = json.loads((resource("data") / "ridge.json").read_text(encoding="utf-8")), module.learned_ridge()
     lipschitz, convexity = constants(ridge, 48)
     assert convexity <= 1 and (lipschitz, convexity) == pytest.approx((stored["lipschitz"], stored["convexity"]), rel=0.01)
     sums = np.einsum("c,ic->i", ridge.first.sum((1, 2, 3)), ridge.second.sum((2, 3, 4)))

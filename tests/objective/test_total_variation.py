@@ -1,28 +1,32 @@
-"""Total variation: kernel, float64 twin, finite differences, and its definition."""
+"""Total variation: the term of splats and the maps of voxel methods, kernels against twins, twins against definitions."""
 
 import numpy as np
 import pytest
 from kernel_kit import random_weights
-from tolerances import FLOAT64, TV_GRADIENT, TV_VALUE, TWIN_GRADIENT
+from tolerances import FLOAT64, TV_GRADIENT, TV_MAP, TV_VALUE, TWIN_GRADIENT
 
+from phyradgs_cl.objective import TvDescent, TvProx
 from phyradgs_cl.objective.terms import TotalVariation, total_variation
+from phyradgs_cl.objective.tv import differences, tv_descent, tv_gradient, tv_prox
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 
-SHAPES = [(5, 6, 7), (4, 3, 33), (1, 8, 16), (8, 1, 5), (6, 7, 1), (1, 1, 1)]
+SHAPES = [(5, 6, 7), (4, 3, 33), (1, 8, 17), (8, 1, 5), (6, 7, 1), (1, 1, 1)]
+SKEWED = (1.0, 0.5, 0.25)
+STATES = [(3, 5, 6, 7), (2, 1, 8, 17), (5, 1, 1, 1), (1, 4, 3, 33)]
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_kernel_is_its_twin(two_rt, shape) -> None:
-    volume = random_weights(shape)
+def test_the_kernel_of_the_term_is_its_twin(two_rt, shape) -> None:
     tv = TotalVariation(two_rt, shape, pitch_of(shape[2]))
-    flat = two_rt.download(tv.evaluate(two_rt.upload(pad_rows(volume))))
-    value, gradient = total_variation(volume)
-    assert abs(tv.value() - value) <= TV_VALUE * max(value, 1)
-    np.testing.assert_allclose(unpad_rows(flat, shape), gradient, rtol=0, atol=TV_GRADIENT)
-    assert np.count_nonzero(flat) == np.count_nonzero(unpad_rows(flat, shape))
+    for volume in (random_weights(shape), np.full(shape, 2.5)):
+        flat = two_rt.download(tv.evaluate(two_rt.upload(pad_rows(volume))))
+        value, gradient = total_variation(volume)
+        assert abs(tv.value() - value) <= TV_VALUE * value
+        np.testing.assert_allclose(unpad_rows(flat, shape), gradient, rtol=0, atol=TV_GRADIENT * gradient.any())
+        assert np.count_nonzero(flat) == np.count_nonzero(unpad_rows(flat, shape))
 
 
-def test_twin_is_the_mean_difference_along_every_axis(finite_differences) -> None:
+def test_the_term_is_the_mean_difference_along_every_axis(finite_differences) -> None:
     for shape in [(5, 6, 7), (2, 3, 2)]:
         volume = random_weights(shape)
         expected = sum(np.abs(np.diff(volume, axis=axis)).mean() for axis in range(3))
@@ -33,8 +37,99 @@ def test_twin_is_the_mean_difference_along_every_axis(finite_differences) -> Non
         np.testing.assert_allclose(total_variation(volume)[1], expected, rtol=0, atol=TWIN_GRADIENT)
 
 
-def test_a_constant_volume_has_none(two_rt) -> None:
-    tv = TotalVariation(two_rt, (4, 5, 6), pitch_of(6))
-    gradient = two_rt.download(tv.evaluate(two_rt.upload(pad_rows(np.full((4, 5, 6), 2.5)))))
-    np.testing.assert_array_equal(gradient, 0)
-    assert tv.value() == 0
+@pytest.mark.parametrize("shape", SHAPES + STATES)
+@pytest.mark.parametrize("nonnegative", [True, False])
+def test_proximal_kernels_are_their_twin(two_rt, shape, nonnegative) -> None:
+    """Of a volume, and of states of one."""
+    volume, weights = random_weights(shape), SKEWED if len(shape) == 3 else (2.0, *SKEWED)
+    found = TvProx(two_rt, shape, weights)(volume.astype(np.float32), 0.3, 12, nonnegative=nonnegative)
+    expected = tv_prox(volume, 0.3, 12, nonnegative=nonnegative, axis_weights=weights)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=TV_MAP)
+
+
+@pytest.mark.parametrize("axis_weights", [SKEWED, (3.0, 2.0, 1.0), (1.5, *SKEWED)])
+def test_the_map_is_the_minimum_of_its_objective(axis_weights) -> None:
+    volume, weight = random_weights((2, 4, 5, 6) if len(axis_weights) == 4 else (4, 5, 6)), 0.4
+
+    def objective(x: np.ndarray) -> float:
+        changes = differences(x, axis_weights)
+        variation = np.linalg.norm(changes[-3:], axis=0).sum() + np.abs(changes[:-3]).sum()
+        return 0.5 * float(((x - volume) ** 2).sum()) + weight * float(variation)
+
+    best = tv_prox(volume, weight, 3000, nonnegative=True, axis_weights=axis_weights)
+    assert best.min() >= 0
+    lowest, rng = objective(best), np.random.default_rng(0)
+    for length in (1e-1, 1e-2, 1e-3):
+        for _ in range(20):
+            other = np.maximum(best + length * rng.normal(size=volume.shape), 0)
+            assert objective(other) >= lowest - 1e-6
+    assert objective(np.maximum(volume, 0)) > lowest + 1
+
+
+def test_total_variation_by_hand() -> None:
+    volume = np.zeros((2, 2, 2))
+    volume[1, 1, 1], volume[0, 0, 0] = 3.0, 4.0
+    # backwards of the corner of 3 lie three steps of it; at the corner of 4 all three axes step at once
+    for first, expected in ((1.0, 3 * 3 + 4 * np.sqrt(3)), (2.0, 3 * 4 + 4 * np.sqrt(6))):
+        variation = np.linalg.norm(differences(volume, (first, 1.0, 1.0)), axis=0).sum()
+        assert variation == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize(("axis_weights", "step"), [((1.0, 1.0, 1.0), 1 / 12), ((3.0, 2.0, 1.0), 1 / 56)])
+def test_the_first_step_by_hand(any_rt, axis_weights, step) -> None:
+    """One over 4 Σ weights², the largest step that is sure to converge: by so much two unequal neighbours approach."""
+    volume = np.array([[[0.0, 1.0]]])
+    found = TvProx(any_rt, volume.shape, axis_weights)(volume, 1.0, 1, nonnegative=False)
+    twin = tv_prox(volume, 1.0, 1, nonnegative=False, axis_weights=axis_weights)
+    for values in (found, twin):
+        np.testing.assert_allclose(values, [[[step, 1 - step]]], rtol=1e-6)
+
+
+def test_the_dual_goes_on_where_the_last_call_left_it(rt) -> None:
+    volume = random_weights((5, 6, 7)).astype(np.float32)
+    goal, prox = tv_prox(volume, 0.4, 4000, nonnegative=False), TvProx(rt, volume.shape)
+    errors = [np.abs(prox(volume, 0.4, 8, nonnegative=False) - goal).max() for _ in range(6)]
+    assert errors[-1] < 0.4 * errors[0]
+    other = TvProx(rt, volume.shape)
+    assert prox.dual.shape == (3, *volume.shape)
+    other.dual = prox.dual
+    once, again = (p(volume, 0.4, 8, nonnegative=False) for p in (prox, other))
+    np.testing.assert_array_equal(once, again)
+
+
+def test_no_weight_only_clips_and_a_flat_volume_stays(rt) -> None:
+    volume, flat = random_weights((3, 4, 5)).astype(np.float32), np.full((4, 5, 6), 2.5, np.float32)
+    prox = TvProx(rt, volume.shape)
+    np.testing.assert_array_equal(prox(volume, 0.0, 5, nonnegative=True), np.maximum(volume, 0))
+    np.testing.assert_array_equal(prox(volume, 0.0, 5, nonnegative=False), volume)
+    np.testing.assert_array_equal(TvDescent(rt, flat.shape)(flat, 0.1, 3), flat)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_descent_kernel_is_its_twin(two_rt, shape) -> None:
+    volume = random_weights(shape)
+    before, descent = volume.copy(), TvDescent(two_rt, shape)
+    np.testing.assert_allclose(descent.gradient(volume), tv_gradient(volume), rtol=0, atol=TV_MAP)
+    np.testing.assert_allclose(descent(volume, 0.05, 5), tv_descent(volume, 0.05, 5), rtol=0, atol=TV_MAP)
+    np.testing.assert_array_equal(volume, before)  # the caller keeps his
+
+
+def test_descent_twin_is_differentiated_right(finite_differences) -> None:
+    volume = random_weights((3, 4, 5))
+
+    def value(x: np.ndarray) -> float:
+        steps = [np.diff(x, axis=a, prepend=x.take([0], axis=a)) for a in range(3)]
+        return float(np.sqrt(sum(s * s for s in steps)).sum())
+
+    expected = finite_differences(value, volume)
+    np.testing.assert_allclose(tv_gradient(volume, 1e-8), expected, rtol=0, atol=TWIN_GRADIENT)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("step, share", [(1e-6, 1 / 2), (3e-6, 3 / 4), (0.01, 1.0)])
+def test_steps_of_the_size_of_rounding_count_less_in_every_unit(two_rt, unit, step, share) -> None:
+    """The length of a difference is counted 1e-6 of the volume's RMS too long."""
+    volume = np.zeros((1, 1, 40))
+    volume[..., :20], volume[..., 20:22] = 1.0, (0.0, step / np.sqrt(2))
+    for gradient in (tv_gradient(unit * volume), TvDescent(two_rt, volume.shape).gradient(unit * volume)):
+        assert gradient[0, 0, 22] == pytest.approx(-share, rel=2e-4)
