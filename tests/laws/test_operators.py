@@ -1,18 +1,24 @@
-"""Laws of every operator: adjoint, linear, additive over frames and time cells, moved and scaled with all space."""
+"""Laws of every operator: adjoint, linear, additive over frames and time cells, moved and scaled with all space.
 
+Some on random geometries, shutters, motions, grids and clouds: a thousand cases of each in `make stress`.
+"""
+
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from kernel_kit import assert_near, frame_cells, splat, splat_gradients
-from laws_kit import grids, many, seeds, tables
 from ray_tables import leaning, noise
 from ray_tables import tables as ray_tables
-from tolerances import ADJOINT, FLOAT32, RAYS_BACK
+from tolerances import ADJOINT, FLOAT32, GRADIENT, RAYS_BACK
 
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, ParallelGeometry, Shutter
+from phyradgs_cl.acquisition.cells import micro_view_cells, per_line_cells, static_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.fields.gaussians import DENSITY, MEAN, SCALE
@@ -20,13 +26,13 @@ from phyradgs_cl.objective import TvProx
 from phyradgs_cl.objective.dct_prox import DctProx
 from phyradgs_cl.operators import RayOperator, Voxeliser
 from phyradgs_cl.operators.rays.intensity import IntensityOperator
+from phyradgs_cl.operators.twins.splat import splat_frame
 from phyradgs_cl.runtime import Runtime
 
 GRID, SHAPE = Grid((12, 15, 13), (0.16, 0.13, 0.15), (0.1, -0.05, 0.2)), (40, 18)
 STEPS = np.array([1, -2, 1])  # whole voxels along z, y, x
 INSIDE = np.s_[2:-2, 3:-3, 2:-2]  # what stays in the volume then
 NEAR = 2 * RAYS_BACK  # of the largest: two ways whose sums are rounded in other orders
-
 
 Shapes = tuple[tuple[int, ...], tuple[int, ...]]  # of x and of y
 
@@ -204,10 +210,7 @@ RAYS = {
     "parallel per-row": ("common", "columns", "parallel"), "intensities": ("common", "rows", "cone"),
     "own times": ("per line", "columns", "cone"), "micro-views": ("micro-views", "columns", "cone"),
 }  # fmt: skip
-SPLATS = ("static", "micro-views", "exact", "per-row")
-
-
-NAMES = [*RAYS, *(f"splats {motion}" for motion in SPLATS), "voxels"]
+NAMES = [*RAYS, *(f"splats {motion}" for motion in ("static", "micro-views", "exact", "per-row")), "voxels"]
 
 
 @pytest.fixture
@@ -242,6 +245,49 @@ def test_frames_and_time_cells_add_up_and_space_may_move_and_grow(rt, make, name
     moves_and_scales(operator)
 
 
+many = settings(
+    max_examples=1000 if int(os.environ.get("STRESS", "1")) > 1 else 20, deadline=None, derandomize=True, database=None,
+    suppress_health_check=list(HealthCheck),
+)  # fmt: skip
+seeds = st.integers(0, 2**32 - 1)
+
+
+@st.composite
+def tables(draw: st.DrawFn) -> tuple[tuple[int, int], list[TimeCells]]:
+    """A detector's shape and the time cells of two frames of a random scanner round a volume of side 2."""
+    shape = (draw(st.integers(1, 9)), draw(st.integers(1, 20)))
+    distance = draw(st.floats(2.5, 20.0))
+    magnification = draw(st.floats(1.05, 3.0))
+    side = 3.0 * magnification
+    offset = (draw(st.floats(-0.4, 0.4)), draw(st.floats(-0.4, 0.4)))
+    pitch = (side / shape[0] * draw(st.floats(0.5, 1.5)), side / shape[1] * draw(st.floats(0.5, 1.5)))
+    cone = ConeGeometry(distance, distance * magnification, shape, pitch, offset)
+    geometry = ParallelGeometry(shape, pitch, offset) if draw(st.booleans()) else cone
+    orbit = CircularOrbit(geometry, ConstantSpeed(draw(st.floats(-7, 7)), draw(st.floats(-2, 2))))
+    axis, direction = draw(st.sampled_from(["rows", "columns"])), draw(st.sampled_from([1, -1]))
+    shutter = Shutter(draw(st.floats(0.01, 1.0)), draw(st.floats(0.0, 1.0)), axis, direction)
+    motion = draw(st.sampled_from(["static", "micro-views", "per-row"]))
+    found = []
+    for frame in range(2):
+        where = (orbit, shutter, frame, 1.7 * frame, shutter.lines(shape))
+        if motion == "static":
+            found.append(static_cells(*where))
+        elif motion == "micro-views":
+            found.append(micro_view_cells(*where, draw(st.integers(1, 4)), draw(st.integers(1, 3))))
+        else:
+            found.append(per_line_cells(*where, draw(st.integers(1, 3))))
+    return shape, found
+
+
+@st.composite
+def grids(draw: st.DrawFn) -> Grid:
+    """Up to some thousand voxels, about as large as a volume of side 2, anywhere near the axis."""
+    shape = tuple(draw(st.integers(1, 14)) for _ in range(3))
+    size = tuple(draw(st.floats(0.8, 2.2)) / n for n in shape)
+    offset = tuple(draw(st.floats(-0.3, 0.3)) for _ in range(3))
+    return Grid(shape, size, offset)  # type: ignore[arg-type]
+
+
 @pytest.mark.slow
 @many
 @given(scanner=tables(), grid=grids(), seed=seeds)
@@ -260,6 +306,21 @@ def test_splats_of_random_scanners(rt, make_cloud, scanner, seed) -> None:
     rows = make_cloud(4, seed, spread=0.7, scale=(0.08, 0.5))
     is_adjoint(Densities(rt, cells[:1], rows, shape), seed)
     is_linear(Densities(rt, cells[:1], rows, shape), seed)
+
+
+@many
+@given(scanner=tables(), seed=seeds)
+def test_the_gradient_is_the_derivative(rt, make_cloud, scanner, seed) -> None:
+    """Along a random direction of all parameters, against central differences of the float64 twin."""
+    shape, (cells, _) = scanner
+    rng, rows = np.random.default_rng(seed), make_cloud(2, seed, spread=0.7, scale=(0.15, 0.5))
+    h = rng.normal(size=shape).astype(np.float32)
+    direction = rng.normal(size=rows.shape) * np.where(np.arange(11)[:, None] < 6, 0.1, 1.0)
+    ends = [float((h * splat_frame(rows + s * 1e-5 * direction, cells, shape)).sum()) for s in (1, -1)]
+    gradient = splat_gradients(rt, rows, cells, h, cutoff_sigma=0.0).astype(np.float64)
+    size = np.linalg.norm(gradient * direction)  # of what is added up, which may nearly cancel
+    found, expected = float(np.vdot(gradient, direction)), (ends[0] - ends[1]) / 2e-5
+    assert abs(found - expected) <= 2 * GRADIENT * max(size, 1e-3)
 
 
 @pytest.mark.parametrize("name", ["total variation", "cosine blocks"])
