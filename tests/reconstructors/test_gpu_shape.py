@@ -56,9 +56,7 @@ def gpu_shaped(scan) -> tuple[list[np.ndarray], set[str]]:
     with pytest.MonkeyPatch.context() as patch:
         launched = note_launches(patch)
         assert rt.best_rates().flops_per_s > 0  # launches multiply_add by itself
-        volumes = [
-            reconstruct(scan, plan(name, changes), rt).volume for name, changes in RUNS
-        ]
+        volumes = [reconstruct(scan, plan(name, changes), rt).volume for name, changes in RUNS]
     return volumes, set(launched)
 
 
