@@ -42,9 +42,7 @@ def make_scan(axis: str, rows: np.ndarray) -> Scan:
     rng = np.random.default_rng(4)
     mask = (rng.uniform(size=SHAPE) < 0.15).astype(np.uint8)
     empty = np.zeros((3, *SHAPE), np.float32)
-    scan = Scan(
-        empty, geometry, orbit, Shutter(0.4, 0.3, axis, -1), np.array([0.0, 2.0, 5.0]), GRID, pixel_mask=mask
-    )
+    scan = Scan(empty, geometry, orbit, Shutter(0.4, 0.3, axis, -1), np.array([0.0, 2.0, 5.0]), GRID, pixel_mask=mask)
     frames = np.stack([splat_frame(rows, internal(OPTIONS.motion.cells(scan, f)), SHAPE) for f in range(3)])
     frames += rng.choice([-1, 1], frames.shape) * rng.uniform(0.05, 0.3, frames.shape)
     return replace(scan, projections=(frames * UNIT.line_integral).astype(np.float32))
