@@ -25,11 +25,10 @@ def draw(volume: np.ndarray, count: int, seed: int = 0, **changes: object):
 def test_centres_are_occupied_voxels_and_density_their_share(volume) -> None:
     cloud = draw(volume, 50)
     assert cloud.count == 50 and len({tuple(m) for m in cloud.mean}) == 50
-    z, y, x = GRID.axes_mm()
-    near = zip((z, y, x), cloud.mean.T[::-1], strict=True)
+    near = zip(GRID.axes_mm(), cloud.mean.T[::-1], strict=True)
     index = tuple(np.abs(axis[:, None] - c).argmin(axis=0) for axis, c in near)
-    expected = np.stack([x[index[2]], y[index[1]], z[index[0]]], -1)
-    np.testing.assert_allclose(cloud.mean, expected, rtol=0, atol=FLOAT64)
+    expected = [axis[i] for axis, i in zip(GRID.axes_mm(), index, strict=True)]
+    np.testing.assert_allclose(cloud.mean.T[::-1], expected, rtol=0, atol=FLOAT64)
     assert np.all(volume[index] > 0.2)
     np.testing.assert_allclose(cloud.density, 0.15 * volume[index], rtol=FLOAT64)
     np.testing.assert_array_equal(cloud.quaternion, np.tile([1.0, 0, 0, 0], (50, 1)))
@@ -51,8 +50,6 @@ def test_scale_is_the_rms_distance_to_the_three_nearest(volume) -> None:
 
 def test_hardly_anything_still_gives_a_cloud() -> None:
     for occupied in (0, 1, 2):
-        volume = np.zeros(GRID.shape)
-        volume.ravel()[:occupied] = 1.0
-        cloud = draw(volume, 30)
+        cloud = draw((np.arange(np.prod(GRID.shape)) < occupied).reshape(GRID.shape) * 1.0, 30)
         assert cloud.count == max(occupied, 1)
         assert np.all(np.isfinite(cloud.scale)) and np.all(cloud.scale > 0) and np.all(cloud.density > 0)
