@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.api import Reconstruction, prepare, reconstruct, simulate
+from phyradgs_cl.api import prepare, reconstruct, simulate
 from phyradgs_cl.errors import InputError, OutOfMemoryError
-from phyradgs_cl.fields import Grid, GridChoice
+from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.reconstructors.result import HELD_OUT
 
 pytestmark = pytest.mark.slow
@@ -47,27 +47,13 @@ def test_a_margin_is_filled_and_discarded(rt, scan, tmp_path) -> None:
         reconstruct(scan, "sirt", **{**chosen, "margin_mm": 0.1}, resume=part)
 
 
-def test_what_belongs_to_voxels_is_cut_with_them() -> None:
-    grid = Grid((4, 5, 6), (1.0, 1.0, 1.0))
-    values = np.arange(120, dtype=np.float32).reshape(grid.shape)
-    inner = grid.part((1, 1, 1), (2, 3, 4))
-    found = Reconstruction(values, grid).within(inner)
-    assert found.grid == inner
-    np.testing.assert_array_equal(found.volume, values[1:3, 1:4, 1:5])
-    assert (of_another := Reconstruction(values[:2], grid.part((0, 0, 0), (2, 5, 6)))).within(inner) is of_another
-
-
-def test_where_a_margin_would_do_nothing_it_is_refused(rt, scan) -> None:
+def test_margins_that_would_do_nothing_or_are_too_wide_for_memory_are_refused(rt, scan) -> None:
+    none, plain = (reconstruct(scan, "fdk", **more, device=rt).volume for more in ({"margin_mm": 0}, {}))
+    np.testing.assert_array_equal(none, plain)
     with pytest.raises(InputError, match="margin_mm: found method fdk with extrapolate=none.*extrapolate=reprojected"):
         reconstruct(scan, "fdk", margin_mm=0.3, device=rt)
     with pytest.raises(InputError, match="margin_mm: found .*without a method"):
         prepare(scan, "sparks", margin_mm=0.3, device=rt)
-
-
-def test_no_margin_is_none_and_one_too_wide_for_memory_is_named(rt, scan) -> None:
-    np.testing.assert_array_equal(
-        reconstruct(scan, "fdk", margin_mm=0, device=rt).volume, reconstruct(scan, "fdk", device=rt).volume
-    )
     with pytest.raises(OutOfMemoryError, match=r"narrower margin_mm \(with it the grid has \d+ × \d+ × \d+ voxels\)"):
         reconstruct(scan, "sirt", margin_mm=1000 * max(scan.grid.voxel_size_mm), iterations=1, device=rt)
 
@@ -81,10 +67,3 @@ def test_volumes_on_the_way_are_those_of_the_box(rt, scan) -> None:
             assert volume.shape == grid.shape
             np.testing.assert_allclose(grid.box_mm, found.grid.box_mm, atol=max(grid.voxel_size_mm))  # may be coarser
     assert any(shown)
-
-
-def test_a_plot_says_that_the_margin_is_gone(rt, scan) -> None:
-    for more, expected in (({}, False), ({"margin_mm": 0.3}, True)):
-        figure = reconstruct(scan, "sirt", roi_mm=0.9, iterations=2, device=rt, report=False, **more).plot(scan, device=rt)
-        titles = [axes.get_title() for part in figure.subfigs for axes in part.axes]
-        assert any("without the margin" in title for title in titles) == expected
