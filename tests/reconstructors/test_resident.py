@@ -9,17 +9,18 @@ from tolerances import RESIDENT
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors import METHODS, RunPlan, method_options, plan_run, reconstruct
-from phyradgs_cl.reconstructors.result import Progress
+from phyradgs_cl.reconstructors import METHODS, RunPlan, plan_run, reconstruct
 from phyradgs_cl.reconstructors.splats.method import SplatRun
 from phyradgs_cl.reconstructors.voxels.system import System
-from phyradgs_cl.runtime import DeviceSpace, Runtime, Traffic
+from phyradgs_cl.runtime import DeviceSpace, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pitch_of
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
 pytestmark = pytest.mark.slow
 
-ITERATIVE = ("sart", "os-sart", "sirt", "cgls", "asd-pocs", "fista", "fista-tv")
+OPTIONS = {name: next(iter(method.presets.values())) for name, method in METHODS.items() if not method.finds_motion}
+ITERATIVE = tuple(name for name, options in OPTIONS.items() if hasattr(options, "tolerance"))
+"""But for methods that find a motion: their search works on the host, and their passes are those of fista."""
 MOST_BYTES = 1024  # over the bus in an iteration
 MOST_WAITS = dict.fromkeys(ITERATIVE, 8) | {"fista": 10}
 GRID = Grid.cube(20, 2.0)
@@ -29,15 +30,13 @@ GRID = Grid.cube(20, 2.0)
 def scan() -> Scan:
     """Read out along columns, with dead pixels: frames are turned, padded and masked on the way to the operators."""
     geometry = ConeGeometry(5.0, 7.0, (24, 28), (4 / 24, 4 / 28))
-    options = SimulationOptions(
-        protocol=Protocol(views=12, exposure_deg=24.0), readout_axis="columns", detector_model="intensity", peak=3.0
-    )
+    options = SimulationOptions(Protocol(views=12, exposure_deg=24.0), "columns", detector_model="intensity", peak=3.0)
     mask = np.zeros((24, 28), np.uint8)
     mask[5:9, 11] = 1
     return replace(simulate(AnalyticSource(shepp_logan(1.0), geometry), geometry, GRID, options), pixel_mask=mask)
 
 
-def options_of(method: str, model: str, iterations: int = 4):
+def plan_of(method: str, model: str, iterations: int = 4) -> RunPlan:
     changes = {"motion": "per-row", "sub_intervals": 2, "iterations": iterations, "detector_model": model}
     if method in ("fista", "fista-tv"):
         changes["transmission_weights"] = True
@@ -45,7 +44,7 @@ def options_of(method: str, model: str, iterations: int = 4):
         changes["noise_stop"] = 0
     if method == "fista":  # one grid: between two the volume comes to the host, once
         changes |= {"subvoxels": 1, "prior": "dct"}  # ridge holds more slices than so small a volume has
-    return method_options(method, None, changes)
+    return plan_run(method, changes)
 
 
 RUNS = [*((name, "intensity") for name in ITERATIVE), ("fista", "log"), ("sirt", "log")]
@@ -56,8 +55,7 @@ def test_a_run_on_the_device_and_one_on_the_host(scan, monkeypatch, method, mode
     """Numbers alone cross the bus; the room that is asked for is enough and not far more than is used; the same bits twice.
     Where the device has too little room for all, the same lines over NumPy's arrays come to the same volume."""
     resident, volume_bytes, frames_bytes = System.resident, 4 * int(np.prod(GRID.shape)), scan.projections.nbytes
-    spaces: list[object] = []
-    asked: list[int] = []
+    spaces, asked = [], []
 
     def noted(self: System, rt: Runtime, volumes: int, frames: int) -> System:
         found = resident(self, rt, volumes, frames)
@@ -67,8 +65,7 @@ def test_a_run_on_the_device_and_one_on_the_host(scan, monkeypatch, method, mode
         asked.append(operators_bytes + (volumes + more[0]) * volume_bytes + (frames + more[1]) * frames_bytes)
         return found
 
-    plan, rt = RunPlan(method, options_of(method, model)), Runtime()
-    seen: list[Traffic] = []
+    plan, rt, seen = plan_of(method, model), Runtime(), []
     on_device = reconstruct(scan, plan, rt, report=lambda p: seen.append(replace(rt.traffic)))
     moved = np.diff([(t.bytes_up, t.bytes_down, t.blocking) for t in seen], axis=0)
     assert len(moved) == 3
@@ -88,21 +85,6 @@ def test_a_run_on_the_device_and_one_on_the_host(scan, monkeypatch, method, mode
     assert on_host.record[-1]["residual"] == pytest.approx(on_device.record[-1]["residual"], rel=1e-4)
 
 
-def test_reports_alone_download(scan) -> None:
-    """Previews and checkpoints bring volumes and state down when they are asked for."""
-    rt = Runtime()
-    moved: dict[str, int] = {}
-
-    def report(progress: Progress) -> None:
-        for name, call in (("volume", progress.volume), ("state", progress.state)):
-            before = rt.traffic.bytes_down
-            call()
-            moved[name] = rt.traffic.bytes_down - before
-
-    reconstruct(scan, RunPlan("sirt", options_of("sirt", "log", 2)), rt, report=report)
-    assert moved == {"volume": 4 * int(np.prod(GRID.shape)), "state": 4 * int(np.prod(GRID.shape))}
-
-
 def test_frames_of_fdk_go_up_once_and_its_volume_comes_down_once(scan) -> None:
     rt = Runtime()
     reconstruct(scan, plan_run("fdk", {"motion": "static"}), rt)
@@ -113,17 +95,10 @@ def test_frames_of_fdk_go_up_once_and_its_volume_comes_down_once(scan) -> None:
     assert rt.traffic.blocking == 4, "frames, poses, weights; the volume"
 
 
-def test_all_iterative_methods_are_looked_at() -> None:
-    """But for methods that find a motion: their search works on the host, and their passes are those of fista."""
-    iterative = {name for name in METHODS if hasattr(method_options(name), "tolerance")}
-    assert set(ITERATIVE) == {name for name in iterative if not METHODS[name].finds_motion}
-
-
 @pytest.mark.parametrize("method", ["phyradgs", "r2"])
 def test_a_step_of_splats_waits_for_nothing(scan, method, monkeypatch) -> None:
     """Between the first step, which learns how long lists are, and density control or a report."""
-    waits: list[int] = []
-    step = SplatRun.step
+    waits, step = [], SplatRun.step
 
     def counted(self: SplatRun) -> None:
         before = self.rt.traffic.blocking
@@ -131,7 +106,7 @@ def test_a_step_of_splats_waits_for_nothing(scan, method, monkeypatch) -> None:
         waits.append(self.rt.traffic.blocking - before)
 
     monkeypatch.setattr(SplatRun, "step", counted)
-    changes = {"gaussians": 200, "iterations": 8, "tv_edge": 8, "control": {"every": 0}}
-    changes |= {"exact_from": 0.0}  # another motion brings its cells
+    changes = {"exact_from": 0.0}  # another motion brings its cells
+    changes |= {"gaussians": 200, "iterations": 8, "tv_edge": 8, "control": {"every": 0}}
     reconstruct(scan, plan_run(method, changes), Runtime())
     assert len(waits) == 8 and waits[0] == 3 and max(waits[1:]) == 0, "lists of frames and of the sub-volume, its axes"
