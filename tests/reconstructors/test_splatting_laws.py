@@ -22,9 +22,7 @@ from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 pytestmark = pytest.mark.slow
 
 CONTROL = DensityControl(every=10, start_iteration=5, threshold=1e-6)
-OPTIONS = SplatOptions(
-    motion=MicroViews(4, 2), iterations=30, gaussians=300, tv_edge=8, control=CONTROL
-)
+OPTIONS = SplatOptions(motion=MicroViews(4, 2), iterations=30, gaussians=300, tv_edge=8, control=CONTROL)
 phyradgs, r2 = METHODS["phyradgs"].run, METHODS["r2"].run
 STEADY = replace(OPTIONS, control=DensityControl(every=0))
 
@@ -53,18 +51,13 @@ def difference(found: np.ndarray, expected: np.ndarray) -> float:
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
 
-def test_same_seed_same_bits(rt, scan, run) -> None:
-    one, two, other = run(), phyradgs(scan, OPTIONS, rt, seed=1), phyradgs(scan, OPTIONS, rt, seed=2)
+def test_same_seed_same_bits(any_rt, scan) -> None:
+    one, two, other = (phyradgs(scan, replace(OPTIONS, iterations=16), any_rt, seed=seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.volume, two.volume)
     np.testing.assert_array_equal(one.gaussians.rows(), two.gaussians.rows())
     assert [r["loss"] for r in one.record] == [r["loss"] for r in two.record]
     assert one.gaussians.count > OPTIONS.gaussians  # density control has acted
     assert difference(other.volume, one.volume) > 0.01
-
-
-def test_every_build_repeats_itself(any_rt, scan) -> None:
-    one, two = (phyradgs(scan, replace(OPTIONS, iterations=12), any_rt, seed=1) for _ in range(2))
-    np.testing.assert_array_equal(one.volume, two.volume)
 
 
 def test_lengths_times_1024_change_no_bit_and_times_1000_nothing_else(rt, run) -> None:
@@ -76,21 +69,12 @@ def test_lengths_times_1024_change_no_bit_and_times_1000_nothing_else(rt, run) -
     assert difference(large.volume * 1000, run(STEADY).volume) <= SCALE_LAW
 
 
-def test_exact_motion_says_how_it_averaged(rt, scan, run) -> None:
-    """By K; with the same bits every time and a loss like that of micro-views."""
-    options = replace(OPTIONS, motion=Exact(segments=3))
-    result = run(options)
+def test_exact_motion_says_how_it_averaged(run) -> None:
+    """By K; with a loss like that of micro-views."""
+    result = run(OPTIONS, motion=Exact(segments=3))
     assert result.facts["segments"] == 3
-    np.testing.assert_array_equal(result.volume, phyradgs(scan, options, rt, seed=1).volume)
     assert result.record[-1]["loss"] < 1.1 * run().record[-1]["loss"]
     assert "segments" not in run(iterations=0).facts
-
-
-def test_it_gets_better(scan, run) -> None:
-    truth = shepp_logan(1.0).voxelise(scan.grid, 3)
-    short, long = run(STEADY, iterations=1), run(STEADY, iterations=200)
-    assert long.record[-1]["loss"] < 0.5 * short.record[-1]["loss"]
-    assert difference(long.volume, truth) < 0.8 * difference(short.volume, truth)
 
 
 def test_the_cloud_is_the_volume(rt, scan, run) -> None:
@@ -117,26 +101,18 @@ def test_ctrl_c_keeps_what_there_is_and_can_go_on(rt, scan, run, monkeypatch) ->
         if progress.iteration == 8:
             raise KeyboardInterrupt
 
-    stopped = phyradgs(scan, OPTIONS, rt, seed=1, report=stop_at_8)
+    stopped, whole = phyradgs(scan, OPTIONS, rt, seed=1, report=stop_at_8), run()
     assert seen == [4, 8] and [r["iteration"] for r in stopped.record] == [1, 2, 3, 4, 5, 6, 7, 8]
-    assert stopped.facts["interrupted_at"] == 8
-    assert stopped.volume.shape == scan.grid.shape and np.all(np.isfinite(stopped.volume))
-    assert stopped.volume.max() > 0
-    whole = run()
+    assert stopped.facts["interrupted_at"] == 8 and stopped.volume.shape == scan.grid.shape
+    assert np.isfinite(stopped.volume).all() and stopped.volume.max() > 0 and np.any(whole.volume != stopped.volume)
     assert whole.facts["interrupted_at"] is None and whole.state is None
-    assert np.any(whole.volume != stopped.volume)
     resumed = phyradgs(scan, OPTIONS, rt, seed=1, resume=stopped.state)
     np.testing.assert_array_equal(resumed.volume, whole.volume)
 
 
-def test_an_empty_scan_ends_in_an_empty_volume(rt, scan) -> None:
-    empty = replace(scan, projections=np.zeros_like(scan.projections))
-    result = phyradgs(empty, replace(STEADY, iterations=5), rt)
-    assert np.all(np.isfinite(result.volume))
-    assert result.volume.mean() < 0.05
-
-
-def test_masked_pixels_have_no_say(rt, scan, masked) -> None:
+def test_empty_scans_end_in_empty_volumes_and_masked_pixels_have_no_say(rt, scan, masked) -> None:
+    result = phyradgs(replace(scan, projections=np.zeros_like(scan.projections)), replace(STEADY, iterations=5), rt)
+    assert np.all(np.isfinite(result.volume)) and result.volume.mean() < 0.05
     mask = np.zeros((6, 24, 24), np.uint8)
     mask[2, 5:9, 7:12] = 1
     one, two = (phyradgs(spoilt, OPTIONS, rt, seed=1) for spoilt in masked(scan, mask))
@@ -145,8 +121,8 @@ def test_masked_pixels_have_no_say(rt, scan, masked) -> None:
 
 def test_r2_is_affine_and_motion_matters(rt, scan, run) -> None:
     exact, affine = run(STEADY, iterations=5), r2(scan, replace(STEADY, iterations=5), rt, seed=1)
-    assert affine.facts["method"] == "r2" and affine.facts["options"]["affine"] is True
-    assert exact.facts["method"] == "phyradgs" and exact.facts["options"]["affine"] is False
+    told = [(one.facts["method"], one.facts["options"]["affine"]) for one in (exact, affine)]
+    assert told == [("phyradgs", False), ("r2", True)]
     assert 1e-4 < difference(affine.volume, exact.volume) < 0.2
     assert difference(run(STEADY, motion=Static()).volume, run(STEADY, motion=MicroViews()).volume) > 0.01
 
