@@ -14,7 +14,6 @@ from phyradgs_cl.metrics import compare
 from phyradgs_cl.operators import IntensityOperator, RayOperator
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.reconstructors import Reconstruction, plan_run, reconstruct
-from phyradgs_cl.reconstructors.preprocess import Preprocessing
 from phyradgs_cl.reconstructors.projected import frame_pairs
 from phyradgs_cl.reconstructors.result import Report
 
@@ -76,8 +75,12 @@ def test_each_line_sees_the_state_of_its_own_time(rt) -> None:
     first, second = of_states[0][15], of_states[1][15]  # from 15 s to 16.0 s: the border of two states
     assert first.any() and np.abs(first - second).max() > 1e-3
     border = operators(rt, scan, STATE_TIMES_S - 0.5)[0].forward(truth.volumes)[15]
-    np.testing.assert_array_equal(border[0], first[0])
-    np.testing.assert_array_equal(border[-1], second[-1])
+    np.testing.assert_array_equal(border[[0, -1]], [first[0], second[-1]])
+    tables = [PerRow(sub_intervals=3).cells(scan, f) for f in range(4)]
+    makes = projector_of(rt, GRID, tables, None, truth.times_s), RayOperator
+    pairs = zip(makes, (truth.volumes, truth.volumes[0]), strict=True)
+    averaged, alone = (IntensityOperator(rt, GRID, SHAPE, tables, make).expected(volumes) for make, volumes in pairs)
+    np.testing.assert_allclose(averaged, alone, rtol=0, atol=RAYS * alone.max())
 
 
 def test_transpose_subsets_and_equal_states(two_rt) -> None:
@@ -91,27 +94,13 @@ def test_transpose_subsets_and_equal_states(two_rt) -> None:
     np.testing.assert_array_equal(operator.subset([7, 2]).forward(stack), forward[[7, 2]])
     same = np.broadcast_to(stack[0], stack.shape)
     np.testing.assert_allclose(operator.forward(np.ascontiguousarray(same)), alone.forward(stack[0]), rtol=RAYS)
-
-
-def test_one_state_is_an_object_that_rests(rt) -> None:
-    scan, volume = empty_scan(6), noise(GRID.shape)
-    operator, alone = operators(rt, scan, np.array([3.0]))
-    np.testing.assert_array_equal(operator.forward(volume[None]), alone.forward(volume))
-    np.testing.assert_array_equal(operator.adjoint(alone.forward(volume))[0], alone.adjoint(alone.forward(volume)))
-
-
-def test_averaged_intensity(rt) -> None:
-    scan, truth = empty_scan(), changing_object()
-    tables = [PerRow(sub_intervals=3).cells(scan, f) for f in range(4)]
-    make = projector_of(rt, GRID, tables, None, truth.times_s)
-    averaged = IntensityOperator(rt, GRID, SHAPE, tables, make).expected(truth.volumes)
-    alone = IntensityOperator(rt, GRID, SHAPE, tables).expected(truth.volumes[0])
-    np.testing.assert_allclose(averaged, alone, rtol=0, atol=RAYS * alone.max())
+    one, _ = operators(two_rt, scan, np.array([6.0]))
+    np.testing.assert_array_equal(one.forward(stack[:1]), alone.forward(stack[0]))
+    np.testing.assert_array_equal(one.adjoint(frames)[0], alone.adjoint(frames))
 
 
 def test_states_come_back(rt, scan) -> None:
-    truth = changing_object()
-    result, resting = run(rt, scan, states=10), run(rt, scan, "fista")
+    truth, result, resting = changing_object(), run(rt, scan, states=10), run(rt, scan, "fista")
     np.testing.assert_allclose(result.states.times_s, 8.0 * np.arange(10) + 4.0, atol=0.1)
     np.testing.assert_allclose(result.volume, result.states.volumes.mean(0), atol=1e-6)
     gains_db = np.subtract(psnr_db(result, truth), psnr_db(resting, truth))
@@ -134,16 +123,14 @@ def test_resumed_runs_have_the_same_bits(rt, scan) -> None:
 
 
 def test_computed_frames_and_held_out_pixels_are_those_of_the_states(rt, scan) -> None:
-    shown = []
-    hold = Preprocessing(holdout=2.0)
-    plan = replace(plan_run("changing", {"states": 5, "iterations": 20}), preprocessing=hold)
+    shown, plan = [], plan_run("changing", {"states": 5, "iterations": 20, "holdout": 2.0})
     result = reconstruct(scan, plan, rt, report=lambda p: shown.append(p.frames(2)) if p.iteration == 20 else None)
     assert max(pair.rms for pair in shown[0]) < 0.007  # 0.015 of the mean of the states
     titles = [re.search(r"RMS (.*) %", axes.get_title()) for axes in result.plot(scan, frame=2, device=rt).axes]
     (percent,) = (float(title[1]) for title in titles if title)
     assert percent < 0.7 * 100 * frame_pairs(rt, scan, result.volume, GRID, [2])[0].relative
     assert result.facts["held_out"]["holdout_rms"] < 0.007
-    resting = reconstruct(scan, replace(plan_run("fista", {"iterations": 20}), preprocessing=hold), rt)
+    resting = reconstruct(scan, plan_run("fista", {"iterations": 20, "holdout": 2.0}), rt)
     assert resting.facts["held_out"]["holdout_rms"] > 0.01
 
 
@@ -152,23 +139,19 @@ def test_subsets_of_fewer_than_half_a_frame_for_each_state_are_joined(rt, scan) 
     np.testing.assert_array_equal(eight, eighty)
 
 
-def test_no_state_is_in_a_pause(rt) -> None:
+def test_no_state_is_in_a_pause_nor_are_there_more_than_frames(rt) -> None:
     times_s = np.concatenate([np.arange(40.0), 1000 + np.arange(40.0)])
     paused = replace(empty_scan(), frame_start_s=times_s)
     found = run(rt, paused, states=8, iterations=1).states.times_s
     np.testing.assert_allclose(found, [5, 15, 25, 35, 1005, 1015, 1025, 1035], atol=0.1)
-
-
-def test_more_states_than_frames(rt) -> None:
     few = replace(empty_scan(3), projections=noise((3, *SHAPE)).astype(np.float32) ** 2)
     assert len(run(rt, few, iterations=1).states.times_s) == 3
 
 
 def test_part_of_a_result_and_times_between_states() -> None:
-    truth = changing_object()
-    inner = Grid((10, 10, 10), GRID.voxel_size_mm)
+    truth, inner = changing_object(), Grid((10, 10, 10), GRID.voxel_size_mm)
     part = Reconstruction(truth.volumes.mean(0), GRID, states=truth).within(inner)
-    assert part.states.volumes.shape == (5, 10, 10, 10)
+    assert part.states.volumes.shape == (5, 10, 10, 10) and part.within(GRID) is part
     np.testing.assert_array_equal(part.states.volumes[2], truth.volumes[2, 5:15, 5:15, 5:15])
     np.testing.assert_allclose(truth.at(12.0), 0.75 * truth.volumes[0] + 0.25 * truth.volumes[1], atol=1e-6)
     np.testing.assert_array_equal(truth.at(-3.0), truth.volumes[0])
