@@ -5,15 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConeGeometry,
-    ConstantSpeed,
-    ParallelGeometry,
-    PerRow,
-    Scan,
-    Shutter,
-)
+from phyradgs_cl import acquisition
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, PerRow, Scan, Shutter
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Gating, Grid, MovingTruth, control_points, deformed
 from phyradgs_cl.metrics import compare
@@ -21,17 +14,13 @@ from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, plan_run, reconstruct
 from phyradgs_cl.reconstructors.moving import motion_line
-from phyradgs_cl.reconstructors.moving.field import MotionField
+from phyradgs_cl.reconstructors.moving import signal as signals
 from phyradgs_cl.reconstructors.moving.method import FieldSearch, coarse_scan, initial_field
 from phyradgs_cl.reconstructors.moving.signal import (
-    Bending,
     MotionSignal,
     TemporalSplines,
-    load_gating,
     middle_times_s,
     motion_signal,
-    period_of,
-    signal_of,
 )
 from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress
 
@@ -42,10 +31,8 @@ FRAMES, PERIOD_S, STEP_S = 90, 3.1, 0.5
 
 def shroud_scan(height_of, noise: float = 0.05) -> Scan:
     """Frames of a horizontal edge at a height in rows, (F,) of the times (F,) in s, whose width changes with the angle."""
-    geometry = ConeGeometry(5.0, 7.0, (24, 20), (0.2, 0.2))
-    start_s = STEP_S * np.arange(FRAMES)
-    turn_rad = 2 * np.pi / (FRAMES * STEP_S)
-    rows = np.arange(24)
+    geometry, start_s = ConeGeometry(5.0, 7.0, (24, 20), (0.2, 0.2)), STEP_S * np.arange(FRAMES)
+    turn_rad, rows = 2 * np.pi / (FRAMES * STEP_S), np.arange(24)
     edge = 1 / (1 + np.exp((rows - 12 - height_of(start_s + 0.2)[:, None]) / 1.5))
     width = 1 + 0.3 * np.cos(2 * turn_rad * start_s) + 0.1 * np.sin(3 * turn_rad * start_s)
     frames = (edge * width[:, None])[:, :, None] + np.random.default_rng(0).normal(0, noise, (FRAMES, 24, 20))
@@ -53,12 +40,14 @@ def shroud_scan(height_of, noise: float = 0.05) -> Scan:
     return Scan(frames.astype(np.float32), geometry, orbit, Shutter(0.4), start_s, Grid.cube(8, 2.0))
 
 
-def test_the_signal_has_the_period_and_the_curve_of_the_motion() -> None:
+def test_the_signal_has_the_period_and_the_curve_of_the_motion_beside_masked_pixels() -> None:
     def phase(t):  # of breaths that differ in length
         return 2 * np.pi * t / PERIOD_S + 0.3 * np.sin(0.2 * t)
 
     scan = shroud_scan(lambda t: 2 * np.cos(phase(t)))
-    signal = motion_signal(scan)
+    frames, mask = scan.projections.copy(), np.zeros((24, 20), np.uint8)
+    frames[:, 3, 5], mask[3, 5] = 1e6, 1
+    signal = motion_signal(replace(scan, projections=frames, pixel_mask=mask))
     assert signal.period_s == pytest.approx(PERIOD_S, rel=0.03)
     curve = np.cos(phase(signal.times_s))
     assert abs(np.corrcoef(signal.values, curve)[0, 1]) > 0.95
@@ -72,16 +61,6 @@ def test_what_does_not_repeat_has_no_period(height_of) -> None:
     assert motion_signal(shroud_scan(height_of)).period_s is None
 
 
-def test_masked_pixels_do_not_matter() -> None:
-    scan = shroud_scan(lambda t: 2 * np.cos(2 * np.pi * t / PERIOD_S))
-    frames = scan.projections.copy()
-    frames[:, 3, 5] = 1e6
-    mask = np.zeros((24, 20), np.uint8)
-    mask[3, 5] = 1
-    masked = replace(scan, projections=frames, pixel_mask=mask)
-    assert motion_signal(masked).period_s == pytest.approx(PERIOD_S, rel=0.03)
-
-
 GRID, SHAPE = Grid.cube(16, 2.0), (24, 24)
 ITERATIONS, ROUNDS = 13, 3  # three rounds of the search, and ten passes
 
@@ -89,12 +68,11 @@ ITERATIONS, ROUNDS = 13, 3  # three rounds of the search, and ten passes
 def breathing_scan(rt, amplitude_mm: float, is_parallel: bool = False) -> Scan:
     """Forty frames of an object whose top rises and falls, of other angles than those of its breaths."""
     origin_mm, counts = control_points(GRID, 0.5)
-    share = np.clip((origin_mm[2] + 0.5 * np.arange(counts[0]) + 1) / 2, 0, 1)[:, None, None]
     control_mm = np.zeros((1, *counts, 3))
-    control_mm[0, ..., 2] = amplitude_mm * share
+    control_mm[0, ..., 2] = amplitude_mm * np.clip((origin_mm[2] + 0.5 * np.arange(counts[0]) + 1) / 2, 0, 1)[:, None, None]
     times_s = np.linspace(0, 17, 171)
     truth = Deformation(control_mm, origin_mm, 0.5, times_s, np.cos(2 * np.pi * times_s / 2.3)[:, None])
-    cone, parallel = ConeGeometry(5.0, 7.0, SHAPE, (4 / 24, 4 / 24)), ParallelGeometry(SHAPE, (2.8 / 24, 2.8 / 24))
+    cone, parallel = ConeGeometry(5.0, 7.0, SHAPE, (4 / 24, 4 / 24)), acquisition.ParallelGeometry(SHAPE, 2.8 / 24)
     geometry, start_s = parallel if is_parallel else cone, 0.4 * np.arange(40)
     orbit, fine = CircularOrbit(geometry, ConstantSpeed(0.0, 2 * np.pi / 16)), GRID.finer(2)
     empty = Scan(np.zeros((40, *SHAPE), np.float32), geometry, orbit, Shutter(0.3), start_s, GRID)
@@ -107,20 +85,15 @@ def breathing_scan(rt, amplitude_mm: float, is_parallel: bool = False) -> Scan:
     return replace(empty, projections=frames, reference=reference, moving_truth=MovingTruth(at_s, states, truth))
 
 
-def run(
-    rt, scan: Scan, method: str = "moving", iterations: int = ITERATIONS, motion=None, options=None, **more
-) -> Reconstruction:
-    plan = plan_run(method, {"iterations": iterations, **(options or {})}, object_motion=motion)
-    return reconstruct(scan, plan, rt, **more)
+def run(rt, scan: Scan, method: str = "moving", iterations: int = ITERATIONS, motion=None, **more) -> Reconstruction:
+    return reconstruct(scan, plan_run(method, {"iterations": iterations}, object_motion=motion), rt, **more)
 
 
 def mean_psnr_db(result: Reconstruction, scan: Scan) -> float:
     """Over the true states, of which the volume shows those that its deformation says."""
     field, truth = result.deformation, scan.moving_truth
-    shown = [
-        result.volume if field is None else deformed(result.volume, GRID, field, field.weights_at(time_s)[0])
-        for time_s in truth.times_s
-    ]
+    weights = [None] * len(truth.times_s) if field is None else field.weights_at(truth.times_s)
+    shown = (result.volume if one is None else deformed(result.volume, GRID, field, one) for one in weights)
     return float(np.mean([compare(one, true)["psnr_db"] for one, true in zip(shown, truth.volumes, strict=True)]))
 
 
@@ -174,20 +147,18 @@ def test_an_object_at_rest_stays_at_rest(rt) -> None:
 
 
 def loaded(path, scan: Scan):
-    return signal_of(load_gating(str(path), scan), scan, f"gating {path}")
+    return signals.signal_of(signals.load_gating(str(path), scan), scan, f"gating {path}")
 
 
 def test_a_signal_of_a_file_is_followed_and_others_are_refused(scan, tmp_path) -> None:
-    times_s = np.linspace(-1, 22, 200)
-    path = tmp_path / "breath.csv"
+    times_s, path = np.linspace(-1, 22, 200), tmp_path / "breath.csv"
     path.write_text("time_s,height\n" + "\n".join(f"{t},{5 + np.cos(2 * np.pi * t / 2.3)}" for t in times_s))
     signal = loaded(path, scan)
     assert signal.period_s == pytest.approx(2.3, rel=0.03) and np.abs(signal.values).max() == pytest.approx(1)
     for text, found in {
-        "": "0 lines of numbers", "time_s,height\n": "0 lines", "0,1\n1,2\n2,3\n3,4\n": "4 times from 0 to 3 s",
-        "0\n1\n2\n40\n": "4 values without times",
-        "0,1\n1,1\n1,2\n40,1\n": "some are equal", "0,1\n1,1,7\n2,2\n40,1\n": "not two numbers", "0,1\n40,2\n": "2 lines",
-        "0,nan\n1,1\n2,2\n40,1\n": "1 lines with NaN", "a,b\nc,d\n": "'c'", "0,5\n1,5\n2,5\n40,5\n": "the same value 5",
+        "": "0 lines of numbers", "0,1\n1,2\n2,3\n3,4\n": "4 times from 0 to 3 s", "0\n1\n2\n40\n": "4 values without times",
+        "0,1\n1,1\n1,2\n40,1\n": "some are equal", "0,1\n1,1,7\n2,2\n40,1\n": "not two numbers", "a,b\nc,d\n": "'c'",
+        "0,nan\n1,1\n2,2\n40,1\n": "1 lines with NaN", "0,5\n1,5\n2,5\n40,5\n": "the same value 5",
     }.items():  # fmt: skip
         path.write_text(text)
         with pytest.raises(InputError, match=f"gating .*{found}"):
@@ -199,8 +170,7 @@ def test_a_signal_of_a_file_is_followed_and_others_are_refused(scan, tmp_path) -
 
 
 def test_a_signal_that_does_not_repeat_is_followed_without_a_period(scan, tmp_path) -> None:
-    times_s = np.linspace(-1, 22, 400)
-    path = tmp_path / "drying.csv"
+    times_s, path = np.linspace(-1, 22, 400), tmp_path / "drying.csv"
     path.write_text("\n".join(f"{t},{np.exp(-t / 5)}" for t in times_s), encoding="utf-8-sig")
     signal = loaded(path, scan)
     assert signal.period_s is None and len(signal.values) == 400
@@ -214,20 +184,18 @@ def test_a_signal_that_does_not_repeat_is_followed_without_a_period(scan, tmp_pa
 def test_long_and_uneven_signals() -> None:
     """A belt's 60,000 values, and pauses between them, in which the quadrature goes on."""
     long_s = np.arange(60_000) / 100
-    assert period_of(long_s, np.cos(2 * np.pi * long_s / 4)) == pytest.approx(4, rel=0.01)
+    assert signals.period_of(long_s, np.cos(2 * np.pi * long_s / 4)) == pytest.approx(4, rel=0.01)
     times_s = np.sort(np.random.default_rng(0).uniform(0, 40, 500))
     later = MotionSignal(times_s, np.cos(2 * np.pi * times_s / 4)).pair()[:, 1]
     assert np.corrcoef(later, np.sin(2 * np.pi * times_s / 4))[0, 1] > 0.97
 
 
 def test_the_search_sees_every_breath_of_a_long_scan(rt, scan) -> None:
-    many = replace(
-        scan, projections=np.zeros((700, *SHAPE), np.float32), frame_start_s=0.4 * np.arange(700), moving_truth=None
-    )
-    times_s = middle_times_s(many)
-    signals = [MotionSignal(times_s, np.cos(times_s), knot_s=knot_s) for knot_s in (0.4, 10.0)]
-    searches = [FieldSearch(rt, many, PerRow(), signal, 1, 0.01) for signal in signals]
-    assert [one.scan.frames for one in searches] == [699, 600]
+    start_s, frames = 0.4 * np.arange(700), np.zeros((700, *SHAPE), np.float32)
+    many = replace(scan, projections=frames, frame_start_s=start_s, moving_truth=None)
+    for knot_s, frames in ((0.4, 699), (10.0, 600)):
+        signal = MotionSignal(middle_times_s(many), np.cos(start_s), knot_s=knot_s)
+        assert FieldSearch(rt, many, PerRow(), signal, 1, 0.01).scan.frames == frames
 
 
 def test_phases_of_a_file_or_of_the_scan_are_followed(rt, scan, tmp_path) -> None:
@@ -236,7 +204,7 @@ def test_phases_of_a_file_or_of_the_scan_are_followed(rt, scan, tmp_path) -> Non
     stated = replace(scan, gating=Gating(middle_times_s(scan), phase, is_phase=True))
     path = tmp_path / "phase.csv"
     path.write_text("phase\n" + "\n".join(str(float(one)) for one in phase))
-    for signal in (loaded(path, scan), signal_of(stated.gating, stated, "gating scan")):
+    for signal in (loaded(path, scan), signals.signal_of(stated.gating, stated, "gating scan")):
         assert signal.period_s == pytest.approx(2.3)
         field = initial_field(scan, signal, 16.0, 0.0)
         weights = field.deformation().weights_at(signal.times_s)
@@ -246,16 +214,15 @@ def test_phases_of_a_file_or_of_the_scan_are_followed(rt, scan, tmp_path) -> Non
     with pytest.raises(InputError, match=r"phase\.csv: found the same value 0\.5 throughout"):
         loaded(path, scan)
     with pytest.raises(InputError, match="gating: found scan, and no gating"):
-        run(rt, scan, options={"gating": "scan"})
+        reconstruct(scan, plan_run("moving", {"gating": "scan"}), rt)
 
 
 def test_splines_sum_to_one_and_bending_is_none_of_a_rigid_motion() -> None:
-    splines = TemporalSplines.of_step(1.0, 8.0, 0.9)
-    times_s = np.linspace(1, 8, 50)
+    splines, times_s = TemporalSplines.of_step(1.0, 8.0, 0.9), np.linspace(1, 8, 50)
     np.testing.assert_allclose(splines.at(times_s).sum(1), 1)
     curve = np.stack([times_s, np.cos(times_s)], -1)
     np.testing.assert_allclose(splines.at(times_s) @ splines.fit(times_s, curve), curve, atol=0.02)
-    bend, rigid = Bending((5, 4, 6)), np.ones((2, 5, 4, 6, 3))
+    bend, rigid = signals.Bending((5, 4, 6)), np.ones((2, 5, 4, 6, 3))
     np.testing.assert_allclose(bend(rigid), 0, atol=1e-12)
     x, y = np.random.default_rng(0).normal(size=(2, 2, 5, 4, 6, 3))
     assert np.vdot(bend(x), y) == pytest.approx(np.vdot(x, bend(y))) and np.vdot(bend(x), x) > 0
@@ -265,8 +232,7 @@ def test_the_search_has_blocks_of_pixels_and_large_voxels_in_the_same_box() -> N
     geometry, start_s = ConeGeometry(5.0, 7.0, (128, 100), (0.03, 0.03)), np.arange(3.0)
     frames = np.random.default_rng(0).uniform(size=(3, 128, 100)).astype(np.float32)
     orbit, grid = CircularOrbit(geometry, ConstantSpeed(0.0, 0.1)), Grid((64, 48, 48), (0.04,) * 3, (0.1, 0.0, 0.0))
-    whole = Scan(frames, geometry, orbit, Shutter(0.4, 0.5), start_s, grid)
-    small = coarse_scan(whole)
+    small = coarse_scan(Scan(frames, geometry, orbit, Shutter(0.4, 0.5), start_s, grid))
     assert small.projections.shape == (3, 64, 50) and small.grid.shape == (32, 24, 24)
     np.testing.assert_allclose(small.grid.size_mm, grid.size_mm)
     assert small.grid.offset_mm == grid.offset_mm
@@ -274,16 +240,3 @@ def test_the_search_has_blocks_of_pixels_and_large_voxels_in_the_same_box() -> N
     line_s = 0.5 / 127
     np.testing.assert_allclose(small.frame_start_s, start_s + line_s / 2)
     assert small.shutter.readout_s == pytest.approx(0.5 - line_s)
-
-
-def test_closer_control_points_carry_the_same_field(scan) -> None:
-    splines = TemporalSplines.of_step(0.0, 16.0, 1.0)
-    weights = np.random.default_rng(1).normal(size=(splines.count, 2))
-    coarse = MotionField.at_rest(scan, 1.0, splines, weights)
-    coarse = replace(coarse, control_mm=np.random.default_rng(2).normal(scale=0.1, size=coarse.control_mm.shape))
-    fine = coarse.refined(scan, 0.5)
-    assert fine.control_mm.size > 2 * coarse.control_mm.size
-    before, after = (one.deformation().on_grid_mm(GRID, (1.0, -0.5)) for one in (coarse, fine))
-    np.testing.assert_allclose(after, before, atol=0.02 * np.abs(before).max())
-    scaled = replace(coarse, temporal=3 * coarse.temporal, control_mm=coarse.control_mm / 3).scaled()
-    np.testing.assert_allclose(scaled.control_mm, coarse.scaled().control_mm)
