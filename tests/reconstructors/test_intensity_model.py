@@ -17,7 +17,7 @@ from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 pytestmark = pytest.mark.slow
 
 ITERATIONS = {
-    "sart": 6, "os-sart": 8, "sirt": 25, "cgls": 8, "asd-pocs": 6, "fista": 12, "fista-tv": 25,
+    "sart": 6, "os-sart": 8, "sirt": 25, "cgls": 8, "asd-pocs": 6, "fista": 8, "fista-tv": 25,
     "phyradgs exact": 500,
 }  # fmt: skip
 VOXELS = [method for method in ITERATIONS if "phyradgs" not in method]

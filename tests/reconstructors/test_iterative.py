@@ -165,7 +165,7 @@ def test_fista_reaches_the_minimum_of_its_objective(rt) -> None:
 
     # plain proximal gradients in float64, with the exact norm and long inner solutions
     curvature, x = np.linalg.norm(matrix, 2) ** 2, np.zeros(VOLUME)
-    for _ in range(500):
+    for _ in range(250):
         gradient = (matrix.T @ (matrix @ x.ravel() - system.measured.ravel())).reshape(VOLUME)
         x = tv_prox(x - gradient / curvature, weight / curvature, 30, nonnegative=True)
     assert total_variation(x) > 0
