@@ -1,11 +1,15 @@
-"""The loop around stepwise methods: what it records and reports where a step is of several iterations."""
+"""The loop around stepwise methods: what it records and reports, why it ends, what it goes on from."""
 
 import time
+from collections.abc import Callable
 
 import numpy as np
+import pytest
 
+from phyradgs_cl.errors import NumericalError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.parallel import Communicator
+from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.reconstructors.loop import Loop
 
 
@@ -28,15 +32,49 @@ class Halving:
     def measures(self) -> dict[str, float]:
         return {"loss": self.loss}
 
+    def state(self) -> dict[str, np.ndarray]:
+        return {"iteration": np.array(self.iteration), "loss": np.array(self.loss)}
+
+    def restore(self, state) -> None:
+        self.iteration, self.loss = int(state["iteration"]), float(state["loss"])
+
     def present_volume(self) -> tuple[np.ndarray, Grid]:
         return np.full((1, 1, 1), self.loss, np.float32), Grid.cube(1, 1.0)
 
 
+def loop_of(report: Callable[[Progress], None], every: int = 1, record_every: int = 1) -> Loop:
+    return Loop(Halving(), Communicator(), report, time.perf_counter(), record_every, every)
+
+
+def iterations_of(loop: Loop) -> list[float]:
+    return [line["iteration"] for line in loop.record]
+
+
 def test_lines_and_reports_come_when_their_number_is_reached() -> None:
     seen: list[tuple[int, float]] = []
-    report = lambda p: seen.append((p.iteration, float(p.volume()[0].max())))  # noqa: E731
-    loop = Loop(Halving(), Communicator(), report, time.perf_counter(), 1, 5)
+    loop = loop_of(lambda p: seen.append((p.iteration, float(p.volume()[0].max()))), every=5)
     loop.run(None)
-    assert [line["iteration"] for line in loop.record] == [3, 6, 9]
+    assert iterations_of(loop) == [3, 6, 9]
     assert seen == [(6, 2.0**-6)]
     assert (loop.stopped_by, loop.interrupted_at, loop.state_if_interrupted()) == ("small enough", None, None)
+
+
+def test_a_report_stops_the_run_which_goes_on_from_there() -> None:
+    def stop(progress: Progress) -> None:
+        raise KeyboardInterrupt
+
+    stopped = loop_of(stop)
+    stopped.run(None)
+    assert (stopped.stopped_by, stopped.interrupted_at) == ("interrupt", 3)
+    resumed, whole = loop_of(lambda progress: None), loop_of(lambda progress: None)
+    resumed.run(stopped.state_if_interrupted())
+    whole.run(None)
+    assert [line["loss"] for line in resumed.record] == [line["loss"] for line in whole.record]
+    assert resumed.seconds > resumed.record[-1]["seconds"] >= stopped.record[-1]["seconds"]
+
+
+def test_a_loss_that_is_no_number_is_named() -> None:
+    loop = loop_of(lambda progress: None)
+    loop.method.loss = np.nan
+    with pytest.raises(NumericalError, match="loss: found nan at iteration 3; .*lower the rate"):
+        loop.run(None)
