@@ -312,7 +312,7 @@ __kernel void backproject_lines(
         const int of_b = line_seeing(table, lines, of_a, b.x, b.y, b.z, &t, &speed, &depth1, &next1);
         const int is_in_front = depth0 > 0.0f && next0 > 0.0f && depth1 > 0.0f && next1 > 0.0f;
         const int from = is_in_front ? min(of_a, of_b) : 0, to = is_in_front ? max(of_a, of_b) : last;
-        vi waits = V_IOTA < (float)count; /* lanes that have not yet found their line */
+        vi waits = V_IOTA < (float)count; /* lanes still without their line */
         for (int line = from; line <= to && V_ANY(waits); ++line) {
             __global const float *m = table + (size_t)line * 12, *n = m + step, *pixels = image + (size_t)line * image_pitch;
             const vf depth = PROJECTED(m, 2), next_depth = PROJECTED(n, 2);

@@ -1,6 +1,6 @@
 /* Soft thresholding of the DCTs of all 4³ blocks of a volume, averaged over blocks (Coifman and Donoho 1995).
    A coefficient c is reduced by clamp(c, ±threshold); a block's mean stays. `excess` sums by how much the blocks reduce each
-   voxel. A call takes one in TURNS blocks, so the result is v − TURNS excess / (number of blocks that cover the voxel).
+   voxel. A call takes every TURNS-th block, so the result is v − TURNS excess / (number of blocks that cover the voxel).
    Volumes are a guard, then (z, y, pitch).
    A work-item has LANES blocks in registers, one voxel apart along x. The blocks of a launch do not overlap in y and z, nor
    in x if LANES is 1, so no two work-items add to the same voxel. Twin: objective/dct_prox.py. */

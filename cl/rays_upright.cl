@@ -60,8 +60,8 @@ RAY_INLINE planes_t planes_of(__global const float *cell, const int along_x, con
     return r;
 }
 
-/* The planes of planes_of as plane i needs them: in a parallel beam with a source of its own (common/ray.h), in a cone beam
-   unchanged. */
+/* Returns the planes of planes_of for plane i. In a parallel beam every plane has another source (common/ray.h); in a cone
+   beam nothing changes. */
 RAY_INLINE planes_t planes_from(planes_t r, const int i)
 {
 #if RAY_PARALLEL

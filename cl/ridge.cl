@@ -18,7 +18,7 @@
 #define SECOND_BACK (SECOND + TAPS * CHANNELS * FILTERS)
 #define CURVES (SECOND_BACK + TAPS * CHANNELS * FILTERS)
 
-#define AT_ONCE (LANES == 16 || LANES == 1 ? FILTERS : FILTERS / 2) /* sums that fit in registers beside weights */
+#define AT_ONCE (LANES == 16 || LANES == 1 ? FILTERS : FILTERS / 2) /* filters whose sums fit in the registers */
 
 #if BLOCK_PIXEL
 #define FOR_X(x, width) const int x = (int)get_global_id(0); if (x < width)
