@@ -38,7 +38,7 @@ __kernel void push_displacement(
     __global const float *pull, /* (3: x y z, wide): w in voxels on a wider grid; zeros follow, which vectors may read */
     const int4 wide, const int4 margin, /* sides x y z of the wider grid; where the grid begins in it */
     const int4 shape, const int most_steps,
-    __global float *push)       /* (3: x y z, shape): u in voxels */
+    __global float *push)       /* (3: x y z, shape): the displacement in voxels */
 {
     const int first = (int)get_global_id(0) * LANES, y = get_global_id(1), z = get_global_id(2);
     if (first >= shape.x)

@@ -63,7 +63,7 @@ ALWAYS_INLINE void add_line(const footprint_line line, const float limit, __glob
     const int cell_count, const int lines, const int width, const int pitch,                                            \
     const int tile_w, const int tile_h, const int tiles_u, const float cutoff2,                                         \
     const int layer_count,            /* LAYERED: number of images, each a guard and (lines, pitch) */                  \
-    __global float *image             /* guard, then (lines, pitch) */
+    __global float *image             /* IMAGE_GUARD floats, then the image (lines, pitch) */
 
 #if BLOCK_PIXEL
 #define STAGED 32 /* number of records that a work-group reads into local memory at a time */

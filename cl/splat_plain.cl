@@ -15,8 +15,8 @@ static inline float unit_of(const int row, const float per_mm, const float per_d
 __kernel void rows_enter(
     __global const float *plain,  /* (11, count): a column is a Gaussian */
     const int count, const int stride,
-    const float per_mm,           /* internal units of length in a mm */
-    const float per_density,      /* internal units of density in 1/mm */
+    const float per_mm,           /* 1 mm in internal units of length */
+    const float per_density,      /* 1/mm in internal units of density */
     __global float *rows,         /* (11, stride): as in common/gaussian.h */
     __global float *norms)        /* (stride): lengths of the quaternions */
 {

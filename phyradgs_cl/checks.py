@@ -166,4 +166,4 @@ def is_number(value: object) -> bool:
     """Returns whether ``value`` is a finite number. A bool is not."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return False
-    return isinstance(value, int) or math.isfinite(value)  # isfinite fails on whole numbers beyond floats
+    return isinstance(value, int) or math.isfinite(value)  # isfinite raises for an int too large for a float

@@ -58,7 +58,7 @@ def launched(environment: Mapping[str, str] = os.environ) -> Launch:
 
 
 def _count(text: str | None) -> int | None:
-    """Returns the number at the start of ``text``, or None. SLURM writes 4(x2) for four on each of two machines."""
+    """Returns the number at the start of ``text``, or None. SLURM writes 4(x2) for two machines with four processes each."""
     number = (text or "").split("(")[0].split(",")[0]
     return int(number) if number.isdigit() else None
 

@@ -43,7 +43,7 @@ class Ticker:
         self.end_line()
 
     def end_line(self) -> None:
-        """Ends the open line. A line with a count stays; a line that names a stage is cleared."""
+        """Ends the line that is being rewritten, if any. A line with a count stays; a line that names a stage is cleared."""
         if self.is_open:
             _write("" if self.is_counting else self._over(""), ends_line=self.is_counting)
         self.is_open = False

@@ -12,6 +12,7 @@ from typing import Any
 
 # Control characters may move a terminal's cursor. Lone surrogates, which stand for bytes not in UTF-8, cannot be written.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+_UNIT = re.compile("(.+?)_(per_mm|mm|s|ms|rad|deg|px|db)")  # a name that ends in a unit
 _MANY = 8  # longer lists are told by their ends
 
 
@@ -75,15 +76,22 @@ def value_text(value: Any, digits: int = 6) -> str:
         case float():
             return f"{value:.{digits}g}"
         case Mapping():
-            told = {str(name).replace("_", " "): own for name, own in value.items() if own is not None}
-            forms = ((name, "({})" if isinstance(own, Mapping) else "{}", own) for name, own in told.items())
-            return ", ".join(f"{name} {form.format(value_text(own, digits))}" for name, form, own in forms)
+            told = {str(name): own for name, own in value.items() if own is not None}
+            return ", ".join(_fact_text(name, own, digits) for name, own in told.items())
         case [Mapping(), *_]:
             return "; ".join(value_text(one, digits) for one in value)
         case list() | tuple():
             texts = [value_text(one, digits) for one in value]
             return f"({', '.join(texts)})" if len(texts) <= _MANY else f"{len(texts)} values from {texts[0]} to {texts[-1]}"
     return str(value)
+
+
+def _fact_text(name: str, value: Any, digits: int) -> str:
+    """Returns a name and its value. A unit that ends the name follows the value: ``rim_mm`` of 2 is "rim 2 mm"."""
+    of_unit = None if isinstance(value, Mapping | str | bool) else _UNIT.fullmatch(name)
+    words, unit = of_unit.groups() if of_unit else (name, "")
+    text = f"({value_text(value, digits)})" if isinstance(value, Mapping) else value_text(value, digits)
+    return f"{words.replace('_', ' ')} {text} {unit.replace('per_', '1/').replace('db', 'dB')}".rstrip()
 
 
 def to_digits_of(value: float, deviation: float) -> str:

@@ -1,6 +1,6 @@
-/* Sums over the items of a work-group, in pairs and a fixed order, so that results repeat bit for bit. All items must call
-   it. `own`: the item's part of each of `fields` sums. `tree`: local memory (fields, items). `sums`: receives `fields`
-   results. */
+/* Adds `fields` values over the items of a work-group, pair by pair in a fixed order, so that results repeat bit for bit.
+   All items must call it. `own`: the item's `fields` values. `tree`: local memory (fields, items). `sums`: receives the
+   `fields` sums. */
 #include "common/lanes.h"
 
 #define GROUP_ITEM ((int)(get_local_id(1) * get_local_size(0) + get_local_id(0)))

@@ -101,8 +101,8 @@ static inline float v_sum(vf v)
 #endif
 #endif
 
-/* V_LOOKUP(low, high, i) picks, in each lane, element i of the 2 LANES elements of two vectors. It is defined only if the
-   processor has an instruction for it, which is much faster than GATHER. */
+/* V_LOOKUP(low, high, i) returns, in each lane, element i of the 2 × LANES elements of `low` followed by `high`. It is
+   defined only if the processor has an instruction for it, which is much faster than GATHER. */
 #ifdef __has_builtin
 #if LANES == 16 && defined(__AVX512F__) && __has_builtin(__builtin_ia32_vpermi2varps512)
 typedef float v_table __attribute__((vector_size(64)));

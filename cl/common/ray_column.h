@@ -53,7 +53,7 @@ RAY_INLINE int is_along_x(__global const float *cell, const int u, const int v)
 #endif
 }
 
-/* The length of each ray from one plane to the next, in mm. */
+/* The length of each ray from one plane of voxels to the next, in mm. */
 RAY_INLINE vf column_steps_mm(__global const float *cell, column_rays_t d, const float4 pitch_mm)
 {
 #if RAY_PARALLEL

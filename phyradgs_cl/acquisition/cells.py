@@ -130,7 +130,7 @@ def _served_lines(served: np.ndarray) -> Served:
 
 
 def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np.ndarray:
-    """Returns the middles (K,) in s of a frame's cells, whose edges (K + 1,) are in s after the frame's start."""
+    """Returns the middles (K,) of a frame's cells in s on the scan's clock. Their edges (K + 1,) count from its start."""
     step_s = edges_s[1] - edges_s[0]
     start_s, origin_s = float(frame_start_s[frame]), float(frame_start_s[0])
     cells = (start_s - origin_s) / step_s

@@ -36,7 +36,7 @@ _GAUGE_FACTOR = 2.0
 _MOST_GAUGE = 0.2
 DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
 _MOST_PX = 2.0  # a step moves the image by at most this many coarse pixels at its edge: beyond, its effect is not linear
-_SETTLED = 0.1  # the steps on a grid end when all are smaller than this many standard deviations
+_SETTLED = 0.1  # the steps on a grid end when every parameter's step is below this many of its standard deviations
 
 
 @dataclass(frozen=True, eq=False)

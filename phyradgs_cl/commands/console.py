@@ -168,7 +168,7 @@ class GroupedCommand(TyperCommand):
 
 
 def takes_part(arguments: Sequence[str]) -> bool:
-    """Returns whether this process takes part in the command. Turns off the output of all ranks but 0."""
+    """Returns whether this process takes part in the command. On ranks other than 0, turns off the output."""
     if launched().rank == 0:
         return True
     sys.stdout = sys.stderr = None  # None as in programs without a console: libraries check for it

@@ -25,7 +25,7 @@ _SAME = 1e-3  # flats and the largest count that differ by less than this fracti
 _MOST_FRAMES = 8  # noise outside saturated pixels is sought in at most this many frames
 _LONGEST_EDGE = 1024  # of larger frames only the middle, this many pixels a side, is searched for noise
 _ROUNDING = 0.5  # rounding of counts alone causes an estimate up to this, in counts
-_RELATIVE = 2e-5  # an estimate up to this fraction of the largest count does not prove noise
+_RELATIVE = 2e-5  # an estimated noise up to this fraction of the largest count is too small to show that there is noise
 # Noise estimated along both axes is white if it is at least this fraction of noise estimated along rows; else structure.
 _WHITE = 0.5
 _ROOT_OF_NORMAL = 0.8222  # mean of √|x| over the root of the standard deviation of a normal x with mean 0

@@ -232,8 +232,8 @@ def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
 def parallel(
     options: ImportOptions, panel: tuple[int, int], pitch_mm: Pitch, offset_mm: tuple[float, float]
 ) -> ParallelGeometry:
-    """Returns a parallel beam. Options replace the file's values, which are the other arguments. Raises InputError for an
-    option that is a distance."""
+    """Returns the geometry of a parallel beam. Options replace the file's values, which are the other arguments. Raises
+    InputError if an option gives a distance of the source."""
     for name in options.given(_DISTANCES):
         expected, remedy = "no distance: this file has a parallel beam", "leave it out"
         raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)

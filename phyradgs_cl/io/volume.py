@@ -331,7 +331,8 @@ def shares_of_maximum(values: np.ndarray) -> np.ndarray:
 
 
 def finite_float32(subject: str, values: np.ndarray) -> np.ndarray:
-    """Returns ``values`` as contiguous float32. Raises InputError about ``subject`` for NaN and values beyond float32."""
+    """Returns ``values`` as contiguous float32. Raises InputError about ``subject`` for NaN, infinity and too
+    large values."""
     with np.errstate(over="ignore"):  # values beyond float32 become infinite
         volume = np.ascontiguousarray(values, np.float32)
     bad = int(volume.size - np.count_nonzero(np.isfinite(volume)))

@@ -120,8 +120,8 @@ class LineAttentionBlocks(nn.Module):
 class AttenuationNetwork(nn.Module):
     """Maps features (P, inputs) to attenuation (P,) in the unit of ``options.density_bound``.
 
-    middle: the modules between the first and the last layer. skip: the index of the layer that gets the features again.
-    Leaky ReLU follows every layer but the last, which ``options.last_activation`` follows."""
+    middle: the modules between the first and the last layer. skip: the index of the layer whose input also
+    has the features. Each layer is followed by a leaky ReLU, the last one by ``options.last_activation``."""
 
     def __init__(self, inputs: int, middle: list[nn.Module], skip: int, options: NeuralOptions) -> None:
         super().__init__()

@@ -145,7 +145,7 @@ def _axis_weights(shape: tuple[int, ...]) -> list[float]:
 
 
 def mean_density(rows: np.ndarray, weight: float) -> tuple[float, np.ndarray]:
-    """Returns ``weight`` times the mean density of parameter rows (11, G), and its gradient by the rows, (11, G): the
+    """Returns ``weight`` times the mean density of parameter rows (11, G), and its gradient (11, G) for these rows: the
     float64 twin of the term in ``chain_activations``."""
     gradient = np.zeros_like(rows)
     if (count := rows.shape[1]) == 0:

@@ -118,8 +118,8 @@ _Launch = Callable[[Arguments, Brick, DeviceArray], None]
 
 
 def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch) -> Array:
-    """Returns a volume (nz, ny, nx), which ``launch`` fills for some views and one brick at a time. The whole volume is one
-    brick if it fits; else bricks' sides along z are multiples of ``step``. Raises OutOfMemoryError if no brick fits."""
+    """Returns a volume (nz, ny, nx). ``launch`` adds some views to one brick at a time. The whole volume is one brick if it
+    fits; else bricks' sides along z are multiples of ``step``. Raises OutOfMemoryError if no brick fits."""
     is_resident = isinstance(views.frames, DeviceArray)
     volume: Array = rt.empty(grid.shape) if is_resident else np.empty(grid.shape, np.float32)
 

@@ -148,10 +148,10 @@ class Reconstruction:
 
     @naming_arguments()
     def plot(self, scan: "Scan | None" = None, *, frame: int = 0, device: "str | Runtime | None" = None) -> "Figure":
-        """Returns a figure: the three middle slices in 1/mm with a bar in mm, and the convergence if there is a record.
+        """Returns a figure: the three middle slices in 1/mm with a scale bar in mm, and the convergence if it is recorded.
 
         scan: the scan of the result. It adds a frame, the frame's residual and, if the scan has a reference (nz, ny, nx) in
-        1/mm, the truth and the difference. device: what projects the volume for the residual.
+        1/mm, the truth and the difference. device: where the volume is projected for the residual.
 
         Raises InputError if ``scan`` is no Scan or has no such frame."""
         from phyradgs_cl.reconstructors.plot import plot_result

@@ -19,7 +19,8 @@ _HELP = (
 
 
 def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
-    """Returns three pictures with sliders, controls for layer, grey values and zoom, and the script's data."""
+    """Returns three slices, each with a slider for its plane, controls for what is shown (result, truth, ...), grey values
+    and zoom, and the data of the page's script."""
     sliders = [
         slider("black", "Black", 0, 255, 0, ""),
         slider("white", "White", 0, 255, 255, ""),

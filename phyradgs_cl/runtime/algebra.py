@@ -29,7 +29,7 @@ class Space(Protocol, Generic[A]):
         """Returns NumPy values as an array of this space. Both may share memory."""
 
     def numpy(self, x: A) -> np.ndarray:
-        """Returns the values as a NumPy array. Both may share memory."""
+        """Returns the values of ``x`` as a NumPy array, which may share memory with ``x``."""
 
     def full(self, shape: Shape, value: float) -> A: ...
 

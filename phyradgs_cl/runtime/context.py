@@ -293,7 +293,7 @@ class Runtime:
 
     def tile(self, kernel: Kernel | None = None) -> tuple[int, int]:
         """Returns the (width, lines) of the tile of pixels that a GPU's work-group takes. The width is the number of
-        work-items that run in lockstep; ``kernel``, or the device, limits the lines."""
+        work-items that run in lockstep, within 16 and 64. The device, and ``kernel`` if given, limit the lines."""
         rates = self.kernel("rates", "multiply_add")
         if self._multiple is None:
             self._multiple = min(max(self._asked(rates, "PREFERRED_WORK_GROUP_SIZE_MULTIPLE"), 16), 64)

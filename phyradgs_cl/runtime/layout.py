@@ -55,8 +55,8 @@ def move(
 
 
 def beside(rt: Runtime, volume: Array, out: DeviceArray | None) -> tuple[DeviceArray, DeviceArray]:
-    """Returns a volume on the device, where a NumPy array is uploaded, and memory for a result of its shape: ``out``, or new
-    memory if that is None."""
+    """Returns a volume on the device (a NumPy array is uploaded), and memory for a result of its shape: ``out``, or new
+    memory if ``out`` is None."""
     there = volume if isinstance(volume, DeviceArray) else rt.upload(volume, np.float32)
     return there, rt.empty(volume.shape) if out is None else out
 

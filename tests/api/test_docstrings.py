@@ -10,7 +10,7 @@ import pytest
 from phyradgs_cl import api
 
 SHAPE = re.compile(r"\((?:[A-Z]\w*|\.\.\.|n?[zvyxu]|n|rows|lines|\d+)(?:,|\))")
-UNIT = re.compile(r"\b(mm|s|rad(ians)?|deg(rees)?|dB|dimensionless|line integrals?|counts)\b|_(mm|s|rad|deg)\b")
+UNIT = re.compile(r"(?<!')\b(mm|s|rad(ians)?|deg(rees)?|dB|dimensionless|line integrals?|counts)\b|_(mm|s|rad|deg)\b")
 ERROR = re.compile(r"\b[A-Z]\w*Error\b|\bKeyboardInterrupt\b")
 ARRAYS = ("ndarray", "NDArray", "ArrayLike", "Gaussians", "Scan")
 

@@ -51,7 +51,7 @@ def test_info_tells_tables_in_words_and_long_ones_in_few_lines(cli, tmp_path, ca
     told = capsys.readouterr().out
     lines = told.splitlines()
     for key, text in {
-        "doubt": "runs 3, mean per mm 0.0123457", "times": "500 values from 0 to 49.9", "scan": facts["scan"],
+        "doubt": "runs 3, mean 0.0123457 1/mm", "times": "500 values from 0 to 49.9", "scan": facts["scan"],
     }.items():
         assert f"{key:24s} {text}" in lines
     (first,) = [line for line in lines if line.startswith("prepared")]

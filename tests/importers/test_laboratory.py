@@ -73,7 +73,7 @@ def test_nikon_s_axis_is_offset_and_leans(tmp_path, make_truth, caplog) -> None:
 
 def test_nikon_s_frames_may_lie_in_a_folder_of_their_own(tmp_path, make_truth) -> None:
     """A folder on the scanner's own disk is not looked for."""
-    for name in ("frames", r"C:\scans\mine"):
+    for name in ("frames", "/scans/mine", r"\\server\scans", r"C:\scans\mine"):
         path = lab.write_nikon(tmp_path / str(len(name)), make_truth(geometry=CENTRED), InputFolderName=name)
         if name == "frames":
             (path / "frames").mkdir()

@@ -14,7 +14,7 @@ from phyradgs_cl.acquisition import Exact  # noqa: E402
 from phyradgs_cl.api import load_scan, reconstruct  # noqa: E402
 from phyradgs_cl.parallel import launched_ranks  # noqa: E402
 from phyradgs_cl.reconstructors import RunPlan
-from phyradgs_cl.reconstructors import reconstruct as run_method  # noqa: E402, RunPlan
+from phyradgs_cl.reconstructors import reconstruct as run_method  # noqa: E402
 from phyradgs_cl.runtime import Runtime  # noqa: E402
 
 SPLATS = {"micro-views": OPTIONS, "exact": replace(OPTIONS, motion=Exact())}

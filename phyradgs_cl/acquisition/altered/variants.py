@@ -24,10 +24,10 @@ _STEPS = _ROW_STEP, _COLUMN_STEP  # the step along axis 0 (v), then along axis 1
 class AlteredTrajectory:
     """Poses of ``base`` for a ``panel`` (rows, columns), altered by the following fields in their order.
 
-    - is_reversed: the gantry turns the other way. Poses are mirrored at y = 0, then the order of columns is reversed, so
-      that frames are not mirrored. The panel's offset ``offset_u_mm`` keeps its sign.
+    - is_reversed: the gantry turns the other way. Poses are mirrored in the plane y = 0. That alone would mirror the
+      frames, so the order of columns is reversed too. The panel's offset ``offset_u_mm`` keeps its sign.
     - shift_px: a shift of the panel along u, in columns.
-    - images: a function that changes poses (..., 12), for example to suit mirrored frames. None changes nothing.
+    - images: a function that changes poses (..., 12), for example as mirrored frames need it. None changes nothing.
     - blocks: the (rows, columns) of pixels that are averaged to one.
     - frames (F,): the numbers of the frames of ``base`` that are used. None takes all."""
 

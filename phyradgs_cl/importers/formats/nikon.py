@@ -56,7 +56,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     count, *panel = (scan.count(name, _MOST_FRAMES) for name in sizes)
     prefix = scan.word("Name", default="") + scan.word("InputSeparator", default="_")
     place, inside = folder, scan.word("InputFolderName", default="")  # often a folder of the scanner's disk, absent here
-    if inside and folder.exists(inside.split("\\")[0].split("/")[0]):
+    if (first := inside.replace("\\", "/").split("/")[0]) and folder.exists(first):
         place = SafeFolder(folder.root / checked_name(inside, scan.name("InputFolderName")))
     frames, at, said = read_numbered(place, prefix, (count, *panel), [*map(scan.name, sizes)], options, first=1)
     measured = file_of_angles(folder, description.stem, ".ang", "_ctdata.txt")

@@ -113,8 +113,9 @@ def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredT
 
 
 def _white(scan: settings.Settings, frames: np.ndarray, options: ImportOptions) -> float:
-    """Returns the counts of air: the option's, else Reference Intensity, else the largest that Depth (bits) allows. Raises
-    InputError for frames (F, v, u) brighter than Reference Intensity, and for uncorrected frames without the option."""
+    """Returns the counts of air: the option ``flat_value``, else Reference Intensity, else the largest that Depth (bits)
+    allows. Without the option, raises InputError for frames (F, v, u) that are brighter than Reference Intensity, and
+    for frames without flat-field correction."""
     remedy = f"say {options.named('flat_value')}"
     if not options.flat_value and scan.word("Flat Field Correction", default="ON").upper() == "OFF":
         raise scan.error("Flat Field Correction", "OFF", "frames that the scanner has corrected", remedy)

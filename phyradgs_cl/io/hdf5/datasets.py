@@ -1,4 +1,4 @@
-"""Reads, checks and writes values in HDF5: numbers with units, words, whole numbers and voxel grids."""
+"""Reads, checks and writes values in HDF5: numbers with units, text, whole numbers and voxel grids."""
 
 import logging
 import math

@@ -147,7 +147,7 @@ class RayCells:
         served = [table.line_cells() + start for table, start in zip(tables, starts[:-1], strict=True)]
         if rows_across is not None:
             pose = np.concatenate([table.pose for table in tables])
-            # Vectors may begin at any column and reach beyond the columns of a cell, where its weight must be 0.
+            # A SIMD vector may begin at any column and reach beyond a cell's columns. There the cell's weight must be 0.
             weights = [np.pad(weight, _WIDEST) for weight in weights]
             served = [np.tile(ends, (rows_across, 1)) for ends in zip(starts[:-1], starts[1:], strict=True)]
         weight_at = np.concatenate([[0], np.cumsum([len(weight) for weight in weights])])

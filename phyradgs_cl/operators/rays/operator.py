@@ -52,8 +52,9 @@ class RayOperator:
     NumPy arrays give NumPy arrays; device arrays (not padded, float32) give device arrays. ``out``, of the same kind,
     receives the result. detector_shape: (rows, columns). tables: the time cells of each frame, all read along one axis.
     memory: buffers to share with other operators. Operators that share them, and subsets of an operator, must be used one
-    at a time. fewest_lines: as in ``upright_of``; ``FEWEST_LINES`` is fastest for panels with few lines, and rounds
-    differently. subrays: the rays of a pixel along (v, u), see ``subrays_of``; a given ``memory`` has its own.
+    at a time. fewest_lines: the upright kernels are used if a pose serves as many lines on average (``upright_of``).
+    ``FEWEST_LINES`` is fastest for panels with few lines; its results differ by rounding. subrays: the numbers of rays of a
+    pixel along (v, u), see ``subrays_of``. A given ``memory`` determines them instead.
 
     Joseph, IEEE Trans. Med. Imaging 1 (1982) 192. Raises InputError for tables that do not fit the detector."""
 
@@ -71,7 +72,7 @@ class RayOperator:
         self._tables = list(tables)
         if subrays != SINGLE:
             tables = [table.finer(*subrays) for table in tables]
-        # The upright kernels are for CPUs. The general one is fast on GPUs, where neighbouring pixels read side by side.
+        # The upright kernels are for CPUs. GPUs are fast with the general one: neighbouring pixels read neighbouring memory.
         may_use_slots = not rt.pixel_items and (memory is None or memory.slot_floats > 0)
         self._upright = upright_of(grid, tables, rays_shape, rt.lanes, fewest_lines) if may_use_slots else None
         self._poses: UprightPoses | None = None

@@ -1,4 +1,5 @@
-"""Slots: buffers of the upright kernels, each with the line integrals of one pose on the lines that this pose serves.
+"""Slots: buffers of the upright kernels (``upright.py``). A slot has the line integrals from one pose, for the lines that
+the panel reads out or exposes while the pose holds.
 
 A frame is a weighted average of slots, with a weight for each of its lines. If exposures follow each other without gaps,
 neighbouring frames share poses. A shared pose is projected only once."""

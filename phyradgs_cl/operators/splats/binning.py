@@ -43,7 +43,7 @@ class TileLists:
 
     @property
     def samples(self) -> int:
-        """The largest work of a launch (``samples`` of ``Runtime.launch``): list entries × pixels or voxels of a tile."""
+        """The most work of a launch (``samples`` of ``Runtime.launch``): list entries times pixels (or voxels) in a tile."""
         return self.splat_ids.size * int(np.prod(self.tile[:3], dtype=np.int64))
 
     def build(self, extents: DeviceArray, count: int, stride: int, cells: int = 1) -> None:

@@ -28,7 +28,7 @@ _FILL_REACH = 0.5
 log = logging.getLogger(__name__)
 
 # Limits in pairs: beyond the first a warning is logged; beyond the second, _NO_…, InputError is raised.
-_CIRCLE = 0.05  # distance of source or panel from a circle about z, over their distance from each other
+_CIRCLE = 0.05  # distance of source or panel from a circle about z, divided by that from source to panel
 _NO_CIRCLE = 0.5
 _PLANE_DEG = 10.0  # elevation of the source above the plane z = 0, seen from the origin
 _NO_PLANE_DEG = 45.0

@@ -200,7 +200,8 @@ def _few_rows(scan: Scan, frame: int) -> np.ndarray:
 
 
 def _rough_shift(pairs: list[_Pair]) -> float:
-    """Returns the shift in pixels, in steps of 1/2, at which overlapping images differ least, relative to their energy."""
+    """Returns the shift in pixels, in steps of 1/2, at which two images differ least where they overlap: the squared
+    difference over the sum of their squares."""
     columns = pairs[0].view.shape[1]
     # a shift moves the view and the mirror image against each other, by twice its size
     lags = np.arange(1 - columns, columns)  # column of the mirror image minus column of the view

@@ -18,7 +18,7 @@ from phyradgs_cl.fields import Gating
 
 _NODES = 4  # weights are stored at this many times per interval between knots, and are linear between them
 _STRETCH = 0.02  # weight of first differences in the bending energy: without it, a field could grow linearly in air
-_HARMONICS = 6  # an object at rest changes the signal with these harmonics of the gantry's angle: they are removed
+_HARMONICS = 6  # the first harmonics of the gantry's angle, which are removed: an object at rest causes them too
 _FEWEST_CYCLES = 5  # a motion with fewer cycles in the scan is modelled freely in time
 _BAND = 0.25  # breaths differ in length: rates that differ from the dominant one by up to this fraction count as it
 # A signal repeats if at least this fraction of its power lies in the band, not counting what white noise has there.

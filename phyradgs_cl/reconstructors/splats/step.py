@@ -136,7 +136,7 @@ def tables_of(
 
 
 def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[float]]:
-    """Uploads masks, 1 at valid pixels: one for all frames, or one each. Returns them and their numbers of valid pixels."""
+    """Uploads one mask for all frames, or one per frame: 1 at valid pixels. Returns masks and numbers of valid pixels."""
     masks = np.zeros((1, *scan.geometry.detector_shape)) if scan.pixel_mask is None else scan.pixel_mask
     stack = [(m == 0).astype(np.float32) for m in (masks if masks.ndim == 3 else masks[None])]
     arrays = [rt.upload(pad_rows(scan.shutter.readout.frames(m))) for m in stack]

@@ -55,7 +55,7 @@ _COARSE_TIMES = 1 / 3  # a coarse pass has this fraction of the times per exposu
 _STEPS_PER_MAP = 3
 _FULL_PASSES = 5
 _MOST_OPTIMISED = 23  # most iterations by POGM: its momentum has no restart, and the noise of subsets grows with it
-_CALM = 3  # last iterations on one grid, which are FISTA's: they take out the noise of subsets that POGM leaves
+_CALM = 3  # last iterations of a run on one grid alone, which are FISTA's: they remove the noise of subsets
 _FAINTEST = 1e-6  # smaller row sums of AᵀA count as this fraction of the largest: dividing by less would inflate the bound
 # Voxels are divided if a slice (y, x) has at most this many of them: dividing is worth its time at 64³, not at 128³.
 # Slices are not counted, so that thick and thin slabs of one scan are reconstructed in the same manner.

@@ -141,8 +141,10 @@ class PriorInputs:
         return TvAndDct(self.tv(tv_share), DctProx(self.rt, self.grid.shape), dct_share)
 
     def dct_then_ridge(self) -> "Prior":
-        """Returns ``dct`` with ridge steps, or ``dct`` alone on grids smaller than a ridge step needs. For scans that stop,
-        ridge steps are stronger, the more so the lower the noise. Fly-scans of flat bodies would lose quality by that."""
+        """Returns ``dct`` with steps of the learned ridge regulariser, or ``dct`` alone on grids too small for them.
+
+        For stop-and-shoot scans the steps are stronger, the more so the lower the noise. In fly-scans, stronger steps would
+        cost slab-shaped objects quality."""
         if min(self.grid.shape) < RIDGE_EDGE:
             return self.tv_and_dct()
         ridge = RidgeStep(self.rt, self.grid.shape, learned_ridge())

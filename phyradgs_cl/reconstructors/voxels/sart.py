@@ -83,7 +83,7 @@ def _cached_columns(volume_shape: tuple[int, ...], subsets: int) -> int:
 
 
 def held_volumes(scan: Scan, options: SartOptions) -> int:
-    """Returns how many volumes a run holds at one time, with the column weights."""
+    """Returns how many volumes a run holds at one time; stored column weights count as volumes."""
     return 4 + _cached_columns(scan.grid.shape, checks.ceil_div(scan.frames, options.frames_per_subset))
 
 
