@@ -28,11 +28,12 @@ def sum_frames(
 ) -> Scan:
     """Makes a fly-scan without gaps, in which each frame sums the intensities of ``count`` successive projections.
 
-    scan: F projections (F, rows, columns), line integrals. Each stands for an interval about its middle,
-    as long as from frame to frame, in which the gantry turns evenly. count: the projections in an exposure. readout_ratio,
-    readout, readout_direction: how the new panel is read, as in ``fly_scan``. A line whose exposure begins within a projection takes a fraction of it. Frames
-    that would need further projections are left out. Photons, detector and object are the given scan's, so the result tests
-    a motion model on real data. For this the object must move by less than a pixel from projection to projection.
+    scan: F projections (F, rows, columns), line integrals. Each stands for an interval about its middle, as long as from
+    frame to frame, in which the gantry turns evenly. count: the projections in an exposure. readout_ratio, readout,
+    readout_direction: how the new panel is read, as in ``fly_scan``. A line whose exposure begins within a projection
+    takes a fraction of it. Frames that would need further projections are left out. Photons, detector and object are the
+    given scan's, so the result tests a motion model on real data. For this the object must move by less than a pixel
+    from projection to projection.
 
     Raises InputError for too few projections for one frame, a rolling shutter or lag in ``scan``, and uneven intervals."""
     if not isinstance(scan, Scan):
