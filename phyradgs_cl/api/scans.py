@@ -51,7 +51,7 @@ def fly_scan(
     last, and 0 is a global shutter. readout: which lines are read one after the other, "rows" or "columns".
     readout_direction: 1 reads index 0 (the lowest row, the left column) first, -1 last. exposure_s: how long a line is
     exposed, in s; None means 1.
-    flats, darks: (n, rows, columns) counts without an object, and without a beam (None means 0).
+    flats, darks: (n, rows, columns) or (rows, columns), counts without an object, and without a beam (None means 0).
     mask: (rows, columns) or (F, rows, columns), non-zero for pixels that must not be used.
     quantity: what ``frames`` are, "attenuation", "transmission" or "counts"; None takes counts if there are ``flats``.
     grid: None takes what a full turn sees, as high as the panel sees, in voxels of one pixel's size at the axis.
@@ -191,8 +191,11 @@ def _scan(
 
 
 def _stack(name: str, frames: "ArrayLike", panel: tuple[int, int]) -> np.ndarray:
-    """Checks frames (n, rows, columns) of real numbers. Raises InputError for other shapes and types, and for no frame."""
+    """Checks frames (n, rows, columns) of real numbers; one flat or dark alone may be (rows, columns). Raises InputError for
+    other shapes and types, and for no frame."""
     stack = checks.real_array(name, frames)
+    if stack.ndim == 2 and name != "frames":
+        stack = stack[None]
     checks.shape(name, stack, (None, *panel))
     if len(stack) == 0:
         raise InputError(name, "no frame", "at least one")

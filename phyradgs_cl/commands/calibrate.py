@@ -52,9 +52,9 @@ def calibrate_command(
     Corrects the parameters that differ from the stated ones by three deviations. Parameters that the frames do not
     determine stay as stated."""
     wish = device_wish(device)
-    picture = picture or (output and output.with_suffix(".png"))
     if output is not None:
         check_output(output, scan, other, phantom)
+        picture = picture or output.with_suffix(".png")
     if picture is not None:
         check_picture("--picture", picture, scan, other, phantom)
     with Ticker("pass") as ticker:

@@ -62,6 +62,8 @@ def import_command(
     form: Annotated[FormatName | None, option("Format of SRC.", "recognised", "--format")] = None,  # type: ignore[valid-type]
 ) -> None:
     if template:
+        if output is not None:
+            raise InputError("--output", f"{output} with --template, which prints", "one of both", "write > scan.toml")
         say(TEMPLATE)
         return
     if output is None:

@@ -228,8 +228,11 @@ def former_checkpoint_path(output: str | Path) -> Path:
 
 
 def partial_path(output: str | Path) -> Path:
-    """Returns where an interrupted run writes its result: NAME.partial.SUFFIX for ``output`` NAME.SUFFIX."""
+    """Returns where an interrupted run writes its result: NAME.partial.SUFFIX for ``output`` NAME.SUFFIX. Raises OutputError
+    for a path without a name, as "." and "/" are."""
     path = Path(output)
+    if not path.name:
+        raise OutputError(str(output), "a folder", "a file that can be written", "add the file's name")
     return beside(path.with_suffix(""), f".partial{path.suffix}")
 
 

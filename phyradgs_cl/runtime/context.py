@@ -80,7 +80,7 @@ class Runtime:
         """Declares the kernel ``name`` of ``cl/<program>.cl``. Its first launch builds it; equal declarations share it."""
         merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
         flags = [f"-D{name}={_literal(value)}" for name, value in sorted(merged.items())]
-        key = (program, name, ("-cl-std=CL1.2", _FUSING, *flags))
+        key = (program, name, ("-cl-std=CL1.2", "-w", _FUSING, *flags))
         return self._kernels.setdefault(key, Kernel(*key))
 
     def compile(self, kernel: Kernel) -> "cl.Kernel":

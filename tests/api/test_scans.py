@@ -115,6 +115,8 @@ def test_counts_are_divided_and_bad_pixels_masked(tmp_path) -> None:
     bad = scan.pixel_mask != 0
     assert sorted(zip(*np.nonzero(bad), strict=True)) == [(1, 2), (4, 5)]
     np.testing.assert_allclose(scan.projections[:, ~bad], wanted[:, ~bad], atol=1e-5)
+    single = static_scan(counts, cone, 90.0 * np.arange(4), flats=flats[0], darks=darks[0], mask=mask)
+    np.testing.assert_array_equal(single.projections, scan.projections)
     assert "stop-and-shoot" in repr(scan) and not scan.is_fly and scan.saturation is not None
     applied = {"flats_applied": 3, "darks_applied": 2}
     assert scan.provenance == {**applied, "taken": "flats: the median of 3; darks: the median of 2"}

@@ -76,10 +76,10 @@ def test_wrong_options(kept, scan, tmp_path, command) -> None:
 
 def test_outputs_that_cannot_be_written(refused, scan, tmp_path) -> None:
     simulate, fdk = ["simulate", *SMALL.split()], ["reconstruct", scan, "--method", "fdk"]
-    for output in (tmp_path / "nowhere" / "volume.h5", tmp_path):
-        for words in (fdk, simulate):
+    for output in (tmp_path / "nowhere" / "volume.h5", tmp_path, "/", "."):
+        for words in (fdk, simulate, ["calibrate", scan]):
             line = refused([*words, "-o", output], status=4)
-            assert str(output) in line or str(output.parent) in line
+            assert str(output) in line or str(Path(output).parent) in line
     for name in ("v.nii", "v.nii.gz", "V.MHA"):
         refused([*fdk, "-o", tmp_path / name], "another format", f"export volume.h5 -o {name}")
     for words in (simulate, ["reconstruct", "scan.h5"]):

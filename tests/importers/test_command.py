@@ -115,6 +115,7 @@ def test_a_template_that_is_filled_in_is_the_same_scan(run, tmp_path, make_truth
     (folder / "scan.toml").unlink()
     assert f"phyradgs import {folder} --template" in run(folder)[2]
     np.savetxt(folder / "angles.txt", np.rad2deg(truth.angle_rad))
+    assert "one of both; write > scan.toml" in run(folder, "--template")[2]
     status, text, error = run(folder, "--template", out=())
     assert (status, error) == (0, "") and not (tmp_path / "scan.h5").exists()
     stored = {"flats": '"flat_*.tif"', "darks": '"dark_*.tif"', "file": '"angles.txt"'}

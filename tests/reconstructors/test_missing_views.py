@@ -51,6 +51,16 @@ def test_a_panel_that_sees_both_sides_takes_missing_rays_from_opposite_views(rt,
     assert not caplog.records
 
 
+@pytest.mark.parametrize(("kind", "views"), [("fdk", 115), ("fbp", 90)])
+def test_half_a_turn_beside_a_displaced_panel_is_a_short_scan(rt, kind, views, caplog) -> None:
+    """The views at its ends stood for the other half, which cost up to 10 dB. All that the shorter side sees is right."""
+    whole = levels(rt, kind, EVERY_DEG, 52, 0.2)
+    np.testing.assert_allclose(levels(rt, kind, EVERY_DEG[:views], 52, 0.2), whole, atol=FDK_PARTIAL)
+    (record,) = caplog.records
+    within = {"fdk": "1.08", "fbp": "1.1"}[kind]
+    assert f"from {2 * views}.0° the volume is right within {within} mm of the axis" in record.message
+
+
 @pytest.mark.slow
 def test_gaps_that_nothing_covers_are_named(rt, caplog) -> None:
     """In degrees, in one line each."""

@@ -97,6 +97,11 @@ class Fan:
         return min(self.high_rad, -self.low_rad) / self.pixel_rad + 0.5
 
     @property
+    def short_rad(self) -> float:
+        """The fan angle of the shorter side, to the outer edge of its last pixel; in a parallel beam its distance in mm."""
+        return min(self.high_rad, -self.low_rad) + self.pixel_rad / 2
+
+    @property
     def half_rad(self) -> float:
         """The fan angle of the wider side; in a parallel beam its distance in mm from the axis."""
         return max(self.high_rad, -self.low_rad)
