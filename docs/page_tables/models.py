@@ -73,9 +73,9 @@ def times_per_exposure() -> str:
 
 @table("beside_rtk")
 def beside_rtk() -> str:
-    """Returns FDK, projector and adjoint compared with RTK's, on two processors."""
+    """Returns FDK, projector and adjoint compared with RTK's, on three processors."""
     text = []
-    for processor, suffix in (("AMD EPYC", ""), ("Intel Xeon", "_intel")):
+    for processor, suffix in (("EPYC, AVX-512", ""), ("Xeon, AVX-512", "_intel"), ("EPYC, AVX2", "_zen3")):
         fdk = facts_of(f"rtk_fdk{suffix}.json")["speed"]
         rays = facts_of(f"ray_speed{suffix}.json")["beside_rtk"]
         cells = [f"{fdk[key]:.3f}" for key in ("seconds", "rtk_seconds")]

@@ -116,11 +116,14 @@ def test_of_frames_that_are_mostly_noise_the_noise_alone_is_named(rt, clean) -> 
     assert suspected(found) == ["noise"] and verdicts(found)["consistency"] == CANNOT_TELL
 
 
-def test_the_wrong_sign_of_readout(rt, scan_of) -> None:
+def test_a_wrong_readout(rt, scan_of) -> None:
     """Columns that are read in the wrong order bend the object, which shows; in a wide cone."""
     scan = scan_of(ConeGeometry(3.0, 4.5, (48, 48), (0.125, 0.125)), "foot", 32, "columns", views=25)
-    other = replace(scan, shutter=replace(scan.shutter, direction=-1))
-    assert [check_readout(rt, coarse(one, FINE_COLUMNS)).verdict for one in (scan, other)] == [OK, SUSPICIOUS]
+    other, at_once = (replace(scan, shutter=replace(scan.shutter, **k)) for k in ({"direction": -1}, {"readout_s": 0.0}))
+    right, turned, shut = (check_readout(rt, coarse(one, FINE_COLUMNS)) for one in (scan, other, at_once))
+    assert (right.verdict, turned.verdict, shut.verdict) == (OK, SUSPICIOUS, CANNOT_TELL)
+    assert "set readout_direction to 1, or import with --first" in turned.advice
+    assert "by columns, index 0 first" in shut.text  # of four orders
 
 
 def test_the_command_and_its_status(cli, clean, tmp_path, capsys) -> None:
