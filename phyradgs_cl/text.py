@@ -125,17 +125,19 @@ def each_warning_once() -> Any:
 
 
 def without_warnings() -> AbstractContextManager[None]:
-    """Silences this package's warnings while the body of a ``with`` runs."""
+    """Silences this package's warnings while the body of a ``with`` runs. An outer ``each_warning_once`` does not count
+    them: they may come again."""
     return _filtered(lambda: lambda record: not _is_warning(record))
 
 
 @contextmanager
 def _filtered(make_filter: Callable[[], Callable[[logging.LogRecord], bool]]) -> Iterator[None]:
-    """Adds a filter to every handler of log records while the body runs. It drops the records for which it returns False."""
+    """Puts a filter before those of every handler of log records while the body runs. It drops the records for which it
+    returns False, before an outer ``each_warning_once`` sees them."""
     handlers = [*logging.getLogger(__package__).handlers, *logging.getLogger().handlers, logging.lastResort]
     filters = [(handler, make_filter()) for handler in handlers if handler is not None]
     for handler, one in filters:
-        handler.addFilter(one)
+        handler.filters.insert(0, one)
     try:
         yield
     finally:

@@ -8,6 +8,7 @@ import scipy
 from phyradgs_cl.acquisition import ParallelGeometry, Scan
 from phyradgs_cl.acquisition.geometry import field_of_view_mm
 from phyradgs_cl.check.finding import FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
+from phyradgs_cl.check.timing import is_full_turn
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.detector.noise_level import noise_rms
@@ -93,7 +94,8 @@ def _check_values(p: np.ndarray, valid: np.ndarray, largest: float, noise: float
 def _check_sides(scan: Scan, p: np.ndarray, valid: np.ndarray, largest: float, threshold: float) -> Finding:
     """Returns the finding about the object at the panel's sides, and about its width compared with the grid's."""
     sides = {"left": _border(p, valid, slice(0, 2)), "right": _border(p, valid, slice(-2, None))}
-    sides.pop(_short_side(scan), None)
+    if is_full_turn(scan):  # opposite views see what the short side of a displaced panel cuts off
+        sides.pop(_short_side(scan), None)
     name, level = max(sides.items(), key=lambda item: item[1])
     width_mm, grid_mm = _width_mm(scan, p, valid, threshold), max(scan.grid.size_mm[1:])
     text = (
@@ -109,7 +111,8 @@ def _check_sides(scan: Scan, p: np.ndarray, valid: np.ndarray, largest: float, t
     if level <= threshold:
         return Finding(_QUESTION, OK, level, threshold, "line integral", text)
     advice = (
-        "the object reaches beyond the panel (or air is not 0: check the flats). Expect a bright rim, unless the method "
+        "the object reaches beyond the panel (or air is not 0: check the flats; a panel beside the axis needs a full turn). "
+        "Expect a bright rim, unless the method "
         "reconstructs a box as large as the object: --roi-mm with --margin-mm, or fdk with --set extrapolate=reprojected"
     )
     return Finding(_QUESTION, SUSPICIOUS, level, threshold, CUT_OFF, text, advice)

@@ -29,6 +29,7 @@ _LONGEST_TABLE = 100.0  # a table that lasts this many times as long as the scan
 _FEW_RAD = math.radians(5)  # if frames see a smaller arc of a long table of angles, its times may be in another unit
 _MILLISECONDS = (900.0, 3000.0)  # if a table lasts this many times as long as the scan, it is in ms and the frames are in s
 _WIDE = 3.0  # a gap between views is wide above this multiple of the median gap
+_SAME_VIEW = 0.05  # views nearer to each other than this fraction of the mean step are repeats whose angles jitter
 _SAME_RAD = 1e-6  # views nearer to each other than this have the same angle
 _TOLERATED_DEG = 1.0  # coverage may be less by this than half a turn plus fan: nearly parallel rays need half a turn only
 
@@ -161,7 +162,7 @@ def _steps_deg(scan: Scan, turn_deg: float = 360.0) -> np.ndarray:
     angles_deg = np.rad2deg(azimuth_rad(middle_poses(scan))) % turn_deg
     angles_deg = np.sort(angles_deg % turn_deg)  # the second % is needed because -1e-16 % 360 is 360
     steps_deg = np.diff(angles_deg, append=angles_deg[0] + turn_deg)
-    return steps_deg[steps_deg > math.degrees(_SAME_RAD)]
+    return steps_deg[steps_deg > max(math.degrees(_SAME_RAD), _SAME_VIEW * turn_deg / len(angles_deg))]
 
 
 def _half_fan_deg(scan: Scan, geometry: ConeGeometry) -> float:

@@ -119,7 +119,7 @@ def resampled(volume: NDArray[np.floating], grid: Grid, onto: Grid) -> tuple[NDA
     share = 1.0
     for axis, (at, ratio) in enumerate(zip(first, step, strict=True)):
         place = at + ratio * np.arange(onto.shape[axis])
-        inside = (place >= -0.5) & (place <= grid.shape[axis] - 0.5)
+        inside = (place >= -0.5 - _ROUNDING) & (place <= grid.shape[axis] - 0.5 + _ROUNDING)
         share *= float(inside.mean())
         values *= inside.reshape([-1 if a == axis else 1 for a in range(3)])
     return values, share

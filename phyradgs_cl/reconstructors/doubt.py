@@ -54,6 +54,9 @@ _AROUND = 9  # bars are averaged over squares of this many pixels a side: two sa
 _UNEXPLAINED = 2.0  # a residual above this many times the noise has other causes than noise; simulations had at most 1.2
 _NOISY = 0.03  # noise over line integrals: at 0.05 to 0.06, 43 to 59 % of voxels were within σ; below 0.02, 59 % or more
 _WIDEST = 4.0  # σ is widened by at most this factor: held-out pixels farther off have other causes
+# Views for each voxel along a slice's longer side at which a law holds as it is: 25 views of 64 voxels.
+_USUAL_VIEWS = 25 / 64
+_FEWEST_VIEWS = 0.1  # fewer views for each voxel count as this many: none were measured
 _SHARE, _NORMAL_95 = 0.68, 1.96  # fraction of errors within σ; 95 % of normal noise is within 1.96 of its deviations
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
@@ -61,7 +64,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Law:
-    """The factors in ``spread``, which computes σ. near: smoothing (std) in voxels. multiple_95: the 95 % bar over σ."""
+    """The factors in ``spread``, which computes σ. near: smoothing (std) in voxels. multiple_95: the 95 % bar over σ.
+    sparse: the part of σ that is inverse to the number of views."""
 
     shape: float
     noise: float
@@ -69,6 +73,18 @@ class Law:
     slope: float
     near: float
     multiple_95: float
+    sparse: float = 0.0
+
+    def factor(self, views: int, grid: Grid) -> float:
+        """Returns the factor of σ for so many views. The runs of one scan lack the same views. Their differences show too
+        little of what is missing where views are few for the grid, and too much where they are many."""
+        of_voxel = max(views / max(grid.shape[1:]), _FEWEST_VIEWS)
+        return 1 - self.sparse + self.sparse * _USUAL_VIEWS / of_voxel
+
+    def for_views(self, views: int, grid: Grid) -> "Law":
+        """Returns the law with ``factor`` in all of its factors of σ."""
+        factor = self.factor(views, grid)
+        return replace(self, shape=factor * self.shape, noise=factor * self.noise, slope=factor * self.slope)
 
 
 def fitted_law(kind: str) -> Law:
@@ -180,7 +196,7 @@ class Doubter:
 
     def finished(self, results: list[Reconstruction]) -> Reconstruction:
         """Returns the first run's result with σ, facts about σ, and the seconds of all runs."""
-        law, first = fitted_law(self.kind), results[0]
+        law, first = fitted_law(self.kind).for_views(self.scan.frames, self.scan.grid), results[0]
         if all(np.array_equal(first.volume, other.volume) for other in results[1:]):
             log.warning("all three runs have the same volume: there are no error bars; give the method more iterations")
             return first

@@ -82,11 +82,11 @@ def reprojection(rt: Runtime | None, scan: Scan) -> Model:
         raise InputError("--steps", "a step that reconstructs, without a device", "a Runtime", "pass one")
     from phyradgs_cl.operators import RayOperator  # imported here because methods are slow to import
     from phyradgs_cl.operators.rays.subrays import subrays_of
-    from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk
+    from phyradgs_cl.reconstructors.fdk import FbpOptions, FdkOptions, fdk
     from phyradgs_cl.reconstructors.voxels import fista_tv
 
     motion = LineMiddles()
-    fdk_options = FdkOptions(window="hann", motion=motion)
+    fdk_options = (FbpOptions if scan.is_parallel else FdkOptions)(window="hann", motion=motion)
     tv_options = fista_tv.FistaTvOptions(motion=PerRow(sub_intervals=2), iterations=30, tv_weight=0.002)
     tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
     operator = RayOperator(rt, scan.grid, scan.geometry.detector_shape, tables, subrays=subrays_of(scan.grid, tables))

@@ -100,6 +100,14 @@ def test_a_table_in_another_unit_of_time_than_the_frames(clean) -> None:
             assert f"the table of {'poses' if is_poses else 'angles'} runs" in finding.text
 
 
+@pytest.mark.parametrize(("views", "turns", "jitter_deg"), [(25, 2, 0.05), (25, 3, 0.05), (180, 3, 0.01)])
+def test_turns_whose_angles_jitter_have_no_gaps(views, turns, jitter_deg) -> None:
+    angles = np.tile(np.arange(views) * 360 / views, turns)
+    angles = angles + np.random.default_rng(0).normal(0, jitter_deg, len(angles))
+    scan = static_scan(np.ones((len(angles), 4, 6)), ConeGeometry(100.0, 150.0, (4, 6), 1.0), angles)
+    assert check_angles(scan).verdict == OK
+
+
 def test_missing_views_and_too_short_a_turn(clean) -> None:
     gap = check_angles(some_frames(clean, np.r_[0:5, 9:15]))
     assert gap.verdict == OK and gap.value == pytest.approx(24)  # a short scan, which is long enough
@@ -124,12 +132,13 @@ def test_half_a_turn_is_enough_for_rays_that_are_nearly_parallel(clean, away, ve
 
 
 def test_a_panel_that_cuts_the_object(clean) -> None:
-    """A displaced one may, on its short side."""
+    """A displaced one may, on its short side, if there are opposite views."""
     finding = check_coverage(cropped(clean, np.s_[:, :, 9:23]))
     assert finding.verdict == SUSPICIOUS and finding.value > finding.threshold
     for offset_mm, verdict in ((0.875, OK), (-0.875, SUSPICIOUS)):
         right_half = cropped(clean, np.s_[:, :, 14:32], detector_offset_mm=(0.0, offset_mm))
         assert check_coverage(right_half).verdict == verdict
+        assert check_coverage(some_frames(right_half, np.arange(10))).verdict == SUSPICIOUS
 
 
 def test_saturated_areas_but_not_noise_that_is_cut_off(clean) -> None:

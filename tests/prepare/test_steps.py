@@ -32,6 +32,13 @@ def psnr_db(rt, scan: Scan, steps: str = "", **options: object) -> float:
     return float(compare(volume, scan.reference)["psnr_db"])
 
 
+def test_steps_that_reconstruct_take_parallel_beams(rt) -> None:
+    """By FBP: FDK refused them."""
+    scan = simulate("foot", size=16, detector=24, views=20, protocol="static", scanner="parallel", kvp=120.0, device=rt)
+    made = prepared(scan, preprocessing_of({"steps": "hardening", "hardening": {"kvp": 120.0}}), rt)
+    assert np.isfinite(made.projections).all() and not np.array_equal(made.projections, scan.projections)
+
+
 def test_what_is_bone_may_be_stated(rt, planted) -> None:
     """The half of the largest attenuation that the simulation takes; where nothing is as dense, all is water."""
     clean, spoilt = planted(), planted(kvp=120.0)

@@ -13,6 +13,7 @@ from phyradgs_cl.acquisition.altered.coarse import some_frames
 from phyradgs_cl.api import prepare, reconstruct, simulate, static_scan
 from phyradgs_cl.detector.noise_level import noise_map
 from phyradgs_cl.errors import InputError
+from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_checkpoint, write_checkpoint
 from phyradgs_cl.metrics import coverage
 from phyradgs_cl.metrics.align import block_means
@@ -110,6 +111,15 @@ def test_bars_follow_slopes_density_shape_and_noise() -> None:
         assert np.sqrt(np.mean(spread(0 * one, one, other, law)[inner] ** 2)) == pytest.approx(2, rel=0.1)
         assert not spread(0 * one, one, -other, law).any()
     assert np.sqrt(np.mean(spread(0 * one, 3 + one, 3 - one, LAW)[inner] ** 2)) == pytest.approx(10**0.5, rel=0.1)
+
+
+def test_bars_are_wider_with_few_views_for_the_grid() -> None:
+    """They stay for 25 views of 64 voxels, the longer side of a slice. Fewer than 0.1 views a voxel count as so many."""
+    law, grid = replace(LAW, sparse=0.25, slope=1.0), Grid((9, 32, 64), (1.0,) * 3)
+    volume, one, two = np.random.default_rng(1).random((3, 8, 8, 8))
+    for views, times in ((25, 1.0), (50, 0.875), (10**9, 0.75), (1, 0.75 + 0.25 * 25 / 6.4)):
+        bars = spread(volume, one, two, law.for_views(views, grid))
+        np.testing.assert_allclose(bars, times * spread(volume, one, two, law), rtol=1e-6)
 
 
 def test_noise_is_told_from_what_is_smooth_where_pixels_are_valid() -> None:

@@ -118,6 +118,7 @@ def fdk(
     if isinstance(options, FbpOptions) and options.deblur > 0:
         middles = np.stack([p[len(p) // 2] for p in poses])
         frames = deblurred(scan, frames, azimuth_rad(middles), options.deblur)
+    frames, pose = _without_dark_sides(scan, frames, pose)
     whole = partial(whole_object, scan, options.motion, rt, report)
     volume = fdk_volume(
         rt, frames, pose, scan.grid, window=options.window, axis=scan.shutter.axis,
@@ -127,6 +128,20 @@ def fdk(
     )  # fmt: skip
     facts = {"method": method, "options": option_facts(options), "seconds": time.perf_counter() - started}
     return Reconstruction(volume, scan.grid, facts=facts)
+
+
+def _without_dark_sides(scan: Scan, frames: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns frames (F, rows, columns) and poses without the columns at both sides that are masked in all frames. Values
+    continued there would stand for an object that the panel does not see; a narrower panel has weights of its own."""
+    seen = np.flatnonzero(scan.valid.any(axis=(0, 1)))
+    if scan.metal is not None or len(seen) in (0, frames.shape[2]):
+        return frames, pose
+    columns = slice(int(seen[0]), int(seen[-1]) + 1)
+    if pose.ndim == 3 and scan.shutter.axis == "columns":
+        pose = pose[:, columns]
+    moved = pose.copy()
+    moved[..., 3:6] += columns.start * pose[..., 6:9]
+    return frames[:, :, columns], moved
 
 
 def _moving(
@@ -278,8 +293,8 @@ def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _measured(scan: Scan) -> np.ndarray:
-    """Returns the numbers (n,) of frames without the completely masked ones, whose neighbours cover their angles. If all
-    frames are masked, it returns all."""
-    if np.asarray(scan.pixel_mask).ndim == 3 and len(measured := np.flatnonzero(scan.valid.any(axis=(1, 2)))):
-        return measured
+    """Returns the numbers (n,) of frames without those that are masked for the most part, whose neighbours cover their
+    angles. If all frames are masked, it returns all."""
+    if np.asarray(scan.pixel_mask).ndim == 3 and (valid := scan.valid.mean(axis=(1, 2))).any():
+        return np.flatnonzero(valid > valid.max() / 2)
     return np.arange(scan.frames)

@@ -16,7 +16,8 @@ from phyradgs_cl.reconstructors.fdk import weights
 # The widest gap is compared with the second widest: by the median, uneven views of a full turn would be a short scan.
 # Any gap wider than _WIDE_RAD is compared with both of its neighbours.
 SHORT_SCAN_GAP = 2.5
-_SAME_VIEW = 1e-3  # views nearer to each other than this fraction of the mean gap count as one, as those of a second turn
+# Views nearer to each other than this fraction of the mean gap count as one, as those of a second turn whose angles jitter.
+_SAME_VIEW = 0.05
 # A warning names filled gaps from this width on: narrower ones changed the density of large balls by less than 1 %.
 _NAMED_RAD = np.deg2rad(5)
 # All gaps up to this width but the widest are filled: dividing the arc there would cost more accuracy.
@@ -38,9 +39,11 @@ _LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the p
 _NO_LEAN_DEG = 10.0
 _ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: there densities are 0.1 % too low
 _NO_ROLL_DEG = 10.0  # larger angles of the rows are refused: here densities are 1.5 % too low, at 90° they are 0
+_UNLIKE = 0.1  # a warning comes if the ends of the fan differ among the views by more than this fraction of it
 _LEAST_OVERLAP = 2.0  # a displaced panel must reach this many columns beyond the axis, or a warning comes
 # A smaller missing angle causes no warning: nearly parallel rays have so narrow a fan that half a turn is enough.
 _TOLERATED_RAD = np.deg2rad(0.5)
+_PARTS = 16  # of a view's step, over which weights of a short scan are averaged
 RayWeight = Callable[[int], np.ndarray]
 
 
@@ -228,10 +231,15 @@ def opposite_weight(
 
 
 def _redundancy(view: int, angle_rad: np.ndarray, arc: Arc, fan: weights.Fan) -> np.ndarray | float:
+    progress_rad, gap_rad = float(arc.progress_rad[view]), float(arc.gap_rad[view])
     if len(arc.parts_rad) > 1:
-        return weights.parted_weight(float(arc.progress_rad[view]), angle_rad, arc.parts_rad)
+        return weights.parted_weight(progress_rad, angle_rad, arc.parts_rad)
     if not arc.is_full:
-        return weights.short_scan_weight(float(arc.progress_rad[view]), angle_rad, arc.coverage_rad)
+        # A view stands for its step. Where that is as wide as what half a turn leaves over, its middle alone does not do.
+        is_coarse = gap_rad > (arc.coverage_rad - np.pi) / 2 > 0
+        within = gap_rad * (np.arange(_PARTS) - (_PARTS - 1) / 2) / _PARTS if is_coarse else (0.0,)
+        at_rad = np.clip(progress_rad + np.asarray(within), 0, arc.coverage_rad)
+        return sum(weights.short_scan_weight(at, angle_rad, arc.coverage_rad) for at in at_rad) / len(at_rad)
     return weights.displaced_weight(angle_rad, fan) if fan.is_displaced else 1.0
 
 
@@ -347,6 +355,9 @@ def warn_if_incomplete(
         text = "%s: %.1f° are missing where %s: the views beside them stand for them, and densities are approximate"
         where = "a displaced detector needs a full turn" if fan.is_put_aside else "views are uneven"
         log.warning(text, name, np.rad2deg(arc.filled_rad), where)
+    if fan.unlike > _UNLIKE:
+        text = "%s: the panel stands elsewhere in some views, by %.0f %% of its width: densities may be wrong by a third; %s"
+        log.warning(text, name, 100 * fan.unlike, "take an iterative method")
 
 
 def _warn_of_axis(name: str, fan: weights.Fan) -> None:

@@ -69,12 +69,13 @@ class Fan:
     """The fan angles that every view sees; in a parallel beam distances in mm from the axis (see ``fan_angle``).
 
     missing_columns: columns that would make the panel symmetric about the axis, at its two ends. pixel_rad: the width of the
-    pixel at the shorter end."""
+    pixel at the shorter end. unlike: by which fraction of the fan its ends differ among the views."""
 
     low_rad: float
     high_rad: float
     missing_columns: tuple[int, int] = (0, 0)
     pixel_rad: float = 0.0
+    unlike: float = 0.0
 
     @property
     def is_displaced(self) -> bool:
@@ -115,15 +116,16 @@ def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = F
     ends = np.sort(fan_angle(outer, pixel_rays(outer, rows, columns[[0, -1]], is_parallel), is_parallel), axis=-1)
     low, high = float(ends[..., 0].max()), float(ends[..., 1].min())
     overhang = abs(high + low) * max(shape[1] - 1, 1)
+    unlike = float(np.ptp(ends.reshape(-1, 2), axis=0).max()) / max(high - low, 1e-12)
     if shape[1] == 1 or overhang <= _SYMMETRIC * (high - low):
-        return Fan(low, high)
+        return Fan(low, high, unlike=unlike)
     middle = pose[0, [pose.shape[1] // 2]]
     across = fan_angle(middle, pixel_rays(middle, rows[[shape[0] // 2]], columns, is_parallel), is_parallel)[0]
     axis = float(np.interp(0.0, across if across[-1] > across[0] else -across, columns))
     missing = max(1, int(np.ceil(abs(shape[1] - 1 - 2 * axis) - 1e-6)))
     is_low = axis < (shape[1] - 1) / 2
     pixel_rad = float(np.ptp(across[:2] if is_low else across[-2:]))
-    return Fan(low, high, (missing, 0) if is_low else (0, missing), pixel_rad)
+    return Fan(low, high, (missing, 0) if is_low else (0, missing), pixel_rad, unlike)
 
 
 def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
