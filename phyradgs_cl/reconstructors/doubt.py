@@ -54,7 +54,7 @@ _AROUND = 9  # bars are averaged over squares of this many pixels a side: two sa
 _UNEXPLAINED = 2.0  # a residual above this many times the noise has other causes than noise; simulations had at most 1.2
 _NOISY = 0.03  # noise over line integrals: at 0.05 to 0.06, 43 to 59 % of voxels were within σ; below 0.02, 59 % or more
 _WIDEST = 4.0  # σ is widened by at most this factor: held-out pixels farther off have other causes
-# Views for each voxel along a slice's longer side at which a law holds as it is: 25 views of 64 voxels.
+# Views for each voxel along a slice's longer side from which a law holds as it is: 25 views of 64 voxels.
 _USUAL_VIEWS = 25 / 64
 _FEWEST_VIEWS = 0.1  # fewer views for each voxel count as this many: none were measured
 _SHARE, _NORMAL_95 = 0.68, 1.96  # fraction of errors within σ; 95 % of normal noise is within 1.96 of its deviations
@@ -65,7 +65,7 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class Law:
     """The factors in ``spread``, which computes σ. near: smoothing (std) in voxels. multiple_95: the 95 % bar over σ.
-    sparse: the part of σ that is inverse to the number of views."""
+    sparse: how much σ grows where views are few for the grid."""
 
     shape: float
     noise: float
@@ -76,10 +76,10 @@ class Law:
     sparse: float = 0.0
 
     def factor(self, views: int, grid: Grid) -> float:
-        """Returns the factor of σ for so many views. The runs of one scan lack the same views. Their differences show too
-        little of what is missing where views are few for the grid, and too much where they are many."""
+        """Returns the factor of σ for so many views. The runs of one scan lack the same views: where these are few for the
+        grid, their differences show too little of what is missing."""
         of_voxel = max(views / max(grid.shape[1:]), _FEWEST_VIEWS)
-        return 1 - self.sparse + self.sparse * _USUAL_VIEWS / of_voxel
+        return 1 + self.sparse * max(_USUAL_VIEWS / of_voxel - 1, 0)
 
     def for_views(self, views: int, grid: Grid) -> "Law":
         """Returns the law with ``factor`` in all of its factors of σ."""
