@@ -93,6 +93,19 @@ def test_columns_that_are_always_masked_make_a_narrower_panel(rt, axis) -> None:
     np.testing.assert_allclose(*volumes, atol=1e-5)
 
 
+def test_frames_that_are_masked_for_the_most_part_are_left_out(rt) -> None:
+    """One pixel that was left stood for the whole frame."""
+    geometry, angles = ConeGeometry(6.0, 9.0, (30, 52), 0.075), 4.0 * np.arange(90)
+    frames, mask = frames_of(PHANTOM, geometry.pose(np.deg2rad(angles)), (30, 52)), np.zeros((90, 30, 52))
+    mask[10:60:10] = 1
+    volumes = []
+    for kept in (0, 1):
+        mask[10:60:10, 15, 26] = 1 - kept
+        scan = static_scan(frames, geometry, angles, mask=mask, grid=GRID)
+        volumes.append(reconstruct(scan, "fdk", device=rt, report=False).volume)
+    np.testing.assert_array_equal(*volumes)
+
+
 def test_panels_that_stand_in_two_places_and_approximations_are_warned_of(rt, caplog) -> None:
     """By the API, which looks at the scan before: a look's warnings, which are silenced, counted as said."""
     aside = (ConeGeometry(6.0, 9.0, (30, 40), 0.075, (0.0, offset)) for offset in (0.45, -0.45))
