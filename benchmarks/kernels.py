@@ -5,7 +5,8 @@
 It runs short reconstructions of 64³ voxels from 128² pixels, and of 128³ from 256², with every motion model that has kernels
 of its own. A kernel's time is the least of its runs, in ns per voxel of the volume. It is divided by the time in which this
 machine copies a float, and by that of a multiply-add. The smaller of the two quotients is compared with kernels.json. What
-seems slower is measured again, up to three times. Jobs are compared by their processor time over that of a fixed loop.
+seems slower is measured again, up to three times. Jobs are compared by their processor time over that of a fixed loop; on a
+GPU they do not run.
 
 Prints a line for each that takes 1.3 times as long as in the table, and then ends with 1. --quick: the small size, and half
 of the jobs. --write: puts this run in the table. --all: prints every kernel with its share of the machine's rate of copying.
@@ -175,7 +176,8 @@ def measure_jobs(rt: Runtime, names: list[str]) -> dict[str, float]:
 
 def kind_of(rt: Runtime) -> str:
     """Names the kind of processor whose table is right: its maker, and the instructions for which kernels are built."""
-    return f"{cpu_facts().get('vendor_id', 'unknown')} {rt.device.target or rt.device.name}"
+    maker = f"{cpu_facts().get('vendor_id', 'unknown')} " if rt.device.kind == "cpu" else ""
+    return f"{maker}{rt.device.target or rt.device.name}"
 
 
 def slower(now: Table, table: Table) -> list[str]:
@@ -195,7 +197,8 @@ def main() -> None:
     tables: dict[str, Table] = json.loads(TABLE.read_text()) if TABLE.is_file() else {}
     kind = kind_of(rt)
     now, kernels = measure(rt, sizes, {} if given.write else tables.get(kind, {}))
-    now |= {name: [round(ratio, 3)] for name, ratio in measure_jobs(rt, jobs).items()}
+    if rt.device.kind == "cpu":
+        now |= {name: [round(ratio, 3)] for name, ratio in measure_jobs(rt, jobs).items()}
     if given.all:
         for name, (ns, share) in sorted(kernels.items(), key=lambda item: item[1][1]):
             print(f"{name:60s} {ns:9.2f} ns  {share:6.0%} of copying")

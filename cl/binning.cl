@@ -90,33 +90,39 @@ __kernel void bin_fill(
 }
 
 /* Writes into `boxes` (6, items) the lowest and highest tile of the item's splat along x, y, z; an empty range if the item
-   has no splat. */
-ALWAYS_INLINE void share_box(
-    __global const int *extents, const int stride, const int count, const int g, const int4 tile, __local int *boxes)
+   has no splat. Writes into `around` (6) the same of all the group's splats. */
+ALWAYS_INLINE void share_box(__global const int *extents, const int stride, const int count, const int g, const int4 tile,
+                             __local int *boxes, __local int *around)
 {
     const int item = GROUP_ITEM, items = GROUP_ITEMS;
     const int size[3] = {tile.x, tile.y, tile.z};
     const int is_drawn = g < count && extents[stride + g] >= extents[g];
-    for (int side = 0; side < 6; ++side)
-        boxes[side * items + item] = is_drawn ? extents[(size_t)side * stride + g] / size[side / 2] : -(side & 1);
+    if (item < 6)
+        around[item] = item & 1 ? -1 : INT_MAX;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    for (int side = 0; side < 6; ++side) {
+        const int at = is_drawn ? extents[(size_t)side * stride + g] / size[side / 2] : -(side & 1);
+        boxes[side * items + item] = at;
+        if (is_drawn) /* integers: the result does not depend on the order */
+            side & 1 ? atomic_max(around + side, at) : atomic_min(around + side, at);
+    }
     barrier(CLK_LOCAL_MEM_FENCE);
 }
 
-/* Returns how many of the items first..stop-1 have a splat that touches tile (x, y, z). */
-ALWAYS_INLINE int having(__local const int *boxes, const int first, const int stop, const int x, const int y, const int z)
+/* Returns whether the item's splat touches tile (x, y, z). */
+ALWAYS_INLINE int touches(__local const int *boxes, const int item, const int x, const int y, const int z)
 {
-    const int items = GROUP_ITEMS;
-    int sum = 0;
-    for (int k = first; k < stop; ++k)
-        sum += x >= boxes[k] && x <= boxes[items + k] && y >= boxes[2 * items + k] && y <= boxes[3 * items + k] &&
-               z >= boxes[4 * items + k] && z <= boxes[5 * items + k];
-    return sum;
+    __local const int *own = boxes + item;
+    const int n = GROUP_ITEMS;
+    return x >= own[0] && x <= own[n] && y >= own[2 * n] && y <= own[3 * n] && z >= own[4 * n] && z <= own[5 * n];
 }
 
-#define FOR_TILES_OF(item, boxes, tiles, x, y, z, t)                                                       \
-    for (int items_ = GROUP_ITEMS, z = boxes[4 * items_ + item]; z <= boxes[5 * items_ + item]; ++z)       \
-        for (int y = boxes[2 * items_ + item]; y <= boxes[3 * items_ + item]; ++y)                         \
-            for (int x = boxes[item], t = (z * tiles.y + y) * tiles.x + x; x <= boxes[items_ + item]; ++x, ++t)
+/* The items of a group divide the tiles around all its splats. */
+#define FOR_OWN_TILES(around, tiles, x, y, z, t)                                                                           \
+    for (int nx_ = around[1] - around[0] + 1, ny_ = around[3] - around[2] + 1, n_ = GROUP_ITEM;                             \
+         around[1] >= 0 && n_ < nx_ * ny_ * (around[5] - around[4] + 1); n_ += GROUP_ITEMS)                                 \
+        for (int x = around[0] + n_ % nx_, y = around[2] + n_ / nx_ % ny_, z = around[4] + n_ / (nx_ * ny_),                \
+                 t = (z * tiles.y + y) * tiles.x + x; t >= 0; t = -1)
 
 __kernel void bin_count_group(
     __global const int *extents,
@@ -125,11 +131,15 @@ __kernel void bin_count_group(
     __global int *counts,            /* (tiles, chunks), zero before */
     __local int *boxes)              /* (6, chunk): tiles lo and hi along x, y, z of each splat */
 {
-    const int item = GROUP_ITEM, k = (int)get_group_id(0);
-    share_box(extents, stride, count, k * chunk + item, tile, boxes);
-    FOR_TILES_OF(item, boxes, tiles, x, y, z, t)
-        if (having(boxes, 0, item, x, y, z) == 0) /* the first item of the chunk whose splat touches the tile counts */
-            counts[(size_t)t * chunks + k] = having(boxes, item, chunk, x, y, z);
+    __local int around[6];
+    const int k = (int)get_group_id(0);
+    share_box(extents, stride, count, k * chunk + GROUP_ITEM, tile, boxes, around);
+    FOR_OWN_TILES(around, tiles, x, y, z, t) {
+        int sum = 0;
+        for (int item = 0; item < chunk; ++item)
+            sum += touches(boxes, item, x, y, z);
+        counts[(size_t)t * chunks + k] = sum;
+    }
 }
 
 /* Returns the sum of `own` over the work-items before this one. group_sum: the sum over all. */
@@ -192,11 +202,16 @@ __kernel void bin_fill_group(
     __global int *tile_splat_ids, const int capacity,
     __local int *boxes)
 {
-    const int item = GROUP_ITEM, k = (int)get_group_id(0), g = k * chunk + item;
-    share_box(extents, stride, count, g, tile, boxes);
-    FOR_TILES_OF(item, boxes, tiles, x, y, z, t) {
-        const int position = tile_offsets[t] + counts[(size_t)t * chunks + k] + having(boxes, 0, item, x, y, z);
-        if (position < capacity)
-            tile_splat_ids[position] = g;
+    __local int around[6];
+    const int k = (int)get_group_id(0);
+    share_box(extents, stride, count, k * chunk + GROUP_ITEM, tile, boxes, around);
+    FOR_OWN_TILES(around, tiles, x, y, z, t) {
+        int position = tile_offsets[t] + counts[(size_t)t * chunks + k];
+        for (int item = 0; item < chunk; ++item)
+            if (touches(boxes, item, x, y, z)) {
+                if (position < capacity)
+                    tile_splat_ids[position] = k * chunk + item;
+                ++position;
+            }
     }
 }

@@ -9,22 +9,51 @@
 #endif
 #define FEW_CELLS 8    /* with at most this many time cells in a frame, searching would take longer than trying all */
 
-/* The weight of the voxel in the ray's samples, times the length of ray per sample, as in rays_forward. */
-static inline float ray_weight(const rays_t r, __global const float *cell, const int4 voxel)
+#define SURELY 1.001f  /* voxels by which a coordinate must exceed the others so that it is the main axis of all rays near */
+
+/* Sums the window's pixels of a cell, times the voxel's weight in the samples of their rays on planes across axis a. sure: all
+   rays that touch the voxel have this main axis; otherwise each ray is asked. `of` line v is the line's weight. UPRIGHT: pixels
+   lie in columns along z, so the rays of column p have the same weight across it, unless a is z. 1: lines are rows. 2: lines
+   are columns. */
+RAY_INLINE float from_planes(__global const float *frame, const int image_pitch, __global const float *of, const window_t w,
+                             __global const float *cell, const float4 pitch_mm, const int4 voxel, const int a, const int sure)
 {
-    const int a = r.axis, b = a == 0 ? 1 : 0, c = a == 2 ? 1 : 2;
-    const float da = a == 0 ? r.x : (a == 1 ? r.y : r.z), db = a == 0 ? r.y : r.x, dc = a == 2 ? r.y : r.z;
+    const int b = a == 0 ? 1 : 0, c = a == 2 ? 1 : 2, by_rows = UPRIGHT != 2;
     const float i = (float)(a == 0 ? voxel.x : (a == 1 ? voxel.y : voxel.z));
     const float j = (float)(a == 0 ? voxel.y : voxel.x), k = (float)(a == 2 ? voxel.y : voxel.z);
-    const float sa = cell[RAY_SOURCE + a];
-#if !RAY_PARALLEL
-    if (i < min(sa, sa + da) || i > max(sa, sa + da))
-        return 0.0f;
+    const float pa = a == 0 ? pitch_mm.x : (a == 1 ? pitch_mm.y : pitch_mm.z);
+    const float pb = a == 0 ? pitch_mm.y : pitch_mm.x, pc = a == 2 ? pitch_mm.y : pitch_mm.z;
+    const float sa = cell[RAY_SOURCE + a], ahead = AHEAD_OF(sa, i);
+    const float b_from = START_OF(cell[RAY_SOURCE + b], i) - j, c_from = START_OF(cell[RAY_SOURCE + c], i) - k;
+    __global const float *d = cell + RAY_D00, *ep = cell + (by_rows ? RAY_EU : RAY_EV), *eq = cell + (by_rows ? RAY_EV : RAY_EU);
+    const int p_lo = by_rows ? w.u_lo : w.v_lo, p_hi = by_rows ? w.u_hi : w.v_hi;
+    const int q_lo = by_rows ? w.v_lo : w.u_lo, q_hi = by_rows ? w.v_hi : w.u_hi;
+    float sum = 0.0f;
+    for (int p = p_lo; p <= p_hi; ++p) {
+        const float a0 = fma((float)p, ep[a], d[a]), b0 = fma((float)p, ep[b], d[b]), c0 = fma((float)p, ep[c], d[c]);
+        float da = a0, db = b0, inv = 1.0f / da, wb = 1.0f - fabs(fma(db, ahead * inv, b_from));
+        for (int q = q_lo; q <= q_hi; ++q) {
+            if (!UPRIGHT || a == 2) {
+                da = fma((float)q, eq[a], a0);
+                db = fma((float)q, eq[b], b0);
+                inv = 1.0f / da;
+                wb = 1.0f - fabs(fma(db, ahead * inv, b_from));
+            }
+            const float dc = fma((float)q, eq[c], c0), wc = 1.0f - fabs(fma(dc, ahead * inv, c_from));
+            const int u = by_rows ? p : q, v = by_rows ? q : p;
+            if (!(wb > 0.0f && wc > 0.0f) || (!sure && rays_through(cell, pitch_mm, (float)u, (float)v).axis != a))
+                continue;
+#if RAY_PARALLEL
+            const float lb = cell[RAY_SOURCE + b] * pb, lc = cell[RAY_SOURCE + c] * pc;
+#else
+            if (i < min(sa, sa + da) || i > max(sa, sa + da)) /* behind the source, or the panel */
+                continue;
+            const float lb = db * inv * pb, lc = dc * inv * pc;
 #endif
-    const float inv = 1.0f / da;
-    const float wb = 1.0f - fabs(fma(db * inv, AHEAD_OF(sa, i), START_OF(cell[RAY_SOURCE + b], i)) - j);
-    const float wc = 1.0f - fabs(fma(dc * inv, AHEAD_OF(sa, i), START_OF(cell[RAY_SOURCE + c], i)) - k);
-    return wb > 0.0f && wc > 0.0f ? wb * wc * r.step_mm : 0.0f;
+            sum = fma(of[v] * frame[(size_t)v * image_pitch + u], wb * wc * sqrt(fma(pa, pa, fma(lb, lb, lc * lc))), sum);
+        }
+    }
+    return sum;
 }
 
 __kernel void rays_adjoint(
@@ -46,8 +75,7 @@ __kernel void rays_adjoint(
     const int inside = own.x < shape.x && own.y < shape.y && own.z < shape.z;
     const index_t sy = volume_pitch, sz = sy * (shape.y + 2 * BORDER);
     __global float *to = volume + IMAGE_GUARD + (own.z + BORDER) * sz + (own.y + BORDER) * sy + own.x;
-    const float4 sides = (float4)(BLOCK, BLOCK, BLOCK_Z, BLOCK);
-    const float4 around = 0.5f * (sides + 1.0f), middle = convert_float4(corner) + 0.5f * (sides - 1.0f);
+    const float4 around = 0.5f * ((float4)(BLOCK, BLOCK, BLOCK_Z, BLOCK) + 1.0f), middle = convert_float4(corner) + around - 1.0f;
     float sum = inside && add ? *to : 0.0f;
     for (int n = frame_first; n < frame_stop; ++n) {
         __global const float *frame = image + IMAGE_GUARD + (size_t)n * lines * image_pitch;
@@ -55,10 +83,8 @@ __kernel void rays_adjoint(
         window_t w;
         if (stop - first > FEW_CELLS) { /* the same for all items of a group, as barriers need */
             barrier(CLK_LOCAL_MEM_FENCE);
-            if (item == 0) {
-                range[0] = stop;
-                range[1] = first;
-            }
+            if (item < 2)
+                range[item] = item ? first : stop;
             barrier(CLK_LOCAL_MEM_FENCE);
             for (int c = first + item; c < stop; c += items)
                 if (window_of(matrices, matrix_stride, cell_lines, width, c, stop, middle, around, &w)) {
@@ -70,16 +96,16 @@ __kernel void rays_adjoint(
             stop = range[1];
         }
         for (int c = first; inside && c < stop; ++c) {
-            if (!window_of(matrices, matrix_stride, cell_lines, width, c, stop, convert_float4(voxel), (float4)(1.0f), &w))
-                continue;
             __global const float *cell = cells + (size_t)c * RAY_CELL;
-            __global const float *own = weights + weight_at[c] - cell_lines[2 * c];
-            for (int v = w.v_lo; v <= w.v_hi; ++v) {
-                float from_line = 0.0f;
-                for (int u = w.u_lo; u <= w.u_hi; ++u)
-                    from_line += frame[(size_t)v * image_pitch + u]
-                                 * ray_weight(rays_through(cell, pitch_mm, (float)u, (float)v), cell, voxel);
-                sum += own[v] * from_line;
+            const float4 from = vload4(0, cell + RAY_SOURCE), far = fabs(RAY_PARALLEL ? from : convert_float4(voxel) - from);
+            const int main = far.x >= far.y && far.x >= far.z ? 0 : (far.y >= far.z ? 1 : 2);
+            const float next = main == 0 ? fmax(far.y, far.z) : (main == 1 ? fmax(far.x, far.z) : fmax(far.x, far.y));
+            const int sure = RAY_PARALLEL || fmax(fmax(far.x, far.y), far.z) > next + SURELY;
+            __global const float *of = weights + weight_at[c] - cell_lines[2 * c];
+            for (int axis = sure ? main : 0; axis <= (sure ? main : 2); ++axis) {
+                const float4 around_it = (float4)(axis != 0, axis != 1, axis != 2, 0.0f); /* only one plane across the axis */
+                if (window_of(matrices, matrix_stride, cell_lines, width, c, stop, convert_float4(voxel), around_it, &w))
+                    sum += from_planes(frame, image_pitch, of, w, cell, pitch_mm, voxel, axis, sure);
             }
         }
     }

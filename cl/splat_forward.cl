@@ -1,7 +1,7 @@
 /* Draws the splats of all time cells into the merged frame. Every tile sums its list of splats over the cells that serve its
    lines, so that micro-views are accumulated and strips joined (paper, Eq. 3) in one pass.
    splat_forward_rows: a work-item takes some complete lines and adds vectors of pixels (CPUs).
-   splat_forward_pixels: a work-item takes a pixel, and a work-group a tile, whose records it reads once (GPUs).
+   splat_forward_pixels: a work-group takes a tile, whose records it reads once; some work-items share a pixel (GPUs).
    Each pixel is written by one work-item, without atomics. */
 #if BLOCK_PIXEL
 #define SPLAT_SPACE __local
@@ -66,17 +66,22 @@ ALWAYS_INLINE void add_line(const footprint_line line, const float limit, __glob
     __global float *image             /* IMAGE_GUARD floats, then the image (lines, pitch) */
 
 #if BLOCK_PIXEL
-#define STAGED 32 /* number of records that a work-group reads into local memory at a time */
+#define STAGED 64 /* number of records that a work-group reads into local memory at a time */
+#define MOST_ITEMS 256
 
-/* Groups have tile_w by tile_h items. Cells are sorted, so the first and last line give the cells of all lines of a tile. */
+/* Groups have tile_w by tile_h by `parts` items (a power of 2), because few tiles with long lists would leave a GPU idle. The
+   items of a pixel divide the records by index, so that sums do not depend on whether lists were written. LAYERED: they divide
+   the cells, each with a layer of its own. Cells are sorted: the first and last line give those of all lines of a tile. */
 __kernel void splat_forward_pixels(ARGUMENTS)
 {
     __local int records_here[STAGED * RECORD]; /* as ints: copied as floats, a device may set small ints to 0 */
     __local float cells_here[STAGED * CELL];
     __local int place[STAGED], cell_of[STAGED]; /* index in records, -1 if not visible in this tile; and its cell */
+    __local float sums[MOST_ITEMS];
     const int u = (int)get_global_id(0), v = (int)get_global_id(1);
-    const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
-    const int items = (int)(get_local_size(0) * get_local_size(1));
+    const int part = (int)get_local_id(2), parts = (int)get_local_size(2), pixels = (int)(get_local_size(0) * get_local_size(1));
+    const int pixel = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
+    const int item = part * pixels + pixel, items = parts * pixels;
     /* Not from get_group_id, which restarts in each part of a launch. */
     const int left = u - (int)get_local_id(0), top = v - (int)get_local_id(1);
     const int right = min(left + tile_w, width) - 1, bottom = min(top + tile_h, lines) - 1;
@@ -87,9 +92,11 @@ __kernel void splat_forward_pixels(ARGUMENTS)
     const int own_first = line_cells[2 * min(v, bottom)], own_stop = inside ? line_cells[2 * v + 1] : own_first;
     const size_t at = IMAGE_GUARD + (size_t)v * pitch + u, layer_size = IMAGE_GUARD + (size_t)lines * pitch;
     const float limit = cutoff2 > 0.0f ? cutoff2 : MAXFLOAT;
-    if (inside)
-        for (int layer = 0; layer < LAYERS(layer_count); ++layer)
-            image[layer * layer_size + at] = 0.0f;
+#if LAYERED
+    for (int layer = part; inside && layer < layer_count; layer += parts)
+        image[layer * layer_size + at] = 0.0f;
+    barrier(CLK_GLOBAL_MEM_FENCE);
+#endif
     float sum = 0.0f;
     for (int done = 0; done < list.count * c_count; done += STAGED) {
         const int here = min(STAGED, list.count * c_count - done);
@@ -115,7 +122,7 @@ __kernel void splat_forward_pixels(ARGUMENTS)
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int k = 0; k < here; ++k) {
             const int c = cell_of[k];
-            if (place[k] < 0 || c < own_first || c >= own_stop)
+            if (place[k] < 0 || ((LAYERED ? c : place[k]) & (parts - 1)) != part || c < own_first || c >= own_stop)
                 continue;
             __local const int *record_as_int = records_here + k * RECORD;
             __local const float *splat_record = (__local const float *)record_as_int, *cell = cells_here + k * CELL;
@@ -132,8 +139,13 @@ __kernel void splat_forward_pixels(ARGUMENTS)
         }
     }
 #if !LAYERED
-    if (inside)
+    sums[item] = sum;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (part == 0 && inside) {
+        for (int p = 1; p < parts; ++p)
+            sum += sums[p * pixels + pixel];
         image[at] = sum;
+    }
 #endif
 }
 #else

@@ -8,7 +8,7 @@
 #include "common/voxel.h"
 
 #define STAGED 32 /* number of records of Gaussians that a work-group reads into local memory at a time */
-#define DEPTH 8   /* voxels along z of a work-item; equals tile.z */
+#define DEPTH 2   /* voxels along z of a work-item; DEPTH in operators/splats/voxelise.py */
 
 __kernel void voxel_forward(
     __global const float *records, __global const int *tile_offsets, __global const int *tile_splat_ids,
@@ -20,9 +20,9 @@ __kernel void voxel_forward(
 #if BLOCK_PIXEL
     __local int records_here[STAGED * VOXEL_RECORD]; /* as ints: copied as floats, a device may set small ints to 0 */
     const int x = (int)get_global_id(0), y = (int)get_global_id(1), z_first = (int)get_global_id(2) * DEPTH;
-    const int item = (int)(get_local_id(1) * get_local_size(0) + get_local_id(0));
-    const int items = (int)(get_local_size(0) * get_local_size(1));
-    const int t = ((int)get_global_id(2) * tiles.y + y / tile.y) * tiles.x + x / tile.x; /* get_group_id restarts in each part of a launch */
+    const int item = (int)((get_local_id(2) * get_local_size(1) + get_local_id(1)) * get_local_size(0) + get_local_id(0));
+    const int items = (int)(get_local_size(0) * get_local_size(1) * get_local_size(2));
+    const int t = (z_first / tile.z * tiles.y + y / tile.y) * tiles.x + x / tile.x; /* get_group_id restarts in each part of a launch */
     const tile_list list = list_of(tile_offsets, t, capacity, count);
     float sum[DEPTH] = {0.0f};
     for (int done = 0; done < list.count; done += STAGED) {

@@ -8,19 +8,23 @@ import pytest
 
 from phyradgs_cl.runtime import MemoryShortage, Runtime
 
+PLANNED = 0.9  # share of free memory that is planned with
+
 
 @contextmanager
 def room_for(rt: Runtime, nbytes: int) -> Iterator[None]:
-    """So much device memory and no more; that it was kept to is checked at the end."""
+    """So much device memory and no more; that it was kept to is checked at the end. Plans take the share of it that they take
+    where a driver says what is free."""
     gc.collect()  # what others have left would count as held
     ledger = rt.ledger
-    before, ledger.limit_bytes = ledger.limit_bytes, ledger.held_bytes + nbytes
+    before = ledger.limit_bytes, ledger.planned
+    ledger.limit_bytes, ledger.planned = ledger.held_bytes + nbytes, PLANNED
     rt.reset_peak()
     try:
         yield
         assert ledger.peak_bytes <= ledger.limit_bytes
     finally:
-        ledger.limit_bytes = before
+        ledger.limit_bytes, ledger.planned = before
 
 
 def refuse_large(monkeypatch: pytest.MonkeyPatch, rt: Runtime, floats: int, times: int) -> None:

@@ -16,7 +16,7 @@ from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.runtime.device import DeviceInfo, choose_device, warn_of_fault
 from phyradgs_cl.runtime.memory import DeviceArray, LaterItem, MemoryLedger, Room, Traffic, memory_limit
-from phyradgs_cl.runtime.opencl import Kernel, cl, kernel_source, naming_failures
+from phyradgs_cl.runtime.opencl import Kernel, cl, kernel_source, naming_failures, placed_errors
 from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
 
 log = logging.getLogger(__name__)
@@ -105,13 +105,12 @@ class Runtime:
     def _build(self, program: str, options: tuple[str, ...]) -> "cl.Program":
         started = time.perf_counter()
         try:
+            source = kernel_source(program)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", cl.CompilerWarning)
-                source = kernel_source(program)
                 built = cl.Program(self.context, source).build(options=self._allowed(source, options))
         except cl.Error as error:
-            message_lines = [line for line in str(error).splitlines() if "error:" in line]
-            message = " ".join((message_lines or str(error).splitlines())[:3])[:600]
+            message = " ".join((placed_errors(str(error), source) or str(error).splitlines())[:3])[:600]
             subject, remedy = f"kernel {program}.cl on {self.device.name}", "try another --device"
             raise DeviceError(subject, message, "a program that builds", remedy) from error
         log.debug("built %s in %.2f s", program, time.perf_counter() - started)

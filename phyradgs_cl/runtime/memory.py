@@ -1,6 +1,7 @@
 """Device memory: arrays, a limit of their sum, errors of drivers, and exchange of arrays with pyopencl."""
 
 import logging
+import math
 import os
 import re
 import sys
@@ -42,7 +43,7 @@ class DeviceArray:
 
     @property
     def size(self) -> int:
-        return int(np.prod(self.shape, dtype=np.int64))
+        return math.prod(self.shape)  # NumPy's takes 20 µs, and a launch asks several arrays
 
     @property
     def nbytes(self) -> int:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 from phyradgs_cl import resource
 from phyradgs_cl.runtime import pocl
 
-__all__ = ["Kernel", "cl", "kernel_source", "naming_failures"]
+__all__ = ["Kernel", "cl", "kernel_source", "naming_failures", "placed_errors"]
 
 if TYPE_CHECKING:
     import pyopencl as cl
@@ -31,6 +31,7 @@ else:
 
 P = ParamSpec("P")
 R = TypeVar("R")
+_LINE, _UNNAMED = re.compile(r'#line (\d+) "(.*)"$'), re.compile(r"^<kernel>:(\d+)")
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 
 
@@ -68,6 +69,18 @@ def _expand(relative: str, pasted: set[str]) -> list[str]:
         else:
             lines.append("")  # an empty line keeps the line numbers
     return lines
+
+
+def placed_errors(log: str, source: str) -> list[str]:
+    """Returns the lines of a compiler's log that tell errors, with file and line as in ``source``'s ``#line`` directives.
+    NVIDIA's compiler ignores these, and counts from the first line of the text."""
+    files, place = [""], ("", 0)
+    for line in source.splitlines():
+        named = _LINE.match(line)
+        place = (named.group(2), int(named.group(1)) - 1) if named else (place[0], place[1] + 1)
+        files.append(f"{place[0]}:{place[1]}")
+    errors = [line.strip() for line in log.splitlines() if "error:" in line]
+    return [_UNNAMED.sub(lambda at: files[min(int(at.group(1)), len(files) - 1)], line) for line in errors]
 
 
 def naming_failures(work: str) -> Callable[[Callable[P, R]], Callable[P, R]]:

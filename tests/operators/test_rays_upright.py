@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from kernel_kit import note_launches
-from memory_limits import room_for
+from memory_limits import PLANNED, room_for
 from ray_tables import leaning, noise, tables
 from remembered import remembered
 from tolerances import RAYS, RAYS_BACK
@@ -22,7 +22,6 @@ from phyradgs_cl.runtime import Runtime
 ray_frame, ray_volume = remembered(ray_frame), remembered(ray_volume)
 GRID = Grid((19, 14, 23), (0.11, 0.13, 0.08), (0.1, -0.05, 0.2))
 TALL_PANEL = (85, 7)
-PLANNED = 0.9  # share of free memory that is planned with
 
 
 @pytest.fixture(scope="module", params=[8, pytest.param(16, marks=pytest.mark.slow)])

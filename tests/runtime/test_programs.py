@@ -73,6 +73,16 @@ def test_a_build_error_names_file_and_line(rt, tmp_path, monkeypatch) -> None:
         assert all(word in str(raised.value) for word in (f"{program}.cl", place, rt.device.name))
 
 
+def test_errors_that_name_no_file_are_placed() -> None:
+    """NVIDIA's compiler ignores #line, and counts lines of the pasted text."""
+    source = '#line 1 "a.cl"\nint a;\n#line 1 "common/b.h"\nint b;\nthis is not C;\n#line 3 "a.cl"\nint c;'
+    log = "<kernel>:5:1: error: unknown type name 'this'\nthis is not C;\n^\n<kernel>:7:5: error: no\n<kernel>:99:1: error: end"
+    expected = ["common/b.h:2:1: error: unknown type name 'this'", "a.cl:3:5: error: no", "a.cl:3:1: error: end"]
+    assert sources.placed_errors(log, source) == expected
+    own = "error: a.cl:2:79: use of undeclared identifier 'u'"
+    assert sources.placed_errors(f"Build on <device>:\n\n{own}\n", source) == [own]
+
+
 def test_pairs_of_floats_are_built_without_multiply_adds(monkeypatch) -> None:
     """Where a driver ignores the pragma, the option alone would break their sums. Others keep the option."""
     built: dict[str, list[str]] = {}
@@ -131,7 +141,7 @@ def test_splats_and_voxels_where_the_smallest_numbers_are_0(monkeypatch, make_cl
 
 def test_lanes_follow_the_device_and_can_be_told(rt) -> None:
     assert rt.lanes == (1 if rt.pixel_items else default_lanes(rt.device))
-    assert Runtime(lanes=4).lanes == 4 and Runtime(fp64=False).fp64 is False
+    assert Runtime(lanes=4, pixel_items=False).lanes == 4 and Runtime(fp64=False).fp64 is False
     for wrong in ({"lanes": 3}, {"lanes": 4, "pixel_items": True}):
         with pytest.raises(DeviceError, match="lanes"):
             Runtime(**wrong)

@@ -59,6 +59,7 @@ def _owners(rt: Runtime, layout: RayLayout, cells: RayCells) -> tuple[tuple[int,
     if not rt.pixel_items:
         defines |= dict(zip(("BRICK_X", "BRICK_Y", "BRICK_Z"), owned, strict=True))
         return owned, rt.kernel("rays_adjoint_cpu", "rays_adjoint", **defines)
+    defines["UPRIGHT"] = cells.upright
     kernel = rt.kernel("rays_adjoint_gpu", "rays_adjoint", **defines)
     if (thin := rt.group(1, _BLOCK**3, kernel) // _BLOCK**2) == _BLOCK:
         return owned, kernel

@@ -18,6 +18,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
 _RAY_CELL_FLOATS = 16  # number of floats of a time cell in ``ray_constants``
 BORDER = 1  # width of the zeros around a volume in y and z, in voxels: samples at its faces need no test
+_UPRIGHT = 1e-6  # voxels by which a column of pixels may lean
 _WIDEST = 16  # width of the widest vector, which may read beyond the last cell or line
 
 
@@ -133,6 +134,7 @@ class RayCells:
     weight_at: DeviceArray
     is_parallel: bool
     is_across: bool
+    upright: int  # UPRIGHT in cl/rays_adjoint_gpu.cl
     most_per_line: int  # largest number of cells that serve the same line of a frame
 
     @classmethod
@@ -152,10 +154,11 @@ class RayCells:
             served = [np.tile(ends, (rows_across, 1)) for ends in zip(starts[:-1], starts[1:], strict=True)]
         weight_at = np.concatenate([[0], np.cumsum([len(weight) for weight in weights])])
         matrices, stride = matrix_table(pose, grid, tables[0].is_parallel)
+        constants = ray_constants(pose, grid, tables[0].is_parallel)
         cell_lines = np.zeros((stride, 2), np.int32)
         cell_lines[: starts[-1]] = np.concatenate(ranges)
         return cls(
-            cells=rt.upload(ray_constants(pose, grid, tables[0].is_parallel)),
+            cells=rt.upload(constants),
             cell_lines=rt.upload(cell_lines),
             line_cells=rt.upload(np.stack(served), np.int32),
             matrices=rt.upload(matrices, np.float32),
@@ -165,8 +168,19 @@ class RayCells:
             weight_at=rt.upload(weight_at + (_WIDEST if rows_across is not None else 0), np.int32),
             is_parallel=tables[0].is_parallel,
             is_across=rows_across is not None,
+            upright=_upright(constants, max(int(table.line_stop.max(initial=0)) for table in tables)),
             most_per_line=max(1, *(int(np.ptp(ends, axis=1).max()) for ends in served)),
         )
+
+
+def _upright(constants: np.ndarray, lines: int) -> int:
+    """Returns whether pixels lie in columns along z in all poses, given as ``ray_constants``: 1 if lines are rows, 2 if they
+    are columns, 0 if columns lean. Rounding may move pixels by ``_UPRIGHT`` voxels within ``lines`` lines."""
+    eu, ev = np.abs(constants[:, 6:9]) * lines, np.abs(constants[:, 9:12]) * lines
+    for kind, along, across in (1, ev, eu), (2, eu, ev):
+        if max(along[:, :2].max(), across[:, 2].max()) <= _UPRIGHT and along[:, 2].min() > 0:
+            return kind
+    return 0
 
 
 def matrix_table(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> tuple[np.ndarray, int]:

@@ -22,6 +22,7 @@ DEFAULT_TIME_ERROR = 0.005  # largest relative RMS error of averages over an exp
 # Distance in standard deviations beyond which a Gaussian counts as 0: there it has fallen to 0.1 % of its peak.
 DEFAULT_CUTOFF_SIGMA = 3.7
 _BAND_LINES = 8  # number of detector lines of a tile on a CPU
+_TILE, _PARTS = 8, 4  # on a GPU: the side of a tile in pixels, and most work-items that share a pixel
 GROUP_DEFINES = {False: {"GROUP": 1, "ACROSS": 1}, True: {"GROUP": 32, "ACROSS": 8}}
 """Build options of the adjoint, by ``Runtime.pixel_items``: the work-items per Gaussian, and how many lie along a line."""
 
@@ -87,7 +88,7 @@ class SplatProjector:
         self.cutoff2 = np.float32(cutoff_sigma**2)
         self.time_error = time_error
         self.by_pixel = rt.pixel_items
-        self._cut(*(rt.tile() if self.by_pixel else (self.pitch, _BAND_LINES)))
+        self._cut(self.pitch, _BAND_LINES)
         self.image = padded_zeros(rt, lines, width)
         self._layers = None if intensity_unit is None else Layers(rt, lines, width, intensity_unit)
         self._records = rt.empty(1)
@@ -122,20 +123,29 @@ class SplatProjector:
         """Renders the layers of a frame in the padded layout, or the frame itself if line integrals are averaged. The layers
         of several clouds may be added before ``merge``."""
         rt, kernel = self.rt, self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel].forward
-        if self.by_pixel and rt.tile(kernel) != (self.tile_w, self.tile_h):
-            self._cut(*rt.tile(kernel))
+        items: int | tuple[int, ...] = self.lists.total
+        group: int | tuple[int, ...] = 1
+        if self.by_pixel:
+            group = self._group(kernel)
+            items = self.width, self.lines, group[2]
+            if group[:2] != (self.tile_w, self.tile_h):
+                self._cut(*group[:2])
         self.prepare(gaussians, cells)
         self.lists.build(self._extents, gaussians.count, gaussians.stride, cells.count)
         drawn = self.image if self._layers is None else self._layers.images(cells)
-        items = (self.width, self.lines) if self.by_pixel else self.lists.total
         rt.launch(
             kernel, items, self._records, self._is_visible, cells.cells, cells.line_cells, cells.line_times,
             cells.time_pitch, self.path_limits, self.lists.tile_offsets, self.lists.splat_ids, self.lists.splat_ids.size,
             gaussians.count, cells.count, self.lines, self.width, self.pitch, self.tile_w, self.tile_h,
             ceil_div(self.width, self.tile_w), self.cutoff2, cells.layers, drawn,
-            group=(self.tile_w, self.tile_h) if self.by_pixel else 1, samples=self.lists.samples * cells.count,
+            group=group, samples=self.lists.samples * cells.count,
         )  # fmt: skip
         return drawn
+
+    def _group(self, kernel: Kernel) -> tuple[int, int, int]:
+        """Returns the sides of a GPU's work-group: a tile of pixels, and the work-items that share each pixel."""
+        items = self.rt.group(1, _TILE**2 * _PARTS, kernel)
+        return _TILE, min(_TILE, items // _TILE), max(items // _TILE**2, 1)
 
     def merge(self, cells: DeviceCells) -> DeviceArray:
         """Merges the layers of the last ``draw`` to a frame. Its memory is valid until the next call."""

@@ -13,7 +13,8 @@ from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, 
 
 RECORD_FLOATS = 20  # number of floats that ``voxel_prepare`` writes for each Gaussian
 SUM_FLOATS = 16  # number of floats for the sums over voxels of a Gaussian
-_TILE_ROWS = 8  # height of a tile along z, in voxels
+_TILE = 8  # side of a tile in voxels; on a CPU along y and z alone
+_DEPTH = 2  # voxels along z of a GPU's work-item; DEPTH in cl/voxel_forward.cl
 _DEFAULT_BRICK_BYTES = 1 << 28  # bytes of voxels that are computed at a time
 
 
@@ -54,11 +55,12 @@ class Voxeliser:
         self.prepare(gaussians, grid, start)
         self.lists.build(self._extents, gaussians.count, gaussians.stride)
         nz, ny, nx = self.shape
+        x, y, z, _ = self.tile.tolist()
         rt.launch(
-            self._forward, (nx, ny, ceil_div(nz, _TILE_ROWS)) if self.by_pixel else self.lists.total,
+            self._forward, (nx, ny, ceil_div(nz, _DEPTH)) if self.by_pixel else self.lists.total,
             self._records, self.lists.tile_offsets, self.lists.splat_ids, self.lists.splat_ids.size,
             gaussians.count, self._shape4, self.pitch, self.tile, self.lists.tiles, self.cutoff2, self.volume,
-            group=tuple(self.tile[:2].tolist()) if self.by_pixel else 1, samples=self.lists.samples,
+            group=(x, y, z // _DEPTH) if self.by_pixel else 1, samples=self.lists.samples,
         )  # fmt: skip
         return self.volume
 
@@ -156,10 +158,12 @@ def _in_bricks(
 def _tiles(rt: Runtime, shape: Shape) -> tuple[Shape, Shape]:
     """Returns the size and the number of the tiles of a volume with ``shape`` (nz, ny, nx), both along x, y, z."""
     nz, ny, nx = shape
-    # A GPU's work-group has a work-item for each column (x, y) of a tile.
-    tile_x = 16 if rt.pixel_items else pitch_of(nx)
-    tile_y = rt.group(16 * _TILE_ROWS, 16 * _TILE_ROWS, _forward(rt)) // 16
-    return (tile_x, tile_y, _TILE_ROWS), (ceil_div(nx, tile_x), ceil_div(ny, tile_y), ceil_div(nz, _TILE_ROWS))
+    size = (pitch_of(nx), _TILE, _TILE)
+    if rt.pixel_items:  # smaller tiles where a work-group must be small
+        items = rt.group(1, _TILE**3 // _DEPTH, _forward(rt))
+        size = _TILE, min(_TILE, items // _TILE), _DEPTH * max(items // _TILE**2, 1)
+    x, y, z = size
+    return size, (ceil_div(nx, x), ceil_div(ny, y), ceil_div(nz, z))
 
 
 def _forward(rt: Runtime) -> Kernel:
