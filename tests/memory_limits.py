@@ -13,8 +13,8 @@ PLANNED = 0.9  # share of free memory that is planned with
 
 @contextmanager
 def room_for(rt: Runtime, nbytes: int) -> Iterator[None]:
-    """So much device memory and no more; that it was kept to is checked at the end. Plans take the share of it that they take
-    where a driver says what is free."""
+    """So much device memory and no more; that it was kept to is checked at the end. Plans take their share of it as where a
+    driver says what is free."""
     gc.collect()  # what others have left would count as held
     ledger = rt.ledger
     before = ledger.limit_bytes, ledger.planned

@@ -32,6 +32,8 @@ OWN = "h5"
 """This package's volume files. Their values stay in 1/mm; a scale of Hounsfield units is stored next to them."""
 ScaleOf = Callable[[Volume], Hounsfield | None]
 _SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": (), "zarr": (".ome.zarr", ".zarr")}
+# Formats of other programs that are not written: HDF5 under such a name would be read as something else.
+_NOT_WRITTEN = (".mhd", ".dcm", ".png", ".jpg", ".raw", ".vol", ".bin", ".img", ".mat", ".vtk", ".vti", ".csv", ".json")
 _PLAIN = "values in 1/mm"  # a note for files of other programs, which have no field for this unit
 
 
@@ -193,7 +195,7 @@ def _write_own(target: Path, volume: Volume, path: str, scale: Hounsfield | None
 
 def foreign_suffix(output: str | Path) -> str | None:
     """Returns the path's suffix if it belongs to another program's format, so that no HDF5 may have it; else None."""
-    suffixes = (*(suffix for to in EXPORTS for suffix in _suffixes(to)), ".mhd", ".dcm", ".png")
+    suffixes = *(suffix for to in EXPORTS for suffix in _suffixes(to)), *_NOT_WRITTEN
     return next((suffix for suffix in suffixes if Path(output).name.lower().endswith(suffix)), None)
 
 

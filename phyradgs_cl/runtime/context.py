@@ -290,20 +290,20 @@ class Runtime:
             sides[sides.index(max(sides))] //= 2
         return tuple(sides)
 
-    def tile(self, kernel: Kernel | None = None) -> tuple[int, int]:
+    def _tile(self, kernel: Kernel) -> tuple[int, int]:
         """Returns the (width, lines) of the tile of pixels that a GPU's work-group takes. The width is the number of
-        work-items that run in lockstep, within 16 and 64. The device, and ``kernel`` if given, limit the lines."""
-        rates = self.kernel("rates", "multiply_add")
+        work-items that run in lockstep, within 16 and 64. Device and kernel limit the lines."""
         if self._multiple is None:
+            rates = self.kernel("rates", "multiply_add")
             self._multiple = min(max(self._asked(rates, "PREFERRED_WORK_GROUP_SIZE_MULTIPLE"), 16), 64)
-        most = min(_TILE_ITEMS, self.device.handle.max_work_group_size, self.most_items(kernel or rates))
+        most = min(_TILE_ITEMS, self.device.handle.max_work_group_size, self.most_items(kernel))
         width = min(self._multiple, most)
         return width, most // width
 
     def shape_of_lines(self, kernel: Kernel, width: int, *rows: int) -> tuple[tuple[int, ...], tuple[int, int], int]:
         """Returns work-items, work-group and number of groups of a kernel over ``rows`` (one count per axis) of ``width``
         pixels. A work-item takes one row on a CPU, and one pixel on a GPU."""
-        items, group = ((width, *rows), self.tile(kernel)) if self.pixel_items else ((1, *rows), (1, 1))
+        items, group = ((width, *rows), self._tile(kernel)) if self.pixel_items else ((1, *rows), (1, 1))
         sides = (*group, *([1] * (len(rows) - 1)))
         return items, group, math.prod(ceil_div(n, side) for n, side in zip(items, sides, strict=True))
 

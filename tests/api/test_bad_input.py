@@ -238,6 +238,7 @@ CASES: list[tuple[str, str, Callable[[], object]]] = [
     ("save_scan", "scan", lambda: api.save_scan("s.h5", VOLUME)),
     ("save_volume", "result", lambda: api.save_volume("v.h5", VOLUME.volume)),
     ("save_volume", "path", lambda: api.save_volume("v.png", VOLUME)),
+    ("save_volume", "path", lambda: api.save_volume("v.raw", VOLUME)),
     ("save_volume", "result:/entry/gaussians", lambda: api.save_volume("v.ply", VOLUME)),
     ("save_volume", "metrics", lambda: api.save_volume("v.nii", VOLUME, {"psnr_db": 3.0})),
     ("save_volume", "volume", lambda: api.save_volume("v.npy", replace(VOLUME, volume=VOLUME.volume * np.nan))),

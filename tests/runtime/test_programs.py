@@ -76,7 +76,7 @@ def test_a_build_error_names_file_and_line(rt, tmp_path, monkeypatch) -> None:
 def test_errors_that_name_no_file_are_placed() -> None:
     """NVIDIA's compiler ignores #line, and counts lines of the pasted text."""
     source = '#line 1 "a.cl"\nint a;\n#line 1 "common/b.h"\nint b;\nthis is not C;\n#line 3 "a.cl"\nint c;'
-    log = "<kernel>:5:1: error: unknown type name 'this'\nthis is not C;\n^\n<kernel>:7:5: error: no\n<kernel>:99:1: error: end"
+    log = "<kernel>:5:1: error: unknown type name 'this'\nnot C;\n^\n<kernel>:7:5: error: no\n<kernel>:99:1: error: end"
     expected = ["common/b.h:2:1: error: unknown type name 'this'", "a.cl:3:5: error: no", "a.cl:3:1: error: end"]
     assert sources.placed_errors(log, source) == expected
     own = "error: a.cl:2:79: use of undeclared identifier 'u'"
