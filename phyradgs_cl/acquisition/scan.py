@@ -129,8 +129,10 @@ class Scan:
             raise InputError("projections", found, f"(frames, rows, columns) = {expected}")
         if self.frames == 0:
             raise InputError("projections", "no frame", "at least one projection")
-        if self.reference is not None and self.reference.shape != self.grid.shape:
-            raise InputError("reference", f"shape {self.reference.shape}", f"the grid's {self.grid.shape}")
+        if self.reference is not None:
+            object.__setattr__(self, "reference", checks.real_array("reference", self.reference))
+            if np.shape(self.reference) != self.grid.shape:
+                raise InputError("reference", f"shape {np.shape(self.reference)}", f"the grid's {self.grid.shape}")
         if self.moving_truth is not None and self.moving_truth.volumes.shape[1:] != self.grid.shape:
             found = f"states of shape {self.moving_truth.volumes.shape[1:]}"
             raise InputError("moving_truth", found, f"the grid's {self.grid.shape}")

@@ -165,6 +165,14 @@ def _is_without_jumps(steps_rad: np.ndarray) -> bool:
     return bool(size_rad.max(initial=0) <= np.pi or np.median(size_rad) >= np.pi / 2)
 
 
+def unwrapped(angles: np.ndarray, turn: float = 2 * np.pi) -> np.ndarray:
+    """Returns gantry angles (N,) without jumps by a ``turn``, as an encoder makes at 360°. Angles that count on beyond a
+    turn have none, and may step by more than half a turn."""
+    steps = np.diff(angles)
+    counts_on = np.ptp(angles) > turn and ((steps > 0).all() or (steps < 0).all())
+    return np.asarray(angles if counts_on else np.unwrap(angles, period=turn))
+
+
 @dataclass(frozen=True, eq=False)
 class CircularOrbit:
     """A circular orbit: a ``geometry`` in mm at the angles of ``kinematics``, anything with angle_rad(frame, time_s).

@@ -61,7 +61,7 @@ def move_views(scan: Scan, views: np.ndarray, *, without_gauges: bool = False) -
     """Returns the scan with the same frames and other poses of its views.
 
     views: (F, 3), for each view the gantry's turn about the axis in rad, counterclockwise seen from above, and the panel's
-    shifts along u and v in mm. They hold for all times of a view. without_gauges: leaves out the part of ``views`` that a
+    shifts along v and u in mm. They hold for all times of a view. without_gauges: leaves out the part of ``views`` that a
     turned or shifted object explains as well (docs/calibrate.md). If frames overlap in time, ``save_scan`` refuses the
     result, because a file has one pose at a time.
 

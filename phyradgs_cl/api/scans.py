@@ -15,6 +15,7 @@ from phyradgs_cl.acquisition.geometry import GEOMETRIES, Geometry, default_grid
 from phyradgs_cl.acquisition.plausible import check_plausible
 from phyradgs_cl.acquisition.scans_from import check_not_counts, check_others
 from phyradgs_cl.acquisition.shutter import AXES
+from phyradgs_cl.acquisition.trajectory import unwrapped
 from phyradgs_cl.detector.attenuation import QUANTITIES
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -71,7 +72,7 @@ def fly_scan(
     checks.positive("exposure_s", exposure_s)
     pixels = _pixels(frames, geometry, flats, darks, mask, quantity)
     start_deg = checks.numbers("angles_deg", angles_deg, (len(pixels.values),))
-    turned_deg = np.unwrap(start_deg, period=360.0)
+    turned_deg = unwrapped(start_deg, 360.0)
     steps = np.diff(turned_deg) / exposure_deg
     if np.all(steps < 0) and 0 < np.abs(np.diff(turned_deg)).max(initial=0) < _CLEAR_STEP_DEG:
         remedy = f"write exposure_deg={-exposure_deg:g}, or reverse the angles' sign"

@@ -5,6 +5,7 @@ The world's x, y, z are written as left, posterior, superior (LPS, the frame of 
 up in every viewer. A slice looks the same in viewers that know directions and in viewers that show row 0 at the top."""
 
 import json
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ _WRITERS = {".mha": "MetaImageIO", ".nii": "NiftiImageIO", ".nii.gz": "NiftiImag
 _MOST_NIFTI_VOXELS = 32_767  # NIfTI allows at most this many voxels along an axis
 _MOST_IMAGEJ_BYTES = 4_000_000_000  # from this size on BigTIFF is written: offsets in ImageJ's TIFF have 32 bits
 _CHUNK = 64  # voxels of a chunk along each axis; the resolution is halved until the volume fits into one chunk
+log = logging.getLogger(__name__)
 _PLY_NAMES = (
     *("x", "y", "z", "scale_0", "scale_1", "scale_2"), *("rot_0", "rot_1", "rot_2", "rot_3", "density")
 )
@@ -29,8 +31,8 @@ _PLY_NAMES = (
 
 def write_image(path: Path, volume: Volume, note: str, times_s: Sequence[float] = (), states: Sequence[Volume] = ()) -> None:
     """Writes NIfTI, NRRD or MetaImage, by the suffix. note: "values in 1/mm", or "values in HU" with their scale. states:
-    the object at evenly spaced ``times_s``, written in place of ``volume`` as one file of four dimensions. Raises
-    InputError for more voxels than NIfTI allows."""
+    the object at ``times_s``, written in place of ``volume`` as one file of four dimensions. Warns of times that are not
+    evenly spaced. Raises InputError for more voxels than NIfTI allows."""
     sitk = checks.package("SimpleITK", "the package that this export needs", "phyradgs-cl[formats]")
     suffix = next(suffix for suffix in reversed(_WRITERS) if path.name.lower().endswith(suffix))
     if suffix.startswith(".nii") and max(volume.values.shape) > _MOST_NIFTI_VOXELS:
@@ -40,7 +42,10 @@ def write_image(path: Path, volume: Volume, note: str, times_s: Sequence[float] 
         image.SetSpacing(volume.required_grid.voxel_size_mm[::-1])
         image.SetOrigin(volume.required_grid.first_centre_mm[::-1])
     if states:
-        step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else 1.0
+        step_s = float(times_s[-1] - times_s[0]) / (len(times_s) - 1) if len(times_s) > 1 else 1.0
+        if not np.allclose(np.diff(times_s), step_s, rtol=1e-3):
+            text = "%s: the file has one step between states, %.4g s; theirs are uneven: %s s"
+            log.warning(text, path, step_s, np.asarray(times_s).tolist())
         image = sitk.JoinSeries(images, float(times_s[0]), step_s)
     image.SetMetaData("ITK_FileNotes", note)
     with written_beside(path, len(images) * volume.values.nbytes, suffix) as temporary:

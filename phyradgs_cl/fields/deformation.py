@@ -44,7 +44,9 @@ class Deformation:
         if 0 in control_mm.shape:
             raise InputError("deformation control_mm", f"shape {control_mm.shape}", "at least one field and control point")
         origin_mm = checks.numbers("deformation origin_mm", self.origin_mm, (3,))
-        spacing_mm = checks.numbers("deformation spacing_mm", np.broadcast_to(self.spacing_mm, 3), (3,))
+        given = checks.numbers("deformation spacing_mm", self.spacing_mm)
+        checks.shape("deformation spacing_mm", given, (3,) if given.ndim else ())
+        spacing_mm = np.broadcast_to(given, 3)
         if (spacing_mm <= 0).any():
             raise InputError("deformation spacing_mm", str(self.spacing_mm), "lengths above 0")
         times_s = checks.rising("deformation times_s", self.times_s)
@@ -72,6 +74,7 @@ class Deformation:
         weights = vectors[:, ::-1][:, : min(rank, len(times_s))]
         largest = np.abs(weights).max(0)
         fields_mm = (weights * largest).T @ rows
+        checks.within("spacing_mm", spacing_mm, max(grid.size_mm) / 1000, np.inf)
         control_mm, origin_mm = fitted_control_mm(fields_mm.reshape(-1, *dense_mm.shape[1:]), grid, spacing_mm)
         return cls(control_mm, origin_mm, spacing_mm, times_s, weights / largest)
 

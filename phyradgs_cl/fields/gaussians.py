@@ -36,6 +36,8 @@ class Gaussians:
             object.__setattr__(self, name, np.asarray(getattr(self, name)))
         if (self.scale <= 0).any():
             raise InputError("Gaussians' scale", f"{self.scale.min():g}", "lengths above 0", "of logarithms: np.exp(scale)")
+        if not self.quaternion.any(axis=1).all():
+            raise InputError("Gaussians' quaternion", "0, 0, 0, 0", "a rotation", "of none: 1, 0, 0, 0")
 
     def __repr__(self) -> str:
         return f"Gaussians({self.count} of them)"
@@ -55,13 +57,13 @@ class Gaussians:
     @classmethod
     def from_rows(cls, rows: np.ndarray) -> "Gaussians":
         """Makes a cloud from rows (11, G). Raises InputError for another shape."""
-        checks.shape("rows", rows, (11, None))
+        rows = checks.numbers("rows", rows, (11, None))
         return cls(rows[MEAN].T.copy(), rows[SCALE].T.copy(), rows[QUATERNION].T.copy(), rows[DENSITY].copy())
 
     @classmethod
     def of_covariance(cls, mean: np.ndarray, covariance: np.ndarray, density: np.ndarray) -> "Gaussians":
         """Makes a cloud from means (G, 3), covariances (G, 3, 3) and densities (G,)."""
-        variance, axes = np.linalg.eigh(covariance)
+        variance, axes = np.linalg.eigh(checks.numbers("covariance", covariance, (len(np.atleast_1d(mean)), 3, 3)))
         axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # makes a rotation of eigenvectors that form a reflection
         x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(axes).as_quat().T
         return cls(mean, np.sqrt(variance), np.stack([w, x, y, z], -1), density)

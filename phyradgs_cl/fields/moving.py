@@ -31,8 +31,10 @@ class States:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "times_s", checks.rising("times of states", self.times_s))
-        checks.shape("states", self.volumes, (len(self.times_s), None, None, None))
-        checks.finite("states", self.volumes)
+        volumes = checks.real_array("states", self.volumes)
+        checks.shape("states", volumes, (len(self.times_s), None, None, None))
+        checks.finite("states", volumes)
+        object.__setattr__(self, "volumes", np.asarray(volumes, np.float32))
 
     @property
     def span_s(self) -> tuple[float, float]:

@@ -17,7 +17,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, PoseTable, Scan, Shutter
 from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry, plain_geometry
 from phyradgs_cl.acquisition.plausible import check_plausible
-from phyradgs_cl.acquisition.trajectory import grid_of_scan, resting_poses
+from phyradgs_cl.acquisition.trajectory import grid_of_scan, resting_poses, unwrapped
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers.frames import TAKEN, LineIntegrals, line_integrals, oriented
@@ -114,9 +114,9 @@ def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> Circul
     exposure_s = timing.shutter.exposure_s
     if not timing.is_fly:
         return CircularOrbit(geometry, FrameSweeps(timing.start_s, exposure_s, angle_rad, angle_rad))
-    unwrapped = np.unwrap(angle_rad)
-    speed = np.gradient(unwrapped, timing.angle_time_s)
-    first = unwrapped - speed * (timing.angle_time_s - timing.start_s)
+    turned_rad = unwrapped(angle_rad)
+    speed = np.gradient(turned_rad, timing.angle_time_s)
+    first = turned_rad - speed * (timing.angle_time_s - timing.start_s)
     return CircularOrbit(geometry, FrameSweeps(timing.start_s, exposure_s, first, first + speed * exposure_s))
 
 
@@ -295,14 +295,14 @@ class RotaryStage:
         circular orbit where the axis crosses the central ray at a right angle, else a pose table."""
         if self.axis_u_mm == self.roll_rad == self.tilt_rad == 0 and self.shift_mm is None:
             return turning(self.geometry, angle_rad, timing), self.geometry
-        unwrapped = np.unwrap(angle_rad)
-        shift_mm = np.zeros((len(unwrapped), 2)) if self.shift_mm is None else self.shift_mm
+        turned_rad = unwrapped(angle_rad)
+        shift_mm = np.zeros((len(turned_rad), 2)) if self.shift_mm is None else self.shift_mm
 
         def poses(position: np.ndarray) -> np.ndarray:
-            return self.poses(along(unwrapped, position), along(shift_mm, position))
+            return self.poses(along(turned_rad, position), along(shift_mm, position))
 
         is_parallel = isinstance(self.geometry, ParallelGeometry)
-        at_frames = poses(np.arange(len(unwrapped), dtype=np.float64))
+        at_frames = poses(np.arange(len(turned_rad), dtype=np.float64))
         geometry = plain_geometry(at_frames, self.geometry.detector_shape, is_parallel)
         return table_over_time(poses, timing, subject, is_parallel), geometry
 

@@ -8,10 +8,12 @@ import logging
 import math
 import os
 import re
+import shutil
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -46,8 +48,16 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     sitk = checks.package("SimpleITK", "the package that reads NIfTI, NRRD and MetaImage", "phyradgs-cl[formats]")
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
     reader = sitk.ImageFileReader()
-    reader.SetFileName(subject)
     reader.SetImageIO(f"{_READERS[path.suffix.lower()]}ImageIO")
+    with TemporaryDirectory() as folder:
+        # ITK reads NAME.nii in place of NAME.nii.gz where both are in a folder.
+        is_shadowed = path.suffix.lower() == ".gz" and path.with_suffix("").exists()
+        reader.SetFileName(shutil.copy(path, folder) if is_shadowed else subject)
+        yield from _read(sitk, reader, subject)
+
+
+def _read(sitk: Any, reader: Any, subject: str) -> Iterator[tuple[Any, Any]]:
+    """Yields what ``_opened`` yields, once the header is read."""
     try:
         reader.ReadImageInformation()
         yield sitk, reader

@@ -63,6 +63,7 @@ class Reconstruction:
     def __post_init__(self) -> None:
         if not isinstance(self.grid, Grid):
             raise InputError("grid", checks.short_repr(self.grid), "a Grid")
+        object.__setattr__(self, "volume", checks.real_array("volume", self.volume))
         checks.shape("volume", self.volume, self.grid.shape)
         if self.states is not None:
             checks.shape("states", self.states.volumes, (None, *self.grid.shape))

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from tolerances import FLOAT64
 
-from phyradgs_cl.acquisition import ConeGeometry, FrameSweeps, Protocol, Scan
+from phyradgs_cl.acquisition import ConeGeometry, FrameSweeps, Protocol, Scan, Shutter
 from phyradgs_cl.acquisition.geometry import ParallelGeometry, default_grid, pixel_centres
-from phyradgs_cl.acquisition.trajectory import EncoderTable
+from phyradgs_cl.acquisition.trajectory import EncoderTable, unwrapped
 from phyradgs_cl.api import fly_scan, load_scan, save_scan, static_scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.importers.assemble import Timing, turning
 
 SHAPE, ANGLES = (12, 20), np.arange(0.0, 360.0, 12.0)
 CONE = ConeGeometry(100.0, 150.0, SHAPE, (0.9, 0.6))
@@ -84,6 +85,17 @@ def test_frames_sweep_as_the_gantry_turns_when_it_swings_back(sign, caplog) -> N
     golden = (137.5 * np.arange(20)) % 360  # steps too large to have a sense
     sweeps = fly_scan(np.ones((20, *SHAPE)), CONE, golden, exposure_deg=9.0).trajectory.kinematics
     np.testing.assert_allclose(sweeps.angle_end_rad - sweeps.angle_start_rad, np.deg2rad(9.0))
+
+
+@pytest.mark.parametrize("step_deg", [9.0, 222.5, 369.0, -137.0])
+def test_angles_that_count_on_beyond_a_turn_are_as_they_say(step_deg) -> None:
+    """Their steps were taken to be less than half a turn: 222.5° turned back by 137.5°."""
+    said_deg = step_deg * np.arange(50)
+    np.testing.assert_array_equal(unwrapped(said_deg, 360.0), said_deg)
+    timing = Timing(Shutter(0.09), np.arange(50.0), True)
+    orbit = turning(ConeGeometry(5.0, 7.0, (4, 4), 1.0), np.deg2rad(said_deg), timing)
+    np.testing.assert_allclose(orbit.kinematics.angle_rad(3, np.array(3.09)), np.deg2rad(3.09 * step_deg))
+    np.testing.assert_allclose(np.diff(unwrapped(9.0 * np.arange(50) % 360, 360.0)), 9.0)
 
 
 def test_angles_that_jump_by_a_turn_are_put_together_again() -> None:

@@ -11,8 +11,10 @@ import pytest
 import SimpleITK as sitk
 import tifffile
 
+from phyradgs_cl.api import States, load_volume
 from phyradgs_cl.errors import InputError, OutputError
 from phyradgs_cl.exporters import EXPORTS, export_volume
+from phyradgs_cl.exporters.writers import write_image
 from phyradgs_cl.io import write_volume
 
 pytestmark = pytest.mark.slow
@@ -56,6 +58,20 @@ def test_nibabel(volume_file, stored, tmp_path, suffix) -> None:
     assert b"1/mm" in image.header["descrip"].tobytes()
     again = export_volume(volume_file, "nii", tmp_path / f"again{suffix}").read_bytes()
     assert again == path.read_bytes() and (again[:2] == b"\x1f\x8b") == (suffix == ".nii.gz")
+
+
+def test_a_compressed_file_is_read_though_its_name_is_there_without_gz(volume_file, stored, tmp_path) -> None:
+    """ITK reads the other, silently."""
+    image = sitk.ReadImage(str(export_volume(volume_file, "nii", tmp_path / "a.nii.gz")))
+    sitk.WriteImage(2 * image, str(tmp_path / "a.nii"))
+    np.testing.assert_array_equal(load_volume(tmp_path / "a.nii.gz").volume, stored.values)
+
+
+def test_nifti_warns_of_states_at_uneven_times(stored, tmp_path, caplog) -> None:
+    states = States(np.array([1.0, 2.0, 4.5]), np.stack([stored.values] * 3).astype(np.uint8))
+    assert states.at(3.0).dtype == np.float32
+    write_image(tmp_path / "s.nii", stored, "values in 1/mm", states.times_s, [stored] * 3)
+    assert "one step between states, 1.75 s; theirs are uneven: [1.0, 2.0, 4.5] s" in caplog.text
 
 
 def test_tifffile_as_imagej_reads_it(volume_file, stored) -> None:

@@ -153,6 +153,10 @@ ANGLES = {
     "an index that falls": "".join(f"{6 - i};{a}\n" for i, a in enumerate(range(75, -1, -15))),
     "names": "no\tTheta (deg)\ttime\n" + "".join(f"{i}\t{15 * i}\t{7 * i}\n" for i in range(6)),
     "radians by the header": "angle [rad]\n" + "".join(f"{np.deg2rad(15 * i)}\n" for i in range(6)),
+    "words with rad in them": "radiograph,angle_deg\n" + "".join(f"{i},{15 * i}.0\n" for i in range(6)),
+    "radians by the column": "radial shift;angleRad\n" + "".join(f"0.1;{np.deg2rad(15 * i)}\n" for i in range(6)),
+    "radians as NumPy writes them": "# theta [rad]\n" + "".join(f"{np.deg2rad(15 * i)}\n" for i in range(6)),
+    "an index behind, that falls": "theta_deg\tno\n" + "".join(f"{15 * i}.0\t{i}\n" for i in range(5, -1, -1)),
     "decimal commas": "".join(f"{15 * i},00\n" for i in range(6)),
     "one line": ", ".join(f"{15 * i}" for i in range(6)),
     "commas": "".join(f"{i},{15 * i}.0\n" for i in range(6)),
@@ -165,6 +169,7 @@ def test_files_of_angles(tmp_path) -> None:
         (tmp_path / "a.txt").write_bytes(text if isinstance(text, bytes) else text.encode())
         np.testing.assert_allclose(read_angles_rad(tmp_path / "a.txt", 6), np.deg2rad(15 * np.arange(6)), err_msg=kind)
     wrong = {"0 1 2\n3 4 5\n": "one angle a line", "0,1\n1,2\n2,4\n": "a decimal comma, or two", "7\n8\n": "2 angles"}
+    wrong["p0.tif,0.0\n"] = "line 1: found 'p0.tif,0.0'"
     for text, said in wrong.items():
         (tmp_path / "a.txt").write_text(text)
         with pytest.raises(InputError, match=said):

@@ -83,6 +83,13 @@ def test_fields_come_back(path, make_scan) -> None:
     same_poses(scan, again)
 
 
+def test_a_signal_faster_than_the_frames_is_cut_with_a_warning(path, make_scan, caplog) -> None:
+    scan = make_scan()
+    times_s = np.linspace(scan.frame_start_s[0], scan.frame_start_s[-1] + scan.shutter.span_s, 50)
+    again = again_of(path, replace(scan, gating=Gating(times_s, np.sin(times_s))))
+    assert len(again.gating.times_s) == scan.frames and "of 50 samples a scan file keeps one per frame" in caplog.text
+
+
 @pytest.mark.parametrize("is_phase", [False, True])
 def test_a_signal_or_a_phase_of_each_frame_comes_back(path, make_scan, is_phase) -> None:
     scan = make_scan()

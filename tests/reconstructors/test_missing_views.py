@@ -116,6 +116,11 @@ def test_panels_that_stand_in_two_places_and_approximations_are_warned_of(rt, ca
     assert "the panel stands elsewhere in some views" in caplog.text and "above the middle of their circle" in caplog.text
 
 
+def test_views_that_are_denser_in_one_half_lack_nothing(rt, caplog) -> None:
+    levels(rt, "fdk", np.concatenate([np.arange(0, 180, 3.6), np.arange(180, 360, 12.0)]))
+    assert not caplog.records
+
+
 @pytest.mark.slow
 def test_gaps_that_nothing_covers_are_named(rt, caplog) -> None:
     """In degrees, in one line each."""

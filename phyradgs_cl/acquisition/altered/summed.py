@@ -16,6 +16,7 @@ from phyradgs_cl.acquisition.trajectory import (
     PoseTable,
     Trajectory,
     checked_poses,
+    unwrapped,
 )
 from phyradgs_cl.errors import InputError
 
@@ -83,7 +84,7 @@ def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, i
     own_s = scan.frame_start_s + scan.shutter.middle_s
     if isinstance(scan.trajectory, CircularOrbit):
         angle_rad = np.array([scan.trajectory.angle_rad(f, np.array(t)) for f, t in enumerate(own_s)])
-        angle_rad = np.unwrap(angle_rad)
+        angle_rad = unwrapped(angle_rad)
         rim_px = np.abs(np.diff(angle_rad)).mean() * scan.geometry.detector_shape[1] / 2
         if rim_px > 1:
             text = "the rim moves by %.3g pixels from projection to projection: a sum has as many images of it, not a smear"

@@ -181,6 +181,9 @@ def read_gating(source: Hdf5Source, entry: str, used: np.ndarray, middle_s: np.n
 
 
 def write_gating(extra: h5py.Group, gating: Gating, middle_s: np.ndarray) -> None:
-    """Writes the signal, or the phase in cycles, for all stored frames. middle_s (F,): the middle of each frame's time."""
+    """Writes the signal, or the phase in cycles, for all stored frames. middle_s (F,): the middle of each frame's time.
+    Warns where the signal has more samples than that."""
+    if len(gating.times_s) > len(middle_s):
+        _log.warning("gating: of %d samples a scan file keeps one per frame, %d", len(gating.times_s), len(middle_s))
     group, values = h5.new_group(extra, "gating", "NXcollection"), gating.at(middle_s)
     h5.write_number(group, "phase" if gating.is_phase else "signal", values, "cycle" if gating.is_phase else None)

@@ -139,9 +139,9 @@ def _steps(ahead: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _filled_rad(ahead: np.ndarray) -> float:
-    """Returns Σ (gap − median) in rad over the gaps (K,) above both ``SHORT_SCAN_GAP`` medians and ``_NAMED_RAD``."""
-    usual = np.median(ahead) if ahead.size else 0.0
-    return float((ahead - usual)[ahead > max(SHORT_SCAN_GAP * usual, _NAMED_RAD)].sum())
+    """Returns Σ (gap − usual) in rad over gaps (K,) above ``_NAMED_RAD`` and ``SHORT_SCAN_GAP`` medians and neighbours."""
+    usual = np.maximum(np.median(ahead) if ahead.size else 0.0, np.maximum(np.roll(ahead, 1), np.roll(ahead, -1)))
+    return float((ahead - usual)[ahead > np.maximum(SHORT_SCAN_GAP * usual, _NAMED_RAD)].sum())
 
 
 def _filled_cells(ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
