@@ -31,5 +31,5 @@ def report_command(
 
 
 def view_command(volume: Annotated[Path, file_argument("VOLUME", "Volume file.")]) -> None:
-    """Open a volume in napari, if that is installed (pip install 'napari[all]')."""
+    """Open a volume in napari, if that is installed (pip install 'phyradgs-cl[view]')."""
     view_volume(volume)

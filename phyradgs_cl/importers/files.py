@@ -54,6 +54,9 @@ def read_npy(path: Path, ndim: int) -> np.ndarray:
     header that announces more than the file holds, other types, and other or empty axes."""
     subject = str(path)
     regular_file(path, subject)
+    with open(path, "rb") as file:
+        if file.read(6) != b"\x93NUMPY":
+            raise InputError(subject, "another kind of file", "a NumPy array")
     with naming_damage(path, "a damaged .npy file", "a NumPy array"):
         values = np.load(path, mmap_mode="r", allow_pickle=False)  # mapping fails where the header announces too much
         dtype, shape = values.dtype, values.shape

@@ -111,7 +111,7 @@ def view_volume(path: Path) -> None:
     """Opens a volume file in a window of napari, and returns when it is closed.
 
     Raises InputError if napari is missing, and for anything but a volume file of phyradgs-cl."""
-    napari = checks.package("napari", "the package for this, 0.5.4 or later", "napari[all]")
+    napari = checks.package("napari", "the package for this, 0.5.4 or later", "phyradgs-cl[view]")
     if (kind := file_kind(path)) != "volume":
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl")
     add_volume(napari.Viewer(title=f"{path.name} – phyradgs"), read_volume(path), path.stem)

@@ -84,7 +84,7 @@ def test_the_window_has_the_volume_in_millimetres(cli, refused, any_volume, tmp_
     assert opened[-1].dims.axis_labels == ("z", "y", "x") and opened[-1].scale_bar.visible
     assert opened[-1].camera.orientation2d == ("up", "right")
     monkeypatch.setitem(sys.modules, "napari", None)
-    refused(["view", tmp_path / "v.h5"], "pip install 'napari")
+    refused(["view", tmp_path / "v.h5"], "pip install 'phyradgs-cl[view]'")
 
 
 def test_napari_reads_volumes_and_scans_by_the_manifest(any_volume, tmp_path) -> None:
