@@ -106,7 +106,9 @@ def test_the_command_says_time_and_memory(cli, scan, capsys, method) -> None:
     assert re.search(r"^time +\S+ (s|min)", text, re.M) and re.search(r"^memory +\d+ MiB", text, re.M)
     if method == "fista-tv":
         whole, count, each, *others = re.findall(r"([\d.]+) (?:s|ms|iterations)", text.splitlines()[1])
-        assert float(whole) == pytest.approx(int(count) * float(each) / 1e3 + sum(map(float, others)), rel=0.05, abs=0.05)
+        rounding = 1.0 if float(whole) >= 10 else 0.05  # on a busy machine it takes so long, and is printed without decimals
+        parts = int(count) * float(each) / 1e3 + sum(map(float, others))
+        assert float(whole) == pytest.approx(parts, rel=0.05, abs=rounding)
     assert text.endswith("\nblur at the rim: 2 px, at half radius 1 px\n")  # 14.4° of 8 columns
 
 
