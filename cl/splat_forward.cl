@@ -71,7 +71,7 @@ ALWAYS_INLINE void add_line(const footprint_line line, const float limit, __glob
 
 /* Groups have tile_w by tile_h by `parts` items (a power of 2), because few tiles with long lists would leave a GPU idle. The
    items of a pixel divide the records by index, so that sums do not depend on whether lists were written. LAYERED: they divide
-   the cells, each with a layer of its own. Cells are sorted: the first and last line give those of all lines of a tile. */
+   the cells, whose layers differ at a pixel. Cells are sorted: the first and last line give those of all lines of a tile. */
 __kernel void splat_forward_pixels(ARGUMENTS)
 {
     __local int records_here[STAGED * RECORD]; /* as ints: copied as floats, a device may set small ints to 0 */

@@ -126,21 +126,17 @@ def rising(subject: str, value: ArrayLike) -> NDArray[np.float64]:
 
 
 def real_array(subject: str, value: ArrayLike) -> np.ndarray:
-    """Returns ``value`` as an array, its type unchanged. Raises InputError unless it holds integers or floats."""
+    """Returns ``value`` as an array, its type unchanged. Raises InputError unless it holds integers or floats, and for a
+    masked array, whose mask would be lost."""
+    if np.ma.is_masked(value):
+        raise InputError(subject, "a masked array", "a plain array", "give its mask apart: array.data, and mask=array.mask")
     try:
-        array = plain(subject, value)
+        array = np.asarray(value)
     except ValueError as error:  # NumPy's own message is too long for one line
         raise InputError(subject, "lists of unequal length", "an array of numbers") from error
     if array.dtype.kind not in "iuf":
         raise InputError(subject, short_repr(value), "numbers")
     return array
-
-
-def plain(subject: str, value: ArrayLike) -> np.ndarray:
-    """Returns ``value`` as an array. Raises InputError for a masked array, whose mask would be lost."""
-    if np.ma.is_masked(value):
-        raise InputError(subject, "a masked array", "a plain array", "give its mask apart: array.data, and mask=array.mask")
-    return np.asarray(value)
 
 
 def whole(subject: str, value: float, lowest: int, highest: int) -> None:

@@ -11,7 +11,7 @@ import re
 import shutil
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -49,15 +49,10 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     sitk.ProcessObject.SetGlobalWarningDisplay(False)
     reader = sitk.ImageFileReader()
     reader.SetImageIO(f"{_READERS[path.suffix.lower()]}ImageIO")
-    with TemporaryDirectory() as folder:
-        # ITK reads NAME.nii in place of NAME.nii.gz where both are in a folder.
-        is_shadowed = path.suffix.lower() == ".gz" and path.with_suffix("").exists()
-        reader.SetFileName(shutil.copy(path, folder) if is_shadowed else subject)
-        yield from _read(sitk, reader, subject)
-
-
-def _read(sitk: Any, reader: Any, subject: str) -> Iterator[tuple[Any, Any]]:
-    """Yields what ``_opened`` yields, once the header is read."""
+    reader.SetFileName(subject)
+    opened = ExitStack()
+    if path.suffix.lower() == ".gz" and path.with_suffix("").exists():  # ITK would read NAME.nii in place of NAME.nii.gz
+        reader.SetFileName(shutil.copy(path, opened.enter_context(TemporaryDirectory())))
     try:
         reader.ReadImageInformation()
         yield sitk, reader
@@ -65,6 +60,8 @@ def _read(sitk: Any, reader: Any, subject: str) -> Iterator[tuple[Any, Any]]:
         text = str(error).rpartition("ERROR: ")[2].partition("Reason:")[0]  # "Reason:" begins an earlier error
         reason = re.sub(r"^\w+\(0x\w+\): ", "", text.strip()).replace(subject, "")[:100]
         raise InputError(subject, f"a damaged file ({reason})", "an image of three axes") from error
+    finally:
+        opened.close()
 
 
 def image_times_s(path: Path) -> list[float]:
