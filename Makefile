@@ -84,7 +84,9 @@ docs: $(VENV)/.installed-test-all
 	$(BIN)/mkdocs build --strict --site-dir site
 
 stress: $(VENV)/.installed-test-all
-	STRESS=50 $(BIN)/python -m pytest -m "" tests/cli/test_kills.py tests/faults tests/importers tests/laws tests/test_built_ins.py tests/test_packed.py
+	STRESS=50 $(BIN)/python -m pytest -m "" \
+		tests/cli/test_kills.py tests/faults tests/importers tests/laws tests/objective tests/operators tests/optim tests/phantoms \
+		tests/test_built_ins.py tests/test_packed.py tests/test_benchmarks.py
 
 # Environments beside the first, one per target: what each has beside pytest, and the extras of pyproject.toml.
 EXTRAS_browser   := cpu,test

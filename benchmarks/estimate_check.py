@@ -23,11 +23,12 @@ from phyradgs_cl.workflow import load_scan, run_reconstruction
 RUNS: dict[str, tuple[str, Facts]] = {
     "fdk": ("fdk", {}),
     "sart": ("sart", {}),
+    "sirt static": ("sirt", {"motion": "static"}),
     "sirt": ("sirt", {}),
-    "sirt per-row": ("sirt", {"motion": "per-row"}),
     "cgls": ("cgls", {}),
     "asd-pocs": ("asd-pocs", {}),
     "fista-tv": ("fista-tv", {}),
+    "fista": ("fista", {}),
     "r2": ("r2", {}),
     "phyradgs static": ("phyradgs", {"motion": "static"}),
     "phyradgs 8x5": ("phyradgs", {"motion": "micro-views"}),

@@ -21,6 +21,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # a process per core: each has one thre
 
 import numpy as np  # noqa: E402
 from guarded import guard  # noqa: E402
+from stress import STRESSED  # noqa: E402
 
 from phyradgs_cl.__main__ import load_cli  # noqa: E402
 from phyradgs_cl.acquisition import ConeGeometry  # noqa: E402
@@ -89,8 +90,8 @@ def banded_rt() -> Runtime:
 
 
 BUILDS = {"own lanes": {}, "work-items as lanes": {"lanes": 1, "pixel_items": True}}
-OTHER_BUILDS = {"lanes 1": {"lanes": 1}, "float pairs": {"fp64": False}}
-"""Beside those that run on a CPU and on a GPU: rarely wrong alone."""
+OTHER_BUILDS = {"lanes 1": {"lanes": 1}, "float pairs": {"fp64": False}} if STRESSED else {}
+"""Rarely wrong alone: otherwise tests/test_device_check.py alone asks every kernel so, in one build."""
 
 
 @pytest.fixture(scope="session", params=BUILDS.values(), ids=BUILDS)
@@ -99,12 +100,12 @@ def two_rt(request: pytest.FixtureRequest) -> Runtime:
     return Runtime(**request.param)
 
 
-@pytest.fixture(
-    scope="session", ids=[*BUILDS, *OTHER_BUILDS],
-    params=[*BUILDS.values(), *(pytest.param(build, marks=pytest.mark.slow) for build in OTHER_BUILDS.values())],
-)  # fmt: skip
+ALL_BUILDS = BUILDS | OTHER_BUILDS
+
+
+@pytest.fixture(scope="session", params=ALL_BUILDS.values(), ids=ALL_BUILDS)
 def any_rt(request: pytest.FixtureRequest) -> Runtime:
-    """Scalars and no float64 too: for a test or two of each kernel. tests/test_device_check.py asks all of them so."""
+    """Under ``make stress`` scalars and no float64 too: for a test or two of each kernel."""
     return Runtime(**request.param)
 
 

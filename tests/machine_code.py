@@ -35,7 +35,6 @@ TARGETS = [("skylake-avx512", "avx512", 16, "avx512vl"), ("haswell", "avx2", 8, 
 WHEEL = find_spec("pocl_binary_distribution")
 HERE = [row[:3] for row in TARGETS if WHEEL is not None and row[3] in pocl._cpu_flags()]
 """The targets that this processor can execute, the widest first."""
-STRESSED = int(os.environ.get("STRESS", "1")) > 1
 
 
 def built(

@@ -5,7 +5,8 @@ import re
 from pathlib import Path
 
 import pytest
-from machine_code import HERE, STRESSED, built
+from machine_code import HERE, built
+from stress import STRESSED
 
 from phyradgs_cl.runtime import pocl
 

@@ -3,7 +3,8 @@ is masked by one condition for all lanes. PoCL may undo either silently, and the
 `make stress`: every target, as AVX2's masks are vectors."""
 
 import pytest
-from machine_code import HERE, STRESSED, built, code_of
+from machine_code import HERE, built, code_of
+from stress import STRESSED
 
 CHECKS = ("_algebra", "_image_terms", "_variation", "_optimiser")
 """The checks of a device whose kernels stream; their programs build quickly."""

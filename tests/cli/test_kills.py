@@ -1,6 +1,5 @@
 """Runs that are killed leave their last checkpoint, and go on from it to the bits of a run that was not."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -9,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stress import TIMES
 
 from phyradgs_cl.io import checkpoint_path, read_volume
 from phyradgs_cl.io.output import lock_path
@@ -24,7 +24,6 @@ RUNS = {
     "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "40"],
 }
 # STRESS=50 is what `make stress` sets
-KILLS = int(os.environ.get("STRESS", "1"))
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +62,7 @@ def test_killed_runs_end_with_the_bits_of_one_that_was_not(cli, scan, tmp_path, 
     assert list(tmp_path.iterdir()) == [whole]
     rng = np.random.default_rng(len(name))
     run = command(scan, killed, options)
-    for kill in range(KILLS):
+    for kill in range(TIMES):
         kill_in_the_middle(run if kill == 0 else [*run, "--resume"], killed, float(rng.uniform(0, 0.05)))
         if killed.exists():  # it was too fast: from the start again
             killed.unlink()

@@ -1,6 +1,5 @@
 """A device that fails at any launch, memory that runs out: one line, outputs as they were, resumed runs as if whole."""
 
-import os
 import subprocess
 import sys
 
@@ -8,13 +7,14 @@ import faults_kit as kit
 import h5py
 import numpy as np
 import pytest
+from stress import TIMES
 
 from phyradgs_cl.io import checkpoint_path
 from phyradgs_cl.runtime import context
 
 pytestmark = pytest.mark.slow
 # STRESS=50 is what `make stress` sets: there a hundred launches all over a run fail once each, or all where it has fewer
-MOST = 2 * int(os.environ.get("STRESS", "1"))
+MOST = 2 * TIMES
 RUNS = {
     "sirt": ["--method", "sirt", "--motion", "per-row", "--iterations", "5"],
     "phyradgs": ["--method", "phyradgs", "--iterations", "60", "--gaussians", "30", "--set", "control.start_iteration=20"],

@@ -2,7 +2,6 @@
 
 `make stress` sets STRESS, by which the numbers of files are multiplied."""
 
-import os
 import random
 import re
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ import SimpleITK as sitk
 import tifffile
 import writers_of_importers as w
 from damage import changed, put, removed, value
+from stress import TIMES
 
 from phyradgs_cl.errors import PhyradgsError
 from phyradgs_cl.exporters.writers import write_zarr
@@ -29,7 +29,6 @@ from phyradgs_cl.workflow import load_scan
 
 pytestmark = pytest.mark.slow
 
-TIMES = int(os.environ.get("STRESS", "1"))
 OPTIONS = {
     "phyradgs-real": ImportOptions(pixel_size_mm=(3.0, 2.5)),
     "data-exchange": ImportOptions(source_to_axis_mm=500.0, source_to_detector_mm=800.0),

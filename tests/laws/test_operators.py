@@ -3,7 +3,6 @@
 Some on random geometries, shutters, motions, grids and clouds: a thousand cases of each in `make stress`.
 """
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -15,6 +14,7 @@ from hypothesis import strategies as st
 from kernel_kit import assert_near, frame_cells, splat, splat_gradients
 from ray_tables import leaning, noise
 from ray_tables import tables as ray_tables
+from stress import STRESSED
 from tolerances import ADJOINT, FLOAT32, GRADIENT, RAYS_BACK
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, ParallelGeometry, Shutter
@@ -246,7 +246,7 @@ def test_frames_and_time_cells_add_up_and_space_may_move_and_grow(rt, make, name
 
 
 many = settings(
-    max_examples=1000 if int(os.environ.get("STRESS", "1")) > 1 else 20, deadline=None, derandomize=True, database=None,
+    max_examples=1000 if STRESSED else 20, deadline=None, derandomize=True, database=None,
     suppress_health_check=list(HealthCheck),
 )  # fmt: skip
 seeds = st.integers(0, 2**32 - 1)
