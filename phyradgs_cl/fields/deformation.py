@@ -110,13 +110,13 @@ class Deformation:
 
     def weights_at(self, times_s: "ArrayLike") -> np.ndarray:
         """Returns the weights φ_r (n, R) of the fields at times (n,) in s."""
-        times = np.atleast_1d(np.asarray(times_s, np.float64))
+        times = np.atleast_1d(checks.numbers("times_s", times_s))
         return np.stack([np.interp(times, self.times_s, column) for column in self.weights.T], -1)
 
     def displacement_mm(self, points_mm: "ArrayLike", weights: "ArrayLike") -> np.ndarray:
         """Returns displacements w (n, 3) float64 in mm at points (n, 3), x y z, for fields weighted by ``weights`` (R,)."""
         control_mm = self._state(weights)
-        place = self._in_spacings(np.asarray(points_mm, np.float64)).T[::-1]
+        place = self._in_spacings(points_mm).T[::-1]
         components = [
             scipy.ndimage.map_coordinates(control_mm[..., i], place, order=3, prefilter=False, mode="grid-constant")
             for i in range(3)
@@ -126,7 +126,7 @@ class Deformation:
     def jacobian(self, points_mm: "ArrayLike", weights: "ArrayLike") -> np.ndarray:
         """Returns the derivative ∂w_i/∂y_j (n, 3, 3) at points (n, 3), x y z, for fields weighted by ``weights`` (R,)."""
         control_mm = np.pad(self._state(weights), [(1, 1)] * 3 + [(0, 0)])
-        place = self._in_spacings(np.asarray(points_mm, np.float64))[..., None]
+        place = self._in_spacings(points_mm)[..., None]
         taps = np.floor(place).astype(np.int64) + np.arange(-1, 3)  # (n, 3, 4): the control points that act on each point
         values, slopes = cubic(place - taps), cubic_slope(place - taps) / np.reshape(self.spacing_mm, (3, 1))
         last = np.reshape(control_mm.shape[2::-1], (3, 1)) - 1
@@ -186,8 +186,8 @@ class Deformation:
         """Returns the fields' control vectors summed with ``weights`` (R,), as (nz, ny, nx, 3) in mm."""
         return np.tensordot(checks.numbers("weights", weights, (self.rank,)), self.control_mm, 1)
 
-    def _in_spacings(self, points_mm: np.ndarray) -> np.ndarray:
-        return (points_mm - self.origin_mm) / self.spacing_mm
+    def _in_spacings(self, points_mm: "ArrayLike") -> np.ndarray:
+        return (checks.numbers("points_mm", points_mm, (None, 3)) - self.origin_mm) / self.spacing_mm
 
     def bases(self, grid: Grid, slope_along: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns β³ (voxels, control points) along z, y and x at the voxel centres of ``grid``. slope_along: an axis
