@@ -210,8 +210,8 @@ __kernel void rays_upright(
     const long4 to,                   /* a result is at to.x + u to.y + v to.z + slot to.w, counted in the slot */
     __global float *image)
 {
-    __global const int *slot = slots + SLOT * (size_t)get_global_id(2);
-    const int u = slot[SLOT_U] + (int)get_global_id(0), start = slot[SLOT_V] + (int)get_global_id(1) * block;
+    __global const int *slot = slots + SLOT * (size_t)get_global_id(0);
+    const int u = slot[SLOT_U] + (int)get_global_id(1), start = slot[SLOT_V] + (int)get_global_id(2) * block;
     const int count = min(block, slot[SLOT_V_STOP] - start);
     if (u >= slot[SLOT_U_STOP] || count <= 0)
         return;
@@ -245,7 +245,7 @@ __kernel void rays_upright(
         }
     }
     __global float *pixels = image + to.x + (u - slot[SLOT_U]) * to.y + (start - slot[SLOT_V]) * to.z
-                             + (size_t)get_global_id(2) * to.w;
+                             + (size_t)get_global_id(0) * to.w;
     for (int k = 0; k < count; ++k)
         pixels[k * to.z] = total[k];
 }

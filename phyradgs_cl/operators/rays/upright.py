@@ -27,6 +27,9 @@ _OWNED = ((16, 16, 128), (8, 8, 128), (8, 4, 128))
 _ITEMS_PER_UNIT = 4  # wanted work-items per compute unit: with fewer, some units would wait long for the last item
 _UPRIGHT = 1e-6  # a column of pixels does not lean if x and y change by at most this many voxels over the detector
 _MOST_LEAN = 0.25  # largest lean of a column, in voxels across per voxel along z: beyond, the general kernel is faster
+# Detector columns in a work-group. All poses project them before the next group: near poses read the same voxels, which are
+# still in the cache.
+_GROUP = 16
 _TURN = 16  # side of the tile (x and z) that a work-item transposes, in voxels; TURN in cl/rays_upright.cl
 
 
@@ -113,9 +116,9 @@ def launch_upright(
     array, strides = target
     rt.launch(
         rt.kernel("rays_upright", "rays_upright", **_defines(how)),
-        (slots.columns, ceil_div(slots.rows, how.block), slots.count), columns, poses.cells, slots.slots,
+        (slots.count, slots.columns, ceil_div(slots.rows, how.block)), columns, poses.cells, slots.slots,
         shape, origin, pitch_of(layout.grid.shape[0]), pitch_mm, how.block, strides, array,
-        group=min(slots.columns, 8),
+        group=(1, min(slots.columns, _GROUP)),
     )  # fmt: skip
 
 
