@@ -133,15 +133,15 @@ def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = N
 
 
 def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as ``line_integrals`` does. Raises InputError also for what looks like counts, because nobody stated
-    the quantity."""
+    """Returns frames as ``line_integrals`` does. Raises InputError also for frames that look like raw counts, because nobody
+    stated what quantity they are."""
     values = checks.real_array("frames", frames)
     check_not_counts(values, "give −ln(counts / flats)", mask)
     return line_integrals(values, mask)
 
 
 def line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as float32, with 0 for masked pixels that are not finite. Raises InputError for unmasked ones."""
+    """Returns frames as float32, with 0 for masked pixels that are not finite. Other pixels not finite raise InputError."""
     values = checks.real_array("projections", frames)
     with np.errstate(over="ignore"):
         values = values.astype(np.float32, copy=False)

@@ -21,7 +21,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.text import repr_of_changes
 
 _LEAST_SPAN_S = 1e-6  # ``sampled`` needs two different times in a frame, also in one without duration
-_MOST_SAMPLES = 1024  # ``sampled`` raises an error when more samples per frame than this are not close enough
+_MOST_SAMPLES = 1024  # ``sampled`` raises an error if a table of more samples per frame than this is not close enough
 _LEAST_INCIDENCE = 1e-6  # least sine of the angle between rays and panel
 _AT_AXIS = 1e-6  # a panel within this fraction of the source-to-axis distance is at the axis
 _AWAY = 2.0  # a panel at the axis is moved so that its distance from the source and its size grow by this factor
@@ -113,7 +113,7 @@ class FrameSweeps:
 
     The speed continues through the readout. Equal angles mean a gantry at rest (stop-and-shoot). ``start_s`` (F,): when
     each frame's first line opens, in s. ``exposure_s``: the exposure of a line. ``angle_start_rad``, ``angle_end_rad``
-    (F,) in rad. A jump by a turn between them, as from 355° to 4°, is removed.
+    (F,) in rad. A jump by a turn between the two angles of a frame, as from 355° to 4°, is removed.
 
     Raises InputError for arrays of unequal length, infinite values and NaN."""
 
@@ -166,8 +166,8 @@ def _is_without_jumps(steps_rad: np.ndarray) -> bool:
 
 
 def unwrapped(angles: np.ndarray, turn: float = 2 * np.pi) -> np.ndarray:
-    """Returns gantry angles (N,) without jumps by a ``turn``, as an encoder makes at 360°. Angles that count on beyond a
-    turn have none, and may step by more than half a turn."""
+    """Returns gantry angles (N,) without jumps by a ``turn``, as an encoder makes at 360°. Angles that only rise or only
+    fall, by more than a turn in all, have no jumps: they stay as they are, even with steps of more than half a turn."""
     steps = np.diff(angles)
     counts_on = np.ptp(angles) > turn and ((steps > 0).all() or (steps < 0).all())
     return np.asarray(angles if counts_on else np.unwrap(angles, period=turn))
@@ -325,8 +325,8 @@ _AS_TABLE = "give it as a PoseTable"
 
 
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
-    """Samples a user-defined trajectory into a pose table within ``error_mm``, over ``span_s`` from each frame's start
-    (F,).
+    """Samples a user-defined trajectory into a pose table, over ``span_s`` from each frame's start (F,). The table's poses
+    differ from the trajectory's by at most ``error_mm``.
 
     Raises InputError if even a fine table is not close enough, as for frames that overlap in time with different poses."""
     samples = 2
