@@ -4,7 +4,7 @@ PoCL links each kernel with a library of built-in functions (fma, min, vload16, 
 family of x86 processors. LLVM inlines a function only if the caller's processor has all instruction sets of the function's.
 PoCL 3.0 builds kernels for the processor that LLVM 14 takes the host for, which may differ from the library's:
 
-- Ice Lake lacks CLWB in LLVM's list, so no built-in is inlined, and kernels are 3 times slower.
+- Ice Lake lacks the instruction CLWB in LLVM's list, so no built-in is inlined, and kernels are 3 times slower.
 - An unknown processor becomes "generic", for which no kernel builds (pocl/pocl issue 1049).
 - Zen 4 is taken for a Zen 3 without AVX-512, and LLVM aborts ("Cannot select: i64 = fma").
 
@@ -49,7 +49,7 @@ _LIBRARIES = (
 )
 """PoCL's libraries, as (flags, processor): PoCL takes the first one whose flags are all in /proc/cpuinfo. ``processor`` is
 LLVM's name of the processor for which the library was compiled."""
-_OLDEST_TARGET = "athlon64"
+_OLDEST_TARGET = "athlon64"  # the processor of PoCL's library for processors with none of these sets of flags
 THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
 _MOST_THREADS = 1024  # largest POCL_MAX_PTHREAD_COUNT that is accepted
 _NO_CACHE_VARIABLE = "PYOPENCL_NO_CACHE"
