@@ -293,8 +293,8 @@ def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
 
 
 def cuts(grid: Grid, whole: Grid, geometry: Geometry) -> bool:
-    """Returns whether ``grid`` leaves out, on any side, more than one voxel's width of the seen part of ``whole``: the part
-    in the field of view."""
+    """Returns whether ``grid`` leaves out, on any side, more than one of its voxels of the part of ``whole`` that lies in
+    the field of view."""
     half_mm = np.array(field_of_view_mm(geometry))
     low_mm, high_mm = np.clip(whole.box_mm.T, -half_mm, half_mm)
     begin_mm, end_mm = grid.box_mm.T

@@ -1,8 +1,7 @@
 """Motion models: each gives the poses from which the lines of a frame are projected, and their weights.
 
-A model is a frozen class with ``cells(scan, frame)``, which returns ``TimeCells``: poses with the lines that each serves. A
-user-defined class works in every method (docs/methods.md). For a stop-and-shoot scan every model of this module gives one
-pose per frame."""
+A model is a frozen class with ``cells(scan, frame)``, which returns ``TimeCells``: poses with the lines that each serves.
+User-defined classes work in every method (docs/methods.md). In a stop-and-shoot scan each model gives one pose per frame."""
 
 import math
 from collections.abc import Mapping
@@ -214,7 +213,7 @@ class Exact(_Model):
     its own exposure.
 
     With ``segments`` = 0 a frame has as many segments as keep its relative RMS error (dimensionless) below ``time_error``.
-    This limit holds for the numerical integration over time, too. Raises InputError for numbers out of range."""
+    ``time_error`` also limits the error of numerical integration over time. Raises InputError for numbers out of range."""
 
     poses: ClassVar = "integrals over time, of splats"
     operators: ClassVar = (SPLATS,)

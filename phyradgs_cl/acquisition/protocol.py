@@ -86,7 +86,7 @@ class Protocol:
         return np.arange(self.views) * abs(self.step_deg) / self.exposure_deg * self.exposure_s
 
     def window_s(self) -> tuple[float, float]:
-        """Returns when the scan's first line opens and its last one closes, in s."""
+        """Returns when the scan's first line opens and its last line closes, in s."""
         start_s = self.frame_start_s()
         return float(start_s[0]), float(start_s[-1]) + self.shutter().span_s
 
@@ -135,8 +135,7 @@ PROTOCOLS = {
 
 
 def make_protocol(name: str, **changes: Any) -> Protocol:
-    """Returns the protocol ``name`` with ``changes`` to its fields. A change to None is ignored. Raises InputError for an
-    unknown name."""
+    """Returns the protocol ``name`` with ``changes`` to its fields, None ignored. Raises InputError for an unknown name."""
     if name not in PROTOCOLS:
         raise InputError("protocol", repr(name), f"one of {', '.join(PROTOCOLS)}")
     return replace(PROTOCOLS[name], **{k: v for k, v in changes.items() if v is not None})

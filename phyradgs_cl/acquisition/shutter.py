@@ -74,7 +74,7 @@ class Shutter:
 
     @property
     def lit_span_s(self) -> tuple[float, float]:
-        """When the frame's first and last light falls on the panel, in s after its start: ``span_s``, cut to the pulse."""
+        """When the frame's first and last light falls on the panel, in s after the frame's start."""
         first_s, last_s = self.in_pulse(np.array([0.0, self.span_s]))
         return float(first_s), float(last_s)
 
@@ -87,7 +87,7 @@ class Shutter:
     def in_pulse(self, time_s: np.ndarray) -> np.ndarray:
         """Moves times (...) after the frame's start to the nearest moment at which the beam is on.
 
-        This cuts a window to the pulse. Both ends become equal if the pulse misses the window."""
+        The two ends of a window are thus cut to the pulse. They become equal if the pulse misses the window."""
         if self.pulse_s is None:
             return time_s
         start_s, length_s = self.pulse_s

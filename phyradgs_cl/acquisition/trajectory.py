@@ -20,7 +20,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.text import repr_of_changes
 
-_LEAST_SPAN_S = 1e-6  # ``sampled`` needs two different times in a frame, also in one without duration
+_LEAST_SPAN_S = 1e-6  # least time that ``sampled`` covers in a frame: it needs two times, even if the frame has no duration
 _MOST_SAMPLES = 1024  # ``sampled`` raises an error if a table of more samples per frame than this is not close enough
 _LEAST_INCIDENCE = 1e-6  # least sine of the angle between rays and panel
 _AT_AXIS = 1e-6  # a panel within this fraction of the source-to-axis distance is at the axis
@@ -36,7 +36,7 @@ class Trajectory(Protocol):
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s. A pose is source, centre of pixel (0,
-        0), step to the next column, step to the next row, x y z each. A parallel beam's begins with the rays' direction."""
+        0), step to the next column, step to the next row, x y z each. In a parallel beam the rays' direction comes first."""
 
 
 def is_parallel(trajectory: Trajectory) -> bool:
@@ -380,7 +380,8 @@ def body_frames(table: np.ndarray) -> np.ndarray:
 
 
 def _check_covered(subject: str, frame: int, t: np.ndarray, table_s: np.ndarray) -> None:
-    """Raises InputError for times beyond a table. A nanosecond is tolerated, because stored times are rounded."""
+    """Raises InputError for times (...) in s beyond a table's times ``table_s``. Tolerates the rounding of stored times: a
+    billionth of the table's last time, at least 1 ns."""
     slack = 1e-9 * max(1.0, abs(table_s[-1]))
     if t.size and (t.min() < table_s[0] - slack or t.max() > table_s[-1] + slack):
         found = f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s"

@@ -67,7 +67,8 @@ def printed(metrics: Mapping[str, object], names: Mapping[str, Metric] = METRICS
 
 
 def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Returns psnr_db in dB, ssim (3D) and data_range, the maximum of ``reference``. volume, reference: (z, y, x).
+    """Returns psnr_db in dB, ssim (of slices across all three axes) and data_range, the maximum of ``reference``. volume,
+    reference: (z, y, x) in the same unit.
 
     Raises InputError for an empty reference, shapes that differ, NaN and infinity."""
     for name, values in {"volume": volume, "reference": reference}.items():
@@ -181,8 +182,7 @@ def motion_error_mm(
 
 
 def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike, title: str) -> None:
-    """Writes a PNG with a row for the middle slice across each axis, and columns for result, truth and difference. z and y
-    point up.
+    """Writes a PNG of middle slices: a row for each axis, and columns for result, truth and difference. z and y point up.
 
     Grey values extend over the truth's range, so that a wrong gain shows. The difference has its own scale, symmetric about
     0. result, reference: (z, y, x). ``title``: the heading's first line. Raises InputError for shapes that differ, NaN and

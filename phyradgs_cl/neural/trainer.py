@@ -25,7 +25,7 @@ Field = Callable[[torch.Tensor], torch.Tensor]
 
 
 class Trainer:
-    """Fits a field to a scan's rays, step by step for a ``Loop``. A step takes one frame, an iteration all frames once.
+    """Fits a field to a scan's rays, in steps that ``reconstructors.loop`` runs. A step takes one frame, an iteration all.
     A trainer holds what changes from step to step: the field, its optimiser and the random draws.
 
     Lengths are in units of half the volume's longest side, attenuation in units of ``density_per_mm``."""
@@ -174,8 +174,7 @@ class Trainer:
     def _squares(
         self, source: np.ndarray, direction: np.ndarray, shifts: np.ndarray, measured: np.ndarray, times: int
     ) -> torch.Tensor:
-        """Returns the squared errors (R,) of pixels from ``measured`` (R,). Each pixel has rays (R, s, 3) at s of its K
-        ``times``."""
+        """Returns the squared errors (R,) of pixels ``measured`` (R,), from rays (R, s, 3) at s of a pixel's K ``times``."""
         from_, along, shift = (
             to_tensor(a.reshape(-1, a.shape[-1]).astype(np.float32), self.device)
             for a in (source, direction, shifts)
@@ -237,8 +236,8 @@ class ExposureRays:
         return len(self.cell)
 
     def __call__(self, pixels: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the rays' sources and unit directions (R, s, 3). pixels (R, 2): row and column. times (R, s): which of a
-        line's K times each ray has.
+        """Returns the sources and unit directions (R, s, 3) of s rays for each pixel. pixels (R, 2): row and column. times
+        (R, s): which of a line's K times each ray has.
 
         Parallel rays begin in front of the volume."""
         rows, columns = pixels.T
@@ -351,8 +350,7 @@ def intensity_average(integrals: torch.Tensor, unit: float) -> torch.Tensor:
 
 
 def log_squares(integrals: torch.Tensor, measured: torch.Tensor, times: int) -> torch.Tensor:
-    """Returns squared errors (R,) of the mean over all K ``times`` of a pixel, estimated from the line integrals (R, s) at s
-    of these times.
+    """Returns squared errors (R,) of a pixel's mean over all K ``times``, estimated from line integrals (R, s) at s of them.
 
     The squared error of a subset's mean is too large by the variance of that mean. This is estimated as the s samples'
     variance times (1/s − 1/K), and subtracted. Expectation and gradient are then the same as with all K times."""

@@ -33,8 +33,7 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class VoxelPhantom:
-    """A phantom of voxels: attenuation (nz, ny, nx) float32 in 1/mm on a grid. Raises InputError for shapes that differ, NaN
-    and infinity."""
+    """Attenuation (nz, ny, nx) float32 in 1/mm on a grid. Raises InputError for shapes that differ, NaN and infinity."""
 
     volume: NDArray[np.float32]
     grid: Grid

@@ -1,8 +1,8 @@
 """Bodies for procedural phantoms: signed distances, smooth unions, band-limited texture.
 
 They are functions of position in the cube [-1, 1]^3, averaged over voxels, so every resolution shows the same object.
-Lengths are in units of half the cube's side. Distances are negative inside a body. Points are (x, y, z); arrays are (z, y,
-x), float32."""
+Lengths are in half sides of the cube. Distances are negative inside a body. Points are (x, y, z); arrays are (z, y, x),
+float32."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ class Capsule:
 
 @dataclass(frozen=True)
 class Lattice:
-    """The centres of `count` voxels along each axis of the cube [-1, 1]^3."""
+    """A lattice of voxels that fill the cube [-1, 1]^3, `count` along each axis."""
 
     count: int
 

@@ -26,7 +26,7 @@ class Space(Protocol, Generic[A]):
     """Arrays on the host or on a device, and their algebra. Operands have the same shape unless a method says otherwise."""
 
     def array(self, values: np.ndarray) -> A:
-        """Returns NumPy values as an array of this space. Both may share memory."""
+        """Returns NumPy values as an array of this space. The two may share memory."""
 
     def numpy(self, x: A) -> np.ndarray:
         """Returns the values of ``x`` as a NumPy array, which may share memory with ``x``."""

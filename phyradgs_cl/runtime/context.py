@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 Sides = tuple[int, ...]
 
 LANE_CHOICES = (1, 4, 8, 16)  # numbers of floats that a kernel's vectors may have
-_FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'  # option that fuses; mark of sources with float pairs
+_FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'  # fuses multiply and add; marks sources with float pairs
 _TILE_ITEMS = 256  # largest work-group that shares a tile of pixels, in work-items
 _FEWEST_ITEMS = 32  # a device whose work-groups must be smaller than this is refused
 
@@ -280,8 +280,7 @@ class Runtime:
         return int(self.compile(kernel).get_work_group_info(getattr(cl.kernel_work_group_info, name), self.device.handle))
 
     def _fitting(self, kernel: Kernel, group: tuple[int, ...]) -> tuple[int, ...]:
-        """Halves a work-group's sides until the kernel can run. Raises DeviceError for a kernel that allows less than 32
-        work-items."""
+        """Halves the sides of a work-group until the kernel can run. Raises DeviceError if it allows fewer than 32 items."""
         if math.prod(group) == 1:
             return group
         most, sides = self.most_items(kernel), list(group)
@@ -338,7 +337,7 @@ def default_lanes(device: DeviceInfo) -> int:
 
 def _parts(items: Sides, group: Sides, pieces: int) -> Iterator[tuple[Sides | None, Sides]]:
     """Divides a launch of ``items`` into ``pieces`` or more, each of whole work-groups; into fewer if there are too few
-    groups. Yields, per axis, the first item and the number of items of each piece; None as first item if undivided."""
+    groups. Yields each piece's first item and its number of items per axis. An undivided launch's first item is None."""
     if pieces <= 1:
         yield None, items
         return

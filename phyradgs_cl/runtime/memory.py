@@ -151,7 +151,7 @@ class MemoryLedger:
         """Returns an OpenCL error as a DeviceError, or as a MemoryShortage if memory ran out. work: what failed.
 
         Some drivers report a shortage only at a launch or a wait. They also say "out of resources" after a kernel that
-        crashed or ran too long. Then ``queue`` no longer works, which tells the two apart."""
+        crashed or ran too long. In that case ``queue`` no longer works, which tells the two causes apart."""
         code = getattr(error, "code", 0)  # some errors of pyopencl have no code, as those of builds
         is_dead = queue is not None and not answers(queue)
         if not is_dead and (isinstance(error, cl.MemoryError) or code in _MEMORY_CODES):

@@ -37,7 +37,7 @@ class ObjectMotion(checks.Checked):
     lowers its top and shrinks it sideways, and never returns. "sliding" moves a cylinder about the z axis up and down in
     surroundings at rest.
 
-    - amplitude_mm: the largest displacement. None takes ``amplitude`` times half of the box's shortest side.
+    - amplitude_mm: the largest displacement along z. None takes ``amplitude`` times half of the box's shortest side.
     - period_s: the time of a breath, or of sliding up and down. jitter: spread (std) of a breath's period over ``period_s``.
     - hysteresis: the delay of the motion along y, in periods.
     - settling_s: the time in which drying goes 63 % of its way. None takes a third of the scan.
@@ -95,7 +95,8 @@ class ObjectMotion(checks.Checked):
 
     def _sliding_mm(self, places: list[Array], height: Array) -> list[Array]:
         """Returns the control vectors of a cylinder about the z axis that moves along z, for unit amplitude. Its edge is
-        about three control points wide. places: z, y, x of the control points from the box's middle, over ``half_mm``."""
+        about three control points wide. places: z, y, x of control points from the box's middle, over half its shortest
+        side."""
         _, y, x = places
         return [_vectors(z=(np.hypot(x, y) < self.radius).astype(float))]
 
@@ -147,8 +148,7 @@ def load_object_motion(path: str | Path) -> ObjectMotion:
 
 
 def _breath(phase: Array) -> Array:
-    """Returns how far a breath has gone at a phase in cycles, as a fraction of its amplitude: 0 at whole numbers, 1 half-way
-    between."""
+    """Returns a breath's displacement over its amplitude at a phase in cycles: 0 at whole numbers, 1 half-way between."""
     return np.asarray(1 - np.cos(np.pi * phase) ** 4)
 
 

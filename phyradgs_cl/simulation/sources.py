@@ -127,9 +127,9 @@ def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:
 def on_panel(geometry: Geometry, grid: Grid, pixel_samples: int, make: Callable[[Geometry], FrameSource]) -> FrameSource:
     """Returns the source that ``make`` builds for the panel. With several samples per pixel it averages a finer panel.
 
-    pixel_samples: samples along each side of a pixel, at most 32. 0 takes one where a pixel, projected to the axis, is at
-    most ``WIDEST_RAY`` voxels of the grid wide, else one per voxel: rays through the middles of wide pixels would miss parts
-    of the object. Raises InputError for a number out of range."""
+    pixel_samples: samples along each side of a pixel, at most 32. 0 takes one sample where a pixel's image at the axis is at
+    most ``WIDEST_RAY`` voxels of the grid wide, else one sample per voxel: rays through the middles of wide pixels would
+    miss parts of the object. Raises InputError for a number out of range."""
     checks.within("--pixel-samples", pixel_samples, 0, _MOST_SAMPLES)
     if pixel_samples == 0:
         voxels = max(geometry.pixel_size_mm) / geometry.magnification / min(grid.voxel_size_mm)

@@ -17,9 +17,8 @@ class GeometryCorrection:
     """Differences from a scan's stated geometry and timing. With all zeros the scan stays as stated.
 
     Offsets move the panel in its plane, along u and v. Roll rotates the panel in its plane; tilts rotate it about v or u
-    through its middle. Distances move source and panel away from the axis. Times are added to readout and exposure. turn_rad
-    rotates source and panel about the axis in all views, and lift_mm raises them along it. A turned or lowered object has
-    the same effect."""
+    through its middle. Distances move source and panel away from the axis. Times are added to readout and exposure. In all
+    views, turn_rad rotates the scanner about the axis and lift_mm raises it, as if the object were turned or lowered."""
 
     offset_u_mm: float = 0.0
     offset_v_mm: float = 0.0
@@ -47,7 +46,7 @@ class Views:
 class Sway:
     """A rigid motion of the object: rotations about x, y and z in rad, and shifts along them in mm.
 
-    All six are cubic splines of time from ``start_s`` to ``end_s``, with coefficients (n, 6), and constant outside."""
+    All six are cubic splines of time from ``start_s`` to ``end_s``, with coefficients (n, 6). They are constant outside."""
 
     coefficients: np.ndarray
     start_s: float

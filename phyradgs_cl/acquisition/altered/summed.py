@@ -78,8 +78,8 @@ def _interval_s(scan: Scan) -> tuple[float, float]:
 
 
 def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, int]:
-    """Returns a continuous trajectory through the projections' poses, and how many projections at either end have intervals
-    that it does not wholly cover."""
+    """Returns a continuous trajectory through the projections' poses. Also returns how many projections at either end have
+    intervals that the trajectory does not wholly cover."""
     middle_s = first_s + (np.arange(scan.frames) + 0.5) * step_s
     own_s = scan.frame_start_s + scan.shutter.middle_s
     if isinstance(scan.trajectory, CircularOrbit):
