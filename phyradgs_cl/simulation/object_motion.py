@@ -37,7 +37,7 @@ class ObjectMotion(checks.Checked):
     lowers its top and shrinks it sideways, and never returns. "sliding" moves a cylinder about the z axis up and down in
     surroundings at rest.
 
-    - amplitude_mm: the largest displacement along z. None takes ``amplitude`` times half of the box's shortest side.
+    - amplitude_mm: the limit of the displacement along z. None takes ``amplitude`` times half of the box's shortest side.
     - period_s: the time of a breath, or of sliding up and down. jitter: spread (std) of a breath's period over ``period_s``.
     - hysteresis: the delay of the motion along y, in periods.
     - settling_s: the time in which drying goes 63 % of its way. None takes a third of the scan.
