@@ -1,6 +1,7 @@
 """Builds the ``TimeCells`` of a frame, by one function for each motion model.
 
-"Lit span" means the time from a frame's first light on the panel to its last, and a line's "window" its exposure."""
+A time cell is one pose, or one segment of time, with the detector lines that are projected from it. The "lit span" is the
+time from a frame's first light on the panel to its last. A line's "window" is the time in which it receives light."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -12,12 +13,12 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames, is_parallel
 
 _SAME_TIME = 1e-6  # times that differ by less than this fraction of a cell's duration are equal
-_NOTHING = 1e-9  # a smaller fraction of a line's exposure in a cell is a rounding error, and set to 0
-_INSTANT = 1e-9  # an exposure of a line shorter than this fraction of the frame's lit span is treated as a single time
-_OVERHANG = 0.1  # a line skips a segment of time of which its exposure covers at most this fraction
-_TURN_SAMPLES = 32  # the gantry's highest speed in a frame is the highest mean speed of this many equal intervals
+_NOTHING = 1e-9  # a cell's fraction of a line's exposure below this is a rounding error, and becomes 0
+_INSTANT = 1e-9  # a line's exposure shorter than this fraction of the frame's lit span counts as a single moment
+_OVERHANG = 0.1  # a line leaves out a segment of time if its exposure covers at most this fraction of the segment
+_TURN_SAMPLES = 32  # number of equal intervals of a frame: the highest mean speed in one counts as the gantry's highest
 _TURN_FACTOR = 0.32  # measured relative RMS error of a frame, per squared radian that the gantry turns in a segment
-_HARMLESS_PEAK = 4.0  # largest line integral up to which averaging intensities needs no more segments
+_HARMLESS_PEAK = 4.0  # up to this line integral, averaging intensities needs no more segments than averaging line integrals
 _MOST_SEGMENTS = 1000  # most segments that ``segments_for`` chooses for a frame
 
 
@@ -44,8 +45,9 @@ def micro_view_cells(
 ) -> TimeCells:
     """Divides the lines into M ``strips`` and the exposure into N ``sub_intervals``, and returns a cell for each pair.
 
-    Strip j in sub-interval k of a frame that starts at t_f has the time t_f + (j+½)/M·T_ro + (k+½)/N·T_exp (paper, Eq. 2).
-    With a pulsed beam the sub-intervals divide the part of the exposure with light. Strips without a line have no cells."""
+    Strip j in sub-interval k of a frame that starts at t_f has the time t_f + (j+½)/M·T_ro + (k+½)/N·T_exp, with readout
+    time T_ro and exposure T_exp (paper, Eq. 2). With a pulsed beam the sub-intervals divide the lit part of the exposure.
+    Strips without a line have no cells."""
     share = (np.arange(sub_intervals) + 0.5) / sub_intervals
     ranges = np.array(shutter.strip_ranges(lines, strips))
     strip = np.flatnonzero(ranges[:, 1] > ranges[:, 0])
@@ -61,7 +63,7 @@ def centre_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, strips: int,
     sub_intervals: int
 ) -> TimeCells:
-    """Returns the cells of ``micro_view_cells``, with the pose of ``static_cells`` as ``conic_pose``."""
+    """Returns the cells of ``micro_view_cells``. Their ``conic_pose`` is the pose of ``static_cells``."""
     table = micro_view_cells(trajectory, shutter, frame, start_s, lines, strips, sub_intervals)
     return replace(table, conic_pose=static_cells(trajectory, shutter, frame, start_s, lines).pose[0])
 
@@ -90,9 +92,9 @@ def common_time_cells(
     the paper's strip concatenation with fractional strips.
 
     frame_start_s (F,): the starts of all frames in s. In a scan without gaps, frames overlap in time because of the
-    readout. In the overlap they share poses if they start a whole number of cells after frame 0. With an exposure of 0 s,
+    readout. Overlapping frames share poses if they start a whole number of cells after frame 0. With an exposure of 0 s,
     or cells shorter than the readout of a line, sharing is useless: the result is ``per_line_cells``. With a pulsed beam,
-    the exposure counts as the longest time that a line receives light."""
+    the longest time for which a line receives light counts as the exposure."""
     start_s = float(frame_start_s[frame])
     windows_s = shutter.line_windows_s(lines)
     length_s = float(np.ptp(windows_s, axis=1).max())
@@ -130,7 +132,7 @@ def _served_lines(served: np.ndarray) -> Served:
 
 
 def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np.ndarray:
-    """Returns the middles (K,) of a frame's cells in s on the scan's clock. Their edges (K + 1,) count from its start."""
+    """Returns the middles (K,) of a frame's cells in s on the scan's clock. edges_s (K + 1,): after the frame's start."""
     step_s = edges_s[1] - edges_s[0]
     start_s, origin_s = float(frame_start_s[frame]), float(frame_start_s[0])
     cells = (start_s - origin_s) / step_s
@@ -161,7 +163,7 @@ def exact_cells(
 ) -> TimeCells:
     """Divides the time from a frame's first light to its last into equal ``segments``, in which Gaussians move on the panel.
 
-    Every line integrates over its own window (docs/mathematics.md). For a gantry at rest, or a time of 0 s, returns
+    Every line integrates over its own window (docs/mathematics.md). For a gantry at rest, or a lit span of 0 s, returns
     ``static_cells``."""
     first_s, last_s = shutter.lit_span_s
     if last_s <= first_s:
@@ -213,13 +215,13 @@ def segments_for(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, time_error: float,
     intensity_peak: float = 0.0
 ) -> int:
-    """Returns how many segments, at most 1000, keep a frame's relative RMS error below ``time_error``.
+    """Returns how many segments of time, at most 1000, keep a frame's relative RMS error below ``time_error``.
 
-    In a segment, Gaussians move along straight lines and keep their shape. The error grows with the square of the gantry's
-    turn in a segment. The factor was measured (benchmarks/time_exact.py) for Gaussians of 0.5 to 4 % of the half-width.
+    In a segment, Gaussians move along straight lines and keep their shape. The error is ``_TURN_FACTOR`` times the square
+    of the gantry's turn in a segment, as benchmarks/time_exact.py measured for Gaussians of 0.5 to 4 % of the half-width.
     intensity_peak: the largest line integral if the detector averages intensities, else 0. Averaging intensities adds an
-    error of half the variance of the line integrals in a segment. Up to a peak of 4 this error is the smaller one; above,
-    more segments are needed."""
+    error of half the variance of the line integrals in a segment. Up to a peak of 4 this added error is the smaller one.
+    Larger peaks need more segments."""
     first_s, last_s = shutter.lit_span_s
     pose = trajectory.pose(frame, start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1))
     fastest_rad = float(np.max(_turns_rad(pose))) * _TURN_SAMPLES
@@ -229,7 +231,7 @@ def segments_for(
 
 
 def _turns_rad(pose: np.ndarray) -> np.ndarray:
-    """Returns the angle in rad from each pose (T, 12) to the next, (T − 1,), of source or panel, whichever turns more."""
+    """Returns the larger angle (T − 1,) in rad by which source or panel turns from each pose (T, 12) to the next."""
     u_hat, _, normal = np.moveaxis(body_frames(pose), -1, 0)
     source = pose[:, :3] / np.maximum(np.linalg.norm(pose[:, :3], axis=1, keepdims=True), 1e-300)
     chords = [np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (u_hat, normal, source)]
@@ -245,7 +247,7 @@ def cell_table(
     trajectory: Trajectory, shutter: Shutter, frame: int, time_s: np.ndarray, line_start: np.ndarray,
     line_stop: np.ndarray, weight: np.ndarray, lines: int
 ) -> TimeCells:
-    """Returns the cells at times (C,) in s with the poses that the trajectory has then, sorted by their first lines."""
+    """Returns the cells at times (C,) in s, sorted by their first lines, with the trajectory's poses at these times."""
     order = np.argsort(line_start, kind="stable")
     return TimeCells(
         pose=trajectory.pose(frame, time_s[order]), time_s=time_s[order],

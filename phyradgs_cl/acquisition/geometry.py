@@ -19,7 +19,7 @@ POSE_LENGTH = 12
 # Largest distance of the source from the axis, in voxels. At this distance float32 displaces rays by 6 % of a voxel, at 1e7
 # voxels by half a voxel.
 _MOST_VOXELS_AWAY = 1e6
-# A central ray counts as having at least this sin² of its angle to z: where a steeper one passes the axis is too uncertain.
+# Least sin² of a central ray's angle to z. A steeper ray counts as having it: where that ray passes the axis is uncertain.
 _STEEP = 1e-2
 
 
@@ -182,8 +182,8 @@ def plain_geometry(pose: np.ndarray, panel: tuple[int, int], is_parallel: bool =
 
 
 def towards_source(pose: np.ndarray, is_parallel: bool) -> np.ndarray:
-    """Returns vectors (..., 3) from the origin to the source, for poses (..., 12). A parallel beam's are unit vectors
-    against the rays."""
+    """Returns vectors (..., 3) from the origin to the source, for poses (..., 12). In a parallel beam these are unit
+    vectors against the direction of the rays."""
     return -pose[..., :3] if is_parallel else pose[..., :3]
 
 
@@ -195,9 +195,9 @@ def transpose_pose(pose: np.ndarray) -> np.ndarray:
 def field_of_view_mm(geometry: Geometry) -> tuple[float, float, float]:
     """Returns half the sides (z, y, x) in mm of the field of view of a full turn, a box about the origin.
 
-    The radius is DSO·sin(atan(half width/DSD)), where the half width reaches to the farther edge of a shifted panel. The
-    height is the cone's height at that radius behind the axis. A parallel beam's box reaches to the panel's farther
-    edges."""
+    The radius is DSO·sin(atan(half width/DSD)), with the distances DSO from source to axis and DSD from source to panel.
+    The half width reaches from the central ray to the farther edge of a shifted panel. The height is the cone's height at
+    that radius behind the axis. A parallel beam's box reaches to the panel's farther edges."""
     sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)
     half_height_mm, half_width_mm = (count * pitch / 2 + abs(offset) for count, pitch, offset in sides)
     if isinstance(geometry, ParallelGeometry):
@@ -293,8 +293,8 @@ def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
 
 
 def cuts(grid: Grid, whole: Grid, geometry: Geometry) -> bool:
-    """Returns whether ``grid`` leaves out, on any side, more than the width of its voxels of that part of ``whole`` which
-    lies in the field of view."""
+    """Returns whether ``grid`` leaves out, on any side, more than one of its voxels of the part of ``whole`` that lies in
+    the field of view."""
     half_mm = np.array(field_of_view_mm(geometry))
     low_mm, high_mm = np.clip(whole.box_mm.T, -half_mm, half_mm)
     begin_mm, end_mm = grid.box_mm.T

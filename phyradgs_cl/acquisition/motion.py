@@ -1,7 +1,7 @@
 """Motion models: each gives the poses from which the lines of a frame are projected, and their weights.
 
-A model is a frozen class with ``cells(scan, frame)``, which returns ``TimeCells``. A user-defined class works in every
-method (docs/methods.md). For a stop-and-shoot scan every model of this module gives one pose per frame."""
+A model is a frozen class with ``cells(scan, frame)``, which returns ``TimeCells``: poses with the lines that each serves.
+User-defined classes work in every method (docs/methods.md). In a stop-and-shoot scan each model gives one pose per frame."""
 
 import math
 from collections.abc import Mapping
@@ -23,11 +23,11 @@ from phyradgs_cl.fields import Deformation
 
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator that a model may suit: projectors of voxels, of Gaussians, and filtered backprojection."""
-_USUAL_TIMES = 6  # ``PerRow`` samples an exposure at no more times than this, unless motion is fast
-_MOST_TIMES = 100  # ``PerRow`` samples an exposure at no more times than this, however fast the motion
-_FINE_STEP_VOXELS = 0.3  # most travel of the volume's rim from one time of ``PerRow`` to the next
-_OBJECT_STEP_VOXELS = 0.7  # most travel of an object's fastest part from one time to the next; other parts travel less
-_COARSE_STEP_VOXELS = 3.6  # most travel of rim or object from one time to the next where _USUAL_TIMES are too few
+_USUAL_TIMES = 6  # most times at which ``PerRow`` samples an exposure, unless the motion is fast
+_MOST_TIMES = 100  # most times at which ``PerRow`` samples an exposure, however fast the motion
+_FINE_STEP_VOXELS = 0.3  # most voxels that the volume's rim travels from one time of ``PerRow`` to the next
+_OBJECT_STEP_VOXELS = 0.7  # most voxels that an object's fastest part travels between two times; other parts travel less
+_COARSE_STEP_VOXELS = 3.6  # most voxels that rim or object travels between two times where _USUAL_TIMES are too few
 _SUB_INTERVALS = "Sub-intervals N of an exposure; for phyradgs means micro-views."
 _WEIGHT_TOLERANCE = 1e-3  # largest difference from 1 of the sum of a line's weights in a user-defined model
 
@@ -39,7 +39,7 @@ class Motion(Protocol):
 
 
 def rim_travel_voxels(scan: Scan) -> float:
-    """Returns how far the grid's rim moves, relative to the panel, during a line's exposure, in voxels of a slice (y, x).
+    """Returns how far the grid's rim moves, relative to the panel, during a line's exposure, in voxel sides along y or x.
 
     The middles of the grid's four sides around the axis stand for the rim. On a circular orbit they move by about r Δθ, for
     a radius r and an arc Δθ. The largest travel in the first, middle and last frame counts. For a gantry at rest it is 0."""
@@ -68,7 +68,7 @@ def _place(scan: Scan, frame: int) -> tuple[Trajectory, Shutter, int, float, int
 
 
 class _Model(checks.Checked):
-    """Base of this module's models, with words for help texts and reports."""
+    """Base of this module's motion models, with words for help texts and reports."""
 
     operators: ClassVar[tuple[str, ...]]  # which methods take the model: some of RAYS, SPLATS, LINE_POSES
     poses: ClassVar[str] = ""  # a frame's poses in words, for the help of --motion; "" hides the model from the command line
@@ -159,9 +159,9 @@ class PerRow(_Model):
         """Returns the model with as many times as the scan needs. A stated number stays. object_mm_per_s: the speed of the
         object's fastest part.
 
-        An exposure has one time per 0.3 voxels that the rim moves, or per 0.7 voxels that the object moves, whichever are
-        more, but at most 6. These suffice up to 22 voxels. Longer travel needs one time per 3.6 voxels, at most 100
-        (measured in docs/results/settings.md)."""
+        An exposure has one time per 0.3 voxels that the grid's rim moves, or per 0.7 voxels that the object moves, whichever
+        gives more times, but at most 6. Six times suffice for a travel of up to 22 voxels. Longer travel needs one time per
+        3.6 voxels, at most 100 times (measured in docs/results/settings.md)."""
         if self.sub_intervals:
             return self
         rim_voxels = rim_travel_voxels(scan)
@@ -212,8 +212,8 @@ class Exact(_Model):
     """Gaussians move on the panel during a frame, which is divided into ``segments`` of time. Every line integrates over
     its own exposure.
 
-    With ``segments`` = 0 a frame has as many as keep its relative RMS error (dimensionless) below ``time_error``, which
-    also limits the error of the numerical integration over time. Raises InputError for numbers out of range."""
+    With ``segments`` = 0 a frame has as many segments as keep its relative RMS error (dimensionless) below ``time_error``.
+    ``time_error`` also limits the error of numerical integration over time. Raises InputError for numbers out of range."""
 
     poses: ClassVar = "integrals over time, of splats"
     operators: ClassVar = (SPLATS,)
@@ -251,7 +251,8 @@ def motion_of(motion: str | Motion) -> Motion:
 
 
 def with_times(motion: Motion, scan: Scan, deformation: Deformation | None = None) -> Motion:
-    """Returns the motion model. A ``PerRow`` without a stated number of times gets the number that the scan needs."""
+    """Returns the motion model. A ``PerRow`` without a stated number of times gets the number that the scan needs.
+    deformation: how the object moves; None if it is at rest."""
     speed_mm_per_s = 0.0 if deformation is None else deformation.fastest_mm_per_s
     return motion.of(scan, speed_mm_per_s) if isinstance(motion, PerRow) else motion
 
@@ -293,7 +294,7 @@ def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
 
 
 class MotionOptions(checks.Checked):
-    """Base of a method's options: checks that ``motion`` is one of ``MOTIONS`` or of a user-defined class."""
+    """Base of a method's options: checks that ``motion`` has the class of one of ``MOTIONS``, or a user-defined class."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]]
     motion: Motion

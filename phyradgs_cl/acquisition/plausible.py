@@ -1,4 +1,4 @@
-"""Summarises a scan in two or three lines, and finds numbers that no scanner has, as from a wrong unit."""
+"""Summarises a scan in two or three lines, and finds numbers that no scanner has, such as lengths in a wrong unit."""
 
 import logging
 import math
@@ -20,8 +20,8 @@ FEW = 0.01  # fraction of pixels above OPAQUE that is ignored, since some pixels
 _WIDEST_DEG = 120.0  # a fan or cone angle above this is refused: dental scanners have 30°, nano-CT 60°
 _LARGEST_PITCH_MM = 5.0  # pixels larger than this are not real, so they are named as the cause of too wide a fan
 _LEAST_DISTANCE_MM = 10.0  # a panel nearer to the source than this is not real, so distances are named as the cause
-_WRONG_UNIT = 100.0  # a readout of more frame times than this is refused: ms given as s make it some hundreds
-_SHORT_READOUT_S = 0.5e-3  # a shorter readout of at least _MANY_LINES causes a warning: real panels take some ms
+_WRONG_UNIT = 100.0  # a readout longer than this many frame times is refused: ms given as s make it some hundreds
+_SHORT_READOUT_S = 0.5e-3  # a shorter readout of at least _MANY_LINES lines causes a warning: real panels take some ms
 _MANY_LINES = 100
 _SLOW_FPS = 2.0  # a lower frame rate causes a warning if the gantry turns more than _LARGE_STEP_DEG between frames
 _LARGE_STEP_DEG = 10.0
@@ -40,14 +40,14 @@ def summary(scan: "Scan") -> str:
 def blur_facts(scan: "Scan") -> dict[str, float]:
     """Returns ``blur_at_rim_px`` and ``blur_at_half_radius_px`` of a fly-scan, in columns; {} for a gantry at rest.
 
-    The blur is Δθ times the radius on the panel, in columns. Δθ is the arc of an exposure. A point at radius r moves by
-    r·Δθ. Where it moves at right angles to the ray, its image moves by M·r·Δθ, with the magnification M. M·r is the image's
-    largest distance from the axis. This is the first order in r/R, with R from source to axis: a point nearer to the
-    source blurs up to R/(R − r) times as much, one nearer to the panel down to R/(R + r) times.
+    The blur is Δθ times the radius on the panel, in columns. Δθ is the arc of an exposure in rad. A point at radius r moves
+    by r·Δθ. Where the point moves at right angles to the ray, its image moves by M·r·Δθ, with the magnification M. M·r is
+    the image's largest distance from the axis. This is the first order in r/R, with R from source to axis: a point nearer
+    to the source blurs up to R/(R − r) times as much, a point nearer to the panel down to R/(R + r) times as much.
 
-    Δθ is the median over the frames, while a line is open and the beam on. The rim is the largest radius that every view
-    sees, which the panel's nearer side limits. A panel more than a tenth of its width off centre was displaced for a wider
-    field of view, where opposite views complete each other: its rim is the farther side."""
+    Δθ is the arc while a line is open and the beam is on, as the median over the frames. The rim is the largest radius that
+    every view sees: the distance from the axis to the panel's nearer side. A panel more than a tenth of its width off centre
+    was displaced for a wider field of view, where opposite views complete each other: its rim is at the farther side."""
     if not scan.is_fly:
         return {}
     windows_s = scan.shutter.line_windows_s(scan.lines)
@@ -83,8 +83,8 @@ def _frame_time_s(scan: "Scan") -> float:
 
 
 def _source_angle_rad(scan: "Scan", first_s: float, last_s: float) -> np.ndarray:
-    """Returns the source's angle (F, T) in rad about the axis, without jumps, at T times from ``first_s`` to ``last_s``
-    after each frame's start."""
+    """Returns the source's angle (F, T) in rad about the axis, without jumps by a turn. The T times are from ``first_s`` to
+    ``last_s`` after each frame's start."""
     delay_s = np.linspace(first_s, last_s, _TIMES)
     poses = np.stack([scan.trajectory.pose(f, t + delay_s) for f, t in enumerate(scan.frame_start_s)])
     source = towards_source(poses, scan.is_parallel)

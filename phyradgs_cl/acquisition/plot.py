@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
     from phyradgs_cl.acquisition.scan import Scan
 
-_MOST_CORNERS = 129  # most points on either side of an outline: a panel may have thousands of lines
+_MOST_CORNERS = 129  # most points on either side of an exposure's outline: a panel may have thousands of lines
 
 
 def plot_frame(scan: "Scan", frame: int = 0) -> "Figure":
-    """Draws one frame's line integrals (rows, columns) with the panel's size in mm, and beside them when each line is
+    """Draws one frame's line integrals (rows, columns) with the panel's size in mm. Beside them it draws when each line is
     exposed, in s.
 
     Raises InputError for a frame number out of range."""

@@ -20,11 +20,13 @@ _MOST_TURNS = 10_000
 
 @dataclass(frozen=True)
 class Protocol:
-    """``views`` frames in ``turns`` turns at constant speed, each exposing an arc of ``exposure_deg`` (paper, section 3.1).
+    """A scan of ``views`` frames in ``turns`` turns at constant speed. In the exposure of a line, the gantry turns by
+    ``exposure_deg`` (paper, section 3.1).
 
-    A negative ``turns`` means clockwise, seen from above. ``start_deg``: the gantry's angle at the start. ``exposure_s``
-    is the exposure T_exp, ``readout_ratio`` is T_ro/T_exp. ``pulse``: (start, length) of the time when the beam is on, after
-    a frame's start, in units of T_exp; None means always. Raises InputError for values out of range."""
+    A negative ``turns`` means clockwise, seen from above. start_deg: the gantry's angle as the first frame begins.
+    exposure_s: the exposure T_exp of a line. readout_ratio: the readout time over T_exp. is_fly: False if the gantry stops
+    for every frame. pulse: (start, length) of the time in which the beam is on, after a frame's start, in units of T_exp;
+    None means always. Raises InputError for values out of range."""
 
     views: int = checks.option(25, "Frames of the scan.", "protocol's", range=(1, 100_000))
     exposure_deg: float = checks.option(14.4, "Arc of one exposure, degrees.", "protocol's", range=(0, 360))
@@ -77,14 +79,14 @@ class Protocol:
         return Shutter(self.exposure_s, self.readout_ratio * self.exposure_s, axis, direction, pulse_s)
 
     def frame_start_s(self) -> np.ndarray:
-        """Returns when the frames open, (F,) in s. From one to the next the gantry turns by ``step_deg``; with an arc of 0
-        each opens as the one before it closes."""
+        """Returns when the frames open, (F,) in s. From one frame to the next the gantry turns by ``step_deg``. With an arc
+        of 0, each frame opens as the frame before it closes."""
         if self.exposure_deg == 0:
             return np.arange(self.views) * self.shutter().span_s
         return np.arange(self.views) * abs(self.step_deg) / self.exposure_deg * self.exposure_s
 
     def window_s(self) -> tuple[float, float]:
-        """Returns when the scan's first line opens and its last one closes, in s."""
+        """Returns when the scan's first line opens and its last line closes, in s."""
         start_s = self.frame_start_s()
         return float(start_s[0]), float(start_s[-1]) + self.shutter().span_s
 
@@ -96,8 +98,8 @@ class Protocol:
     ) -> CircularOrbit:
         """Returns the trajectory. A stop-and-shoot gantry rests where the same fly-scan would be in the middle of a frame.
 
-        jitter_deg: the standard deviation of a random angle per frame, linear in between, that is added to a fly-scan's
-        angles and that the encoder records. Raises InputError for jitter without an arc or without ``rng``."""
+        jitter_deg: the standard deviation of random angles, about one per frame and linear in between. They are added to a
+        fly-scan's angles, and the encoder records them. Raises InputError for jitter without an arc or without ``rng``."""
         first = self.angle_start_rad()
         arc_rad = self._arc_rad
         if not self.is_fly:
@@ -133,7 +135,7 @@ PROTOCOLS = {
 
 
 def make_protocol(name: str, **changes: Any) -> Protocol:
-    """Returns the protocol ``name`` with ``changes`` to its fields, except None. Raises InputError for an unknown name."""
+    """Returns the protocol ``name`` with ``changes`` to its fields, None ignored. Raises InputError for an unknown name."""
     if name not in PROTOCOLS:
         raise InputError("protocol", repr(name), f"one of {', '.join(PROTOCOLS)}")
     return replace(PROTOCOLS[name], **{k: v for k, v in changes.items() if v is not None})

@@ -20,7 +20,8 @@ Named = Callable[[str], str]
 class Readout:
     """The ``axis`` of readout: whether the panel reads "rows" or "columns" one after the other.
 
-    Operators need frames and poses in the order (lines, width). The methods convert them from (rows, columns) and back."""
+    Operators need frames and poses in the order (lines, width): the rows or columns that are read one after the other, and
+    the pixels of each. The methods convert them from (rows, columns) and back."""
 
     axis: str
 
@@ -76,7 +77,7 @@ def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named 
 
 
 def check_readout(readout_ms: float | None, readout_ratio: float | None, fps: float | None, named: Named = str) -> None:
-    """Raises InputError for a readout ratio or time out of range, for both together, and for a time in ms without fps."""
+    """Raises InputError for a readout ratio or time out of range, if both are given, and for a time in ms without fps."""
     if readout_ratio is not None:
         checks.within(named("readout_ratio"), readout_ratio, 0, 1000)
     if readout_ms is None:

@@ -42,7 +42,7 @@ LARGEST_LAG = 0.9  # largest ``Scan.lag``: panels have less, and a frame with a 
 
 @dataclass(frozen=True)
 class Saturation:
-    """Saturation of the raw counts. level: the largest count. share: the fraction of pixels clipped at it."""
+    """Saturation of the raw counts. level: the largest count. share: the fraction of pixels clipped at this count."""
 
     level: float
     share: float
@@ -58,11 +58,11 @@ class Scan:
     - frame_start_s (F,): when each frame's first line opens, in s.
     - is_fly: False if the gantry stops for every frame (stop-and-shoot), whatever the exposure time.
     - detector_model: what the detector averages over an exposure, "log" (line integrals) or "intensity".
-    - pixel_mask (nv, nu) or (F, nv, nu): non-zero for pixels not to be used. Lines that a pulsed beam misses become so too.
+    - pixel_mask (nv, nu) or (F, nv, nu): non-zero for pixels not to be used. Lines that a pulsed beam misses are masked too.
     - reference (nz, ny, nx): the true volume in 1/mm on ``grid``. moving_truth: true volumes and motion of a simulated
       object that moves.
     - gating: a signal or phase of a moving object, recorded with the frames.
-    - metal: the metal that is put back into volumes. The mask hides its shadow (docs/prepare.md).
+    - metal: the metal that is put back into reconstructed volumes. pixel_mask hides its shadow (docs/prepare.md).
     - lag: the fraction λ of the recorded intensity that comes from earlier frames (detector/effects.py). The projections
       still contain it.
     - saturation: None if raw counts were not examined. title and provenance are stored in files.

@@ -133,15 +133,16 @@ def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = N
 
 
 def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as ``line_integrals`` does. Raises InputError also for what looks like counts, because nobody stated
-    the quantity."""
+    """Returns frames as ``line_integrals`` does. Raises InputError also for frames that look like raw counts, because nobody
+    stated what quantity they are."""
     values = checks.real_array("frames", frames)
     check_not_counts(values, "give −ln(counts / flats)", mask)
     return line_integrals(values, mask)
 
 
 def line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as float32, with 0 for masked pixels that are not finite. Raises InputError for unmasked ones."""
+    """Returns frames as float32, with 0 for masked pixels that are not finite. Raises InputError for unmasked pixels that
+    are not finite."""
     values = checks.real_array("projections", frames)
     with np.errstate(over="ignore"):
         values = values.astype(np.float32, copy=False)
@@ -224,8 +225,8 @@ def _counts(geo: Any, name: str, length: int) -> np.ndarray:
 
 
 def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.ndarray:
-    """Returns an attribute of a TIGRE geometry, given for all frames or per frame, as (F, length). A missing one counts as
-    ``absent``. Raises InputError if DSO or DSD is missing, and for other shapes."""
+    """Returns an attribute of a TIGRE geometry, given for all frames or per frame, as (F, length). A missing attribute
+    counts as ``absent``. Raises InputError if DSO or DSD is missing, and for other shapes."""
     value = _of(geo, name) if name in ("DSO", "DSD") else getattr(geo, name, None)
     table = checks.numbers(f"geo.{name}", absent if value is None else value)
     per_frame = (frames,) if length == 1 else (frames, length)

@@ -9,7 +9,7 @@ from phyradgs_cl.acquisition.readout import FIRST_LINES, Readout
 from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")
-_STEPS = 1000  # least number of float64 steps in an exposure: its parts are then exact to a thousandth
+_STEPS = 1000  # an exposure is at least this many times the rounding of float64 times: its parts are exact to a thousandth
 _DARK = 1e-9  # a line lit for less than this fraction of the longest lit time counts as missed by the pulsed beam
 
 
@@ -17,10 +17,11 @@ _DARK = 1e-9  # a line lit for less than this fraction of the longest lit time c
 class Shutter:
     """Exposure and readout of one frame, in s (paper, section 2.1).
 
-    Line r of H opens ``r/(H−1)·readout_s`` after the frame's start and stays open for ``exposure_s``. A readout of 0 is a
-    global shutter. ``axis``: "rows" or "columns", whichever the panel reads one after the other. ``direction``: +1 reads
-    index 0 first, −1 the last index. ``pulse_s`` (start, length): when the beam is on, after the frame's start; None means
-    always. Raises InputError for times below 0, other axes or directions, and a pulse that misses the frame."""
+    Line r of H, in the order of reading, opens ``r/(H−1)·readout_s`` after the frame's start and stays open for
+    ``exposure_s``. A readout of 0 is a global shutter. ``axis``: "rows" or "columns", whichever the panel reads one after
+    the other. ``direction``: +1 reads index 0 first, −1 the last index. ``pulse_s`` (start, length): when the beam is on,
+    after the frame's start; None means always. Raises InputError for times below 0, other axes or directions, and a pulse
+    that misses the frame."""
 
     exposure_s: float
     readout_s: float = 0.0
@@ -49,7 +50,7 @@ class Shutter:
             raise InputError("pulse_s", found, expected, "correct the pulse, or leave it out")
 
     def check_resolved(self, frame_start_s: np.ndarray, subject: str = "exposure_s") -> None:
-        """Raises InputError if float64 opening times (F,) are too coarse for the exposure: its angles would be noise."""
+        """Raises InputError if the exposure is too short for the float64 precision of the frames' opening times (F,)."""
         latest_s = float(np.max(np.abs(frame_start_s), initial=0.0)) + self.span_s
         shortest_s = _STEPS * float(np.spacing(latest_s))
         if 0 < self.exposure_s < shortest_s:
@@ -73,7 +74,7 @@ class Shutter:
 
     @property
     def lit_span_s(self) -> tuple[float, float]:
-        """When the frame's first and last light falls on the panel, in s after its start: ``span_s``, cut to the pulse."""
+        """When the frame's first and last light falls on the panel, in s after the frame's start."""
         first_s, last_s = self.in_pulse(np.array([0.0, self.span_s]))
         return float(first_s), float(last_s)
 
@@ -86,7 +87,7 @@ class Shutter:
     def in_pulse(self, time_s: np.ndarray) -> np.ndarray:
         """Moves times (...) after the frame's start to the nearest moment at which the beam is on.
 
-        This cuts a window to the pulse. Both ends become equal if the pulse misses the window."""
+        The two ends of a window are thus cut to the pulse. They become equal if the pulse misses the window."""
         if self.pulse_s is None:
             return time_s
         start_s, length_s = self.pulse_s
@@ -108,8 +109,8 @@ class Shutter:
         return self.in_pulse(np.stack([delay, delay + self.exposure_s], -1))
 
     def lit_share(self, lines: int) -> np.ndarray:
-        """Returns how long each line receives light, (lines,) as a fraction of the longest; all 1 without a pulse. Raises
-        InputError if all are 0."""
+        """Returns how long each line receives light, (lines,) as a fraction of the longest time; all 1 without a pulse.
+        Raises InputError if no line receives light."""
         if self.pulse_s is None:
             return np.ones(lines)
         seen_s = np.diff(self.line_windows_s(lines))[:, 0]

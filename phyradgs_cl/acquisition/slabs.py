@@ -11,7 +11,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 
 HALO_ROWS = 4
-"""Rows that are read beyond each side of a slab: a slice between two rows needs both, and priors compare neighbours."""
+"""Rows that are read beyond each side of a slab: a slice between two rows needs both rows, and priors compare neighbours."""
 
 
 def check_has_slabs(scan: Scan, subject: str, found: str) -> None:
@@ -59,7 +59,7 @@ def slab(scan: Scan, first: int, stop: int) -> Scan:
 
 
 def slices_of(scan: Scan, first: int, stop: int) -> slice:
-    """Returns the slices of the scan's grid whose centres lie on detector rows [first, stop). Slices beyond the panel count
+    """Returns the slices of the scan's grid whose centres lie on detector rows [first, stop). Slices beyond the panel belong
     to its first or last row, so that the slabs of all rows together have every slice."""
     rows, pitch_mm = scan.geometry.detector_shape[0], scan.geometry.pixel_size_mm[0]
     row = (scan.grid.axes_mm()[0] - scan.geometry.detector_offset_mm[0]) / pitch_mm + (rows - 1) / 2

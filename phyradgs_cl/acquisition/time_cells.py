@@ -1,4 +1,4 @@
-"""Time cells: the poses of a frame, with the lines of pixels that each pose serves and its weight. Operators read them.
+"""Time cells: the poses of a frame, each with its weight and the detector lines that are projected from it.
 
 A frame is a weighted sum of projections, one per cell. A cell adds ``weight`` times the projection from its pose to the
 lines [line_start, line_stop). The weights of a line sum to 1. A *still* cell has one pose. A *moving* cell is a segment of
@@ -19,16 +19,16 @@ from phyradgs_cl.errors import InputError
 class TimeCells:
     """The time cells of one frame, sorted by line_start.
 
-    - pose (C, 12) in mm, for the detector's own rows and columns, whatever the readout axis. time_s (C,) in s. Moving cells
-      have both in their middle.
+    - pose (C, 12) in mm, for the detector's own rows and columns, whatever the readout axis. time_s (C,) in s. For moving
+      cells, both hold in the middle of the cell's time.
     - line_start, line_stop (C,): the lines of a cell, counted along the readout ``axis``. The panel has ``lines`` lines.
       weight (C,).
     - line_share (C, lines): for still cells, a further factor of the weight: the fraction of each line's exposure that
       lies in the cell. None means 1.
     - end_poses (C, 2, 12) in mm, end_times_s (C, 2) in s: at both ends of moving cells, whose ``weight`` is 1; None for
       still cells. The times are needed if the object moves.
-    - line_times (C, 3, lines): for moving cells, the part of each line's exposure in the cell. Its middle, counted from the
-      cell's mid-time, and half its length, both over the cell's length; then its fraction of the exposure.
+    - line_times (C, 3, lines): for moving cells, three numbers about the part of each line's exposure in the cell: the
+      part's middle after the cell's mid-time and half-length, both over the cell's length, and its fraction of the exposure.
     - is_parallel: poses begin with the direction of parallel rays.
     - conic_pose (12,): for Gaussians only. Cells then move only the Gaussians' centres on the panel; their shapes and
       densities there are computed for this pose.
@@ -67,7 +67,7 @@ class TimeCells:
         return [slice(int(a), int(b)) for a, b in zip(self.line_start, self.line_stop, strict=True)]
 
     def weights_of(self, cell: int) -> np.ndarray:
-        """Returns the weight (line_stop − line_start,) of a cell for each of its lines."""
+        """Returns the weights (line_stop − line_start,) of cell number ``cell``, one for each line that it serves."""
         lines = slice(int(self.line_start[cell]), int(self.line_stop[cell]))
         share = self.line_share[cell, lines] if self.line_share is not None else np.ones(lines.stop - lines.start)
         if self.line_times is not None:
@@ -86,7 +86,7 @@ class TimeCells:
 
     @property
     def averages(self) -> bool:
-        """Whether any line averages over several cells, which then are in different layers."""
+        """Whether any line averages over several cells. Such cells have different ``layer_numbers``."""
         return bool(self.layer_numbers.any())
 
     def scaled(self, factor: float) -> "TimeCells":
@@ -98,7 +98,7 @@ class TimeCells:
         return replace(self, pose=self.pose * factors, end_poses=ends, conic_pose=conic)
 
     def finer(self, rows: int, columns: int) -> "TimeCells":
-        """Returns the still cells for pixels divided into ``rows`` by ``columns``. The parts of a line keep its times."""
+        """Returns still cells for pixels divided into ``rows`` by ``columns``. The parts of a line keep the line's times."""
         pose, (of_line, _) = self.pose.copy(), self.readout.shape((rows, columns))
         pose[:, 6:9] /= columns
         pose[:, 9:12] /= rows
@@ -137,7 +137,7 @@ class TimeCells:
         return self.pose[cell[nearest[first]]]
 
     def line_cells(self) -> np.ndarray:
-        """Returns a range [first, stop) of cells for each line, (lines, 2), in which are all cells that serve the line, and
+        """Returns a range [first, stop) of cells for each line, (lines, 2). The range has all cells that serve the line, and
         maybe others."""
         line = np.arange(self.lines)
         first = np.searchsorted(np.maximum.accumulate(self.line_stop), line, side="right")

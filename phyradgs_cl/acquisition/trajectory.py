@@ -20,8 +20,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.text import repr_of_changes
 
-_LEAST_SPAN_S = 1e-6  # ``sampled`` needs two different times in a frame, also in one without duration
-_MOST_SAMPLES = 1024  # ``sampled`` raises an error when more samples per frame than this are not close enough
+_LEAST_SPAN_S = 1e-6  # least time that ``sampled`` covers in a frame: it needs two times, even if the frame has no duration
+_MOST_SAMPLES = 1024  # ``sampled`` raises an error if a table of more samples per frame than this is not close enough
 _LEAST_INCIDENCE = 1e-6  # least sine of the angle between rays and panel
 _AT_AXIS = 1e-6  # a panel within this fraction of the source-to-axis distance is at the axis
 _AWAY = 2.0  # a panel at the axis is moved so that its distance from the source and its size grow by this factor
@@ -36,7 +36,7 @@ class Trajectory(Protocol):
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s. A pose is source, centre of pixel (0,
-        0), step to the next column, step to the next row, x y z each. A parallel beam's begins with the rays' direction."""
+        0), step to the next column, step to the next row, x y z each. In a parallel beam the rays' direction comes first."""
 
 
 def is_parallel(trajectory: Trajectory) -> bool:
@@ -113,7 +113,7 @@ class FrameSweeps:
 
     The speed continues through the readout. Equal angles mean a gantry at rest (stop-and-shoot). ``start_s`` (F,): when
     each frame's first line opens, in s. ``exposure_s``: the exposure of a line. ``angle_start_rad``, ``angle_end_rad``
-    (F,) in rad. A jump by a turn between them, as from 355° to 4°, is removed.
+    (F,) in rad. A jump by a turn between the two angles of a frame, as from 355° to 4°, is removed.
 
     Raises InputError for arrays of unequal length, infinite values and NaN."""
 
@@ -166,8 +166,8 @@ def _is_without_jumps(steps_rad: np.ndarray) -> bool:
 
 
 def unwrapped(angles: np.ndarray, turn: float = 2 * np.pi) -> np.ndarray:
-    """Returns gantry angles (N,) without jumps by a ``turn``, as an encoder makes at 360°. Angles that count on beyond a
-    turn have none, and may step by more than half a turn."""
+    """Returns gantry angles (N,) without jumps by a ``turn``, as an encoder makes at 360°. Angles that only rise or only
+    fall, by more than a turn in all, have no jumps: they stay as they are, even with steps of more than half a turn."""
     steps = np.diff(angles)
     counts_on = np.ptp(angles) > turn and ((steps > 0).all() or (steps < 0).all())
     return np.asarray(angles if counts_on else np.unwrap(angles, period=turn))
@@ -325,8 +325,8 @@ _AS_TABLE = "give it as a PoseTable"
 
 
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
-    """Samples a user-defined trajectory into a pose table within ``error_mm``, over ``span_s`` from each frame's start
-    (F,).
+    """Samples a user-defined trajectory into a pose table, over ``span_s`` from each frame's start (F,). The table's poses
+    differ from the trajectory's by at most ``error_mm``.
 
     Raises InputError if even a fine table is not close enough, as for frames that overlap in time with different poses."""
     samples = 2
@@ -380,7 +380,8 @@ def body_frames(table: np.ndarray) -> np.ndarray:
 
 
 def _check_covered(subject: str, frame: int, t: np.ndarray, table_s: np.ndarray) -> None:
-    """Raises InputError for times beyond a table. A nanosecond is tolerated, because stored times are rounded."""
+    """Raises InputError for times (...) in s beyond a table's times ``table_s``. Tolerates the rounding of stored times: a
+    billionth of the table's last time, at least 1 ns."""
     slack = 1e-9 * max(1.0, abs(table_s[-1]))
     if t.size and (t.min() < table_s[0] - slack or t.max() > table_s[-1] + slack):
         found = f"frame {frame} needs {t.min():.6g} to {t.max():.6g} s"

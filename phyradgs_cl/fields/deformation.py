@@ -15,10 +15,10 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import Grid
 
-_LEVELS = 16  # the folding check rounds weights to this many levels, so that few different states must be checked
-_MOST_STEPS = 200  # most iterations that invert a field: enough if each makes the error 0.93 times as large
-_FLAT = 1e-4  # where the displacement has a smaller slope, in mm per mm, the folding check leaves points out
-_CLOSE = 1e-6  # the inversion stops at a change below this fraction of the smallest control spacing
+_LEVELS = 16  # ``smallest_determinant`` rounds weights to this many levels, so that it tests few different states
+_MOST_STEPS = 200  # most iterations that invert a displacement field: enough if each makes the error 0.93 times as large
+_FLAT = 1e-4  # ``smallest_determinant`` leaves out points where the displacement's slope, in mm per mm, is below this
+_CLOSE = 1e-6  # the inversion stops when no displacement changes by more than this fraction of the control spacing
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +63,9 @@ class Deformation:
     ) -> "Deformation":
         """Returns the deformation closest to displacements w, as image registration gives them at every voxel.
 
-        displacements_mm: (T, nz, ny, nx, 3) in mm, x y z, at the voxel centres of ``grid`` and times_s (T,). A singular
-        value decomposition makes them ``rank`` fields or fewer, on control points ``spacing_mm`` apart. The largest absolute
-        weight of each is 1. Raises InputError for other shapes, values that are not finite, and times that do not rise."""
+        displacements_mm: (T, nz, ny, nx, 3) in mm, x y z, at the voxel centres of ``grid`` and times_s (T,) in s. A singular
+        value decomposition makes at most ``rank`` fields of them, with control points ``spacing_mm`` apart. Each field's
+        largest absolute weight is 1. Raises InputError for other shapes, values not finite, and times that do not rise."""
         times_s = checks.numbers("times_s", times_s, (None,))
         dense_mm = checks.numbers("displacements_mm", displacements_mm, (len(times_s), *grid.shape, 3))
         checks.whole("rank", rank, 1, 1000)
@@ -167,7 +167,7 @@ class Deformation:
         deformation folds matter over itself.
 
         Without a grid, points half a control spacing apart are tested. To save time, weights are rounded to a 16th of each
-        field's largest weight, and a point whose slopes stay below 1e-4 counts as 1."""
+        field's largest weight, and a point whose slopes stay below 1e-4 counts as having the determinant 1."""
         grid = grid or self._half_spacing_grid()
         slopes = np.stack([self._slopes(grid, control_mm) for control_mm in self.control_mm])  # of each field, (R, 3, 3, n)
         largest = np.abs(self.weights).max(axis=0)
@@ -190,8 +190,8 @@ class Deformation:
         return (checks.numbers("points_mm", points_mm, (None, 3)) - self.origin_mm) / self.spacing_mm
 
     def bases(self, grid: Grid, slope_along: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns β³ (voxels, control points) along z, y and x at the voxel centres of ``grid``. slope_along: an axis
-        (0: z) for which the slope of β³ in 1/mm is returned instead."""
+        """Returns the splines' values β³ along z, y and x at the voxel centres of ``grid``, each (voxels, control points).
+        slope_along: an axis (0: z) for which the slope of β³ in 1/mm is returned instead."""
         matrices = []
         spacing_mm = np.broadcast_to(self.spacing_mm, 3)
         for axis, centres_mm in enumerate(grid.axes_mm()):

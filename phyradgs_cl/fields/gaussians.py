@@ -12,7 +12,7 @@ from phyradgs_cl.errors import InputError
 
 ROWS = 11  # mean 3, scale 3, quaternion 4, density 1
 MEAN, SCALE, QUATERNION, DENSITY = slice(0, 3), slice(3, 6), slice(6, 10), 10
-_DENSITY_FLOOR = 1e-12
+_DENSITY_FLOOR = 1e-12  # least density of a Gaussian, so that its raw number is finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,8 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class Activation:
-    """Maps raw numbers x to parameters: scale = min + (max − min) sigmoid(x), density = softplus(x), quaternion = x/|x|."""
+    """Maps raw numbers x to parameters: scale = min + (max − min) sigmoid(x), density = softplus(x), quaternion = x/|x|.
+    The mean is its own raw number."""
 
     scale_min: float
     scale_max: float

@@ -17,8 +17,8 @@ _ROI = "Box of the volume about the axis, mm, or its sides about the scan's midd
 _MARGIN = "Width around the box, mm, that is reconstructed and discarded: for objects larger than box or panel."
 _SCAN = "the scan's"
 _LARGEST_MM = 1e9  # largest length in mm that an option takes; the smallest is 1e-9 mm
-_ROUNDING = 1e-6  # a box may exceed whole voxels by this much, in voxels, without needing one more: it is rounding
-# A typed box may exceed the scan's voxels by this much without needing one more: voxel sides are rarely round numbers.
+_ROUNDING = 1e-6  # a box that exceeds whole voxels by at most this fraction of a voxel gets no further voxel: it is rounding
+# The same for a box that a user typed, which rarely fits the scan's voxels exactly: voxel sides are rarely round numbers.
 _TYPED = 0.01
 
 
@@ -30,7 +30,7 @@ class GridChoice:
     - voxel_mm: sides of a voxel (z, y, x), or one length.
     - roi_mm: the box (z0, z1, y0, y1, x0, x1) in the world frame. Three sides (z, y, x), or the side of a cube, are a box
       about the middle of the scan's grid.
-    - margin_mm: width (z, y, x), or on all sides, that methods reconstruct beyond this box and discard.
+    - margin_mm: widths (z, y, x) around this box, or one width, that methods reconstruct too and then discard.
 
     Raises InputError for other values, a box that ends before it begins, and all of size, voxel_mm and roi_mm."""
 

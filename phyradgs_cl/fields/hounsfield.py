@@ -19,19 +19,19 @@ HOUNSFIELD = "hounsfield"
 Box = tuple[float, ...]
 """A box in world coordinates: Z0, Z1, Y0, Y1, X0, X1 in mm."""
 Window = tuple[float, float, int]
-"""A peak of a histogram: the two attenuations in 1/mm at half of its rise, and the number of voxels in between."""
+"""A histogram's peak: its attenuations in 1/mm at half of its rise on either side, and the number of voxels in between."""
 _FEWEST = 100  # least number of voxels of air and of water: the noise of their mean is then a tenth of a voxel's
 # Water's attenuation in 1/mm is 0.0097 at 500 keV and 0.53 at 10 keV. Outside these limits a warning is logged.
 _WATER_PER_MM = (0.009, 0.6)
 _AIR_BELOW = 0.25  # a lowest peak above this fraction of water's attenuation is not air; it may be fat
-_ONE_MATERIAL = 0.4  # a box whose standard deviation is more than this times water minus air may hold two materials
-_BINS = 512
+_ONE_MATERIAL = 0.4  # a box whose standard deviation is above this fraction of water minus air may hold two materials
+_BINS = 512  # number of bins of the histogram
 _SMOOTH_BINS = 2.0  # standard deviation of the Gaussian that smooths the histogram, in bins
 _PROMINENT = 0.1  # a peak must rise above its surroundings by this fraction of its smoothed count
-# A peak must also rise by this times the root of its smoothed count: three roots are eight times the noise after smoothing.
+# A peak must also rise by this times the square root of its smoothed count. That is eight times the smoothed count's noise.
 _CERTAIN = 3.0
 _ZOOM = 2.5  # the last histogram ends at this times the upper end of water's peak, so that peaks span many bins
-_SHORTENED = 5  # most times that the histogram's range is cut to a quarter: metal may be 1000 times denser than water
+_SHORTENED = 5  # how often the histogram's range may be cut to a quarter: metal may be 1000 times denser than water
 _NUMBER = r"-?\d+\.?\d*(?:e[-+]\d+)?"
 _NOTE = re.compile(rf"values in HU(?:, water ({_NUMBER}), air ({_NUMBER}) 1/mm)?")
 
@@ -39,7 +39,7 @@ _NOTE = re.compile(rf"values in HU(?:, water ({_NUMBER}), air ({_NUMBER}) 1/mm)?
 @dataclass(frozen=True)
 class Hounsfield:
     """The scale of Hounsfield units: the attenuation in 1/mm of water (0 HU) and of air (−1000 HU). fitted: what the scale
-    was fitted to, in words. Raises InputError for water outside 1e-6 to 1e3, and for air that is not below it."""
+    was fitted to, in words. Raises InputError for water outside 1e-6 to 1e3 1/mm, and for air that is not below water."""
 
     water_per_mm: float
     air_per_mm: float = 0.0
@@ -105,9 +105,9 @@ def fitted(
 ) -> Hounsfield:
     """Fits the scale of a volume (z, y, x) in 1/mm to the means of two boxes, of air and of water.
 
-    Without a box of air, the lowest peak of the histogram is air. Without a box of water, the largest peak above is water.
-    insert_hu: the HU of the material in the second box, if it is not water. Raises InputError for fewer than 100 voxels, air
-    that is not below water, and a histogram without two peaks that can be air and water."""
+    Without a box of air, the lowest peak of the histogram is air. Without a box of water, the largest other peak is water.
+    insert_hu: the HU of the material in the box ``water``, if it is not water. Raises InputError for fewer than 100 voxels,
+    air that is not below water, and a histogram without two peaks that can be air and water."""
     checks.within("--insert-hu", insert_hu, -900, 30_000)
     if values.min() < -10:  # attenuation in 1/mm is never so negative
         raise InputError("--hu", f"values from {values.min():g}, as of Hounsfield units", "attenuation in 1/mm")
@@ -144,7 +144,7 @@ def _mean(name: str, voxels: np.ndarray, is_peak: bool) -> tuple[float, str]:
 
 
 def _inside(option: str, values: np.ndarray, grid: Grid, box: Box) -> np.ndarray:
-    """Returns the voxels whose centres lie in a box. Raises InputError unless it has six numbers, rising in pairs."""
+    """Returns the voxels whose centres lie in a box. Raises InputError unless the box is six numbers that rise in pairs."""
     ends_mm = checks.numbers(option, np.asarray(box), (6,)).reshape(3, 2)
     if (ends_mm[:, 0] >= ends_mm[:, 1]).any():
         raise InputError(option, checks.short_repr(box), "Z0 below Z1, Y0 below Y1, X0 below X1")
@@ -169,7 +169,7 @@ def _peaks(values: np.ndarray) -> tuple[Window, Window]:
 
 
 def _largest(windows: list[Window]) -> Window:
-    """Returns the peak with most voxels, except the lowest peak."""
+    """Returns the peak with the most voxels among all but the first, which is the lowest."""
     return max(windows[1:], key=lambda window: window[2])
 
 

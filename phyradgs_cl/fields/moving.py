@@ -14,7 +14,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.deformation import Deformation
 from phyradgs_cl.fields.volume import Grid, triple
 
-_SLAB_VOXELS = 1 << 18  # voxels that a thread deforms at a time: their coordinates need six times the memory of voxels
+_SLAB_VOXELS = 1 << 18  # voxels that a thread deforms at a time: their coordinates need six times the voxels' own memory
 _BORDER = 8  # zeros around a volume, in voxels: over this width the spline's coefficients fall to 3e-5
 
 
@@ -53,7 +53,7 @@ class States:
 
 @dataclass(frozen=True, eq=False)
 class MovingTruth(States):
-    """True volumes of a simulated moving object. deformation: its motion relative to ``Scan.reference``, if known."""
+    """True volumes of a simulated moving object. deformation: the motion relative to ``Scan.reference``; None: not known."""
 
     deformation: Deformation | None = None
 
@@ -62,8 +62,8 @@ class MovingTruth(States):
 class Gating:
     """A signal that tells the state of the object's motion, as a breathing belt or an ECG does.
 
-    times_s: (n,) rising, on the clock of ``Scan.frame_start_s``. values: (n,) of any unit and sign. is_phase: the values
-    are rising phases in cycles, of which only the fraction of a cycle matters.
+    times_s: (n,) in s, rising, on the clock of ``Scan.frame_start_s``. values: (n,) of any unit and sign. is_phase: the
+    values are phases in cycles that rise in time. Only their fraction of a cycle matters: after 0.9, 0.1 means 1.1.
 
     Raises InputError for shapes that differ, values that are not finite, and times that do not rise."""
 

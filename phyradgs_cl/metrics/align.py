@@ -11,7 +11,7 @@ from phyradgs_cl.fields import Grid, triple
 
 Values = NDArray[np.floating]
 VOXEL_BY_VOXEL = "voxel by voxel"
-_ROUNDING = 1e-6  # faces of two boxes that are at most this far apart, in voxels, count as equal
+_ROUNDING = 1e-6  # a voxel's centre that is at most this far outside a box, in voxels, counts as inside: it is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid)
 
 
 def overlap(one: Grid, other: Grid) -> tuple[float, float]:
-    """Returns the volume that both boxes share, as a fraction of each."""
+    """Returns the space that the boxes of two grids share, as a fraction of the first box and of the other."""
     low, high = np.maximum(one.box_mm[:, 0], other.box_mm[:, 0]), np.minimum(one.box_mm[:, 1], other.box_mm[:, 1])
     shared_mm3 = float(np.prod(np.maximum(high - low, 0)))
     return shared_mm3 / math.prod(one.size_mm), shared_mm3 / math.prod(other.size_mm)
@@ -109,8 +109,8 @@ def resampled(volume: NDArray[np.floating], grid: Grid, onto: Grid) -> tuple[NDA
     """Samples a volume (nz, ny, nx) on ``grid`` trilinearly at the voxel centres of ``onto``. Outside the box of ``grid``
     the result is 0.
 
-    Between the outermost centres and the faces the value is constant. Also returns the fraction of the voxels of ``onto``
-    that lie in that box."""
+    Between the outermost voxel centres and the box's faces the value is constant. Also returns the fraction of the voxels of
+    ``onto`` whose centres lie in the box of ``grid``."""
     step = np.divide(onto.voxel_size_mm, grid.voxel_size_mm)
     first = np.subtract(onto.first_centre_mm, grid.first_centre_mm) / grid.voxel_size_mm
     values = scipy.ndimage.affine_transform(

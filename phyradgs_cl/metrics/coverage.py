@@ -1,5 +1,5 @@
-"""Tests error bars of voxels against a true volume: the fraction of errors within the bars, and the mean σ over the RMS
-error."""
+"""Tests the error bars of voxels (standard deviations σ in 1/mm) against a true volume: the fraction of errors within the
+bars, and the mean σ over the RMS error."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ COVERAGE = {
     "within_doubt_95": Metric("within the 95 % bar", "", ".3f"),
     "doubt_over_error": Metric("mean σ / RMS error", "", ".3f"),
 }
-_OBJECT, _AROUND = 0.01, 2  # errors count in the object, denser than 1 % of the truth's maximum, and 2 voxels around
+_OBJECT, _AROUND = 0.01, 2  # errors count where the truth is above 1 % of its maximum, and up to 2 voxels around
 
 
 def object_voxels(truth: Array) -> NDArray[np.bool_]:
@@ -26,7 +26,7 @@ def object_voxels(truth: Array) -> NDArray[np.bool_]:
 
 def coverage(sigma: Array, volume: Array, truth: Array, multiple_95: float) -> dict[str, float]:
     """Returns the fractions of errors within σ and within ``multiple_95`` σ in the object's voxels, and the mean σ over the
-    RMS error. sigma, volume, truth: (nz, ny, nx) in 1/mm."""
+    RMS error. sigma, volume, truth: (nz, ny, nx) in 1/mm. multiple_95: the 95 % bar over σ."""
     inside = object_voxels(truth)
     size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)
     over_error = float(bar.mean() / (np.sqrt(np.mean(size**2)) or np.inf))
@@ -34,9 +34,9 @@ def coverage(sigma: Array, volume: Array, truth: Array, multiple_95: float) -> d
 
 
 def reliability_png(path: str | Path, sigma: Array, volume: Array, truth: Array, multiple_95: float) -> None:
-    """Draws the size of errors over σ. The object's voxels are divided into tenths by σ; for each tenth, the 68th and 95th
-    percentiles of its errors, divided by 1 and ``multiple_95``, are drawn over its mean σ. For right error bars the points
-    lie on the dashed line."""
+    """Draws the size of errors over σ to a PNG file. The object's voxels are sorted by σ and divided into tenths. For each
+    tenth, the 68th percentile of its absolute errors, and the 95th over ``multiple_95``, are drawn over its mean σ. If the
+    error bars are right, the points lie on the dashed line. Arguments are as in ``coverage``."""
     inside = object_voxels(truth)
     size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)
     tenths = [part for part in np.array_split(np.argsort(bar, kind="stable"), 10) if part.size]

@@ -29,7 +29,7 @@ WINDOW = 11  # SSIM's window, in voxels a side (Wang et al. 2004)
 SIGMA = 1.5  # standard deviation in voxels of the Gaussian weights in SSIM's window (Wang et al. 2004)
 K1, K2 = 0.01, 0.03  # SSIM's constants for means and for variances, as fractions of the data range (Wang et al. 2004)
 _VOXELS_PER_BATCH = 1 << 20  # voxels compared at a time: SSIM holds about ten float64 arrays of them, 80 MB
-_EDGE = 0.25  # motion shows at edges only, so it is compared where the slope is at least this fraction of the steepest
+_EDGE = 0.25  # motion shows at edges only, so it is compared where the slope is at least this fraction of the steepest slope
 _MOST_POINTS = 2000  # most voxels at which motions are compared: enough for a mean and a percentile
 _INCH = 3.2  # side of a slice in the figure, in inches
 _DPI = 110
@@ -67,7 +67,8 @@ def printed(metrics: Mapping[str, object], names: Mapping[str, Metric] = METRICS
 
 
 def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """Returns psnr_db in dB, ssim (3D) and data_range, the maximum of ``reference``. volume, reference: (z, y, x).
+    """Returns psnr_db in dB, ssim (of slices across all three axes) and data_range, the maximum of ``reference``. volume,
+    reference: (z, y, x) in the same unit.
 
     Raises InputError for an empty reference, shapes that differ, NaN and infinity."""
     for name, values in {"volume": volume, "reference": reference}.items():
@@ -181,7 +182,7 @@ def motion_error_mm(
 
 
 def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike, title: str) -> None:
-    """Writes a PNG with a row for each middle slice, and columns for result, truth and difference. z and y point up.
+    """Writes a PNG of middle slices: a row for each axis, and columns for result, truth and difference. z and y point up.
 
     Grey values extend over the truth's range, so that a wrong gain shows. The difference has its own scale, symmetric about
     0. result, reference: (z, y, x). ``title``: the heading's first line. Raises InputError for shapes that differ, NaN and

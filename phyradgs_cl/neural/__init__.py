@@ -1,6 +1,6 @@
-"""Attenuation as a neural field: hash encoding, networks, rays over an exposure, training. No other package uses PyTorch.
+"""Attenuation as a neural field: hash encoding, networks, rays over an exposure, training.
 
-PyTorch is optional. This module and ``options`` load without it; the other modules need it."""
+PyTorch is optional, and only this folder uses it. This module and ``options`` load without PyTorch; the others need it."""
 
 import importlib.util
 

@@ -19,7 +19,7 @@ from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
-_ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # each axis of a volume (z, y, x) comes last once: segments run along the last
+_ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # each axis of a volume (z, y, x) comes last once: line segments run along it
 _WIDER = 4  # feed-forward layers of a transformer are this many times as wide as its other layers
 _FACTORS = (1, 2_654_435_761, 805_459_861)  # factors of x, y, z in the hash (Müller et al., Eq. 4)
 _FIRST_FEATURES = 1e-4  # initial features are random, between ± this (Müller et al., NAF)
@@ -66,7 +66,8 @@ def to_array(tensor: torch.Tensor) -> np.ndarray:
 
 
 class LineAttention(nn.Module):
-    """Multi-head attention within each group of ``segment`` successive rows of values (P, width). ``segment`` divides P."""
+    """Multi-head attention within line segments: groups of ``segment`` successive rows of values (P, width), which belong to
+    successive points of a line. ``segment`` divides P."""
 
     def __init__(self, width: int, segment: int, heads: int, head_width: int) -> None:
         super().__init__()
@@ -121,7 +122,7 @@ class AttenuationNetwork(nn.Module):
     """Maps features (P, inputs) to attenuation (P,) in the unit of ``options.density_bound``.
 
     middle: the modules between the first and the last layer. skip: the index of the layer whose input also
-    has the features. Each layer is followed by a leaky ReLU, the last one by ``options.last_activation``."""
+    has the features. A leaky ReLU follows each layer but the last, and ``options.last_activation`` the last layer."""
 
     def __init__(self, inputs: int, middle: list[nn.Module], skip: int, options: NeuralOptions) -> None:
         super().__init__()
@@ -163,8 +164,8 @@ def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
 class HashEncoding(nn.Module):
     """Maps positions (P, 3) in [0, 1]³ to features (P, levels · features), interpolated linearly from a grid cell's corners.
 
-    Each level is a finer grid. If it has at most 2^table_log2 corners, each has its own entry in the level's table.
-    Otherwise a hash assigns entries, and corners share them."""
+    Each level is a finer grid, with base_resolution · growth^level cells along a side. If a level has at most 2^table_log2
+    corners, each corner has its own entry in the level's table. Otherwise a hash assigns entries, which corners share."""
 
     def __init__(
         self, levels: int, features: int, base_resolution: int, growth: float, table_log2: int
@@ -222,8 +223,8 @@ def weighted_rows(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor
 
 
 class _Interpolate(torch.autograd.Function):
-    """Returns Σ weight · table[index] over 8 corners, for index and weight (B, 8). The gradient, by the table alone, is
-    summed in a fixed order, so that runs repeat."""
+    """Returns Σ weight · table[index] over 8 corners, for index and weight (B, 8). Only the table has a gradient. It is
+    summed in a fixed order, so that every run gives the same bits."""
 
     @staticmethod
     def forward(ctx: Any, table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
@@ -263,8 +264,9 @@ def voxel_values(
 ) -> np.ndarray:
     """Returns the field in all voxels (nz, ny, nx) float32. ``grid``: centred, in units of half the longest side.
 
-    A voxel is the mean over the centres of its ``points``³ equal parts. With segments, a point's value depends on its
-    neighbours along the segment. The result is then the mean over segments along x, y and z."""
+    A voxel is the mean over the centres of its ``points``³ equal parts. With line segments, a point's value depends on its
+    neighbours along the segment. The result is then the mean over segments along x, y and z. points_at_once: most points
+    that are evaluated together."""
     orders = _ORDERS if field.segment > 1 else _ORDERS[:1]
     values = np.zeros(grid.shape, np.float32)
     for order in orders:
@@ -279,8 +281,8 @@ def _in_rows(
     field: NeuralField, grid: Grid, order: tuple[int, int, int], device: torch.device, points_at_once: int,
     points: int,
 ) -> np.ndarray:
-    """Returns the voxels of a grid whose axes are z, y, x in another ``order``, with segments along the last axis. A row is
-    extended beyond its end to fill the last segment."""
+    """Returns the voxels of a grid whose axes are z, y, x in another ``order``, with line segments along the last axis. A
+    row of points is extended beyond its end to fill the last segment."""
     fine = grid.finer(points)
     slow, middle, fast = fine.axes_mm()
     filled = ceil_div(fast.size, field.segment) * field.segment

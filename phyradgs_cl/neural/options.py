@@ -26,11 +26,11 @@ class NeuralOptions(MotionOptions):
     """A field on a hash encoding and a small network, fitted to rays.
 
     - iterations: passes over all frames, with one step per frame. rays: pixels per step.
-    - samples: along each ray inside the volume. 0: 1.5 per voxel of the longest side, 1.2 if a pixel has several times.
+    - samples: number along each ray in the volume. 0: 1.5 per voxel of the longest side, 1.2 if a pixel has several times.
     - jitter: random shift of the samples, one per ``ray``, one per ``sample`` inside its own interval, or ``none``.
-    - times: how many times of a line a step uses, drawn for each pixel; 0: all.
+    - times: how many of the times in a line's exposure a step uses, drawn for each pixel; 0: all of them.
     - positive_only: use only pixels with a line integral above 0.
-    - voxel_points: points along each side of a voxel, whose value is the field's mean over them.
+    - voxel_points: points along each side of a voxel. The voxel's value is the field's mean over all of its points.
 
     - levels (0: until the finest has one cell per voxel), features, base_resolution (cells along a side), level_growth,
       table_log2 (each level has at most 2^table_log2 entries): sizes of the hash encoding.
@@ -88,10 +88,10 @@ class NeuralOptions(MotionOptions):
         return self.samples or max(round(density * longest_voxels), 2)
 
     def times_for(self, count: int, model: str) -> int:
-        """Returns how many of a line's ``count`` times a step uses.
+        """Returns how many of the ``count`` times in a line's exposure a step uses. model: what the detector averages.
 
         Raises InputError for a subset that would bias the loss. The log model must estimate a variance, which takes two
-        times. In the intensity model, the logarithm of a mean is not the mean over subsets."""
+        times. In the intensity model, the logarithm of a mean is not the mean over subsets of the logarithm."""
         if self.times == 0:
             return count
         if self.times < count and model == "intensity":
@@ -104,7 +104,7 @@ class NeuralOptions(MotionOptions):
 
 @dataclass(frozen=True)
 class LineOptions(NeuralOptions):
-    """Options of a field with a transformer over line segments, and windows of pixels in addition to the scattered ones.
+    """Options of a field with a transformer over line segments, fitted to windows of pixels and to scattered pixels.
 
     segment: number of samples in a line segment. heads, head_width, blocks: sizes of the attention within segments. windows:
     number of windows per step, each of ``window`` by ``window`` pixels."""

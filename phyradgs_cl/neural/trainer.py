@@ -25,8 +25,8 @@ Field = Callable[[torch.Tensor], torch.Tensor]
 
 
 class Trainer:
-    """Fits a field to a scan's rays, step by step for a ``Loop``. A step takes one frame, an iteration all frames once.
-    Holds what changes from step to step: the field, its optimiser and the random draws.
+    """Fits a field to a scan's rays, in steps that ``reconstructors.loop`` runs. A step takes one frame, an iteration all.
+    A trainer holds what changes from step to step: the field, its optimiser and the random draws.
 
     Lengths are in units of half the volume's longest side, attenuation in units of ``density_per_mm``."""
 
@@ -174,7 +174,7 @@ class Trainer:
     def _squares(
         self, source: np.ndarray, direction: np.ndarray, shifts: np.ndarray, measured: np.ndarray, times: int
     ) -> torch.Tensor:
-        """Returns the squared errors (R,) of pixels, from rays (R, s, 3) at s of each pixel's ``times``."""
+        """Returns the squared errors (R,) of pixels ``measured`` (R,), from rays (R, s, 3) at s of a pixel's K ``times``."""
         from_, along, shift = (
             to_tensor(a.reshape(-1, a.shape[-1]).astype(np.float32), self.device)
             for a in (source, direction, shifts)
@@ -236,8 +236,8 @@ class ExposureRays:
         return len(self.cell)
 
     def __call__(self, pixels: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the rays' sources and unit directions (R, s, 3). pixels (R, 2): row and column. times (R, s): which of a
-        line's K times each ray has.
+        """Returns the sources and unit directions (R, s, 3) of s rays for each pixel. pixels (R, 2): row and column. times
+        (R, s): which of a line's K times each ray has.
 
         Parallel rays begin in front of the volume."""
         rows, columns = pixels.T
@@ -253,7 +253,7 @@ class ExposureRays:
         return pose[..., :3], direction
 
     def shadow(self, half_sides: np.ndarray, detector_shape: tuple[int, int]) -> tuple[slice, slice]:
-        """Returns the rows and columns outside which no ray meets a box of ``half_sides`` (x, y, z) about 0."""
+        """Returns the rows and columns of all pixels whose rays may meet a box of ``half_sides`` (x, y, z) about 0."""
         corners = np.array(np.meshgrid(*[(-h, h) for h in half_sides], indexing="ij")).reshape(3, -1).T
         source, first, steps = self.pose[:, None, :3], self.pose[:, None, 3:6], self.pose[:, None, 6:12]
         to_corner = corners - source  # from each source to each corner of the box, (C, 8, 3)
@@ -287,7 +287,7 @@ def windows_and_scattered_pixels(
 ) -> np.ndarray:
     """Draws the pixels (R, 2) of ``windows`` windows of ``edge``² usable pixels, and ``count`` scattered ones outside them.
 
-    Windows are tiles of the frame. If fewer tiles have only usable pixels, there are fewer windows."""
+    Windows are tiles of the frame. If fewer than ``windows`` tiles have only usable pixels, there are fewer windows."""
     down, across = (n // edge for n in usable.shape)
     tiles = usable[: down * edge, : across * edge].reshape(down, edge, across, edge).all(axis=(1, 3))
     whole = np.flatnonzero(tiles)
@@ -322,7 +322,7 @@ def box_span(
 
 
 def sample_shifts(rays: int, samples: int, jitter: str, rng: np.random.Generator) -> np.ndarray:
-    """Returns where samples lie in their intervals, 0 to 1: (R, 1) if all samples of a ray lie alike, else (R, samples)."""
+    """Returns the places of samples in their intervals, 0 to 1: (R, 1) if a ray's samples share one, else (R, samples)."""
     if jitter == "none":
         return np.full((rays, 1), 0.5, np.float32)
     return rng.random((rays, samples if jitter == "sample" else 1), np.float32)
@@ -350,8 +350,7 @@ def intensity_average(integrals: torch.Tensor, unit: float) -> torch.Tensor:
 
 
 def log_squares(integrals: torch.Tensor, measured: torch.Tensor, times: int) -> torch.Tensor:
-    """Returns squared errors (R,) of the mean over all K ``times`` of a pixel, estimated from the line integrals (R, s) at s
-    of them.
+    """Returns squared errors (R,) of a pixel's mean over all K ``times``, estimated from line integrals (R, s) at s of them.
 
     The squared error of a subset's mean is too large by the variance of that mean. This is estimated as the s samples'
     variance times (1/s − 1/K), and subtracted. Expectation and gradient are then the same as with all K times."""

@@ -1,4 +1,5 @@
-"""Phantoms with exact line integrals: Shepp and Logan's head, circles of beads, and the moving sphere of RTK's tests."""
+"""Phantoms with exact line integrals: Shepp and Logan's head, circles of beads, and the moving sphere of the tests of RTK
+(Reconstruction Toolkit)."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -37,10 +38,10 @@ def shepp_logan(
 ) -> EllipsoidPhantom:
     """Returns Shepp and Logan's head in a cube of side 2 · ``half_size_mm`` about the origin.
 
-    variant: "toft" (high contrast) or "kak-slaney". unit_attenuation_per_mm: attenuation of grey level 1. None takes 1 /
-    ``half_size_mm``, so that line integrals do not depend on the size.
+    variant: "toft" (high contrast) or "kak-slaney". unit_attenuation_per_mm: the attenuation in 1/mm of grey level 1. None
+    takes 1 / ``half_size_mm``, so that line integrals do not depend on the size.
 
-    Raises InputError for a wrong size or variant."""
+    Raises InputError for a size or attenuation not above 0, and for another variant."""
     positive("half_size_mm", half_size_mm)
     one_of("Shepp-Logan variant", variant, _GREY_LEVELS)
     unit = 1.0 / half_size_mm if unit_attenuation_per_mm is None else unit_attenuation_per_mm
@@ -87,9 +88,9 @@ def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
 class MovingBody:
     """A body that moves forth and back along a line at constant speed.
 
-    body: the body at the middle of the line. swing_mm: (x, y, z) from the middle to one end. The body starts at the other
-    end, and reaches this one after half a period. period_s: the time forth and back. Raises InputError for a period that is
-    not positive."""
+    body: the body when it is at the middle of the line. swing_mm: the vector (x, y, z) from the middle to one end. At time 0
+    the body is at the other end; after half a period it reaches this end. period_s: the time forth and back. Raises
+    InputError for a period that is not positive."""
 
     body: Body
     swing_mm: Triple
@@ -172,9 +173,9 @@ def moving_sphere(half_size_mm: float, period_s: float = float(_STEPS)) -> Movin
     """Returns a ball in which a small sphere, half as dense, moves along y. The cube of side 2 · ``half_size_mm`` is about
     the origin.
 
-    With 64 mm it has the lengths of RTK's tests: a ball of radius 60 mm, and in it a sphere of 8 mm that moves by ±8 mm in 8
-    frames of 1 s (S. Rit et al., J. Phys. Conf. Ser. 489, 012079, 2014). The ball attenuates 1 / ``half_size_mm`` and the
-    small sphere half as much, as with RTK's added densities of 2 and −1."""
+    A half-size of 64 mm gives the lengths of RTK's tests: a ball of radius 60 mm, and in it a sphere of radius 8 mm that
+    moves by ±8 mm in 8 frames of 1 s (S. Rit et al., J. Phys. Conf. Ser. 489, 012079, 2014). The ball's attenuation is
+    1 / ``half_size_mm`` and the small sphere's half of it, as with RTK's added densities of 2 and −1."""
     positive("half_size_mm", half_size_mm)
     outer, inner, swing = (share * half_size_mm for share in (_OUTER, _INNER, _SWING))
     ball = Ellipsoid((0.0, 0.0, 0.0), (outer,) * 3, 1 / half_size_mm)

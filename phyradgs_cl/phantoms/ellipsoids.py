@@ -18,7 +18,7 @@ Triple = tuple[float, float, float]
 Matrix = tuple[Triple, Triple, Triple]
 
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_PARALLEL = 1e-30  # stands for a divisor of 0, which a ray along or across a cylinder's axis gives
+_PARALLEL = 1e-30  # replaces a divisor of 0, which a ray along a cylinder's axis, or at right angles to the axis, gives
 RAYS_PER_CHUNK = 1 << 15  # most rays projected at a time: their intermediate arrays, 2-3 MB, stay in a core's cache
 
 
@@ -66,7 +66,8 @@ class Ellipsoid:
 
     @property
     def ends_mm(self) -> tuple[Triple, Triple]:
-        """The ends of a line segment in the body; every point of the body is within ``reach_mm`` of this segment."""
+        """The ends of a line segment in the body, here both the centre. No point of the body is further than ``reach_mm``
+        from the segment."""
         return self.centre_mm, self.centre_mm
 
     @property
@@ -179,8 +180,8 @@ class EllipsoidPhantom:
     def line_integrals(self, source: ArrayLike, target: ArrayLike) -> Array:
         """Integrates attenuation from ``source`` to ``target``, world points (..., 3) in mm, x y z, that broadcast.
 
-        Returns (...) float64, dimensionless. A segment that misses or has no length gives 0. Raises InputError for a last
-        axis that is not 3, and for shapes that do not broadcast."""
+        Returns (...) float64, dimensionless. A segment that misses every body, or has no length, gives 0. Raises InputError
+        for a last axis whose length is not 3, and for shapes that do not broadcast."""
         start, end = _broadcast_points(source, target)
         result = np.zeros(start.shape[:-1])
         flat = result.reshape(-1)

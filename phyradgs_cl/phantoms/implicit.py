@@ -1,7 +1,8 @@
 """Bodies for procedural phantoms: signed distances, smooth unions, band-limited texture.
 
 They are functions of position in the cube [-1, 1]^3, averaged over voxels, so every resolution shows the same object.
-Distances are negative inside a body. Points are (x, y, z); arrays are (z, y, x), float32."""
+Lengths are in half sides of the cube. Distances are negative inside a body. Points are (x, y, z); arrays are (z, y, x),
+float32."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ Box = tuple[slice, slice, slice]
 Point = tuple[float, float, float]
 
 FAR = np.float32(4.0)  # stands for a large distance: no two points of the cube are this far apart
-_REACH = 5.0  # a body counts in a union up to this distance, in blend widths: beyond, its part is below exp(-5) = 0.7 %
+_REACH = 5.0  # a body counts in a smooth union up to this distance, in blend widths: beyond, it adds less than exp(-5)
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class Capsule:
 
 @dataclass(frozen=True)
 class Lattice:
-    """The centres of `count` voxels along each axis of the cube [-1, 1]^3."""
+    """A lattice of voxels that fill the cube [-1, 1]^3, `count` along each axis."""
 
     count: int
 
@@ -62,8 +63,8 @@ class Lattice:
         return (z, y, x)
 
     def coverage(self, distance: Field) -> Field:
-        """Returns the fraction of each voxel in a body at signed ``distance``, as if its surface were parallel to a voxel's
-        face."""
+        """Returns the fraction of each voxel that lies in a body, from the voxel centre's signed ``distance`` to the body,
+        as if the body's surface were parallel to a face of the voxel."""
         return np.clip(0.5 - distance / np.float32(self.step), 0.0, 1.0)
 
 
@@ -100,7 +101,8 @@ def capsule_box(lattice: Lattice, capsules: Sequence[Capsule], margin: float) ->
 
 
 def add_to_union(union: Field, box: Box, distance: Field, blend: float) -> None:
-    """Adds a body to a smooth union of bodies, in place. The union is stored as the sum of exp(-distance / blend)."""
+    """Adds a body to a smooth union of bodies, in place. The union is stored as the sum of exp(-distance / blend). blend:
+    the width over which bodies merge."""
     union[box] += np.exp(np.clip(-distance / np.float32(blend), -60.0, 60.0))
 
 
@@ -136,7 +138,7 @@ def texture(
 ) -> Field:
     """Draws isotropic noise (n, n, n) float32 of variance 1: a sum of ``waves`` random cosines, averaged over each voxel.
 
-    Their wavelengths lie between the two ``wavelengths``. The numbers drawn from ``rng`` do not depend on the resolution."""
+    The cosines' wavelengths lie between the two ``wavelengths``. The draws from ``rng`` do not depend on the resolution."""
     direction = rng.standard_normal((waves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     k = 2 * np.pi * direction / rng.uniform(*wavelengths, waves)[:, None]  # rad per unit length

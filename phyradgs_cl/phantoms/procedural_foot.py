@@ -13,7 +13,7 @@ from phyradgs_cl.phantoms.implicit import Capsule, Field, Lattice, Point
 
 Bone = tuple[Capsule, ...]
 
-# Attenuation of each tissue; dense bone is near 1.
+# Attenuation of each tissue, relative: dense bone is near 1.
 _CORTICAL, _TRABECULAR, _MARROW = 0.92, 0.56, 0.36
 _MUSCLE, _FAT, _SKIN = 0.24, 0.18, 0.27
 _SHELL = 0.022  # thickness of cortical bone
@@ -50,8 +50,8 @@ _FLESH = (
 
 
 def foot(grid_shape: int, seed: int) -> Field:
-    """Returns the phantom (n, n, n) float32 (z, y, x) in [0, 1], with air exactly 0. It fits into the cube's inscribed
-    cylinder. A ``seed`` gives the same foot at every resolution. Raises InputError for fewer than 4 voxels."""
+    """Returns relative attenuation (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, for n = ``grid_shape``. The foot
+    fits into the cube's inscribed cylinder. A ``seed`` gives the same foot at every n. Raises InputError for n below 4."""
     at_least("grid_shape", grid_shape, 4)
     rng = np.random.default_rng(seed)
     bones = [_chain([(p[:3], p[3]) for p in chain], rng) for chain in _TARSALS]

@@ -23,7 +23,7 @@ _BONE_BLEND, _FLESH_BLEND = 0.025, 0.04  # widths over which bodies that touch m
 # The arc of the mandible: x = A sin(phi), y = Y0 - B cos(phi), phi from -_PHI_END to +_PHI_END.
 _ARC_A, _ARC_B, _ARC_Y0 = 0.60, 0.86, 0.22
 _PHI_END = 0.46 * np.pi
-_BODY_Z, _BODY_HEIGHT, _BODY_WIDTH = -0.26, 0.19, 0.105
+_BODY_Z, _BODY_HEIGHT, _BODY_WIDTH = -0.26, 0.19, 0.105  # z of the ellipse's centre, and its semi-axes along z and across
 _GUM_Z = -0.08  # upper rim of the bone, where the crowns begin
 # Teeth of one side, from the middle: width along the arc, width across, crown height, number of roots.
 _TEETH = (
@@ -35,7 +35,7 @@ _TEETH = (
     (0.150, 0.145, 0.12, 2),
     (0.150, 0.145, 0.11, 2),
 )
-_FIRST_GAP = 0.006
+_FIRST_GAP = 0.006  # from the middle of the arc to the first tooth on either side, along the arc
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,8 @@ class Tooth:
 
 
 def jaw(grid_shape: int, seed: int) -> Field:
-    """Returns the phantom (n, n, n) float32 (z, y, x) in [0, 1], with air exactly 0. It fits into the cube's inscribed
-    cylinder. A ``seed`` gives the same jaw at every resolution. Raises InputError for fewer than 4 voxels."""
+    """Returns relative attenuation (n, n, n) float32 (z, y, x) in [0, 1], air exactly 0, for n = ``grid_shape``. The jaw
+    fits into the cube's inscribed cylinder. A ``seed`` gives the same jaw at every n. Raises InputError for n below 4."""
     at_least("grid_shape", grid_shape, 4)
     rng = np.random.default_rng(seed)
     teeth = _teeth(rng)
@@ -91,7 +91,7 @@ def _teeth(rng: np.random.Generator) -> list[Tooth]:
 
 
 def _arc_distance(lattice: Lattice) -> Field:
-    """Returns the horizontal distance (1, n, n) of each vertical column of voxels from the arc."""
+    """Returns the horizontal distance (1, n, n) from each vertical column of voxels to the mandible's arc."""
     axis = lattice.axis()
     x, y = axis[None, :], axis[:, None]
     nearest = np.full((lattice.count, lattice.count), np.inf, dtype=np.float32)

@@ -16,9 +16,9 @@ from phyradgs_cl.runtime.memory import DeviceArray
 
 A = TypeVar("A")
 Shape = tuple[int, ...]
-_CPU_SPAN = 1 << 14  # least number of elements that a CPU's work-item sums, so that the work outweighs its start
+_CPU_SPAN = 1 << 14  # least number of elements that a CPU's work-item sums, so that summing outweighs its start
 _GPU_GROUP = 256  # largest work-group on a GPU, in work-items
-_GPU_GROUPS = 512  # a sum's largest number of work-groups on a GPU, or of work-items on a CPU
+_GPU_GROUPS = 512  # most work-groups (on a GPU) or work-items (on a CPU) that share a sum
 _ITEMS = 64  # size of a work-group of element-wise kernels on a CPU, in work-items
 
 
@@ -26,7 +26,7 @@ class Space(Protocol, Generic[A]):
     """Arrays on the host or on a device, and their algebra. Operands have the same shape unless a method says otherwise."""
 
     def array(self, values: np.ndarray) -> A:
-        """Returns NumPy values as an array of this space. Both may share memory."""
+        """Returns NumPy values as an array of this space. The two may share memory."""
 
     def numpy(self, x: A) -> np.ndarray:
         """Returns the values of ``x`` as a NumPy array, which may share memory with ``x``."""
@@ -38,7 +38,7 @@ class Space(Protocol, Generic[A]):
         allocate their results."""
 
     def take(self, x: A, chosen: Sequence[int]) -> A:
-        """Returns the entries with indices ``chosen`` along the first axis, in that order."""
+        """Returns the entries of ``x`` with the indices ``chosen`` along its first axis, in the order of ``chosen``."""
 
     def add(self, x: A, y: A, scale: float = 1.0, *, nonnegative: bool = False) -> A:
         """Returns x + ``scale`` y, clipped at 0 if ``nonnegative``."""
@@ -50,7 +50,7 @@ class Space(Protocol, Generic[A]):
         """Returns x + ``scale`` y z element by element, clipped at 0 if ``nonnegative``."""
 
     def multiply(self, x: A, y: A) -> A:
-        """Returns x y element by element. y may lack the first axes of x; it then repeats along them."""
+        """Returns x y element by element. y may lack the first axes of x: all of x's parts are then multiplied by it."""
 
     def reciprocal(self, x: A, share: float) -> A:
         """Returns 1/max(x, ``share`` · largest x) where x > 0, else 0, so that small x give no huge result."""
@@ -65,7 +65,7 @@ class Space(Protocol, Generic[A]):
         """Returns √Σ x²."""
 
     def sum_squares(self, arrays: Iterable[A]) -> float:
-        """Returns Σ ‖x‖² over ``arrays``, which may be a generator. A device sends back only the sum of all."""
+        """Returns Σ ‖x‖² over ``arrays``, which may be a generator. A device sends back only the sum over all arrays."""
 
     def largest(self, x: A, *, absolute: bool = False) -> float:
         """Returns the largest x, or the largest |x| if ``absolute``."""
@@ -217,7 +217,7 @@ class DeviceSpace:
 
     def _each(self, name: str, x: DeviceArray, *others: Any, period: int = 0) -> DeviceArray:
         """Launches an element-wise kernel with x and the other arguments. period: the size of a second operand that is
-        smaller than x and repeats along it; 0 if it has the size of x."""
+        smaller than x and repeats along x; 0 if all operands have the size of x."""
         result, count = self.empty(x.shape), period or x.size
         items = ceil_div(count, self.rt.lanes), x.size // max(count, 1)
         kernel = self.rt.kernel("algebra", name)
@@ -231,15 +231,16 @@ class DeviceSpace:
         return float(values[0] if self.rt.fp64 else values.view(np.float32).astype(np.float64).sum())
 
     def _sum(self, name: str, whole: DeviceArray, *arrays: DeviceArray, add: bool = False) -> None:
-        """Writes a sum over arrays to ``whole``, or adds it there. Kernel ``name`` sums in work-groups, a second one sums
-        over them."""
+        """Writes a sum over arrays to ``whole``, or adds the sum to ``whole``. Kernel ``name`` sums in each work-group, a
+        second kernel over the work-groups."""
         groups = self._reduce(name, *arrays, scratch=8)
         kernel = self.rt.kernel("algebra", "dot_whole")
         group = self.rt.group(1, _GPU_GROUP, kernel)
         self.rt.launch(kernel, group, self._parts, groups, add, self.rt.local(8 * group), whole, group=group)
 
     def _reduce(self, name: str, *arguments: Any, scratch: int) -> int:
-        """Launches kernel ``name``, whose work-groups write partial results to ``_parts``. Returns their number."""
+        """Launches kernel ``name``, whose work-groups each write a partial result to ``_parts``. Returns the number of these
+        results. scratch: bytes of local memory per work-item."""
         kernel = self.rt.kernel("algebra", name)
         count, group = arguments[0].size, self.rt.group(1, _GPU_GROUP, kernel)
         if self.rt.pixel_items:  # on a GPU, neighbouring work-items read neighbouring elements

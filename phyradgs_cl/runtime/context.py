@@ -22,8 +22,8 @@ from phyradgs_cl.runtime.profile import KernelUse, Profile, Rates, measure_rates
 log = logging.getLogger(__name__)
 Sides = tuple[int, ...]
 
-LANE_CHOICES = (1, 4, 8, 16)
-_FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'
+LANE_CHOICES = (1, 4, 8, 16)  # numbers of floats that a kernel's vectors may have
+_FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'  # fuses multiply and add; marks sources with float pairs
 _TILE_ITEMS = 256  # largest work-group that shares a tile of pixels, in work-items
 _FEWEST_ITEMS = 32  # a device whose work-groups must be smaller than this is refused
 
@@ -35,9 +35,9 @@ class Runtime:
       work-items do the work of a CPU's vector.
     - fp64: False makes kernels use pairs of float32 in place of float64.
     - pixel_items: True gives each work-item one pixel (GPUs, needs ``lanes`` 1), False several lines of pixels (CPUs).
-    - memory: the limit of the sum of its buffers in bytes, or as text like 2GiB.
+    - memory: the largest sum of the sizes of all buffers, in bytes or as text like 2GiB. profile: True times every kernel.
     - ranks: the MPI processes that work on the same scan, each with its own Runtime. On a machine with several devices,
-      each rank takes another one."""
+      each rank takes another device."""
 
     # Most samples of rays in one GPU launch: a display driver kills launches of seconds, and these take 0.1 s on a slow GPU.
     most_samples = 2**29
@@ -77,7 +77,8 @@ class Runtime:
         self._kernels: dict[tuple[str, str, tuple[str, ...]], Kernel] = {}
 
     def kernel(self, program: str, name: str, **defines: int | float | bool) -> Kernel:
-        """Declares the kernel ``name`` of ``cl/<program>.cl``. Its first launch builds it; equal declarations share it."""
+        """Declares the kernel ``name`` of ``cl/<program>.cl`` with macros ``defines``. Its first launch builds it. Equal
+        declarations return the same kernel."""
         merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
         flags = [f"-D{name}={_literal(value)}" for name, value in sorted(merged.items())]
         key = (program, name, ("-cl-std=CL1.2", "-w", _FUSING, *flags))
@@ -99,7 +100,7 @@ class Runtime:
 
     @property
     def group_limits(self) -> dict[str, int]:
-        """The largest work-group in work-items, by kernel; only of kernels for which the driver has been asked."""
+        """The largest work-group of each kernel, in work-items; only of kernels for which the driver has been asked."""
         return {one.function_name: one.most_items for one in self._kernels.values() if one.most_items is not None}
 
     def _build(self, program: str, options: tuple[str, ...]) -> "cl.Program":
@@ -124,7 +125,7 @@ class Runtime:
         return [option for option in options if not (has_pairs and option == _FUSING)]
 
     def empty(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:
-        """Returns an array with undefined values. Raises MemoryShortage where the device or the limit has too little."""
+        """Returns an array with undefined values. Raises MemoryShortage if the device or the limit has too little memory."""
         shape = (int(shape),) if isinstance(shape, (int, np.integer)) else tuple(int(n) for n in shape)
         kind = np.dtype(dtype)
         nbytes = max(int(np.prod(shape, dtype=np.int64)), 1) * kind.itemsize
@@ -226,8 +227,8 @@ class Runtime:
 
         group: the sides of a work-group in work-items; missing sides are 1. An int is the side along the first axis; if this
         axis is short, a GPU's group extends along other axes. Sides are halved until the kernel can run.
-        samples: how long the launch takes, as the number of samples of rays that could be read in that time. On a GPU, more
-        than ``most_samples`` are divided among several launches. Items keep their global ids, groups get new ids.
+        samples: how long the launch takes, as the number of samples of rays that could be read in that time. On a GPU, a
+        launch of more than ``most_samples`` is divided into several. Items keep their global ids, groups get new ids.
         args: a Python int becomes a C int, a Python float a C float. Give np.int64 for a long.
         Raises DeviceError, or MemoryShortage, where a launch fails."""
         shape = (items,) if isinstance(items, (int, np.integer)) else items
@@ -252,7 +253,7 @@ class Runtime:
 
     def _sides(self, items: int, shape: Sides) -> Sides:
         """Returns the sides of a work-group of ``items`` work-items for a launch of ``shape``: (items, 1, ...). On a GPU,
-        items past a short first axis would idle. Factors of 2 then move to an axis that they divide."""
+        items past a short first axis would idle. Factors of 2 of its side then move to another axis that they divide."""
         sides = [int(items), *([1] * (len(shape) - 1))]
         while self.pixel_items and sides[0] % 2 == 0 and sides[0] // 2 >= shape[0]:
             axis = next((k for k in range(1, len(shape)) if shape[k] % (2 * sides[k]) == 0), None)
@@ -262,8 +263,8 @@ class Runtime:
         return tuple(sides)
 
     def group(self, on_cpu: int = 1, on_gpu: int = 64, *kernels: Kernel) -> int:
-        """Returns a work-group's size in work-items, ``on_cpu`` or ``on_gpu``. A GPU's is halved until ``kernels`` can run.
-        Name kernels that size local memory by the group here, because a later halving by ``launch`` would break them."""
+        """Returns a work-group's size in work-items, ``on_cpu`` or ``on_gpu``. A GPU's size is halved until ``kernels`` can
+        run. Give kernels here whose local memory has the group's size: a later halving by ``launch`` would break them."""
         while self.pixel_items and any(on_gpu > self.most_items(kernel) for kernel in kernels):
             on_gpu //= 2
         return on_gpu if self.pixel_items else on_cpu
@@ -301,8 +302,8 @@ class Runtime:
         return width, most // width
 
     def shape_of_lines(self, kernel: Kernel, width: int, *rows: int) -> tuple[tuple[int, ...], tuple[int, int], int]:
-        """Returns work-items, work-group and number of groups of a kernel over ``rows`` (one count per axis) of ``width``
-        pixels. A work-item takes one row on a CPU, and one pixel on a GPU."""
+        """Returns the numbers of work-items, the work-group's sides and the number of groups for a kernel over ``rows`` (one
+        count per axis) of ``width`` pixels. A work-item takes one row on a CPU, and one pixel on a GPU."""
         items, group = ((width, *rows), self._tile(kernel)) if self.pixel_items else ((1, *rows), (1, 1))
         sides = (*group, *([1] * (len(rows) - 1)))
         return items, group, math.prod(ceil_div(n, side) for n, side in zip(items, sides, strict=True))
@@ -317,7 +318,7 @@ class Runtime:
             self._profile.add(name, event, nbytes)
 
     def kernel_uses(self) -> dict[str, KernelUse]:
-        """Returns what each kernel used since the last call, the one with the most time first. Needs ``profile=True``."""
+        """Returns what each kernel used since the last call, by falling total seconds. Needs ``profile=True``."""
         self.queue.finish()
         return self._profile.uses()
 
@@ -336,7 +337,7 @@ def default_lanes(device: DeviceInfo) -> int:
 
 def _parts(items: Sides, group: Sides, pieces: int) -> Iterator[tuple[Sides | None, Sides]]:
     """Divides a launch of ``items`` into ``pieces`` or more, each of whole work-groups; into fewer if there are too few
-    groups. Yields, per axis, the first item and the number of items of each piece; None as first item if undivided."""
+    groups. Yields each piece's first item and its number of items per axis. An undivided launch's first item is None."""
     if pieces <= 1:
         yield None, items
         return

@@ -18,10 +18,10 @@ from phyradgs_cl.runtime import pocl
 from phyradgs_cl.runtime.opencl import cl
 
 DEVICE_VARIABLE = "PHYRADGS_DEVICE"
-_NEVER_BY_DEFAULT = ("oclgrind", "fpga", "emulat")
+_NEVER_BY_DEFAULT = ("oclgrind", "fpga", "emulat")  # parts of the names of devices that are used only if a user names them
 _RIGHT_MESA = 25  # rusticl, the OpenCL of Mesa, computes wrong sums before this major version
 log = logging.getLogger(__name__)
-_targets: dict[int, str | None] = {}
+_targets: dict[int, str | None] = {}  # by a CPU device's address, the processor for which PoCL builds its kernels
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,8 @@ def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, s
     """Returns the device to use, and the reason in words. Raises DeviceError where no device fits.
 
     wish (or the environment variable PHYRADGS_DEVICE): an index, ``cpu``, ``gpu``, a part of a device's or platform's
-    name, or a list of these with commas. turn: this process's number among the processes on this machine. Process k takes
-    entry k of a list. If ``wish`` is no list and no index, process k takes the k-th further device of the same name."""
+    name, or a list of these with commas. turn: the number k of this process among the processes on this machine. Process k
+    takes entry k of a list. If ``wish`` is no list and no index, process k takes the k-th further device of that name."""
     source = "--device"
     if not wish:
         wish, source = os.environ.get(DEVICE_VARIABLE), DEVICE_VARIABLE

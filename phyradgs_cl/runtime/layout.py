@@ -71,7 +71,7 @@ def pitch_of(width: int) -> int:
 
 
 def padded_zeros(rt: Runtime, rows: int, width: int, images: int = 1) -> DeviceArray:
-    """Returns zeros in the padded layout, for ``images`` images or volumes with ``rows`` rows each."""
+    """Returns zeros in the padded layout, for ``images`` images or volumes with ``rows`` rows of ``width`` floats each."""
     return rt.zeros(images * (GUARD + rows * pitch_of(width)) + GUARD)
 
 

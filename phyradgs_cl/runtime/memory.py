@@ -1,4 +1,4 @@
-"""Device memory: arrays, a limit of their sum, errors of drivers, and exchange of arrays with pyopencl."""
+"""Device memory: arrays, a limit of their total size, errors of drivers, and exchange of arrays with pyopencl."""
 
 import logging
 import math
@@ -30,7 +30,7 @@ _MEMORY_CODES = (-4, -5, -6, -61)
 
 
 class MemoryShortage(OutOfMemoryError):
-    """Raised for a buffer that is too large for the device or the limit. Work in smaller parts of a volume may fit."""
+    """Raised for a buffer that is too large for the device or for the limit. Work on smaller parts of a volume may fit."""
 
 
 @dataclass(eq=False)
@@ -151,7 +151,7 @@ class MemoryLedger:
         """Returns an OpenCL error as a DeviceError, or as a MemoryShortage if memory ran out. work: what failed.
 
         Some drivers report a shortage only at a launch or a wait. They also say "out of resources" after a kernel that
-        crashed or ran too long. Then ``queue`` no longer works, which tells the two apart."""
+        crashed or ran too long. In that case ``queue`` no longer works, which tells the two causes apart."""
         code = getattr(error, "code", 0)  # some errors of pyopencl have no code, as those of builds
         is_dead = queue is not None and not answers(queue)
         if not is_dead and (isinstance(error, cl.MemoryError) or code in _MEMORY_CODES):
@@ -195,8 +195,8 @@ def memory_limit(wish: str | int | None) -> int | None:
 
 
 def bytes_of(wish: str | int, subject: str) -> int:
-    """Returns the number of bytes that a text such as 2GiB, 1.5 GB or 512M, or a plain number, means. K, M, G and T alone
-    mean powers of 1024, as KiB does. Raises InputError about ``subject`` for other text."""
+    """Returns the number of bytes that a text such as 2GiB, 1.5 GB or 512M, or a plain number, means. The letters K, M, G
+    and T alone mean powers of 1024, like KiB; KB means 1000. Raises InputError about ``subject`` for other text."""
     text = "" if isinstance(wish, bool) else str(wish)
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
     factor = _UNITS.get(match.group(2).upper()) if match else None
@@ -212,8 +212,8 @@ def mebibytes(nbytes: int) -> str:
 
 
 class Attempt:
-    """One attempt at work that is divided to fit the memory. As a context manager it gives the fraction of the free memory
-    to use. It catches a MemoryShortage of the first attempt, so that a second can follow."""
+    """One attempt at work that is divided to fit the memory. As a context manager it gives the fraction ``share`` of the
+    free memory to use. It catches a MemoryShortage of the first attempt (share 1), so that a second attempt can follow."""
 
     has_failed = False
 
@@ -232,7 +232,8 @@ class Attempt:
 
 
 def attempts(what: str) -> Iterator[Attempt]:
-    """Yields an attempt that may use all of the free memory. If memory runs short, warns and yields one with a quarter."""
+    """Yields an attempt that may use all of the free memory. If memory runs short, warns and yields a second attempt, which
+    may use a quarter. what: the work, for the warning."""
     yield (first := Attempt(what, 1.0))
     if first.has_failed:
         yield Attempt(what, _SMALLER)

@@ -73,7 +73,7 @@ def _expand(relative: str, pasted: set[str]) -> list[str]:
 
 def placed_errors(log: str, source: str) -> list[str]:
     """Returns the lines of a compiler's log that tell errors, with file and line as in ``source``'s ``#line`` directives.
-    NVIDIA's compiler ignores these, and counts from the first line of the text."""
+    NVIDIA's compiler ignores the directives and counts from the source's first line, so its line numbers are translated."""
     files, place = [""], ("", 0)
     for line in source.splitlines():
         named = _LINE.match(line)

@@ -1,10 +1,10 @@
 """Makes PoCL (OpenCL on CPUs) fast and safe: sets its cache and threads, and the processor for which it builds kernels.
 
 PoCL links each kernel with a library of built-in functions (fma, min, vload16, ...). Its wheel has one such library for each
-family of x86 processors. LLVM inlines a function only if the caller's processor has all instruction sets of the function's.
-PoCL 3.0 builds kernels for the processor that LLVM 14 takes the host for, which may differ from the library's:
+family of x86 processors. LLVM inlines a function only if the processor that the kernel is built for has all instruction
+sets of the library's. PoCL 3.0 builds for the processor that LLVM 14 takes the host for, which may be another one:
 
-- Ice Lake lacks CLWB in LLVM's list, so no built-in is inlined, and kernels are 3 times slower.
+- Ice Lake lacks the instruction CLWB in LLVM's list, so no built-in is inlined, and kernels are 3 times slower.
 - An unknown processor becomes "generic", for which no kernel builds (pocl/pocl issue 1049).
 - Zen 4 is taken for a Zen 3 without AVX-512, and LLVM aborts ("Cannot select: i64 = fma").
 
@@ -49,7 +49,7 @@ _LIBRARIES = (
 )
 """PoCL's libraries, as (flags, processor): PoCL takes the first one whose flags are all in /proc/cpuinfo. ``processor`` is
 LLVM's name of the processor for which the library was compiled."""
-_OLDEST_TARGET = "athlon64"
+_OLDEST_TARGET = "athlon64"  # the processor of PoCL's library for processors with none of these sets of flags
 THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
 _MOST_THREADS = 1024  # largest POCL_MAX_PTHREAD_COUNT that is accepted
 _NO_CACHE_VARIABLE = "PYOPENCL_NO_CACHE"
@@ -108,7 +108,7 @@ def unusable_cache() -> Path | None:
 
 
 def warn_of_cache() -> None:
-    """Warns once if kernels are kept in the temporary folder. Called when PoCL is used, since others need no cache."""
+    """Warns once if kernels are kept in the temporary folder. Called when PoCL is used: other drivers need no cache."""
     global _unusable
     if _unusable is not None:
         text = "PoCL's kernel cache %s cannot be %s: kernels are kept in %s; set %s to a folder that can"
@@ -143,7 +143,8 @@ def _fault_of(folder: Path) -> str | None:
 
 
 def _temporary_cache() -> Path:
-    """Returns a temporary folder that only this user can write, as its binaries are executed. Raises OSError without one."""
+    """Returns a temporary folder that only this user can write, because binaries in it are executed. Raises OSError if no
+    folder can be made."""
     places = [Path(place) for place in (tempfile.gettempdir(), "/var/tmp", "/dev/shm")]
     place = next((place for place in places if _fault_of(place) is None), None)
     if place is None:
@@ -215,7 +216,7 @@ def _cpu_flags() -> set[str]:
 
 
 def cpu_facts(described: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
-    """Returns the entries of /proc/cpuinfo for the first processor ("model name", "flags", …); none without that file."""
+    """Returns the entries of /proc/cpuinfo for the first processor ("model name", "flags", …); {} without that file."""
     facts: dict[str, str] = {}
     with contextlib.suppress(OSError):
         for line in described.read_text().split("\n\n", 1)[0].splitlines():

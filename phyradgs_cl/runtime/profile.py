@@ -1,5 +1,5 @@
-"""Device time by kernel: launches, seconds and bytes. OpenCL's events give the seconds. Bytes are the sizes of a launch's
-buffers. For comparison, the driver's copies and a kernel of multiply-adds measure the best rates of the device."""
+"""Measures what each kernel uses: launches, seconds and bytes. OpenCL's events give the seconds. The bytes are the sizes of
+a launch's buffers. For comparison, the driver's copies and a kernel of multiply-adds measure the device's best rates."""
 
 from collections import defaultdict
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 
 from phyradgs_cl.runtime.opencl import cl
 
-_FOLD_AT = 20_000  # number of events that are kept before they are added up, which waits for the device
+_FOLD_AT = 20_000  # number of events that are kept before their times are added up: adding up waits for the device
 _COPY_BYTES = 1 << 26  # size of the copy that measures the memory's rate: larger than most caches
 _STEPS = 20_000  # length of each chain of multiply-adds that measures the arithmetic rate
 _REPEATS = 5  # number of runs of each measurement; the fastest counts
@@ -36,7 +36,7 @@ class Profile:
             self._fold()
 
     def uses(self) -> dict[str, KernelUse]:
-        """Returns what each kernel used since the last call, the one with the most time first."""
+        """Returns what each kernel used since the last call, by falling total seconds."""
         self._fold()
         uses = dict(sorted(self._uses.items(), key=lambda item: -item[1].seconds))
         self._uses = defaultdict(KernelUse)

@@ -13,7 +13,7 @@ from phyradgs_cl.fields import Deformation, Grid, control_points
 from phyradgs_cl.io.tables import Fields, read_toml
 
 _NODES = 40  # weights stored per cycle; linear interpolation between them is then off by 0.3 % at most
-_SETTLING_NODES = 200  # drying is a slow curve, for which weights at this many times are enough
+_SETTLING_NODES = 200  # number of times at which drying's weights are stored: its curve is slow
 _SPACINGS = 8.0  # breathing and drying are smooth, so this many spacings of control points along the longest side are enough
 _SLIDING_SPACINGS = 16.0  # sliding has a sharp edge, which becomes about three control points wide
 _ASIDE = 1 / 3  # breathing moves the object along y, too, by this fraction of its motion along z
@@ -37,7 +37,7 @@ class ObjectMotion(checks.Checked):
     lowers its top and shrinks it sideways, and never returns. "sliding" moves a cylinder about the z axis up and down in
     surroundings at rest.
 
-    - amplitude_mm: the largest displacement. None takes ``amplitude`` times half of the box's shortest side.
+    - amplitude_mm: the limit of the displacement along z. None takes ``amplitude`` times half of the box's shortest side.
     - period_s: the time of a breath, or of sliding up and down. jitter: spread (std) of a breath's period over ``period_s``.
     - hysteresis: the delay of the motion along y, in periods.
     - settling_s: the time in which drying goes 63 % of its way. None takes a third of the scan.
@@ -95,13 +95,14 @@ class ObjectMotion(checks.Checked):
 
     def _sliding_mm(self, places: list[Array], height: Array) -> list[Array]:
         """Returns the control vectors of a cylinder about the z axis that moves along z, for unit amplitude. Its edge is
-        about three control points wide."""
+        about three control points wide. places: z, y, x of control points from the box's middle, over half its shortest
+        side."""
         _, y, x = places
         return [_vectors(z=(np.hypot(x, y) < self.radius).astype(float))]
 
     def _cycles_s(self, first_s: float, last_s: float) -> Array:
-        """Returns when each cycle that the scan meets begins, and when the last one ends, in s. The first begins at first
-        light."""
+        """Returns when each cycle of the motion in the scan begins, and when the last cycle ends, in s. The first cycle
+        begins at first light."""
         count = int(np.ceil((last_s - first_s) / self.period_s)) + 1
         if count > _MOST_CYCLES:
             expected = f"at most {_MOST_CYCLES} cycles in the scan's {last_s - first_s:.4g} s"
@@ -113,7 +114,7 @@ class ObjectMotion(checks.Checked):
         return np.asarray(begins_s[: int(np.searchsorted(begins_s, last_s)) + 1])
 
     def _weights(self, first_s: float, last_s: float) -> tuple[Array, Array]:
-        """Returns times (T,) in s, and the weights (T, R) of the R fields at these times."""
+        """Returns times (T,) in s, and the weights (T, R) of the R displacement fields at these times."""
         if self.kind == "drying":
             settling_s = (last_s - first_s) / 3 if self.settling_s is None else self.settling_s
             times_s = np.linspace(first_s, max(last_s, np.nextafter(first_s, np.inf)), _SETTLING_NODES)
@@ -147,12 +148,13 @@ def load_object_motion(path: str | Path) -> ObjectMotion:
 
 
 def _breath(phase: Array) -> Array:
-    """Returns how far a breath has gone at a phase in cycles: 0 at whole numbers, 1 half-way between."""
+    """Returns a breath's displacement over its amplitude at a phase in cycles: 0 at whole numbers, 1 half-way between."""
     return np.asarray(1 - np.cos(np.pi * phase) ** 4)
 
 
 def _breathing_mm(places: list[Array], height: Array) -> list[Array]:
-    """Returns two sets of control vectors of unit amplitude, along z and along y, which grow from the base to the top."""
+    """Returns two sets of control vectors of unit amplitude, along z and along y. They grow with ``height``, which is 0 at
+    the box's base and 1 at its top."""
     share = height**2 * (3 - 2 * height)
     return [_vectors(z=share), _vectors(y=-_ASIDE * share)]
 

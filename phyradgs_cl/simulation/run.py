@@ -29,9 +29,9 @@ from phyradgs_cl.simulation.scenes import Scene, phantom_scene, volume_scene
 from phyradgs_cl.simulation.sources import FrameSource
 from phyradgs_cl.text import flag_of
 
-_LARGEST_GRID = 4096  # limit of --size
-_SMALLEST_PHANTOM = 2  # fewest voxels along a side: a procedural phantom is drawn on twice as many, and needs 4
-_STATES = 8  # a phantom whose parts move gets this many true volumes over a period
+_LARGEST_GRID = 4096  # limit of --size, in voxels along the longest side
+_SMALLEST_PHANTOM = 2  # fewest voxels along a phantom's side: a procedural phantom is drawn on twice as many, and needs 4
+_STATES = 8  # number of true volumes that are stored of a phantom whose parts move, over one period
 log = logging.getLogger(__name__)
 _PEAK = "Largest line integral, by scaling the attenuation; 0: unscaled."
 _NOISE = "tigre: TIGRE's rescaled Poisson; beer: Beer-Lambert counts."
@@ -43,21 +43,21 @@ _LARGEST_PEAK = 1e4  # limit of --peak, a line integral
 _LARGEST_NOISE = 1e9  # limit of --electronic-noise, in counts
 _SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12  # limits of --dose, in photons per pixel
 _LARGEST_DETECTOR = 32_000  # limit of --detector, in pixels along a side of the panel
-_SLACK = 1.001  # an exposure whose arc exceeds this many steps from frame to frame overlaps the next by more than rounding
-_TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse", "turns")
-_DATA_SHEET = ("first", "fps", "readout_ms")
+_SLACK = 1.001  # largest exposure arc without a warning, over the turn from frame to frame: a larger one is no rounding
+_TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse", "turns")  # options that change the protocol
+_DATA_SHEET = ("first", "fps", "readout_ms")  # options that state readout and frame rate as data sheets do
 
 
 @dataclass(frozen=True)
 class SimulationOptions:
     """Options of a simulation. ``peak`` > 0 scales attenuation so that the largest line integral is ``peak``.
 
-    - time_samples: at how many times a line's exposure is sampled, in the middles of equal parts. 0: as many, from 8 to 128,
-      as keep the way of the volume's edge, and of a moving object, below half a voxel of ``grid`` (docs/mathematics.md).
-    - dose: photons of a pixel without object, on a line that sees the whole pulse.
-    - lag (λ), rings, sparks, drift, scatter: effects of panel and tube (detector/effects.py); 0 is without.
-    - kvp: tube voltage in kV, of a beam that hardens; 0 is a beam of one energy.
-    - motion_of_object: how the object moves during the scan. None: it rests."""
+    - time_samples: at how many times a line's exposure is sampled, in the middles of equal parts. 0 takes 8 to 128 times, so
+      that the volume's edge, and a moving object, go at most half a voxel from time to time (docs/mathematics.md).
+    - dose: photons that a pixel without an object in front receives in a frame, on the line that sees light longest.
+    - lag (λ), rings, sparks, drift, scatter: effects of panel and tube (detector/effects.py); 0 leaves an effect out.
+    - kvp: tube voltage in kV of a beam that hardens; 0 means a beam of one energy.
+    - motion_of_object: how the object moves during the scan; None means that it rests."""
 
     protocol: Protocol = Protocol()
     readout_axis: str = "rows"
@@ -98,7 +98,7 @@ def scanner_for(
     """Returns a scanner by its name, or from a TOML file.
 
     detector: another number of columns, with rows in proportion. detector_offset_mm: the panel's offset (v, u). truncation:
-    the fraction of the columns that is cut off, half of it at each side."""
+    the fraction of the columns that is cut off, half of these columns at each side."""
     scanner = load_scanner(name, resource("data"))
     geometry = scanner.geometry
     if detector is not None:
@@ -114,8 +114,8 @@ def scanner_for(
 
 
 def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> SimulationOptions:
-    """Returns options of a simulation with the protocol of that name. Where an option is missing or None, the scanner's
-    value counts, or else the default.
+    """Returns options of a simulation with the protocol named ``protocol``. An option that is missing or None has the
+    scanner's value if the scanner states one, else the default.
 
     Raises InputError for unknown options, values out of range, and values that contradict each other."""
     given = {key: value for key, value in given.items() if value is not None}
@@ -157,8 +157,8 @@ def simulated_scan(
     """Returns a scanner's scan of a phantom (given by name or as an object) or of a volume. The truth is its reference.
 
     name: the volume's name, for titles. size: voxels along the longest side of grid and reference; None: the scanner's or
-    the volume's. pixel_samples: rays along each side of a pixel; 0 chooses them by the size of the truth's voxels. Warns of
-    an inverse crime."""
+    the volume's. pixel_samples: rays along each side of a pixel; 0 chooses them by the size of the truth's voxels. report:
+    called with the numbers of frames done and in all. Warns of an inverse crime (``Scene.warn_of_inverse_crime``)."""
     if size is not None:
         checks.within("--size", size, 1 if isinstance(of, Volume) else _SMALLEST_PHANTOM, _LARGEST_GRID)
     where, axis = (scanner.geometry, scanner.grid), options.readout_axis
@@ -208,8 +208,8 @@ def simulate(
 ) -> Scan:
     """Returns a scan of the object that ``source`` projects, with the noise and effects that ``options`` ask for.
 
-    reference (nz, ny, nx): the truth in 1/mm, which ``peak`` scales too. bone: projects the bone alone, for a beam of many
-    energies."""
+    reference (nz, ny, nx): the truth in 1/mm, which ``peak`` scales too. bone: projects the object's bone alone, as a beam
+    of many energies needs it."""
     if options.kvp and bone is None:
         expected = "an object of voxels, whose dense ones are bone: foot, jaw or a volume"
         raise InputError("--kvp", "a phantom in closed form", expected, "leave it out")
@@ -259,7 +259,8 @@ def simulate(
 
 
 def _gating(scan: Scan, scene: Scene) -> Gating:
-    """Returns the motion's state in the middle of every frame: the first field's weight, or the phase without fields."""
+    """Returns the motion's state in the middle of every frame: the weight of the deformation's first field; without a
+    deformation, the phase of the phantom's period."""
     middle_s = np.asarray(scan.frame_start_s) + scan.shutter.span_s / 2
     if scene.deformation is not None:
         return Gating(middle_s, scene.deformation.weights_at(middle_s)[:, 0])
@@ -267,15 +268,16 @@ def _gating(scan: Scan, scene: Scene) -> Gating:
 
 
 def default_time_samples(protocol: Protocol, grid: Grid, fastest_mm_per_s: float = 0.0) -> int:
-    """Returns the number of time samples per line, limited to 8 to 128, between which the volume's edge, and the fastest
-    part of a moving object, go at most half a voxel."""
+    """Returns at how many times, limited to 8 to 128, an exposure is sampled. From one time to the next, the volume's edge
+    and the fastest part of a moving object go at most half a voxel."""
     path_mm = np.deg2rad(protocol.exposure_deg) * max(grid.size_mm[1:]) / 2
     path_mm = max(path_mm, fastest_mm_per_s * protocol.exposure_s)
     return int(np.clip(np.ceil(2 * path_mm / min(grid.voxel_size_mm)), 8, 128))
 
 
 def _recorded(frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Adds to frames (F, v, u), in physical order, the effects that the options ask for."""
+    """Adds to frames (F, v, u), in physical order, the effects that the options ask for. light: how long each pixel receives
+    light, as a fraction of the longest time; it broadcasts with a frame."""
     if options.scatter > 0:
         frames = effects.add_scatter(frames, options.scatter).astype(np.float32)
     if options.drift > 0:

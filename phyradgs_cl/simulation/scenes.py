@@ -17,7 +17,7 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.sources import AnalyticSource, DeformedSource, FrameSource, VolumeSource, on_panel
 
 _DENSE = 0.5  # in a beam of many energies, voxels above this fraction of the largest attenuation may be bone
-# Bone begins at an attenuation that few voxels have, at most this fraction of the commonest one's: that cuts no material.
+# Bone begins in a bin of the histogram with at most this fraction of the fullest bin's voxels: no material is cut in two.
 _RARE = 0.2
 log = logging.getLogger(__name__)
 Moves = Callable[[Grid], Deformation]
@@ -28,8 +28,8 @@ Moves = Callable[[Grid], Deformation]
 class Scene:
     """An object to scan: source of its frames, grid to reconstruct on, and true volume ``reference`` (nz, ny, nx) in 1/mm.
 
-    - source_shape: voxels (z, y, x) of the user's volume that frames are projected from. bone: makes the source of frames of
-      the dense part alone.
+    - source_shape: voxels (z, y, x) of the user's volume that frames are projected from; None for a phantom. bone: makes the
+      source of frames of the object's dense part alone.
     - deformation: how the object moves. state: returns the true volume of a moving object at a time in s.
     - period_s: the period of a phantom whose parts move by themselves.
     - fastest_mm_per_s: a bound on the speed of every part."""
@@ -61,9 +61,9 @@ def phantom_scene(
 ) -> Scene:
     """Returns the scene of a phantom, given as an object or by name, in the scanner's box, with ``size`` voxels per side.
 
-    Closed forms are integrated exactly unless they deform. Other phantoms are projected at twice ``size``, and the truth is
-    their block mean. Pixels average ``pixel_samples``² rays over their area; 0 chooses them by the size of the truth's
-    voxels."""
+    Phantoms in closed form are integrated exactly unless they deform. Other phantoms are projected from voxels at twice
+    ``size``, and the truth is their block mean. Pixels average ``pixel_samples``² rays over their area; 0 chooses the number
+    by the size of the truth's voxels. axis: the panel's readout axis."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
     if isinstance(phantom, MovingPhantom):
@@ -154,8 +154,8 @@ def _voxel_scene(
 
 
 def bone_from(volume: np.ndarray) -> float:
-    """Returns the attenuation in 1/mm from which voxels (nz, ny, nx) count as bone: half the largest value, or, if that
-    would cut a material in two, the upper end of the material. It is infinite if that material has no upper end."""
+    """Returns the attenuation in 1/mm from which voxels (nz, ny, nx) count as bone: half the largest value. If that would
+    cut a material in two, it is the upper end of this material's attenuations, or infinite if they have no upper end."""
     largest = float(volume.max())
     counts, edges = np.histogram(volume, 64, (0.1 * largest, max(largest, 1e-20)))
     is_rare = (edges[1:] > _DENSE * largest) & (counts < _RARE * counts.max())

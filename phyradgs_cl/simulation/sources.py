@@ -20,15 +20,16 @@ from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom
 from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
 
-# One ray is enough for a pixel up to this width at the axis, in voxels. A scanner with as many voxels as pixels has 1.43.
+# One ray is enough for a pixel whose image at the axis is at most this many voxels wide. In a common scanner with as many
+# voxels as pixels along a side, a pixel is 1.43 voxels wide.
 WIDEST_RAY = 1.5
 _MOST_SAMPLES = 32  # most rays along each side of a pixel: the time grows with their square
 NEAREST = 0.1  # moving matter is projected at most this far from its exact position, in voxels to be reconstructed
 
 
 class FrameSource:
-    """Projects an object, its attenuation multiplied by ``factor``, to the frame of each table of time cells. A subclass
-    writes ``frame`` or ``frames``."""
+    """Projects an object, its attenuation multiplied by ``factor``, to the frame of each table of time cells. model: what
+    the detector averages, "log" (line integrals) or "intensity". A subclass writes ``frame`` or ``frames``."""
 
     pixel_samples = 1  # rays along each side of a pixel
 
@@ -74,7 +75,7 @@ class VolumeSource(FrameSource):
 class AnalyticSource(FrameSource):
     """Projects a phantom by closed-form line integrals, computed in float64, to float32 frames.
 
-    Parts that move are where they are at each time cell's time."""
+    Parts that move are projected where they are at the time of each time cell."""
 
     def __init__(self, phantom: EllipsoidPhantom | MovingPhantom, geometry: Geometry) -> None:
         self._phantom, self._geometry = phantom, geometry
@@ -99,7 +100,7 @@ class AnalyticSource(FrameSource):
 
 
 class PixelAreaSource(FrameSource):
-    """Averages each pixel over its area: over ``samples`` × ``samples`` pixels of a finer panel, the source ``finer``."""
+    """Averages each pixel over its area: over ``samples`` × ``samples`` pixels of the finer panel of source ``finer``."""
 
     def __init__(self, finer: FrameSource, samples: int) -> None:
         self._finer, self._samples = finer, samples
@@ -126,9 +127,9 @@ def line_groups(cells: TimeCells) -> Iterator[tuple[int, int, np.ndarray]]:
 def on_panel(geometry: Geometry, grid: Grid, pixel_samples: int, make: Callable[[Geometry], FrameSource]) -> FrameSource:
     """Returns the source that ``make`` builds for the panel. With several samples per pixel it averages a finer panel.
 
-    pixel_samples: samples along each side of a pixel, at most 32. 0 takes one where a pixel, projected to the axis, is at
-    most ``WIDEST_RAY`` voxels of the grid wide, else one per voxel: rays through the middles of wide pixels would miss parts
-    of the object. Raises InputError for a number out of range."""
+    pixel_samples: samples along each side of a pixel, at most 32. 0 takes one sample where a pixel's image at the axis is at
+    most ``WIDEST_RAY`` voxels of the grid wide, else one sample per voxel: rays through the middles of wide pixels would
+    miss parts of the object. Raises InputError for a number out of range."""
     checks.within("--pixel-samples", pixel_samples, 0, _MOST_SAMPLES)
     if pixel_samples == 0:
         voxels = max(geometry.pixel_size_mm) / geometry.magnification / min(grid.voxel_size_mm)
@@ -188,14 +189,14 @@ class DeformedSource(FrameSource):
 
 
 class _Average:
-    """Averages a frame from partial frames, each of which holds some of its time cells."""
+    """Averages a frame from partial frames, each of which is projected from some of the frame's time cells."""
 
     def __init__(self, cells: TimeCells, model: str) -> None:
         self._readout, self._is_log = cells.readout, model == "log"
         self._sum: np.ndarray | None = None  # so far: Σ w p in the log model, ln Σ w exp(−p) in the intensity model
 
     def add(self, frame: np.ndarray, share: np.ndarray) -> None:
-        """Adds line integrals (rows, columns). share (lines,): which fraction of each line's weight they have."""
+        """Adds line integrals (rows, columns). share (lines,): the fraction of each line's weight that their cells have."""
         weight = self._readout.spread(share)
         if self._is_log:
             self._sum = weight * frame + (0.0 if self._sum is None else self._sum)
@@ -212,9 +213,9 @@ class _Average:
 
 
 def part_of(cells: TimeCells, members: np.ndarray) -> tuple[TimeCells, np.ndarray]:
-    """Returns a table of the cells ``members``, bool (C,), and which fraction (lines,) of each line's weight they have.
+    """Returns a table of the cells ``members``, bool (C,), and the fraction (lines,) of each line's weight that they have.
 
-    Weights are rescaled: in the new table a line's weights sum to 1, or are all 0. The cells must be still."""
+    Weights are rescaled: in the new table a line's weights sum to 1, or are all 0. The cells must be still cells."""
     part = some_cells(cells, np.flatnonzero(members))
     share = part.line_weights()
     factors = np.divide(1.0, share, out=np.zeros_like(share), where=share > 0)

@@ -8,13 +8,13 @@ _ACROSS = 1e-3  # a ray is perpendicular to the axis if the cosine of their angl
 
 
 def azimuth_rad(pose: np.ndarray) -> np.ndarray:
-    """Returns the angles (...) about +z, −π to π, of the source in poses (..., 12); in a parallel beam, of the rays'
-    direction."""
+    """Returns the angles (...) in rad about +z, −π to π, of the source in poses (..., 12); in a parallel beam, of the
+    rays' direction."""
     return np.asarray(np.arctan2(pose[..., 1], pose[..., 0]))
 
 
 def start_azimuths_rad(scan: Scan) -> np.ndarray:
-    """Returns the ``azimuth_rad`` (F,) of each frame's pose at the moment its first line opens."""
+    """Returns the ``azimuth_rad`` (F,) of each frame's pose when its first line opens."""
     starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
     return azimuth_rad(np.concatenate(starts))
 

@@ -12,22 +12,22 @@ from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.fields import Grid
 
-MOST_FRAMES = 60
+MOST_FRAMES = 60  # most frames of a coarse scan
 QUICK_COLUMNS = 20  # most blocks of pixels along the panel's longer side, for quick searches of a parameter
 FINE_COLUMNS = 32  # most blocks of pixels along the panel's longer side, for fine searches of a parameter
 SMOOTHING = 0.8  # standard deviation, in blocks, of the Gaussian that smooths frames before pixels are averaged
 _LEAST_VALID = 0.5  # a block with a smaller fraction of valid pixels is masked
 _MOST_VOXELS = 64  # most voxels along the grid's longest side, without the margin
-_MARGIN = 1  # voxels of air added on each side: with an object as large as the grid, too small a pixel size would fit better
+_MARGIN = 1  # voxels of air added on each side: without air around a large object, too small a pixel size would fit better
 _OBJECT_SHARE = 0.02  # a column shows the object if its largest line integral is above this fraction of the scan's largest
-_LEAST_COLUMNS = 12  # least number of blocks from left to right, if the panel has as many columns
-_NARROW = 3  # on a panel lower than two blocks, the blocks' side is divided by this: one row of blocks tells little
+_LEAST_COLUMNS = 12  # least number of blocks from left to right, if the panel has at least as many columns
+_NARROW = 3  # on a panel lower than two blocks, a block's side is divided by this: a single row of blocks tells little
 
 
 def coarse(scan: Scan, columns: int) -> Scan:
     """Returns the scan with at most 60 frames, pixels averaged in blocks, a coarse grid, and no reference.
 
-    The panel's longer side has at most ``columns`` blocks, or more if the other side would have too few."""
+    The panel's longer side has at most ``columns`` blocks, or more if the shorter side would have too few blocks."""
     shape = scan.geometry.detector_shape
     block = min(math.ceil(max(shape) / columns), max(1, shape[1] // _LEAST_COLUMNS))
     if 2 * block > shape[0]:
@@ -37,8 +37,8 @@ def coarse(scan: Scan, columns: int) -> Scan:
 
 
 def smooth(scan: Scan, pixels: float | tuple[float, float]) -> Scan:
-    """Returns the scan with frames smoothed by a Gaussian, so that averaging blocks does not alias. Leaves out masked
-    pixels.
+    """Returns the scan with frames smoothed by a Gaussian, so that averaging blocks does not alias. Masked pixels do not
+    count.
 
     pixels: the standard deviation in pixels, or a pair (v, u). Up to 0.5 the scan is returned unchanged."""
     v_px, u_px = pixels if isinstance(pixels, tuple) else (pixels, pixels)
@@ -61,7 +61,7 @@ def fewer_frames(scan: Scan, most: int) -> Scan:
 
 
 def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
-    """Returns the scan with only the frames of the given indices. The trajectory looks up poses by original numbers."""
+    """Returns the scan with only the frames of the given indices. Its trajectory finds their poses by their old numbers."""
     trajectory = altered_trajectory(scan)
     mask = scan.pixel_mask
     return replace(
@@ -76,8 +76,8 @@ def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
 def binned(scan: Scan, block: int) -> Scan:
     """Returns the scan with blocks of ``block`` × ``block`` pixels averaged to one, and without true volumes.
 
-    Only valid pixels are averaged. A block is masked if fewer than half of its pixels are valid. Last rows and columns that
-    fill no block are dropped. A block of lines opens at the mean of its lines' opening times."""
+    Only valid pixels are averaged. A block is masked if fewer than half of its pixels are valid. The last rows and columns
+    are dropped if they fill no block. A block of lines opens at the mean of its lines' opening times."""
     if block == 1:
         return replace(scan, reference=None, moving_truth=None)
     height, width = blocks = tuple(min(block, count) for count in scan.geometry.detector_shape)
@@ -114,8 +114,8 @@ def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
     """Returns a coarse scan whose grid is cut, in y and x, to the object that the frames show.
 
     A grid of the whole field of view has much air. With few frames, voxels of air let a wrong geometry fit better than the
-    right one. spare_columns: pixels added to the object's radius, because the axis may be off by as many. A scan whose grid
-    is off the axis, or whose frames show nothing, is returned unchanged."""
+    right one. spare_columns: added to the object's radius on the panel, in columns, because the axis may be off by as many.
+    A scan whose grid is off the axis, or whose frames show nothing, is returned unchanged."""
     geometry, grid = scan.geometry, scan.grid
     columns = np.where(scan.valid, scan.projections, 0).max((0, 1))
     shown = np.flatnonzero(columns > _OBJECT_SHARE * columns.max())
@@ -147,7 +147,7 @@ def _binned_panel(geometry: Geometry, height: int, width: int) -> Geometry:
 
 
 def _binned_shutter(scan: Scan, block: int) -> tuple[Shutter, float]:
-    """Returns the shutter for blocks of lines, and the time in s after the frame's start when the first block opens."""
+    """Returns the shutter for blocks of ``block`` lines, and when the first block opens, in s after the frame's start."""
     shutter, lines = scan.shutter, scan.lines
     line_s = shutter.readout_s / max(lines - 1, 1)
     blocks = lines // block

@@ -1,4 +1,4 @@
-"""A scan with changes of its panel, distances, timing and single views: to correct errors, or to simulate them."""
+"""Changes the panel, distances, timing and single views of a scan, to correct errors of its geometry or to simulate them."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,9 +16,9 @@ from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_par
 class GeometryCorrection:
     """Differences from a scan's stated geometry and timing. With all zeros the scan stays as stated.
 
-    Offsets move the panel in its plane, along u and v. Roll rotates it in its plane; tilts rotate it about v or u through
-    its middle. Distances move source and panel away from the axis. Times are added to readout and exposure. turn_rad
-    rotates all views about the axis, and lift_mm raises them along it; a turned or lowered object has the same effect."""
+    Offsets move the panel in its plane, along u and v. Roll rotates the panel in its plane; tilts rotate it about v or u
+    through its middle. Distances move source and panel away from the axis. Times are added to readout and exposure. In all
+    views, turn_rad rotates the scanner about the axis and lift_mm raises it, as if the object were turned or lowered."""
 
     offset_u_mm: float = 0.0
     offset_v_mm: float = 0.0
@@ -46,7 +46,7 @@ class Views:
 class Sway:
     """A rigid motion of the object: rotations about x, y and z in rad, and shifts along them in mm.
 
-    All six are cubic splines of time from ``start_s`` to ``end_s``, with coefficients (n, 6), and constant outside."""
+    All six are cubic splines of time from ``start_s`` to ``end_s``, with coefficients (n, 6). They are constant outside."""
 
     coefficients: np.ndarray
     start_s: float
@@ -166,6 +166,6 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
 
 
 def scan_course(scan: Scan) -> np.ndarray:
-    """Returns when each frame begins, (F,), from −1/2 for the first frame to 1/2 for the last."""
+    """Returns when each frame begins, (F,), as a fraction of the scan from −1/2 (first frame) to 1/2 (last frame)."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     return np.asarray((starts_s - starts_s.min()) / max(np.ptp(starts_s), 1e-30) - 0.5)

@@ -29,12 +29,12 @@ def sum_frames(
 ) -> Scan:
     """Makes a fly-scan without gaps, in which each frame sums the intensities of ``count`` successive projections.
 
-    scan: F projections (F, rows, columns), line integrals. Each stands for an interval about its middle, as long as from
-    frame to frame, in which the gantry turns evenly. count: the projections in an exposure. readout_ratio, readout,
-    readout_direction: how the new panel is read, as in ``fly_scan``. A line whose exposure begins within a projection
-    takes a fraction of it. Frames that would need further projections are left out. Photons, detector and object are the
-    given scan's, so the result tests a motion model on real data. For this the object must move by less than a pixel
-    from projection to projection.
+    scan: F projections (F, rows, columns), line integrals. Each projection stands for an interval about its mid-time, as
+    long as the time from frame to frame, in which the gantry turns evenly. count: the number of projections in an exposure.
+    readout_ratio, readout, readout_direction: how the new panel is read, as in ``fly_scan``. A line whose exposure begins
+    within a projection takes a fraction of it. Frames that would need further projections are left out. Photons, detector
+    and object are the given scan's, so the result tests a motion model on real data. For this test the object must move by
+    less than a pixel from projection to projection.
 
     Raises InputError for too few projections for one frame, a rolling shutter or lag in ``scan``, and uneven intervals."""
     if not isinstance(scan, Scan):
@@ -78,8 +78,8 @@ def _interval_s(scan: Scan) -> tuple[float, float]:
 
 
 def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, int]:
-    """Returns a continuous trajectory through the projections' poses, and how many projections at either end have intervals
-    that it does not wholly cover."""
+    """Returns a continuous trajectory through the projections' poses. Also returns how many projections at either end have
+    intervals that the trajectory does not wholly cover."""
     middle_s = first_s + (np.arange(scan.frames) + 0.5) * step_s
     own_s = scan.frame_start_s + scan.shutter.middle_s
     if isinstance(scan.trajectory, CircularOrbit):
@@ -98,16 +98,17 @@ def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, i
 
 
 def _shares(delay: np.ndarray, count: int) -> np.ndarray:
-    """Returns for which fraction of each projection's interval a line is exposed, (projections, lines). count: the exposure
-    in intervals. delay (lines,): when each line opens, in intervals after the frame's start."""
+    """Returns for which fraction of each projection's interval each line is exposed, (projections, lines). count: the
+    exposure in intervals. delay (lines,): when each line opens, in intervals after the frame's start."""
     number = np.arange(int(np.ceil(delay.max() - 1e-9)) + count)[:, None]
     overlap = np.minimum(number + 1, delay + count) - np.maximum(number, delay)
     return np.where(overlap > 1e-9, overlap, 0.0)
 
 
 def _sum(scan: Scan, start: int, share: np.ndarray, readout: Readout) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a frame's line integrals (rows, columns) and masked pixels. The frame sums the intensities of projections
-    from ``start`` on, times the fractions ``share`` (projections, lines). A pixel is masked if any of them masks it."""
+    """Returns a frame's line integrals and masked pixels, both (rows, columns). The frame sums the intensities of
+    projections from ``start`` on, times the fractions ``share`` (projections, lines). A pixel is masked if any of these
+    projections masks it."""
     total, is_masked = np.zeros(scan.projections.shape[1:]), np.zeros(scan.projections.shape[1:], bool)
     for number, lines in enumerate(share, start):
         of_lines = np.broadcast_to(readout.spread(lines), total.shape)

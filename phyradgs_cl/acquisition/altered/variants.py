@@ -27,8 +27,8 @@ class AlteredTrajectory:
     - is_reversed: the gantry turns the other way. Poses are mirrored in the plane y = 0. That alone would mirror the
       frames, so the order of columns is reversed too. The panel's offset ``offset_u_mm`` keeps its sign.
     - shift_px: a shift of the panel along u, in columns.
-    - images: a function that changes poses (..., 12), for example as mirrored frames need it. None changes nothing.
-    - blocks: the (rows, columns) of pixels that are averaged to one.
+    - images: a function that changes poses (..., 12), for example to those of mirrored frames. None changes nothing.
+    - blocks: the (rows, columns) of a block of pixels that is averaged to one pixel.
     - frames (F,): the numbers of the frames of ``base`` that are used. None takes all."""
 
     base: Trajectory
@@ -72,7 +72,7 @@ class AlteredTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class MappedTrajectory:
-    """Poses of ``base``, changed by a function ``change`` of a frame's number and its poses (..., 12)."""
+    """Poses of ``base``, changed by a function ``change``: from a frame's number and poses (..., 12) to other poses."""
 
     base: Trajectory
     change: Callable[[int, np.ndarray], np.ndarray]
@@ -110,8 +110,8 @@ def reversed_readout(scan: Scan) -> Scan:
 
 
 def shifted(scan: Scan, pixels: float) -> Scan:
-    """Returns the scan with its panel moved along u by ``pixels`` columns of the recorded scan, even if ``scan`` averages
-    blocks of them."""
+    """Returns the scan with its panel moved along u by ``pixels`` columns of the recorded panel, even if ``scan`` averages
+    blocks of its pixels."""
     return with_trajectory(scan, shift_px=pixels)
 
 
@@ -148,7 +148,8 @@ def stretched(scan: Scan, v: float, u: float) -> Scan:
 
 
 def mirrored(scan: Scan, axis: str) -> Scan:
-    """Returns the scan as if frames were mirrored along ``axis``, u or v. Lines read along this axis are reversed too."""
+    """Returns the scan as if frames were mirrored along ``axis``, "u" or "v". If lines are read one after the other along
+    this axis, the order of readout is reversed too."""
     number = ("v", "u").index(axis)
     is_read_along = scan.shutter.axis == ("rows", "columns")[number]
     images = partial(_flipped, axis=number, count=altered_trajectory(scan).panel[number])
@@ -158,7 +159,7 @@ def mirrored(scan: Scan, axis: str) -> Scan:
 def resized(scan: Scan, factor: float, keeps_axis: bool) -> Scan:
     """Returns a cone beam's scan with pixels ``factor`` times as large.
 
-    keeps_axis: the central ray keeps its pixel, as if distances had changed instead. Else the panel's middle stays."""
+    keeps_axis: True enlarges the panel about the central ray, as if distances had changed. False: about its middle."""
     trajectory = altered_trajectory(scan)
     rows, columns = trajectory.panel
 
