@@ -25,6 +25,7 @@ _SHORT_READOUT_S = 0.5e-3  # a shorter readout of at least _MANY_LINES lines cau
 _MANY_LINES = 100
 _SLOW_FPS = 2.0  # a lower frame rate causes a warning if the gantry turns more than _LARGE_STEP_DEG between frames
 _LARGE_STEP_DEG = 10.0
+_LEAST_LIT = 0.25  # and if exposure and readout fill less than this fraction of the time from frame to frame
 _TIMES = 17  # number of angles sampled in an exposure: no gantry makes half a turn from one to the next
 _SLACK = 1e-3  # relative tolerance, because stated times and angles are rounded
 _MANY_FRAMES = 10  # fewer frames may lie within a few degrees on purpose, so they cause no warning about radians
@@ -153,7 +154,7 @@ def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> 
             raise _longer_than_a_frame(named("exposure_s"), f"exposure of {exposure_s:.4g} s", exposure_s, frame_s)
         _check_readout(scan, named("readout_s"))
         if is_timed:
-            _warn_of_slow_frames(frame_s, angle_deg, named("frame_time_s"))
+            _warn_of_slow_frames(scan, angle_deg, named("frame_time_s"))
     _check_opaque(scan, named("quantity"))
 
 
@@ -168,7 +169,7 @@ def _check_opaque(scan: "Scan", subject: str) -> None:
         found = f"line integrals of up to {largest:.3g}, most above {OPAQUE:g}"
         remedy = "say counts, with flats; line integrals in another unit: divide them by it first"
         raise InputError(subject, found, "−ln(counts / flats), which is below 20 behind most objects", remedy)
-    if opaque > FEW * scan.projections.size:
+    if opaque > FEW * valid_pixels:
         text = "line integrals of up to %.3g: no panel sees through more than %g; are they counts? say %s"
         log.warning(text, largest, OPAQUE, subject)
 
@@ -228,8 +229,10 @@ def _longer_than_a_frame(subject: str, stated: str, time_s: float, frame_s: floa
     return InputError(subject, found, "at most one frame's time", "correct its unit, or the frame time's")
 
 
-def _warn_of_slow_frames(frame_s: float, angle_deg: np.ndarray, subject: str) -> None:
-    """Warns of a low frame rate if the gantry turns far from frame to frame. angle_deg (F,): the frames' angles."""
-    step_deg = float(np.median(np.abs(np.diff(angle_deg))))
-    if _SLOW_FPS * frame_s > 1 and step_deg > _LARGE_STEP_DEG:
+def _warn_of_slow_frames(scan: "Scan", angle_deg: np.ndarray, subject: str) -> None:
+    """Warns of a low frame rate if the gantry turns far from frame to frame, most of the time in the dark. angle_deg (F,):
+    the frames' angles."""
+    frame_s, step_deg = _frame_time_s(scan), float(np.median(np.abs(np.diff(angle_deg))))
+    is_dark = scan.shutter.span_s < _LEAST_LIT * frame_s
+    if is_dark and _SLOW_FPS * frame_s > 1 and step_deg > _LARGE_STEP_DEG:
         log.warning("%s: %.3g fps and %.3g° from frame to frame; is the rate right?", subject, 1 / frame_s, step_deg)

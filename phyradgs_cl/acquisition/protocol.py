@@ -44,7 +44,7 @@ class Protocol:
             expected = f"a number from {_FEWEST_TURNS} to {_MOST_TURNS}, negative for a clockwise gantry"
             raise InputError("--turns", checks.short_repr(self.turns), expected)
         if self.pulse is not None:
-            self._check_pulse(*self.pulse)
+            self._check_pulse(*checks.numbers("--pulse", self.pulse, (2,)))
 
     def _check_pulse(self, start: float, length: float) -> None:
         last = 1 + self.readout_ratio

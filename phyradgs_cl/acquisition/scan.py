@@ -25,7 +25,7 @@ from phyradgs_cl.acquisition.trajectory import (
     CircularOrbit,
     Trajectory,
     behind_axis,
-    checked_poses,
+    checked,
     is_parallel,
 )
 from phyradgs_cl.errors import InputError
@@ -117,6 +117,7 @@ class Scan:
             raise InputError("detector_model", repr(self.detector_model), "'log' or 'intensity'")
         if not callable(getattr(self.trajectory, "pose", None)):
             raise InputError("trajectory", checks.short_repr(self.trajectory), "anything with pose(frame, time_s)")
+        object.__setattr__(self, "trajectory", checked(self.trajectory))
         if self.is_parallel != isinstance(self.geometry, ParallelGeometry):
             beam, other = ("parallel", "cone") if self.is_parallel else ("cone", "parallel")
             remedy = "make both of one kind; a trajectory of parallel beams has is_parallel = True"
@@ -179,6 +180,11 @@ class Scan:
         return np.broadcast_to(unmasked, self.projections.shape)
 
     @property
+    def middle_times_s(self) -> np.ndarray:
+        """The times (F,) in s in the middle between a frame's first and last light."""
+        return np.asarray(self.frame_start_s, np.float64) + self.shutter.middle_s
+
+    @property
     def lines(self) -> int:
         """The number of lines that the shutter reads one after the other: rows or columns."""
         return self.shutter.lines(self.geometry.detector_shape)
@@ -214,13 +220,13 @@ class Scan:
         self.shutter.check_resolved(self.frame_start_s)
         last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # at rest, a frame has one pose
         for frame, start_s in enumerate(self.frame_start_s):
-            checked_poses(self.trajectory, frame, np.array([start_s, start_s + last_s]))
+            self.trajectory.pose(frame, np.array([start_s, start_s + last_s]))
 
     def warn_of_near_panel(self) -> None:
         """Warns if the panel of a cone beam stands inside the grid as the first frame opens: no ray sees the part behind."""
         if self.is_parallel:  # parallel rays are not taken to end at the panel
             return
-        (pose,) = checked_poses(self.trajectory, 0, np.array(self.frame_start_s[:1]))
+        (pose,) = self.trajectory.pose(0, np.array(self.frame_start_s[:1]))
         behind_mm, half_mm = panel_behind_mm(self.grid, pose), min(self.grid.size_mm[1:]) / 2
         if 0 <= behind_mm < half_mm:
             text = "the panel stands %.4g mm behind the middle of the grid, inside of it: rays end there"
@@ -262,7 +268,7 @@ class Scan:
         self.warn_of_near_panel()
         places = set()
         for frame, start_s in enumerate(self.frame_start_s):
-            (pose,) = checked_poses(self.trajectory, frame, np.array([start_s]))
+            (pose,) = self.trajectory.pose(frame, np.array([start_s]))
             place = hidden(self.grid, pose, self.geometry.detector_shape, self.is_parallel)
             if not place:
                 return

@@ -105,7 +105,7 @@ def astra_vectors(scan: "Scan") -> np.ndarray:
 
     Inverse: ``from_astra``. ASTRA takes frames as (rows, F, columns): give it ``scan.projections.swapaxes(0, 1)``. Its
     volumes are (z, y, x), as here."""
-    times_s = scan.frame_start_s + scan.shutter.middle_s
+    times_s = scan.middle_times_s
     vectors = np.stack([scan.trajectory.pose(f, np.array(t)) for f, t in enumerate(times_s)]).astype(np.float64)
     vectors[:, 3:6] += _to_middle(vectors, scan.geometry.detector_shape)
     return vectors
@@ -124,10 +124,11 @@ def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = N
     """Raises InputError for frames that look like raw counts: integers, or many unmasked values above 50."""
     if frames.dtype.kind in "iu":
         raise InputError("frames", f"whole numbers ({frames.dtype}) without flats", "line integrals", remedy)
-    opaque = frames > OPAQUE
+    opaque, used = frames > OPAQUE, np.ones(frames.shape, bool)
     if mask is not None and np.shape(mask) in (frames.shape, frames.shape[1:]):
-        opaque &= np.asarray(mask) == 0
-    if np.count_nonzero(opaque) > FEW * opaque.size:
+        used &= np.asarray(mask) == 0
+        opaque &= used
+    if np.count_nonzero(opaque) > FEW * np.count_nonzero(used):
         found = f"values of up to {frames[opaque].max():g} without flats"
         raise InputError("frames", found, f"line integrals, which are below {OPAQUE:g}", remedy)
 

@@ -44,6 +44,33 @@ def is_parallel(trajectory: Trajectory) -> bool:
     return bool(getattr(trajectory, "is_parallel", False))
 
 
+@dataclass(frozen=True, eq=False)
+class UserTrajectory:
+    """A user-defined trajectory, ``own``, whose poses are checked whenever they are computed."""
+
+    own: Trajectory
+
+    @property
+    def is_parallel(self) -> bool:
+        """True for a parallel beam."""
+        return is_parallel(self.own)
+
+    def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
+        """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s; directions of parallel rays have length
+        1. Raises InputError for poses of another shape, for numbers that are not finite, and for rays along the panel."""
+        times_s = np.asarray(time_s, np.float64)
+        subject = f"trajectory {type(self.own).__name__}"
+        poses = checks.numbers(subject, self.own.pose(frame, times_s.ravel()), (times_s.size, POSE_LENGTH))
+        poses = unit_directions(subject, poses) if self.is_parallel else poses
+        return poses.reshape(*times_s.shape, POSE_LENGTH)
+
+
+def checked(trajectory: Trajectory) -> Trajectory:
+    """Returns a trajectory of the package unchanged, and one of the user's as ``UserTrajectory``."""
+    is_own = type(trajectory).__module__.startswith("phyradgs_cl.")
+    return trajectory if is_own else UserTrajectory(trajectory)
+
+
 class Kinematics(Protocol):
     """The interface of kinematics: the gantry's angles (...) of a frame at times (...) in s."""
 
@@ -195,11 +222,13 @@ class CircularOrbit:
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s."""
-        return self.geometry.pose(self.kinematics.angle_rad(frame, time_s))
+        return self.geometry.pose(self.angle_rad(frame, time_s))
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Returns angles (...) in rad of frame number ``frame`` at times (...) s."""
-        return self.kinematics.angle_rad(frame, time_s)
+        """Returns angles (...) in rad of frame number ``frame`` at times (...) s. Raises InputError if user-defined kinematics
+        return another shape, or numbers that are not finite."""
+        subject = f"kinematics {type(self.kinematics).__name__}"
+        return checks.numbers(subject, self.kinematics.angle_rad(frame, time_s), np.shape(time_s))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -317,7 +346,7 @@ def grid_of_scan(geometry: Geometry, trajectory: Trajectory, frame_start_s: np.n
     """Returns the grid of the field of view (``default_grid``), longer if the gantry travels along z."""
     if isinstance(trajectory, CircularOrbit):
         return default_grid(geometry)
-    poses = [checked_poses(trajectory, f, np.array([t])) for f, t in enumerate(frame_start_s)]
+    poses = [checked(trajectory).pose(f, np.array([t])) for f, t in enumerate(frame_start_s)]
     return default_grid(geometry, np.concatenate(poses))
 
 
@@ -333,7 +362,7 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
     while True:
         offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), samples)
         times = np.asarray(frame_start_s, np.float64)[:, None] + offsets_s
-        poses = np.concatenate([checked_poses(trajectory, f, t) for f, t in enumerate(times)])
+        poses = np.concatenate([trajectory.pose(f, t) for f, t in enumerate(times)])
         time_s, at = np.unique(times.ravel(), return_index=True)  # unique, because frames may overlap in time
         table = PoseTable(time_s, poses[at], "trajectory", is_parallel(trajectory))
         between = (time_s[:-1] + time_s[1:]) / 2  # the table is tested between all samples, since frames may overlap
@@ -349,13 +378,6 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
             raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", remedy)
         # Halves the intervals between samples.
         samples = 2 * samples - 1
-
-
-def checked_poses(trajectory: Trajectory, frame: int, time_s: np.ndarray) -> np.ndarray:
-    """Returns poses (T, 12) of a trajectory at times (T,) s. Raises InputError if a user-defined trajectory returns another
-    shape, or numbers that are not finite."""
-    subject = f"trajectory {type(trajectory).__name__}"
-    return checks.numbers(subject, trajectory.pose(frame, time_s), (*time_s.shape, POSE_LENGTH))
 
 
 def _checked_table(

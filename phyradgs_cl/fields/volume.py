@@ -101,7 +101,7 @@ class Grid:
         return self.shape == other.shape and same_voxels and np.allclose(self.offset_mm, other.offset_mm, atol=near_mm)
 
     def part(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> "Grid":
-        """Returns the grid of the voxels [start, start + shape) (z, y, x)."""
+        """Returns the grid of the voxels [start, start + shape) (z, y, x), which may lie beyond this grid."""
         sides = zip(self.first_centre_mm, start, shape, self.voxel_size_mm, strict=True)
         return Grid(shape, self.voxel_size_mm, triple(first + (s + (n - 1) / 2) * d for first, s, n, d in sides))
 
@@ -117,10 +117,12 @@ class Grid:
 
     def in_shape(self, shape: tuple[int, int, int]) -> "Grid":
         """Returns the same box divided into ``shape`` (z, y, x) voxels."""
+        checks.numbers("shape", shape, (3,))
         return Grid(shape, triple(side / n for side, n in zip(self.size_mm, shape, strict=True)), self.offset_mm)
 
     def finer(self, parts: int) -> "Grid":
         """Returns the same box with every voxel divided into ``parts`` along each axis."""
+        checks.whole("parts", parts, 1, 1000)
         return Grid(triple(parts * n for n in self.shape), triple(d / parts for d in self.voxel_size_mm), self.offset_mm)
 
     def scaled(self, factor: float) -> "Grid":

@@ -79,7 +79,7 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
 
 def state_times_s(scan: Scan, count: int) -> np.ndarray:
     """Returns the mean times (K,) in s of up to ``count`` states, over which successive frames are shared evenly."""
-    middles_s = np.unique(np.asarray(scan.frame_start_s, np.float64)) + scan.shutter.span_s / 2
+    middles_s = np.unique(scan.middle_times_s)
     shares = np.array_split(middles_s, min(count, len(middles_s)))
     return np.array([share.mean() for share in shares])
 

@@ -261,7 +261,7 @@ def simulate(
 def _gating(scan: Scan, scene: Scene) -> Gating:
     """Returns the motion's state in the middle of every frame: the weight of the deformation's first field; without a
     deformation, the phase of the phantom's period."""
-    middle_s = np.asarray(scan.frame_start_s) + scan.shutter.span_s / 2
+    middle_s = scan.middle_times_s
     if scene.deformation is not None:
         return Gating(middle_s, scene.deformation.weights_at(middle_s)[:, 0])
     return Gating(middle_s, middle_s / (scene.period_s or 1.0) % 1.0, is_phase=True)

@@ -76,6 +76,9 @@ def test_speed_within_frames_fits_the_steps_between_them_but_for_wandering(clean
     assert check_timing(scan).verdict == OK
     assert np.rad2deg(exposure_arc_rad(clean)) == pytest.approx(24.0)
     assert exposure_arc_rad(replace(clean, is_fly=False)) == 0
+    ends = replace(sweeps, angle_end_rad=sweeps.angle_start_rad - np.deg2rad(270))
+    long = replace(clean, trajectory=CircularOrbit(clean.geometry, ends))
+    assert np.rad2deg(exposure_arc_rad(long)) == pytest.approx(270.0)
 
 
 def test_a_table_in_another_unit_of_time_than_the_frames(clean) -> None:

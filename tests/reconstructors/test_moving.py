@@ -19,7 +19,6 @@ from phyradgs_cl.reconstructors.moving.method import FieldSearch, coarse_scan, i
 from phyradgs_cl.reconstructors.moving.signal import (
     MotionSignal,
     TemporalSplines,
-    middle_times_s,
     motion_signal,
 )
 from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress
@@ -194,14 +193,14 @@ def test_the_search_sees_every_breath_of_a_long_scan(rt, scan) -> None:
     start_s, frames = 0.4 * np.arange(700), np.zeros((700, *SHAPE), np.float32)
     many = replace(scan, projections=frames, frame_start_s=start_s, moving_truth=None)
     for knot_s, frames in ((0.4, 699), (10.0, 600)):
-        signal = MotionSignal(middle_times_s(many), np.cos(start_s), knot_s=knot_s)
+        signal = MotionSignal(many.middle_times_s, np.cos(start_s), knot_s=knot_s)
         assert FieldSearch(rt, many, PerRow(), signal, 1, 0.01).scan.frames == frames
 
 
 def test_phases_of_a_file_or_of_the_scan_are_followed(rt, scan, tmp_path) -> None:
     """One a frame, in cycles, which wrap around."""
-    phase = (0.1 + middle_times_s(scan) / 2.3) % 1
-    stated = replace(scan, gating=Gating(middle_times_s(scan), phase, is_phase=True))
+    phase = (0.1 + scan.middle_times_s / 2.3) % 1
+    stated = replace(scan, gating=Gating(scan.middle_times_s, phase, is_phase=True))
     path = tmp_path / "phase.csv"
     path.write_text("phase\n" + "\n".join(str(float(one)) for one in phase))
     for signal in (loaded(path, scan), signals.signal_of(stated.gating, stated, "gating scan")):

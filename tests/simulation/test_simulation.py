@@ -114,6 +114,7 @@ def test_a_pulse_freezes_what_it_lights() -> None:
     flash = replace(FLY, readout_ratio=1.5, pulse=(0.8, 1e-6))
     scan = run(SimulationOptions(flash))
     assert scan.shutter.pulse_s == (0.8, 1e-6)
+    np.testing.assert_allclose(scan.middle_times_s, scan.frame_start_s + 0.8, atol=1e-6)
     lit = np.flatnonzero(np.arange(SHAPE[0]) / (SHAPE[0] - 1) * 1.5 < 0.8)
     expected = integrals(np.deg2rad(120.0 + 0.8 * 12.0))
     np.testing.assert_allclose(scan.projections[1][lit], expected[lit], rtol=0, atol=1e-4)

@@ -5,6 +5,7 @@ import numpy as np
 from phyradgs_cl.acquisition.scan import Scan
 
 _ACROSS = 1e-3  # a ray is perpendicular to the axis if the cosine of their angle is below this
+_ARC_STEPS = 32  # steps of an exposure whose arc is measured: the gantry turns by less than half a turn in each
 
 
 def azimuth_rad(pose: np.ndarray) -> np.ndarray:
@@ -21,7 +22,7 @@ def start_azimuths_rad(scan: Scan) -> np.ndarray:
 
 def middle_poses(scan: Scan) -> np.ndarray:
     """Returns the poses (F, 12) in the middle of each frame (``Shutter.middle_s``)."""
-    times_s = np.asarray(scan.frame_start_s) + scan.shutter.middle_s
+    times_s = scan.middle_times_s
     return np.stack([scan.trajectory.pose(f, times_s[f : f + 1])[0] for f in range(scan.frames)])
 
 
@@ -31,14 +32,14 @@ def has_opposite_views(scan: Scan) -> bool:
 
 
 def exposure_arc_rad(scan: Scan) -> float:
-    """Returns the angle in rad, 0 to π, that the gantry turns in one line's exposure in the scan's middle frame; 0 for a
-    gantry at rest."""
+    """Returns the angle in rad that the gantry turns in one line's exposure in the scan's middle frame; 0 for a gantry at
+    rest."""
     if not scan.is_fly:
         return 0.0
     frame = scan.frames // 2
-    start_s = float(scan.frame_start_s[frame])
-    ends = azimuth_rad(scan.trajectory.pose(frame, np.array([start_s, start_s + scan.shutter.exposure_s])))
-    return abs(float(wrapped(ends[1:] - ends[:1])[0]))
+    # in small steps, because azimuths at both ends do not tell 270° from 90°
+    times_s = float(scan.frame_start_s[frame]) + scan.shutter.exposure_s * np.linspace(0, 1, _ARC_STEPS + 1)
+    return abs(float(wrapped(np.diff(azimuth_rad(scan.trajectory.pose(frame, times_s)))).sum()))
 
 
 def wrapped(angle: np.ndarray | float) -> np.ndarray:

@@ -15,7 +15,6 @@ from phyradgs_cl.acquisition.trajectory import (
     EncoderTable,
     PoseTable,
     Trajectory,
-    checked_poses,
     unwrapped,
 )
 from phyradgs_cl.errors import InputError
@@ -81,7 +80,7 @@ def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, i
     """Returns a continuous trajectory through the projections' poses. Also returns how many projections at either end have
     intervals that the trajectory does not wholly cover."""
     middle_s = first_s + (np.arange(scan.frames) + 0.5) * step_s
-    own_s = scan.frame_start_s + scan.shutter.middle_s
+    own_s = scan.middle_times_s
     if isinstance(scan.trajectory, CircularOrbit):
         angle_rad = np.array([scan.trajectory.angle_rad(f, np.array(t)) for f, t in enumerate(own_s)])
         angle_rad = unwrapped(angle_rad)
@@ -93,7 +92,7 @@ def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, i
         time_s = np.concatenate([middle_s[:1] - step_s / 2, middle_s, middle_s[-1:] + step_s / 2])
         table = EncoderTable(time_s, np.concatenate([ends_rad[:1], angle_rad, ends_rad[1:]]))
         return CircularOrbit(scan.trajectory.geometry, table), 0
-    poses = np.concatenate([checked_poses(scan.trajectory, f, np.array([t])) for f, t in enumerate(own_s)])
+    poses = np.concatenate([scan.trajectory.pose(f, np.array([t])) for f, t in enumerate(own_s)])
     return PoseTable(middle_s, poses, is_parallel=scan.is_parallel), 1
 
 

@@ -130,7 +130,7 @@ class MotionSignal:
 
 def motion_signal(scan: Scan) -> MotionSignal:
     """Returns the motion signal of a scan's frames. period_s and knot_s are None if ``period_of`` finds no period."""
-    times_s = middle_times_s(scan)
+    times_s = scan.middle_times_s
     order = np.argsort(times_s, kind="stable")
     times_s, rows = times_s[order], _shroud(scan)[order]
     explained = _gantry(scan, times_s, order)
@@ -138,11 +138,6 @@ def motion_signal(scan: Scan) -> MotionSignal:
     values = scaled(np.linalg.svd(rest, full_matrices=False)[0][:, 0])
     period_s = period_of(times_s, values)
     return MotionSignal(times_s, values, period_s, knot_s=None if period_s is None else period_s / _KNOTS_PER_PERIOD)
-
-
-def middle_times_s(scan: Scan) -> np.ndarray:
-    """Returns the middle (F,) in s of the time in which any line of a frame is open."""
-    return np.asarray(scan.frame_start_s, np.float64) + scan.shutter.span_s / 2
 
 
 def period_of(times_s: np.ndarray, values: np.ndarray) -> float | None:
@@ -228,7 +223,7 @@ def load_gating(path: str, scan: Scan) -> Gating:
     if widths == {1}:
         if len(rows) != scan.frames:
             raise InputError(subject, f"{len(rows)} values without times", f"one for each of {scan.frames} frames")
-        numbers = np.column_stack([middle_times_s(scan), numbers])
+        numbers = np.column_stack([scan.middle_times_s, numbers])
     times_s, values = numbers[np.argsort(numbers[:, 0], kind="stable")].T
     try:
         return Gating(times_s, values, is_phase=names.split(",")[-1].strip() == "phase")
