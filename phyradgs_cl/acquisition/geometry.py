@@ -192,49 +192,51 @@ def transpose_pose(pose: np.ndarray) -> np.ndarray:
     return np.concatenate([pose[..., :6], pose[..., 9:12], pose[..., 6:9]], -1)
 
 
-def field_of_view_mm(geometry: Geometry) -> tuple[float, float, float]:
-    """Returns half the sides (z, y, x) in mm of the field of view of a full turn, a box about the origin.
+def field_of_view_mm(geometry: Geometry) -> np.ndarray:
+    """Returns the box (3, 2) in mm of a full turn's field of view: its lowest and highest z, y and x.
 
     The radius is DSO·sin(atan(half width/DSD)), with the distances DSO from source to axis and DSD from source to panel.
-    The half width reaches from the central ray to the farther edge of a shifted panel. The height is the cone's height at
-    that radius behind the axis. A parallel beam's box reaches to the panel's farther edges."""
+    The half width reaches from the central ray to the farther edge of a shifted panel. Along z the box ends where the rays
+    to the panel's lower and upper edge are farthest out within that radius."""
     sides = zip(geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm, strict=True)
-    half_height_mm, half_width_mm = (count * pitch / 2 + abs(offset) for count, pitch, offset in sides)
-    if isinstance(geometry, ParallelGeometry):
-        return half_height_mm, half_width_mm, half_width_mm
-    half_fan_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
-    radius_mm = geometry.source_to_axis_mm * math.sin(half_fan_rad)
-    behind_mm = geometry.source_to_axis_mm + radius_mm
-    return half_height_mm * behind_mm / geometry.source_to_detector_mm, radius_mm, radius_mm
+    (low_mm, top_mm), (left_mm, right_mm) = ((off - n * pitch / 2, off + n * pitch / 2) for n, pitch, off in sides)
+    radius_mm = max(-left_mm, right_mm)
+    if isinstance(geometry, ConeGeometry):
+        source_mm, panel_mm = geometry.source_to_axis_mm, geometry.source_to_detector_mm
+        radius_mm = source_mm * math.sin(math.atan2(radius_mm, panel_mm))
+        low_mm = low_mm * (source_mm + math.copysign(radius_mm, -low_mm)) / panel_mm
+        top_mm = top_mm * (source_mm + math.copysign(radius_mm, top_mm)) / panel_mm
+    return np.array([(low_mm, top_mm), (-radius_mm, radius_mm), (-radius_mm, radius_mm)])
 
 
 def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
     """Returns the grid of a full turn's field of view: a cube, or lower if the panel sees less along z.
 
-    Voxels are as large as a pixel's image at the axis: the pitch of rows along z, the pitch of columns along y and x. In a
-    parallel beam the grid is as high as the panel. If ``poses`` (F, 12) travel along z, as in a helix, the grid is longer
-    by that travel."""
-    half_height_mm, radius_mm, _ = field_of_view_mm(geometry)
+    Voxels are as large as a pixel's image at the axis: the pitch of rows along z, the pitch of columns along y and x. The
+    middle of a cube is where the ray to the panel's middle meets the axis. In a parallel beam the grid is as high as the
+    panel. If ``poses`` (F, 12) travel along z, as in a helix, the grid is longer by that travel."""
+    (low_mm, top_mm), (_, radius_mm), _ = field_of_view_mm(geometry).tolist()
     high_mm, wide_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     wide = max(1, math.ceil(2 * radius_mm / wide_mm))
-    high = max(1, round(2 * half_height_mm / high_mm))
-    if isinstance(geometry, ConeGeometry):
-        high = min(max(1, round(wide * wide_mm / high_mm)), high)
-    low_mm, top_mm = (0.0, 0.0) if poses is None else _travel_mm(poses, geometry)
-    if top_mm - low_mm < high_mm:  # a travel of less than a voxel is a wobble of the gantry
-        return Grid((high, wide, wide), (high_mm, wide_mm, wide_mm))
-    high += math.ceil((top_mm - low_mm) / high_mm)
-    return Grid((high, wide, wide), (high_mm, wide_mm, wide_mm), ((low_mm + top_mm) / 2, 0.0, 0.0))
+    at_axis_mm = geometry.detector_offset_mm[0] / geometry.magnification
+    high, beside_mm = max(1, round((top_mm - low_mm) / high_mm)), (low_mm + top_mm) / 2 - at_axis_mm
+    if isinstance(geometry, ConeGeometry) and (side := max(1, round(wide * wide_mm / high_mm))) < high:
+        high, beside_mm = side, 0.0
+    first_mm, last_mm = (at_axis_mm, at_axis_mm) if poses is None else _travel_mm(poses, geometry)
+    middle_mm = (first_mm + last_mm) / 2
+    if last_mm - first_mm >= high_mm:
+        high += math.ceil((last_mm - first_mm) / high_mm)
+    elif abs(middle_mm - at_axis_mm) < high_mm:  # less than a voxel is a wobble of the gantry
+        middle_mm = at_axis_mm
+    return Grid((high, wide, wide), (high_mm, wide_mm, wide_mm), (middle_mm + beside_mm, 0.0, 0.0))
 
 
 def _travel_mm(poses: np.ndarray, geometry: Geometry) -> tuple[float, float]:
-    """Returns the lowest and highest z in mm at which the central rays of poses (F, 12) pass the z axis. The central ray
-    ends at the panel's middle minus the geometry's offset."""
-    (rows, columns), (off_v, off_u) = geometry.detector_shape, geometry.detector_offset_mm
+    """Returns the lowest and highest z in mm at which the rays of poses (F, 12) to the panel's middle row, in the column of
+    the central ray, pass the z axis."""
+    (rows, columns), off_u = geometry.detector_shape, geometry.detector_offset_mm[1]
     start, first, step_u, step_v = (poses[:, i : i + 3] for i in (0, 3, 6, 9))
-    at_v, at_u = ((n - 1) / 2 - off / pitch for n, off, pitch in
-                  zip((rows, columns), (off_v, off_u), geometry.pixel_size_mm, strict=True))
-    middle = first + at_u * step_u + at_v * step_v
+    middle = first + ((columns - 1) / 2 - off_u / geometry.pixel_size_mm[1]) * step_u + (rows - 1) / 2 * step_v
     ray = start if isinstance(geometry, ParallelGeometry) else middle - start
     across = np.maximum(np.sum(ray[:, :2] ** 2, axis=1), _STEEP * np.sum(ray**2, axis=1))
     z_mm = middle[:, 2] - np.sum(middle[:, :2] * ray[:, :2], axis=1) / across * ray[:, 2]
@@ -255,9 +257,8 @@ def check_distances(geometry: Geometry, grid: Grid) -> None:
 
 def misses(grid: Grid, geometry: Geometry) -> bool:
     """Returns whether no voxel of ``grid`` lies in the field of view."""
-    low_mm, high_mm = grid.box_mm.T
-    half_mm = np.array(field_of_view_mm(geometry))
-    return bool(np.any((low_mm >= half_mm) | (high_mm <= -half_mm)))
+    (low_mm, high_mm), (first_mm, last_mm) = grid.box_mm.T, field_of_view_mm(geometry).T
+    return bool(np.any((low_mm >= last_mm) | (high_mm <= first_mm)))
 
 
 def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_parallel: bool = False) -> str:
@@ -295,7 +296,6 @@ def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
 def cuts(grid: Grid, whole: Grid, geometry: Geometry) -> bool:
     """Returns whether ``grid`` leaves out, on any side, more than one of its voxels of the part of ``whole`` that lies in
     the field of view."""
-    half_mm = np.array(field_of_view_mm(geometry))
-    low_mm, high_mm = np.clip(whole.box_mm.T, -half_mm, half_mm)
+    low_mm, high_mm = np.clip(whole.box_mm.T, *field_of_view_mm(geometry).T)
     begin_mm, end_mm = grid.box_mm.T
     return bool(np.any((begin_mm - low_mm > grid.voxel_size_mm) | (high_mm - end_mm > grid.voxel_size_mm)))

@@ -120,7 +120,7 @@ def _timing(scan: "Scan") -> str:
 
 def _sizes(scan: "Scan") -> str:
     cone, fan = _cone_deg(scan.geometry)
-    seen_mm = tuple(2 * half for half in field_of_view_mm(scan.geometry))
+    seen_mm = tuple(np.ptp(field_of_view_mm(scan.geometry), axis=1))
     voxel_mm = scan.grid.voxel_size_mm
     beam = "parallel beam" if scan.is_parallel else f"fan {fan:.3g}°, cone {cone:.3g}°"
     return (
@@ -203,7 +203,7 @@ def _check_panel(geometry: Geometry, named: Named) -> None:
 
 
 def _check_voxels(grid: Grid, geometry: Geometry, subject: str) -> None:
-    half_mm = field_of_view_mm(geometry)[1]
+    half_mm = field_of_view_mm(geometry)[1, 1]
     columns = geometry.detector_shape[1]
     if columns > 2 and min(grid.voxel_size_mm) > half_mm:
         shape = "×".join(map(str, grid.shape))

@@ -209,8 +209,8 @@ class Scan:
         orbit's field of view."""
         grid = choice.of(self.grid)
         if choice.roi_mm is not None and isinstance(self.trajectory, CircularOrbit) and misses(grid, self.geometry):
-            half_mm = ", ".join(f"±{half:.4g}" for half in field_of_view_mm(self.geometry))
-            expected = f"a box that meets the field of view, (z, y, x) {half_mm} mm"
+            seen_mm = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in field_of_view_mm(self.geometry))
+            expected = f"a box that meets the field of view, (z, y, x) {seen_mm} mm"
             raise InputError("--roi-mm", str(choice.roi_mm), expected)
         return self.on_grid(grid)
 
@@ -237,12 +237,12 @@ class Scan:
         if not isinstance(self.trajectory, CircularOrbit):
             return
         fitting = default_grid(self.geometry)
-        box_mm, half_mm = np.round(fitting.box_mm, 3).tolist(), np.round(field_of_view_mm(self.geometry), 3).tolist()
+        box_mm, seen_mm = (np.round(box, 3).tolist() for box in (fitting.box_mm, field_of_view_mm(self.geometry)))
         if misses(self.grid, self.geometry):
             found_mm = np.round(self.grid.box_mm, 3).tolist()
-            text = "the grid in %s mm (z, y, x) lies beside the field of view of ±%s mm: few views see its voxels, whose "
+            text = "the grid in %s mm (z, y, x) lies beside the field of view, %s mm: few views see its voxels, whose "
             text += "values mean nothing; a grid that fits: %s mm"
-            log.warning(text, found_mm, half_mm, box_mm)
+            log.warning(text, found_mm, seen_mm, box_mm)
         offset_mm, pitch_mm = abs(self.geometry.detector_offset_mm[1]), self.geometry.pixel_size_mm[1]
         half_panel_mm = self.geometry.detector_shape[1] * pitch_mm / 2
         if offset_mm > half_panel_mm:

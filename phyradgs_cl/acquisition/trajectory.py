@@ -225,8 +225,8 @@ class CircularOrbit:
         return self.geometry.pose(self.angle_rad(frame, time_s))
 
     def angle_rad(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Returns angles (...) in rad of frame number ``frame`` at times (...) s. Raises InputError if user-defined kinematics
-        return another shape, or numbers that are not finite."""
+        """Returns angles (...) in rad of frame number ``frame`` at times (...) s. Raises InputError if the kinematics return
+        another shape, or numbers that are not finite."""
         subject = f"kinematics {type(self.kinematics).__name__}"
         return checks.numbers(subject, self.kinematics.angle_rad(frame, time_s), np.shape(time_s))
 

@@ -102,7 +102,7 @@ def _check_sides(scan: Scan, p: np.ndarray, valid: np.ndarray, largest: float, t
         f"at most {level:.3g} at the {name} border, where air is 0 and the object reaches {largest:.3g}; "
         f"it is about {width_mm:.3g} mm wide at the axis, the grid {grid_mm:.3g} mm"
     )
-    panel_mm = 2 * field_of_view_mm(scan.geometry)[1]
+    panel_mm = 2 * field_of_view_mm(scan.geometry)[1, 1]
     if grid_mm > _ANOTHER_SIZE * max(panel_mm, *scan.grid.voxel_size_mm) or width_mm > _ANOTHER_SIZE * grid_mm:
         text += f", and the panel sees {panel_mm:.3g} mm"
         distances = "" if scan.is_parallel else ", distances"

@@ -11,12 +11,20 @@ from phyradgs_cl.acquisition import (
     CircularOrbit,
     ConeGeometry,
     ConstantSpeed,
+    ParallelGeometry,
     Scan,
     Shutter,
     pixel_centres,
     transpose_pose,
 )
-from phyradgs_cl.acquisition.geometry import cuts, field_of_view_mm, hidden, misses, plain_geometry
+from phyradgs_cl.acquisition.geometry import (
+    cuts,
+    default_grid,
+    field_of_view_mm,
+    hidden,
+    misses,
+    plain_geometry,
+)
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, GridChoice
 
@@ -77,9 +85,26 @@ def scan() -> Scan:
 
 
 def test_the_box_that_the_cones_fill() -> None:
-    assert field_of_view_mm(WIDE) == pytest.approx((20 * 640 / 800, 240, 240))
-    shifted = ConeGeometry(400.0, 800.0, (20, 30), (2.0, 20.0), (-5.0, 300.0))
-    assert field_of_view_mm(shifted) == pytest.approx((25 * 640 / 800, 240, 240))
+    wide = [[-240, 240]] * 2
+    np.testing.assert_allclose(field_of_view_mm(WIDE), [[-16, 16], *wide])
+    shifted = replace(WIDE, pixel_size_mm=(2.0, 20.0), detector_offset_mm=(-5.0, 300.0), detector_shape=(20, 30))
+    np.testing.assert_allclose(field_of_view_mm(shifted), [[-25 * 640 / 800, 15 * 640 / 800], *wide])
+    above = replace(shifted, detector_offset_mm=(30.0, 300.0))
+    np.testing.assert_allclose(field_of_view_mm(above), [[10 * 160 / 800, 50 * 640 / 800], *wide])
+
+
+@pytest.mark.parametrize("geometry", [ConeGeometry(300.0, 500.0, (40, 48), 1.6), ParallelGeometry((40, 48), 1.6)])
+def test_the_default_grid_is_where_the_panel_looks(geometry) -> None:
+    """A panel moved up sees the same height further up; the turn sees all that the panel sees at the axis."""
+    straight = default_grid(geometry)
+    for offset_mm in (-20.0, 0.4, 20.0, 60.0):
+        moved = replace(geometry, detector_offset_mm=(offset_mm, 0.0))
+        grid, ends_mm = default_grid(moved), (np.array([-32, 32]) + offset_mm) / geometry.magnification
+        assert grid.shape[0] - straight.shape[0] in (0, 3) and grid.shape[1:] == straight.shape[1:]
+        low_mm, high_mm = grid.box_mm[0]
+        assert low_mm <= ends_mm[0] + 1 and high_mm >= ends_mm[1] - 1 and not cuts(grid, grid, moved)
+        poses = moved.pose(np.deg2rad([0, 90, 200]))
+        np.testing.assert_allclose(default_grid(moved, poses).box_mm, grid.box_mm, atol=1e-9)
 
 
 def test_a_panel_that_stands_in_the_grid_is_said(scan, caplog) -> None:
@@ -131,7 +156,7 @@ def test_a_reference_goes_with_a_part_of_its_grid_that_is_seen(scan) -> None:
     np.testing.assert_array_equal(part.reference, scan.reference[4:6, 3:6, 5:6])
     for other in ({"size": 11}, {"voxel_mm": 41}, {"roi_mm": (-240, 40, -80, 40, 0, 40)}):
         assert scan.with_grid(GridChoice(**other)).reference is None
-    with pytest.raises(InputError, match=r"--roi-mm: found .*field of view, \(z, y, x\) ±16, ±240, ±240 mm"):
+    with pytest.raises(InputError, match=r"--roi-mm: found .*field of view, .* -16 to 16, -240 to 240, -240 to 240 mm"):
         scan.with_grid(GridChoice(roi_mm=(40, 80, -10, 10, -10, 10)))
 
 
