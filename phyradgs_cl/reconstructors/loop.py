@@ -1,6 +1,7 @@
 """The loop of every iterative method: progress, convergence record, Ctrl-C, stopping, resuming.
 
-A method is a class with the attributes of ``Stepwise``. ``Loop`` runs it, in one process or in ranks that do the same."""
+A method is a class with the attributes of ``Stepwise``. ``Loop`` runs it, in one process or in ranks (MPI processes) that do
+the same."""
 
 import json
 import time
@@ -16,7 +17,7 @@ from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport
 from phyradgs_cl.signals import stop_on_interrupt
 
-SILENT_S = 10.0  # a run of slow iterations reports at least once in this many seconds
+SILENT_S = 10.0  # longest time in s between two reports of a run with slow iterations
 
 
 class Stepwise(Protocol):
@@ -137,6 +138,6 @@ class Loop:
         return False
 
     def _reaches(self, every: int, before: int) -> bool:
-        """Returns whether a step from iteration ``before`` on reached a multiple of ``every``, or the last iteration."""
+        """Returns whether the step that began at ``before`` reached a multiple of ``every``, or the last iteration."""
         now = self.method.iteration
         return now // every > before // every or now == self.method.iterations

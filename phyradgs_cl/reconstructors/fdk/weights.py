@@ -1,14 +1,14 @@
 """FDK's weights of rays: a measure of each ray, and the weights of displaced detectors and of short scans.
 
-The measure generalises FDK's cosine to any pose (docs/mathematics.md). Displaced detectors follow G. Wang, Med. Phys. 29
-(2002) 1634, in the fan angle. Short scans follow D. L. Parker, Med. Phys. 9 (1982) 254, with M. D. Silver's margin for arcs
-longer than the shortest, Med. Phys. 27 (2000) 773. The redundancy weights of a ray and its opposite sum to 2."""
+The measure generalises FDK's cosine weight to any pose (docs/mathematics.md). Displaced detectors follow G. Wang, Med. Phys.
+29 (2002) 1634, in the fan angle. Short scans follow D. L. Parker, Med. Phys. 9 (1982) 254, with M. D. Silver's margin for
+arcs longer than the shortest, Med. Phys. 27 (2000) 773. The redundancy weights of a ray and its opposite sum to 2."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-# Width of the transition between rays measured once and twice, over the overhang of the panel's longer side.
+# Width of the transition from rays measured twice to rays measured once, over the overhang of the panel's longer side.
 # Wang's transition covers all rays that are measured twice: it was up to 15 % noisier, with no fewer artefacts.
 TRANSITION = 1.0
 _SYMMETRIC = 0.01  # a panel whose two sides differ by less, in pixels, is symmetric about the axis
@@ -69,7 +69,7 @@ class Fan:
     """The fan angles that every view sees; in a parallel beam distances in mm from the axis (see ``fan_angle``).
 
     missing_columns: columns that would make the panel symmetric about the axis, at its two ends. pixel_rad: the width of the
-    pixel at the shorter end. unlike: by which fraction of the fan its ends differ among the views."""
+    pixel at the shorter end. unlike: by how much its ends differ among the views, over its width."""
 
     low_rad: float
     high_rad: float
