@@ -17,7 +17,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, pad_rows, unpad_row
 
 _FRAMES_SHARE = 0.25  # fraction of the free device memory for a batch of frames if the volume does not fit as a whole
 _SLOTS_SHARE = 0.125  # fraction of the free device memory for slots
-_MOST_SLOT_FLOATS = 2**26  # most floats of all slots at a time: more was not faster
+_MOST_SLOT_FLOATS = 2**26  # most floats that all slots take at one time: more was not faster
 
 
 class RayMemory:
@@ -43,8 +43,8 @@ class RayMemory:
         self._padded: dict[tuple[int, int, int], np.ndarray] = {}
 
     def plan(self, share: float = 1.0) -> list[Brick]:
-        """Returns the bricks of the volume. A ``share`` below 1 makes new ones, for that fraction of the free memory. Raises
-        OutOfMemoryError if no brick fits."""
+        """Returns the bricks (parts) of the volume. A ``share`` below 1 makes new ones, for that fraction of the free
+        memory. Raises OutOfMemoryError if no brick fits."""
         if not self._bricks or share < 1:
             self.release()
             self._bricks, self._batch = self._planned(share)
@@ -96,7 +96,7 @@ class RayMemory:
         return cut(layout.grid.shape, steps, needs, room, share), frames
 
     def batches(self, count: int) -> Iterator[slice]:
-        """Yields slices of consecutive frames that fit on the device together."""
+        """Yields slices of the first ``count`` frames. The frames of a slice fit on the device together."""
         self.plan()
         for start in range(0, count, self._batch):
             yield slice(start, min(start + self._batch, count))
