@@ -21,7 +21,7 @@ SILENT_S = 10.0  # longest time in s between two reports of a run with slow iter
 
 
 class Stepwise(Protocol):
-    """What ``Loop`` needs of an iterative method, between its start and its result. iterations: how many to do."""
+    """What ``Loop`` needs of an iterative method, between its start and its result. iterations: number in a whole run."""
 
     iterations: int
 
@@ -35,7 +35,7 @@ class Stepwise(Protocol):
 
     @property
     def iteration(self) -> int:
-        """Finished iterations. A step may make several, or a part of one."""
+        """Number of finished iterations. A step may make several iterations, or a part of one."""
 
     @property
     def finished(self) -> str | None:
@@ -59,9 +59,9 @@ class Stepwise(Protocol):
 class Loop:
     """Runs a method to its end, an interruption, or its own reason to stop, and records its convergence.
 
-    stopped_by: ``iterations``, ``interrupt``, or the method's reason. record_every, report_every: iterations between lines
-    of the record, and between reports, which come sooner if iterations are slow. started: the ``time.perf_counter`` from
-    which seconds count."""
+    stopped_by: ``iterations``, ``interrupt``, or the method's reason. record_every, report_every: number of iterations
+    between lines of the record, and between reports, which come sooner if iterations are slow. started: the
+    ``time.perf_counter`` from which seconds count."""
 
     def __init__(
         self, method: Stepwise, ranks: Communicator, report: ProgressReport, started: float,

@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 def method_options(method: object, preset: str | None = None, changes: Mapping[str, Any] | None = None) -> Any:
-    """Returns the options of a method: a preset with ``changes`` by field name, nested ones as tables.
+    """Returns the options of a method: a preset with ``changes`` by field name; changes of nested options are tables.
 
     ``motion``, ``strips``, ``sub_intervals``, ``segments`` and ``time_error`` change the motion model together; ``motion``
     may be the user's own model. Raises InputError for a name that the method lacks, so that no option is ignored."""

@@ -34,7 +34,7 @@ from phyradgs_cl.runtime import Runtime
 WAYS = ("none", "cosine", "cylinder", "reprojected")
 _SHARE = 0.5  # "cosine" and "cylinder" extend rows at each side by this fraction of the panel's columns
 _SLOPE_PIXELS = 5  # the slope at a row's end is taken over this many pixels, to lower its noise
-_NOISE = 0.01  # below this fraction of the line integrals' 99.9th percentile, the end of a row is air
+_NOISE = 0.01  # a row that ends below this fraction of the line integrals' 99.9th percentile ends in air
 _UNEVEN = 0.02  # largest deviation of an angular step from the median, as a fraction, in evenly spaced views
 _REACH = 8  # the end views of an arc are repeated over this many exposures' arcs, so that the filter meets no edge
 _FULL_TURN = 1.5  # if a gap is wider than this many median steps, the views cover less than a full turn

@@ -72,7 +72,7 @@ class Arc:
         return float(np.pi * (1 - min(shares)))
 
     def covers(self, at_rad: np.ndarray) -> np.ndarray:
-        """Returns whether a part of the arc holds each angle (...), counted as progress in rad; bool (...)."""
+        """Returns which of the angles (...), given as progress in rad, lie in a part of the arc; bool (...)."""
         turned = np.mod(at_rad, 2 * np.pi)[..., None]
         return ((turned >= self.parts_rad[:, 0]) & (turned <= self.parts_rad[:, 1])).any(-1)
 

@@ -94,7 +94,7 @@ class Fan:
 
     @property
     def overlap_columns(self) -> float:
-        """Columns of a displaced detector from the axis to its nearer edge."""
+        """Number of columns of a displaced detector from the axis to its nearer edge."""
         return self.short_rad / self.pixel_rad
 
     @property
@@ -104,7 +104,7 @@ class Fan:
 
     @property
     def half_rad(self) -> float:
-        """The fan angle of the wider side; in a parallel beam its distance in mm from the axis."""
+        """The fan angle at the end of the wider side; in a parallel beam its distance in mm from the axis."""
         return max(self.high_rad, -self.low_rad)
 
 
@@ -129,7 +129,8 @@ def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = F
 
 
 def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
-    """Returns the weights of rays at fan angles of any shape: 1 ± sin where both sides of the axis are seen, 0 and 2 beyond.
+    """Returns the weights of rays at fan angles of any shape: 1 ± sin where both sides of the axis are seen; beyond, 2 on
+    the seen side, else 0.
 
     If the panel does not see the axis, every ray is measured once and counts 2. If the axis meets the panel's outermost
     pixel, there is no room for a transition. A pixel then counts by which part of it lies on the long side."""

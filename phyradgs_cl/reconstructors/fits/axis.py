@@ -32,7 +32,7 @@ _LEAST_OVERLAP = 0.25  # a view and its mirrored opposite must overlap in this f
 _LEAST_ENERGY = 0.2  # an overlap whose sum of squares is below this fraction of the largest shows air alone
 _STEPS = 12  # most steps of Gauss–Newton
 _SETTLED_PX = 1e-3  # Gauss–Newton ends after a step shorter than this, in pixels
-_BIAS_PX = 0.02  # error (std) of a shift that comes from interpolating views
+_BIAS_PX = 0.02  # error (std) of a shift that is due to interpolated views
 
 
 @dataclass(frozen=True, eq=False)

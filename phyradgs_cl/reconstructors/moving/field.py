@@ -73,8 +73,8 @@ class MotionField:
 
 @dataclass(eq=False)
 class FieldProblem:
-    """The misfit of a scan under a motion model, as a function of the field. bending: weight γ of the field's bending,
-    relative to how strongly frames respond to a control vector."""
+    """The misfit of a scan under the gantry's motion model, as a function of the object's displacement field. bending:
+    weight γ of the field's bending, relative to how strongly frames respond to a control vector."""
 
     rt: Runtime
     scan: Scan

@@ -44,7 +44,7 @@ class SplatOptions(MotionOptions):
     tv_edge: int = checks.ranged(32, 1, 4096)
     density_weight: float = checks.ranged(0.001, 0, 1e6)
     parameter_terms_from: int = checks.ranged(500, 0, 1_000_000_000)
-    cutoff_sigma: float = checks.ranged(DEFAULT_CUTOFF_SIGMA, 0, 100)  # 0 cuts nothing off
+    cutoff_sigma: float = checks.ranged(DEFAULT_CUTOFF_SIGMA, 0, 100)  # in standard deviations; 0 cuts nothing off
     initial_threshold: float = checks.ranged(0.05, 0, 1e6)
     initial_density: float = checks.ranged(0.15, 1e-6, 1e3)
     initial_scale: float = checks.ranged(1.0, 1e-6, 1e3)

@@ -156,8 +156,8 @@ def _curvature(system: System) -> float:
 
 
 def _tight_curvature(system: System) -> float:
-    """Returns a smaller Lipschitz constant in mm² for one more pass: the norm of AᵀA is at most the largest (AᵀA x)/x of an
-    x > 0 (Collatz and Wielandt). With row sums as x the bound is a sixth smaller than the largest row sum."""
+    """Returns a smaller Lipschitz constant in mm², at the cost of one more pass: the norm of AᵀA is at most the largest (AᵀA
+    x)/x of an x > 0 (Collatz and Wielandt). With row sums as x the bound is a sixth smaller than the largest row sum."""
     sums, space = _row_sums(system), system.space
     again = system.adjoint(system.apply_weights(system.forward(sums)))
     bound = space.largest(space.multiply(again, space.reciprocal(sums, _FAINTEST)))
@@ -328,8 +328,8 @@ def fista_stage(
 
 
 def _gains_from_subvoxels(run: MethodRun, parts: int) -> bool:
-    """Returns whether smaller voxels are worth their time on this grid, and fit on every rank's device. Logs a warning if
-    only room is missing."""
+    """Returns whether voxels divided into ``parts`` along a side are worth their time on this grid, and fit on every rank's
+    device. Logs a warning if only room is missing."""
     shape, rt = run.scan.grid.shape, run.rt
     if math.prod(shape[1:]) > _MOST_DIVIDED:
         return False

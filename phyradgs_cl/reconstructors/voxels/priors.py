@@ -227,7 +227,7 @@ class ThenRidge(Prior):
     def __init__(self, before: Prior, ridge: RidgeStep, noise_factor: float) -> None:
         """Joins both maps. noise_factor: noise that the ridge step assumes, over the part of the weight due to noise."""
         self.before, self.ridge, self.noise_factor = before, ridge, noise_factor
-        self.maps = 0  # maps since the last ridge step
+        self.maps = 0  # number of maps since the last ridge step
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         volume = self.before(space, volume, weight, nonnegative=nonnegative)
@@ -329,7 +329,7 @@ def volumes_of(prior: str | Denoiser) -> int:
 
 def subvoxel_share(prior: str | Denoiser, shape: tuple[int, int, int]) -> float:
     """Returns the weight of the smaller voxels in a result, 0 to 1. shape: (nz, ny, nx) of the smaller voxels. The weight is
-    larger with ridge, because large voxels serve to average noise, of which ridge leaves less."""
+    larger with the prior ridge, since large voxels serve to average noise, and ridge leaves less of it."""
     return _SUBVOXELS_WITH_RIDGE if prior == "ridge" and min(shape) >= RIDGE_EDGE else _SUBVOXELS
 
 

@@ -89,7 +89,7 @@ class Algorithm:
             setattr(self, name, self.system.space.array(state[name]))
         for name in self.NUMBERS:
             setattr(self, name, state[name].item())
-        if self.system.intensity is not None:  # the derivative J is taken at the volume
+        if self.system.intensity is not None:  # the derivative J depends on the volume
             self.system.expected(self.volume)
 
 
