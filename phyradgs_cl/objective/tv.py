@@ -151,8 +151,8 @@ class TvDescent:
         return self._where_it_is(lambda x: self._gradient(x, self._least(x)), volume)
 
     def __call__(self, volume: SameArray, step: float, count: int) -> SameArray:
-        """Returns a volume (nz, ny, nx) after ``count`` steps downhill of Euclidean length ``step``, in the volume's unit. A
-        device array gives a device array."""
+        """Returns a volume (nz, ny, nx) after ``count`` steps downhill of Euclidean length ``step``, in the volume's unit.
+        For a device array the result is a device array."""
 
         def descended(x: DeviceArray) -> DeviceArray:
             least = self._least(x)

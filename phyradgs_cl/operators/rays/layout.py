@@ -243,10 +243,11 @@ def layers(table: TimeCells) -> list[TimeCells]:
 
 
 def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np.ndarray]]:
-    """Divides the cells of F frames into layers. Returns the tables of each layer with weights of 1, and the weights.
+    """Divides the time cells of F frames into layers, in which a line has at most one cell. Returns the tables of each layer
+    with weights of 1, and the weights.
 
-    The weights of a layer are float32, (F, lines, 1) or (F, 1, lines) by the axis of readout, and 0 for lines without a
-    cell in it."""
+    The weights of a layer are float32, (F, lines, 1) or (F, 1, lines) by the axis of readout, and 0 for lines without a cell
+    in it."""
     split = [layers(table) for table in tables]
     ones, weights = [], []
     for k in range(max(len(parts) for parts in split)):
@@ -258,7 +259,7 @@ def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np
 
 
 def some_cells(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
-    """Returns a table of only the time cells with the numbers ``cells``, which must be still."""
+    """Returns a table of only the time cells numbered ``cells``. All must be still: one pose each."""
     names = ["pose", "time_s", "line_start", "line_stop", "weight"]
     names += [] if table.line_share is None else ["line_share"]
     return replace(table, **{name: getattr(table, name)[cells] for name in names})

@@ -114,7 +114,7 @@ class RayMemory:
         return True
 
     def volume(self, brick: Brick) -> tuple[RayLayout, DeviceArray]:
-        """Returns the layout of a brick, and memory for it with undefined values."""
+        """Returns the layout of a brick (part of the volume), and memory for it with undefined values."""
         if self._volume is None:
             largest = self._bricks[0]
             self._volume = self.rt.zeros(self.layout.of(largest).volume_floats)

@@ -143,7 +143,7 @@ class Slots:
 
     @property
     def pitch(self) -> int:
-        """The floats from one detector column of a slot to the next."""
+        """The number of floats from one detector column of a slot to the next."""
         return pitch_of(self.rows)
 
     @property

@@ -151,7 +151,7 @@ def projector_of(
     rt: Runtime, grid: Grid, tables: Sequence[TimeCells], deformation: Deformation | None,
     state_times_s: np.ndarray | None = None,
 ) -> Callable[..., RayOperator | WarpedOperator]:
-    """Returns a function that makes projectors from the arguments of ``RayOperator``: for an object at rest ``RayOperator``.
+    """Returns a function that makes projectors from the arguments of ``RayOperator``: at rest ``RayOperator`` itself.
 
     deformation: how the object moves. state_times_s (K,): for an object that changes instead, the times in s of its volumes.
     Each time cell of ``tables`` takes the nearest state. A blend of two states would blur and project most cells twice."""
@@ -242,8 +242,8 @@ class FieldDerivative:
 
 
 def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Returns the gradients ∇v(y + w(y)), (nz, ny, nx, 3) float32 per voxel, x, y, z, at voxel centres y. v is the cubic
-    spline through a volume (nz, ny, nx), and 0 outside. displacement: w (nz, ny, nx, 3) in voxels, x, y, z."""
+    """Returns the gradients ∇v(y + w(y)), (nz, ny, nx, 3) float32, along x, y, z per voxel, at voxel centres y. v is the
+    cubic spline through a volume (nz, ny, nx), and 0 outside. displacement: w (nz, ny, nx, 3) in voxels, x, y, z."""
     wide = scipy.ndimage.spline_filter(np.pad(volume, _BORDER + _SETTLES), output=np.float32)
     padded = np.ascontiguousarray(wide[(slice(_SETTLES, -_SETTLES),) * 3])
     strides = (padded.shape[1] * padded.shape[2], padded.shape[2], 1)

@@ -80,8 +80,9 @@ class MotionStates:
     def shares(self, times_s: np.ndarray | Sequence[float]) -> np.ndarray:
         """Returns the fractions of the states (T, K) at times (T,) in s. They sum to 1, with at most two above 0.
 
-        A blend takes the two states with the smallest error in voxels. This is a sum: the distance of the time's weights
-        from the line between the states, and the blur of adding two volumes that are displaced against each other."""
+        A blend takes the two states with the smallest error in voxels. The error is a sum: the distance of the object at
+        that time from the line between both states, and the blur of adding two volumes that are displaced against each
+        other."""
         wanted = self.deformation.weights_at(times_s)
         if not self.blends:
             distances = np.stack([_length(wanted - weights, self.metric) for weights in self.weights], -1)
@@ -103,7 +104,7 @@ class MotionStates:
 
 
 def unit_fields_mm(deformation: Deformation, grid: Grid) -> np.ndarray:
-    """Returns the displacements (R, nz, ny, nx, 3) in mm by each field with weight 1, x, y, z."""
+    """Returns the displacements (R, nz, ny, nx, 3) in mm, x, y, z, by each field with weight 1."""
     return np.stack([deformation.on_grid_mm(grid, unit) for unit in np.eye(deformation.rank)])
 
 
