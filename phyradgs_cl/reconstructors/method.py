@@ -36,8 +36,8 @@ class Method:
     """A reconstruction method: its function, and its presets of options by name, of which the first is the default.
 
     is_resumable: has checkpoints. is_shared: several ranks (MPI processes) can share its work. takes_initial: can start from
-    a volume. takes_deformation: can use a given motion of the object. finds_motion: finds how the object moves. check(scan,
-    options): raises InputError for a scan that the method cannot take. It is called before any warning."""
+    a volume. takes_deformation: can use a given motion of the object. finds_motion: finds how the object moves or changes.
+    check(scan, options): raises InputError for a scan that the method cannot take. It is called before any warning."""
 
     run: Callable[..., Reconstruction]
     presets: Mapping[str, Any]

@@ -77,7 +77,7 @@ def regrid_and_remove_lag(scan: Scan, options: Preprocessing) -> Scan:
 
 
 def reprojection(rt: Runtime | None, scan: Scan) -> Model:
-    """Returns the reconstruction and projection that steps of ``prepare`` call. FDK takes every line at its mid-exposure."""
+    """Returns the reconstructions and projections that ``prepare`` calls. FDK takes each line at its mid-exposure."""
     if rt is None:
         raise InputError("--steps", "a step that reconstructs, without a device", "a Runtime", "pass one")
     from phyradgs_cl.operators import RayOperator  # imported here because methods are slow to import
