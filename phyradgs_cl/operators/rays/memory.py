@@ -125,7 +125,7 @@ class RayMemory:
         return layout, DeviceArray(self._volume.buffer, (layout.volume_floats,), self._volume.dtype)
 
     def write_volume(self, volume: Array, brick: Brick) -> tuple[RayLayout, DeviceArray]:
-        """Copies a brick of a volume (nz, ny, nx) to the device. Returns its layout and the padded copy.
+        """Copies a brick (part) of a volume (nz, ny, nx) to the device. Returns the brick's layout and the padded copy.
 
         The padded array on the host is kept for the next call: allocating it takes longer than the copy."""
         layout, on_device = self.volume(brick)
@@ -145,7 +145,7 @@ class RayMemory:
         return layout, on_device
 
     def read_volume(self, layout: RayLayout, on_device: DeviceArray, result: Array) -> None:
-        """Copies a padded brick from the device into the volume ``result`` (nz, ny, nx)."""
+        """Copies a padded brick (part) from the device into the volume ``result`` (nz, ny, nx)."""
         brick = layout.brick
         if isinstance(result, DeviceArray):
             plain = Strides.plain(result.shape, brick.start)
@@ -155,7 +155,7 @@ class RayMemory:
 
     @property
     def has_columns(self) -> bool:
-        """Whether the transposed volume fits in addition to the volume. Known after ``plan``."""
+        """Whether a transposed copy of the volume fits on the device beside the volume. Known after ``plan``."""
         return self._columns_bytes > 0
 
     def turned(self, volume: Array) -> DeviceArray:
@@ -180,7 +180,7 @@ class RayMemory:
         return 2 * GUARD + self.slot_frames * self.slot_floats if self.slot_frames else 0
 
     def frames(self, count: int) -> DeviceArray:
-        """Returns memory for ``count`` frames of a batch, with undefined values."""
+        """Returns memory for ``count`` padded frames, with undefined values."""
         return self._some_frames(self.layout.frames_floats(count))
 
     def _some_frames(self, floats: int) -> DeviceArray:

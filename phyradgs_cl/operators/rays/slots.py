@@ -113,8 +113,8 @@ class UprightPoses:
         return table
 
     def _shares(self, cells: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Returns the shares (E, 4), each a cell's part in a frame: number of its slot or frame (``of``), lines [first,
-        stop), and where its weights begin in ``RayCells``."""
+        """Returns the shares (E, 4). A share is a cell's part in a frame: number of its slot or frame (``of``), lines
+        [first, stop), and where its weights begin in ``RayCells``."""
         begins = np.concatenate([[0], np.cumsum(self.stop - self.first)])
         return np.stack([of, self.first[cells], self.stop[cells], begins[cells]], -1)
 

@@ -52,7 +52,7 @@ class PlainRows:
         self._copy = rt.kernel("splat_plain", "row_copy")
 
     def enter(self, rows: DeviceArray) -> SplatPoint:
-        """Returns a copy of parameter rows (11, G) float32 in the kernels' layout."""
+        """Returns a copy of parameter rows (11, G) float32, in the kernels' units and padded."""
         rt, count = self.rt, rows.shape[1]
         stride = stride_of(count)
         inside, norms = rt.empty((ROWS, stride)), rt.empty(stride)
@@ -124,7 +124,7 @@ class GaussianOperator(Operator):
         super().__init__(rows.rt, (_ROWS, (ROWS, None)), range_, self._at_rows, **parts)
 
     def forward(self, point: SplatPoint) -> DeviceArray:
-        """Applies the operator to Gaussians in the kernels' layout. Returns y float32."""
+        """Applies the operator to the Gaussians ``point``, in the kernels' layout. Returns y float32 on the device."""
         raise NotImplementedError
 
     def back(self, point: SplatPoint, by_y: DeviceArray) -> DeviceArray:
