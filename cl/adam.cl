@@ -29,13 +29,13 @@ __kernel void activate(
     V_STORE(softplus(V_LOAD(r + 10 * (size_t)stride)), g + 10 * (size_t)stride);
 }
 
-/* Replaces dL/d(parameters) by dL/d(raw parameters). Adds the gradient of the objective's term that penalises density. */
+/* Replaces dL/d(parameters) by dL/d(raw parameters). Adds the gradient of the objective's density term. */
 __kernel void chain_activations(
     __global const float *raw, __global const float *gaussians, const int count, const int stride,
     const float scale_min, const float scale_max,
     const float density_weight,      /* the term's weight divided by the number of Gaussians */
     __global float *gradients,       /* (13, stride): dL/d(the 11 parameters), dL/d(centre u, v) */
-    __global float *statistics)      /* (2, stride): sum of |dL/d(centre on the detector)|, number of those above 0 */
+    __global float *statistics)      /* (2, stride): sum over frames of |dL/d(centre u, v)|, number of frames with one above 0 */
 {
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)

@@ -16,7 +16,7 @@
 #define BY_DISTANCE(weight, inv) (weight) * (inv) * (inv)
 #endif
 
-/* Interpolates linearly at LANES places of a line in memory, with the share wv of the next element. `fits`: two vectors from
+/* Interpolates linearly at LANES places of a line in memory, with the weight wv of the next element. `fits`: two vectors from
    `least` on contain all places; if so, elements are looked up in them, else gathered. */
 #ifdef V_LOOKUP
 #define COLUMN_SAMPLES(column, least, place, wv, fits)                                                       \
@@ -34,7 +34,7 @@ ALWAYS_INLINE vf lerp_of(const vf low, const vf high, const vf share) { return f
 
 __kernel void backproject(
     __global const float *projections, /* views of (guard, (rows, pitch)) */
-    __global const float *matrices,    /* (views, 12): rows give u z, v z, z of a voxel index x y z */
+    __global const float *matrices,    /* (views, 12): rows give u d, v d and the depth d of voxel x y z */
     __global const float *weights,     /* (views,): the factor of each view in the sum */
     const int views, const int rows, const int width, const int image_pitch, const long image_step,
     const int4 shape, const int4 origin, const int volume_pitch,
@@ -192,7 +192,7 @@ __kernel void backproject_leaning(
         const float inv_0 = 1.0f / depth_0, per_z = (1.0f / fma((float)count, m[10], depth_0) - inv_0) / (float)count;
         const int is_even = fabs((float)count * m[10]) <= EVEN_DEPTH * depth_0;
         const int rises = m[2] * depth_0 > u_0 * m[10]; /* whether u rises along z */
-        int own = 0;         /* vectors that end before `until` project between this detector column and the next */
+        int own = 0;         /* vectors that end before voxel `until` project between this detector column and the next */
         float until = -1.0f;
         for (int k = start; k < stop; k += LANES) {
             const float end = (float)(k + LANES - 1);
@@ -312,7 +312,7 @@ __kernel void backproject_lines(
         const int of_b = line_seeing(table, lines, of_a, b.x, b.y, b.z, &t, &speed, &depth1, &next1);
         const int is_in_front = depth0 > 0.0f && next0 > 0.0f && depth1 > 0.0f && next1 > 0.0f;
         const int from = is_in_front ? min(of_a, of_b) : 0, to = is_in_front ? max(of_a, of_b) : last;
-        vi waits = V_IOTA < (float)count; /* lanes still without their line */
+        vi waits = V_IOTA < (float)count; /* lanes whose line is still to be found */
         for (int line = from; line <= to && V_ANY(waits); ++line) {
             __global const float *m = table + (size_t)line * 12, *n = m + step, *pixels = image + (size_t)line * image_pitch;
             const vf depth = PROJECTED(m, 2), next_depth = PROJECTED(n, 2);

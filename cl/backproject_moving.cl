@@ -35,7 +35,7 @@ static inline vf sample_at(__global const float *field, const int4 shape, const 
 }
 
 __kernel void push_displacement(
-    __global const float *pull, /* (3: x y z, wide): w in voxels on a wider grid; zeros follow, which vectors may read */
+    __global const float *pull, /* (3: x y z, wide): w, in voxels, on a wider grid; then zeros that vectors may read */
     const int4 wide, const int4 margin, /* sides x y z of the wider grid; where the grid begins in it */
     const int4 shape, const int most_steps,
     __global float *push)       /* (3: x y z, shape): the displacement in voxels */
@@ -77,7 +77,7 @@ __kernel void push_displacement(
 
 __kernel void backproject_moving(
     __global const float *projections, __global const float *matrices,
-    __global const float2 *weights, /* (views,): weight, and the fraction of the second state */
+    __global const float2 *weights, /* (views,): the view's weight, and the fraction of the second state */
     const int views, const int rows, const int width, const int image_pitch, const long image_step,
     const int4 shape, const int4 origin, const int volume_pitch,
     __global const float *first_push, __global const float *second_push, /* (3: x y z, grid): u of both states in voxels */

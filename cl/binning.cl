@@ -6,7 +6,7 @@
 #include "common/group_sums.h"
 
 __kernel void bin_count(
-    __global const int *extents, /* (6, stride): lo and hi along x, y, z; empty where hi < lo */
+    __global const int *extents, /* (6, stride): lo and hi along x, y, z, in pixels or voxels; empty if hi < lo */
     const int stride, const int count, const int chunk, const int chunks,
     const int4 tile,             /* tile size along x, y, z */
     const int4 tiles,            /* number of tiles along x, y, z */
@@ -90,7 +90,7 @@ __kernel void bin_fill(
 }
 
 /* Writes into `boxes` (6, items) the lowest and highest tile of the item's splat along x, y, z; an empty range if the item
-   has no splat. Writes into `around` (6) the same of all the group's splats. */
+   has no splat. Writes into `around` (6) the range of tiles of all the group's splats. */
 ALWAYS_INLINE void share_box(__global const int *extents, const int stride, const int count, const int g, const int4 tile,
                              __local int *boxes, __local int *around)
 {

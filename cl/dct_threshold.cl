@@ -11,7 +11,7 @@
 #define COS_1 0.65328148f /* cos(π/8)/√2 */
 #define COS_3 0.27059805f /* cos(3π/8)/√2 */
 
-/* Orthonormal DCT-II of four values that are `step` apart. */
+/* Orthonormal DCT-II of four values that are `step` elements apart. */
 static inline void forward_4(vf *v, const int step)
 {
     const vf outer = v[0] + v[3 * step], inner = v[step] + v[2 * step];

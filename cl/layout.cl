@@ -25,7 +25,7 @@ __kernel void move_rows(
         target[k] = source[k];
 }
 
-/* Transposes rows and columns. A work-item takes a tile of TILE by TILE elements. */
+/* Copies and transposes rows and columns. A work-item takes a tile of TILE by TILE elements. */
 __kernel void move_turned(
     __global const float *source, const long4 from, __global float *target, const long4 to, const int rows, const int width)
 {

@@ -49,7 +49,7 @@ __kernel void ssim_map(
     const int lines, const int width, const int pitch, const float c1, const float c2,
     __global float *partials,        /* 3 images */
     __local float *tree,             /* scratch for three sums: (3, group's items) */
-    __global float *sums)            /* (groups, 3): SSIM, mask · |x - y|, mask */
+    __global float *sums)            /* (groups, 3): sums of SSIM, mask · |x - y| and mask */
 {
     const int v = (int)get_global_id(1), stop = v < lines ? width : 0;
     const size_t image = IMAGE_GUARD + (size_t)lines * pitch;

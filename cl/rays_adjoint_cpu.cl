@@ -9,7 +9,7 @@
 #define TILE_Y (BRICK_Y + 2)
 #define TILE_Z (BRICK_Z + 2)
 
-/* Backprojects pixels u_lo..u_hi of a line, from one cell, into the tile. row: the line's values. own: the cell's weights. */
+/* Backprojects pixels u_lo..u_hi of a line, from one cell, into the tile. row: the line's pixels. own: the cell's weights. */
 RAY_INLINE void line_onto(__global const float *cell, __global const float *row, __global const float *own, const float4 pitch_mm,
                           const int u_lo, const int u_hi, const int v, const int4 corner, const int4 size,
                           __local float *tile)
@@ -51,7 +51,7 @@ RAY_INLINE void line_onto(__global const float *cell, __global const float *row,
 __kernel void rays_adjoint(
     __global const float *image,      /* guard, then (listed frames, lines, pitch) */
     __global const float *cells, __global const int *cell_lines,
-    __global const float *matrices,   /* (12, matrix_stride): rows give u z, v z, z of a voxel index */
+    __global const float *matrices,   /* (12, matrix_stride): rows give u d, v d, depth d of a voxel */
     const int matrix_stride,
     __global const int *frame_cells,  /* (F + 1,): where a frame's cells begin */
     __global const int *frame_list, __global const float *weights, __global const int *weight_at,

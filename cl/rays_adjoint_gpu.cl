@@ -12,7 +12,7 @@
 #define SURELY 1.001f  /* voxels by which a coordinate must exceed the others so that it is the main axis of all rays near */
 
 /* Sums the window's pixels of a cell, times the voxel's weight in the samples of their rays on planes across axis a. sure: all
-   rays that touch the voxel have this main axis; otherwise each ray is asked. `of` line v is the line's weight. UPRIGHT: pixels
+   rays that touch the voxel have this main axis; else each ray is tested. `of` line v is the line's weight. UPRIGHT: pixels
    lie in columns along z, so the rays of column p have the same weight across it, unless a is z. 1: lines are rows. 2: lines
    are columns. */
 RAY_INLINE float from_planes(__global const float *frame, const int image_pitch, __global const float *of, const window_t w,

@@ -139,7 +139,7 @@ RAY_INLINE void meet_planes(const column_t r, const float sa, const int2 between
 }
 
 /* Adds the part of a detector column on plane p to columns of voxels, which begin at voxel z_first. Column j is summed
-   at sums + (j - b_first) step if b_first <= j < b_stop. Others are other work-items' and are summed at `beyond`, unused. */
+   at sums + (j - b_first) step if b_first <= j < b_stop. Sums of other columns, other work-items' ones, go to `beyond`. */
 RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p, const int z_first, const int b_first,
                            const int b_stop, float *sums, const int step, float *beyond)
 {
@@ -232,7 +232,7 @@ __kernel void rays_upright_adjoint(
     __global const float *values,     /* slots, as split_slots writes them */
     const int slot_columns, const int slot_pitch, const long slots_floats,
     __global const float *cells, __global const int *slots, const int slot_count,
-    __global const float *matrices, const int matrix_stride, /* (12, matrix_stride): rows give u z, v z, z of a voxel index */
+    __global const float *matrices, const int matrix_stride, /* (12, matrix_stride): rows give u d, v d, depth d of a voxel */
     const int4 shape, const int4 origin,
     const long4 to,                   /* voxel (z, y, x) is at to.x + y to.y + z to.z + x */
     const int add,

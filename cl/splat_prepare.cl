@@ -72,14 +72,14 @@ __kernel void splat_prepare(
     __global const float *gaussians,      /* (11, stride): mean, scale, quaternion, density */
     const int count, const int stride,
     __global const float *cells,          /* (C, CELL): the time cells of the frame */
-    __global const coefficient *matrices, /* (C, POSES, 12): rows give u z, v z and z of a world point */
+    __global const coefficient *matrices, /* (C, POSES, 12): rows give u d, v d, depth d of a world point */
     __global const int *cell_lines,       /* (C, 2): the lines [first, stop) of a cell */
     const int cell_count,
     const int width,                      /* pixels of a line */
     const float cutoff2,                  /* squared Mahalanobis radius of the cutoff; 0 for none */
     __global float *records,              /* (stride, C, RECORD), unchanged where nothing is visible */
     __global uchar *is_visible,           /* (stride, C): 1 where a record was written */
-    __global int *extents,                /* (6, stride): box over all cells: u lo, hi, v lo, hi, 0, 0 */
+    __global int *extents,                /* (6, stride): box of pixels in all cells: u lo, hi, v lo, hi, 0, 0 */
     __global const float *states,         /* DEFORMED: (S, STATE_ROWS, stride) */
     __global const int *cell_states)      /* (C,): the state of each cell */
 {

@@ -12,7 +12,7 @@ __kernel void total_variation(
     __global const float *volume, const int4 shape, const int pitch, const float4 weight, /* weight of each axis x, y, z */
     __global float *gradient,
     __local float *tree,             /* scratch for sums: a float per work-item of a group */
-    __global float *sums)            /* (groups): the variation in each group's voxels */
+    __global float *sums)            /* (groups): the total variation of each work-group's voxels */
 {
     const int y = (int)get_global_id(1), z = (int)get_global_id(2);
     const int stop = y < shape.y ? pitch : 0;

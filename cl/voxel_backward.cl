@@ -32,7 +32,7 @@ ALWAYS_INLINE int2 voxel_span(const voxel_row r, const int lo, const int hi, con
 __kernel void voxel_backward(
     __global const float *records, __global const float *by_volume, /* guard, then (z, y, pitch) */
     const int4 shape, const int pitch, const int count, const float cutoff2,
-    __global float *sums)            /* (stride, SUMS): w, w x y z, w xx xy xz yy yz zz in voxels */
+    __global float *sums)            /* (stride, SUMS): sums of w = value dL/d(volume), of w (x y z), of w (xx xy xz yy yz zz) */
 {
     const int g = (int)get_global_id(0) / ACROSS;
 #if GROUP == 1 /* Larger groups need no test, and in PoCL 3.0 a return before barriers leads to wrong writes. */
@@ -84,7 +84,7 @@ __kernel void voxel_backward(
 __kernel void voxel_chain(
     __global const float *gaussians, __global const float *sums, const float4 pitch, const int stride,
     const int add, const float weight,
-    __global float *gradients)       /* (13, stride); leaves the last two rows, dL/d(centre u, v) */
+    __global float *gradients)       /* (13, stride); does not change the last two rows, dL/d(centre u, v) */
 {
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)

@@ -7,7 +7,7 @@
 __kernel void voxel_prepare(
     __global const float *gaussians,      /* (11, stride): mean, scale, quaternion, density */
     __global const coefficient *matrix,   /* (12): rows give the voxel index x, y, z of a world point */
-    const float4 pitch,                   /* voxel size x, y, z */
+    const float4 pitch,                   /* size of a voxel along x, y, z */
     const int4 start,                     /* first voxel of the computed part, x y z */
     const int4 shape,                     /* voxels of the computed part along x, y, z */
     const int count, const int stride,

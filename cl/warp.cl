@@ -131,7 +131,7 @@ __kernel void warp_forward(
     __global const float *volume, /* coefficients, padded; strides: start, row, slice */
     const long4 strides,
     __global const float *fields, /* (RANK, 3: x y z, nz, ny, nx) in voxels; zeros follow, which vectors may read */
-    __global const float *shares, /* (RANK,): the fields' weights in the state */
+    __global const float *shares, /* (RANK,): the weight of each field in the state */
     const int4 shape,
     __global float *result)       /* (nz, ny, nx): the warped volume */
 {

@@ -1,4 +1,4 @@
-/* Gradients (13, stride): dL/d(the 11 parameters), then dL/d(centre on the detector) (u, v), which density control reads.
+/* Gradients (13, stride): dL/d(the 11 parameters), then dL/d(centre on the detector) (u, v), which density control needs.
    The gradient by rotation is first computed as a torque, dL/d(small rotation about the Gaussian's own axes). It is stored
    as a gradient by the unit quaternion, 2 q (0, torque). */
 #include "common/gaussian.h"

@@ -1,7 +1,7 @@
 /* Backprojects a view whose lines have their own poses to a voxel. For backproject.cl and backproject_moving.cl. */
 
 #define LINE_STEPS 6      /* most Newton steps to find the line that sees a voxel */
-#define LEAST_SPEED 0.1f  /* least `speed` of a voxel, since the Newton steps divide by it */
+#define LEAST_SPEED 0.1f  /* least `speed` that counts, since the Newton steps divide by it */
 
 static inline float line_position(__global const float *m, const float x, const float y, const float z, float *depth)
 {

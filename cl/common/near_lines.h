@@ -2,7 +2,7 @@
    (rays_upright_adjoint.cl). LEAN: see ray_column.h. */
 #include "common/ray_column.h"
 
-#define LEAST_SLOPE 1e-6f /* least distance of lines, in voxels: at the source it is 0 */
+#define LEAST_SLOPE 1e-6f /* least distance between lines that counts, in voxels: at the source it is 0 */
 
 /* A detector column and its rays, which lie in a plane. They meet the plane of voxels that is `ahead` planes from the source.
    There line v has the height c = sc + ahead (dz + v ez) / (da + v ea), and b = sb + across ahead + along (c - sc). */
@@ -12,7 +12,7 @@ typedef struct {
     int v_first, v_stop, last_start; /* last_start: the last line from which two vectors can be loaded */
     float sb, sc, da, ea, dz, ez;
     float inv;                      /* 1 / da; if LEAN, 1 / (da ez - dz ea) */
-    float bend, per_along;          /* 4 |ea / da|, by which lines beyond the ends are denser; 1 / |along| */
+    float bend, per_along;          /* bend: 4 |ea / da|, how much denser lines beyond the ends are; 1 / |along| */
     float across, along;
     float first, last;              /* slopes of the first and the last line */
     float dense;                    /* largest number of lines per voxel, multiplied by `ahead` */

@@ -17,7 +17,7 @@ RAY_INLINE void window_along(const vf at, const vf mx, const vf my, const vf mz,
 
 /* Finds all pixels to which points of a box may be projected, from LANES neighbouring cells, on the lines that each serves.
    The box has its middle at voxel index `at`. others: the pixels of a line. Returns which cells see the box; cells from
-   `stop` on do not count. matrix (12, stride): rows give u z, v z and z of a voxel index. cell_lines (C, 2). */
+   `stop` on do not count. matrix (12, stride): rows give u d, v d and depth d of a voxel. cell_lines (C, 2). */
 RAY_INLINE vi window_of(__global const float *matrix, const int stride, __global const int *cell_lines, const int others,
                         const int cell, const int stop, const float4 at, const float4 half_size, window_t *w)
 {

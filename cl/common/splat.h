@@ -35,7 +35,7 @@
 #define REC_AMP 8         /* amp, including the density and the cell's weight */
 #define REC_U_WHOLE 9     /* int */
 #define REC_V_WHOLE 10    /* int */
-#define REC_U_LO 11       /* int: first and last pixel to visit; none if HI < LO */
+#define REC_U_LO 11       /* int: first and last pixel to visit; no pixel if HI < LO */
 #define REC_U_HI 12
 #define REC_V_LO 13
 #define REC_V_HI 14
@@ -45,7 +45,7 @@
 #define REC_ACROSS_V 2
 #define REC_ACROSS_U 15
 #define REC_SPEED 16      /* length of the path in the segment, in widths of the splat */
-#define REC_REACH2 17     /* limit of |(along, across)|^2, which includes the largest Q */
+#define REC_REACH2 17     /* limit of |(along, across)|^2 within the cutoff, for the largest Q */
 #endif
 
 /* Floats from the first image to the image of a cell. All cells of a frame share one image, unless LAYERED. */

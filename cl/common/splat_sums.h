@@ -17,7 +17,7 @@
 #define SUM_TC 11
 #else
 #define SUMS 0           /* first index of the sums in the record */
-#define SUM_COUNT 10     /* number of sums */
+#define SUM_COUNT 10     /* number of sums per splat */
 #define SUM_UU 2         /* dL/dS11, half of dL/dS12, dL/dS22 */
 #define SUM_UV 3
 #define SUM_VV 4

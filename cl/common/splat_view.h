@@ -11,7 +11,7 @@
 /* A position in pixels: u = u_whole + u_rest, and likewise v. Depth 1 is on the detector. */
 typedef struct { vf u_whole, u_rest, v_whole, v_rest, depth; } splat_centre;
 
-/* matrix (12,): its rows give u z, v z and z of a world point. */
+/* matrix (12,): its rows give u d, v d and the depth d of a world point. */
 ALWAYS_INLINE splat_centre project_centre(__global const coefficient *matrix, const v3 mean)
 {
     splat_centre centre;

@@ -1,5 +1,5 @@
-/* The splats of a tile, as binning.cl lists them, from tile_splat_ids[tile_offsets[tile]] up to before
-   tile_splat_ids[tile_offsets[tile + 1]]. If the list did not fit into `capacity`, all splats are taken: slower, with the
+/* The splats of a tile, as binning.cl lists them: the elements of tile_splat_ids from tile_offsets[tile] up to, but without,
+   tile_offsets[tile + 1]. If the list did not fit into `capacity`, all splats are taken: slower, with the
    same result. */
 #include "common/lanes.h"
 

@@ -16,7 +16,7 @@
 #define VOX_U33 8
 #define VOX_DENSITY 9
 #define VOX_WHOLE 10    /* 3 ints: the voxel nearest to the centre, x y z */
-#define VOX_LO 13       /* 3 ints: the first voxel to visit, x y z; none if HI.z < LO.z */
+#define VOX_LO 13       /* 3 ints: the first voxel to visit, x y z; no voxel if HI.z < LO.z */
 #define VOX_HI 16
 
 /* A Gaussian on one row of voxels. */

@@ -1,8 +1,8 @@
 """Shrinks the cosine transforms of all blocks of 4³ voxels: a prior that keeps textures, which total variation flattens.
 
-For each shift s of the blocks, B_s takes the transforms; the result is the average of B_sᵀ T(B_s v) over the shifts (Coifman
-and Donoho, "Translation-invariant de-noising", 1995; block DCT: Guleryuz, IEEE Trans. Image Process. 16 (2007) 3020). T is a
-soft threshold that keeps each block's mean. Only blocks inside the volume count.
+For each shift s of the blocks, B_s takes the transforms of a volume v. The result is the average of B_sᵀ T(B_s v) over the
+shifts (Coifman and Donoho, "Translation-invariant de-noising", 1995; block DCT: Guleryuz, IEEE Trans. Image Process. 16
+(2007) 3020). T is a soft threshold that keeps each block's mean. Only blocks that lie inside the volume count.
 
 Each call takes a quarter of the shifts, in turn. Over iterations the average is the same (cycle spinning; Kamilov, Bostan
 and Unser, IEEE Signal Process. Lett. 21 (2014) 1326)."""
@@ -17,14 +17,14 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, beside, brought_to, padded_zeros, pitch_of
 
 EDGE = 4  # voxels along each side of a block
-_SAMPLES = 8  # time of a voxel over that of a ray's sample, by which launches are divided: drivers kill long ones
+_SAMPLES = 8  # time of a voxel over the time of a ray's sample; by it launches are divided, since drivers kill long ones
 # TURNS[turn][z]: the blocks' shift along y, in voxels, for their shift z along z. Four turns contain all 16 pairs once.
 TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 
 
 class DctProx:
-    """Shrinks the block cosine transforms of volumes of one ``shape`` (nz, ny, nx). Volumes thinner than a block stay the
-    same."""
+    """Shrinks the block cosine transforms of volumes of one ``shape`` (nz, ny, nx). Volumes thinner than a block (4 voxels)
+    are not shrunk."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int]) -> None:
         self.rt, self.shape = rt, shape
@@ -43,14 +43,14 @@ class DctProx:
         """Returns the shrunk volume (nz, ny, nx) float32. threshold: by how much T shrinks coefficients of the orthonormal
         transform, in the volume's unit.
 
-        turn: 0 to 3, chooses a quarter of the shifts. nonnegative: clips the result at 0. A device array gives a device
-        array (``out``, if given)."""
+        turn: 0 to 3, chooses a quarter of the blocks' shifts. nonnegative: clips the result at 0. For a device array the
+        result is a device array (``out``, if given)."""
         rt, (nz, ny, nx) = self.rt, self.shape
         observed, result = beside(rt, volume, out)
         voxels, by_voxel = (nx, ny, nz), rt.group(on_cpu=16)
         layout = self._shape4, self._pitch
         rt.launch(self._start, voxels, observed, *layout, self._padded, self._excess, group=by_voxel)
-        # Blocks of one launch do not overlap, so results repeat. On a GPU each is a work-item; on a CPU vectors run along x.
+        # Blocks of one launch do not overlap, so results repeat. A GPU's work-item takes one; a CPU's vectors run along x.
         along_x = EDGE if rt.pixel_items else 1
         blocks = ceil_div(nx, EDGE) if rt.pixel_items else 1, ceil_div(ny, EDGE), ceil_div(nz, EDGE)
         for (z, y), x in itertools.product(enumerate(TURNS[turn]), range(along_x)):

@@ -19,9 +19,9 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, beside, brought_to, move,
 
 EDGE = 5
 """Voxels along each side of a filter."""
-_SAMPLES = 200  # largest time of a voxel over that of a ray's sample, by which launches are divided: drivers kill long ones
-_SLICES = 2  # slices computed at a time: channels and responses of a whole volume would need 24 times its memory
-_RING = _SLICES + 2  # slices in memory: correlating two slices needs one more on either side
+_SAMPLES = 200  # largest time of a voxel over that of a ray's sample; by it launches are divided: drivers kill long ones
+_SLICES = 2  # slices computed at a time: channels and responses of a whole volume would take 24 volumes of memory
+_RING = _SLICES + 2  # slices kept in memory: correlating two slices needs one more on either side
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,11 +67,11 @@ def learned_ridge() -> Ridge:
 
 
 class RidgeStep:
-    """Steps down the ridge regulariser for volumes of one ``shape`` (nz, ny, nx). Volumes thinner than a filter stay the
-    same."""
+    """Steps down the ridge regulariser for volumes of one ``shape`` (nz, ny, nx). Volumes thinner than a filter (5 voxels)
+    get no step."""
 
     VOLUMES = 4
-    """Most memory of a step, in volumes of floats, if a volume has at least 50 slices and 64 voxels a row."""
+    """Most memory of a step, counted in volumes of floats, for volumes of at least 50 slices and 64 voxels a row."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], ridge: Ridge) -> None:
         self.rt, self.shape = rt, shape
@@ -90,15 +90,15 @@ class RidgeStep:
     def __call__(
         self, volume: SameArray, sigma: float, step: float, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Returns v − ``step`` ∇R(v), float32, for a volume v (nz, ny, nx); sigma in v's unit. nonnegative: clips the result
-        at 0. out: a device array that takes the result."""
+        """Returns v − ``step`` ∇R(v), float32, for a volume v (nz, ny, nx). sigma: its noise, in v's unit. nonnegative:
+        clips the result at 0. out: a device array that receives the result."""
         nz, ny, nx = self.shape
         observed, result = beside(self.rt, volume, out)
         padded = self._padded, Strides(GUARD, ny * pitch_of(nx), pitch_of(nx))
         move(self.rt, (observed, Strides.plain(self.shape)), padded, self.shape)
         is_thin = min(self.shape) < EDGE  # the volume is thinner than a filter, so the gradient stays 0
         end = np.float32(step), np.int32(nonnegative), result
-        # A response needs three slices of channels, so responses follow two slices behind the channels.
+        # A response needs three slices of channels, so responses are computed two slices behind the channels.
         for first in range(0, nz + 2, _SLICES):
             if not is_thin:
                 self._launch(self._channels_of, first, 2, self._padded, ends=(self._channels,))
@@ -108,7 +108,7 @@ class RidgeStep:
         return brought_to(self.rt, volume, result)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
-        """Runs a kernel on slices from ``first`` on, for a result that is ``less`` voxels shorter along each axis."""
+        """Runs a kernel on slices from ``first`` on, whose result is ``less`` voxels shorter than the volume."""
         nz, ny, nx = (count - less for count in self.shape)
         start, stop = max(first, 0), min(first + _SLICES, nz)
         if start < stop:
@@ -119,7 +119,7 @@ class RidgeStep:
 
 
 def ridge_gradient(volume: np.ndarray, sigma: float, ridge: Ridge) -> np.ndarray:
-    """Returns the regulariser's gradient ∇R at a volume (nz, ny, nx), float64; sigma in the volume's unit."""
+    """Returns the regulariser's gradient ∇R at a volume (nz, ny, nx), float64. sigma: its noise, in its unit."""
     volume = np.asarray(volume, np.float64)
     if min(volume.shape) < EDGE:
         return np.zeros_like(volume)

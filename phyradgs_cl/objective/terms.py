@@ -1,8 +1,8 @@
 """Terms of the objective (paper, Eq. 4): image loss, total variation of a small volume, mean density.
 
-A frame's image loss is L1 + λ (1 − SSIM). Eq. 4 prints "+ SSIM", but the paper minimises 1 − SSIM, as this module does.
-SSIM follows Wang et al. 2004 (IEEE Trans. Image Process. 13, 600), with an 11-tap Gaussian window of σ 1.5, zero padding,
-C1 = 0.01² and C2 = 0.03².
+A frame's image loss is L1 + λ (1 − SSIM): mean absolute error and structural similarity. Eq. 4 prints "+ SSIM", but the
+paper minimises 1 − SSIM, as this module does. SSIM follows Wang et al. 2004 (IEEE Trans. Image Process. 13, 600), with an
+11-tap Gaussian window of σ 1.5, zero padding, C1 = 0.01² and C2 = 0.03².
 
 Total variation is anisotropic, as in R2-Gaussian: the mean absolute difference between neighbouring voxels along z, plus
 those along y and x."""
@@ -24,7 +24,7 @@ C2 = 0.03**2  # keeps SSIM finite where variances are 0; for images with values 
 
 
 class ImageLoss:
-    """Computes the loss of a frame of ``lines`` × ``width`` pixels, and its gradient, in images with padded rows."""
+    """Computes the loss of a frame of ``lines`` × ``width`` pixels, and its gradient. pitch: floats from line to line."""
 
     def __init__(
         self, rt: Runtime, lines: int, width: int, pitch: int, ssim_weight: float, l1_weight: float = 1.0
@@ -44,7 +44,7 @@ class ImageLoss:
     def evaluate(
         self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float
     ) -> DeviceArray:
-        """Returns dL/d(rendered), valid until the next call. mask: 1 if a pixel counts, else 0. pixels: how many count."""
+        """Returns dL/d(rendered), valid until the next call. mask: 1 at valid pixels, else 0. pixels: number of 1s."""
         rt = self.rt
         vectors = ceil_div(self.width, rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
@@ -98,7 +98,8 @@ def _blur(image: np.ndarray) -> np.ndarray:
 
 
 class TotalVariation:
-    """Computes the anisotropic total variation of volumes of one ``shape`` (nz, ny, nx), padded, and its gradient."""
+    """Computes the total variation of volumes of one ``shape`` (nz, ny, nx), and its gradient. pitch: floats from row to
+    row."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], pitch: int) -> None:
         self.rt, self.shape, self.pitch = rt, shape, pitch
@@ -139,7 +140,7 @@ def total_variation(volume: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _axis_weights(shape: tuple[int, ...]) -> list[float]:
-    """Returns one over the number of differences along each axis (z, y, x), to turn sums into means; 0 without any."""
+    """Returns 1/(number of differences) along each axis (z, y, x), to turn sums into means; 0 for an axis without any."""
     total = int(np.prod(shape))
     return [1.0 / (total // n * (n - 1)) if n > 1 else 0.0 for n in shape]
 

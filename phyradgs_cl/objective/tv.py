@@ -5,7 +5,8 @@ dual (Beck and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weight
 cubes. For an object that changes, the sum of |differences| between successive states is added.
 
 ``TvDescent`` takes steps of a fixed length, as ASD-POCS does (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777), with TIGRE's
-backward differences. A number far below the volume's values is added to lengths of differences, so that none is 0."""
+backward differences. A number far below the volume's values is added to the lengths of differences, by which its gradient
+divides."""
 
 import math
 from collections.abc import Callable
@@ -20,8 +21,8 @@ from phyradgs_cl.runtime.layout import beside, brought_to
 class TvProx:
     """The proximal map of TV for volumes of a fixed ``shape``: (nz, ny, nx), or (K, nz, ny, nx) for K states.
 
-    Each call starts from the dual where the last one ended. axis_weights: factors of differences along z, y, x; for states,
-    the factor in time comes first."""
+    Each call starts from the dual field at which the last one ended. axis_weights: factors of differences along z, y, x; for
+    states, the factor in time comes first."""
 
     def __init__(
         self, rt: Runtime, shape: tuple[int, ...], axis_weights: tuple[float, ...] = (1.0, 1.0, 1.0)
@@ -50,10 +51,10 @@ class TvProx:
     def __call__(
         self, volume: SameArray, weight: float, iterations: int, *, nonnegative: bool, out: DeviceArray | None = None
     ) -> SameArray:
-        """Returns the proximal map of a volume of ``shape``, float32, after ``iterations`` from the last dual. weight: in
-        the volume's unit.
+        """Returns the proximal map of a volume of ``shape``, float32, after ``iterations`` steps from the last dual field.
+        weight: in the volume's unit.
 
-        nonnegative: maps to x ≥ 0. A device array gives a device array (``out``, if given)."""
+        nonnegative: maps to x ≥ 0. For a device array the result is a device array (``out``, if given)."""
         observed, result = beside(self.rt, volume, out)
         weight = max(weight, 0.0)
         steps = np.float32(np.array(_steps(self.axis_weights)) / (weight or 1.0))
@@ -122,7 +123,7 @@ def _primal_of(
 
 
 def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
-    """Returns the steps of the dual in space and in time: one over the Lipschitz constant of the differences.
+    """Returns the lengths of the dual's steps in space and in time: 1/(Lipschitz constant of the differences).
 
     For states, each step is half as long as it would be alone, so a large weight in time does not shorten that in space."""
     *time, z, y, x = axis_weights
@@ -131,7 +132,7 @@ def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
 
 
 # TV's gradient divides by the length of differences, which may be 0, plus the larger of _SMALLEST and _NOTHING.
-_SMALLEST = 1e-6  # relative to the volume's RMS, so that units do not matter
+_SMALLEST = 1e-6  # fraction of the volume's RMS, so that units do not matter
 _NOTHING = 1e-30  # in 1/mm, for a volume of zeros, whose RMS is 0
 
 
@@ -146,12 +147,12 @@ class TvDescent:
         self._space = DeviceSpace(rt)
 
     def gradient(self, volume: SameArray) -> SameArray:
-        """Returns dTV/d(volume), (nz, ny, nx) float32. A device array gives a device array."""
+        """Returns dTV/d(volume), (nz, ny, nx) float32. For a device array the result is a device array."""
         return self._where_it_is(lambda x: self._gradient(x, self._least(x)), volume)
 
     def __call__(self, volume: SameArray, step: float, count: int) -> SameArray:
-        """Returns a volume (nz, ny, nx) after ``count`` steps downhill of Euclidean length ``step``, in the volume's unit. A
-        device array gives a device array."""
+        """Returns a volume (nz, ny, nx) after ``count`` steps downhill of Euclidean length ``step``, in the volume's unit.
+        For a device array the result is a device array."""
 
         def descended(x: DeviceArray) -> DeviceArray:
             least = self._least(x)
@@ -178,8 +179,8 @@ class TvDescent:
 
 
 def tv_gradient(volume: np.ndarray, least: float | None = None) -> np.ndarray:
-    """Returns the gradient of Σ |backward difference|, (nz, ny, nx): the float64 twin of ``TvDescent.gradient``. least:
-    added to the length of differences; None: chosen from the volume."""
+    """Returns the gradient of Σ |backward difference|, (nz, ny, nx): the float64 twin of ``TvDescent.gradient``. least: a
+    small number added to the length of differences; None: chosen from the volume."""
     volume = np.asarray(volume, np.float64)
     least = _least_of(volume) if least is None else least
     difference = np.stack([np.diff(volume, axis=a, prepend=volume.take([0], axis=a)) for a in range(3)])

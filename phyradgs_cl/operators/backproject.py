@@ -21,13 +21,13 @@ _BYTES_A_LAUNCH = 1 << 28  # most bytes of frames that are uploaded together
 _VIEWS_SHARE = 0.25  # fraction of the free device memory for uploaded frames; the volume needs the rest
 # Most voxels along z that a work-item sums in the kernels for upright columns of voxels (see ``_UPRIGHT``).
 _BLOCK_VOXELS = 128
-_COLUMN_ROWS = 512  # most detector rows to which the voxels of such a work-item may project
+_COLUMN_ROWS = 512  # most detector rows to which the voxels of a work-item of these kernels may project
 # A column of voxels along z is upright if over its height u·depth and depth change by at most this fraction of the depth.
 _UPRIGHT = 1e-7
 # Largest lean of the image of a column of voxels, in detector columns per row. Beyond it the general kernel is faster.
 _MOST_LEAN = 0.25
-LINE_SAMPLES = 4  # time of a voxel with one pose per line, over its time with one pose per view
-_WIDEST = 16  # width of the widest vector of voxels along z, which may reach beyond the volume
+LINE_SAMPLES = 4  # time that a voxel takes with one pose per line, over its time with one pose per view
+_WIDEST = 16  # number of voxels along z in the widest vector, which may reach beyond the volume
 Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
 
@@ -58,8 +58,8 @@ def backproject_lines(
     """Backprojects frames (F, rows, columns) in which every line along ``axis`` has its own pose: pose (F, lines, 12) mm.
 
     A voxel reads the line onto which that line's pose projects it, interpolated between neighbouring lines. The value is
-    divided by the rate at which the voxel crosses lines, because this rate changes the angular step. If a ramp filter ran
-    across lines (``axis`` columns), it is divided once more, because the filter's scale changes too. See
+    divided by the rate at which the readout crosses the voxel's image, because this rate changes the angular step. If a ramp
+    filter ran across lines (``axis`` columns), it is divided once more, because the filter's scale changes too. See
     docs/mathematics.md. power: as in ``backproject``; 1 means frames that were not filtered."""
     pose = Readout(axis).poses(pose)
     matrices = voxel_matrices(pose.reshape(-1, 12), grid, is_parallel).reshape(len(pose), -1)
@@ -107,7 +107,7 @@ class Views:
         return rt.upload(on_host)
 
     def parts(self, room: Room) -> Iterator[slice]:
-        """Yields slices of the views such that each fits into the memory of one launch."""
+        """Yields slices of the views, each of as many as fit into the memory of one launch."""
         most_bytes = min(_BYTES_A_LAUNCH, room.largest_bytes, int(_VIEWS_SHARE * room.free_bytes))
         count = max(1, min(_VIEWS_PER_LAUNCH, most_bytes // self.bytes(1)))
         for first in range(0, len(self.matrices), count):
@@ -118,8 +118,8 @@ _Launch = Callable[[Arguments, Brick, DeviceArray], None]
 
 
 def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch) -> Array:
-    """Returns a volume (nz, ny, nx). ``launch`` adds some views to one brick at a time. The whole volume is one brick if it
-    fits; else bricks' sides along z are multiples of ``step``. Raises OutOfMemoryError if no brick fits."""
+    """Returns the views' volume (nz, ny, nx). ``launch`` adds some views to a part of it (brick). The whole volume is one
+    brick if it fits; else the bricks' sides along z are multiples of ``step``. Raises OutOfMemoryError if no brick fits."""
     is_resident = isinstance(views.frames, DeviceArray)
     volume: Array = rt.empty(grid.shape) if is_resident else np.empty(grid.shape, np.float32)
 

@@ -34,8 +34,8 @@ def cut(
 ) -> list[Brick]:
     """Cuts a volume of ``shape`` into bricks, as large as ``share`` (0 to 1) of the free memory in ``room`` allows.
 
-    The sides of bricks are multiples of ``steps`` (z, y), except at the volume's end. needs: returns the bytes of each
-    buffer that a brick of shape (z, y, x) takes. A brick of the smallest size may take all of the free memory. Raises
+    The sides of bricks are multiples of ``steps`` (z, y) in voxels, except at the volume's end. needs: returns the bytes of
+    each buffer that a brick of shape (z, y, x) takes. A brick of the smallest size may take all of the free memory. Raises
     OutOfMemoryError if it does not fit."""
     nz, ny, nx = shape
     smallest = (min(steps[0], nz), min(steps[1], ny), nx)

@@ -1,8 +1,8 @@
 """Optimises Gaussians by Adam (Kingma and Ba 2015), with decaying learning rates for each kind of parameter. Adaptive
-density control clones and splits Gaussians with a large gradient in the image, and removes faint and thin ones.
+density control clones and splits Gaussians that the gradient would move most in the image, and removes faint and thin ones.
 
 Density control follows Kerbl et al. 2023 in R2-Gaussian's radiative form. Its statistic is the mean norm of dL/d(projected
-centre), in normalised detector units. A clone or split gives two Gaussians of half the density."""
+centre), with the centre in halves of the detector's size. A clone or split gives two Gaussians of half the density."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from phyradgs_cl.fields import Activation
 from phyradgs_cl.fields import gaussians as g
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
-_RANGE = (1e-12, 10)  # limits of a learning rate: 0 could not decay, and 1e-12 moves nothing in float32
+_RANGE = (1e-12, 10)  # least and largest learning rate: 0 could not decay by a factor, and 1e-12 moves nothing in float32
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Rates(checks.Checked):
     density: tuple[float, float] = checks.ranged((6e-2, 6e-3), *_RANGE)
 
     def at(self, progress: float) -> np.ndarray:
-        """Returns the learning rates (11,) of the parameter rows at ``progress``, 0 to 1, of the run."""
+        """Returns the learning rates (11,) of a Gaussian's parameters at the fraction ``progress``, 0 to 1, of the run."""
         position, scale, rotation, density = (
             first * (last / first) ** progress
             for first, last in (self.position, self.scale, self.rotation, self.density)
@@ -49,7 +49,7 @@ EPSILON = 1e-15  # keeps Adam from dividing by a second moment of 0
 
 
 def folded_rates(rates: np.ndarray, step: int) -> np.ndarray:
-    """Returns the learning rates (11,) times both of Adam's bias corrections for step ``step``, from 1.
+    """Returns the learning rates (11,) times both of Adam's bias corrections. step: the number t of the step, from 1.
 
     m̂/√v̂ = m/√v · √(1−β2^t)/(1−β1^t). This scales ε as well, which does not matter at 1e-15."""
     return np.asarray(rates * np.sqrt(1 - BETA2**step) / (1 - BETA1**step))
@@ -66,7 +66,7 @@ def adam_step(
 
 
 class DeviceAdam:
-    """Runs Adam's kernels on raw parameters (11, stride) and their moments on the device."""
+    """Runs Adam's kernels on raw (unconstrained) parameters (11, stride) and their moments on the device."""
 
     def __init__(self, rt: Runtime, activation: Activation) -> None:
         self.rt, self.activation = rt, activation
@@ -75,7 +75,7 @@ class DeviceAdam:
         self._step = rt.kernel("adam", "adam_step")
 
     def activate(self, raw: DeviceArray, parameters: DeviceArray, count: int, stride: int) -> None:
-        """Computes parameter rows (11, stride) from raw rows. The first ``count`` columns are Gaussians, others padding."""
+        """Computes parameters (11, stride) from raw ones. The first ``count`` columns are Gaussians, others padding."""
         self.rt.launch(
             self._activate, stride // self.rt.lanes, raw, count, stride,
             np.float32(self.activation.scale_min), np.float32(self.activation.scale_max), parameters,
@@ -114,8 +114,10 @@ class DensityControl(checks.Checked):
     of a run.
 
     ``every``: iterations between two rounds of cloning, splitting and removing; 0 keeps the first population. Gaussians
-    whose longest scale is more than ``prune_aspect`` times their shortest are removed (0: never). Such thin sheets and
-    needles lie between the rays, where no measurement constrains them, and are visible in the volume."""
+    whose statistic reaches ``threshold`` are split if their longest scale is above ``split_scale``, else cloned. The parts
+    of a split are smaller by ``split_factor``. Gaussians fainter than ``prune_density`` (in the reference density) are
+    removed, and those whose longest scale is more than ``prune_aspect`` times their shortest (0: never). Such thin sheets
+    and needles lie between the rays, where no measurement constrains them, and are visible in the volume."""
 
     PREFIX = "control."
 
@@ -162,8 +164,8 @@ def control_density(
 ) -> Population:
     """Returns the population after one round of density control: cloned, split and pruned.
 
-    statistic (G,): mean gradient norm. box (2, 3): lowest and highest corner x y z; Gaussians centred outside are
-    removed."""
+    statistic (G,): mean norm of dL/d(projected centre). box (2, 3): lowest and highest corner x y z; Gaussians centred
+    outside are removed."""
     rows = activation.apply(population.raw)
     room = max(control.max_gaussians - statistic.size, 0)
     has_large_gradient = _strongest(statistic, control.threshold, room)
@@ -197,7 +199,7 @@ def prune(
 
 
 def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray:
-    """Returns which statistics reach the threshold, bool (G,). If more than ``room`` do, only the largest are chosen."""
+    """Returns which statistics reach the threshold, bool (G,). If more than ``room`` reach it, only the largest count."""
     chosen = statistic >= threshold
     if int(chosen.sum()) > room:
         order = np.argsort(-statistic, kind="stable")[:room]

@@ -1,6 +1,6 @@
-"""Methods: a file or a folder each. ``run.py`` runs a plan (``reconstruct``), ``method.py`` lists the methods (``METHODS``).
+"""Reconstruction methods, one per file or folder. ``run.py`` runs a plan (``reconstruct``), ``method.py`` lists the methods.
 
-Modules are imported when they are used, so that commands that do not reconstruct need not wait for them."""
+Modules are imported at their first use, so that commands that do not reconstruct start sooner."""
 
 import lazy_loader
 

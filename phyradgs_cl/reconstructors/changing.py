@@ -1,9 +1,10 @@
-"""``changing``: an object that changes during the scan, as a stack of states: min ½‖p − A x‖² + R(x), x ≥ 0.
+"""``changing``: reconstructs an object that changes during the scan as volumes at successive times, its states.
 
-A projects each state to the lines of its own time. R is the total variation of each state in space, and of each voxel in
-time. Most voxels keep their value from one state to the next. So where the object rests, views of other times help a state.
-The steps are those of ``fista``. Total variation in space and time: L. Ritschl et al., Iterative 4D cardiac micro-CT image
-reconstruction using an adaptive spatio-temporal sparsity prior, Phys. Med. Biol. 57 (2012) 1517."""
+It minimises ½‖p − A x‖² + R(x) for x ≥ 0, with the frames p and the stack x of states. A projects each state to the detector
+lines exposed near its time. R is the total variation of each state in space, and of each voxel in time. Most voxels keep
+their value from one state to the next, so where the object rests, views of other times help a state. The steps are those of
+``fista``. Total variation in space and time: L. Ritschl et al., Iterative 4D cardiac micro-CT image reconstruction using an
+adaptive spatio-temporal sparsity prior, Phys. Med. Biol. 57 (2012) 1517."""
 
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -22,20 +23,20 @@ from phyradgs_cl.reconstructors.voxels.priors import PriorWeight, TvPrior, axis_
 from phyradgs_cl.reconstructors.voxels.run import Iterations, IterativeOptions, MethodRun
 from phyradgs_cl.runtime import Runtime
 
-_STACKS = 18  # memory of a run, in stacks of all states' volumes
-_FRAMES = 3  # memory of a run, in copies of all projections
+_STACKS = 18  # stacks of all states that the method holds in memory at one time
+_FRAMES = 3  # arrays of all frames that the method holds in memory at one time
 
 
 @dataclass(frozen=True)
 class ChangingOptions(IterativeOptions):
     """Options of ``changing``.
 
-    - states: number of the object's states, over which frames are shared evenly; fewer if the scan has fewer frames.
+    - states: number of states of the object. Frames are shared evenly among them. A scan with fewer frames has fewer states.
     - prior_weight: weight of total variation in space, relative to the error of the data term's gradient.
     - time_weight: weight of a voxel's change from one state to the next, relative to an equal difference between
       neighbouring voxels.
-    - subsets: number of subsets of the frames, each with one step; at most two for each frame of a state. tv_iterations:
-      dual iterations per proximal map."""
+    - subsets: number of subsets of the frames, each with one step; at most twice the number of a state's frames.
+      tv_iterations: dual iterations per proximal map of total variation."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 8)
     """Iterations of the two short runs that ``estimate`` times. Both begin with the slower first pass."""
@@ -50,8 +51,8 @@ class ChangingOptions(IterativeOptions):
 
 
 def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the object's states in 1/mm, and their mean as volume. ``arguments``: further fields of ``MethodRun``, whose
-    seed has no effect."""
+    """Returns the object's states in 1/mm, and their mean as volume. ``arguments``: further fields of ``MethodRun``. The
+    seed among them has no effect."""
     times_s = state_times_s(scan, options.states)
     shape = (len(times_s), *scan.grid.shape)
     run = MethodRun(scan, options, rt, state_times_s=times_s, **arguments)

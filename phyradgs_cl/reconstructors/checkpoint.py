@@ -1,4 +1,4 @@
-"""States of interrupted runs. Each has the identity of its run and a checksum, which are compared before a run resumes."""
+"""States of interrupted runs: named arrays with the run's identity and a checksum, which a run checks before it resumes."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -20,7 +20,7 @@ _LONGEST_NAME = 60  # in an error, names of differences are cut after this many 
 
 
 def with_identity(state: State, identity: Mapping[str, Any]) -> State:
-    """Returns a method's state with a checksum and the identity of its run, from ``RunPlan.identity``."""
+    """Returns a method's state with a checksum and the identity of its run, as ``RunPlan.identity`` returns it."""
     arrays = {**state, RUN: np.array(json.dumps(identity, default=repr))}
     return {**arrays, _CHECKSUM: np.array(_checksum(arrays))}
 
@@ -28,8 +28,8 @@ def with_identity(state: State, identity: Mapping[str, Any]) -> State:
 def without_identity(
     state: State, identity: Mapping[str, Any], completed: Callable[[dict[str, Any]], dict[str, Any]]
 ) -> State:
-    """Returns the method's own state. completed: adds to a stored identity the defaults of options that did not exist yet.
-    Raises InputError for a damaged state, and for the state of another run."""
+    """Returns the method's state as it was before ``with_identity``. completed: adds to a stored identity the defaults of
+    options that did not exist yet. Raises InputError for a damaged state, and for the state of another run."""
     arrays = {name: array for name, array in state.items() if name != _CHECKSUM}
     if not np.array_equal(state.get(_CHECKSUM, -1), _checksum(arrays)):
         raise InputError("checkpoint", "arrays that do not match their checksum", "a whole checkpoint", _REMEDY)

@@ -1,11 +1,11 @@
-"""Error bars of voxels: the method runs on two more scans, which are made of the first one and its volume.
+"""Error bars of voxels: the method runs on two more scans, which are made of the first scan and its volume.
 
-- Iterative methods get scans that are synthesised from the volume and the residual. The differences of their volumes from
-  the first hold the noise, other causes of the residual, and what the method does to such an object: blur, prior, missing
-  views. That is a wild bootstrap (Wu, Ann. Stat. 14 (1986) 1261): each frame's residual keeps its size and shape, but a
+- Iterative methods get scans that are synthesised from the volume and the residual. How far their volumes differ from the
+  first shows the noise, other causes of the residual, and what the method does to such an object: blur, prior, missing
+  views. This is a wild bootstrap (Wu, Ann. Stat. 14 (1986) 1261): each frame's residual keeps its size and shape, but gets a
   random sign. The second scan has the opposite signs (antithetic variables).
 - Analytic methods get every second view, and then the other half. Half the difference of both volumes has the noise of the
-  whole scan's volume, and the streaks of missing views. A synthesised scan would not show these: FDK returns them
+  whole scan's volume, and the streaks of missing views. A synthesised scan would not show these streaks: FDK returns them
   unchanged.
 
 The factors that turn these differences into σ come from procedural volumes (benchmarks/doubt.py), and from held-out pixels
@@ -38,34 +38,35 @@ from phyradgs_cl.reconstructors.result import DOUBT, Progress, Reconstruction, R
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import without_warnings
 
-# Methods whose error bars were measured against true volumes; both laws are fitted to runs of the first 3.
+# Methods whose error bars were checked against true volumes. The laws of ``fitted_law`` come from runs of the first 3.
 MEASURED = ("fista", "fista-tv", "fdk", "asd-pocs", "cgls", "os-sart", "sart", "sirt")
 RUNS = 3  # times that the method runs: on the scan, and on two scans made from it
-PARTS = 2  # voxels are divided by this along each side before they are projected: projecting large ones would blur
-FEWEST_FRAMES = 4  # analytic methods need this many: with one frame in each half, bars were 3 times too narrow
+PARTS = 2  # a voxel's side is divided into this many parts before projection, because projecting large voxels blurs
+FEWEST_FRAMES = 4  # analytic methods need this many frames: with one in each half, bars were 3 times too narrow
 _EDGE = 0.8  # standard deviation, in voxels, of the Gaussian whose derivative gives the slope of edges
 _DENSEST = 3.0  # matter denser than this many times the object's mean density counts as this dense
-LEAST = 0.01  # least σ of a voxel, as a fraction of the RMS of σ: no voxel is certain
-_SLOPES = (0.00387, -0.01443, 0.05385, -0.20096, 0, 0.20096, -0.05385, 0.01443, -0.00387)  # 1/4 of a histospline's slopes
-_KEPT = "doubt."  # begins the names of arrays that a state keeps from complete runs
+LEAST = 0.01  # least error bar σ of a voxel, as a fraction of the RMS of σ over the volume
+# A filter along one axis: 1/4 of the slope of the spline of ``finer``, which has the means of all voxels.
+_SLOPES = (0.00387, -0.01443, 0.05385, -0.20096, 0, 0.20096, -0.05385, 0.01443, -0.00387)
+_KEPT = "doubt."  # prefix of the arrays that a state keeps from complete runs
 _PARTS = {"gaussians": Gaussians, "deformation": Deformation, "states": States}
-_CHECKED_FRAMES = 16  # σ is corrected by the held-out pixels of this many frames
-_AROUND = 9  # bars are averaged over squares of this many pixels a side: two samples alone give a rough bar
-_UNEXPLAINED = 2.0  # a residual above this many times the noise has other causes than noise; simulations had at most 1.2
-_NOISY = 0.03  # noise over line integrals: at 0.05 to 0.06, 43 to 59 % of voxels were within σ; below 0.02, 59 % or more
+_CHECKED_FRAMES = 16  # number of frames whose held-out pixels correct σ
+_AROUND = 9  # side in pixels of the squares over which a pixel's bar is averaged: two samples give a rough bar
+_UNEXPLAINED = 2.0  # a residual above this many times the noise causes a warning; simulations had at most 1.2
+_NOISY = 0.03  # larger noise over line integrals causes a warning: at 0.05 to 0.06, 43 to 59 % of errors were within σ
 _WIDEST = 4.0  # σ is widened by at most this factor: held-out pixels farther off have other causes
-# Views for each voxel along a slice's longer side from which a law holds as it is: 25 views of 64 voxels.
+# Views per voxel along a slice's longer side from which on a law needs no factor for few views: 25 views for 64 voxels.
 _USUAL_VIEWS = 25 / 64
-_FEWEST_VIEWS = 0.1  # fewer views for each voxel count as this many: none were measured
-_SHARE, _NORMAL_95 = 0.68, 1.96  # fraction of errors within σ; 95 % of normal noise is within 1.96 of its deviations
+_FEWEST_VIEWS = 0.1  # fewer views per voxel count as this many, because no law was measured there
+_SHARE, _NORMAL_95 = 0.68, 1.96  # fraction of errors within σ; standard deviations that hold 95 % of normal noise
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Law:
-    """The factors in ``spread``, which computes σ. near: smoothing (std) in voxels. multiple_95: the 95 % bar over σ.
-    sparse: how much σ grows where views are few for the grid."""
+    """Fitted factors with which ``spread`` computes σ: of its parts shape, noise, density and slope. near: smoothing (std)
+    in voxels. multiple_95: the 95 % bar over σ. sparse: how much σ grows if the scan has few views for its grid."""
 
     shape: float
     noise: float
@@ -76,13 +77,13 @@ class Law:
     sparse: float = 0.0
 
     def factor(self, views: int, grid: Grid) -> float:
-        """Returns the factor of σ for so many views. The runs of one scan lack the same views: where these are few for the
-        grid, their differences show too little of what is missing."""
+        """Returns the factor by which σ grows with only ``views`` views on ``grid``. All runs of a scan lack the same views.
+        With few views, the differences between the runs therefore show too little of what is missing."""
         of_voxel = max(views / max(grid.shape[1:]), _FEWEST_VIEWS)
         return 1 + self.sparse * max(_USUAL_VIEWS / of_voxel - 1, 0)
 
     def for_views(self, views: int, grid: Grid) -> "Law":
-        """Returns the law with ``factor`` in all of its factors of σ."""
+        """Returns the law with shape, noise and slope times ``factor``. Density needs no factor: it multiplies their sum."""
         factor = self.factor(views, grid)
         return replace(self, shape=factor * self.shape, noise=factor * self.noise, slope=factor * self.slope)
 
@@ -95,11 +96,11 @@ def fitted_law(kind: str) -> Law:
 def spread(first: Array, second: Array, third: Array, law: Law) -> Array:
     """Returns the error bar σ (nz, ny, nx) of the first of three volumes, or of the first of three images.
 
-    Both others differ from the first. The mean of the two differences is what the method does to the object. Half the
-    difference between the two is noise, whose signs are opposite. The squares of both, smoothed over ``near`` voxels, are
-    weighed by ``shape``² and ``noise``². Dense matter may have texture that all runs lack: it gets ``density``² of the
-    object's mean variance, in proportion to its density. Edges may be blurred in all runs: they get ``slope``² times the
-    square of the change of density in a voxel. σ is at least a hundredth of its RMS."""
+    The mean difference of the second and third from the first is what the method does to the object. Half the difference
+    between the second and third is noise, which has opposite signs in them. The squares of both, smoothed over ``near``
+    voxels, are weighted by ``shape``² and ``noise``². Dense matter may have texture that all three lack: it gets
+    ``density``² of the object's mean variance, in proportion to its density. Edges may be blurred in all three: they get
+    ``slope``² times the squared change of density per voxel. σ is at least a hundredth of its RMS."""
     one, two = (other.astype(np.float64) - first for other in (second, third))
     shape, noise = (scipy.ndimage.gaussian_filter(part**2 / 4, law.near) for part in (one + two, one - two))
     variance = law.shape**2 * shape + law.noise**2 * noise
@@ -113,9 +114,9 @@ def spread(first: Array, second: Array, third: Array, law: Law) -> Array:
 
 
 def finer(volume: Array) -> NDArray[np.float32]:
-    """Returns a volume (nz, ny, nx) on voxels of half the side, whose means over the old voxels are the old values.
+    """Returns a volume (nz, ny, nx) on voxels of half the side. The eight parts of an old voxel have its value as mean.
 
-    Along an axis, a voxel's halves are means of a spline that has the means of all voxels (histospline)."""
+    Along an axis, the two halves of a voxel are means of a spline that has the means of all voxels (histospline)."""
     for axis in range(3):
         half = scipy.ndimage.correlate1d(volume, _SLOPES, axis, mode="nearest")
         halves = np.stack([volume - half, volume + half], axis + 1)
@@ -124,10 +125,10 @@ def finer(volume: Array) -> NDArray[np.float32]:
 
 
 def halves(scan: Scan) -> tuple[Array, Array]:
-    """Returns the frames of both halves of a scan: every second view in the order of angles.
+    """Returns the frame numbers of both halves of a scan: every second view in the order of angles, and the others.
 
-    Views of one angle are in one half: if both had them, their streaks would not differ. An orbit that travels along the
-    axis is halved in time, because each turn sees another height."""
+    Views of one angle go to the same half: if both halves had them, their streaks would not differ. An orbit that travels
+    along the axis is divided in the order of time, because each turn sees another height."""
     pose = middle_poses(scan)
     view, angles_rad = distinct_views(azimuth_rad(pose))
     if len(angles_rad) < FEWEST_FRAMES or travels(pose[:, None, None], scan.projections.shape[1], scan.is_parallel):
@@ -137,9 +138,9 @@ def halves(scan: Scan) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Doubter:
-    """Runs a method three times, and computes error bars. scan: what the method sees. whole: the scan with the held-out
-    pixels, which ``hidden``, bool (F, v, u), marks. deformation: how the object moves. kind: ``iterative`` or ``analytic``,
-    as in ``fitted_law``."""
+    """Runs a method three times, and computes error bars from the results. scan: what the method sees. whole: the scan with
+    its held-out pixels. hidden: bool (F, rows, columns), marks these pixels. deformation: how the object moves. kind:
+    ``iterative`` or ``analytic``, as in ``fitted_law``."""
 
     rt: Runtime
     scan: Scan
@@ -150,13 +151,13 @@ class Doubter:
     kind: str = "iterative"
 
     def run(self, once: Callable[..., Reconstruction], report: Report, resume: State | None) -> Reconstruction:
-        """Returns the method's result with ``doubt``. once: runs the method on a scan from a state. resume: the state of
-        whichever run was interrupted."""
+        """Returns the method's result with ``doubt``. once: runs the method on a scan, from a state or from the start.
+        resume: the state of the run that was interrupted."""
         arrays = dict(resume or {})
         results = _restored({name: arrays.pop(name) for name in list(arrays) if name.startswith(_KEPT)}, self.scan.grid)
         while len(results) < RUNS:
             scan = self.scan_of_run(results[0], len(results)) if results else self.scan
-            half = without_warnings() if results and self.kind == "analytic" else nullcontext()  # of the gaps
+            half = without_warnings() if results and self.kind == "analytic" else nullcontext()  # about gaps
             with report.through(partial(_counted, results=results)), half:
                 result = once(scan, arrays or None)
             if result.state is not None:
@@ -185,8 +186,8 @@ class Doubter:
         return replace(self.scan, projections=self.rt.ranks.bcast(frames))
 
     def _pairs(self, result: Reconstruction, count: int) -> Iterator[FramePair]:
-        """Yields ``count`` measured frames, each with the one computed from a result, whose voxels are divided for
-        projection."""
+        """Yields ``count`` measured frames, each with the frame computed from a result's volume on finer voxels
+        (``finer``)."""
         chosen, moves = spread_frames(self.whole.frames, count), result.moves or self.deformation
         volume, grid = finer(result.volume), result.grid.finer(PARTS)
         if isinstance(moves, States):
@@ -212,9 +213,9 @@ class Doubter:
         return replace(first, doubt=sigma, facts={**first.facts, **facts})
 
     def _against_held_out(self, results: list[Reconstruction], hidden: NDArray[np.bool_], law: Law) -> dict[str, float]:
-        """Returns the shares of held-out pixels within their bars, and the factor of σ, 1 to 4, for which 68 % would be.
-
-        A pixel's bar combines its noise with the ``spread`` of the projected volumes around it."""
+        """Returns the fractions of held-out pixels whose errors are within σ and within the 95 % bar, and the factor of σ,
+        from 1 to 4, with which 68 % would be within σ. A pixel's σ combines its noise with the ``spread`` of the projections
+        around it."""
         ratios, inside = [], []
         for first, one, two in zip(*(self._pairs(result, _CHECKED_FRAMES) for result in results), strict=True):
             held = hidden[first.frame]
@@ -246,7 +247,7 @@ def _warn_of(residual_square: float, noise_square: float, square: float, mean: f
 
 
 def _counted(progress: Progress, results: list[Reconstruction]) -> Progress:
-    """Returns progress that counts the iterations of all runs together. During later runs it shows the first volume."""
+    """Returns progress that counts the iterations of all runs together. Later runs show the volume of the first."""
     done, each = progress.iteration + len(results) * progress.iterations, RUNS * progress.iterations
     progress = progress.mapped(state=lambda state: {**state, **_kept(results)}, iteration=done, iterations=each)
     if not results:
@@ -258,14 +259,14 @@ def _counted(progress: Progress, results: list[Reconstruction]) -> Progress:
 
 
 def _interrupted(result: Reconstruction, results: list[Reconstruction]) -> Reconstruction:
-    """Returns the first volume with the state of the run that was interrupted."""
+    """Returns the first run's result, with the state of the interrupted run and of the complete runs before it."""
     first, run = (*results, result)[0], {"interrupted_in_run": f"{len(results) + 1} of {RUNS}"}
     facts = {**first.facts, "interrupted_at": result.facts["interrupted_at"], DOUBT: run}
     return replace(first, state={**(result.state or {}), **_kept(results)}, facts=facts)
 
 
 def _kept(results: list[Reconstruction]) -> State:
-    """Returns what a state keeps from complete runs: everything of the first run, and volume and seconds of the others."""
+    """Returns what a state keeps of complete runs: all parts of the first one, volume and seconds of the others."""
     if not results:
         return {}
     first, seconds = results[0], [one.facts["seconds"] for one in results]
@@ -277,7 +278,7 @@ def _kept(results: list[Reconstruction]) -> State:
 
 
 def _restored(kept: Mapping[str, np.ndarray], grid: Grid) -> list[Reconstruction]:
-    """Returns the complete runs that ``_kept`` has put into a state; [] without any."""
+    """Returns the complete runs that ``_kept`` has put into a state, on ``grid``; an empty list if the state holds none."""
     if not kept:
         return []
     arrays = {name.removeprefix(_KEPT): values for name, values in kept.items()}

@@ -1,6 +1,7 @@
 """The loop of every iterative method: progress, convergence record, Ctrl-C, stopping, resuming.
 
-A method is a class with the attributes of ``Stepwise``. ``Loop`` runs it, in one process or in ranks that do the same."""
+A method is a class with the attributes of ``Stepwise``. ``Loop`` runs it, in one process or in ranks (MPI processes) that do
+the same."""
 
 import json
 import time
@@ -16,11 +17,11 @@ from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport
 from phyradgs_cl.signals import stop_on_interrupt
 
-SILENT_S = 10.0  # a run of slow iterations reports at least once in this many seconds
+SILENT_S = 10.0  # longest time in s between two reports of a run with slow iterations
 
 
 class Stepwise(Protocol):
-    """What ``Loop`` needs of an iterative method, between its start and its result. iterations: how many to do."""
+    """What ``Loop`` needs of an iterative method, between its start and its result. iterations: number in a whole run."""
 
     iterations: int
 
@@ -34,7 +35,7 @@ class Stepwise(Protocol):
 
     @property
     def iteration(self) -> int:
-        """Finished iterations. A step may make several, or a part of one."""
+        """Number of finished iterations. A step may make several iterations, or a part of one."""
 
     @property
     def finished(self) -> str | None:
@@ -58,9 +59,9 @@ class Stepwise(Protocol):
 class Loop:
     """Runs a method to its end, an interruption, or its own reason to stop, and records its convergence.
 
-    stopped_by: ``iterations``, ``interrupt``, or the method's reason. record_every, report_every: iterations between lines
-    of the record, and between reports, which come sooner if iterations are slow. started: the ``time.perf_counter`` from
-    which seconds count."""
+    stopped_by: ``iterations``, ``interrupt``, or the method's reason. record_every, report_every: number of iterations
+    between lines of the record, and between reports, which come sooner if iterations are slow. started: the
+    ``time.perf_counter`` from which seconds count."""
 
     def __init__(
         self, method: Stepwise, ranks: Communicator, report: ProgressReport, started: float,
@@ -137,6 +138,6 @@ class Loop:
         return False
 
     def _reaches(self, every: int, before: int) -> bool:
-        """Returns whether a step from iteration ``before`` on reached a multiple of ``every``, or the last iteration."""
+        """Returns whether the step that began at ``before`` reached a multiple of ``every``, or the last iteration."""
         now = self.method.iteration
         return now // every > before // every or now == self.method.iterations

@@ -1,5 +1,5 @@
-"""The methods by name, and the user's own. A new method is a file with a METHOD, which is a ``Method``, and a line in
-METHODS.
+"""Lists the methods by name, and makes methods of users' own functions. To add a method, write a file with a METHOD, which
+is a ``Method``, and a line in METHODS.
 
 A method's function takes ``(scan, options, rt, *, seed, report, resume)``; a user's function needs only the first three. If
 ``options`` is annotated with a dataclass, its fields are the options of ``--set`` and ``reconstruct``. The function returns
@@ -35,8 +35,8 @@ _FORM = "a function (scan, options, rt, …)"
 class Method:
     """A reconstruction method: its function, and its presets of options by name, of which the first is the default.
 
-    is_resumable: has checkpoints. is_shared: several ranks can share its work. takes_initial: can start from a volume.
-    takes_deformation: can take an object that moves. finds_motion: finds how the object moves or changes.
+    is_resumable: has checkpoints. is_shared: several ranks (MPI processes) can share its work. takes_initial: can start from
+    a volume. takes_deformation: can use a given motion of the object. finds_motion: finds how the object moves or changes.
     check(scan, options): raises InputError for a scan that the method cannot take. It is called before any warning."""
 
     run: Callable[..., Reconstruction]
@@ -59,7 +59,7 @@ class OwnOptions:
 def own_method(name: str, function: Any) -> Method:
     """Returns a user's function as a method, with the defaults of its options' class.
 
-    Raises InputError for anything but a function (scan, options, rt), and for options without defaults."""
+    Raises InputError for anything but a function (scan, options, rt, …), and for options that lack a default."""
     subject = f"--method {name}"
     try:
         parameters = inspect.signature(function).parameters
@@ -88,8 +88,8 @@ def own_method(name: str, function: Any) -> Method:
 
 
 def imported(text: str, subject: str = "--method") -> Any:
-    """Returns the object ``package.module:name``, also from the present folder, as ``python -m`` does. Raises InputError,
-    which names ``subject``, if the import fails."""
+    """Imports the object ``package.module:name`` and returns it. Modules in the present folder are found too, as by ``python
+    -m``. Raises InputError, which names ``subject``, if the import fails."""
     module, _, name = text.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())

@@ -50,7 +50,7 @@ def reconstruct_neural(
     return Reconstruction(*trainer.present_volume(), record=loop.record, facts=facts, state=state)
 
 
-# NAF's paper, section 3, and its released configuration chest_50: 192 samples for 128 voxels per side.
+# NAF's paper, section 3, and its released configuration chest_50: 192 samples per ray for 128 voxels per side.
 NAF_PUBLISHED = NeuralOptions(
     iterations=1500, rays=1024, jitter="sample", positive_only=True, voxel_points=1, levels=16,
     base_resolution=16, table_log2=19, density_bound=1.0, first_share=0.5, rate=1e-3, rate_factor=0.1,
@@ -61,9 +61,9 @@ NAF_PRESETS = {"default": NeuralOptions(), "published": NAF_PUBLISHED}
 NAF = Method(partial(reconstruct_neural, method="naf"), NAF_PRESETS)
 
 
-# SAX-NeRF's released configuration Lineformer/chest_50 is NAF's with 256 samples for 128 voxels.
+# SAX-NeRF's released configuration Lineformer/chest_50 is NAF's with 256 samples per ray for 128 voxels per side.
 SAX_PUBLISHED = LineOptions(**{**vars(NAF_PUBLISHED), "samples": 256})
-# No windows by default: they do not change the expected gradient of a squared error, but make it noisier.
+# No windows of rays by default: they keep the expected gradient of a squared error, but make it noisier.
 SAX_PRESETS = {"default": LineOptions(iterations=50, windows=0), "published": SAX_PUBLISHED}
 
 SAX_NERF = Method(partial(reconstruct_neural, method="sax-nerf"), SAX_PRESETS)

@@ -25,9 +25,9 @@ _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) 
 """Fields of motion models, such as the number of times per line, which are also options, under the same names."""
 _ALL = motions_for(RAYS, SPLATS)  # a user's own method may take any motion model
 LARGEST_SEED = 2**63
-_DECIMALS = 6  # decimals of mm and s in a run's identity: a scan that was stored and read is still the same scan
+_DECIMALS = 6  # decimals of mm and s in a run's identity: a scan keeps its identity when it is stored and read
 _SUBJECT = "--object-motion"
-_MOST_VOXELS = 24  # deformations are smooth, so a grid of this many voxels a side is enough to check one
+_MOST_VOXELS = 24  # most voxels a side of the grid on which a deformation is checked: deformations are smooth
 _LEAST_DETERMINANT = 0.05  # a deformation w(y) with a smaller det(I + ∂w/∂y) is refused: at 0 matter folds
 _LEAST_COVERED = 0.5  # a deformation that covers less than this fraction of the scan's time is refused
 _MOSTLY_COVERED = 0.98  # a deformation that covers less than this fraction of the scan's time causes a warning
@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 
 
 def method_options(method: object, preset: str | None = None, changes: Mapping[str, Any] | None = None) -> Any:
-    """Returns the options of a method: a preset with ``changes`` by field name, nested ones as tables.
+    """Returns the options of a method: a preset with ``changes`` by field name; changes of nested options are tables.
 
     ``motion``, ``strips``, ``sub_intervals``, ``segments`` and ``time_error`` change the motion model together; ``motion``
     may be the user's own model. Raises InputError for a name that the method lacks, so that no option is ignored."""
@@ -70,7 +70,7 @@ def preprocessing_of(changes: Mapping[str, Any]) -> Preprocessing:
 
 
 def _models(options: Any) -> dict[str, Any]:
-    """Returns by name the motion models that a method's options allow. The preset's model keeps its strips and times."""
+    """Returns by name the motion models that a method's options allow. The options' own model keeps its strips and times."""
     own = [options.motion] if hasattr(options.motion, "name") else []
     return {model.name: model for model in (*getattr(options, "MOTIONS", _ALL), *own)}
 
@@ -80,8 +80,8 @@ def _has(model: Any, count: str) -> bool:
 
 
 def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> Motion:
-    """Returns the motion model named ``motion``, with the given numbers of strips and times, or the user's own model. Raises
-    InputError for an unknown name, and for numbers that the model lacks."""
+    """Returns the motion model named ``motion``, with the numbers of strips and times in ``counts``, or the user's own
+    model. Raises InputError for an unknown name, and for numbers that the model lacks."""
     if callable(getattr(motion, "cells", None)) and not counts:
         return motion
     models = _models(options)
@@ -203,8 +203,8 @@ class RunPlan:
     """What to run on a scan. method: a name as ``method_name`` returns it, or the user's own function. options: the method's
     options, checked. preprocessing: changes of the frames before the method.
 
-    Raises InputError for a seed out of range, an object that moves with a method for objects at rest, and error bars of runs
-    that cannot differ."""
+    Raises InputError for a seed out of range, for an object that moves with a method for objects at rest, and for error bars
+    if their runs cannot differ."""
 
     method: "str | Callable[..., Any]"
     options: Any
@@ -233,7 +233,7 @@ class RunPlan:
         return method_name(self.method)
 
     def identity(self, scan: Scan) -> dict[str, Any]:
-        """Returns everything that a run must share with the interrupted one that it continues. Reads all frames."""
+        """Returns everything that a run must share with the interrupted run that it continues. Reads all frames."""
         grid = scan.grid
         return {
             "scan": _digest(scan.projections, np.packbits(scan.valid), *_geometry(scan)),
@@ -271,7 +271,7 @@ def plan_run(
     seed: int = 0, initial: InitialVolume | None = None, object_motion: ObjectMotion | None = None,
     of_preprocessing: Collection[str] = (),
 ) -> RunPlan:
-    """Returns the plan of a run: ``values`` by name over the method's preset.
+    """Returns the plan of a run: the method's preset with changes ``values``, by name.
 
     A name that both the method and the preprocessing have is the method's, except for names in ``of_preprocessing``. Raises
     InputError for a method, preset, option or value that does not exist."""

@@ -19,7 +19,7 @@ from phyradgs_cl.prepare.step import Facts
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.text import each_warning_once, flag_of
 
-MOST_HELD_OUT = 50.0
+MOST_HELD_OUT = 50.0  # largest percentage of pixels that ``holdout`` may hide
 _HOLDOUT = "Pixels hidden from the method, to measure its error on them."
 _DOUBT = "Run twice more, for an error bar of every voxel: dataset doubt of the volume file (docs: methods.md)."
 
@@ -63,7 +63,7 @@ def prepared(scan: Scan, options: Preprocessing, rt: Runtime | None = None) -> S
 
 
 def stages(scan: Scan, options: Preprocessing, rt: Runtime) -> Iterator[tuple[str, Scan, Facts]]:
-    """Yields (name, scan, numbers) before the steps of ``options`` and after each step."""
+    """Yields (name, scan, numbers): the scan before the steps of ``options``, then each step's name, result and numbers."""
     scan = regrid_and_remove_lag(scan, options)
     yield "", scan, {}
     yield from one_by_one(scan, options, partial(reprojection, rt))
@@ -77,7 +77,7 @@ def regrid_and_remove_lag(scan: Scan, options: Preprocessing) -> Scan:
 
 
 def reprojection(rt: Runtime | None, scan: Scan) -> Model:
-    """Returns a model of FDK with every line at the middle of its own exposure, and of projection at the same times."""
+    """Returns the reconstructions and projections that ``prepare`` calls. FDK takes each line at its mid-exposure."""
     if rt is None:
         raise InputError("--steps", "a step that reconstructs, without a device", "a Runtime", "pass one")
     from phyradgs_cl.operators import RayOperator  # imported here because methods are slow to import

@@ -1,4 +1,4 @@
-"""Frames computed from a volume, to compare with the measured ones, at held-out pixels, and for steps of ``prepare``.
+"""Computes frames from a volume to compare them with the measured frames, also at held-out pixels.
 
 Held-out pixels measure quality without a true volume, by cross-validation over pixels (Golub, Heath and Wahba, Technometrics
 21 (1979) 215, for one parameter). They are the same for all methods, options and seeds, so that errors can be compared."""
@@ -18,8 +18,8 @@ from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.runtime import Runtime
 
-TIMES_PER_LINE = 16  # a line is projected at this many times of its exposure: the error is then far below the noise
-_HOLDOUT_SEED = 20  # all runs hold out the same pixels, by this seed
+TIMES_PER_LINE = 16  # number of times of a line's exposure at which it is projected: the error is then far below the noise
+_HOLDOUT_SEED = 20  # seed that draws the held-out pixels, the same in all runs
 FRAMES_AT_A_TIME = 8  # frames are projected in groups of at most this many, to limit memory
 Image = NDArray[np.float32]
 
@@ -64,7 +64,7 @@ def frame_pairs(
     moves: Deformation | States | None = None,
 ) -> list[FramePair]:
     """Returns the frames of a scan with those computed from a volume (nz, ny, nx) in 1/mm, under the motion of gantry and
-    object. If ``moves`` is States, their volumes are used in place of ``volume``.
+    object (``moves``). If ``moves`` is States, their volumes are used in place of ``volume``.
 
     If the detector averages intensity, so do the computed frames."""
     motion = PerRow(sub_intervals=TIMES_PER_LINE)

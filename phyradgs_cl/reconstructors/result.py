@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 VolumeMap = Callable[[np.ndarray, Grid], tuple[np.ndarray, Grid]]
 """A function from a volume and its grid to another volume and grid."""
 HELD_OUT = "held_out"
-"""This key, and the next ones, are in a result's facts. Here: the error on held-out pixels."""
+"""Key of a result's facts, as are the next ones: the error on held-out pixels."""
 COMPARED = "compared"
-"""How the volume was compared with the scan's reference, if not voxel by voxel."""
+"""Key of facts: how the volume was compared with the scan's reference, if not voxel by voxel."""
 MOTION_FOUND = "motion_found"
-"""What a method has found about the motion of the object."""
+"""Key of facts: what a method has found about the motion of the object."""
 MARGIN_MM = "margin_mm"
-"""The width (z, y, x) of the discarded margin."""
+"""Key of facts: the width (z, y, x) in mm of the margin around the volume that was reconstructed and discarded."""
 DOUBT = "doubt"
-"""Facts about the error bars, and in which of their runs they were interrupted."""
+"""Key of facts about the error bars, or about which of their runs was interrupted."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,8 +42,8 @@ class Reconstruction:
     """A volume (nz, ny, nx) float32 in 1/mm on ``grid``, whose lengths are in mm.
 
     - gaussians: the cloud in mm, for methods that have one. record: the convergence record, one dict per line.
-    - facts: what is needed to make it again (method, options, scales, seconds).
-    - state: from where an interrupted run resumes.
+    - facts: what is needed to repeat the reconstruction (method, options, scales), and its seconds.
+    - state: the arrays from which an interrupted run resumes.
     - deformation: how the object moves, for ``moving``, whose volume is its reference state.
     - states: the object at some times, for ``changing``, whose volume is their mean.
     - doubt: σ (nz, ny, nx) in 1/mm of the volume's errors (docs/methods.md#error-bars).
@@ -202,8 +202,8 @@ class Progress:
     def mapped(
         self, state: "Callable[[State], State] | None" = None, volume: "VolumeMap | None" = None, **changes: Any
     ) -> "Progress":
-        """Returns the report with other fields. ``state`` and ``volume`` change the results of the report's functions of
-        that name."""
+        """Returns the report with ``changes`` of its fields. ``state`` and ``volume``, if given, change what the report's
+        own functions of that name return."""
         own_state, own_volume = self.state, self.volume
         if state is not None and own_state is not None:
             changes["state"] = lambda: state(own_state())

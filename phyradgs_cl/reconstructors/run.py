@@ -44,13 +44,13 @@ from phyradgs_cl.text import each_warning_once
 
 log = logging.getLogger(__name__)
 
-# Most volumes that each voxel method holds in memory, two of them for the intensity model (docs/large.md).
-# Besides, they hold _STACKS arrays of all frames, and need one buffer of _ONE_BUFFER volumes.
+# Most volumes that each voxel method holds in memory at one time, two of them for the intensity model (docs/large.md).
+# The methods also hold _STACKS arrays of all frames, and need one buffer of _ONE_BUFFER volumes.
 _HELD = {"sirt": 8, "sart": 28, "os-sart": 28, "cgls": 11, "asd-pocs": 32, "fista-tv": 16}
 _HELD |= {"fista": 20, "moving": 28}
 _STACKS, _ONE_BUFFER = 12, 3
 _OF_OTHERS = 4  # memory of other methods in volumes: the result, and copies in which it is made, checked and written
-_DEVICE_SHARE = 0.9
+_DEVICE_SHARE = 0.9  # fraction of the device's memory limit that a proposed --size may fill
 _ROUND = 8  # a proposed --size is rounded down to a multiple of this
 
 
@@ -128,7 +128,7 @@ class _Prepared:
         self.box = None if preprocessing.margin_mm is None else preprocessing.of(scan.grid)
 
     def shown(self, progress: Progress) -> Progress:
-        """Returns a report with the run's identity in its states, with frames, and with volumes without the margin."""
+        """Returns progress with the run's identity in its state, with frames, and with its volume without the margin."""
         progress = progress.mapped(state=lambda state: with_identity(state, self.identity()))
         if progress.volume is not None and self.rt.ranks.size == 1:  # several ranks can only project together
             whole = cache(progress.volume)
@@ -170,7 +170,8 @@ def _with_defaults(identity: dict[str, Any]) -> dict[str, Any]:
 
 
 def _initial(plan: RunPlan, initial: InitialVolume, grid: Grid) -> np.ndarray:
-    """Returns the first volume on the scan's ``grid``. Raises InputError for a method that cannot start from one."""
+    """Returns the first volume, resampled onto the scan's ``grid``. Raises InputError for a method that cannot start from
+    one."""
     check_able("--initial", plan.method, "takes_initial", "a method that starts from a volume", "leave --initial out")
     if initial.grid == grid:
         return initial.values
@@ -182,7 +183,7 @@ def _initial(plan: RunPlan, initial: InitialVolume, grid: Grid) -> np.ndarray:
 
 
 def _with_metal(result: Reconstruction, metal: Metal) -> Reconstruction:
-    """Puts the metal that ``prepare`` found into the result's volume and states; Gaussians get none."""
+    """Puts the metal that ``prepare`` has found into the result's volume and states, in place; not into its Gaussians."""
     amount, _ = resampled((metal.values != 0).astype(np.float32), metal.grid, result.grid)
     values, _ = resampled(metal.values, metal.grid, result.grid)
     inside = amount >= 0.5
@@ -193,7 +194,7 @@ def _with_metal(result: Reconstruction, metal: Metal) -> Reconstruction:
 
 
 def _check_margin(plan: RunPlan) -> None:
-    """Raises InputError for a method in which voxels outside the box do not help those inside."""
+    """Raises InputError for a margin with a method in which voxels outside the box do not help the voxels inside."""
     if (way := getattr(plan.options, "extrapolate", None)) not in (None, "reprojected"):
         found = f"--method {plan.method_name} with extrapolate={way}, whose voxels do not depend on each other"
         remedy = "add --set extrapolate=reprojected, or leave it out"
@@ -201,7 +202,7 @@ def _check_margin(plan: RunPlan) -> None:
 
 
 def _within(volume: np.ndarray, grid: Grid, box: Grid) -> tuple[np.ndarray, Grid]:
-    """Returns the part of a volume (nz, ny, nx) that lies in the box; its voxels may be coarser than the box's."""
+    """Returns the part of a volume (nz, ny, nx) that lies in the box. Voxels may be coarser than those of the box."""
     if (part := shared_slices(grid, box)) is None:
         return volume, grid
     inner = volume[part]
@@ -222,7 +223,7 @@ def _check_ranks(method: str, rt: Runtime) -> None:
 
 @contextmanager
 def _naming_size_that_fits(rt: Runtime, scan: Scan, plan: RunPlan) -> Iterator[None]:
-    """Adds to a shortage of memory the ``--size`` that fits, if one does, and the size of the grid with its margin.
+    """Adds to an OutOfMemoryError the ``--size`` that would fit, if there is one, and the size of the grid with its margin.
 
     Raises OutOfMemoryError at once for a volume that this machine cannot hold."""
     size = _size_that_fits(rt, scan, plan.method_name, plan.options)
@@ -243,7 +244,7 @@ def _naming_size_that_fits(rt: Runtime, scan: Scan, plan: RunPlan) -> Iterator[N
 
 
 def _size_that_fits(rt: Runtime, scan: Scan, method: str, options: Any) -> int:
-    """Returns for how many voxels along the grid's longest side the memory suffices; 0 if unknown."""
+    """Returns the number of voxels along the grid's longest side for which the memory suffices; 0 if it is unknown."""
     free, held = HOST_SHARE * free_bytes(), _HELD.get(method)
     voxels = (free - scan.projections.nbytes) / (4 * _OF_OTHERS)
     if held is not None:

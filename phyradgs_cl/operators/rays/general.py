@@ -14,7 +14,7 @@ from phyradgs_cl.runtime.layout import GUARD
 _BRICK = (32, 32, 8)
 _SMALL_BRICK = (24, 24, 8)  # takes 27 kB, for devices with only the 32 kB of local memory that OpenCL guarantees
 _BLOCK = 4  # on a GPU, each work-group sums for a cube of this side (less along z if groups are small), in voxels
-_SAMPLES_PER_VOXEL = 4  # estimated number of samples of rays, per pose, that touch a voxel
+_SAMPLES_PER_VOXEL = 4  # estimated number of ray samples from one pose that touch a voxel
 _LONG_FROM = 2**31  # a volume with this many floats needs indices of 64 bits
 
 
@@ -22,8 +22,8 @@ def launch_forward(
     rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, volume: DeviceArray,
     frames: DeviceArray, *, add: bool = False,
 ) -> None:
-    """Projects a padded volume, or a brick of one, to padded frames with the numbers ``frame_list``. add: adds to frames, as
-    all bricks after the first must; else overwrites them."""
+    """Projects a padded volume, or a part of one (brick), to padded frames, those numbered ``frame_list``. add: adds to
+    these frames, as all bricks after the first must; else overwrites them."""
     blocks = ceil_div(layout.width, rt.lanes)
     kernel = rt.kernel("rays", "rays_forward", **_defines(layout, cells))
     items = blocks, layout.lines, frame_list.size
@@ -38,7 +38,7 @@ def launch_adjoint(
     rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, frames: DeviceArray,
     volume: DeviceArray, *, add: bool = False,
 ) -> None:
-    """Backprojects padded frames, with the numbers ``frame_list``, to a padded volume. add: adds to the volume's values."""
+    """Backprojects padded frames, those numbered ``frame_list``, to a padded volume. add: adds to its values."""
     owned, kernel = _owners(rt, layout, cells)
     nz, ny, nx = layout.brick.shape
     columns, rows, slices = (ceil_div(n, side) for n, side in zip((nx, ny, nz), owned, strict=True))

@@ -54,7 +54,7 @@ class IntensityOperator:
 
     @property
     def holds(self) -> tuple[int, int]:
-        """How many volumes, and how many stacks of frames, are on the device besides ``memory``, such as each layer's line
+        """The numbers of volumes and of arrays of all frames on the device besides ``memory``, such as each layer's line
         integrals and weights."""
         return 2, 2 * len(self._operators) + 3
 
@@ -93,8 +93,8 @@ class IntensityOperator:
         return cast(SameArray, self._given(total, out))
 
     def subset(self, frames: Sequence[int]) -> "IntensityOperator":
-        """Returns the operator to some of the frames, in the order given. Its J is at x = 0 until its own ``expected`` is
-        called."""
+        """Returns the operator to the frames numbered ``frames``, in that order. Its J is at x = 0 until its own
+        ``expected`` is called."""
         chosen = list(frames)
         part = copy(self)
         part.frames_shape = (len(chosen), *self.frames_shape[1:])
@@ -103,7 +103,7 @@ class IntensityOperator:
         return part
 
     def _set(self, weights: list[np.ndarray]) -> None:
-        """Sets the weights of each layer, (F, lines, 1) or (F, 1, lines), and J to the derivative at x = 0."""
+        """Sets the weights w_k of each layer k, (F, lines, 1) or (F, 1, lines), and J to the derivative at x = 0."""
         self._weights = weights
         self._line_weights: list[DeviceArray] = []
         self._shares = []

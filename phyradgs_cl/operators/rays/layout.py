@@ -1,4 +1,5 @@
-"""Layout of volumes, frames and time cells in device memory for the ray-driven projector (cl/common/ray.h).
+"""Layout of volumes, frames and time cells (poses with lines) in device memory for the ray-driven projector
+(cl/common/ray.h).
 
 A detector that averages intensities needs separate line integrals for each time cell of a line. ``layered`` divides the
 cells into layers, in which every line has at most one cell."""
@@ -17,9 +18,9 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
 _RAY_CELL_FLOATS = 16  # number of floats of a time cell in ``ray_constants``
-BORDER = 1  # width of the zeros around a volume in y and z, in voxels: samples at its faces need no test
-_UPRIGHT = 1e-6  # voxels by which a column of pixels may lean
-_WIDEST = 16  # width of the widest vector, which may read beyond the last cell or line
+BORDER = 1  # width in voxels of the zeros around a volume in y and z, with which samples at its faces need no test
+_UPRIGHT = 1e-6  # a column of pixels counts as upright if it leans by at most this many voxels
+_WIDEST = 16  # number of elements in the widest vector, which may read beyond the last cell or line
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class RayLayout:
         return cls(grid, *Readout(own).shape(shape), whole(grid.shape), subrays, own, is_across)
 
     def of(self, brick: Brick) -> "RayLayout":
-        """Returns the memory layout for the same frames and another brick of the grid."""
+        """Returns the memory layout for the same frames and another part (brick) of the grid."""
         return replace(self, brick=brick)
 
     @property
@@ -82,7 +83,7 @@ class RayLayout:
 
     @property
     def frames_strides(self) -> Strides:
-        """The strides in floats of a stack of padded frames (F, lines, width)."""
+        """The strides in floats of a stack of padded frames (F, lines, width), from frame to frame and from line to line."""
         row = pitch_of(self.width)
         return Strides(GUARD, self.lines * row, row)
 
@@ -122,7 +123,7 @@ class RayLayout:
 
 @dataclass(frozen=True, eq=False)
 class RayCells:
-    """The time cells of many frames on the device, frame after frame, in the arrays that cl/rays.cl describes."""
+    """The time cells (poses with their lines) of many frames on the device, in the arrays that cl/rays.cl describes."""
 
     cells: DeviceArray
     cell_lines: DeviceArray
@@ -134,7 +135,7 @@ class RayCells:
     weight_at: DeviceArray
     is_parallel: bool
     is_across: bool
-    upright: int  # UPRIGHT in cl/rays_adjoint_gpu.cl
+    upright: int  # whether pixels lie in columns along z, as ``_upright`` tells
     most_per_line: int  # largest number of cells that serve the same line of a frame
 
     @classmethod
@@ -236,16 +237,17 @@ def voxel_matrices(pose: np.ndarray, grid: Grid, is_parallel: bool = False) -> n
 
 
 def layers(table: TimeCells) -> list[TimeCells]:
-    """Divides the cells of a frame into tables in which every line has at most one cell. Keeps their order."""
+    """Divides the time cells of a frame into tables in which every line has at most one cell. Keeps their order."""
     numbers = table.layer_numbers
     return [some_cells(table, np.flatnonzero(numbers == k)) for k in range(int(numbers.max()) + 1)]
 
 
 def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np.ndarray]]:
-    """Divides the cells of F frames into layers. Returns the tables of each layer with weights of 1, and the weights.
+    """Divides the time cells of F frames into layers, in which a line has at most one cell. Returns the tables of each layer
+    with weights of 1, and the weights.
 
-    The weights of a layer are float32, (F, lines, 1) or (F, 1, lines) by the axis of readout, and 0 for lines without a
-    cell in it."""
+    The weights of a layer are float32, (F, lines, 1) or (F, 1, lines) by the axis of readout, and 0 for lines without a cell
+    in it."""
     split = [layers(table) for table in tables]
     ones, weights = [], []
     for k in range(max(len(parts) for parts in split)):
@@ -257,7 +259,7 @@ def layered(tables: Sequence[TimeCells]) -> tuple[list[list[TimeCells]], list[np
 
 
 def some_cells(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells:
-    """Returns a table of only the time cells with the numbers ``cells``, which must be still."""
+    """Returns a table of only the time cells numbered ``cells``. All must be still: one pose each."""
     names = ["pose", "time_s", "line_start", "line_stop", "weight"]
     names += [] if table.line_share is None else ["line_share"]
     return replace(table, **{name: getattr(table, name)[cells] for name in names})

@@ -17,7 +17,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, pad_rows, unpad_row
 
 _FRAMES_SHARE = 0.25  # fraction of the free device memory for a batch of frames if the volume does not fit as a whole
 _SLOTS_SHARE = 0.125  # fraction of the free device memory for slots
-_MOST_SLOT_FLOATS = 2**26  # most floats of all slots at a time: more was not faster
+_MOST_SLOT_FLOATS = 2**26  # most floats that all slots take at one time: more was not faster
 
 
 class RayMemory:
@@ -43,8 +43,8 @@ class RayMemory:
         self._padded: dict[tuple[int, int, int], np.ndarray] = {}
 
     def plan(self, share: float = 1.0) -> list[Brick]:
-        """Returns the bricks of the volume. A ``share`` below 1 makes new ones, for that fraction of the free memory. Raises
-        OutOfMemoryError if no brick fits."""
+        """Returns the bricks (parts) of the volume. A ``share`` below 1 makes new ones, for that fraction of the free
+        memory. Raises OutOfMemoryError if no brick fits."""
         if not self._bricks or share < 1:
             self.release()
             self._bricks, self._batch = self._planned(share)
@@ -96,7 +96,7 @@ class RayMemory:
         return cut(layout.grid.shape, steps, needs, room, share), frames
 
     def batches(self, count: int) -> Iterator[slice]:
-        """Yields slices of consecutive frames that fit on the device together."""
+        """Yields slices of the first ``count`` frames. The frames of a slice fit on the device together."""
         self.plan()
         for start in range(0, count, self._batch):
             yield slice(start, min(start + self._batch, count))
@@ -114,7 +114,7 @@ class RayMemory:
         return True
 
     def volume(self, brick: Brick) -> tuple[RayLayout, DeviceArray]:
-        """Returns the layout of a brick, and memory for it with undefined values."""
+        """Returns the layout of a brick (part of the volume), and memory for it with undefined values."""
         if self._volume is None:
             largest = self._bricks[0]
             self._volume = self.rt.zeros(self.layout.of(largest).volume_floats)
@@ -125,7 +125,7 @@ class RayMemory:
         return layout, DeviceArray(self._volume.buffer, (layout.volume_floats,), self._volume.dtype)
 
     def write_volume(self, volume: Array, brick: Brick) -> tuple[RayLayout, DeviceArray]:
-        """Copies a brick of a volume (nz, ny, nx) to the device. Returns its layout and the padded copy.
+        """Copies a brick (part) of a volume (nz, ny, nx) to the device. Returns the brick's layout and the padded copy.
 
         The padded array on the host is kept for the next call: allocating it takes longer than the copy."""
         layout, on_device = self.volume(brick)
@@ -145,7 +145,7 @@ class RayMemory:
         return layout, on_device
 
     def read_volume(self, layout: RayLayout, on_device: DeviceArray, result: Array) -> None:
-        """Copies a padded brick from the device into the volume ``result`` (nz, ny, nx)."""
+        """Copies a padded brick (part) from the device into the volume ``result`` (nz, ny, nx)."""
         brick = layout.brick
         if isinstance(result, DeviceArray):
             plain = Strides.plain(result.shape, brick.start)
@@ -155,7 +155,7 @@ class RayMemory:
 
     @property
     def has_columns(self) -> bool:
-        """Whether the transposed volume fits in addition to the volume. Known after ``plan``."""
+        """Whether a transposed copy of the volume fits on the device beside the volume. Known after ``plan``."""
         return self._columns_bytes > 0
 
     def turned(self, volume: Array) -> DeviceArray:
@@ -180,7 +180,7 @@ class RayMemory:
         return 2 * GUARD + self.slot_frames * self.slot_floats if self.slot_frames else 0
 
     def frames(self, count: int) -> DeviceArray:
-        """Returns memory for ``count`` frames of a batch, with undefined values."""
+        """Returns memory for ``count`` padded frames, with undefined values."""
         return self._some_frames(self.layout.frames_floats(count))
 
     def _some_frames(self, floats: int) -> DeviceArray:

@@ -51,9 +51,9 @@ class RayOperator:
 
     NumPy arrays give NumPy arrays; device arrays (not padded, float32) give device arrays. ``out``, of the same kind,
     receives the result. detector_shape: (rows, columns). tables: the time cells of each frame, all read along one axis.
-    memory: buffers to share with other operators. Operators that share them, and subsets of an operator, must be used one
-    at a time. fewest_lines: the upright kernels are used if a pose serves as many lines on average (``upright_of``).
-    ``FEWEST_LINES`` is fastest for panels with few lines; its results differ by rounding. subrays: the numbers of rays of a
+    memory: buffers to share with other operators. Operators that share them, and subsets of an operator, must be used one at
+    a time. fewest_lines: the upright kernels are used if a pose serves at least this many lines on average (``upright_of``).
+    ``FEWEST_LINES`` is fastest for panels with few lines, and changes results by rounding. subrays: the numbers of rays of a
     pixel along (v, u), see ``subrays_of``. A given ``memory`` determines them instead.
 
     Joseph, IEEE Trans. Med. Imaging 1 (1982) 192. Raises InputError for tables that do not fit the detector."""
@@ -122,7 +122,7 @@ class RayOperator:
         return self._upright is not None and self.memory.slot_frames > 0
 
     def _forward_upright(self, columns: DeviceArray, part: slice, frames: DeviceArray) -> None:
-        """Projects a volume transposed to ``columns`` (y, x, z) to the frames ``part``, in the padded layout."""
+        """Projects a volume transposed to ``columns`` (y, x, z) to the frames ``part``, whose rows are padded."""
         assert self._upright is not None and self._poses is not None
         layout = self.memory.layout
         start, *steps = layout.pixel_strides(self._axis)
@@ -209,7 +209,7 @@ class RayOperator:
         self._slots: dict[tuple[int, int], Slots] = {}
 
     def _listed(self, part: slice) -> DeviceArray:
-        """Returns the numbers that this operator's frames ``part`` have in the scan. Uploads them to the device once."""
+        """Returns, on the device, the numbers in the scan of this operator's frames ``part``. They are uploaded once."""
         key = part.start, part.stop
         if key not in self._lists:
             self._lists[key] = self.rt.upload(self._chosen[part], np.int32)

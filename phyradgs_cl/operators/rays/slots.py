@@ -16,15 +16,15 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pitch_of
 
 _SLOT_INTS, _SHARE_INTS = 8, 4  # integers per slot (cl/common/ray_column.h) and per share (cl/rays_slots.cl)
-_SAME_POSE = 10  # poses, divided by the largest number in any, are the same if they agree to this many decimals
+_SAME_POSE = 10  # decimals to which two poses, divided by the largest number in any, must agree to count as the same
 
 
 @dataclass(frozen=True, eq=False)
 class UprightPoses:
-    """The distinct poses of F frames on the device, and which of them each of the frames' E time cells has.
+    """The distinct poses of F frames on the device, and which pose each of the frames' E time cells has.
 
-    pose_of (E,): the number of a cell's pose. first, stop (E,): a cell's lines [first, stop). frame_cells (F + 1,): frame
-    f has the cells frame_cells[f] to frame_cells[f + 1] − 1."""
+    pose_of (E,): the number of a cell's pose. first, stop (E,): a cell's lines [first, stop). frame_cells (F + 1,): frame f
+    has the cells frame_cells[f] to frame_cells[f + 1] − 1."""
 
     cells: DeviceArray
     matrices: DeviceArray
@@ -57,8 +57,8 @@ class UprightPoses:
         )
 
     def floats_per_frame(self, detector_shape: tuple[int, int], leans: bool) -> int:
-        """Returns the most floats that a frame's slots need: line integrals and, if columns lean, the rays' slopes along
-        z."""
+        """Returns the most floats that the slots (buffers, one per pose) of a frame need: line integrals and, if columns
+        lean, the rays' slopes along z."""
         rows, columns = detector_shape
         widest = int((self.stop - self.first).max())
         each = columns * pitch_of(widest) if self.axis == "rows" else widest * pitch_of(rows)
@@ -113,8 +113,8 @@ class UprightPoses:
         return table
 
     def _shares(self, cells: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Returns the shares (E, 4), each a cell's part in a frame: number of its slot or frame (``of``), lines [first,
-        stop), and where its weights begin in ``RayCells``."""
+        """Returns the shares (E, 4). A share is a cell's part in a frame: number of its slot or frame (``of``), lines
+        [first, stop), and where its weights begin in ``RayCells``."""
         begins = np.concatenate([[0], np.cumsum(self.stop - self.first)])
         return np.stack([of, self.first[cells], self.stop[cells], begins[cells]], -1)
 
@@ -125,8 +125,8 @@ def _largest(table: np.ndarray) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """The slots of some frames on the device, as the arrays that cl/rays_slots.cl describes. columns, rows: the size in
-    pixels of every slot, as large as the largest needs."""
+    """The slots (buffers, one per pose) of some frames on the device, as the arrays that cl/rays_slots.cl describes.
+    columns, rows: the size in pixels of every slot, as large as the largest needs."""
 
     slots: DeviceArray
     frame_shares: DeviceArray
@@ -143,7 +143,7 @@ class Slots:
 
     @property
     def pitch(self) -> int:
-        """The floats from one detector column of a slot to the next."""
+        """The number of floats from one detector column of a slot to the next."""
         return pitch_of(self.rows)
 
     @property
@@ -164,8 +164,8 @@ def merge_slots(
     rt: Runtime, cells: RayCells, slots: Slots, integrals: DeviceArray,
     target: tuple[DeviceArray, np.ndarray], detector_shape: tuple[int, int], axis: str,
 ) -> None:
-    """Averages the line integrals in slots to frames. target: the frames, their offset, and their strides to the next
-    column, row and frame, in floats."""
+    """Averages slots, the line integrals of one pose each, to frames. target: the frames, their offset, and their strides to
+    the next column, row and frame, in floats."""
     rows, columns = detector_shape
     rt.launch(
         rt.kernel("rays_slots", "merge_slots", **{**slots.defines, "LEAN": 0}),

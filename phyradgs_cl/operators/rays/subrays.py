@@ -14,11 +14,11 @@ from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
 SINGLE = (1, 1)
-_WIDEST = 1.25  # largest distance of sub-rays in the grid's middle, in voxels
+_WIDEST = 1.25  # largest distance between neighbouring sub-rays in the grid's middle, in voxels
 _FARTHEST = 1.45
 """Largest distance of rays, in voxels, without sub-rays. A common scanner with as many voxels as pixels has 1.43. The volume
 of least norm that fits such rays loses 4 % of its density at 1.5, 16 % at 1.9, and half at 2, where rays may miss voxels."""
-# Largest distance of rays without sub-rays if a method begins with the object's density: voxels without a ray keep it.
+# Largest distance between rays, in voxels, if a method begins with the object's density: voxels without a ray keep it.
 _FARTHEST_OF_DENSE = 2.0
 _ROUNDING = 1e-3  # a distance may exceed its limit by this fraction, so that rounding does not add rays
 _MOST = 8  # most sub-rays of a pixel along an axis: enough where single rays are 10 voxels apart
@@ -70,7 +70,7 @@ def spread(frames: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
 def launch_means(
     rt: Runtime, fine: DeviceArray, strides: Sequence[int], subrays: tuple[int, int], frames: DeviceArray, part: slice
 ) -> None:
-    """Writes the means over sub-rays, B y, of padded frames ``fine`` to the frames ``part`` of ``frames`` (F, rows,
+    """Writes the means over sub-rays, B y, of padded frames y, ``fine``, to the frames ``part`` of ``frames`` (F, rows,
     columns)."""
     _, rows, columns = frames.shape
     rt.launch(

@@ -18,11 +18,11 @@ from phyradgs_cl.operators.rays.slots import Slots, UprightPoses
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
-_LINES = 128  # most pixels of a detector column per work-item
+_LINES = 128  # most pixels of a detector column that one work-item projects
 # Least number of lines that a pose must serve on average: with fewer, slots cost more time than they save.
 FEWEST_LINES = 8
 _VOXELS = 512  # most voxels along z that the rays of a work-item may meet in one plane of voxels
-# Boxes of voxels (x, y, z) that a work-item of the adjoint may sum: the largest is fastest, as neighbours share rays.
+# Boxes of voxels (x, y, z) that a work-item of the adjoint may sum: the largest is fastest, as its voxels share rays.
 _OWNED = ((16, 16, 128), (8, 8, 128), (8, 4, 128))
 _ITEMS_PER_UNIT = 4  # wanted work-items per compute unit: with fewer, some units would wait long for the last item
 _UPRIGHT = 1e-6  # a column of pixels does not lean if x and y change by at most this many voxels over the detector
@@ -35,8 +35,8 @@ _TURN = 16  # side of the tile (x and z) that a work-item transposes, in voxels;
 
 @dataclass(frozen=True)
 class Upright:
-    """How the upright kernels are built. block: the pixels of a detector column per work-item. leans: detector columns are
-    not exactly along z. is_parallel: rays are parallel."""
+    """How the upright kernels are built. block: number of pixels of a detector column per work-item. leans: detector columns
+    are not exactly along z. is_parallel: rays are parallel."""
 
     block: int
     leans: bool
@@ -77,7 +77,7 @@ def upright_of(
 
 
 def _is_steep(cells: np.ndarray, rows: int, columns: int) -> bool:
-    """Returns whether z may be the main axis of any ray of the cells (C, 16)."""
+    """Returns whether z may be the main axis of any ray of ``cells``, poses (C, 16) as in ``ray_constants``."""
     d00, eu, ev = cells[:, 3:6], cells[:, 6:9], cells[:, 9:12]
     across = np.linalg.norm(ev[:, :2], axis=1)
     ends_z = [np.abs(d00 + u * eu + v * ev)[:, 2] for u in (0, columns - 1) for v in (0, rows - 1)]

@@ -5,11 +5,11 @@ import numpy as np
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime import DeviceArray, LaterItem, MemoryShortage, Runtime
 
-_CHUNK = 512  # a CPU's work-item counts the tiles of this many splats
-_GROUP = 64  # a GPU's work-group counts the tiles of this many splats
-_LARGEST_GROUP = 256  # most splats per work-group on a GPU, taken where _GROUP would give more than _MANY_COUNTS
+_CHUNK = 512  # number of splats whose tiles one work-item of a CPU counts
+_GROUP = 64  # number of splats whose tiles one work-group of a GPU counts
+_LARGEST_GROUP = 256  # most splats per work-group of a GPU, taken if _GROUP would give more than _MANY_COUNTS counts
 _MANY_COUNTS = 1 << 22  # above this many counts, tiles × work-groups, counting takes much memory and time
-_SCANNED = 64  # number of counts that a work-group adds at a time in its prefix sum
+_SCANNED = 64  # number of counts that a work-group adds at a time when it sums counts to positions
 _SLACK = 1.5  # new lists get memory for this many times the entries needed, because clouds grow
 _NEAR = 1.25  # lists with memory for less than this many times the entries needed are replaced before they overflow
 # Most tests of a splat at a pixel in a launch whose lists overflow, which tests every splat: a second on a fast GPU.
@@ -18,10 +18,10 @@ _MOST_ENTRIES = 2**31 - 1  # most entries of all lists together: kernels use 32-
 
 
 class TileLists:
-    """Builds a list, for each tile of an image or volume, of the splats whose extent touches it.
+    """Builds a list, for each tile of an image or volume, of the splats (projected Gaussians) that touch it.
 
-    tile: a tile's size in pixels or voxels along x, y, z. tiles: the number of tiles along x, y, z. Lists keep the order of
-    the splats, so that sums over them repeat bit for bit. The number of list entries is known only on the device. The host
+    tile: a tile's size in pixels or voxels along x, y, z. tiles: the number of tiles along x, y, z. A list keeps the order
+    of the splats, so that sums over it repeat bit for bit. The number of list entries is known only on the device. The host
     waits for it if the number of splats is new, ``waits`` is set, or a GPU would take long without lists. Otherwise it reads
     the number later. Until then, kernels test all splats in a tile whose list did not fit (cl/common/tile.h)."""
 
@@ -85,7 +85,7 @@ class TileLists:
 
     @staticmethod
     def bytes(rt: Runtime, tiles: int, count: int) -> int:
-        """Returns how many bytes the lists of ``count`` splats take, without their entries."""
+        """Returns how many bytes the offsets and counts of the lists of ``count`` splats take, without the entries."""
         return 4 * (tiles + 1 + tiles * max(ceil_div(count, chunk_of(rt, tiles, count)), 1))
 
     def _make_room(self, needed: int, share: float) -> None:
@@ -101,7 +101,7 @@ class TileLists:
 
 
 def chunk_of(rt: Runtime, tiles: int, count: int) -> int:
-    """Returns how many splats a CPU's work-item counts, or a GPU's work-group, whose work-items take one splat each."""
+    """Returns the number of splats that a CPU's work-item counts, or a GPU's work-group with one splat per work-item."""
     if not rt.pixel_items:
         return _CHUNK
     kernels = (rt.kernel("binning", f"bin_{step}_group") for step in ("count", "fill"))

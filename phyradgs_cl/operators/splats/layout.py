@@ -1,8 +1,8 @@
-"""Layout of Gaussians, time cells and layers of frames in device memory.
+"""Layout of Gaussians, time cells (poses with their lines) and layers of frames in device memory.
 
-A detector that averages intensities records −ln Σ w_k exp(−p_k) over the time cells k of a line. So the projector draws
-w_k p_k into a separate image ("layer") for each k, and the layers are then merged. Merging also keeps d(frame)/d(layer),
-which the adjoint needs."""
+A detector that averages intensities records −ln Σ w_k exp(−p_k) over the time cells k of a line, with weights w_k and line
+integrals p_k. So the projector draws w_k p_k into a separate image ("layer") for each k, and the layers are then merged.
+Merging also keeps d(frame)/d(layer), which the adjoint needs."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, padded_zeros, pitch_of
 
 STRIDE_OF = 16  # the number of Gaussians is padded to a multiple of this, the width of the widest vector
-CELL_FLOATS = 24  # number of floats in which cl/common/splat.h expects a time cell
+CELL_FLOATS = 24  # number of floats of a time cell, as cl/common/splat.h describes it
 
 
 @dataclass(eq=False)
@@ -61,10 +61,10 @@ class DeviceCells:
 
     - matrices: one pose per cell. If ``moving``, three: the middle and both ends.
     - line_times (C, 3, time_pitch): the integration times of the lines if ``moving``, else one element.
-    - layers, layer_weights (layers, lines): number of layers for averaging intensities, and the weights of their cells.
+    - layers: number of layers for averaging intensities. layer_weights (layers, lines): weights of the cells in each.
     - fixed_conic: ``cells`` describe the pose that gives splats their shape; ``matrices`` have that pose, then the cell's.
-    - shares (S, R), cell_states (C, poses): for an object that moves, the weights of its R displacement fields in S
-      states, and the state at each pose; else one element each."""
+    - shares (S, R), cell_states (C, poses): for an object that moves, the weights of its R displacement fields in S states,
+      and the state at each pose; else one element each."""
 
     cells: DeviceArray
     matrices: DeviceArray
@@ -164,7 +164,7 @@ def cell_constants(
 
 class Layers:
     """Memory for a frame's layers of ``lines`` × ``width`` pixels, and the kernels that merge them. unit: the line integral
-    that the value 1 in a layer stands for."""
+    for which a value of 1 in a layer stands."""
 
     def __init__(self, rt: Runtime, lines: int, width: int, unit: float) -> None:
         self.rt, self.lines, self.width, self.unit = rt, lines, width, unit

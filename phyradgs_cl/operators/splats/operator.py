@@ -31,7 +31,7 @@ _FRAMES, _VOLUME, _ROWS, _DENSITY = "frames", "volume", "rows", "density"
 
 @dataclass(eq=False)
 class SplatPoint:
-    """Gaussians in the kernels' layout. norms (stride,): the lengths of their quaternions before these were normalised."""
+    """Gaussians in the kernels' layout. norms (stride,): the lengths of their quaternions before normalisation."""
 
     gaussians: DeviceGaussians
     norms: DeviceArray
@@ -52,7 +52,7 @@ class PlainRows:
         self._copy = rt.kernel("splat_plain", "row_copy")
 
     def enter(self, rows: DeviceArray) -> SplatPoint:
-        """Returns a copy of parameter rows (11, G) float32 in the kernels' layout."""
+        """Returns a copy of parameter rows (11, G) float32, in the kernels' units and padded."""
         rt, count = self.rt, rows.shape[1]
         stride = stride_of(count)
         inside, norms = rt.empty((ROWS, stride)), rt.empty(stride)
@@ -99,7 +99,7 @@ class PlainImages:
         self._image: DeviceArray | None = None
 
     def enter(self, images: DeviceArray, number: int = 0) -> DeviceArray:
-        """Returns image ``number`` of the stack ``images`` in the padded layout. The memory is valid until the next call."""
+        """Returns image ``number`` of the stack ``images`` with padded rows. The memory is valid until the next call."""
         if self._image is None:
             self._image = padded_zeros(self.rt, *self._by_line[1:])
         source, target = (images, self._place(number)), (self._image, self._padded)
@@ -124,7 +124,7 @@ class GaussianOperator(Operator):
         super().__init__(rows.rt, (_ROWS, (ROWS, None)), range_, self._at_rows, **parts)
 
     def forward(self, point: SplatPoint) -> DeviceArray:
-        """Applies the operator to Gaussians in the kernels' layout. Returns y float32."""
+        """Applies the operator to the Gaussians ``point``, in the kernels' layout. Returns y float32 on the device."""
         raise NotImplementedError
 
     def back(self, point: SplatPoint, by_y: DeviceArray) -> DeviceArray:
@@ -170,7 +170,7 @@ class SplatProjection(GaussianOperator):
         self._images = PlainImages(rt, self._projector.lines, self._projector.width, turned=readout.axis != "rows")
         self._tables = [DeviceCells.upload(rt, table.scaled(1 / length_mm)) for table in tables]
         self._poses = [table.pose[table.count // 2] for table in tables]
-        self._ready: list[object] = []  # for which Gaussians and cells the kernels' buffers are valid; parts share this list
+        self._ready: list[object] = []  # Gaussians and cells for which the kernels' buffers are valid; parts share this list
         self._detector_shape = detector_shape
         self._choose(range(len(tables)), PlainRows(rt, length_mm, line_integrals=True))
 
@@ -191,7 +191,7 @@ class SplatProjection(GaussianOperator):
     def forward(self, point: SplatPoint) -> DeviceArray:
         """Renders Gaussians to frames (F, rows, columns) float32."""
         frames = self.rt.empty((len(self._cells), *self._detector_shape))
-        self._ready.clear()  # at once, because a failure below may leave the buffers half written
+        self._ready.clear()  # cleared at once, because a failure below may leave the buffers half written
         for number, cells in enumerate(self._cells):
             self._images.leave(self._projector.forward(point.gaussians, cells), frames, number)
         self._ready[:] = point, self._cells[-1]
@@ -214,7 +214,7 @@ class SplatProjection(GaussianOperator):
         self._ready.clear()
         if not is_ready:
             see = self._projector.forward if self._is_layered else self._projector.prepare
-            see(point.gaussians, cells)  # averages of intensities need all layers, so these are drawn
+            see(point.gaussians, cells)  # averages of intensities need all layers, so ``forward`` draws them
         self._projector.backward(point.gaussians, cells, by_image, gradients)
 
     def by_poses(self, gaussians: Any, by_frames: Any) -> np.ndarray:
@@ -233,7 +233,7 @@ class SplatProjection(GaussianOperator):
             turn, along, across = by_pose(rows[:, : cloud.count], by_rows)
             shifts = [across / (self._projector.lines / 2), along / (self._projector.width / 2)]
             found[number] = turn, *(shifts[::-1] if self._images.turned else shifts)
-            if not (self._affine or cells.is_parallel):  # there all rays count as equally long
+            if not (self._affine or cells.is_parallel):  # with these, all rays count as equally long
                 found[number, 1:] += by_length(self._poses[self._chosen[number]], weighed[number])
         return found
 
@@ -267,7 +267,7 @@ class VoxelOperator(GaussianOperator):
         self._inside = grid.scaled(1 / length_mm)
         self._voxeliser = Voxeliser(rt, grid.shape, cutoff_sigma=cutoff_sigma)
         self._images = PlainImages(rt, nz * ny, nx)
-        self._ready: list[object] = []  # for which Gaussians the kernels' buffers are valid
+        self._ready: list[object] = []  # Gaussians for which the kernels' buffers are valid
 
     def forward(self, point: SplatPoint) -> DeviceArray:
         """Returns the volume (nz, ny, nx) float32 of Gaussians."""
@@ -310,7 +310,7 @@ def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, floa
 
 
 def by_length(pose: np.ndarray, weighed: np.ndarray) -> np.ndarray:
-    """Returns the part (2,) of dL/d(panel shift), per pixel along columns and rows, that comes from the lengths of rays.
+    """Returns the part (2,) of dL/d(panel shift), per pixel along v and u, that comes from the lengths of rays.
 
     Line integrals are proportional to these lengths. pose (12,) mm; weighed (rows, columns): frame × dL/d(frame)."""
     source, first, column, row = pose.reshape(4, 3)

@@ -17,29 +17,29 @@ from phyradgs_cl.operators.splats.states import CloudStates
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
-RECORD_FLOATS = {False: 16, True: 20}  # floats of a splat in a time cell, by whether poses move within the cell
-DEFAULT_TIME_ERROR = 0.005  # largest relative RMS error of averages over an exposure
+RECORD_FLOATS = {False: 16, True: 20}  # floats of a splat's record in a time cell, by whether the cell is moving
+DEFAULT_TIME_ERROR = 0.005  # largest relative RMS error of averages over an exposure in moving cells, by default
 # Distance in standard deviations beyond which a Gaussian counts as 0: there it has fallen to 0.1 % of its peak.
 DEFAULT_CUTOFF_SIGMA = 3.7
 _BAND_LINES = 8  # number of detector lines of a tile on a CPU
-_TILE, _PARTS = 8, 4  # on a GPU: the side of a tile in pixels, and most work-items that share a pixel
+_TILE, _PARTS = 8, 4  # on a GPU: the side of a tile in pixels, and the most work-items that share a pixel
 GROUP_DEFINES = {False: {"GROUP": 1, "ACROSS": 1}, True: {"GROUP": 32, "ACROSS": 8}}
 """Build options of the adjoint, by ``Runtime.pixel_items``: the work-items per Gaussian, and how many lie along a line."""
 
 
 def items_by_gaussian(rt: Runtime, count: int) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Returns work-items and work-group, both (x, y), of kernels that sum over the pixels of each of ``count`` Gaussians."""
+    """Returns the numbers of work-items and the work-group's sides, (x, y) each, for kernels that sum per Gaussian."""
     items, across = (GROUP_DEFINES[rt.pixel_items][name] for name in ("GROUP", "ACROSS"))
     return (count * across, items // across), ((across, items // across) if items > 1 else (16, 1))
 
 
 def path_limits(time_error: float) -> tuple[float, float, float]:
-    """Returns how far a splat may move during a line's exposure, in widths of the splat, for 1, 2 and 3 sample times.
+    """Returns how far a splat may move during a line's exposure, in widths of the splat, if that has 1, 2 or 3 sample times.
 
-    The exposure is integrated by Gauss–Legendre rules. Their errors are at most path²/24, path⁴/1440 and path⁶/134400 of
-    the peak, because the 2nd, 4th and 6th derivatives of exp(−x²/2) are at most 1, 3 and 15. An error of 2 ``time_error``
-    in the worst pixel means a relative RMS error of about ``time_error``. Longer paths are integrated in closed form, which
-    loses digits for paths below 0.7."""
+    The exposure is integrated by Gauss–Legendre rules. Their errors are at most path²/24, path⁴/1440 and path⁶/134400 of the
+    peak, because the 2nd, 4th and 6th derivatives of exp(−x²/2) are at most 1, 3 and 15. An error of 2 ``time_error`` in the
+    worst pixel means a relative RMS error of about ``time_error``. Longer paths are integrated in closed form, which loses
+    digits for paths below 0.7."""
     worst = 2 * time_error
     one, two, three = (24 * worst) ** (1 / 2), (1440 * worst) ** (1 / 4), (134400 * worst) ** (1 / 6)
     return one, two, max(three, 0.7)
@@ -47,7 +47,7 @@ def path_limits(time_error: float) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class _Kernels:
-    """The four kernels, built for splats that rest in a cell, that move in it, or of which only the centres move."""
+    """The projector's four kernels, built for splats that rest in a time cell, move in it, or move only their centres."""
 
     prepare: Kernel
     forward: Kernel
@@ -115,13 +115,13 @@ class SplatProjector:
         return np.array([*path_limits(self.time_error), 0], np.float32)
 
     def forward(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
-        """Renders the merged frame in the padded layout. Its memory is valid until the next call."""
+        """Renders the frame, merged over all time cells, with padded rows. Its memory is valid until the next call."""
         self.draw(gaussians, cells)
         return self.merge(cells)
 
     def draw(self, gaussians: DeviceGaussians, cells: DeviceCells) -> DeviceArray:
-        """Renders the layers of a frame in the padded layout, or the frame itself if line integrals are averaged. The layers
-        of several clouds may be added before ``merge``."""
+        """Renders the layers of a frame with padded rows, or the frame itself if line integrals are averaged. The layers of
+        several clouds may be added before ``merge``."""
         rt, kernel = self.rt, self._kernels[cells.moving, cells.fixed_conic, cells.is_parallel].forward
         items: int | tuple[int, ...] = self.lists.total
         group: int | tuple[int, ...] = 1
@@ -156,8 +156,8 @@ class SplatProjector:
     def backward(
         self, gaussians: DeviceGaussians, cells: DeviceCells, by_image: DeviceArray, gradients: DeviceArray
     ) -> None:
-        """Writes dL/d(parameters) into ``gradients`` (13, stride), with rows as in cl/common/gradient.h, from dL/d(frame) in
-        the padded layout.
+        """Writes dL/d(parameters) into ``gradients`` (13, stride), with rows as in cl/common/gradient.h, from dL/d(frame)
+        with padded rows.
 
         Call ``prepare`` or ``forward`` with the same Gaussians and cells before each call, because their results are
         overwritten."""

@@ -15,14 +15,14 @@ from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 
 STATE_ROWS = 12  # numbers of a Gaussian in a state: its centre x, y, z, and the 3 × 3 matrix that deforms its shape
 _PROBED_SIDE = 9  # number of points along each axis of the grid at which the inverse of a field is checked
-_PROBED_STATES = 16  # number of evenly spaced times at which the inverse is checked, besides those of largest displacement
-_WRONG = 0.01  # largest accepted error of an inverse, in voxels
+_PROBED_STATES = 16  # number of even times at which a field's inverse is checked, besides those of largest displacement
+_WRONG = 0.01  # largest accepted error of a field's inverse, in voxels
 _BEND = 0.25  # largest deviation of a point's path in a segment from a straight line, in voxels; the blur is 0.3 times this
-_MOST_SEGMENTS = 32  # most segments of a frame, even if paths then deviate more
+_MOST_SEGMENTS = 32  # most segments of a frame, even if paths then deviate by more than _BEND
 
 
 class CloudStates:
-    """Moves Gaussians as ``deformation`` does, to the states at a frame's times. Both have the same unit of length."""
+    """Moves Gaussians by ``deformation`` to their states at a frame's times. Both have the same unit of length."""
 
     def __init__(self, rt: Runtime, deformation: Deformation) -> None:
         self.rt, self.deformation = rt, deformation
@@ -65,8 +65,8 @@ class CloudStates:
         )  # fmt: skip
 
     def check_inverse(self, grid: Grid) -> None:
-        """Raises InputError if the field has no inverse. Tests whether some points of ``grid``, moved to some states and
-        back, return to where they were."""
+        """Raises InputError if the displacement field has no inverse. Tests whether some points of ``grid``, moved to some
+        states and back, return to where they were."""
         rt, (z, y, x) = self.rt, (np.linspace(axis[0], axis[-1], _PROBED_SIDE) for axis in grid.axes_mm())
         mean = np.stack(np.meshgrid(x, y, z, indexing="ij")).reshape(3, -1)
         rows = np.ones((11, mean.shape[1]))
@@ -89,7 +89,7 @@ class CloudStates:
 
 
 def segments_for_object(deformation: Deformation, lit_s: np.ndarray, voxel_mm: float) -> int:
-    """Returns how many segments of time a frame needs that is exposed from lit_s[0] to lit_s[1], up to ``_MOST_SEGMENTS``.
+    """Returns how many segments of time, up to ``_MOST_SEGMENTS``, a frame needs that is exposed from lit_s[0] to lit_s[1].
 
     Splats move straight in a segment, so in it no point of the object may deviate from a straight path by over 1/4 voxel."""
     for count in range(1, _MOST_SEGMENTS):

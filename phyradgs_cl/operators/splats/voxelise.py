@@ -1,4 +1,4 @@
-"""Evaluates Gaussians on a voxel grid, with the adjoint of this map."""
+"""Evaluates Gaussians at the voxel centres of a grid, and differentiates the result by their parameters."""
 
 import numpy as np
 
@@ -12,10 +12,10 @@ from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime, attempts
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
 RECORD_FLOATS = 20  # number of floats that ``voxel_prepare`` writes for each Gaussian
-SUM_FLOATS = 16  # number of floats for the sums over voxels of a Gaussian
+SUM_FLOATS = 16  # number of floats for a Gaussian's sums over its voxels
 _TILE = 8  # side of a tile in voxels; on a CPU along y and z alone
 _DEPTH = 2  # voxels along z of a GPU's work-item; DEPTH in cl/voxel_forward.cl
-_DEFAULT_BRICK_BYTES = 1 << 28  # bytes of voxels that are computed at a time
+_DEFAULT_BRICK_BYTES = 1 << 28  # most bytes of voxels that are computed at a time, by default
 
 
 class Voxeliser:
@@ -46,8 +46,8 @@ class Voxeliser:
     def forward(
         self, gaussians: DeviceGaussians, grid: Grid, start: tuple[int, int, int] = (0, 0, 0)
     ) -> DeviceArray:
-        """Evaluates the Gaussians on the voxels [start, start + shape) of ``grid``. Returns them in the padded layout, in
-        memory that is valid until the next call.
+        """Evaluates the Gaussians on the voxels [start, start + shape) of ``grid``. Returns them with padded rows, in memory
+        that is valid until the next call.
 
         The grid has the Gaussians' unit of length; ``start`` is (z, y, x). A part of a grid gets the same bits as the whole
         grid."""
@@ -68,8 +68,8 @@ class Voxeliser:
         self, gaussians: DeviceGaussians, grid: Grid, by_volume: DeviceArray, gradients: DeviceArray, *,
         add: bool, weight: float = 1.0,
     ) -> None:
-        """Writes ``weight`` × dL/d(parameters) to ``gradients`` (13, stride), or adds it, from dL/d(volume) in the padded
-        layout. Call ``forward`` or ``prepare`` with the same Gaussians before."""
+        """Writes ``weight`` × dL/d(parameters) to ``gradients`` (13, stride), or adds it, from dL/d(volume) with padded
+        rows. Call ``forward`` or ``prepare`` with the same Gaussians before."""
         rt = self.rt
         if self._sums.size < gaussians.stride * SUM_FLOATS:
             self._sums = rt.zeros(gaussians.stride * SUM_FLOATS)
@@ -149,7 +149,7 @@ def _in_bricks(
         if made is None or made.shape != brick.shape:
             made = None  # frees its memory before the next one is made
             made = Voxeliser(rt, brick.shape, cutoff_sigma=cutoff_sigma)
-            made.lists.waits = True  # lists differ from brick to brick, and the host waits for each brick anyway
+            made.lists.waits = True  # lists differ between bricks, and the host waits for each brick anyway
         part = made.forward(gaussians, grid, brick.start)
         volume[brick.box] = unpad_rows(rt.download(part), brick.shape)
     return volume

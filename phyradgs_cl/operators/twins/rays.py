@@ -17,7 +17,7 @@ from phyradgs_cl.fields.gaussians import MEAN
 from phyradgs_cl.operators.rays.layout import some_cells
 from phyradgs_cl.operators.twins.splat import moving_frame, precision_matrices, splat_frame
 
-_REACH = 2  # a spline coefficient acts up to this far, in voxels; points further outside the volume have the value 0
+_REACH = 2  # distance in voxels up to which a spline coefficient acts; points further outside the volume have the value 0
 _BORDER = 4  # width in voxels around the volume in which spline coefficients are kept
 Volume = np.ndarray
 
@@ -185,8 +185,8 @@ def detector_position(
 def _seen(
     frame: np.ndarray, u: np.ndarray, ahead: np.ndarray, depth: np.ndarray, power: int, speed_power: int
 ) -> float:
-    """Returns the contribution of a frame to one voxel. u, ahead, depth (lines,), by the pose of each line: the voxel's
-    pixel along the line, the line onto which it is projected minus the pose's own line, and its depth."""
+    """Returns what a frame adds to one voxel. u, ahead, depth (lines,), in the pose of each line: the voxel's pixel along
+    the line, the line onto which it is projected minus the pose's own line, and its depth."""
     crossing = np.flatnonzero((ahead[:-1] >= 0) & (ahead[1:] <= 0))
     if crossing.size == 0 or depth.min() <= 0:
         return 0.0
@@ -248,7 +248,7 @@ def _taps(displacement: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, ...], np
 
 
 def moved_rows(rows: np.ndarray, deformation: Deformation, weights: np.ndarray) -> np.ndarray:
-    """Returns parameter rows (11, G) of a reference's Gaussians in the state with field weights (R,). Densities stay."""
+    """Returns the parameter rows (11, G) of Gaussians moved from the reference to the state with field weights (R,)."""
     mean = rows[MEAN].T + deformation.inverse_mm(rows[MEAN].T, weights)
     for _ in range(2):  # Newton's method: central differences of frames need more digits
         off = mean + deformation.displacement_mm(mean, weights) - rows[MEAN].T

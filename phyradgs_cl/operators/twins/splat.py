@@ -1,8 +1,9 @@
 """Float64 twins of the projector of Gaussians, at rest or moving during a segment of time, and of their voxelisation.
 
 At rest a Gaussian is integrated along each ray by the definition: ρ √(2π/a) exp(−½ (c − b²/a)) with the ray's direction n,
-the precision A = Σ⁻¹, a = nᵀAn, b = nᵀA(μ−s), c = (μ−s)ᵀA(μ−s). The integral is over the whole line, for Gaussians in front
-of the source. The kernel works in detector coordinates and shares no formula with this (docs/mathematics.md).
+the precision A = Σ⁻¹, a = nᵀAn, b = nᵀA(μ−s), c = (μ−s)ᵀA(μ−s), density ρ, mean μ, source s. The integral is over the whole
+line, for Gaussians in front of the source. The kernel works in detector coordinates and shares no formula with this
+(docs/mathematics.md).
 
 In motion, the definition is integrated over time numerically. In a segment a splat keeps the conic, amplitude and
 perspective factor Q of the middle time, while its centre moves on the panel along a straight line at constant speed. The
@@ -237,7 +238,7 @@ def _exponent(s: _Segment, delta: np.ndarray, at: np.ndarray, big_q: np.ndarray)
 
 
 def _nearest(s: _Segment, delta: np.ndarray, times: np.ndarray, big_q: np.ndarray) -> np.ndarray:
-    """Returns the smallest exponent q (lines, width) during each line's exposure."""
+    """Returns the smallest value of ``_exponent`` (lines, width) during each line's exposure."""
     fast = s.path @ s.conic @ s.path
     best = delta @ s.conic @ s.path / fast if fast > 0 else np.zeros(delta.shape[:2])
     first, last = (times[0] - times[1])[:, None], (times[0] + times[1])[:, None]

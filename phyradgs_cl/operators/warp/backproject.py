@@ -20,10 +20,10 @@ from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD
 
-_MOST_STEPS = 100  # most iterations that invert a displacement field
+_MOST_STEPS = 100  # most iterations to invert a displacement field
 _PROBED = 500  # most voxels at which the inverse is checked
 _WRONG = 0.1  # largest accepted error of the inverse, in voxels
-_HELD_STATES = 3  # most states whose displacements are kept on the device; they take the memory of three volumes each
+_HELD_STATES = 3  # most states whose displacements are kept on the device, each in the memory of three volumes
 
 
 class MovingBackprojector:
@@ -37,7 +37,7 @@ class MovingBackprojector:
         self._push = lru_cache(_HELD_STATES)(self._push_of)
 
     def of_views(self, views: np.ndarray) -> "MovingBackprojector":
-        """Returns the backprojector for the views with the numbers ``views`` (n,)."""
+        """Returns the backprojector for only the views numbered ``views`` (n,)."""
         some = copy(self)  # both share the displacements on the device
         some.shares = self.shares[views]
         return some

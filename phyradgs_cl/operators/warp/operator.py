@@ -1,7 +1,8 @@
 """The system matrix of a moving object: A x = Σ_k P_k W_k x, summed over its states k, and its exact transpose.
 
 W_k warps the volume x to state k. For an object that changes, x is a stack of volumes, and W_k takes volume k. P_k projects
-the result to the time cells for which the state stands (``states.py``). A cell may also be a blend of two states.
+the result to the time cells for which the state stands (``states.py``). A time cell (a pose with its lines) may also be a
+blend of two states.
 
 ``FieldDerivative`` differentiates the frames A v by the displacement field w = Σ_r φ_r U_r. J is the derivative by the
 coefficients d_r of the fields U_r. B maps coefficients to voxels. w_k is the field in state k, and ∇v the gradient of the
@@ -32,7 +33,7 @@ from phyradgs_cl.operators.warp.states import MOST_STATES, MotionStates
 from phyradgs_cl.operators.warp.volume import StateStack, TimeStates, VolumeWarp
 from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 
-# For every 12 frames one state more than MOST_STATES is allowed: with many frames, warps take little of the time.
+# One state more than MOST_STATES is allowed for every 12 frames: with many frames, warps take little of the time.
 _FRAMES_PER_STATE = 12
 _REACH = 2  # a cubic spline's coefficient acts up to this far, in voxels, as in cl/warp.cl
 _BORDER = 4  # width in voxels around the volume in which coefficients are kept, as in cl/warp.cl
@@ -150,7 +151,7 @@ def projector_of(
     rt: Runtime, grid: Grid, tables: Sequence[TimeCells], deformation: Deformation | None,
     state_times_s: np.ndarray | None = None,
 ) -> Callable[..., RayOperator | WarpedOperator]:
-    """Returns a function that makes projectors from the arguments of ``RayOperator``: for an object at rest ``RayOperator``.
+    """Returns a function that makes projectors from the arguments of ``RayOperator``: at rest ``RayOperator`` itself.
 
     deformation: how the object moves. state_times_s (K,): for an object that changes instead, the times in s of its volumes.
     Each time cell of ``tables`` takes the nearest state. A blend of two states would blur and project most cells twice."""
@@ -167,7 +168,7 @@ def projector_of(
 def _tables_by_state(
     tables: Sequence[TimeCells], warp: VolumeWarp | StateStack
 ) -> list[tuple[np.ndarray, list[TimeCells]]]:
-    """Returns for each state the numbers of the frames that need it, and their tables with the cells that it stands for."""
+    """Returns for each state the numbers of the frames that need it, and their tables with only the cells of this state."""
     ends = np.cumsum([table.count for table in tables])[:-1]
     shares = np.split(warp.states.shares(np.concatenate([table.time_s for table in tables])), ends)
     by_state = []
@@ -241,8 +242,8 @@ class FieldDerivative:
 
 
 def warp_slopes(volume: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Returns the gradients ∇v(y + w(y)), (nz, ny, nx, 3) float32 per voxel, x, y, z, at voxel centres y. v is the cubic
-    spline through a volume (nz, ny, nx), and 0 outside. displacement: w (nz, ny, nx, 3) in voxels, x, y, z."""
+    """Returns the gradients ∇v(y + w(y)), (nz, ny, nx, 3) float32, along x, y, z per voxel, at voxel centres y. v is the
+    cubic spline through a volume (nz, ny, nx), and 0 outside. displacement: w (nz, ny, nx, 3) in voxels, x, y, z."""
     wide = scipy.ndimage.spline_filter(np.pad(volume, _BORDER + _SETTLES), output=np.float32)
     padded = np.ascontiguousarray(wide[(slice(_SETTLES, -_SETTLES),) * 3])
     strides = (padded.shape[1] * padded.shape[2], padded.shape[2], 1)

@@ -9,9 +9,9 @@ import numpy as np
 
 from phyradgs_cl.fields import Deformation, Grid
 
-MOST_STATES = 12
-_SPACING = 0.6  # largest distance of a time from a state if states are blended: RMS displacement of moving voxels, in voxels
-_SPACING_OF_NEAREST = 0.3  # the same if each time takes the nearest state, without a blend
+MOST_STATES = 12  # most states that represent a motion, by default
+_SPACING = 0.6  # largest RMS displacement of moving voxels from the object to a state, in voxels, if states are blended
+_SPACING_OF_NEAREST = 0.3  # like _SPACING, if each time takes the nearest state, without a blend
 _MOVES = 0.1  # a voxel counts as moving if its squared displacement is at least this fraction of the largest one
 
 
@@ -20,8 +20,8 @@ class MotionStates:
     """K representative states of ``deformation``, and which of them stand for a time.
 
     fields_mm: (R, nz, ny, nx, 3) displacements on ``grid`` by each field with weight 1, x, y, z. weights: (K, R), the
-    fields' weights in each state. metric: (R, R); two states whose weights differ by d are √(dᵀ metric d) apart, an RMS
-    displacement in voxels. blends: a time between two states gets a blend of both; else the nearest state."""
+    fields' weights in each state. metric: (R, R); two states whose weights differ by d are displaced by √(dᵀ metric d)
+    voxels RMS. blends: a time between two states gets a blend of both; else the nearest state."""
 
     deformation: Deformation
     grid: Grid
@@ -80,8 +80,9 @@ class MotionStates:
     def shares(self, times_s: np.ndarray | Sequence[float]) -> np.ndarray:
         """Returns the fractions of the states (T, K) at times (T,) in s. They sum to 1, with at most two above 0.
 
-        A blend takes the two states with the smallest error in voxels. This is a sum: the distance of the time's weights
-        from the line between the states, and the blur of adding two volumes that are displaced against each other."""
+        A blend takes the two states with the smallest error in voxels. The error is a sum: the distance of the object at
+        that time from the line between both states, and the blur of adding two volumes that are displaced against each
+        other."""
         wanted = self.deformation.weights_at(times_s)
         if not self.blends:
             distances = np.stack([_length(wanted - weights, self.metric) for weights in self.weights], -1)
@@ -103,7 +104,7 @@ class MotionStates:
 
 
 def unit_fields_mm(deformation: Deformation, grid: Grid) -> np.ndarray:
-    """Returns the displacements (R, nz, ny, nx, 3) in mm by each field with weight 1, x, y, z."""
+    """Returns the displacements (R, nz, ny, nx, 3) in mm, x, y, z, by each field with weight 1."""
     return np.stack([deformation.on_grid_mm(grid, unit) for unit in np.eye(deformation.rank)])
 
 

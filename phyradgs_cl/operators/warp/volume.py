@@ -12,10 +12,10 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
 
 # Width in voxels around the volume in which coefficients are kept, as in cl/warp.cl: beyond, they are below 3e-3 of a voxel.
 _BORDER = 4
-_MOST_OWNED = 8  # most slices that a CPU's work-item sums; two work-items compute the voxels near the ends of such a block
+_MOST_OWNED = 8  # most slices that a CPU's work-item sums: voxels near the ends of this block are computed twice
 _ITEMS_PER_UNIT = 4  # wanted work-items per compute unit, so that none waits long for the last
 _HEADROOM = 64  # largest sum of weights that a voxel may receive: 4³, where a field contracts by 4 along each axis
-_TOGETHER = 8, 8, 4  # box of voxels (x, y, z) of a GPU's work-group, which adds in local memory
+_TOGETHER = 8, 8, 4  # box of voxels (x, y, z) that a GPU's work-group adds up in local memory
 _SAMPLES = 16  # time to read the 4³ coefficients of a voxel, over the time of a ray's sample
 _ADDED = 64  # time to add to the 4³ coefficients of a voxel, over the time of a ray's sample
 _ROUNDING = 1e-3  # bounds of displacements along z are widened by this many voxels, to allow for rounding in float32
@@ -43,7 +43,7 @@ class VolumeWarp:
         self.stack = FrameStack(rt, self.kernel("add_frames"))
         self._reaches: dict[int, tuple[DeviceArray, DeviceArray]] = {}
 
-    volumes = 4  # most volumes on the device, besides the displacement fields
+    volumes = 4  # most volumes that a warp holds on the device, besides the displacement fields
 
     def is_still(self, state: int) -> bool:
         """Returns whether the warp to state k = ``state`` displaces nothing."""
@@ -90,7 +90,7 @@ class VolumeWarp:
         return DeviceArray(self._moved.buffer, self.shape, self._moved.dtype)
 
     def zeros(self) -> DeviceArray:
-        """Returns zeros in the layout of the coefficients. The memory is valid until the next call."""
+        """Returns zeros in the layout of the spline coefficients. The memory is valid until the next call."""
         if self._total is None:
             self._total = self.rt.empty(self._floats)
         self.rt.fill(self._total, 0)
@@ -174,9 +174,9 @@ class TimeStates:
 
 
 class StateStack:
-    """Takes states from a stack x (K, nz, ny, nx): W_k x = x_k. Has the methods of ``VolumeWarp``."""
+    """Takes states from a stack x (K, nz, ny, nx): W_k x = x_k. Stands in for ``VolumeWarp``, for an object that changes."""
 
-    volumes = 2  # most stacks x on the device
+    volumes = 2  # most stacks x held on the device
 
     def __init__(self, rt: Runtime, volume_shape: tuple[int, int, int], states: TimeStates) -> None:
         self.rt, self.states, self.shape = rt, states, (states.count, *volume_shape)

@@ -53,10 +53,10 @@ from phyradgs_cl.text import without_warnings
 log = logging.getLogger(__name__)
 # Views share their ray weights if their poses, rotated back to one angle, differ by at most this fraction.
 _SAME_POSE = 1e-9
-_BLOCK_BYTES = 1 << 26  # rows are filtered in blocks of at most this size, to limit memory
-_WORKERS = -1  # SciPy's transforms use all cores
+_BLOCK_BYTES = 1 << 26  # frames are filtered in blocks of at most this many bytes, to limit memory
+_WORKERS = -1  # tells SciPy's Fourier transforms to use all cores
 
-# Windows as functions of the frequency over the Nyquist frequency. All are 1 at frequency 0, so that none changes the mean.
+# Windows of the ramp filter, as functions of frequency over Nyquist frequency. All are 1 at 0, so they keep the mean.
 WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "ram-lak": np.ones_like,
     "shepp-logan": lambda share: np.sinc(share / 2),
@@ -84,9 +84,9 @@ class FdkOptions(MotionOptions):
 
 @dataclass(frozen=True)
 class FbpOptions(FdkOptions):
-    """Options of FBP, with those of FDK. deblur: sharpens a fly-scan along the angle; the value is the power of noise over
-    that of the signal, such as 0.01; 0: off. circle: sets voxels to 0 outside the circle that the panel's wider side
-    reaches, unless rows are extrapolated."""
+    """Options of FBP, with those of FDK. deblur: removes a fly-scan's motion blur along the angle. The value is the power of
+    noise over that of the signal, such as 0.01; 0: off. circle: sets voxels to 0 outside the circle about the axis that the
+    panel's wider side sees, unless rows are extrapolated."""
 
     METHOD: ClassVar[str] = "fbp"
     deblur: float = checks.ranged(0.0, 0, 1)
@@ -101,7 +101,7 @@ def fdk(
     take short scans, full turns, and full turns with the axis near the panel's edge. Of a moving object the volume shows the
     reference state.
 
-    ``seed`` is part of the common signature and not used.
+    ``seed`` has no effect. report: gets progress only with extrapolate ``reprojected``. deformation: how the object moves.
 
     Logs a warning for incomplete turns, and for an orbit that is not a circle about z. Raises InputError for the other
     method's beam, for an orbit far from a circle, and for parallel rays that are not at right angles to the axis."""
@@ -131,8 +131,8 @@ def fdk(
 
 
 def _without_dark_sides(scan: Scan, frames: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns frames (F, rows, columns) and poses without the columns at both sides that are masked in all frames. Values
-    continued there would stand for an object that the panel does not see; a narrower panel has weights of its own."""
+    """Returns frames (F, rows, columns) and poses without the columns at both sides that are masked in all frames. Their
+    values would be guesses of an object that the panel does not see. A narrower panel instead has its own ray weights."""
     seen = np.flatnonzero(scan.valid.any(axis=(0, 1)))
     if scan.metal is not None or len(seen) in (0, frames.shape[2]):
         return frames, pose
@@ -147,14 +147,14 @@ def _without_dark_sides(scan: Scan, frames: np.ndarray, pose: np.ndarray) -> tup
 def _moving(
     rt: Runtime, scan: Scan, motion: Motion, numbers: np.ndarray, deformation: Deformation
 ) -> MovingBackprojector | None:
-    """Returns the backprojector of an object that moves, with each frame at its mean time; None for an object at rest."""
+    """Returns the backprojector of a moving object, which takes each frame at its mean time; None for an object at rest."""
     times_s = np.array([motion.cells(scan, f).time_s.mean() for f in numbers])
     states = MotionStates.of_times(deformation, scan.grid, times_s)
     return None if states.is_at_rest else MovingBackprojector(rt, states, states.shares(times_s))
 
 
 def _check(scan: Scan, options: FdkOptions) -> None:
-    """Raises InputError for the other method's beam, and for orbits and views that the method cannot take."""
+    """Raises InputError for a beam of the wrong kind, and for orbits and views that FDK or FBP cannot take."""
     pose = middle_poses(scan)[_measured(scan)]
     with without_warnings():  # ``fdk`` itself warns of approximations
         check_beam(options.METHOD, pose, scan.is_parallel)
@@ -175,10 +175,10 @@ def fdk_volume(
     """Returns FDK, or FBP of parallel beams, of line integrals (F, rows, columns) on ``grid``, (nz, ny, nx) float32 in 1/mm.
 
     pose: (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns) and short
-    scans are recognised and weighted. whole: reconstructs the complete object (nz, ny, nx) in 1/mm on ``grid``, for
-    extrapolate ``reprojected``. circle, for parallel beams: sets voxels outside of the circle that the panel reaches to 0.
-    moving: backprojects an object that moves. Logs a warning where data are missing. Raises InputError for a source on the
-    rotation axis."""
+    scans are recognised and weighted. whole: reconstructs the complete object (nz, ny, nx) in 1/mm on ``grid``, which
+    extrapolate ``reprojected`` needs. circle, for parallel beams: sets voxels outside of the circle that the panel reaches
+    to 0. moving: backprojects an object that moves. Logs a warning where data are missing. Raises InputError for a source on
+    the rotation axis."""
     by_pixel, canonical, fan, arc = _seen(pose, frames, axis, is_parallel)
     if extrapolate != "none" and fan.is_put_aside:
         log.warning("%s: the rows of a displaced detector are not extrapolated", "FBP" if is_parallel else "FDK")
@@ -198,7 +198,7 @@ def fdk_volume(
     pose = widened(pose, axis, missing)
 
     def of_views(images: np.ndarray, views: np.ndarray, power: int = 2) -> np.ndarray:
-        share, one = 0.5 * arc.gap_rad[views], pose[views]  # 0.5, because every ray is measured twice
+        share, one = 0.5 * arc.gap_rad[views], pose[views]  # 0.5, because a full turn measures every ray twice
         if moving is not None and power == 2:
             return moving.of_views(views)(images, one, share, grid, axis, is_parallel=is_parallel)
         if pose.ndim == 2:
@@ -222,8 +222,8 @@ def fdk_volume(
 def _seen(
     pose: np.ndarray, frames: np.ndarray, axis: str, is_parallel: bool
 ) -> tuple[np.ndarray, np.ndarray, weights.Fan, Arc]:
-    """Returns the poses as ``pose_of_pixels`` does, the same poses rotated back to one angle, their fan, and the arc of all
-    views. Raises InputError for a source on the rotation axis."""
+    """Returns the poses as ``pose_of_pixels`` does, the same poses rotated back to one angle, the fan that they see, and the
+    arc of all views. Raises InputError for a source on the rotation axis."""
     by_pixel = pose_of_pixels(pose, axis)
     if np.any(np.hypot(by_pixel[..., 0], by_pixel[..., 1]) <= 0):
         raise InputError("poses", "a source on the rotation axis", "a source beside it")
@@ -238,8 +238,8 @@ def _seen(
 
 def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], window: str) -> np.ndarray:
     """Returns weighted and filtered frames (F, rows, columns + missing) float32. weight: gives a view's weights (rows,
-    columns). missing: columns added at both ends. The rows of a displaced detector are widened to be symmetric, because the
-    filter's response continues beyond them."""
+    columns). missing: numbers of columns added at both ends. They make a displaced detector symmetric, because the filter's
+    response continues beyond its rows."""
     views, rows, columns = frames.shape
     width = columns + sum(missing)
     filtered = np.empty((views, rows, width), np.float32)
@@ -254,7 +254,7 @@ def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], w
 
 
 def ramp_spectrum(length: int, window: str = "ram-lak") -> np.ndarray:
-    """Returns the filter's real spectrum (length // 2 + 1,) for a pixel pitch of 1 and a period of ``length`` samples.
+    """Returns the ramp filter's real spectrum (length // 2 + 1,) for a pixel pitch of 1 and a period of ``length`` samples.
 
     It comes from the space-domain kernel: sampling |frequency| instead would add a wrong constant to every row."""
     # distance from sample 0, counted around the period: its second half stands for negative distances
@@ -278,8 +278,8 @@ def ramp_filter(rows: np.ndarray, spacing_mm: float, window: str = "ram-lak") ->
 
 
 def static_fdk(rt: Runtime, scan: Scan, deformation: Deformation | None = None) -> np.ndarray:
-    """Returns FDK, or FBP of a parallel beam, (nz, ny, nx) in 1/mm at the mid-window poses: a start or a reference of other
-    methods. deformation: how the object moves; None: it rests."""
+    """Returns the volume (nz, ny, nx) in 1/mm of FDK, or of FBP in a parallel beam, from each frame's mid-exposure pose.
+    Other methods start from it or scale by it. deformation: how the object moves; None: it rests."""
     frames, numbers = _measured_frames(scan)
     pose = np.concatenate([Static().cells(scan, f).pose for f in numbers])
     moving = None if deformation is None else _moving(rt, scan, Static(), numbers, deformation)
@@ -287,14 +287,14 @@ def static_fdk(rt: Runtime, scan: Scan, deformation: Deformation | None = None) 
 
 
 def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-    """Returns frames (n, v, u) with masked pixels filled in, and the frames' numbers (n,), those of ``_measured``."""
+    """Returns the frames (n, rows, columns) of ``_measured``, with masked pixels filled in, and their numbers (n,)."""
     frames, numbers = unmasked_frames(scan), _measured(scan)
     return frames if len(numbers) == scan.frames else frames[numbers], numbers
 
 
 def _measured(scan: Scan) -> np.ndarray:
-    """Returns the numbers (n,) of frames without those that are masked for the most part, whose neighbours cover their
-    angles. If all frames are masked, it returns all."""
+    """Returns the numbers (n,) of all frames that are not masked for the most part. The views beside a masked frame stand
+    for its angle. If all frames are masked, returns all numbers."""
     if np.asarray(scan.pixel_mask).ndim == 3 and (valid := scan.valid.mean(axis=(1, 2))).any():
         return np.flatnonzero(valid > valid.max() / 2)
     return np.arange(scan.frames)

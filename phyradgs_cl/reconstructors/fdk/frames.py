@@ -1,8 +1,8 @@
 """Changes frames before FDK's filter: continues detector rows beyond the panel, and removes motion blur along the angle.
 
-Rows continue so that the filter does not ring where they are cut off. Only ``reprojected`` knows the object there.
+Rows continue so that the filter does not ring where they are cut off. Only the way ``reprojected`` knows the object there.
 
-- cosine: rows end in a quarter of a cosine (similar to Ohnesorge et al., Med. Phys. 27 (2000) 39).
+- cosine: rows fall to 0 along a quarter of a cosine (similar to Ohnesorge et al., Med. Phys. 27 (2000) 39).
 - cylinder: rows continue as chords of a cylinder, from their last values and slope (Hsieh et al., Med. Phys. 31 (2004)
   2385). A parabola through the squares of the row gives its attenuation.
 - reprojected: FISTA-TV reconstructs a volume on a grid that holds the whole object, and its projections continue the rows.
@@ -34,14 +34,14 @@ from phyradgs_cl.runtime import Runtime
 WAYS = ("none", "cosine", "cylinder", "reprojected")
 _SHARE = 0.5  # "cosine" and "cylinder" extend rows at each side by this fraction of the panel's columns
 _SLOPE_PIXELS = 5  # the slope at a row's end is taken over this many pixels, to lower its noise
-_NOISE = 0.01  # below this fraction of the line integrals' 99.9th percentile, the end of a row is air
-_UNEVEN = 0.02  # steps between views may differ by this fraction from the median step and still count as even
-_REACH = 8  # padding at both ends of an arc, in arcs of an exposure: the end views are repeated, so that no edge is filtered
-_FULL_TURN = 1.5  # if a gap between views is wider than this many median steps, they cover less than a full turn
+_NOISE = 0.01  # a row that ends below this fraction of the line integrals' 99.9th percentile ends in air
+_UNEVEN = 0.02  # largest deviation of an angular step from the median, as a fraction, in evenly spaced views
+_REACH = 8  # the end views of an arc are repeated over this many exposures' arcs, so that the filter meets no edge
+_FULL_TURN = 1.5  # if a gap is wider than this many median steps, the views cover less than a full turn
 
 
 def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
-    """Continues line integrals (F, v, u) beyond both sides by the ``way`` named. Returns (F, v, u + 2 n) float32, and n."""
+    """Continues line integrals (F, v, u) beyond both sides, ``way`` cosine or cylinder. Returns (F, v, u + 2 n), and n."""
     count = max(1, round(_SHARE * frames.shape[2]))
     beyond = np.arange(1, count + 1)
     least = _NOISE * float(np.percentile(frames, 99.9))
@@ -62,8 +62,8 @@ def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
 def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: np.ndarray) -> np.ndarray:
     """Returns line integrals p (F, v, n) at d pixels beyond the panel: p² = edge² + 2 edge slope d − a d².
 
-    edge, slope: line integral and its change per pixel at a row's end. A rising slope counts as 0. The curvature a is raised
-    until p reaches 0 within the n pixels."""
+    edge, slope: line integral and its change per pixel at a row's end. A rising slope counts as 0. curvature: a, raised
+    until p reaches 0 within the n pixels. beyond: d."""
     falling, reach = np.minimum(slope, 0), beyond[-1]
     widest = (edge**2 + 2 * reach * edge * falling) / reach**2
     squares = edge**2 + 2 * edge * falling * beyond - np.maximum(curvature, widest) * beyond**2
@@ -71,7 +71,7 @@ def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: 
 
 
 def _curvature(frames: np.ndarray) -> np.ndarray:
-    """Returns the curvature (F, v, 1), positive downwards, of the parabola through a row's squares: the frames' median."""
+    """Returns the downward curvature (F, v, 1) of parabolas through the rows' squared values, as a median over frames."""
     u = np.linspace(-1, 1, frames.shape[2])
     basis = np.stack([np.ones_like(u), u, u**2], axis=1)
     squares = np.maximum(frames, 0).astype(np.float64) ** 2
@@ -79,12 +79,12 @@ def _curvature(frames: np.ndarray) -> np.ndarray:
     return np.broadcast_to(np.maximum(np.median(down, axis=0), 0)[None, :, None], (*frames.shape[:2], 1))
 
 
-_ITERATIONS = 30  # iterations of FISTA-TV for the object beyond the panel
+_ITERATIONS = 30  # iterations of FISTA-TV for the volume whose projections continue the rows
 _MOST = 2.0  # "reprojected" extends rows at each side by at most this many panel widths
 
 
 def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport) -> np.ndarray:
-    """Returns a volume (nz, ny, nx) in 1/mm on the scan's grid that explains the scan's frames.
+    """Returns a volume (nz, ny, nx) in 1/mm on the scan's grid that explains the scan's frames, by FISTA-TV.
 
     Raises KeyboardInterrupt when the user stops the run, because FDK has no checkpoints."""
 

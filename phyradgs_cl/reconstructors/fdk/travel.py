@@ -1,9 +1,9 @@
-"""FDK of helices and other orbits that move along z: each voxel counts only the views that see it.
+"""FDK of helices and other orbits that move along z: each voxel is computed only from the views that see it.
 
 Neighbouring voxels along z are seen by different views, some of their rays twice, others once. The rays' directions about z
 are sorted into overlapping classes. In each class a voxel takes the mean of the views that see it, weighted by the width of
-the class. Views count less towards the panel's first and last rows. After K. Stierstorfer et al., Phys. Med. Biol. 49 (2004)
-2209, with classes of directions in place of rebinned rays."""
+the class. A view's weight falls towards the panel's first and last rows. After K. Stierstorfer et al., Phys. Med. Biol. 49
+(2004) 2209, with classes of directions in place of rebinned rays."""
 
 import logging
 from collections.abc import Callable
@@ -19,13 +19,13 @@ log = logging.getLogger(__name__)
 # An orbit travels along z if the origin's image moves by more than this fraction of the panel's height.
 # Less travel matters at the volume's ends only.
 _TRAVEL = 0.05
-_CLASS_RAD = np.deg2rad(15)  # width of a class of ray directions about z, unless views are few
+_CLASS_RAD = np.deg2rad(15)  # angular width of a class of ray directions about z, unless views are few
 _VIEWS_A_CLASS = 2.0  # each class needs this many views of one turn: with fewer views, classes are wider
-_EVEN = 0.5  # rows count fully up to this fraction of the panel's half height, then less
+_EVEN = 0.5  # rows up to this fraction of the panel's half height from its middle have full weight
 _LEAST_ROW = 0.02  # least weight of a row: some voxels are seen by the outermost row alone
-_LEAST_SHARE = 0.01  # a class of directions counts for a voxel that is seen from at least this fraction of them
-_NAMED = 0.01  # a warning comes if a larger fraction of the voxels lacks views from some directions
-_FEW_VIEWS = 24  # a warning comes below this many views per turn: with 24, densities of balls are within 2 %
+_LEAST_SHARE = 0.01  # a class counts fully for a voxel that is seen from at least this fraction of its directions
+_NAMED = 0.01  # a warning comes if more than this fraction of the voxels lack views from some directions
+_FEW_VIEWS = 24  # fewer views per turn cause a warning: with 24, densities of balls are within 2 %
 Backproject = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """A function from frames (n, rows, columns) and the numbers (n,) of their views to a volume (z, y, x)."""
 
@@ -92,8 +92,8 @@ def seen_volume(
 
 
 def _directions(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles about z (F, 1, columns) of the rays of poses (F, 1, c, 12). Also returns, for voxels on the panel,
-    how far their rays turn per radian of the source."""
+    """Returns the angles about z (F, 1, columns) of the rays of poses (F, 1, c, 12). Also returns, for a voxel at each
+    pixel's place, by how many radians its ray turns per radian of the source's rotation."""
     rays = weights.pixel_rays(pose, np.array([shape[0] // 2]), np.arange(shape[1]))
     if is_parallel:
         angle_rad = np.broadcast_to(np.arctan2(pose[..., 1], pose[..., 0]), rays.shape[:-1])
@@ -110,7 +110,7 @@ def _row_weight(rows: int) -> np.ndarray:
 
 
 def _views_a_turn(angle_rad: np.ndarray) -> float:
-    """Returns how many consecutive views at angles (F,) make a turn; infinity if steps are too wide to tell."""
+    """Returns how many consecutive views at angles (F,) in rad make a turn; infinity if their steps are too wide to tell."""
     steps_rad = np.abs(np.angle(np.exp(1j * np.diff(angle_rad))))
     step_rad = float(np.median(steps_rad)) if steps_rad.size else 0.0
     return 2 * np.pi / step_rad if 0 < step_rad < np.pi / 2 else np.inf
@@ -123,7 +123,7 @@ def _warn_if_few_views(views_a_turn: float, name: str) -> None:
 
 
 def _warn_if_unseen(covered: np.ndarray, name: str, turn: str) -> None:
-    """Logs how many voxels too few directions see. covered: fraction (nz, ny, nx) of the directions that they need."""
+    """Warns of voxels that are seen from too few directions. covered: fraction (nz, ny, nx) of the needed directions."""
     share = float((covered < 1 - 1e-3).mean())
     if share > _NAMED:
         text = "%s: %.0f %% of the voxels are seen from less than %s turn, the least from %.0f°: their densities are wrong"

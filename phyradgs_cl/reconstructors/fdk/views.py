@@ -16,20 +16,20 @@ from phyradgs_cl.reconstructors.fdk import weights
 # The widest gap is compared with the second widest: by the median, uneven views of a full turn would be a short scan.
 # Any gap wider than _WIDE_RAD is compared with both of its neighbours.
 SHORT_SCAN_GAP = 2.5
-_SAME_VIEW = 0.05  # views nearer to each other than this fraction of the mean gap count as one: repeats whose angles jitter
+_SAME_VIEW = 0.05  # views nearer to each other than this fraction of the mean gap count as one repeated view
 # A warning names filled gaps from this width on: narrower ones changed the density of large balls by less than 1 %.
 _NAMED_RAD = np.deg2rad(5)
 # All gaps up to this width but the widest are filled: dividing the arc there would cost more accuracy.
 _WIDE_RAD = np.deg2rad(10)
 # A misaligned panel measures a strip of rays once only. Gaps up to this width are filled, so that the strip counts fully.
 _FILLED_RAD = np.deg2rad(15)
-# The same for a panel put aside, whose strip is wide: with wider gaps a short scan's weights were 0.2 to 10 dB better.
+# The same for a panel displaced on purpose, whose strip is wide: beyond, a short scan's weights were 0.2 to 10 dB better.
 _FILLED_ASIDE_RAD = np.deg2rad(65)
-# Views stand for a filled gap if they are nearer to it than this fraction of its width: more smears, less draws streaks.
+# Views nearer to a filled gap than this fraction of its width stand for it: more views smear, fewer draw streaks.
 _FILL_REACH = 0.5
 log = logging.getLogger(__name__)
 
-# Limits in pairs: beyond the first a warning is logged; beyond the second, _NO_…, InputError is raised.
+# Limits of an orbit, in pairs. Beyond the first a warning is logged; beyond the second, _NO_…, InputError is raised.
 _CIRCLE = 0.05  # distance of source or panel from a circle about z, divided by that from source to panel
 _NO_CIRCLE = 0.5
 _PLANE_DEG = 10.0  # elevation of the source above the plane z = 0, seen from the origin
@@ -42,7 +42,7 @@ _UNLIKE = 0.1  # a warning comes if the ends of the fan differ among the views b
 _LEAST_OVERLAP = 2.0  # a displaced panel must reach this many columns beyond the axis, or a warning comes
 # A smaller missing angle causes no warning: nearly parallel rays have so narrow a fan that half a turn is enough.
 _TOLERATED_RAD = np.deg2rad(0.5)
-_PARTS = 16  # of a view's step, over which weights of a short scan are averaged
+_PARTS = 16  # a short scan's weights are averaged over this many parts of a view's angular step
 RayWeight = Callable[[int], np.ndarray]
 
 
@@ -50,7 +50,7 @@ RayWeight = Callable[[int], np.ndarray]
 class Arc:
     """The angles that the views cover, and how much of them each view stands for.
 
-    - gap_rad (F,): each view's part of the arc.
+    - gap_rad (F,): the angle for which each view stands. coverage_rad: the angle for which all stand. is_full: a full turn.
     - progress_rad (F,): each view's angle from the arc's start, half a step before the first view; the arc ends half a step
       behind the last. In a full turn it counts from the view of the least angle.
     - parts_rad (P, 2): progress at which each part between gaps begins and ends.
@@ -64,22 +64,22 @@ class Arc:
     filled_rad: float = 0.0
 
     def unseen_rad(self, fan_rad: float = 0.0) -> float:
-        """Returns the angle, of half a turn, over which rays are measured from neither side: the largest for rays at fan
-        angles −fan_rad, 0 and fan_rad."""
+        """Returns how much of half a turn, in rad, is measured from neither side: the largest value for rays at fan angles
+        −fan_rad, 0 and fan_rad."""
         at_rad = np.linspace(0, 2 * np.pi, 1440, endpoint=False)
         fans = (-fan_rad, 0.0, fan_rad)
         shares = [(self.covers(at_rad) | self.covers(at_rad + np.pi + 2 * fan)).mean() for fan in fans]
         return float(np.pi * (1 - min(shares)))
 
     def covers(self, at_rad: np.ndarray) -> np.ndarray:
-        """Returns whether a part of the arc holds each angle (...), counted as progress in rad; bool (...)."""
+        """Returns which of the angles (...), given as progress in rad, lie in a part of the arc; bool (...)."""
         turned = np.mod(at_rad, 2 * np.pi)[..., None]
         return ((turned >= self.parts_rad[:, 0]) & (turned <= self.parts_rad[:, 1])).any(-1)
 
 
 def filled_gap_rad(fan: weights.Fan) -> float:
-    """Returns the width in rad up to which the views at both sides fill gaps: 65° for a panel put aside, 15° for another
-    displaced one, because no opposite views measure some of a gap's rays there; else 0."""
+    """Returns the width in rad up to which the views at both sides fill gaps: 65° for a panel displaced on purpose, 15° for
+    a misaligned one, since some of a gap's rays have no opposite there; 0 for a symmetric panel."""
     if fan.is_put_aside:
         return _FILLED_ASIDE_RAD
     return _FILLED_RAD if fan.is_displaced else 0.0
@@ -123,8 +123,8 @@ def _stand_out(ahead: np.ndarray) -> np.ndarray:
 
 
 def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Returns which wide gaps (K,) of at most 15° have a wide gap on the opposite side too, bool (K,). No opposite
-    rays stand for these, so the views at both sides must. The widest gap is never among them."""
+    """Returns which wide gaps (K,) of at most 15° have a wide gap on the opposite side too, bool (K,). Such gaps have no
+    opposite rays, so the views at both sides fill them. The widest gap is never among them."""
     narrow = wide & (ahead <= _FILLED_RAD) & (np.arange(ahead.size) != np.argmax(ahead))
     opposite = centre + ahead / 2 + np.pi
     before = np.searchsorted(centre, np.mod(opposite - centre[0], 2 * np.pi) + centre[0], side="right") - 1
@@ -132,14 +132,14 @@ def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.nd
 
 
 def _steps(ahead: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles (K,) in rad from each view to the next, and from the view before to each. The step on the view's
-    other side takes the place of a gap."""
+    """Returns the angles (K,) in rad from each view to the next, and from the view before to each. Beside a gap, the step on
+    the view's other side is used."""
     forward = np.where(wide, np.roll(ahead, 1), ahead)
     return forward, np.roll(np.where(wide, np.roll(ahead, -1), ahead), 1)
 
 
 def _filled_rad(ahead: np.ndarray) -> float:
-    """Returns Σ (gap − usual) in rad over gaps (K,) above ``_NAMED_RAD`` and ``SHORT_SCAN_GAP`` medians and neighbours."""
+    """Returns the sum in rad by which wide gaps among (K,) exceed the larger of the median and both neighbours."""
     usual = np.maximum(np.median(ahead) if ahead.size else 0.0, np.maximum(np.roll(ahead, 1), np.roll(ahead, -1)))
     return float((ahead - usual)[ahead > np.maximum(SHORT_SCAN_GAP * usual, _NAMED_RAD)].sum())
 
@@ -234,7 +234,7 @@ def _redundancy(view: int, angle_rad: np.ndarray, arc: Arc, fan: weights.Fan) ->
     if len(arc.parts_rad) > 1:
         return weights.parted_weight(progress_rad, angle_rad, arc.parts_rad)
     if not arc.is_full:
-        # A view stands for its step. Where that is as wide as what half a turn leaves over, its middle alone does not do.
+        # A view stands for an angular step. If it is wide against the arc beyond half a turn, its middle is not enough.
         is_coarse = gap_rad > (arc.coverage_rad - np.pi) / 2 > 0
         within = gap_rad * (np.arange(_PARTS) - (_PARTS - 1) / 2) / _PARTS if is_coarse else (0.0,)
         at_rad = np.clip(progress_rad + np.asarray(within), 0, arc.coverage_rad)
@@ -257,7 +257,7 @@ def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc, is_parallel:
 
 
 def widened(pose: np.ndarray, axis: str, missing: tuple[int, int]) -> np.ndarray:
-    """Returns the poses of frames that got ``missing`` more columns at their two ends."""
+    """Returns the poses of frames with ``missing`` (first, last) more columns at their ends."""
     if missing == (0, 0):
         return pose
     if pose.ndim == 3 and axis == "columns":

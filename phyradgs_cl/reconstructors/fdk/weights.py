@@ -1,14 +1,14 @@
 """FDK's weights of rays: a measure of each ray, and the weights of displaced detectors and of short scans.
 
-The measure generalises FDK's cosine to any pose (docs/mathematics.md). Displaced detectors follow G. Wang, Med. Phys. 29
-(2002) 1634, in the fan angle. Short scans follow D. L. Parker, Med. Phys. 9 (1982) 254, with M. D. Silver's margin for arcs
-longer than the shortest, Med. Phys. 27 (2000) 773. The redundancy weights of a ray and its opposite sum to 2."""
+The measure generalises FDK's cosine weight to any pose (docs/mathematics.md). Displaced detectors follow G. Wang, Med. Phys.
+29 (2002) 1634, in the fan angle. Short scans follow D. L. Parker, Med. Phys. 9 (1982) 254, with M. D. Silver's margin for
+arcs longer than the shortest, Med. Phys. 27 (2000) 773. The redundancy weights of a ray and its opposite sum to 2."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-# Width of the transition between rays measured once and twice, over the overhang of the panel's longer side.
+# Width of the transition from rays measured twice to rays measured once, over the overhang of the panel's longer side.
 # Wang's transition covers all rays that are measured twice: it was up to 15 % noisier, with no fewer artefacts.
 TRANSITION = 1.0
 _SYMMETRIC = 0.01  # a panel whose two sides differ by less, in pixels, is symmetric about the axis
@@ -69,7 +69,7 @@ class Fan:
     """The fan angles that every view sees; in a parallel beam distances in mm from the axis (see ``fan_angle``).
 
     missing_columns: columns that would make the panel symmetric about the axis, at its two ends. pixel_rad: the width of the
-    pixel at the shorter end. unlike: by which fraction of the fan its ends differ among the views."""
+    pixel at the shorter end. unlike: by how much its ends differ among the views, over its width."""
 
     low_rad: float
     high_rad: float
@@ -94,7 +94,7 @@ class Fan:
 
     @property
     def overlap_columns(self) -> float:
-        """Columns of a displaced detector from the axis to its nearer edge."""
+        """Number of columns of a displaced detector from the axis to its nearer edge."""
         return self.short_rad / self.pixel_rad
 
     @property
@@ -104,7 +104,7 @@ class Fan:
 
     @property
     def half_rad(self) -> float:
-        """The fan angle of the wider side; in a parallel beam its distance in mm from the axis."""
+        """The fan angle at the end of the wider side; in a parallel beam its distance in mm from the axis."""
         return max(self.high_rad, -self.low_rad)
 
 
@@ -129,7 +129,8 @@ def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = F
 
 
 def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
-    """Returns the weights of rays at fan angles of any shape: 1 ± sin where both sides of the axis are seen, 0 and 2 beyond.
+    """Returns the weights of rays at fan angles of any shape: 1 ± sin where both sides of the axis are seen; beyond, 2 on
+    the seen side, else 0.
 
     If the panel does not see the axis, every ray is measured once and counts 2. If the axis meets the panel's outermost
     pixel, there is no room for a transition. A pixel then counts by which part of it lies on the long side."""

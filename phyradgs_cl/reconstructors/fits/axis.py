@@ -1,5 +1,5 @@
-"""Finds the shift of the panel that puts the axis of rotation in its right place. In any scan: the shift with which a
-coarse reconstruction explains the frames best. In a parallel beam at right angles to the axis also: by views half a turn
+"""Finds the shift of the panel that puts the rotation axis in its right place: the shift with which a coarse reconstruction
+explains the frames best. In a parallel beam at right angles to the axis, the shift also follows from views half a turn
 apart, which are mirror images."""
 
 import math
@@ -17,22 +17,22 @@ from phyradgs_cl.reconstructors.fits.residuals import fit_squares, vertex
 from phyradgs_cl.runtime import Runtime
 
 _ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # shifts of the panel that are tried first, in coarse pixels
-_ROUGH_ITERATIONS = 8  # few iterations are enough to tell coarse shifts of the panel apart
+_ROUGH_ITERATIONS = 8  # iterations of CGLS for each coarse shift: few are enough to tell them apart
 _STEP = 0.25  # distance between the three shifts that bracket the best one, in coarse pixels
-_MOST_STEPS = 8  # most moves of the three shifts that bracket the best one, so that a search that leads away ends
-ANYWHERE = (-math.inf, math.inf)  # no limits of the shift, in pixels
+_MOST_STEPS = 8  # most moves of the three trial shifts, so that a search without a minimum ends
+ANYWHERE = (-math.inf, math.inf)  # limits in pixels that allow every shift
 _MOST_VIEWS = 60  # most views that are compared with their opposites, to save time
 _MOST_ROWS = 64  # most blocks of rows that are compared, to save time
-_BEYOND = 1.5  # at the scan's end, a view's opposite may lie this many steps beyond the last view
+_BEYOND = 1.5  # at the scan's end, a view's opposite may lie this many angular steps beyond the last view
 WIDEST_STEP_RAD = math.radians(10.0)  # views further apart differ too much to be interpolated
 # Smoothing along rows (std, in pixels). Without it, interpolation would lower noise between pixels, which biases shifts.
 SMOOTHING_PX = 1.0
-_CORRELATED_PX = 2 * math.sqrt(math.pi) * SMOOTHING_PX  # smoothing correlates the noise of this many columns
+_CORRELATED_PX = 2 * math.sqrt(math.pi) * SMOOTHING_PX  # columns over which ``SMOOTHING_PX`` correlates noise
 _LEAST_OVERLAP = 0.25  # a view and its mirrored opposite must overlap in this fraction of the columns
-_LEAST_ENERGY = 0.2  # an overlap with less than this fraction of the largest sum of squares shows air alone
-_STEPS = 12
+_LEAST_ENERGY = 0.2  # an overlap whose sum of squares is below this fraction of the largest shows air alone
+_STEPS = 12  # most steps of Gauss–Newton
 _SETTLED_PX = 1e-3  # Gauss–Newton ends after a step shorter than this, in pixels
-_BIAS_PX = 0.02  # error (std) of a shift that comes from interpolating views
+_BIAS_PX = 0.02  # error (std) of a shift that is due to interpolated views
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,8 +54,8 @@ NOT_FOUND = AxisShift(math.nan, math.nan, np.empty(0))
 
 
 def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHERE) -> AxisShift:
-    """Returns the one of five shifts, a coarse pixel apart, within ``limits_px``, with the least residual after few
-    iterations. Its deviation is NaN."""
+    """Returns the best of five shifts within ``limits_px``, one coarse pixel apart: the least residual after few iterations.
+    Its deviation is NaN."""
     block = columns_per_block(scan)
     shifts_px = [block * shift for shift in _ROUGH_SHIFTS if limits_px[0] <= block * shift <= limits_px[1]]
     trials = [fit_squares(rt, shifted(scan, shift_px), _ROUGH_ITERATIONS) for shift_px in shifts_px]
@@ -66,8 +66,8 @@ def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHE
 def refined_shift(
     rt: Runtime, scan: Scan, rough: AxisShift, limits_px: tuple[float, float] = ANYWHERE
 ) -> AxisShift:
-    """Returns the shift near ``rough`` with the least residual, from a parabola through three neighbouring shifts. If it
-    lies outside of ``limits_px``, ``rough`` is fitted with all iterations and returned, with a deviation of NaN."""
+    """Returns the shift near ``rough`` with the least residual, at the vertex of a parabola through three shifts. If it lies
+    outside of ``limits_px``, ``rough`` is fitted with all iterations and returned, with a deviation of NaN."""
     block = columns_per_block(scan)
     centre = rough.pixels / block
     trials: dict[float, np.ndarray] = {}
@@ -96,8 +96,8 @@ def axis_shift(rt: Runtime, scan: Scan) -> AxisShift:
 
 
 def with_best_shift(rt: Runtime, scan: Scan) -> Scan:
-    """Returns the coarse scan with the panel shifted to the least residual, from three shifts one coarse pixel apart and a
-    few iterations; the scan itself if no shift fits best."""
+    """Returns the coarse scan with its panel shifted to the least residual, found from three shifts one coarse pixel apart
+    with few iterations each. If no shift fits best, returns the scan itself."""
     block, start = columns_per_block(scan), altered_trajectory(scan).shift_px
     shifts = np.array([-1.0, 0.0, 1.0])
     trials = np.stack([fit_squares(rt, shifted(scan, start + block * shift), _ROUGH_ITERATIONS) for shift in shifts])
@@ -166,8 +166,8 @@ def _pairs(scan: Scan) -> list[_Pair]:
 
 
 def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Returns two frames and their weights, which sum to 1, that give the view at angle 0; None if no frame is near. away
-    (F,): angles of the frames in rad."""
+    """Returns two frames' numbers, and weights with sum 1 that combine both to the view at angle 0; None if no frame is
+    near. away (F,): angles of the frames in rad."""
     order = np.argsort(away)
     step = float(np.median(np.abs(np.diff(away[order])))) if len(away) > 1 else math.inf
     above = int(np.searchsorted(away[order], 0.0))
@@ -200,8 +200,8 @@ def _few_rows(scan: Scan, frame: int) -> np.ndarray:
 
 
 def _rough_shift(pairs: list[_Pair]) -> float:
-    """Returns the shift in pixels, in steps of 1/2, at which two images differ least where they overlap: the squared
-    difference over the sum of their squares."""
+    """Returns the shift in pixels, in steps of 1/2, at which views and mirror images differ least where they overlap: by the
+    squared difference over the sum of squares."""
     columns = pairs[0].view.shape[1]
     # a shift moves the view and the mirror image against each other, by twice its size
     lags = np.arange(1 - columns, columns)  # column of the mirror image minus column of the view
@@ -223,7 +223,7 @@ def _correlation(mirrored: np.ndarray, view: np.ndarray) -> np.ndarray:
 
 
 def _refined_shift(pair: _Pair, shift_px: float) -> tuple[float, float]:
-    """Returns the shift in pixels of least squares near ``shift_px``, by Gauss–Newton, and the inverse of its variance. The
+    """Returns the shift in pixels near ``shift_px`` with the least squared difference, by Gauss–Newton, and 1/variance. The
     shift is NaN if the steps lead away."""
     last = pair.view.shape[1] - 1
     columns = np.arange(last + 1)

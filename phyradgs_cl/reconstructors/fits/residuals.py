@@ -1,5 +1,5 @@
-"""How well a coarse reconstruction explains the frames, and which of two hypotheses explains them better. Further unknowns,
-such as errors of flats, are found together with the volume."""
+"""How well a coarse reconstruction explains the frames, and which of two hypotheses (such as two directions of readout)
+explains them better. Further unknowns, such as errors of flats, are found together with the volume."""
 
 import math
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from phyradgs_cl.runtime import Runtime
 
 # In a fit, errors of flats have this fraction of the volume's effect on frames. At 1 they would explain motion too.
 _FREEDOM = 0.3
-_ITERATIONS = 20  # iterations of CGLS in a fit, unless stated
-_MOST_TIMES = 12  # most times per exposure: each costs a projection
+_ITERATIONS = 20  # iterations of CGLS in a fit, by default
+_MOST_TIMES = 12  # most times per exposure at which a fit projects, to save time
 _DRAWS = 200  # number of resamplings in a bootstrap, which gives a standard deviation
 _TINY = 1e-30  # keeps divisions finite where residuals are 0
 
@@ -62,8 +62,9 @@ class FlatErrors:
 
 @dataclass(frozen=True, eq=False)
 class ViewParameters:
-    """Unknown parameters of views, of K kinds: coefficients b (n, K) of n functions of the view. View f has the values
-    (basis @ b)[f], with ``basis`` (F, n). signals (F, K, rows, columns): the Jacobian d(frame)/d(values)."""
+    """Unknown parameters of views, of K kinds such as shifts. The unknowns are coefficients b (n, K) of n functions of the
+    view, ``basis`` (F, n). View f has the values (basis @ b)[f]. signals (F, K, rows, columns): the Jacobian
+    d(frame)/d(values)."""
 
     signals: np.ndarray
     basis: np.ndarray
@@ -85,8 +86,8 @@ class ViewParameters:
 
 @dataclass(frozen=True, eq=False)
 class AugmentedOperator:
-    """Maps one vector (x, b), of a volume and further unknowns, to frames A x + B b. B should be about as strong as A,
-    because CGLS moves all unknowns together."""
+    """Maps one vector (x, b), of a volume and further unknowns, to frames A x + B b. ``extra`` gives B. B should be about as
+    strong as A, because CGLS moves all unknowns together."""
 
     operator: LinearOperator
     extra: FlatErrors | ViewParameters
@@ -120,8 +121,8 @@ class AugmentedOperator:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Result of ``fit``. squares (F,): mean squared residual of each frame. level (F,): the constant that the fit added to
-    each frame's line integrals."""
+    """Result of ``fit``. squares (F,): mean squared residual of each frame, dimensionless. level (F,): the constant that the
+    fit added to each frame's line integrals."""
 
     squares: np.ndarray
     level: np.ndarray
@@ -132,7 +133,7 @@ class Fit:
 
 
 def fit(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> Fit:
-    """Reconstructs a coarse scan by CGLS, together with errors of its flats, every line at its own times."""
+    """Reconstructs a coarse scan by CGLS with every line at its own times, and finds the errors of its flats with it."""
     times = min(max(2, math.ceil(rim_travel_voxels(scan))), _MOST_TIMES)
     system = System.of_scan(rt, scan, PerRow(times), fewest_lines=FEWEST_LINES)
     flats = FlatErrors.beside(system.operator)

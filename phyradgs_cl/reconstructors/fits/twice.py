@@ -18,15 +18,15 @@ from phyradgs_cl.reconstructors.fits.axis import NOT_FOUND, SMOOTHING_PX, WIDEST
 
 _COARSE_COLUMNS = 128  # shifts are first tried on frames of at most this many columns
 _MOST_PX = 16.0  # largest shift of the panel that is tried, in coarse pixels: an eighth of the panel
-_STEP_PX = 0.5  # distance between shifts that are tried, in pixels of the compared frames
-_NEAR_PX = 2.0  # full frames are tried with shifts this near to the best coarse one, in coarse pixels
+_STEP_PX = 0.5  # distance between neighbouring trial shifts, in pixels of the compared frames
+_NEAR_PX = 2.0  # distance from the best coarse shift up to which full frames are tried, in coarse pixels
 _FEWEST_VIEWS = 24  # fewer views cannot be interpolated to the opposite of each ray
 _MOST_VIEWS = 360  # most views that are compared, to save time
 _MOST_ROWS = 32  # most rows that are compared, to save time
 _MOST_PAIRS = 48  # most pairs of opposite rays that are compared in a row, to save time
 _LEAST_PX = 1.0  # the axis must lie this far inside the middle of the outer column, in pixels, or no ray has an opposite
 _BLOCKS = 12  # the jackknife leaves out one of this many blocks of views at a time
-_BIAS_PX = 0.05  # error (std) of the shift in pixels without noise, measured with half-fans and features of two pixels
+_BIAS_PX = 0.05  # error (std) of the shift in pixels without noise, measured with half-fans, features of two pixels
 
 
 def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
@@ -53,8 +53,8 @@ def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
 
 
 def _level_rows(scan: Scan, views: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Returns frames (n, few rows, columns) of ``views``, with the rows nearest to the plane of the source: opposite rays
-    there meet the same matter."""
+    """Returns frames (n, few rows, columns) of ``views``, with the rows nearest to the plane of the source: there, opposite
+    rays meet the same matter."""
     rows = scan.projections.shape[1]
     level_mm = pose[5] + np.arange(rows) * pose[11] - (0.0 if scan.is_parallel else pose[2])
     near = np.sort(np.argsort(np.abs(level_mm), kind="stable")[: max(1, min(_MOST_ROWS, rows // 2))])
@@ -98,7 +98,7 @@ def _best(scan: Scan, turned: np.ndarray, frames: np.ndarray, pose: np.ndarray, 
 
 def _mean_squares(turned: np.ndarray, frames: np.ndarray, fan: np.ndarray, is_parallel: bool) -> np.ndarray | None:
     """Returns the mean squared differences (F,) of rays and their opposites; None if the axis lies less than a pixel inside
-    the columns' ends. turned (F,): views' angles in rad. fan (columns,): fan angles, in a parallel beam distances in mm."""
+    the outer columns. turned (F,): views' angles in rad. fan (columns,): fan angles, in a parallel beam distances in mm."""
     columns = np.arange(fan.size)
     if fan[-1] < fan[0]:
         fan, columns = fan[::-1], columns[::-1]

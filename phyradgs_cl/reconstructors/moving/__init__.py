@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 from typing import Any
 
-# An object moves if its field lowers the squared residual by more than this fraction. Eight objects at rest reached 0.02.
+# An object counts as moving if its field lowers the squared residual by over this fraction. Objects at rest reached 0.02.
 # A breath of a third of a voxel reached 0.06 in a clear scan, and gained 1.2 dB, but 0.03 in a noisy one, without any gain.
 LEAST_GAIN = 0.03
 
 
 def motion_line(found: Mapping[str, Any]) -> str:
-    """Returns one line on what was found about the motion of the object."""
+    """Returns a line of text that says what a run has ``found`` about the motion of the object."""
     gain = f"squared residual {100 * found['gain']:.2g} % below that at rest"
     if not found["moves"]:
         if found["gain"] > LEAST_GAIN:

@@ -2,8 +2,9 @@
 
     min over U, φ of ‖p − Σ_k P_k W_k v‖² + γ bending(U) + β roughness(φ)
 
-W_k deforms the volume v to state k, and P_k projects this state. The control vectors U and the weights' coefficients in time
-φ are improved in turn. A step is taken only if it lowers the sum and matter does not fold."""
+p: frames. W_k deforms the volume v to state k, the object near one time, and P_k projects it. U: control vectors of the
+fields. φ: spline coefficients of the fields' weights in time. U and φ are improved in turn. A step is taken only if it
+lowers the sum and matter does not fold."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
@@ -22,18 +23,19 @@ from phyradgs_cl.reconstructors.moving.signal import Bending, TemporalSplines
 from phyradgs_cl.runtime import Runtime
 
 _CG_STEPS = 8  # iterations of conjugate gradients for one step of the control vectors
-_DAMPING = 1e-3  # Levenberg damping over the mean diagonal of JᵀJ: control vectors that no ray sees stay where they are
-_ROUGHNESS = 1e-2  # β, the penalty on the weights' roughness in time, relative to the mean diagonal of JᵀJ
+_DAMPING = 1e-3  # Levenberg damping over the mean diagonal of JᵀJ (J: derivative of frames); holds vectors without rays
+_ROUGHNESS = 1e-2  # β, weight of the roughness in time, relative to the mean diagonal of JᵀJ (J: derivative of frames)
 _SHORTER = (1.0, 0.5, 0.25)  # backtracking line search: fractions of a step, tried in turn until one lowers the misfit
-_LEAST_DETERMINANT = 0.1  # a step may lower det(I + ∂w/∂y) of the displacement w(y) to this: at 0 matter folds
-_LEAST_VOXELS = 1.0  # a weight's change by 1 counts as at least so many voxels, so that fields of zeros have several states
-_SUPPORT = 4  # a cubic spline in time extends over this many intervals between knots
+_LEAST_DETERMINANT = 0.1  # least det(I + ∂w/∂y) of the displacement w(y) after a step: at 0 matter folds
+_LEAST_VOXELS = 1.0  # a weight's change by 1 counts as a displacement of at least this many voxels, also in fields of zeros
+_SUPPORT = 4  # number of intervals between knots over which a cubic spline in time extends
 
 
 @dataclass(frozen=True, eq=False)
 class MotionField:
-    """A displacement field during its search. control_mm: control vectors (R, cz, cy, cx, 3) of R fields, as in
-    ``Deformation``. temporal (count, R): coefficients of the fields' weights in the ``count`` splines of time."""
+    """A displacement field during its search: R fields in space, each times a weight in time. control_mm: the fields'
+    control vectors (R, cz, cy, cx, 3), as in ``Deformation``. temporal (count, R): coefficients of the fields' weights in
+    the ``count`` splines of time."""
 
     control_mm: np.ndarray
     origin_mm: tuple[float, float, float]
@@ -55,7 +57,7 @@ class MotionField:
         return Deformation(self.control_mm, self.origin_mm, self.spacing_mm, times_s, weights)
 
     def scaled(self) -> "MotionField":
-        """Returns the same displacements with weights whose largest size is 1."""
+        """Returns the same displacements, with each field's weight scaled to a largest size of 1."""
         largest = np.abs(self.splines.at(self.splines.node_times_s) @ self.temporal).max(0)
         factor = np.where(largest > 0, largest, 1.0)
         control_mm = self.control_mm * factor[:, None, None, None, None]
@@ -71,8 +73,8 @@ class MotionField:
 
 @dataclass(eq=False)
 class FieldProblem:
-    """The misfit of a scan under a motion model, as a function of the field. bending: weight γ of the field's bending,
-    relative to how strongly frames respond to a control vector."""
+    """The misfit of a scan under the gantry's motion model, as a function of the object's displacement field. bending:
+    weight γ of the field's bending, relative to how strongly frames respond to a control vector."""
 
     rt: Runtime
     scan: Scan
@@ -93,8 +95,8 @@ class FieldProblem:
     def operator(
         self, one: MotionField, tables: list[TimeCells] | None = None, warp: VolumeWarp | StateStack | None = None
     ) -> WarpedOperator:
-        """Returns the projector of an object that moves as ``one`` does. With the ``warp`` of an earlier projector,
-        ``tables`` may differ from the scan's, at the same times."""
+        """Returns the projector of an object that moves by the field ``one``. With the ``warp`` of an earlier projector,
+        ``tables`` may differ from the scan's time cells, but not in their times."""
         if warp is None:
             states = MotionStates.of_times(one.deformation(), self.scan.grid, self.times_s, _LEAST_VOXELS)
             warp = VolumeWarp(self.rt, states)
@@ -108,7 +110,7 @@ class FieldProblem:
         return self._masked(self.scan.projections - self.operator(one).forward(volume))
 
     def space_step(self, one: MotionField, volume: np.ndarray) -> MotionField:
-        """Returns the field after a step of its control vectors; the field itself if no step lowers misfit plus penalty."""
+        """Returns the field after a step of its control vectors; the field itself if no step lowers misfit plus bending."""
         operator = self.operator(one)
         residual = self._masked(self.scan.projections - operator.forward(volume))
         derivative = FieldDerivative(operator, volume)
@@ -160,8 +162,8 @@ class FieldProblem:
     def _temporal_equations(
         self, one: MotionField, operator: WarpedOperator, volume: np.ndarray, residual: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the normal equations of the coefficients in time: JᵀJ (count, R, count, R), and Jᵀ r (count, R) with the
-        residual r (F, rows, columns).
+        """Returns the normal equations of the coefficients in time: JᵀJ (count, R, count, R), and Jᵀ r (count, R), with the
+        frames' derivative J and the residual r (F, rows, columns).
 
         Splines that no frame sees together are projected together."""
         count, rank = one.temporal.shape
@@ -198,8 +200,8 @@ class FieldProblem:
         self, one: MotionField, residual: np.ndarray, candidates: Iterable[MotionField], volume: np.ndarray,
         penalty: Callable[[MotionField], float],
     ) -> MotionField:  # fmt: skip
-        """Returns the first of ``candidates`` that does not fold and that has a smaller sum of squared misfit and
-        ``penalty`` than ``one``; else ``one``."""
+        """Returns the first field of ``candidates`` that does not fold matter and has a smaller sum of squared residual and
+        ``penalty`` than the field ``one``; if none does, ``one``."""
         before = sum_squares(residual) + penalty(one)
         for candidate in candidates:
             # a field that folds has no inverse, so it is passed over however well its frames fit

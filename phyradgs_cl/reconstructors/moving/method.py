@@ -39,25 +39,25 @@ from phyradgs_cl.reconstructors.voxels.run import MethodRun
 from phyradgs_cl.reconstructors.voxels.stages import Stage, Stages
 from phyradgs_cl.runtime import Runtime
 
-_MOST_COLUMNS = 64  # most blocks of pixels along the longer side of the coarse scan's panel
+_MOST_COLUMNS = 64  # most pixels along the longer side of the coarse scan's panel
 _MOST_VOXELS = 32  # most voxels along the longest side of the coarse scan's grid
 _MOST_FRAMES = 600  # most frames of the coarse scan, unless the signal has more knots
-_TIMES_PER_PERIOD = 12  # times per period of a motion at which exposures sample it
-_MOST_TIMES = 6  # most times per exposure that a period may ask for: each costs a projection
+_TIMES_PER_PERIOD = 12  # an exposure is sampled at this many times per period of the motion
+_MOST_TIMES = 6  # most times per exposure that a short period may require: each costs a projection
 _FIRST_PASSES = 8  # passes of fista before the first round, for an object at rest: the field needs a volume to start from
 _PASSES = 3  # passes of fista in each round, which let the volume follow the field
 _WEIGHT = 0.42  # prior weight of fista in the search
-_TV_ITERATIONS = 5  # TV iterations per pass of fista in the search
+_TV_ITERATIONS = 5  # dual iterations of total variation (TV) per pass of fista in the search
 _COARSE_SPACINGS = 2  # the first rounds find coarse motion, with this many spacings of control points along the longest side
 _FINE_SPACINGS = 4  # the last rounds refine that motion with closer control points: this many spacings
 # Finer control points need a larger bending weight γ, by this factor, so that the field is as stiff in mm as before.
 _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4
 _COARSE_SHARE = 0.6  # fraction of the rounds that have coarse control points
-_FREE_KNOTS = 6  # if weights follow no signal, their splines have this many intervals in time
+_FREE_KNOTS = 6  # number of intervals between spline knots in time, if weights follow no signal
 _AT_REST = "no motion found"
-# One in five iterations is a round of the search: by default 7 rounds, and then 26 as in fista.
+# One in five iterations is a round of the search for the field: of the default 33, 7 rounds, then 26 passes of fista.
 _ITERATIONS_PER_ROUND = 5
-_STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")
+_STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")  # arrays in a state
 
 
 def coarse_scan(scan: Scan, most_frames: int = _MOST_FRAMES) -> Scan:
@@ -71,7 +71,7 @@ def coarse_scan(scan: Scan, most_frames: int = _MOST_FRAMES) -> Scan:
 
 def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: float) -> MotionField:
     """Returns a field at rest over the times from ``first_s`` to ``last_s``. Its weights follow ``signal`` if that has a
-    knot spacing, else a line and its square in time."""
+    knot spacing, else two curves: a straight line in time and its square."""
     spacing_mm = max(scan.grid.size_mm) / _COARSE_SPACINGS
     if signal.knot_s is not None:
         between_s = float(np.median(np.diff(signal.times_s)))
@@ -84,8 +84,8 @@ def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: floa
 
 
 class FieldSearch:
-    """Searches the displacement field on a coarse copy of the scan, in rounds, which are iterations of a ``Loop``. bending:
-    the field's stiffness."""
+    """Searches the displacement field on a coarse copy of the scan, in ``rounds``, which are iterations of a ``Loop``.
+    signal: what the field follows at first. bending: the field's stiffness."""
 
     quantity, remedy = "residual", "check the scan for extreme values"
 
@@ -153,8 +153,8 @@ class FieldSearch:
 
     def finding(self) -> tuple[Deformation, float]:
         """Returns the field, and its gain: the fraction by which it lowers the squared residual, compared with an object at
-        rest after as many passes. The field is zeros if the gain is at most ``LEAST_GAIN``, or twice what as many parameters
-        would explain of noise."""
+        rest after as many passes. The field is zeros unless the gain is above ``LEAST_GAIN``, and above twice the share of
+        noise that as many parameters explain."""
         if not self.field.control_mm.any():
             return self.field.deformation(), 0.0
         moving = self._reconstructed(self.field, self.volume, _PASSES)
@@ -183,8 +183,8 @@ class FieldSearch:
 
 
 def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:
-    """Returns the model with as many times per exposure as the gantry and the signal's period need: how fast the object
-    moves is not known yet."""
+    """Returns the motion model with as many times per exposure as the gantry and the signal's period need. How fast the
+    object moves is not known yet."""
     timed = with_times(motion, scan)
     if motion != PerRow() or not isinstance(timed, PerRow) or period_s is None:
         return timed
@@ -238,7 +238,7 @@ class MovingOptions(FistaOptions):
 
 @dataclass
 class _Field:
-    """Hands the field from the search to the passes. A state of the passes holds the field too, because they need it to
+    """Hands the field from the search to the passes of ``fista``. Their state holds the field too, so that they can
     resume."""
 
     deformation: Deformation | None = None

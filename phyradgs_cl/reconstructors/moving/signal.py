@@ -1,9 +1,9 @@
 """The motion signal of a scan: from its frames, or stated in the scan or in a file of comma-separated values. Also cubic
-B-splines in time, for the weights of a field that follows it.
+B-splines in time, for the weights of a displacement field that follows the signal.
 
-From frames it is the first principal component of the Amsterdam shroud: the mean of each detector row in each frame. A
-displacement along the rotation axis shows in it from all sides, while the turning gantry changes it slowly. L. Zijp et al.,
-Extraction of the respiratory signal from sequential thorax cone-beam X-ray images, Proc. ICCR (2004) 507."""
+From frames the signal is the first principal component of the Amsterdam shroud: the mean of each detector row in each frame.
+A displacement along the rotation axis shows in it from all sides, while the turning gantry changes it slowly. L. Zijp et
+al., Extraction of the respiratory signal from sequential thorax cone-beam X-ray images, Proc. ICCR (2004) 507."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,17 +16,17 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gating
 
-_NODES = 4  # weights are stored at this many times per interval between knots, and are linear between them
+_NODES = 4  # a field's weights are stored at this many times per interval between knots, and linear between these
 _STRETCH = 0.02  # weight of first differences in the bending energy: without it, a field could grow linearly in air
-_HARMONICS = 6  # the first harmonics of the gantry's angle, which are removed: an object at rest causes them too
-_FEWEST_CYCLES = 5  # a motion with fewer cycles in the scan is modelled freely in time
-_BAND = 0.25  # breaths differ in length: rates that differ from the dominant one by up to this fraction count as it
-# A signal repeats if at least this fraction of its power lies in the band, not counting what white noise has there.
+_HARMONICS = 6  # number of harmonics of the gantry's angle that are removed, because an object at rest causes them too
+_FEWEST_CYCLES = 5  # a motion with fewer cycles in the scan is fitted freely in time, without a period
+_BAND = 0.25  # rates within this fraction of the dominant rate count as the same, since breaths differ in length
+# A signal repeats if at least this fraction of its power lies about one rate (``_BAND``), beyond the part of white noise.
 _PERIODIC_SHARE = 0.5
 _FEWEST_FRAMES = 16  # a scan of fewer frames shows no period
 _FEWEST = 4  # a file must have at least this many values to be a signal
 _KNOTS_PER_PERIOD = 6  # weights that follow a signal have this many knots per period
-_SLOWER = 0.95  # a stated signal that does not repeat gets knots for its low frequencies, up to this share of its power
+_SLOWER = 0.95  # a stated signal that does not repeat gets knots for the low frequencies that have this share of its power
 _MOST_EVEN = 100_000  # a signal is interpolated to at most this many even steps
 _FORMS = f"at least {_FEWEST} lines: time in s, value; or one value for each frame"
 
@@ -55,7 +55,7 @@ class TemporalSplines:
 
     @property
     def node_times_s(self) -> np.ndarray:
-        """Times at which weights are stored: four for each interval, and the end."""
+        """Times at which weights are stored: four in each interval, and the end of the last."""
         return np.linspace(self.first_s, self.last_s, _NODES * self.intervals + 1)
 
     def at(self, times_s: np.ndarray) -> np.ndarray:
@@ -75,7 +75,7 @@ class TemporalSplines:
 
 
 class Bending:
-    """Half the gradient of the bending energy Σ ‖∂²U/∂i∂j‖² of control vectors, by differences between neighbours.
+    """Half the gradient of the bending energy Σ ‖∂²U/∂i∂j‖² of control vectors U, by differences between neighbours.
 
     counts: (cz, cy, cx) of the control points."""
 
@@ -109,9 +109,9 @@ class MotionSignal:
     """The course of the object's motion in time.
 
     - times_s (F,): the middles of the frames, rising. values (F,): mean 0, largest size 1, without a unit or a sign.
-    - period_s: mean length of a cycle; None if no cycle repeats.
+    - period_s: mean length of a cycle in s; None if no cycle repeats.
     - later (F,): the quadrature, a quarter of a cycle later; None derives it from ``values``.
-    - knot_s: time between two knots of weights that follow the signal; None if weights need not follow it."""
+    - knot_s: time in s between two spline knots of weights that follow the signal; None if weights need not follow it."""
 
     times_s: np.ndarray
     values: np.ndarray
@@ -160,7 +160,7 @@ def period_of(times_s: np.ndarray, values: np.ndarray) -> float | None:
 
 
 def _spectrum(times_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns the power of a signal (n,) at 0, 1, 2 … cycles per time span, and that span in s."""
+    """Returns the power of a signal (n,) at 0, 1, 2 … cycles in its time span, and this span in s."""
     even_s, even = _evenly(times_s, values)
     power = np.abs(np.fft.rfft((even - even.mean()) * np.hanning(len(even)))) ** 2
     return power, float(even_s[-1] - even_s[0]) * len(even) / max(len(even) - 1, 1)
@@ -233,7 +233,7 @@ def load_gating(path: str, scan: Scan) -> Gating:
 
 
 def signal_of(gating: Gating, scan: Scan, subject: str) -> MotionSignal:
-    """Returns the motion signal of a gating. Its period comes from the phases, or from the values by ``period_of``.
+    """Returns the motion signal of stated values or phases. Its period comes from the phases, or from ``period_of``.
 
     Raises InputError, which names ``subject``, for times that miss the scan and for values that do not change."""
     times_s, values = gating.times_s, gating.values

@@ -5,7 +5,7 @@ ST". r2 is R2-Gaussian (Zha et al. 2024): affine splats with its published const
 the paper's "R2 w/ ST".
 
 Internally, lengths are divided by half the volume's longest side and densities by a reference (FDK's 99.9th percentile), so
-that rates, thresholds and SSIM's constants hold for every scan."""
+that learning rates, thresholds and SSIM's constants hold for every scan."""
 
 import json
 import time
@@ -32,12 +32,12 @@ from phyradgs_cl.reconstructors.splats.start import box_of, first_population, in
 from phyradgs_cl.reconstructors.splats.step import Batch, DeviceCloud, FrameStep, Scale, sharing_of
 from phyradgs_cl.runtime import Runtime
 
-REPORT_EVERY = 50  # iterations between reports; lines of the record are as far apart or closer
-LEAST_RECORDED = 20  # short runs record more often, to have a curve of this many lines
+REPORT_EVERY = 50  # iterations between progress reports; lines of the convergence record are as far apart or closer
+LEAST_RECORDED = 20  # short runs record more often, so that the convergence record has at least this many lines
 
 
 class SplatRun:
-    """The state of an optimisation, the same on every rank. A ``Loop`` runs it step by step."""
+    """The running state of a splatting method, the same on every rank (MPI process). A ``Loop`` runs it step by step."""
 
     quantity, remedy, finished = "loss", "check the scan for extreme values", None
 
@@ -86,7 +86,7 @@ class SplatRun:
         return found
 
     def next_batch(self) -> Batch:
-        """Draws the frames of a step in random order, each once per pass."""
+        """Draws the frames of a step in random order, each once per pass over all frames."""
         frames = []
         for _ in range(min(self.batch, max(self.iterations - self.iteration, 1))):
             if not self._queue:
@@ -130,7 +130,7 @@ class SplatRun:
         self._queue = state["queue"].tolist()
 
     def present_cloud(self) -> Gaussians:
-        """Returns the cloud in internal units, without Gaussians whose shape density control would not allow."""
+        """Returns the Gaussians in internal units, without those that density control would remove as too thin."""
         rows = self.activation.apply(self.cloud.population().raw.astype(np.float64))
         return Gaussians.from_rows(rows[:, self.options.control.allows(rows[SCALE])])
 
@@ -184,8 +184,8 @@ def first_cloud(
     rt: Runtime, scan: Scan, options: SplatOptions, seed: int, initial: np.ndarray | None = None,
     deformation: Deformation | None = None,
 ) -> tuple[Scale, Population, np.random.Generator]:
-    """Returns the internal units, the first cloud, and the random generator that drew it. The cloud comes from ``initial``
-    (nz, ny, nx) in 1/mm or, without, from FDK's volume."""
+    """Returns the internal units, the Gaussians to start from, and the random generator that drew them. The Gaussians come
+    from ``initial`` (nz, ny, nx) in 1/mm or, without, from FDK's volume."""
     first = static_fdk(rt, scan, deformation) if initial is None else initial
     scale = internal_scale(first, scan.grid)
     rng = np.random.default_rng(seed)

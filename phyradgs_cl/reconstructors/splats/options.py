@@ -14,16 +14,16 @@ from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 from phyradgs_cl.text import repr_of_changes
 
 # Iterations before ``exact_from`` model motion coarsely, which loses nothing (docs/results/motion_models.md).
-_STATIC_SHARE = 0.4  # this fraction of the coarse iterations, the first ones, have one pose per frame
-_COARSE_ERROR = 0.1  # the other coarse iterations have at least this ``time_error``
+_STATIC_SHARE = 0.4  # fraction of these coarse iterations, the first ones, that have one pose per frame
+_COARSE_ERROR = 0.1  # least ``time_error`` (relative RMS error) of the other coarse iterations
 
 
 @dataclass(frozen=True, repr=False)
 class SplatOptions(MotionOptions):
     """Options of a splatting run; lengths in half-sides of the volume, densities relative to FDK's 99.9th percentile.
 
-    - gaussians: size of the first cloud; 0 chooses it from the grid. The weights are λ of the paper's Eq. 4. tv_edge: edge
-      in voxels of the random sub-volume for total variation. scale_min_voxels: least scale as a fraction of a voxel.
+    - gaussians: number at the start; 0 chooses it from the grid. The weights are λ of the paper's Eq. 4. tv_edge: side in
+      voxels of the random sub-volume for total variation. scale_min_voxels: least scale as a fraction of a voxel.
     - detector_model: what the detector averages over a line's times: line integrals (log), intensity, or what the scan
       states (scan).
     - exact_from: in iterations before this fraction of the run, the motion ``exact`` is coarse: first one pose for each
@@ -44,7 +44,7 @@ class SplatOptions(MotionOptions):
     tv_edge: int = checks.ranged(32, 1, 4096)
     density_weight: float = checks.ranged(0.001, 0, 1e6)
     parameter_terms_from: int = checks.ranged(500, 0, 1_000_000_000)
-    cutoff_sigma: float = checks.ranged(DEFAULT_CUTOFF_SIGMA, 0, 100)  # 0 cuts nothing off
+    cutoff_sigma: float = checks.ranged(DEFAULT_CUTOFF_SIGMA, 0, 100)  # in standard deviations; 0 cuts nothing off
     initial_threshold: float = checks.ranged(0.05, 0, 1e6)
     initial_density: float = checks.ranged(0.15, 1e-6, 1e3)
     initial_scale: float = checks.ranged(1.0, 1e-6, 1e3)
@@ -69,7 +69,7 @@ class SplatOptions(MotionOptions):
         return Activation(smallest, max(self.scale_max, 2 * smallest))
 
     def gaussians_for(self, grid: Grid) -> int:
-        """Returns the size of the first cloud: the option, or one sixteenth of the voxels, within 1,000 to 50,000."""
+        """Returns the number of Gaussians at the start: the option or, for 0, 1/16 of the voxels, from 1,000 to 50,000."""
         if self.gaussians:
             return self.gaussians
         voxels = grid.shape[0] * grid.shape[1] * grid.shape[2]
@@ -92,7 +92,7 @@ class SplatOptions(MotionOptions):
 
     @property
     def asks_for_gaussians(self) -> bool:
-        """Whether the user, not a preset or the grid, chose the size of the first cloud."""
+        """Whether the user, not a preset or the grid, chose the number of Gaussians at the start."""
         return self.gaussians not in {0, *(preset.gaussians for preset in (*PRESETS.values(), R2_PUBLISHED))}
 
 

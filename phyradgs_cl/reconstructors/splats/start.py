@@ -12,7 +12,7 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.splats.step import Scale
 
 log = logging.getLogger(__name__)
-_REFERENCE_PERCENTILE = 99.9  # the unit of density is this percentile of the first volume, because its maximum is noise
+_REFERENCE_PERCENTILE = 99.9  # percentile of the first volume that is the unit of density: its maximum would be noise
 
 
 def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:
@@ -51,8 +51,8 @@ def initial_cloud(
     """Draws up to ``count`` isotropic Gaussians at different voxels above ``threshold``, all in internal units.
 
     volume (nz, ny, nx). A Gaussian's density is ``density_share`` of the voxel's value. Its scale is ``scale_factor`` × the
-    RMS distance to the three nearest others, within ``scale_bounds``. An empty volume still gives one faint Gaussian in the
-    middle, so that there is something to optimise."""
+    RMS distance to its three nearest neighbours, within ``scale_bounds``. An empty volume still gives one faint Gaussian in
+    the middle, so that there is something to optimise."""
     candidates = np.flatnonzero(volume.ravel() > threshold)
     if candidates.size == 0:
         log.warning(
@@ -80,7 +80,7 @@ def neighbour_distance(points: np.ndarray, fallback: float) -> np.ndarray:
 
 
 def box_of(grid: Grid) -> np.ndarray:
-    """Returns the lowest and the highest corner (2, 3) of a grid, x y z."""
+    """Returns the lowest and the highest corner (2, 3) of a grid, x y z, in the grid's unit of length."""
     half = np.array(grid.size_mm[::-1]) / 2
     centre = np.array(grid.offset_mm[::-1])
     return np.stack([centre - half, centre + half])

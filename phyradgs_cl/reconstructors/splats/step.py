@@ -1,8 +1,8 @@
 """One step of a splatting run on the device: its Gaussians and frames there, and the gradient, summed over ranks.
 
 All of it is in ``FrameStep.gradient``: render a frame, compare it, differentiate, add total variation, apply the chain rule.
-Each rank has all Gaussians, and some frames of the batch. The bits of summed gradients depend on the batch, not on the
-number of ranks."""
+Each rank (MPI process) has all Gaussians, and some frames of the batch. The bits of summed gradients depend on the batch,
+not on the number of ranks."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,11 +23,11 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import pad_rows
 
-_PEAK_PERCENTILE = 99.9  # this percentile of the line integrals is their peak, because their maximum is noise
-_ROWS = 11  # parameters of a Gaussian, which are rows of dL/d(parameters)
-_STATISTICS = 2  # numbers for density control: sum of gradient norms, and number of frames
-# Rows of ``cloud.gradients``: dL/d(parameters), then dL/d(projected centre) along and across a line, per half of the image's
-# size.
+_PEAK_PERCENTILE = 99.9  # percentile of the line integrals that counts as their peak: their maximum would be noise
+_ROWS = 11  # number of a Gaussian's parameters, which are the rows of dL/d(parameters)
+_STATISTICS = 2  # numbers per Gaussian for density control: sum of gradient norms, and number of frames in it
+# Number of rows of ``cloud.gradients``: the 11 of dL/d(parameters), then dL/d(projected centre) along and across a line, in
+# units of half the image's size.
 _DERIVED = 13
 Corner = tuple[int, int, int]
 """First voxel (z, y, x) of the random sub-volume whose total variation enters the loss."""
@@ -71,8 +71,8 @@ class DeviceCloud:
         return Population(self.rt.download(self.raw)[:, :count], self.rt.download(self.moments)[:, :, :count])
 
     def read_statistics(self) -> np.ndarray:
-        """Returns (2, count) float32: the norms of the gradient by the projected centre, summed over frames, and the number
-        of frames that have one."""
+        """Returns (2, count) float32 for each Gaussian: the norms of dL/d(projected centre), summed over frames, and the
+        number of frames in which they are above 0."""
         return self.rt.download(self.statistics)[:, : self.count]
 
     def write_statistics(self, statistics: np.ndarray) -> None:
@@ -82,7 +82,7 @@ class DeviceCloud:
 
 
 class DeviceFrames:
-    """All frames on the device, each with its time cells, its measurement in internal units, and its mask."""
+    """All frames on the device, each with its time cells, its measured line integrals in internal units, and its mask."""
 
     def __init__(
         self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, deformation: Deformation | None = None
@@ -98,7 +98,7 @@ class DeviceFrames:
         self._mask, self._pixels = _upload_masks(rt, scan)
 
     def follow(self, motion: Motion) -> bool:
-        """Takes the time cells of a motion model. Returns whether frames average intensities over a line's cells."""
+        """Uploads the time cells of a motion model. Returns whether frames average intensities over a line's cells."""
         tables, merges = tables_of(self.scan, motion, self._model, self.deformation)
         of_object = self.deformation
         states = [None if of_object is None else states_of(table, of_object) for table in tables]
@@ -145,9 +145,9 @@ def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[floa
 
 @dataclass(frozen=True)
 class Batch:
-    """The frames of one step by number. For each, the first voxel of the sub-volume whose total variation counts (None if
-    that has no weight). ``late``: whether the iteration has reached ``parameter_terms_from``, from which the density term
-    applies."""
+    """The frames of one step by number. corners: for each frame, the first voxel of the sub-volume whose total variation
+    counts; None if that has no weight. ``late``: whether the iteration has reached ``parameter_terms_from``, from which the
+    density term applies."""
 
     frames: list[int]
     corners: list[Corner | None]
@@ -155,8 +155,8 @@ class Batch:
 
 
 class FrameStep:
-    """Computes gradients from single frames of a scan, in internal units, for a volume on ``grid``. deformation: how the
-    object moves, in mm."""
+    """Computes the gradient of the objective for one frame of a scan at a time, in internal units. grid: of the volume.
+    deformation: how the object moves, in mm."""
 
     def __init__(
         self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, grid: Grid,
@@ -213,7 +213,7 @@ class FrameStep:
 
 
 class Alone:
-    """One process, which takes one frame per step."""
+    """A step in one process, which takes one frame at a time."""
 
     def differentiate(self, step: FrameStep, cloud: DeviceCloud, batch: Batch) -> None:
         """Writes dL/d(raw parameters) of the batch into the cloud's gradients, and adds to its statistics."""
@@ -224,7 +224,7 @@ class Alone:
 
 
 class SharedFrames(Alone):
-    """Ranks that share several frames per step: rank r takes the frames r, r + ranks, … of the batch."""
+    """A step of several frames that ranks share: rank r takes the frames r, r + ranks, … of the batch."""
 
     def __init__(self, ranks: Communicator) -> None:
         self.ranks = ranks

@@ -1,4 +1,4 @@
-"""ASD-POCS: a SART pass, then a few steps down the total variation (TV), with the lengths of both kept in balance.
+"""ASD-POCS: a SART pass, then a few steps down the total variation (TV), whose lengths are kept in balance.
 
 Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777, with the step control of TIGRE (Biguri et al. 2016)."""
 
@@ -17,11 +17,11 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 @dataclass(frozen=True)
 class AsdPocsOptions(SartOptions):
-    """Options of ASD-POCS. tv_steps: TV steps per iteration. tv_share: α, a TV step's length over the first SART pass's
-    change.
+    """Options of ASD-POCS. tv_steps: TV steps per iteration. tv_share: α, the first length of a TV step over the change by
+    the first SART pass.
 
-    tv_reduction: factor on a TV step's length when TV moves the volume by more than ``tv_ratio`` (r_max) times the SART
-    pass's change and the residual is above ε. residual_share: ε, the residual to aim at, over that of the FDK volume."""
+    tv_reduction: factor on a TV step's length if TV changes the volume by more than ``tv_ratio`` (r_max) times as much as
+    the SART pass, and the residual is above ε. residual_share: ε, the residual to aim at, over that of the FDK volume."""
 
     iterations: int = 10
     relaxation_reduction: float = 0.9999
@@ -79,5 +79,5 @@ def _started(system: System, options: AsdPocsOptions, run: MethodRun) -> AsdPocs
 
 METHOD = voxel_method(
     "asd-pocs", AsdPocsOptions(), _started, frames=2,
-    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # 4 more volumes, to compare the lengths of steps
+    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # 4 more than SART, to compare lengths of steps
 )

@@ -11,8 +11,8 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 @dataclass(frozen=True)
 class CglsOptions(IterativeOptions):
-    """Options of CGLS. noise_stop: ends the run if the residual is at most this many times the noise. nonnegative must stay
-    False, because CGLS does not clip."""
+    """Options of CGLS. noise_stop: the run ends once the residual is at most this many times the estimated noise.
+    nonnegative must stay False, because CGLS does not clip."""
 
     iterations: int = 60
     nonnegative: bool = False

@@ -41,22 +41,22 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.algebra import HostSpace
 
 log = logging.getLogger(__name__)
-_VOLUMES = 16  # memory of a run in volumes, with the prior ``dct``
-_FRAMES = 3  # memory of a run in copies of all projections
-_HELD = 9  # volumes that the prior ``dct`` holds on the device
-_COPIES = 2  # the device holds two copies of a volume on the host while a prior maps it
-# Measured: docs/results/settings.md.
-_COARSE_SHARE = 6 / 13  # fraction of the iterations that are coarse: those before smaller voxels
-_COARSE_PASSES = 2  # passes in a coarse iteration: they cost little, and few views or photons need many
-_COARSE_SUBSETS = 1.6  # a coarse pass has this many times ``subsets`` subsets
-_COARSE_TIMES = 1 / 3  # a coarse pass has this fraction of the times per exposure, but two at least
-# On smaller voxels a map of the prior takes as long as the rays of a subset. Therefore one map stands for several steps,
-# until the last passes: these have all maps, which takes out the noise of the passes before.
+_VOLUMES = 16  # volumes that a run with the prior ``dct`` holds in memory at one time
+_FRAMES = 3  # arrays of all frames that a run holds in memory at one time
+_HELD = 9  # volumes that the prior ``dct`` keeps on the device
+_COPIES = 2  # volumes on the device, input and result, while a prior maps a volume of the host
+# These values were chosen by measurement: docs/results/settings.md.
+_COARSE_SHARE = 6 / 13  # fraction of the iterations that are coarse: those before voxels are divided
+_COARSE_PASSES = 2  # number of passes in a coarse iteration: they cost little, and scans with few views or photons need many
+_COARSE_SUBSETS = 1.6  # number of subsets in a coarse pass, over the option ``subsets``
+_COARSE_TIMES = 1 / 3  # times per exposure in a coarse pass, over those of other passes; at least two
+# On smaller voxels a map of the prior takes as long as the rays of a subset. So one map serves _STEPS_PER_MAP steps,
+# until the last _FULL_PASSES passes. In these every step has its map, which removes the noise of the passes before.
 _STEPS_PER_MAP = 3
 _FULL_PASSES = 5
-_MOST_OPTIMISED = 23  # most iterations by POGM: its momentum has no restart, and the noise of subsets grows with it
-_CALM = 3  # last iterations of a run on one grid alone, which are FISTA's: they remove the noise of subsets
-_FAINTEST = 1e-6  # smaller row sums of AᵀA count as this fraction of the largest: dividing by less would inflate the bound
+_MOST_OPTIMISED = 23  # most iterations by POGM: its momentum is never restarted, and the noise of subsets grows with it
+_CALM = 3  # number of last iterations by FISTA in a run on one grid: they remove the noise of subsets
+_FAINTEST = 1e-6  # smaller row sums of AᵀA count as this fraction of the largest, since less would inflate the bound
 # Voxels are divided if a slice (y, x) has at most this many of them: dividing is worth its time at 64³, not at 128³.
 # Slices are not counted, so that thick and thin slabs of one scan are reconstructed in the same manner.
 _MOST_DIVIDED = 90**2
@@ -69,10 +69,10 @@ class FistaOptions(IterativeOptions):
     - prior: one of ``PRIORS``, a user's function, or its ``package.module:function``. A function takes (volume (nz, ny, nx)
       in 1/mm, weight in 1/mm) and returns a volume; docs/methods.md says how to scale a denoiser.
     - prior_share: s in the prior piccs, (1 − s) TV(x) + s TV(x − first volume).
-    - prior_weight: strength of the prior, relative to the error of the data term's gradient. That error comes from noise of
+    - prior_weight: strength of the prior, relative to the error of the data term's gradient. This error comes from noise of
       the frames and from edges inside large voxels.
-    - subvoxels: parts of a voxel's side in the last 7/13 of the iterations; 0 takes 2 for slices of up to 90² voxels
-      where memory allows, else 1.
+    - subvoxels: number of parts of a voxel's side in the last 7/13 of the iterations; 0 takes 2 for slices of up to 90²
+      voxels where memory allows, else 1.
     - subsets: number of subsets of the frames, each with one step; iterations before smaller voxels have 1.6 times as many.
       Subsets whose steps diverge are joined two by two. tv_iterations: dual iterations per proximal map of TV.
     - transmission_weights: weights pixels by their transmission, as in ``fista-tv``."""
@@ -156,8 +156,8 @@ def _curvature(system: System) -> float:
 
 
 def _tight_curvature(system: System) -> float:
-    """Returns a smaller Lipschitz constant in mm² for one more pass: the norm of AᵀA is at most the largest (AᵀA x)/x of an
-    x > 0 (Collatz and Wielandt). With row sums as x the bound is a sixth smaller than the largest row sum."""
+    """Returns a smaller Lipschitz constant in mm², at the cost of one more pass: the norm of AᵀA is at most the largest (AᵀA
+    x)/x of an x > 0 (Collatz and Wielandt). With row sums as x the bound is a sixth smaller than the largest row sum."""
     sums, space = _row_sums(system), system.space
     again = system.adjoint(system.apply_weights(system.forward(sums)))
     bound = space.largest(space.multiply(again, space.reciprocal(sums, _FAINTEST)))
@@ -168,8 +168,8 @@ class Fista(Accelerated):
     """Passes over subsets by POGM, then by FISTA. A pass's residual combines all subsets, each at the point of its gradient.
 
     passes: number of passes in an iteration, whose residual is the last one's. optimised: number of passes by POGM. sparing:
-    number of passes in which a map of the prior follows only every third step, with the weight of three, and the last one.
-    ``previous`` and ``ahead`` are POGM's wₖ₋₁ and zₖ₋₁, ``momentum`` and ``length`` its θₖ₋₁ and L γₖ₋₁."""
+    number of passes in which the prior's map follows only every third step and the last, with the weight of the steps since
+    the last map. ``previous`` and ``ahead`` are POGM's wₖ₋₁ and zₖ₋₁, ``momentum`` and ``length`` its θₖ₋₁ and L γₖ₋₁."""
 
     ARRAYS = ("volume", "previous", "ahead")
     NUMBERS = ("momentum", "length", "optimised", "sparing")
@@ -215,13 +215,14 @@ class Fista(Accelerated):
         return [*maps, (count - 1) % spacing + 1]
 
     def _descended(self, point: Any, subset: System) -> tuple[Any, Any]:
-        """Returns ``point`` after a gradient step of a subset, and the residual at ``point``."""
+        """Returns the volume ``point`` after a gradient step of a subset, and the subset's residual at ``point``."""
         residual = subset.residual(point)
         downhill = subset.back(subset.apply_weights(residual))
         return self.system.space.add(point, downhill, len(self.subsets) / self.curvature), residual
 
     def _mapped(self, volume: Any, weight: float, maps: int) -> Any:
-        """Applies the prior with the weight of ``maps`` steps; only x ≥ 0 for none."""
+        """Applies the prior's map with ``weight`` for each of ``maps`` steps; for 0 steps only clips at 0, if
+        ``nonnegative``."""
         prior = self.prior if maps else Prior()
         return prior(self.system.space, volume, maps * weight, nonnegative=self.nonnegative)
 
@@ -268,7 +269,7 @@ METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initia
 
 def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
     """Returns the stages of a run: on the scan's own voxels and, if options or grid ask for them, on smaller voxels. A stage
-    takes its run from ``now`` when it starts, because the motion of the object may be known only then."""
+    calls ``now`` for its run when it starts, because the motion of the object may be known only then."""
     options = run.options
     parts = options.subvoxels or (2 if _gains_from_subvoxels(run, 2) else 1)
     first = round(_COARSE_SHARE * options.iterations) if parts > 1 else 0
@@ -295,9 +296,9 @@ def fista_stage(
     now: Callable[[], MethodRun], iterations: int, volume: np.ndarray | None, parts: int = 1, is_coarse: bool = False,
     optimised: int = 0,
 ) -> Iterations:  # fmt: skip
-    """Returns ``iterations`` from ``volume`` (nz, ny, nx; None: the method's own start), with every voxel divided into
-    ``parts`` along each side. is_coarse: the iterations only provide the first volume of the next stage. optimised: how many
-    iterations are POGM's."""
+    """Returns the method of a stage: ``iterations`` from ``volume`` (nz, ny, nx; None: the method's own start), with every
+    voxel's side divided into ``parts``. is_coarse: the iterations only provide the first volume of the next stage.
+    optimised: how many iterations are POGM's."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
     options, rt = replace(whole.options, iterations=iterations), whole.rt
@@ -327,8 +328,8 @@ def fista_stage(
 
 
 def _gains_from_subvoxels(run: MethodRun, parts: int) -> bool:
-    """Returns whether smaller voxels are worth their time on this grid, and fit on every rank's device. Logs a warning if
-    only room is missing."""
+    """Returns whether voxels divided into ``parts`` along a side are worth their time on this grid, and fit on every rank's
+    device. Logs a warning if only room is missing."""
     shape, rt = run.scan.grid.shape, run.rt
     if math.prod(shape[1:]) > _MOST_DIVIDED:
         return False

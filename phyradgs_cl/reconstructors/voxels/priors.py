@@ -1,5 +1,5 @@
-"""The priors of ``fista``, as proximal maps, and their weight, relative to the error of the data term's gradient. A new
-prior is a line of ``PRIORS``: a class, whose map is in ``objective``, or ``OwnPrior`` of a function.
+"""The priors of ``fista`` as proximal maps, and their weight, relative to the error of the data term's gradient. To add a
+prior, add a line to ``PRIORS``: a class, whose map is in ``objective``, or ``OwnPrior`` of a function.
 
 A pixel differs from the projection of the best volume by its noise and, at edges, by the discretisation error of voxels.
 Both reach the gradient through Aᵀ. The constants are fitted (docs/results/settings.md)."""
@@ -26,9 +26,9 @@ from phyradgs_cl.reconstructors.result import function_name
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime, Space
 
-# The length of a path is this many standard deviations of five positions at even times from its start to its end.
+# Length of a path over the standard deviation of five positions on it, at even times from its start to its end.
 _SPREAD = 2.83
-_EDGES = 0.09  # error of a ray's path length at the object's edges, over a voxel's side
+_EDGES = 0.09  # error of a ray's path length at the edges of the object, which voxels cannot show, over a voxel's side
 _LEAST = 1e-4  # least weight of the prior, as a fraction of the largest value of Aᵀp: without noise it would be 0
 # Factors on the option ``prior_weight`` in a prior's maps, measured (docs/results/settings.md).
 _TV_ALONE = 1.6  # weight of TV in the prior ``tv``
@@ -39,12 +39,12 @@ _DCT_AT_REST = 1.35  # threshold of the block cosine transforms before ridge ste
 _RIDGE_NOISE = 17.0  # noise that a ridge step assumes, relative to the prior's weight, for fly-scans
 _RIDGE_NOISE_AT_REST = 20.0  # noise that a ridge step assumes, relative to the prior's weight, for scans that stop
 _RIDGE_LENGTH = 0.5  # length of a ridge step: factor on the regulariser's gradient
-_RIDGE_EVERY = 4  # one ridge step follows after this many maps of the prior ``dct``
+_RIDGE_EVERY = 4  # number of maps of the prior ``dct`` for each ridge step
 # _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals. For other noise, _TV_AT_REST is multiplied by
 # the sixth root of the other noise over this one, and _RIDGE_NOISE_AT_REST is divided by that root.
 _USUAL_NOISE = 0.01
-_LEAST_NOISE = 0.001  # less noise counts as this, because some scans have none
-_LEAST_NOISE_SHARE = 0.1  # a ridge step counts at least this fraction of the weight as noise, because some scans have none
+_LEAST_NOISE = 0.001  # least noise of line integrals that the prior ``ridge`` assumes, because some scans have none
+_LEAST_NOISE_SHARE = 0.1  # least fraction of the prior's weight that a ridge step takes as noise: some scans have none
 _SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result; the larger voxels of the passes before have the rest
 _SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels with the prior ``ridge``, which leaves less noise
 
@@ -53,7 +53,8 @@ _SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels with the prior ``ri
 class FrameError:
     """The error of a pixel that no volume on the grid explains.
 
-    noise: standard deviation of its line integral. edges_mm: discretisation error at edges, per density (1/mm) there."""
+    noise: standard deviation of its line integral. edges_mm: discretisation error at edges, over the density (1/mm)
+    there."""
 
     noise: float
     edges_mm: float = 0.0
@@ -81,8 +82,8 @@ def _blur_mm(scan: Scan, motion: Motion) -> float:
 
 
 def adjoint_response(system: System) -> tuple[float, float]:
-    """Returns how strongly Aᵀ responds to errors, in mm, in a volume's middle half: the standard deviation for independent
-    unit noise in every ray, and the mean for a unit error in all rays."""
+    """Returns how strongly the backprojection Aᵀ responds to errors of frames, in mm, in a volume's middle half: its
+    standard deviation for independent unit noise in every ray, and its mean for a unit error in all rays."""
     noise = np.random.default_rng(0).standard_normal(system.measured.shape, np.float32)
     by_noise = system.adjoint(system.masked(system.apply_weights(system.space.array(noise))))
     by_ones = system.column_sums()
@@ -122,7 +123,7 @@ def _density(space: Space[Any], volume: Any) -> float:
 class PriorInputs:
     """What a prior needs.
 
-    - tv_iterations: dual iterations per map. is_fly: frames expose over an arc.
+    - tv_iterations: dual iterations per map of total variation. is_fly: frames expose over an arc (fly-scan).
     - noise: standard deviation of line integrals behind the object.
     - image (nz, ny, nx) in 1/mm, share: the prior image of the prior piccs, and the weight of the change from that image."""
 
@@ -143,8 +144,8 @@ class PriorInputs:
     def dct_then_ridge(self) -> "Prior":
         """Returns ``dct`` with steps of the learned ridge regulariser, or ``dct`` alone on grids too small for them.
 
-        For stop-and-shoot scans the steps are stronger, the more so the lower the noise. In fly-scans, stronger steps would
-        cost slab-shaped objects quality."""
+        For scans that stop for each projection the steps are stronger, the more so the lower the noise. In fly-scans,
+        stronger steps would cost slab-shaped objects quality."""
         if min(self.grid.shape) < RIDGE_EDGE:
             return self.tv_and_dct()
         ridge = RidgeStep(self.rt, self.grid.shape, learned_ridge())
@@ -198,7 +199,7 @@ class TvPrior(Prior):
 class TvAndDct(Prior):
     """The prior dct: total variation, then a shrinkage of block cosine transforms, which works best on a smooth volume.
 
-    share: threshold of the shrinkage, relative to the prior's weight."""
+    share: threshold of the shrinkage over the prior's weight."""
 
     def __init__(self, tv: TvPrior, shrink: DctProx, share: float) -> None:
         self.tv, self.shrink, self.share, self.turn = tv, shrink, share, 0
@@ -206,7 +207,7 @@ class TvAndDct(Prior):
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         smooth = self.tv(space, volume, weight, nonnegative=nonnegative)
         turn, out = self.turn, space.place(self.shrink.shape)
-        # each map takes the next quarter of the blocks' shifts, so that four maps take all
+        # each map takes the next quarter of the blocks' shifts, so that four maps take them all
         self.turn = (turn + 1) % len(TURNS)
         return self.shrink(smooth, self.share * weight, turn, nonnegative=nonnegative, out=out)
 
@@ -226,14 +227,14 @@ class ThenRidge(Prior):
     def __init__(self, before: Prior, ridge: RidgeStep, noise_factor: float) -> None:
         """Joins both maps. noise_factor: noise that the ridge step assumes, over the part of the weight due to noise."""
         self.before, self.ridge, self.noise_factor = before, ridge, noise_factor
-        self.maps = 0  # maps since the last ridge step
+        self.maps = 0  # number of maps since the last ridge step
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         volume = self.before(space, volume, weight, nonnegative=nonnegative)
         self.maps = (self.maps + 1) % _RIDGE_EVERY
         if self.maps:
             return volume
-        # only a part of the weight is due to noise, the rest to edges: steps that took all for noise lost 0.2 dB (180 views)
+        # only a part of the weight is due to noise: steps that took the part of edges for noise too lost 0.2 dB (180 views)
         sigma = self.noise_factor * weight * max(self.noise_share, _LEAST_NOISE_SHARE)
         out = space.place(self.ridge.shape)
         return self.ridge(volume, sigma=sigma, step=_RIDGE_LENGTH, nonnegative=nonnegative, out=out)
@@ -280,8 +281,8 @@ Denoiser = Callable[[np.ndarray, float], np.ndarray]
 
 
 class OwnPrior(Prior):
-    """A user's denoiser on the host in place of a proximal map (plug-and-play: Venkatakrishnan et al. 2013). Its weights are
-    small, and two different weights must give two different volumes."""
+    """A user's denoiser, a function on the host, in place of a proximal map (plug-and-play: Venkatakrishnan et al. 2013). It
+    gets small weights, and must give different volumes for different weights."""
 
     def __init__(self, denoiser: Denoiser) -> None:
         self.denoiser, self.subject = denoiser, f"--prior {function_name(denoiser)}"
@@ -328,7 +329,7 @@ def volumes_of(prior: str | Denoiser) -> int:
 
 def subvoxel_share(prior: str | Denoiser, shape: tuple[int, int, int]) -> float:
     """Returns the weight of the smaller voxels in a result, 0 to 1. shape: (nz, ny, nx) of the smaller voxels. The weight is
-    larger with ridge, because large voxels serve to average noise, of which ridge leaves less."""
+    larger with the prior ridge, since large voxels serve to average noise, and ridge leaves less of it."""
     return _SUBVOXELS_WITH_RIDGE if prior == "ridge" and min(shape) >= RIDGE_EDGE else _SUBVOXELS
 
 

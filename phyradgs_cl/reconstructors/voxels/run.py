@@ -23,7 +23,7 @@ from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
 MOST_ITERATIONS = 1_000_000
-# A system holds this many arrays of all frames: measurement, mask, transmission, and those to compute a residual.
+# Number of arrays of all frames that a system holds: measurement, mask, transmission, and those to compute a residual.
 _SYSTEM_FRAMES = 6
 
 
@@ -103,8 +103,8 @@ class WithFacts(Stepwise, Protocol):
 @dataclass(frozen=True, eq=False)
 class MethodRun:
     """A method's run on a scan. resume: the state to continue from. initial: the first volume (nz, ny, nx) in 1/mm; None:
-    the method's own start. deformation: how the object moves. state_times_s (K,): times of its states if it changes. Seconds
-    count from ``started``."""
+    the method's own start. deformation: how the object moves. state_times_s (K,): times in s of the states of an object that
+    changes. Seconds count from ``started``."""
 
     scan: Scan
     options: Any
@@ -118,8 +118,8 @@ class MethodRun:
     started: float = field(default_factory=time.perf_counter)
 
     def system(self, *, volumes: int, frames: int) -> System:
-        """Returns the scan's system. Its arrays are on the device if all fit: ``volumes`` volumes and ``frames`` arrays of
-        all frames, which the algorithm holds at one time, and the tables."""
+        """Returns the scan's system. Its arrays are on the device if everything fits there: ``volumes`` volumes and
+        ``frames`` arrays of all frames, which the algorithm holds at one time, and the tables."""
         system = System.of_scan(
             self.rt, self.scan, self.options.motion, self.options.detector_model, deformation=self.deformation,
             state_times_s=self.state_times_s, is_dense=self.initial is not None,

@@ -17,16 +17,17 @@ from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, voxel_method
 from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights, spread_order
 
-_WEIGHT_CACHE_BYTES = 1 << 29  # column weights of subsets are kept up to this size; others are computed in every pass
+_WEIGHT_CACHE_BYTES = 1 << 29  # most bytes of column weights kept; those of other subsets are computed in every pass
 
 
 @dataclass(frozen=True)
 class SartOptions(IterativeOptions):
-    """Options of SART. relaxation: λ, the factor on each correction. relaxation_reduction: the factor on λ per iteration.
+    """Options of SART. relaxation: λ, the factor on each correction. relaxation_reduction: the factor on λ after each
+    iteration.
 
-    frames_per_subset: frames, far apart in time, that are corrected for together, 1 for SART. noise_stop: the run
-    ends when the residual falls to this many times the estimated noise of the measurement (discrepancy principle, Morozov
-    1966); further iterations would fit the noise. 0 runs all iterations."""
+    frames_per_subset: number of frames, far apart in time, per correction; 1 for SART. noise_stop: the run ends when the
+    residual falls to this many times the estimated noise of the measurement (discrepancy principle, Morozov 1966); further
+    iterations would fit the noise. 0 runs all iterations."""
 
     relaxation: float = checks.ranged(1.0, 1e-6, 2)
     relaxation_reduction: float = checks.ranged(0.999, 1e-6, 1)
@@ -83,7 +84,7 @@ def _cached_columns(volume_shape: tuple[int, ...], subsets: int) -> int:
 
 
 def held_volumes(scan: Scan, options: SartOptions) -> int:
-    """Returns how many volumes a run holds at one time; stored column weights count as volumes."""
+    """Returns how many volumes a run holds in memory at one time. Column weights that are kept count as volumes."""
     return 4 + _cached_columns(scan.grid.shape, checks.ceil_div(scan.frames, options.frames_per_subset))
 
 

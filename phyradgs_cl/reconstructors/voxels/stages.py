@@ -15,13 +15,13 @@ from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.voxels.run import MethodRun, WithFacts
 
-_STAGE, _VOLUME = "stage", "volume_before"  # arrays in a state: the stage's number and its first volume
+_STAGE, _VOLUME = "stage", "volume_before"  # names in a state: the stage's number and its first volume
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a run. make: from a first volume (nz, ny, nx), or from None for the method's own start, to the stage's
-    method. merge: from this stage's volume and the volume of the stage before to the run's volume. end: called with the
+    """One stage of a run. make: makes the stage's method from a first volume (nz, ny, nx), or from None for the method's own
+    start. merge: returns the run's volume, from this stage's volume and that of the stage before. end: called with the
     finished method."""
 
     name: str
@@ -88,8 +88,8 @@ class Stages:
         self._facts.update(self.method.facts(True))
 
     def facts(self, is_complete: bool) -> Mapping[str, object]:
-        """Returns the facts of the last stage, with each stage's iterations and its seconds in this process. Of a complete
-        run it first ends all stages but the last, in case the last one has no iterations."""
+        """Returns the facts of the last stage, with each stage's iterations and its seconds in this process. In a complete
+        run, stages before the last are ended first, in case the last one has no iterations."""
         while is_complete and not self.is_last:
             self.advance()
         self._note()

@@ -1,7 +1,7 @@
 """The linear system A x = p of a scan under a motion model, for the iterative methods.
 
 Its arrays are on the device if all fit there (``resident``), else on the host. A method computes with either through the
-system's ``space``. Each of several ranks projects its own frames; frames are gathered, volumes summed."""
+system's ``space``. Each rank (MPI process) projects its own frames; frames are gathered, volumes summed."""
 
 import logging
 import math
@@ -24,9 +24,9 @@ from phyradgs_cl.runtime import DeviceSpace, HostSpace, MemoryShortage, Runtime,
 
 log = logging.getLogger(__name__)
 
-_SHORTEST_PATH = 0.1  # shorter paths of rays count as this fraction of the longest: a division by less amplifies noise
-_FAINTEST = 1e-6  # voxels that rays hardly meet count as if they had this fraction of the largest sum of path lengths
-_GROWTH = 1.2  # steps of subsets diverge if a pass's residual, over the least one so far, exceeds this
+_SHORTEST_PATH = 0.1  # shorter rays count as this fraction of the longest path: a division by less amplifies noise
+_FAINTEST = 1e-6  # voxels that rays hardly meet count as if their sum of path lengths were this fraction of the largest
+_GROWTH = 1.2  # steps of subsets diverge if a pass's residual exceeds this many times the least residual so far
 S = TypeVar("S", bound="SharedOperator")
 
 
@@ -70,7 +70,7 @@ class System:
         measured = np.asarray(scan.projections, np.float32)
         model = scan.detector_model if detector_model == "scan" else detector_model
         intensity: IntensityOperator | SharedIntensity | None = None
-        # if every line has a single time, the models log and intensity are the same
+        # if every line has a single time, the detector models log and intensity are the same
         if model == "intensity" and any(table.averages for table in tables):
             alone = IntensityOperator(rt, scan.grid, shape, tables, projector, subrays)
             intensity = SharedIntensity(rt.ranks, alone) if rt.ranks.size > 1 else alone
@@ -85,7 +85,7 @@ class System:
         """Returns the system with its arrays on the device, if that has room for the operators, ``volumes`` volumes, and
         ``frames`` arrays of all frames. Otherwise they stay on the host.
 
-        They also stay there with several ranks, which sum on the host, and for a volume that is projected in parts."""
+        They also stay on the host with several ranks, which sum on the host, and for a volume that is projected in parts."""
         kinds = RayOperator, WarpedOperator, IntensityOperator
         operators = [o for o in (self.operator, self.intensity) if isinstance(o, kinds)]
         if len(operators) < 1 + (self.intensity is not None):
