@@ -47,7 +47,7 @@ log = logging.getLogger(__name__)
 # Most volumes that each voxel method holds in memory at one time, two of them for the intensity model (docs/large.md).
 # The methods also hold _STACKS arrays of all frames, and need one buffer of _ONE_BUFFER volumes.
 _HELD = {"sirt": 8, "sart": 28, "os-sart": 28, "cgls": 11, "asd-pocs": 32, "fista-tv": 16}
-_HELD |= {"fista": 20, "moving": 28}
+_HELD |= {"fista": 20, "moving": 28, "changing": 22}
 _STACKS, _ONE_BUFFER = 12, 3
 _OF_OTHERS = 4  # memory of other methods in volumes: the result, and copies in which it is made, checked and written
 _DEVICE_SHARE = 0.9  # fraction of the device's memory limit that a proposed --size may fill
@@ -247,14 +247,15 @@ def _size_that_fits(rt: Runtime, scan: Scan, method: str, options: Any) -> int:
     """Returns the number of voxels along the grid's longest side for which the memory suffices; 0 if it is unknown."""
     free, held = HOST_SHARE * free_bytes(), _HELD.get(method)
     voxels = (free - scan.projections.nbytes) / (4 * _OF_OTHERS)
+    states = min(getattr(options, "states", 1), scan.frames)
     if held is not None:
         free = min(free, _DEVICE_SHARE * rt.ledger.limit_bytes)
         if hasattr(options, "prior"):
             from phyradgs_cl.reconstructors.voxels.priors import volumes_of  # here, because it loads SciPy
 
             held += volumes_of(options.prior)
-        voxels = (free - _STACKS * scan.projections.nbytes) / (4 * held)
-        voxels = min(voxels, rt.device.largest_allocation_bytes / (4 * _ONE_BUFFER))
+        voxels = (free - _STACKS * scan.projections.nbytes) / (4 * held * states)
+        voxels = min(voxels, rt.device.largest_allocation_bytes / (4 * _ONE_BUFFER * states))
     if not 0 < voxels < math.inf:
         return 0
     size = int(max(scan.grid.shape) * (voxels / math.prod(scan.grid.shape)) ** (1 / 3))

@@ -51,13 +51,13 @@ class DeviceCloud:
     def __init__(self, rt: Runtime, population: Population) -> None:
         self.rt, self.count = rt, population.count
         stride = stride_of(self.count)
-        moments = np.zeros((2, 11, stride), np.float32)
+        moments = np.zeros((2, _ROWS, stride), np.float32)
         moments[:, :, : self.count] = population.moments
         self.raw = rt.upload(pad_columns(population.raw))
         self.moments = rt.upload(moments)
-        self.gradients = rt.zeros((13, stride))
+        self.gradients = rt.zeros((_DERIVED, stride))
         self.statistics = rt.zeros((2, stride))
-        self.gaussians = DeviceGaussians(rt.zeros((11, stride)), self.count, stride)
+        self.gaussians = DeviceGaussians(rt.zeros((_ROWS, stride)), self.count, stride)
 
     def activate(self, adam: DeviceAdam) -> None:
         adam.activate(self.raw, self.gaussians.rows, self.count, self.gaussians.stride)

@@ -161,12 +161,14 @@ def voxel_method(
 class Iterations:
     """Runs an algorithm step by step for a ``Loop``, and keeps the residual and the change of its last iteration."""
 
-    quantity, remedy = "residual", "check the scan for extreme values, or lower the relaxation"
+    quantity = "residual"
 
     def __init__(self, algorithm: Algorithm, run: MethodRun) -> None:
         self.algorithm, self.options, self.grid = algorithm, run.options, run.scan.grid
         self.iteration, self.iterations = 0, run.options.iterations
         self.residual, self.change = 0.0, 0.0
+        has_relaxation = hasattr(run.options, "relaxation")
+        self.remedy = "check the scan for extreme values" + (", or lower the relaxation" if has_relaxation else "")
         system = algorithm.system
         if run.initial is not None and run.resume is None:
             algorithm.start_from(system.space.array(np.ascontiguousarray(run.initial, np.float32)))
