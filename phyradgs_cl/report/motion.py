@@ -12,10 +12,10 @@ from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.fields import Deformation, Grid, deformed, triple
 from phyradgs_cl.fields.deformation import control_points
 from phyradgs_cl.report.atlas import MOST_EDGE
-from phyradgs_cl.report.images import Plane, Window, base64_of, block_means, middle_planes
+from phyradgs_cl.report.images import Plane, Window, base64_of, block_means, middle_planes, middle_slices
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 from phyradgs_cl.report.scan_charts import box_corners, with_sources
-from phyradgs_cl.report.viewer import decimals_of, picture, place, slider
+from phyradgs_cl.report.viewer import decimals_of, picture, plane_slider, slider
 
 _TIMES = 49  # times at which the page has the scanner's pose; the script interpolates between them
 _MOST_LINES = 64  # more detector lines would merge in the picture
@@ -54,19 +54,18 @@ def frame_in_motion(scan: Scan) -> Markup:
         "turn_deg": -90 - np.rad2deg(np.arctan2(source[1], source[0])) - _LOOK_DEG, "tilt_deg": _TILT_DEG,
     }  # fmt: skip
     words = f"The first frame in motion, {number(last_s - first_s)} s"
-    canvas = element(
-        "canvas", id="rows", tabindex=0, role="img", aria_label=words, aria_describedby="rows-help rows-reading"
-    )
-    controls = [
-        element("button", "Play", type="button", id="rows-play"),
-        element("button", "Reset", type="button", id="rows-reset"),
-        slider("rows-time", "Time", 0, _FRAME_STEPS, _FRAME_STEPS, ""),
-    ]
+    reading = "rows-help rows-reading"
+    canvas = element("canvas", id="rows", tabindex=0, role="img", aria_label=words, aria_describedby=reading)
+    controls = [*_buttons("rows"), slider("rows-time", "Time", 0, _FRAME_STEPS, _FRAME_STEPS, "")]
     return joined(
         element("h3", words), element("div", *controls, class_="tools"),
         element("div", canvas, class_="rows"), element("p", element("output", id="rows-reading"), class_="note help"),
         element("p", _FRAME_HELP, class_="note help", id="rows-help"), json_block("rows-data", facts),
     )
+
+
+def _buttons(of: str) -> list[Markup]:
+    return [element("button", word, type="button", id=f"{of}-{word.lower()}") for word in ("Play", "Reset")]
 
 
 def _angles_deg(scan: Scan, times_s: np.ndarray) -> list[list[float]] | None:
@@ -85,14 +84,9 @@ def object_in_motion(
     means = block_means(volume, MOST_EDGE)
     small = grid.in_shape(triple(means.shape))
     first = deformed(means, small, deformation, deformation.weights_at(span_s[0])[0])
-    middles = [np.take(first, count // 2, axis=axis) for axis, count in enumerate(first.shape)]
-    planes = middle_planes(middles, small, (window.low, window.high))
-    controls = [
-        element("button", "Play", type="button", id="motion-play"),
-        element("button", "Reset", type="button", id="motion-reset"),
-        slider("motion-time", "Time", 0, _STEPS, 0, f"{number(span_s[0])} s"),
-        slider("motion-arrows", "Arrows", 0, _MOST_LENGTH, 1, "1×"),
-    ]
+    planes = middle_planes(middle_slices(first), small, (window.low, window.high))
+    time = slider("motion-time", "Time", 0, _STEPS, 0, f"{number(span_s[0])} s")
+    controls = [*_buttons("motion"), time, slider("motion-arrows", "Arrows", 0, _MOST_LENGTH, 1, "1×")]
     legend = f"The object at {number(span_s[0])} s, the first of {number(span_s[1] - span_s[0])} s."
     data = _data(fitting(deformation, small), small, span_s)
     return joined(
@@ -103,8 +97,7 @@ def object_in_motion(
 
 
 def fitting(deformation: Deformation, grid: Grid) -> Deformation:
-    """Returns the deformation with at most ``MOST_VALUES`` numbers. A larger one is interpolated at fewer control points,
-    at which it keeps its values."""
+    """Returns the deformation in at most ``MOST_VALUES`` numbers: a larger one keeps its values at fewer control points."""
     spacing_mm = float(np.max(deformation.spacing_mm))
     reduced = deformation
     while reduced.control_mm.size > MOST_VALUES and spacing_mm < 2 * max(grid.size_mm):
@@ -144,12 +137,6 @@ def _data(deformation: Deformation, grid: Grid, span_s: tuple[float, float]) -> 
 
 
 def _figure(plane: Plane) -> Markup:
-    middle, slice_id, place_id = plane.indices[0], f"motion-slice-{plane.axis}", f"motion-place-{plane.axis}"
-    caption = element(
-        "figcaption", element("label", f"{plane.name.capitalize()} slice ({plane.axis})", for_=slice_id),
-        element("output", place(plane, 0), id=place_id, for_=slice_id),
-    )
-    places = {"min": 0, "max": plane.count - 1, "value": middle}
-    control = element("input", type="range", id=slice_id, **places, aria_describedby=place_id)
-    shown = picture(plane, "moving object", canvases=2)
-    return element("figure", shown, caption, control, id=f"motion-{plane.axis}", data_right=plane.right, data_up=plane.up)
+    axis, shown = plane.axis, picture(plane, "moving object", canvases=2)
+    parts = plane_slider(plane, f"motion-slice-{axis}", f"motion-place-{axis}", plane.count - 1, plane.indices[0])
+    return element("figure", shown, *parts, id=f"motion-{axis}", data_right=plane.right, data_up=plane.up)
