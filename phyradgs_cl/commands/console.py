@@ -47,6 +47,13 @@ def file_argument(name: str, help: str) -> Any:
     return typer.Argument(parser=file_parser(name), metavar=name, help=help)
 
 
+def pair_option(form: str, example: str, metavar: str, largest: float = math.inf) -> Callable[[str, str, Any], Any]:
+    """Returns a function (flag, help, default) that makes an option of two numbers, which ``pair_of`` parses."""
+    return lambda flag, help, default: option(
+        help, default, flag, parser=pair_of(flag, form, example, largest), metavar=metavar
+    )
+
+
 def pair_of(
     flag: str, form: str, example: str, largest: float = math.inf
 ) -> Callable[[str], tuple[float, float]]:
@@ -109,10 +116,16 @@ def give_up_stdout() -> None:
 
 def scores(metrics: Mapping[str, float | None]) -> str:
     """Returns a run's metrics, and its errors on held-out pixels, as text with a comma before each."""
-    from phyradgs_cl.metrics import HELD_OUT, printed  # here, because it loads SciPy, which takes time
+    from phyradgs_cl.metrics import HELD_OUT  # here, because it loads SciPy, which takes time
 
-    words = [*printed(metrics), *printed(metrics, HELD_OUT)]
-    return "".join(f", {title} {value}" for title, value in words)
+    return "".join(f", {words}" for words in [*told(metrics), *told(metrics, HELD_OUT)])
+
+
+def told(metrics: Mapping[str, object], *names: Any) -> list[str]:
+    """Returns metrics that are present, as "PSNR 31.2 dB". names: as in ``printed``."""
+    from phyradgs_cl.metrics import printed  # here, as in ``scores``
+
+    return [f"{title} {value}" for title, value in printed(metrics, *names)]
 
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:

@@ -5,8 +5,8 @@ import math
 from pathlib import Path
 from typing import Annotated, Any
 
-from phyradgs_cl.commands.console import AsJson, file_argument, file_option, numbers, option, say
-from phyradgs_cl.metrics import COVERAGE, METRICS, printed
+from phyradgs_cl.commands.console import AsJson, file_argument, file_option, numbers, option, say, told
+from phyradgs_cl.metrics import COVERAGE, METRICS
 from phyradgs_cl.workflow import run_evaluation
 
 EXAMPLES = {"evaluate": "Example: phyradgs evaluate volume.h5 --reference scan.h5 --json"}
@@ -39,17 +39,14 @@ def evaluate_command(
     if as_json:
         say(json.dumps(_without_infinity(facts)))
         return
-    words = [f"{title} {value}" for title, value in printed(facts)]
-    say("   ".join([*words, str(facts["compared"]), f"picture {facts['picture']}"]))
+    say("   ".join([*told(facts), str(facts["compared"]), f"picture {facts['picture']}"]))
     if "reliability" in facts:
-        shares = "   ".join(f"{title} {value}" for title, value in printed(facts, COVERAGE))
-        say(f"error bars: {shares}   picture {facts['reliability']}")
+        say(f"error bars: {'   '.join(told(facts, COVERAGE))}   picture {facts['reliability']}")
     states: Any = facts.get("states", [])
     for state in states:
-        say("   ".join([f"at {state['time_s']:.4g} s", *(f"{title} {value}" for title, value in printed(state))]))
+        say("   ".join([f"at {state['time_s']:.4g} s", *told(state)]))
     if states:
-        means = {name: facts[f"mean_{name}"] for name in METRICS}
-        words = [f"mean of {len(states)} states", *(f"{title} {value}" for title, value in printed(means))]
+        words = [f"mean of {len(states)} states", *told({name: facts[f"mean_{name}"] for name in METRICS})]
         if "mean_motion_error_mm" in facts:
             mean_mm, high_mm = facts["mean_motion_error_mm"], facts["p95_motion_error_mm"]
             words.append(f"motion wrong by {mean_mm:.3g} mm (95 % below {high_mm:.3g})")

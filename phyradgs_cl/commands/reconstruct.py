@@ -47,9 +47,7 @@ _GROUPS = {
     "Volume": (*(name for name in OF_GRID if name != "size"), "initial", "mu_water_per_mm", "rows", "slab"),
     "Motion": ("object_motion", *OF_MOTION, "detector_model"),
     "Quality": (
-        *("prior", "preset", "assignments"),
-        *(name for name in OF_FRAMES if name not in OF_GRID),
-        *("gaussians", "seed"),
+        "prior", "preset", "assignments", *(name for name in OF_FRAMES if name not in OF_GRID), "gaussians", "seed",
     ),
     "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
 }
@@ -163,10 +161,6 @@ def estimate_command(scan: Scan, settings: Settings, object_motion: ObjectMotion
     loaded = load_scan(scan, plan.preprocessing.flats)
     rt = settings.runtime()
     before_s = time.process_time()  # a run will need this time too, to start and to read the scan
-
-    def around(result: Reconstruction) -> float:
-        return before_s + seconds_around(scan, loaded, result)
-
-    values = estimate(loaded, plan, rt, around)
+    values = estimate(loaded, plan, rt, lambda result: before_s + seconds_around(scan, loaded, result))
     say(f"{plan.method_name} on {rt.device.name}, from a trial of {duration(values.trial_seconds)}")
     say("\n".join(filter(None, (values.text(), blur_line(loaded)))))
