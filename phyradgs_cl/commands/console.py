@@ -20,8 +20,6 @@ from phyradgs_cl.removed import removal
 from phyradgs_cl.text import plain_text
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-SHARED_BY_RANKS = ("reconstruct",)
-"""Commands whose work is shared by all ranks. All other commands run on rank 0 only."""
 
 
 def numbers(text: str) -> float | list[float] | str:
@@ -185,7 +183,7 @@ def takes_part(arguments: Sequence[str]) -> bool:
     if launched().rank == 0:
         return True
     sys.stdout = sys.stderr = None  # None as in programs without a console: libraries check for it
-    return any(arguments[:1] == [name] for name in SHARED_BY_RANKS)
+    return arguments[:1] == ["reconstruct"]  # all other commands run on rank 0 only
 
 
 def last_words(error: BaseException) -> int:

@@ -44,12 +44,14 @@ def frame_in_motion(scan: Scan) -> Markup:
     poses = with_sources(scan, scan.trajectory.pose(0, scan.frame_start_s[0] + times_s))
     lines = np.unique(np.linspace(0, scan.lines - 1, min(scan.lines, _MOST_LINES)).round().astype(int))
     opens_s = scan.shutter.delay_s(scan.lines)[lines]
-    source = poses[0, :3]
+    source, angles_deg = poses[0, :3], None
+    if isinstance(scan.trajectory, CircularOrbit):
+        angles_deg = np.rad2deg(scan.trajectory.angle_rad(0, scan.frame_start_s[0] + times_s))[:, None].tolist()
     facts = {
         "poses": np.round(poses, 5).tolist(), "times_s": [first_s, last_s], "lines": lines.tolist(),
         "opens_s": scan.shutter.in_pulse(opens_s).tolist(),
         "closes_s": scan.shutter.in_pulse(opens_s + scan.shutter.exposure_s).tolist(),
-        "shape": scan.geometry.detector_shape, "axis": scan.shutter.axis, "angles_deg": _angles_deg(scan, times_s),
+        "shape": scan.geometry.detector_shape, "axis": scan.shutter.axis, "angles_deg": angles_deg,
         "box": np.round(box_corners(scan), 5).tolist(), "steps": _FRAME_STEPS, "is_parallel": scan.is_parallel,
         "turn_deg": -90 - np.rad2deg(np.arctan2(source[1], source[0])) - _LOOK_DEG, "tilt_deg": _TILT_DEG,
     }  # fmt: skip
@@ -66,13 +68,6 @@ def frame_in_motion(scan: Scan) -> Markup:
 
 def _buttons(of: str) -> list[Markup]:
     return [element("button", word, type="button", id=f"{of}-{word.lower()}") for word in ("Play", "Reset")]
-
-
-def _angles_deg(scan: Scan, times_s: np.ndarray) -> list[list[float]] | None:
-    """Returns gantry angles (T, 1) in degrees at times (T,) in s of the first frame; None for a gantry not on a circle."""
-    if not isinstance(scan.trajectory, CircularOrbit):
-        return None
-    return np.rad2deg(scan.trajectory.angle_rad(0, scan.frame_start_s[0] + times_s))[:, None].tolist()
 
 
 def object_in_motion(

@@ -61,19 +61,17 @@ class Run:
         segments = self.stored.provenance.get("segments")
         if table.get("name") == "exact" and isinstance(segments, int):
             table = {**table, "segments": segments}
-        try:
+        with suppress(InputError, TypeError):  # another version or program may have written the provenance
             return motion_from_facts(table)
-        except (InputError, TypeError):  # another version or program may have written the provenance
-            return None
+        return None
 
     @property
     def preprocessing(self) -> Preprocessing:
         """The run's preprocessing of frames, without options that this version lacks; the default if it is unknown."""
         table = self.stored.provenance.get("input")
-        try:
-            return preprocessing_of(_kept(table)) if isinstance(table, Mapping) else Preprocessing()
-        except InputError:
-            return Preprocessing()
+        with suppress(InputError):
+            return preprocessing_of(_kept(table) if isinstance(table, Mapping) else {})
+        return Preprocessing()
 
     @property
     def record(self) -> list[dict[str, float]]:
