@@ -1,7 +1,6 @@
 """The command evaluate: compares a volume with the truth."""
 
 import json
-import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,8 +35,9 @@ def evaluate_command(
     facts = run_evaluation(
         volume, reference, picture or usual, reference_voxel_mm, object_motion, rtk_reference, mu_water_per_mm
     )
-    if as_json:
-        say(json.dumps(_without_infinity(facts)))
+    if as_json:  # JSON has no infinity, the PSNR of equal volumes, which becomes null
+        finite = json.loads(json.dumps(facts), parse_constant=lambda name: None if name == "Infinity" else float(name))
+        say(json.dumps(finite))
         return
     say("   ".join([*told(facts), str(facts["compared"]), f"picture {facts['picture']}"]))
     if "reliability" in facts:
@@ -51,12 +51,3 @@ def evaluate_command(
             mean_mm, high_mm = facts["mean_motion_error_mm"], facts["p95_motion_error_mm"]
             words.append(f"motion wrong by {mean_mm:.3g} mm (95 % below {high_mm:.3g})")
         say("   ".join(words))
-
-
-def _without_infinity(value: Any) -> Any:
-    """Returns facts, also nested ones, with None in place of +inf (the PSNR of equal volumes): JSON has no infinity."""
-    if isinstance(value, dict):
-        return {key: _without_infinity(part) for key, part in value.items()}
-    if isinstance(value, list):
-        return [_without_infinity(part) for part in value]
-    return None if value == math.inf else value

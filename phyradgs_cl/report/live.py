@@ -214,8 +214,7 @@ class LivePage:
     def __init__(self, path: Path, title: str, settings: Mapping[str, object], every_s: float = EVERY_S) -> None:
         self.path, self.every_s = path, every_s
         self.status = Status(title, settings, every_s, time.time())
-        self.spent_s = 0.0
-        """Time in s that the run has waited for pictures."""
+        self.spent_s = 0.0  # the run has waited this long for pictures
         self._pictured_s = -every_s
         self._waits = False  # whether an existing file is still kept, until the first progress
         self._started_s = time.monotonic()

@@ -47,8 +47,7 @@ class _Checkpoints:
         self.path, self.every_s = path, every_s
         self.last_s = time.monotonic()
         self.has_failed = False
-        self.iteration: int | None = None
-        """The iteration of this run's last checkpoint; None before the first."""
+        self.iteration: int | None = None  # of this run's last checkpoint
 
     def __call__(self, progress: methods.Progress) -> None:
         is_due = self.every_s > 0 and time.monotonic() - self.last_s >= self.every_s
