@@ -11,7 +11,7 @@ from phyradgs_cl import __version__, signals
 from phyradgs_cl.commands.console import GroupedCommand, complain, give_up_stdout, say, takes_part, usage_text
 from phyradgs_cl.errors import OutputError, PhyradgsError, naming_host_memory
 from phyradgs_cl.io.output import NO_SPACE
-from phyradgs_cl.removed import removal
+from phyradgs_cl.removed import refuse_removed
 
 _CLICK_ERROR: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 HELP = {"help_option_names": ["-h", "--help"]}
@@ -53,7 +53,6 @@ class Loaded(UserDict[str, Any]):
 
 
 class Commands(TyperGroup):
-
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
         self.commands = Loaded(COMMANDS)
@@ -62,8 +61,7 @@ class Commands(TyperGroup):
         return list(COMMANDS)
 
     def get_command(self, ctx: Any, name: str) -> Any:
-        if error := removal(f"phyradgs {name}"):
-            raise error
+        refuse_removed(f"phyradgs {name}")
         return super().get_command(ctx, name)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:

@@ -82,6 +82,12 @@ class Checked:
         fields_within(self.PREFIX, self)
 
 
+def kind(subject: str, value: object, allowed: Any, expected: str, remedy: str = "") -> None:
+    """Raises InputError unless ``value`` is of a type in ``allowed``, which is what isinstance takes."""
+    if not isinstance(value, allowed):
+        raise InputError(subject, short_repr(value), expected, remedy)
+
+
 def one_of(subject: str, value: object, allowed: Iterable[object]) -> None:
     """Raises InputError unless ``value`` is among ``allowed``. The message lists them."""
     choices = list(allowed)
@@ -126,8 +132,7 @@ def rising(subject: str, value: ArrayLike) -> NDArray[np.float64]:
 
 
 def real_array(subject: str, value: ArrayLike) -> np.ndarray:
-    """Returns ``value`` as an array, its type unchanged. Raises InputError unless it holds integers or floats, and for a
-    masked array, whose mask would be lost."""
+    """Returns ``value`` as an array of its own type. Raises InputError unless it holds plain, unmasked numbers."""
     if np.ma.is_masked(value):
         raise InputError(subject, "a masked array", "a plain array", "give its mask apart: array.data, and mask=array.mask")
     try:

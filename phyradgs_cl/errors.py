@@ -25,10 +25,7 @@ class PhyradgsError(Exception):
 
     def __init__(self, subject: str, found: str = "", expected: str = "", remedy: str = "") -> None:
         super().__init__(subject, found, expected, remedy)  # pickling keeps only what is passed here
-        self.subject = subject
-        self.found = found
-        self.expected = expected
-        self.remedy = remedy
+        self.subject, self.found, self.expected, self.remedy = subject, found, expected, remedy
 
     def __str__(self) -> str:
         found = f"found {self.found}" if self.found and not self.found.startswith(_STATES) else self.found

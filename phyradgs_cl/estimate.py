@@ -135,8 +135,7 @@ def shortened(options: Any, iterations: int) -> Any:
 
 
 def seconds_around(path: Path, scan: Scan, result: Reconstruction) -> float:
-    """Times what ``reconstruct`` does besides the method: hashes the scan, compares with a truth of the volume's shape, and
-    writes the volume."""
+    """Times what ``reconstruct`` does besides the method: it hashes the scan, compares, and writes the volume."""
     started = time.perf_counter()
     sha256_of(path)
     if scan.reference is not None and result.volume.shape == scan.reference.shape:

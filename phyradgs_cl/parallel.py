@@ -209,19 +209,14 @@ def exact_sum(ranks: Communicator, parts: Sequence[np.ndarray], shape: tuple[int
         block = slice(first, min(first + columns, shape[1]))
         integers = np.zeros((shape[0], block.stop - first), np.int64)
         for part in parts:
-            integers += as_integers(part[:, block], shift, not_finite)
+            # exact: the factor is a power of two
+            scaled = np.multiply(part[:, block], np.ldexp(1.0, shift)[:, None], dtype=np.float64)
+            scaled[not_finite] = 0
+            integers += np.rint(scaled, out=scaled).astype(np.int64)
         ranks.allreduce_sum(integers)
         total[:, block] = integers * np.ldexp(1.0, -shift)[:, None]
     total[not_finite] = np.nan
     return total
-
-
-def as_integers(values: np.ndarray, shift: np.ndarray, not_finite: np.ndarray) -> np.ndarray:
-    """Returns values (rows, n) times 2^shift (rows,), rounded to int64. Rows that are ``not_finite`` (rows,) become 0."""
-    wide = np.multiply(values, np.ldexp(1.0, shift)[:, None], dtype=np.float64)  # exact: the factor is a power of two
-    if not_finite.any():
-        wide[not_finite] = 0
-    return np.rint(wide, out=wide).astype(np.int64)
 
 
 def _largest_exponents(ranks: Communicator, parts: Sequence[np.ndarray], rows: int) -> np.ndarray:

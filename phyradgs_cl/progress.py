@@ -56,9 +56,8 @@ class Ticker:
 
     def end(self, text: str) -> None:
         """Replaces the line on a terminal by a last one that stays. Elsewhere shows nothing."""
-        if self.is_terminal:
-            _write(self._over(text), ends_line=False)
-            self.is_open = self.is_counting = True
+        self.stage(text)
+        self.is_counting = self.is_open
 
     def note(self, text: str) -> None:
         """Prints a line that stays; the progress continues in a new line below it."""

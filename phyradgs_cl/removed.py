@@ -2,8 +2,7 @@
 
 from phyradgs_cl.errors import InputError
 
-_ALGEBRAIC = "sart", "os-sart", "sirt", "asd-pocs"
-_UNWEIGHTED = [f"--method {method}: option transmission_weights" for method in _ALGEBRAIC]
+_UNWEIGHTED = [f"--method {of}: option transmission_weights" for of in ("sart", "os-sart", "sirt", "asd-pocs")]
 REMOVED = {
     "--method fused": "take --method fista, or start Gaussians from its volume: --method phyradgs --initial VOLUME",
     "--method asd-pocs: option prior_share": "take --method fista --prior piccs",

@@ -111,14 +111,12 @@ def finish_despite_interrupt() -> Iterator[None]:
 
 def exit_status() -> int:
     """Returns the exit status of a stopped command: 130 after Ctrl-C, 143 after SIGTERM."""
-    flag = _installed()
-    return 128 + (int(signal.SIGINT) if flag is None else flag.number)
+    return 128 + (_installed() or StopFlag()).number
 
 
 def farewell() -> str:
     """Returns what the command line prints when a signal has ended a command."""
-    flag = _installed()
-    return NOTHING if flag is None else flag.farewell
+    return (_installed() or StopFlag()).farewell
 
 
 def _installed() -> StopFlag | None:

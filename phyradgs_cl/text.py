@@ -113,20 +113,18 @@ def _is_new(said: set[str], record: logging.LogRecord) -> bool:
     """Returns False for a warning of this package that is in ``said`` already. Adds a new one to ``said``."""
     if not _is_warning(record):
         return True
-    before = len(said)
+    is_new = record.getMessage() not in said
     said.add(record.getMessage())
-    return len(said) > before
+    return is_new
 
 
 def each_warning_once() -> Any:
-    """Drops this package's warnings that the body repeats word for word, as when several stages of a run check one scan. Use
-    it as a context manager or as a decorator."""
+    """Drops this package's warnings that the body, or a decorated function, repeats word for word."""
     return _filtered(lambda: partial(_is_new, set()))
 
 
 def without_warnings() -> AbstractContextManager[None]:
-    """Silences this package's warnings while the body of a ``with`` runs. An outer ``each_warning_once`` does not count
-    them: they may come again."""
+    """Silences this package's warnings in the body. An outer ``each_warning_once`` does not count them."""
     return _filtered(lambda: lambda record: not _is_warning(record))
 
 

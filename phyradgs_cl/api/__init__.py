@@ -5,15 +5,9 @@
 
 docs/api.md explains everything with runnable examples. Arguments ``device`` are what ``--device`` takes, or a Runtime."""
 
-from phyradgs_cl.acquisition import (
-    Centres,
-    ConeGeometry,
-    ConstantSpeed,
-    ParallelGeometry,
-    SpeedRamp,
-    StaticStart,
-)
+from phyradgs_cl.acquisition import Centres, ConstantSpeed, SpeedRamp, StaticStart
 from phyradgs_cl.acquisition.altered.summed import sum_frames
+from phyradgs_cl.acquisition.geometry import ConeGeometry, ParallelGeometry
 from phyradgs_cl.acquisition.motion import Exact, LineMiddles, MicroViews, Motion, OwnTimes, PerRow, Static
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter

@@ -46,10 +46,8 @@ def calibrate(
     also for other scans that do not fit the first, and for a phantom that the frames do not show."""
     check_scan(scan)
     scan.check_timing()
-    if not (what is None or isinstance(what, str)):
-        raise InputError("what", checks.short_repr(what), "names with commas between", "write for example 'offset,roll'")
-    if not isinstance(others, Sequence):
-        raise InputError("others", checks.short_repr(others), "a list of Scans")
+    checks.kind("what", what, str | None, "names with commas between", "write for example 'offset,roll'")
+    checks.kind("others", others, Sequence, "a list of Scans")
     for other in others:
         check_scan(other, "others")
     shape = None if phantom is None else load_beads(Path(phantom))
@@ -67,8 +65,7 @@ def move_views(scan: Scan, views: np.ndarray, *, without_gauges: bool = False) -
 
     Raises InputError for anything but a Scan, and for ``views`` of another shape or with numbers that are not finite."""
     check_scan(scan)
-    checks.numbers("views", views, (scan.frames, 3))
-    numbers = np.asarray(views, np.float64)
+    numbers = checks.numbers("views", views, (scan.frames, 3))
     if without_gauges:
         numbers = WobbleParameters.of(scan).without_gauges(numbers)
     return perturb(scan, GeometryCorrection(), Views(numbers[:, 0], numbers[:, 1:]))
@@ -89,11 +86,10 @@ def pose_gradient(
 
     Raises InputError as the operators do."""
     check_scan(scan)
-    pitch_mm = np.array(scan.geometry.pixel_size_mm)
     checks.numbers("by_frames", by_frames, scan.projections.shape)
     if isinstance(x, Gaussians):
         in_pixels = splat_operator(scan, motion or "exact", device=device).by_poses(x, by_frames)
-        return in_pixels / np.array([1.0, *pitch_mm])
+        return in_pixels / np.array([1.0, *scan.geometry.pixel_size_mm])
     if np.shape(x)[:1] == (ROWS,) and np.ndim(x) == 2:
         raise InputError("x", f"shape {np.shape(x)}", "Gaussians or a volume", "of rows (11, G): Gaussians.from_rows(rows)")
     checks.numbers("x", x, scan.grid.shape)

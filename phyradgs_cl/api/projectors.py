@@ -45,20 +45,14 @@ def ray_operator(
 
 
 def _rays(engine: RayOperator) -> LinearOperator:
-    return LinearOperator(
-        engine.rt,
-        (_VOLUME, engine.volume_shape),
-        (_FRAMES, engine.frames_shape),
-        engine.forward,
-        engine.adjoint,
-        frames=lambda chosen: _rays(engine.subset(chosen)),
-        intensity=lambda: _intensities(
-            engine.rt,
-            IntensityOperator(
-                engine.rt, engine.grid, engine.detector_shape, engine.tables, subrays=engine.memory.layout.subrays
-            ),
-        ),
-    )
+    def intensity() -> Operator:
+        like, subrays = (engine.rt, engine.grid, engine.detector_shape, engine.tables), engine.memory.layout.subrays
+        return _intensities(engine.rt, IntensityOperator(*like, subrays=subrays))
+
+    domain, frames = (_VOLUME, engine.volume_shape), (_FRAMES, engine.frames_shape)
+    subset = lambda chosen: _rays(engine.subset(chosen))  # noqa: E731
+    maps = engine.forward, engine.adjoint
+    return LinearOperator(engine.rt, domain, frames, *maps, frames=subset, intensity=intensity)
 
 
 def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
@@ -199,8 +193,7 @@ def as_torch(operator: Operator) -> Callable[..., Any]:
             return tensor(ctx.back(array(by_y)), by_y), None
 
     def function(x: Any, frames: Sequence[int] | None = None) -> Any:
-        if not isinstance(x, torch.Tensor):
-            raise InputError("x", checks.short_repr(x), "a tensor", "of a cloud, torch.tensor(cloud.rows())")
+        checks.kind("x", x, torch.Tensor, "a tensor", "of a cloud, torch.tensor(cloud.rows())")
         of = operator if frames is None else operator.frames(frames)
         return (Linear if isinstance(of, LinearOperator) else Curved).apply(x, of)
 
@@ -217,8 +210,7 @@ def _checked(scan: Scan, motion: str | Motion, *kinds: str) -> Motion:
 
 
 def _a_grid(grid: Grid) -> Grid:
-    if not isinstance(grid, Grid):
-        raise InputError("grid", checks.short_repr(grid), "a Grid")
+    checks.kind("grid", grid, Grid, "a Grid")
     return grid
 
 

@@ -17,16 +17,9 @@ from phyradgs_cl.exporters import CLOUDS, export_stored, foreign_suffix, format_
 from phyradgs_cl.fields import Deformation, Grid
 from phyradgs_cl.importers import foreign_volume, load_attenuation, load_beads
 from phyradgs_cl.importers import load_volume as load_voxels
-from phyradgs_cl.io import (
-    Volume,
-    read_deformation,
-    read_state,
-    read_volume,
-    write_deformation,
-    write_scan,
-    write_volume,
-)
+from phyradgs_cl.io import read_deformation, write_deformation, write_scan
 from phyradgs_cl.io.attenuation import attenuation_of, words_of_hu
+from phyradgs_cl.io.volume import Volume, read_state, read_volume, write_volume
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.prepare import DEFAULT_STEPS
 from phyradgs_cl.prepare.light import read_corrected
@@ -52,10 +45,7 @@ def runtime_of(device: Device) -> Runtime:
     return _runtime_by_name(None if device is None else str(device))
 
 
-@lru_cache(maxsize=4)
-def _runtime_by_name(name: str | None) -> Runtime:
-    """Returns always the same Runtime for a device's name, so that kernels are built only once."""
-    return Runtime(name)
+_runtime_by_name = lru_cache(maxsize=4)(Runtime)  # one Runtime per device, so that kernels are built only once
 
 
 @naming_arguments()
@@ -114,8 +104,7 @@ def save_deformation(path: str | Path, deformation: Deformation) -> None:
     """Writes ``deformation``, how an object moves, to a file, completely or not at all.
 
     path: an HDF5 file, new or replaced. Raises InputError for anything but a Deformation, OutputError if writing fails."""
-    if not isinstance(deformation, Deformation):
-        raise InputError("deformation", checks.short_repr(deformation), "a Deformation")
+    checks.kind("deformation", deformation, Deformation, "a Deformation")
     write_deformation(_checked_path(path), deformation)
 
 
@@ -132,9 +121,7 @@ def save_volume(
 
     Raises InputError for anything but a result, a suffix that cannot be written, ``hu`` without a scale or for Gaussians,
     and metrics for another format; OutputError if the file cannot be written."""
-    if not isinstance(result, Reconstruction):
-        remedy = "for an array, Reconstruction(volume, grid)"
-        raise InputError("result", checks.short_repr(result), "a Reconstruction", remedy)
+    checks.kind("result", result, Reconstruction, "a Reconstruction", "for an array, Reconstruction(volume, grid)")
     file = _checked_path(path)
     if hu and result.scale is None:
         raise InputError("hu", "a result without a scale", "a scale", "result.hounsfield(air, water) fits one")
@@ -171,9 +158,7 @@ def simulate(
     at several times.
 
     Raises InputError for unknown names and for values out of range."""
-    if not isinstance(phantom, str | Path):
-        expected = "a name, or the path of a volume file"
-        raise InputError("phantom", checks.short_repr(phantom), expected, "save_volume writes one")
+    checks.kind("phantom", phantom, str | Path, "a name, or the path of a volume file", "save_volume writes one")
     unknown = sorted(set(options) - OPTION_NAMES)
     if unknown:
         names = [*list(signature(simulate).parameters)[1:-1], *sorted(OPTION_NAMES)]
@@ -250,15 +235,17 @@ def reconstruct(
         InputError: options that the method does not have, or anything but a scan, method, grid or partial result.
         NumericalError: numbers overflow.
         KeyboardInterrupt: see ``on_interrupt``."""
-    _check_reconstruct(scan, grid, report, on_interrupt)
+    check_scan(scan)
+    checks.kind("grid", grid, Grid | None, "a Grid, or None for the scan's")
+    checks.kind("report", report, bool | Callable, "a function, True or False")
+    checks.one_of("on_interrupt", on_interrupt, ("raise", "return"))
     scan.check_timing()
     scan = scan if grid is None else scan.on_grid(grid)
     plan = plan_run(method, options, preset=preset, seed=seed)
     if initial is not None:
         plan = replace(plan, initial=_first_volume(initial, scan.with_grid(plan.preprocessing).grid))
     if object_motion is not None:
-        if not isinstance(object_motion, Deformation):
-            raise InputError("object_motion", checks.short_repr(object_motion), "a Deformation")
+        checks.kind("object_motion", object_motion, Deformation, "a Deformation")
         plan = replace(plan, object_motion=ObjectMotion(object_motion))
     state = None if resume is None else _state_of(resume)
     result: Reconstruction | None = None
@@ -275,11 +262,10 @@ def reconstruct(
     return result
 
 
-def _first_volume(initial: object, grid: Grid) -> InitialVolume:
+def _first_volume(initial: Reconstruction | np.ndarray, grid: Grid) -> InitialVolume:
     if isinstance(initial, Reconstruction):
         return InitialVolume(initial.volume, initial.grid)
-    if not isinstance(initial, np.ndarray):
-        raise InputError("initial", checks.short_repr(initial), "a Reconstruction, or an array (nz, ny, nx) in 1/mm")
+    checks.kind("initial", initial, np.ndarray, "a Reconstruction, or an array (nz, ny, nx) in 1/mm")
     return InitialVolume(checks.numbers("initial", initial, grid.shape), grid)
 
 
@@ -290,18 +276,7 @@ def _checked_path(path: object) -> Path:
 
 
 def check_scan(scan: object, subject: str = "scan") -> None:
-    if not isinstance(scan, Scan):
-        remedy = "read a file with load_scan, or make one with fly_scan or static_scan"
-        raise InputError(subject, checks.short_repr(scan), "a Scan", remedy)
-
-
-def _check_reconstruct(scan: object, grid: object, report: object, on_interrupt: object) -> None:
-    check_scan(scan)
-    if not (grid is None or isinstance(grid, Grid)):
-        raise InputError("grid", checks.short_repr(grid), "a Grid, or None for the scan's")
-    if not (isinstance(report, bool) or callable(report)):
-        raise InputError("report", checks.short_repr(report), "a function, True or False")
-    checks.one_of("on_interrupt", on_interrupt, ("raise", "return"))
+    checks.kind(subject, scan, Scan, "a Scan", "read a file with load_scan, or make one with fly_scan or static_scan")
 
 
 @contextmanager

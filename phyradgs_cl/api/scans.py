@@ -79,11 +79,9 @@ def fly_scan(
         found = f"{exposure_deg:g} with angles that turn the other way"
         raise InputError("exposure_deg", found, "the sign of the angles' steps", remedy)
     shutter = Shutter(exposure_s, readout_ratio * exposure_s, readout, readout_direction)
-    start_s = (
-        (turned_deg - turned_deg[:1]) / exposure_deg * exposure_s
-        if np.all(steps > 0)
-        else np.arange(len(start_deg)) * shutter.span_s
-    )
+    start_s = np.arange(len(start_deg)) * shutter.span_s
+    if np.all(steps > 0):
+        start_s = (turned_deg - turned_deg[:1]) / exposure_deg * exposure_s
     first_rad = np.deg2rad(start_deg)
     last_rad = first_rad + np.deg2rad(_arcs_deg(turned_deg, exposure_deg))
     orbit = CircularOrbit(geometry, FrameSweeps(start_s, exposure_s, first_rad, last_rad))
@@ -145,13 +143,11 @@ def _keywords(function: Callable[..., Scan]) -> list[str]:
 
 
 def _pixels(
-    frames: "ArrayLike", geometry: object, flats: "ArrayLike | None", darks: "ArrayLike | None",
+    frames: "ArrayLike", geometry: Geometry, flats: "ArrayLike | None", darks: "ArrayLike | None",
     mask: "ArrayLike | None", quantity: str | None,
 ) -> LineIntegrals:
-    """Converts frames of any quantity to line integrals, with the mask of unusable pixels. Raises InputError for shapes that
-    do not fit, flats or darks that contradict the quantity, values that look like counts, and a mask of all pixels."""
-    if not isinstance(geometry, GEOMETRIES):
-        raise InputError("geometry", checks.short_repr(geometry), "a ConeGeometry or a ParallelGeometry")
+    """Converts frames of any quantity to line integrals, with the mask of unusable pixels."""
+    checks.kind("geometry", geometry, GEOMETRIES, "a ConeGeometry or a ParallelGeometry")
     panel = geometry.detector_shape
     values = _stack("frames", frames, panel)
     flat = None if flats is None else _stack("flats", flats, panel)
@@ -192,8 +188,7 @@ def _scan(
 
 
 def _stack(name: str, frames: "ArrayLike", panel: tuple[int, int]) -> np.ndarray:
-    """Checks frames (n, rows, columns) of real numbers; one flat or dark alone may be (rows, columns). Raises InputError for
-    other shapes and types, and for no frame."""
+    """Checks frames (n, rows, columns) of real numbers; one flat or dark alone may be (rows, columns)."""
     stack = checks.real_array(name, frames)
     if stack.ndim == 2 and name != "frames":
         stack = stack[None]

@@ -17,16 +17,13 @@ from phyradgs_cl.io import only_run, written_beside
 from phyradgs_cl.io.scan.writer import copy_with_motion
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.settings import device_wish
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import check_output, check_picture, load_scan
 
 EXAMPLES = {"calibrate": "Example: phyradgs calibrate scan.h5 -o calibrated.h5"}
-GROUPS = {
-    "calibrate": {
-        "Basics": ("output", "what", "other", "phantom", "picture"), "Run": ("splines", "as_json", "device")
-    }
-}
+GROUPS = {"calibrate": {
+    "Basics": ("output", "what", "other", "phantom", "picture"), "Run": ("splines", "as_json", "device"),
+}}
 _WHAT = f"Parameters to estimate, with commas: {', '.join(NAMES)}."
 _USUAL = "offset,roll,tilt; of a fly-scan also readout,exposure; with --phantom also distance"
 _OUTPUT = "The scan to write, with the corrections. An existing file is replaced."
@@ -51,7 +48,6 @@ def calibrate_command(
 
     Corrects the parameters that differ from the stated ones by three deviations. Parameters that the frames do not
     determine stay as stated."""
-    wish = device_wish(device)
     if output is not None:
         check_output(output, scan, other, phantom)
         picture = picture or output.with_suffix(".png")
@@ -64,22 +60,20 @@ def calibrate_command(
         if output is not None:
             _check_storable(loaded, [word.strip() for word in (what or "").split(",")])
         report = lambda done, total, phase, share: ticker.show(done, total, f"  {phase}", share)  # noqa: E731
-        result = calibrate(loaded, Runtime(wish), what, others, report, shape, splines, ticker.note)
+        result = calibrate(loaded, Runtime(device), what, others, report, shape, splines, ticker.note)
+    written, lines = {}, []
     if output is not None:
         with only_run(output), finish_despite_interrupt():
             copy_with_motion(scan, output, result.scan)
+        written["output"] = str(output)
+        lines.append(f"{output}: {', '.join(one.name for one in result.corrected) or 'nothing'} corrected")
     if picture is not None:
         with finish_despite_interrupt(), written_beside(picture) as temporary:
             result.plot().savefig(temporary, format="png", dpi=110)
-    if as_json:
-        written = {name: str(path) for name, path in (("output", output), ("picture", picture)) if path is not None}
-        say(json.dumps({"scan": str(scan), **result.facts(), **written}))
-        return
-    say(_as_text(result))
-    if output is not None:
-        say(f"{output}: {', '.join(one.name for one in result.corrected) or 'nothing'} corrected")
-    if picture is not None:
-        say(f"{picture}: residuals before and after")
+        written["picture"] = str(picture)
+        lines.append(f"{picture}: residuals before and after")
+    facts = {"scan": str(scan), **result.facts(), **written}
+    say(json.dumps(facts) if as_json else "\n".join([_as_text(result), *lines]))
 
 
 def _check_storable(scan: Loaded, names: list[str]) -> None:

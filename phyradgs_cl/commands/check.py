@@ -14,13 +14,13 @@ from phyradgs_cl.io import only_run, read_scan
 from phyradgs_cl.io.scan.writer import copy_with_offset
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.settings import device_wish
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import check_output, expecting
 
 EXAMPLES = {"check": "Example: phyradgs check scan.h5"}
 SUSPICIOUS_STATUS = 10  # exit status if something is suspicious
 _NOT_ASKED = "not asked: which end of the panel is up (row 0; --row-0 of import), because no frame shows it"
+_COPY = "The copy to write, with --fix-offset."
 _FIX_OFFSET = "Write a copy of the scan (-o) whose panel is shifted along u to the centre of rotation that was found."
 
 
@@ -28,16 +28,13 @@ def check_command(
     scan: Scan,
     as_json: AsJson = False,
     fix_offset: Annotated[bool, option(_FIX_OFFSET, True, "--fix-offset")] = False,
-    output: Annotated[
-        Path | None, file_option("The copy to write, with --fix-offset.", "--output", "-o", default=False)
-    ] = None,
+    output: Annotated[Path | None, file_option(_COPY, "--output", "-o", default=False)] = None,
     device: Device = None,
 ) -> int:
     """Look for what is wrong or suspicious in a scan: timing, angles, pixels, coverage, order of frames, geometry, gain.
 
     Frames that do not fit the others are named, and further questions are answered without them. Exit status: 0 if nothing
     is suspicious, or if --fix-offset has corrected the only suspicious answer; 10 otherwise."""
-    wish = device_wish(device)
     if fix_offset != (output is not None):
         combination = "--fix-offset without -o" if fix_offset else "-o without --fix-offset"
         raise InputError("check", combination, "both or neither", "write for example --fix-offset -o fixed.h5")
@@ -48,7 +45,7 @@ def check_command(
         ticker.stage(f"reading {scan.name}")
         with expecting(scan, "scan"):
             loaded = read_scan(scan, counts)
-        result = check(loaded, Runtime(wish), counts, lambda done, total, name: ticker.show(done, total, f"  {name}"))
+        result = check(loaded, Runtime(device), counts, lambda done, total, name: ticker.show(done, total, f"  {name}"))
     say(_as_json(result, scan, blur_facts(loaded)) if as_json else _as_text(result, blur_line(loaded)))
     suspicious = {finding.question for finding in result.suspicious}
     if output is not None:
@@ -74,8 +71,7 @@ def _as_text(result: CheckResult, blur: str) -> str:
     lines: list[str] = []
     for finding in result.findings:
         lines.append(f"{finding.verdict:12s} {finding.question:19s} {finding.text}")
-        if finding.advice:
-            lines.append(f"{'':33s}-> {finding.advice}")
+        lines += [f"{'':33s}-> {finding.advice}"] if finding.advice else []
     open_questions = [finding.question for finding in result.findings if finding.verdict == CANNOT_TELL]
     names = f": {', '.join(open_questions)}" if open_questions else ""
     suspicious = f"{len(result.suspicious)} of {len(result.findings)} questions suspicious"

@@ -20,8 +20,6 @@ from phyradgs_cl.removed import removal
 from phyradgs_cl.text import plain_text
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-SHARED_BY_RANKS = ("reconstruct",)
-"""Commands whose work is shared by all ranks. All other commands run on rank 0 only."""
 
 
 def numbers(text: str) -> float | list[float] | str:
@@ -45,6 +43,13 @@ def file_option(help: str, *flags: str, default: bool | str = True) -> Any:
 
 def file_argument(name: str, help: str) -> Any:
     return typer.Argument(parser=file_parser(name), metavar=name, help=help)
+
+
+def pair_option(form: str, example: str, metavar: str, largest: float = math.inf) -> Callable[[str, str, Any], Any]:
+    """Returns a function (flag, help, default) that makes an option of two numbers, which ``pair_of`` parses."""
+    return lambda flag, help, default: option(
+        help, default, flag, parser=pair_of(flag, form, example, largest), metavar=metavar
+    )
 
 
 def pair_of(
@@ -109,10 +114,16 @@ def give_up_stdout() -> None:
 
 def scores(metrics: Mapping[str, float | None]) -> str:
     """Returns a run's metrics, and its errors on held-out pixels, as text with a comma before each."""
-    from phyradgs_cl.metrics import HELD_OUT, printed  # here, because it loads SciPy, which takes time
+    from phyradgs_cl.metrics import HELD_OUT  # here, because it loads SciPy, which takes time
 
-    words = [*printed(metrics), *printed(metrics, HELD_OUT)]
-    return "".join(f", {title} {value}" for title, value in words)
+    return "".join(f", {words}" for words in [*told(metrics), *told(metrics, HELD_OUT)])
+
+
+def told(metrics: Mapping[str, object], *names: Any) -> list[str]:
+    """Returns metrics that are present, as "PSNR 31.2 dB". names: as in ``printed``."""
+    from phyradgs_cl.metrics import printed  # here, as in ``scores``
+
+    return [f"{title} {value}" for title, value in printed(metrics, *names)]
 
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:
@@ -172,7 +183,7 @@ def takes_part(arguments: Sequence[str]) -> bool:
     if launched().rank == 0:
         return True
     sys.stdout = sys.stderr = None  # None as in programs without a console: libraries check for it
-    return any(arguments[:1] == [name] for name in SHARED_BY_RANKS)
+    return arguments[:1] == ["reconstruct"]  # all other commands run on rank 0 only
 
 
 def last_words(error: BaseException) -> int:

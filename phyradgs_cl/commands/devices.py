@@ -10,7 +10,6 @@ from phyradgs_cl.device_probes import probe_lines
 from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.runtime import choose_device, known_fault, list_devices
 from phyradgs_cl.runtime.context import default_lanes
-from phyradgs_cl.settings import device_wish
 
 EXAMPLES = {"devices": "Example: phyradgs devices --device cpu"}
 _CHECK = "Run every kernel on the device and compare it with float64."
@@ -18,14 +17,14 @@ _CHECK = "Run every kernel on the device and compare it with float64."
 
 def devices_command(check: Annotated[bool, option(_CHECK)] = False, device: Device = None) -> int:
     """List the OpenCL devices and the one that is used, with the reason; --check runs every kernel on it."""
-    chosen, reason = choose_device(device_wish(device))
+    chosen, reason = choose_device(device)
     if check:
         started = time.perf_counter()
-        verdict = check_device(device_wish(device))
+        verdict = check_device(device)
         say(str(verdict))
         if fault := known_fault(chosen):
             say(f"  known: {fault}")
-        for line in probe_lines(device_wish(device), verdict.group_limits, time.perf_counter() - started):
+        for line in probe_lines(device, verdict.group_limits, time.perf_counter() - started):
             say(f"  {line}")
         return DeviceError.exit_code if verdict.failures else 0
     for d in list_devices():

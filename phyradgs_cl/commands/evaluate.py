@@ -1,12 +1,11 @@
 """The command evaluate: compares a volume with the truth."""
 
 import json
-import math
 from pathlib import Path
 from typing import Annotated, Any
 
-from phyradgs_cl.commands.console import AsJson, file_argument, file_option, numbers, option, say
-from phyradgs_cl.metrics import COVERAGE, METRICS, printed
+from phyradgs_cl.commands.console import AsJson, file_argument, file_option, numbers, option, say, told
+from phyradgs_cl.metrics import COVERAGE, METRICS
 from phyradgs_cl.workflow import run_evaluation
 
 EXAMPLES = {"evaluate": "Example: phyradgs evaluate volume.h5 --reference scan.h5 --json"}
@@ -36,30 +35,19 @@ def evaluate_command(
     facts = run_evaluation(
         volume, reference, picture or usual, reference_voxel_mm, object_motion, rtk_reference, mu_water_per_mm
     )
-    if as_json:
-        say(json.dumps(_without_infinity(facts)))
+    if as_json:  # JSON has no infinity, the PSNR of equal volumes, which becomes null
+        finite = json.loads(json.dumps(facts), parse_constant=lambda name: None if name == "Infinity" else float(name))
+        say(json.dumps(finite))
         return
-    words = [f"{title} {value}" for title, value in printed(facts)]
-    say("   ".join([*words, str(facts["compared"]), f"picture {facts['picture']}"]))
+    say("   ".join([*told(facts), str(facts["compared"]), f"picture {facts['picture']}"]))
     if "reliability" in facts:
-        shares = "   ".join(f"{title} {value}" for title, value in printed(facts, COVERAGE))
-        say(f"error bars: {shares}   picture {facts['reliability']}")
+        say(f"error bars: {'   '.join(told(facts, COVERAGE))}   picture {facts['reliability']}")
     states: Any = facts.get("states", [])
     for state in states:
-        say("   ".join([f"at {state['time_s']:.4g} s", *(f"{title} {value}" for title, value in printed(state))]))
+        say("   ".join([f"at {state['time_s']:.4g} s", *told(state)]))
     if states:
-        means = {name: facts[f"mean_{name}"] for name in METRICS}
-        words = [f"mean of {len(states)} states", *(f"{title} {value}" for title, value in printed(means))]
+        words = [f"mean of {len(states)} states", *told({name: facts[f"mean_{name}"] for name in METRICS})]
         if "mean_motion_error_mm" in facts:
             mean_mm, high_mm = facts["mean_motion_error_mm"], facts["p95_motion_error_mm"]
             words.append(f"motion wrong by {mean_mm:.3g} mm (95 % below {high_mm:.3g})")
         say("   ".join(words))
-
-
-def _without_infinity(value: Any) -> Any:
-    """Returns facts, also nested ones, with None in place of +inf (the PSNR of equal volumes): JSON has no infinity."""
-    if isinstance(value, dict):
-        return {key: _without_infinity(part) for key, part in value.items()}
-    if isinstance(value, list):
-        return [_without_infinity(part) for part in value]
-    return None if value == math.inf else value

@@ -30,29 +30,23 @@ EXAMPLES = {
 
 FormatName = Literal[tuple(FORMATS)]  # type: ignore[valid-type]
 _TEMPLATE = "Print a TOML to fill in for a folder of TIFFs, and write nothing."
-GROUPS = {
-    "import": {
-        "Basics": (
-            *("output", "template", "form", "source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm"),
-            *("fps", "exposure_ms", "readout_ms", "first"),
-        ),
-        "Geometry": ("detector_offset_mm", "unit_mm", "rotates"),
-        "Timing": ("exposure_s", "angles", "angle_at", "detector_model"),
-        "Pixels": ("frames", "quantity", "flats", "flat_value", "row_0", "column_0", "part", "first_view"),
-        "HDF5": ("entry", "at", "linked_folder"),
-        "Volume": ("size", "voxel_mm", "roi_mm"),
-    }
-}
-
-
-_PAIRS = {"pixel_size_mm": pitches, "detector_offset_mm": lengths}
-
-
+GROUPS = {"import": {
+    "Basics": (
+        "output", "template", "form", "source_to_axis_mm", "source_to_detector_mm", "pixel_size_mm", "fps",
+        "exposure_ms", "readout_ms", "first",
+    ),
+    "Geometry": ("detector_offset_mm", "unit_mm", "rotates"),
+    "Timing": ("exposure_s", "angles", "angle_at", "detector_model"),
+    "Pixels": ("frames", "quantity", "flats", "flat_value", "row_0", "column_0", "part", "first_view"),
+    "HDF5": ("entry", "at", "linked_folder"),
+    "Volume": ("size", "voxel_mm", "roi_mm"),
+}}
+_OF_SCAN = of_fields(ImportOptions, pixel_size_mm=pitches, detector_offset_mm=lengths)
 _OF_GRID = {name: known for name, known in of_fields(GridChoice).items() if name != "margin_mm"}
 
 
 @with_options("grid", _OF_GRID, lambda given: GridChoice(**given))
-@with_options("options", of_fields(ImportOptions, _PAIRS), lambda given: ImportOptions(**given, named=option_name))
+@with_options("options", _OF_SCAN, lambda given: ImportOptions(**given, named=option_name))
 def import_command(
     source: Annotated[Path, file_argument("SRC", "File or folder of another program (docs: import.md).")],
     options: ImportOptions,
@@ -80,12 +74,12 @@ def import_command(
             write_scan(output, scan)
     frames, rows, columns = scan.projections.shape
     bad = np.zeros(1, bool) if scan.pixel_mask is None else np.asarray(scan.pixel_mask) != 0
-    masked = int(np.count_nonzero(bad))
     unusable = [] if bad.ndim < 3 else np.flatnonzero(bad.all((1, 2))).tolist()
     if unusable:
         remark(f"no pixel can be used in {len(unusable)} frames (from 0): {', '.join(map(str, unusable[:10]))}")
     facts = [f"{frames} frames of {rows}×{columns}", *_applied_in_words(scan), "fly-scan" if scan.is_fly else "at rest"]
-    say(f"{output}: {format_name}, {', '.join(facts)}, {masked} pixels masked\n{scan.provenance[TAKEN]}\n{scan.summary()}")
+    facts.append(f"{np.count_nonzero(bad)} pixels masked")
+    say(f"{output}: {format_name}, {', '.join(facts)}\n{scan.provenance[TAKEN]}\n{scan.summary()}")
 
 
 import_command.__doc__ = f"Import a scan: {', '.join(dict.fromkeys(whose for _, whose in FORMATS.values()))}."

@@ -10,12 +10,12 @@ from typing import Annotated, Any, Literal, get_args, get_origin
 from phyradgs_cl.acquisition.motion import MODELS
 from phyradgs_cl.acquisition.readout import SIDES
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
-from phyradgs_cl.commands.console import file_argument, file_option, numbers, option, pair_of
+from phyradgs_cl.commands.console import file_argument, file_option, numbers, option, pair_of, pair_option
 from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.reconstructors import DEFAULT_METHOD, METHODS, Preprocessing
 from phyradgs_cl.reconstructors.voxels.priors import PRIORS
 from phyradgs_cl.runtime import DEVICE_VARIABLE, MEMORY_VARIABLE
-from phyradgs_cl.settings import Settings, read_settings
+from phyradgs_cl.settings import Settings, device_wish, read_settings
 from phyradgs_cl.text import flag_of
 
 LARGEST_MM = 1e6  # no scanner has longer lengths
@@ -25,7 +25,7 @@ DetectorModel = Literal[DETECTOR_MODELS]  # type: ignore[valid-type]
 Scan = Annotated[Path, file_argument("SCAN", "Scan file (HDF5, NXtomo).")]
 Output = Annotated[Path, file_option("File to write; an existing one is replaced.", "--output", "-o")]
 _DEVICE = f"Index, cpu, gpu or part of a name (phyradgs devices); a list with commas for ranks. Also ${DEVICE_VARIABLE}."
-Device = Annotated[str | None, option(_DEVICE, "best by capability")]
+Device = Annotated[str | None, option(_DEVICE, "best by capability", parser=device_wish, metavar="TEXT")]
 _MEMORY = f"Limit of device memory, such as 2GiB; larger volumes are cut into bricks (large.md). Also ${MEMORY_VARIABLE}."
 Memory = Annotated[str | None, option(_MEMORY, "what the device has", metavar="SIZE")]
 
@@ -37,8 +37,7 @@ CheckpointEvery = Annotated[float, option(_CHECKPOINT, metavar="SECONDS")]
 CHECKPOINT_EVERY_S = 600.0  # a killed run loses about this time at most; writing a checkpoint takes a small part of it
 
 
-def lengths(flag: str, help: str, default: str) -> Any:
-    return option(help, default, flag, parser=pair_of(flag, "V,U in mm", "0,12.5", LARGEST_MM), metavar="V,U")
+lengths = pair_option("V,U in mm", "0,12.5", "V,U", LARGEST_MM)
 
 
 def pitches(flag: str, help: str, default: str) -> Any:
@@ -51,17 +50,14 @@ def _asked(kind: Any, help: str, default: str, *flags: str, **more: Any) -> Any:
     return Annotated[kind | None, option(help, default, *flags, **more)]
 
 
-_NONE: Mapping[str, Any] = {}
-
-
-def of_fields(kind: type, makers: Mapping[str, Callable[[str, str, Any], Any]] = _NONE) -> dict[str, tuple[Any, Any]]:
+def of_fields(kind: type, **makers: Callable[[str, str, Any], Any]) -> dict[str, tuple[Any, Any]]:
     """Returns options of a command, (annotation, default) by name, for those fields of a dataclass that have a help text.
     makers: functions ``(flag, help, usual)`` that return the options of fields with a special parser. All other fields
     whose type is a tuple take numbers with commas between, which are checked later."""
     return {one.name: _of_field(one, makers) for one in fields(kind) if one.metadata.get("help")}
 
 
-def _of_field(one: Field[Any], makers: Mapping[str, Callable[[str, str, Any], Any]]) -> tuple[Any, Any]:
+def _of_field(one: Field[Any], makers: Mapping[str, Callable[..., Any]]) -> tuple[Any, Any]:
     known = one.metadata
     help, usual, flags = known["help"], known["usual"], [flag_of(one.name), *([known["flag"]] if "flag" in known else [])]
     default = one.default if usual is True else None
@@ -110,7 +106,6 @@ RUN_OPTIONS: dict[str, Any] = {
 
 def with_run_options(*without: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Returns a decorator that replaces the parameter ``settings`` by a reconstruction's options, except ``without``."""
-
     kinds = {name: kind for name, kind in RUN_OPTIONS.items() if name not in without}
     options = {name: (kind, False if get_args(kind)[0] is bool else None) for name, kind in kinds.items()}
     return with_options("settings", options, settings_of)
@@ -135,13 +130,10 @@ def with_options(
         def called(**values: Any) -> Any:
             return command(**{slot: make({name: values.pop(name) for name in options})}, **values)
 
-        own = inspect.signature(command, eval_str=True).parameters.values()
-        keyword = inspect.Parameter.KEYWORD_ONLY
-        parameters = [one.replace(kind=keyword) for one in own if one.name != slot]
-        place = [one.name for one in own].index(slot)
-        parameters[place:place] = [
-            inspect.Parameter(name, keyword, default=default, annotation=kind) for name, (kind, default) in options.items()
-        ]
+        keyword, parameters = inspect.Parameter.KEYWORD_ONLY, list[inspect.Parameter]()
+        for name, one in inspect.signature(command, eval_str=True).parameters.items():
+            listed = options.items() if name == slot else [(name, (one.annotation, one.default))]
+            parameters += [inspect.Parameter(n, keyword, default=usual, annotation=kind) for n, (kind, usual) in listed]
         called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         return called
 

@@ -10,18 +10,9 @@ import typer
 from phyradgs_cl import report, signals
 from phyradgs_cl.acquisition.motion import motion_facts
 from phyradgs_cl.acquisition.plausible import blur_line
+from phyradgs_cl.commands import options
 from phyradgs_cl.commands.console import complain, file_option, last_words, option, say, scores
-from phyradgs_cl.commands.options import (
-    CHECKPOINT_EVERY_S,
-    OF_FRAMES,
-    OF_GRID,
-    OF_MOTION,
-    CheckpointEvery,
-    ObjectMotion,
-    Output,
-    Scan,
-    with_run_options,
-)
+from phyradgs_cl.commands.options import CheckpointEvery, ObjectMotion, Output, Scan, with_run_options
 from phyradgs_cl.estimate import duration, estimate, seconds_around
 from phyradgs_cl.io import partial_path, refuse_overwriting
 from phyradgs_cl.parallel import failing_together, launched_ranks
@@ -44,12 +35,11 @@ EXAMPLES = {
 }
 _GROUPS = {
     "Basics": ("output", "method", "motion", "size", "iterations"),
-    "Volume": (*(name for name in OF_GRID if name != "size"), "initial", "mu_water_per_mm", "rows", "slab"),
-    "Motion": ("object_motion", *OF_MOTION, "detector_model"),
+    "Volume": (*(name for name in options.OF_GRID if name != "size"), "initial", "mu_water_per_mm", "rows", "slab"),
+    "Motion": ("object_motion", *options.OF_MOTION, "detector_model"),
     "Quality": (
-        *("prior", "preset", "assignments"),
-        *(name for name in OF_FRAMES if name not in OF_GRID),
-        *("gaussians", "seed"),
+        "prior", "preset", "assignments", *(name for name in options.OF_FRAMES if name not in options.OF_GRID),
+        "gaussians", "seed",
     ),
     "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
 }
@@ -69,7 +59,7 @@ def reconstruct_command(
     mu_water_per_mm: Annotated[float | None, option(_WATER, "the file's")] = None,
     object_motion: ObjectMotion = None,
     resume: Annotated[bool, option("Continue an interrupted run from its checkpoint.", True, "--resume")] = False,
-    checkpoint_every: CheckpointEvery = CHECKPOINT_EVERY_S,
+    checkpoint_every: CheckpointEvery = options.CHECKPOINT_EVERY_S,
     preview: Annotated[Path | None, file_option(_PREVIEW, "--preview")] = None,
     live: Annotated[Path | None, file_option(_LIVE, "--live")] = None,
     profile: Annotated[bool, option("Print the device's time by kernel.", True, "--profile")] = False,
@@ -163,10 +153,6 @@ def estimate_command(scan: Scan, settings: Settings, object_motion: ObjectMotion
     loaded = load_scan(scan, plan.preprocessing.flats)
     rt = settings.runtime()
     before_s = time.process_time()  # a run will need this time too, to start and to read the scan
-
-    def around(result: Reconstruction) -> float:
-        return before_s + seconds_around(scan, loaded, result)
-
-    values = estimate(loaded, plan, rt, around)
+    values = estimate(loaded, plan, rt, lambda result: before_s + seconds_around(scan, loaded, result))
     say(f"{plan.method_name} on {rt.device.name}, from a trial of {duration(values.trial_seconds)}")
     say("\n".join(filter(None, (values.text(), blur_line(loaded)))))

@@ -4,46 +4,38 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from phyradgs_cl.acquisition import PROTOCOLS, Protocol
-from phyradgs_cl.commands.console import file_option, option, pair_of, say
+from phyradgs_cl.commands.console import file_option, option, pair_option, say
 from phyradgs_cl.commands.options import Device, First, Memory, Output, lengths, of_fields, with_options
 from phyradgs_cl.importers.options import DETECTOR_OFFSET
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.settings import device_wish
 from phyradgs_cl.simulation import SimulationOptions, scanner_for, scanner_options
 from phyradgs_cl.workflow import run_simulation
 
 EXAMPLES = {"simulate": "Example: phyradgs simulate --phantom foot --size 64 --detector 128 --noise tigre -o scan.h5"}
-GROUPS = {
-    "simulate": {
-        "Basics": ("output", "phantom", "volume", "scanner", "protocol", "size", "detector", "noise", "dose", "seed"),
-        "Timing": (
-            *("turns", "motion_of_object"),
-            *("views", "exposure_deg", "fps", "readout_ms", "first"),
-            *("start_deg", "jitter_deg", "pulse"),
-        ),
-        "Panel and beam": (
-            *("detector_offset", "truncation", "detector_model", "peak", "electronic_noise", "lag", "rings", "sparks"),
-            *("drift", "scatter", "kvp"),
-        ),
-        "Run": ("pixel_samples", "time_samples", "device", "memory"),
-    }
-}
+GROUPS = {"simulate": {
+    "Basics": ("output", "phantom", "volume", "scanner", "protocol", "size", "detector", "noise", "dose", "seed"),
+    "Timing": (
+        "turns", "motion_of_object", "views", "exposure_deg", "fps", "readout_ms", "first", "start_deg", "jitter_deg",
+        "pulse",
+    ),
+    "Panel and beam": (
+        "detector_offset", "truncation", "detector_model", "peak", "electronic_noise", "lag", "rings", "sparks",
+        "drift", "scatter", "kvp",
+    ),
+    "Run": ("pixel_samples", "time_samples", "device", "memory"),
+}}
 ProtocolName = Literal[tuple(PROTOCOLS)]  # type: ignore[valid-type]
 _PHANTOM = f"{', '.join(PHANTOMS)}; or a TOML file of beads and wires."
 _NAMES = lambda incomplete: [name for name in PHANTOMS if name.startswith(incomplete)]  # noqa: E731
 _VOLUME = "Volume file: HDF5 with /volume (z, y, x), mha, nii, nrrd, npy or tiff."
 _PROTOCOL = "rapid: 25 frames of 14.4°; standard: 50 of 7.2°; static: rapid with a gantry that stops."
-
-
-def _pulse(flag: str, help: str, usual: str) -> Any:
-    pair = pair_of(flag, "START,LENGTH as fractions of the exposure", "0.86,0.14")
-    return option(help, usual, flag, parser=pair, metavar="START,LENGTH")
-
-
-_MAKERS = {"pulse": _pulse, "motion_of_object": lambda flag, help, usual: file_option(help, flag, default=usual)}
-_OPTIONS = {**of_fields(Protocol, _MAKERS), **of_fields(SimulationOptions, _MAKERS)}
+_MAKERS = {
+    "pulse": pair_option("START,LENGTH as fractions of the exposure", "0.86,0.14", "START,LENGTH"),
+    "motion_of_object": lambda flag, help, usual: file_option(help, flag, default=usual),
+}
+_OPTIONS = {**of_fields(Protocol, **_MAKERS), **of_fields(SimulationOptions, **_MAKERS)}
 
 
 @with_options("given", _OPTIONS, dict)
@@ -66,14 +58,13 @@ def simulate_command(
     memory: Memory = None,
 ) -> None:
     """Simulate a fly-scan (or a stop-and-shoot one) of a phantom or a volume, and write a scan file."""
-    wish = device_wish(device)
     described = scanner_for(scanner, detector, detector_offset, truncation)
     options = scanner_options(described, protocol, fps=fps, readout_ms=readout_ms, first=first, **given)
     of_scanner = scanner if scanner.endswith(".toml") else None
     inputs = [Path(one) for one in (of_scanner, given["motion_of_object"]) if one is not None]
     with Ticker("frame") as ticker:
         scan = run_simulation(
-            output, described, options, Runtime(wish, memory=memory), ticker.show, phantom=phantom, volume=volume,
+            output, described, options, Runtime(device, memory=memory), ticker.show, phantom=phantom, volume=volume,
             size=size, pixel_samples=pixel_samples, inputs=inputs,
         )
     frames, rows, columns = scan.projections.shape

@@ -24,10 +24,12 @@ def sweep_command(
     output: Annotated[Path, option("Folder of lines, volumes and a table.", True, "--output", "-o", metavar="DIR")],
     workers: Annotated[str | None, option(_WORKERS, "none, one run at a time", metavar="N|ADDRESS")] = None,
     checkpoint_every: CheckpointEvery = CHECKPOINT_EVERY_S,
-    device: Annotated[str | None, option(_DEVICES, "the best one, and others of its name")] = None,
+    device: Annotated[
+        str | None, option(_DEVICES, "the best one, and others of its name", parser=device_wish, metavar="TEXT")
+    ] = None,
 ) -> None:
     """Reconstruct many scans with many settings: a results file, volumes, and a table."""
-    wish, runs = device_wish(device), plan_sweep(grid, output, checkpoint_every)
+    runs = plan_sweep(grid, output, checkpoint_every)
     with Ticker("iteration") as ticker:
 
         def tell(done: int, line: dict[str, Any]) -> None:
@@ -37,7 +39,7 @@ def sweep_command(
             say(f"{done}/{len(runs)} {line['run']} ({line['label']}): {outcome}")
 
         try:
-            failed = run_sweep(runs, output, workers, wish, tell=tell, report=ticker.progress)
+            failed = run_sweep(runs, output, workers, device, tell=tell, report=ticker.progress)
         except KeyboardInterrupt:
             ticker.end_line()
             complain(f"interrupted: finished runs are in {output / RESULTS}; repeat the command to continue")

@@ -14,17 +14,8 @@ from phyradgs_cl.fields import Deformation, Hounsfield, States
 from phyradgs_cl.fields.hounsfield import Box
 from phyradgs_cl.io import Volume, read_state, read_volume, refuse_overwriting, write_volume
 
-__all__ = [
-    "CLOUDS", "EXPORTS", "OWN", "DicomLabels", "default_output", "export_states", "export_stored", "export_volume",
-    "foreign_suffix", "format_of", "hu_scale", "state_times_s",
-]  # fmt: skip
-
 VOXELS: dict[str, Callable[[Path, Volume, str], None]] = {
-    "nii": writers.write_image,
-    "mha": writers.write_image,
-    "nrrd": writers.write_image,
-    "tiff": writers.write_tiff,
-    "npy": writers.write_npy,
+    **dict.fromkeys(("nii", "mha", "nrrd"), writers.write_image), "tiff": writers.write_tiff, "npy": writers.write_npy,
 }
 CLOUDS = {"ply": writers.write_ply, "npz": writers.write_npz}
 EXPORTS = (*VOXELS, "dicom", *CLOUDS, "zarr")
@@ -69,8 +60,7 @@ def export_volume(
 
 
 def hu_scale(volume: Volume, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0) -> Hounsfield | None:
-    """Returns the volume's scale of Hounsfield units. Fits a new scale if there is none, or if ``air`` or ``water``, which
-    are boxes in mm, or an insert's HU is given."""
+    """Returns the volume's scale of Hounsfield units, or one fitted to ``air`` and ``water``, boxes in mm, if given."""
     if (stored := volume.scale) is not None and air is None and water is None and insert_hu == 0:
         return replace(stored, fitted=f"{stored.line}, as stored")
     return volume.hounsfield(air, water, insert_hu).scale
@@ -80,8 +70,7 @@ def _checked(
     path: Path, to: str, output: str | Path | None, mu_water_per_mm: float | None, labels: DicomLabels | None,
     scale_of: ScaleOf | None,
 ) -> tuple[Path, ScaleOf | None]:  # fmt: skip
-    """Returns the path to write, and the function from the volume to its HU scale, or None. Raises InputError for an unknown
-    format, a suffix of another format, and options that the format does not have."""
+    """Returns the path to write, and the function from the volume to its HU scale, or None."""
     checks.one_of("--to", to, (*EXPORTS, OWN))
     if mu_water_per_mm is not None and scale_of is not None:
         raise InputError("--mu-water-per-mm", "given with --hu", "one of the two", "leave one out")
@@ -90,8 +79,8 @@ def _checked(
         scale_of = lambda _: stated  # noqa: E731
     if to == OWN and scale_of is None:
         raise InputError("--hu", f"not given for {output}", "another format, or a scale to store", "add --hu")
-    target = default_output(path, to) if output is None else Path(output)
-    suffixes = _suffixes(to)  # programs recognise the format by the suffix
+    suffixes = _suffixes(to)  # programs recognise the format by the suffix; the folder of DICOM has none
+    target = Path(output or (path.with_suffix(suffixes[0]) if suffixes else path.with_name(f"{path.stem}_dicom")))
     if suffixes and not target.name.lower().endswith(suffixes):
         raise InputError(f"output of --to {to}", str(target), f"a name that ends in {' or '.join(suffixes)}")
     refuse_overwriting("output", target, path)
@@ -103,10 +92,10 @@ def _checked(
     return target, scale_of
 
 
-def _in_unit(values: np.ndarray, scale: Hounsfield | None, unit: str = _PLAIN) -> tuple[np.ndarray, str]:
-    """Returns values (z, y, x) float32 and a note of their unit: Hounsfield units if there is a scale, else ``unit``."""
-    plain = np.ascontiguousarray(values, np.float32)
-    return (plain, unit) if scale is None else (scale.of(plain), scale.note)
+def _in_unit(volume: Volume, scale: Hounsfield | None, unit: str = _PLAIN) -> tuple[Volume, str]:
+    """Returns a volume in float32 and a note of its unit: Hounsfield units if there is a scale, else ``unit``."""
+    values = np.ascontiguousarray(volume.values, np.float32)
+    return replace(volume, values=values if scale is None else scale.of(values)), unit if scale is None else scale.note
 
 
 def state_times_s(moves: Deformation | States, count: int, during_s: tuple[float, float] | None = None) -> list[float]:
@@ -148,16 +137,14 @@ def export_states(
         volume = volume.moved_by(deformation, str(path))
     states = [replace(volume, values=volume.at(time_s)) for time_s in times_s]
     if to == "nii":
-        values = [_in_unit(state.values, scale) for state in states]
-        stack = [replace(volume, values=value) for value, _ in values]
-        writers.write_image(target, stack[0], values[0][1], times_s, stack)
+        stack, notes = zip(*(_in_unit(state, scale) for state in states), strict=True)
+        writers.write_image(target, stack[0], notes[0], times_s, stack)
         return [target]
     suffix = next((s for s in _suffixes(to) if target.name.lower().endswith(s)), "")
     stem, digits = target.name[: len(target.name) - len(suffix)], max(2, len(str(len(states))))
-    numbers = range(1, len(states) + 1)
-    targets = [target.with_name(f"{stem}_{number:0{digits}d}{target.name[len(stem) :]}") for number in numbers]
+    targets = [target.with_name(f"{stem}_{k:0{digits}d}{target.name[len(stem) :]}") for k in range(1, len(states) + 1)]
     for state, one in zip(states, targets, strict=True):
-        export_stored(state, to, one, str(path), None if scale is None else lambda _: scale, labels)
+        export_stored(state, to, one, str(path), lambda _: scale, labels)
     return targets
 
 
@@ -165,8 +152,8 @@ def export_stored(
     volume: Volume, to: str, target: Path, subject: str, scale_of: ScaleOf | None = None,
     labels: DicomLabels | None = None, unit: str = _PLAIN,
 ) -> None:  # fmt: skip
-    """Writes a volume as ``export_volume`` does. subject: what messages call the volume. unit: a note for values without a
-    scale of Hounsfield units."""
+    """Writes a volume as ``export_volume`` does. subject: what messages call the volume, for ``OWN`` the path of its file.
+    unit: a note for values without a scale of Hounsfield units."""
     if to in CLOUDS:
         CLOUDS[to](target, writers.gaussians_of(volume, subject))
         return
@@ -174,23 +161,18 @@ def export_stored(
         raise InputError(subject, "values without voxel sizes", "a volume with its grid", "see 'phyradgs info'")
     scale = None if scale_of is None else scale_of(volume)
     if to == OWN:
-        _write_own(target, volume, subject, scale)
+        facts = volume.provenance if scale is None else {**volume.provenance, **scale.facts()}
+        parts = volume.gaussians, volume.metrics, read_state(subject), volume.deformation, volume.states, volume.doubt
+        write_volume(target, volume.values, volume.grid, facts, *parts)
         return
     if to == "zarr":
         writers.write_zarr(target, volume, scale, unit)
         return
-    values, note = _in_unit(volume.values, scale, unit)
-    volume = replace(volume, values=values)
+    volume, note = _in_unit(volume, scale, unit)
     if to == "dicom":
         write_dicom(target, volume, note, labels or DicomLabels())
     else:
         VOXELS[to](target, volume, note)
-
-
-def _write_own(target: Path, volume: Volume, path: str, scale: Hounsfield | None) -> None:
-    facts = volume.provenance if scale is None else {**volume.provenance, **scale.facts()}
-    parts = volume.gaussians, volume.metrics, read_state(path), volume.deformation, volume.states, volume.doubt
-    write_volume(target, volume.values, volume.required_grid, facts, *parts)
 
 
 def foreign_suffix(output: str | Path) -> str | None:
@@ -199,14 +181,8 @@ def foreign_suffix(output: str | Path) -> str | None:
     return next((suffix for suffix in suffixes if Path(output).name.lower().endswith(suffix)), None)
 
 
-def default_output(path: Path, to: str) -> Path:
-    """Returns the volume's path with the format's suffix; for DICOM, NAME_dicom, a folder."""
-    return path.with_name(f"{path.stem}_dicom") if to == "dicom" else path.with_suffix(_suffixes(to)[0])
-
-
 def format_of(output: str | Path | None, subject: str = "--to") -> str:
-    """Returns the format, one of ``EXPORTS`` or ``OWN``, to which an output's suffix belongs. Raises InputError for other
-    suffixes and for None."""
+    """Returns the format, in ``EXPORTS`` or ``OWN``, that a suffix names. Raises InputError for other suffixes and None."""
     for to in (*EXPORTS, OWN):
         if output is not None and _suffixes(to) and Path(output).name.lower().endswith(_suffixes(to)):
             return to

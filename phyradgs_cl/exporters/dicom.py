@@ -5,8 +5,8 @@ import hashlib
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -48,14 +48,13 @@ class DicomLabels:
 
     @property
     def given(self) -> dict[str, object]:
-        return {one.name: value for one in fields(self) if (value := getattr(self, one.name)) is not None}
+        return {name: value for name, value in vars(self).items() if value is not None}
 
     @property
     def _day(self) -> datetime.date | None:
-        try:
+        with suppress(ValueError):
             return datetime.date.fromisoformat(self.date or "")
-        except ValueError:
-            return None
+        return None
 
     def write(self, image: Any) -> None:
         if self.patient is not None:
@@ -91,8 +90,7 @@ def write_dicom(path: Path, volume: Volume, note: str, labels: DicomLabels) -> N
 
 
 def _rescale_slope(values: np.ndarray, unit: str) -> str:
-    """Returns the value of one step of the stored integers, as a decimal string: 1 HU if 16 bits can hold all values, else
-    the smallest step for which 16 bits suffice."""
+    """Returns the value of one step of the stored integers as text: 1 HU, or the smallest for which 16 bits suffice."""
     peak = float(np.abs(values).max())
     if unit == "HU" and peak <= _LARGEST:
         return "1"

@@ -24,9 +24,7 @@ _MOST_NIFTI_VOXELS = 32_767  # NIfTI allows at most this many voxels along an ax
 _MOST_IMAGEJ_BYTES = 4_000_000_000  # from this size on BigTIFF is written: offsets in ImageJ's TIFF have 32 bits
 _CHUNK = 64  # voxels of a chunk along each axis; the resolution is halved until the volume fits into one chunk
 log = logging.getLogger(__name__)
-_PLY_NAMES = (
-    *("x", "y", "z", "scale_0", "scale_1", "scale_2"), *("rot_0", "rot_1", "rot_2", "rot_3", "density")
-)
+_PLY_NAMES = ("x", "y", "z", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "density")
 
 
 def write_image(path: Path, volume: Volume, note: str, times_s: Sequence[float] = (), states: Sequence[Volume] = ()) -> None:
@@ -78,11 +76,9 @@ def write_tiff(path: Path, volume: Volume, note: str) -> None:
 
 def write_npy(path: Path, volume: Volume, note: str) -> None:
     """Writes the values (z, y, x) float32 to ``path``, and the grid to a .json file of the same name."""
-    facts = {
-        "axes": ["z", "y", "x"], "shape": list(volume.values.shape),
-        "voxel_size_mm": list(volume.required_grid.voxel_size_mm),
-        "first_centre_mm": list(volume.required_grid.first_centre_mm), "values": note.removeprefix("values in "),
-    }
+    grid, unit = volume.required_grid, note.removeprefix("values in ")
+    facts: dict[str, object] = {"axes": ["z", "y", "x"], "shape": volume.values.shape}
+    facts |= {"voxel_size_mm": grid.voxel_size_mm, "first_centre_mm": grid.first_centre_mm, "values": unit}
     with written_beside(path.with_suffix(".json")) as temporary:
         temporary.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     with written_beside(path) as temporary, open(temporary, "wb") as file:

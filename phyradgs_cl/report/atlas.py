@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.report.images import Window, base64_of, block_means, bytes_of, png_bytes
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
-from phyradgs_cl.report.viewer import decimals_of, slider
+from phyradgs_cl.report.viewer import choice, decimals_of, slider
 
 MOST_EDGE = 128  # larger volumes are averaged over blocks to this many voxels along each side
 MOST_TEXT = 2_000_000  # limit of base64 characters for voxels and centres together, so that the page stays small
@@ -64,24 +64,17 @@ def _stage() -> Markup:
 
 
 def _controls(threshold: int, cloud: Gaussians | None) -> list[Markup]:
-    def kind(name: str, words: str, is_first: bool = False) -> Markup:
-        button = element("input", type="radio", name="space-kind", id=f"space-{name}", value=name, checked=is_first)
-        return element("label", button, words)
-
-    choice = (kind("maximum", "Maximum", True), kind("surface", "Surface"))
     controls = [
-        element("fieldset", element("legend", "Show"), *choice, class_="choice"),
+        choice("space-kind", "space", {"maximum": "Maximum", "surface": "Surface"}),
         slider("threshold", "Threshold", 1, 255, threshold, ""),
         slider("turn", "Turn", 0, 360, _TURN_DEG, f"{_TURN_DEG}°"),
         slider("tilt", "Tilt", -90, 90, _TILT_DEG, f"{_TILT_DEG}°"),
         slider("space-zoom", "Zoom", 1, MOST_ZOOM, 1, "1×", 0.1),
     ]
     if cloud is not None:
-        words = "Gaussians' centres"
-        if cloud.count > MOST_CENTRES:
-            words += f" ({number(MOST_CENTRES)} of {cloud.count})"
+        some = f" ({number(MOST_CENTRES)} of {cloud.count})" if cloud.count > MOST_CENTRES else ""
         box = element("input", type="checkbox", id="centres")
-        controls.append(element("label", box, words, class_="tick"))
+        controls.append(element("label", box, f"Gaussians' centres{some}", class_="tick"))
     return [*controls, element("button", "Reset", type="button", id="space-reset")]
 
 

@@ -123,8 +123,7 @@ def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:
 
 
 def profile_chart(x_mm: NDArray[Any], line: NDArray[Any], sigma: NDArray[Any], truth: NDArray[Any] | None) -> Markup:
-    """Returns a chart of voxels ``line`` (n,) in 1/mm along ``x_mm``, with a band of ± ``sigma``, and of the ``truth`` if it
-    is known."""
+    """Returns a chart of voxels ``line`` (n,) in 1/mm along ``x_mm``, a band of ± ``sigma`` and, if known, the ``truth``."""
 
     def draw(axes: "Axes") -> None:
         axes.fill_between(x_mm, line - sigma, line + sigma, color=SOFT, alpha=0.4, lw=0)

@@ -4,7 +4,7 @@ pixels allows."""
 import base64
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,10 +126,6 @@ class Plane:
         """Index into ``indices`` of the middle slice, which ``still`` shows."""
         return len(self.indices) // 2
 
-    def position_mm(self, k: int) -> float:
-        return self.first_mm + self.indices[k] * self.step_mm
-
-
 def windows_of(volume: Volume, reference: Volume | None, doubt: Volume | None = None) -> dict[str, Window]:
     """Returns the grey values of each layer: "result", "truth", "difference", "doubt" (the error bars). Result and truth
     share the truth's range, so that a wrong scale of the result shows."""
@@ -167,6 +163,11 @@ def planes_of(
     return planes
 
 
+def middle_slices(volume: Volume) -> tuple[Volume, ...]:
+    """Returns the middle slices (axial, coronal, sagittal) of a volume (nz, ny, nx)."""
+    return tuple(np.take(volume, n // 2, axis=axis) for axis, n in enumerate(volume.shape))
+
+
 def middle_planes(slices: Sequence[Volume], grid: Grid, window: tuple[float, float]) -> list[Plane]:
     """Returns planes of a volume's middle slices (axial, coronal, sagittal). window: the values of black and white."""
     planes = []
@@ -181,12 +182,6 @@ def _extent(grid: Grid, axis: int) -> tuple[float, float, tuple[float, float]]:
     """Returns the first slice's centre, the distance to the next slice, and (width, height) of a slice, all in mm."""
     height_mm, width_mm = (side for a, side in enumerate(grid.size_mm) if a != axis)
     return grid.first_centre_mm[axis], grid.voxel_size_mm[axis], (width_mm, height_mm)
-
-
-def stills_of(planes: Sequence[Plane], volume: Volume, window: tuple[float, float]) -> list[Plane]:
-    """Returns ``planes`` with the middle slices of another volume (nz, ny, nx). window: the values of black and white."""
-    pictures = (_picture(volume, axis, plane.indices[plane.middle], *window) for axis, plane in enumerate(planes))
-    return [replace(plane, layers={}, still=still) for plane, still in zip(planes, pictures, strict=True)]
 
 
 def _slice_counts(shape: tuple[int, ...], layers: int) -> list[int]:

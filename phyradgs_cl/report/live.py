@@ -20,13 +20,14 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import written_beside
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.reconstructors.projected import FramePair
-from phyradgs_cl.report.images import grey_range, middle_planes
-from phyradgs_cl.report.markup import Markup, element, joined, json_block, label, number, raw_text
-from phyradgs_cl.report.page import head, web_script
+from phyradgs_cl.report.images import grey_range, middle_planes, middle_slices
+from phyradgs_cl.report.markup import Markup, element, grouped, joined, json_block, label, number, tiles
+from phyradgs_cl.report.page import document, web_script
 from phyradgs_cl.report.sections import facts_table, frame_pictures, note, section
 from phyradgs_cl.report.viewer import stills
 from phyradgs_cl.text import clock
 
+log = logging.getLogger(__name__)
 _MOST_POINTS = 400  # beyond this many points, every second one of the convergence curve is dropped
 _SAMPLES = 64  # voxels along each side from which grey values are computed, to save time
 # a page that is older than both this time and this many of its intervals says that the run may have been killed
@@ -42,8 +43,7 @@ FRAMES_FROM_S = 60.0  # shorter runs compute no frames, since their report comes
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """Middle slices (axial, coronal, sagittal) in 1/mm of the volume after an iteration, and some frames, measured and
-    computed. high: the value of white in 1/mm."""
+    """Middle slices in 1/mm of the volume after an iteration, and some frames. high: the value of white in 1/mm."""
 
     iteration: int
     slices: tuple[NDArray[np.floating], ...]
@@ -53,9 +53,8 @@ class Snapshot:
 
     @classmethod
     def of(cls, iteration: int, volume: NDArray[np.floating], grid: Grid, frames: Sequence[FramePair]) -> "Snapshot":
-        slices = tuple(np.take(volume, n // 2, axis=axis) for axis, n in enumerate(volume.shape))
         sample = volume[tuple(slice(None, None, math.ceil(n / _SAMPLES)) for n in volume.shape)]
-        return cls(iteration, slices, grid, max(grey_range(sample)[1], 0.0) or 1.0, frames)
+        return cls(iteration, middle_slices(volume), grid, max(grey_range(sample)[1], 0.0) or 1.0, frames)
 
     @cached_property
     def parts(self) -> list[Markup]:
@@ -86,8 +85,7 @@ class Status:
     progress: Progress | None = None
     points: tuple[tuple[int, float], ...] = ()
     first: tuple[int, float] = (0, 0.0)
-    """Iteration and time in s of the present stage's first report. They give the speed, from which the time left is
-    estimated."""
+    """Iteration and time in s of the present stage's first report, from which the speed is computed."""
     reported: float = 0.0
     snapshot: Snapshot | None = None
 
@@ -123,20 +121,14 @@ def live_page(status: Status, now: float) -> str:
     curve = [section("convergence", "Convergence", _curve(status))] if len(status.points) > 1 else []
     parts = [*pictures[:1], *curve, *pictures[1:], section("settings", "Settings", _settings(status))]
     names = ["slices", "convergence", "projections", "settings"]
-    links = [element("a", n.capitalize(), href=f"#{n}") for n in names if any(f' id="{n}"' in part for part in parts)]
-    skip = element("a", "To the content", href="#settings", class_="skip")
+    links = [name for name in names if any(f' id="{name}"' in part for part in parts)]
     data = {
         "written": now, "every_s": status.every_s, "late_s": max(_LATE_S, _LATE_TIMES * status.every_s),
         "is_over": bool(status.ended),
     }  # fmt: skip
-    body = joined(
-        skip, element("header", *_top(status, now), element("nav", *links, aria_label="Sections")),
-        element("main", *parts), json_block("live-data", data),
-    )
-    script = web_script("common", "live")
-    page = element("body", body, raw_text("script", script))
-    seconds = None if status.ended else math.ceil(status.every_s)
-    return "<!doctype html>\n" + element("html", head(_tab(status), script, seconds), page, lang="en") + "\n"
+    seconds, last = None if status.ended else math.ceil(status.every_s), json_block("live-data", data)
+    script, top = web_script("common", "live"), _top(status, now)
+    return document(_tab(status), script, top, links, "settings", parts, last, seconds)
 
 
 def _tab(status: Status) -> str:
@@ -153,30 +145,27 @@ def _top(status: Status, now: float) -> list[Markup]:
     state = status.ended or (f"{status.stage[:1].upper()}{status.stage[1:]}." if status.stage else "")
     kind = "warning" if status.ended and not status.is_complete else None
     news = element("p", state, id="news", role="status", class_=kind, hidden=not state)
-    controls = []
-    if not status.ended:
-        button = element("button", "Pause reloading", type="button", id="pause", aria_pressed="false")
-        controls = [element("p", button, class_="tools")]
-    tiles = [element("li", element("b", value), element("span", name)) for name, value in _tiles(status, now)]
+    button = element("button", "Pause reloading", type="button", id="pause", aria_pressed="false")
+    controls = [] if status.ended else [element("p", button, class_="tools")]
     about = f"{status.settings.get('method', '')}, from {status.settings.get('scan', 'a scan')}"
     title = status.title if status.ended else f"{status.title}, under way"
     parts = [element("h1", title), element("p", about), news, element("p", words, id="written"), *controls]
     if (p := status.progress) is not None:
         parts.append(element("progress", value=p.iteration, max=max(p.iterations, 1), aria_label="Finished iterations"))
-    return [*parts, element("ul", *tiles, class_="tiles")]
+    return [*parts, tiles(_facts(status, now))]
 
 
-def _tiles(status: Status, now: float) -> list[tuple[str, str]]:
-    tiles = []
+def _facts(status: Status, now: float) -> list[tuple[str, str]]:
+    facts = []
     if (p := status.progress) is not None:
-        tiles += [("iteration", f"{p.iteration} of {p.iterations}"), (p.quantity, number(p.loss))]
+        facts += [("iteration", f"{p.iteration} of {p.iterations}"), (p.quantity, number(p.loss))]
         if p.gaussians:
-            tiles.append(("Gaussians", f"{p.gaussians:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")))
+            facts.append(("Gaussians", grouped(p.gaussians)))
         if (per_s := status.per_s) is not None:
-            tiles.append(("per minute", number(60 * per_s)))
+            facts.append(("per minute", number(60 * per_s)))
         if (left_s := status.left_s(now)) is not None and not status.ended:
-            tiles.append(("time left", clock(left_s)))
-    return [*tiles, ("time so far", clock(now - status.started))]
+            facts.append(("time left", clock(left_s)))
+    return [*facts, ("time so far", clock(now - status.started))]
 
 
 def _settings(status: Status) -> Markup:
@@ -196,10 +185,10 @@ def _curve(status: Status) -> Markup:
     height = np.log(y) if is_log else y
     left, top, right, bottom = _MARGIN
     across = left + (x - x[0]) / ((x[-1] - x[0]) or 1) * (_CHART[0] - left - right)
-    down = _CHART[1] - bottom - (height - height.min()) / (np.ptp(height) or 1) * (_CHART[1] - top - bottom)
-    path = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across, down, strict=True))
-    ends = [(top + 4, y.max()), (_CHART[1] - bottom + 4, y.min())]
     base = _CHART[1] - bottom
+    down = base - (height - height.min()) / (np.ptp(height) or 1) * (base - top)
+    path = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across, down, strict=True))
+    ends = [(top + 4, y.max()), (base + 4, y.min())]
     texts = [element("text", number(value), x=left - 8, y=at, text_anchor="end") for at, value in ends]
     texts.append(element("text", number(x[0]), x=left, y=base + 20))
     texts.append(element("text", f"iteration {number(x[-1])}", x=_CHART[0] - right, y=base + 20, text_anchor="end"))
@@ -214,9 +203,6 @@ def _curve(status: Status) -> Markup:
     return element("div", element("figure", drawing, element("figcaption", caption)), class_="charts")
 
 
-log = logging.getLogger(__name__)
-
-
 class LivePage:
     """Writes a page about a run. Use a LivePage as a context manager around the run, and call it with each progress report.
 
@@ -228,8 +214,7 @@ class LivePage:
     def __init__(self, path: Path, title: str, settings: Mapping[str, object], every_s: float = EVERY_S) -> None:
         self.path, self.every_s = path, every_s
         self.status = Status(title, settings, every_s, time.time())
-        self.spent_s = 0.0
-        """Time in s that the run has waited for pictures."""
+        self.spent_s = 0.0  # the run has waited this long for pictures
         self._pictured_s = -every_s
         self._waits = False  # whether an existing file is still kept, until the first progress
         self._started_s = time.monotonic()

@@ -3,6 +3,7 @@
 import html
 import json
 import math
+from collections.abc import Iterable
 
 from phyradgs_cl.text import plain_text
 
@@ -11,7 +12,6 @@ _RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # by unit: a number below a m
 _WORDS = {"psnr": "PSNR", "rms": "RMS", "ssim": "SSIM", "sha256": "SHA-256", "tv": "TV", "l1": "L1", "fdk": "FDK"}
 _LONGEST = 400  # longer values are cut after this many characters
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
 
 
 class Markup(str):
@@ -37,8 +37,7 @@ def joined(*children: object) -> Markup:
 
 
 def raw_text(name: str, content: str, /, **attributes: object) -> Markup:
-    """Returns a ``style`` or ``script`` element of this package's own text, which is not escaped. Raises ValueError for
-    text that would end the element."""
+    """Returns a ``style`` or ``script`` element of own text, not escaped. Raises ValueError for text that would end it."""
     if "</" + name in content.lower():
         raise ValueError(f"{name}: the content would end its element")
     return element(name, Markup(content), **attributes)
@@ -64,11 +63,8 @@ def _plain(value: object) -> str:
 
 def label(key: str) -> str:
     """Returns a key as words without its unit: "source to axis" for ``source_to_axis_mm``."""
-    for ending in UNITS:
-        if key.endswith(ending) and key != ending:
-            key = key[: -len(ending)]
-            break
-    return " ".join(_WORDS.get(word, word) for word in key.replace("_", " ").split())
+    ending = next((ending for ending in UNITS if key.endswith(ending) and key != ending), "")
+    return " ".join(_WORDS.get(word, word) for word in key.removesuffix(ending).replace("_", " ").split())
 
 
 def unit(key: str) -> str:
@@ -98,13 +94,23 @@ def number(value: float, resolution: float = 0.0) -> str:
     return text.replace("-", "−")
 
 
+def grouped(value: int) -> str:
+    """Returns a whole number with spaces between groups of three digits."""
+    return f"{value:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def tiles(facts: Iterable[tuple[str, str]]) -> Markup:
+    """Returns a list of (name, value), each value in large letters above its name."""
+    return element("ul", *(element("li", element("b", v), element("span", name)) for name, v in facts), class_="tiles")
+
+
 def _text(value: object, resolution: float) -> str:
     if value is None:
         return "none"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, int):
-        return f"{value}" if abs(value) < 100_000 else f"{value:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+        return f"{value}" if abs(value) < 100_000 else grouped(value)
     if isinstance(value, float):
         return number(value, resolution)
     if isinstance(value, list | tuple):

@@ -12,10 +12,10 @@ from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.fields import Deformation, Grid, deformed, triple
 from phyradgs_cl.fields.deformation import control_points
 from phyradgs_cl.report.atlas import MOST_EDGE
-from phyradgs_cl.report.images import Plane, Window, base64_of, block_means, middle_planes
+from phyradgs_cl.report.images import Plane, Window, base64_of, block_means, middle_planes, middle_slices
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 from phyradgs_cl.report.scan_charts import box_corners, with_sources
-from phyradgs_cl.report.viewer import decimals_of, picture, place, slider
+from phyradgs_cl.report.viewer import decimals_of, picture, plane_slider, slider
 
 _TIMES = 49  # times at which the page has the scanner's pose; the script interpolates between them
 _MOST_LINES = 64  # more detector lines would merge in the picture
@@ -44,24 +44,21 @@ def frame_in_motion(scan: Scan) -> Markup:
     poses = with_sources(scan, scan.trajectory.pose(0, scan.frame_start_s[0] + times_s))
     lines = np.unique(np.linspace(0, scan.lines - 1, min(scan.lines, _MOST_LINES)).round().astype(int))
     opens_s = scan.shutter.delay_s(scan.lines)[lines]
-    source = poses[0, :3]
+    source, angles_deg = poses[0, :3], None
+    if isinstance(scan.trajectory, CircularOrbit):
+        angles_deg = np.rad2deg(scan.trajectory.angle_rad(0, scan.frame_start_s[0] + times_s))[:, None].tolist()
     facts = {
         "poses": np.round(poses, 5).tolist(), "times_s": [first_s, last_s], "lines": lines.tolist(),
         "opens_s": scan.shutter.in_pulse(opens_s).tolist(),
         "closes_s": scan.shutter.in_pulse(opens_s + scan.shutter.exposure_s).tolist(),
-        "shape": scan.geometry.detector_shape, "axis": scan.shutter.axis, "angles_deg": _angles_deg(scan, times_s),
+        "shape": scan.geometry.detector_shape, "axis": scan.shutter.axis, "angles_deg": angles_deg,
         "box": np.round(box_corners(scan), 5).tolist(), "steps": _FRAME_STEPS, "is_parallel": scan.is_parallel,
         "turn_deg": -90 - np.rad2deg(np.arctan2(source[1], source[0])) - _LOOK_DEG, "tilt_deg": _TILT_DEG,
     }  # fmt: skip
     words = f"The first frame in motion, {number(last_s - first_s)} s"
-    canvas = element(
-        "canvas", id="rows", tabindex=0, role="img", aria_label=words, aria_describedby="rows-help rows-reading"
-    )
-    controls = [
-        element("button", "Play", type="button", id="rows-play"),
-        element("button", "Reset", type="button", id="rows-reset"),
-        slider("rows-time", "Time", 0, _FRAME_STEPS, _FRAME_STEPS, ""),
-    ]
+    reading = "rows-help rows-reading"
+    canvas = element("canvas", id="rows", tabindex=0, role="img", aria_label=words, aria_describedby=reading)
+    controls = [*_buttons("rows"), slider("rows-time", "Time", 0, _FRAME_STEPS, _FRAME_STEPS, "")]
     return joined(
         element("h3", words), element("div", *controls, class_="tools"),
         element("div", canvas, class_="rows"), element("p", element("output", id="rows-reading"), class_="note help"),
@@ -69,11 +66,8 @@ def frame_in_motion(scan: Scan) -> Markup:
     )
 
 
-def _angles_deg(scan: Scan, times_s: np.ndarray) -> list[list[float]] | None:
-    """Returns gantry angles (T, 1) in degrees at times (T,) in s of the first frame; None for a gantry not on a circle."""
-    if not isinstance(scan.trajectory, CircularOrbit):
-        return None
-    return np.rad2deg(scan.trajectory.angle_rad(0, scan.frame_start_s[0] + times_s))[:, None].tolist()
+def _buttons(of: str) -> list[Markup]:
+    return [element("button", word, type="button", id=f"{of}-{word.lower()}") for word in ("Play", "Reset")]
 
 
 def object_in_motion(
@@ -85,14 +79,9 @@ def object_in_motion(
     means = block_means(volume, MOST_EDGE)
     small = grid.in_shape(triple(means.shape))
     first = deformed(means, small, deformation, deformation.weights_at(span_s[0])[0])
-    middles = [np.take(first, count // 2, axis=axis) for axis, count in enumerate(first.shape)]
-    planes = middle_planes(middles, small, (window.low, window.high))
-    controls = [
-        element("button", "Play", type="button", id="motion-play"),
-        element("button", "Reset", type="button", id="motion-reset"),
-        slider("motion-time", "Time", 0, _STEPS, 0, f"{number(span_s[0])} s"),
-        slider("motion-arrows", "Arrows", 0, _MOST_LENGTH, 1, "1×"),
-    ]
+    planes = middle_planes(middle_slices(first), small, (window.low, window.high))
+    time = slider("motion-time", "Time", 0, _STEPS, 0, f"{number(span_s[0])} s")
+    controls = [*_buttons("motion"), time, slider("motion-arrows", "Arrows", 0, _MOST_LENGTH, 1, "1×")]
     legend = f"The object at {number(span_s[0])} s, the first of {number(span_s[1] - span_s[0])} s."
     data = _data(fitting(deformation, small), small, span_s)
     return joined(
@@ -103,8 +92,7 @@ def object_in_motion(
 
 
 def fitting(deformation: Deformation, grid: Grid) -> Deformation:
-    """Returns the deformation with at most ``MOST_VALUES`` numbers. A larger one is interpolated at fewer control points,
-    at which it keeps its values."""
+    """Returns the deformation in at most ``MOST_VALUES`` numbers: a larger one keeps its values at fewer control points."""
     spacing_mm = float(np.max(deformation.spacing_mm))
     reduced = deformation
     while reduced.control_mm.size > MOST_VALUES and spacing_mm < 2 * max(grid.size_mm):
@@ -144,12 +132,6 @@ def _data(deformation: Deformation, grid: Grid, span_s: tuple[float, float]) -> 
 
 
 def _figure(plane: Plane) -> Markup:
-    middle, slice_id, place_id = plane.indices[0], f"motion-slice-{plane.axis}", f"motion-place-{plane.axis}"
-    caption = element(
-        "figcaption", element("label", f"{plane.name.capitalize()} slice ({plane.axis})", for_=slice_id),
-        element("output", place(plane, 0), id=place_id, for_=slice_id),
-    )
-    places = {"min": 0, "max": plane.count - 1, "value": middle}
-    control = element("input", type="range", id=slice_id, **places, aria_describedby=place_id)
-    shown = picture(plane, "moving object", canvases=2)
-    return element("figure", shown, caption, control, id=f"motion-{plane.axis}", data_right=plane.right, data_up=plane.up)
+    axis, shown = plane.axis, picture(plane, "moving object", canvases=2)
+    parts = plane_slider(plane, f"motion-slice-{axis}", f"motion-place-{axis}", plane.count - 1, plane.indices[0])
+    return element("figure", shown, *parts, id=f"motion-{axis}", data_right=plane.right, data_up=plane.up)

@@ -15,7 +15,7 @@ from phyradgs_cl.metrics import printed
 from phyradgs_cl.reconstructors.projected import FramePair
 from phyradgs_cl.report import sections
 from phyradgs_cl.report.images import base64_of
-from phyradgs_cl.report.markup import Markup, element, joined, label, number, raw_text
+from phyradgs_cl.report.markup import Markup, element, grouped, label, number, raw_text, tiles
 from phyradgs_cl.report.run import Change, Run, computed_views, load_run, step_changes
 from phyradgs_cl.runtime import Runtime
 
@@ -60,24 +60,30 @@ def report_page(run: Run, views: Sequence[FramePair] = (), changes: Sequence[Cha
     }  # fmt: skip
     parts = {
         "slices": sections.slices_section(run), "doubt": sections.doubt_section(run),
-        "metrics": sections.metrics_section(run, views),
-        "convergence": sections.convergence_section(run), "motion": sections.motion_section(run),
-        "states": sections.states_section(run),
-        "volume": sections.volume_section(run), **of_scan,
-        "provenance": sections.provenance_section(run),
+        "metrics": sections.metrics_section(run, views), "convergence": sections.convergence_section(run),
+        "motion": sections.motion_section(run), "states": sections.states_section(run),
+        "volume": sections.volume_section(run), **of_scan, "provenance": sections.provenance_section(run),
     }  # fmt: skip
     shown = {name: part for name, part in parts.items() if part is not None}
-    links = [element("a", name.capitalize(), href=f"#{name}", hidden=name in _SCRIPTED) for name in shown]
-    skip = element("a", "To the content", href="#slices", class_="skip")
-    body = joined(
-        skip, element("header", *_top(run), element("nav", *links, aria_label="Sections")),
-        element("main", *_arranged(shown)),
-        element("footer", f"Written by phyradgs-cl {__version__} from {run.path.name}."),
-    )
+    footer = element("footer", f"Written by phyradgs-cl {__version__} from {run.path.name}.")
     title = f"{run.path.name} – {run.stored.provenance.get('method', 'volume')}"
     script = web_script(*(part for part in _SCRIPT if part != "motion" or part in shown))
-    page = element("body", body, raw_text("script", script))
-    return "<!doctype html>\n" + element("html", head(title, script), page, lang="en") + "\n"
+    return document(title, script, _top(run), list(shown), "slices", _arranged(shown), footer)
+
+
+def document(
+    title: str, script: str, top: Sequence[Markup], links: Sequence[str], content: str, parts: Sequence[Markup],
+    last: Markup, reload_s: int | None = None,
+) -> str:
+    """Returns a whole page: ``top``, ``links`` to sections, the sections ``parts`` and ``last``. content: the section to
+    which users of a keyboard may skip. reload_s: as in ``_head``."""
+    anchors = [element("a", name.capitalize(), href=f"#{name}", hidden=name in _SCRIPTED) for name in links]
+    body = element(
+        "body", element("a", "To the content", href=f"#{content}", class_="skip"),
+        element("header", *top, element("nav", *anchors, aria_label="Sections")),
+        element("main", *parts), last, raw_text("script", script),
+    )
+    return "<!doctype html>\n" + element("html", _head(title, script, reload_s), body, lang="en") + "\n"
 
 
 def _arranged(shown: dict[str, Markup]) -> list[Markup]:
@@ -88,7 +94,7 @@ def _arranged(shown: dict[str, Markup]) -> list[Markup]:
     return [wide[0], pair, *wide[1:]]
 
 
-def head(title: str, script: str, reload_s: int | None = None) -> Markup:
+def _head(title: str, script: str, reload_s: int | None) -> Markup:
     """Returns the page's head, with styles and a policy that forbids network access and all scripts except ``script``.
     reload_s: time in s after which a browser without scripts loads the page again."""
     digest = base64_of(hashlib.sha256(script.encode()).digest())
@@ -112,21 +118,19 @@ def _top(run: Run) -> list[Markup]:
     if run.scan_path is not None:
         words += f", from {run.scan_path.name}"
     notes = [element("p", note, class_="warning", role="note") for note in run.notes]
-    tiles = [element("li", element("b", value), element("span", name)) for name, value in _tiles(run)]
-    return [element("h1", title), element("p", words), *notes, element("ul", *tiles, class_="tiles")]
+    return [element("h1", title), element("p", words), *notes, tiles(_facts(run))]
 
 
-def _tiles(run: Run) -> list[tuple[str, str]]:
-    tiles = [("method", str(run.stored.provenance.get("method", "unknown"))[:40])]
-    tiles += printed(run.metrics)
+def _facts(run: Run) -> list[tuple[str, str]]:
+    facts = [("method", str(run.stored.provenance.get("method", "unknown"))[:40]), *printed(run.metrics)]
     if run.record and (names := [k for k in run.record[-1] if k in ("loss", "residual")]):
-        tiles.append((f"last {label(names[0])}", number(run.record[-1][names[0]])))
+        facts.append((f"last {label(names[0])}", number(run.record[-1][names[0]])))
     gaussians, seconds = (run.stored.provenance.get(key) for key in ("gaussians", "seconds"))
     if isinstance(gaussians, int) and gaussians > 0:
-        tiles.append(("Gaussians", f"{gaussians:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")))
+        facts.append(("Gaussians", grouped(gaussians)))
     if isinstance(seconds, int | float):
-        tiles.append(("run time", f"{number(float(seconds))} s"))
-    return tiles
+        facts.append(("run time", f"{number(float(seconds))} s"))
+    return facts
 
 
 def web_script(*names: str) -> str:

@@ -16,14 +16,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError, PhyradgsError
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.io import (
-    Volume,
-    file_kind,
-    partial_path,
-    read_scan,
-    read_volume,
-    written_beside,
-)
+from phyradgs_cl.io import Volume, file_kind, partial_path, read_scan, read_volume, written_beside
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.report.images import bytes_of, grey_range, png_bytes, top_row_first
 
@@ -47,8 +40,7 @@ def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) ->
 class Preview:
     """Writes a picture of the volume during a run; call it with each progress report.
 
-    It writes to ``io.partial_path`` of ``path``, at most every ``every_s`` seconds. Pictures that cannot be written give
-    one warning, and no error."""
+    It writes to ``io.partial_path`` of ``path``, at most every ``every_s`` seconds. A failure gives one warning."""
 
     def __init__(self, path: Path, every_s: float = 5.0) -> None:
         self.path, self.partial, self.every_s = path, partial_path(path), every_s
@@ -114,19 +106,15 @@ def view_volume(path: Path) -> None:
     napari = checks.package("napari", "the package for this, 0.5.4 or later", "phyradgs-cl[view]")
     if (kind := file_kind(path)) != "volume":
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl")
-    add_volume(napari.Viewer(title=f"{path.name} – phyradgs"), read_volume(path), path.stem)
-    napari.run()
-
-
-def add_volume(viewer: Any, stored: Volume, name: str) -> None:
-    """Adds a volume to napari's ``viewer``, in mm at its position. Axes are z, y, x, y points up, and black is 0."""
-    viewer.add_image(stored.values, **_look_of_volume(stored, name))
+    viewer, stored = napari.Viewer(title=f"{path.name} – phyradgs"), read_volume(path)
+    viewer.add_image(stored.values, **_look_of_volume(stored, path.stem))
     viewer.dims.axis_labels = _AXES
     if hasattr(viewer.camera, "orientation2d"):  # napari 0.6 and later; in earlier ones y points down
         viewer.camera.orientation2d = ("up", "right")
     # napari 0.9 moved overlays to its canvas
     overlays = viewer.canvas.overlays if hasattr(viewer, "canvas") else viewer
     overlays.scale_bar.visible = True
+    napari.run()
 
 
 def napari_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Layer]] | None:
@@ -134,7 +122,7 @@ def napari_reader(path: str | list[str]) -> Callable[[str | list[str]], list[Lay
     paths = [path] if isinstance(path, str) else path
     with suppress(PhyradgsError):
         if all(file_kind(one) in ("volume", "scan") for one in paths):
-            return lambda path: [napari_layer(Path(one)) for one in ([path] if isinstance(path, str) else path)]
+            return lambda _: [napari_layer(Path(one)) for one in paths]
     return None
 
 

@@ -15,14 +15,7 @@ from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.motion import motion_from_facts
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid
-from phyradgs_cl.io import (
-    Volume,
-    file_kind,
-    read_deformation,
-    read_volume,
-    scan_summary,
-    sha256_of,
-)
+from phyradgs_cl.io import Volume, file_kind, read_deformation, read_volume, scan_summary, sha256_of
 from phyradgs_cl.metrics import METRICS, aligned, compare
 from phyradgs_cl.prepare.light import read_corrected
 from phyradgs_cl.prepare.step import Facts
@@ -68,19 +61,17 @@ class Run:
         segments = self.stored.provenance.get("segments")
         if table.get("name") == "exact" and isinstance(segments, int):
             table = {**table, "segments": segments}
-        try:
+        with suppress(InputError, TypeError):  # another version or program may have written the provenance
             return motion_from_facts(table)
-        except (InputError, TypeError):  # another version or program may have written the provenance
-            return None
+        return None
 
     @property
     def preprocessing(self) -> Preprocessing:
         """The run's preprocessing of frames, without options that this version lacks; the default if it is unknown."""
         table = self.stored.provenance.get("input")
-        try:
-            return preprocessing_of(_kept(table)) if isinstance(table, Mapping) else Preprocessing()
-        except InputError:
-            return Preprocessing()
+        with suppress(InputError):
+            return preprocessing_of(_kept(table) if isinstance(table, Mapping) else {})
+        return Preprocessing()
 
     @property
     def record(self) -> list[dict[str, float]]:
@@ -137,42 +128,41 @@ def _with_scan(run: Run, path: Path, is_given: bool, notes: list[str]) -> Run:
     if pair is None or not pair.reference.max() > 0:
         notes.append("Nothing of the scan's reference lies in the volume's box: there is no PSNR.")
         return run
-    metrics = run.metrics
-    if not metrics.keys() >= METRICS.keys():
-        metrics = {**compare(pair.volume, pair.reference), **metrics}
+    if not run.metrics.keys() >= METRICS.keys():
+        run = replace(run, metrics={**compare(pair.volume, pair.reference), **run.metrics})
     if pair.grid is not grid:
         notes.append("The scan's reference is on another grid than the volume: its slices are not shown.")
-        return replace(run, metrics=metrics, compared=pair.how)
-    return replace(run, metrics=metrics, compared=pair.how, reference=pair.reference)
+    return replace(run, compared=pair.how, reference=pair.reference if pair.grid is grid else None)
 
 
 def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Path | None:
     """Returns the scan file that the provenance names, if it is found with the stored hash; else None with a note."""
-    name = provenance.get("scan")
-    if not isinstance(name, str) or not name:
+    name, place = _named_file(path, provenance, "scan")
+    if not name:
         notes.append("The volume file names no scan.")
-        return None
-    place = _same_file(path, name, provenance.get("scan_sha256"))
-    if place is not None and file_kind(place) == "scan":
+    elif place is not None and file_kind(place) == "scan":
         return place
-    notes.append(f"The scan {plain_text(name)} was not found, or has changed since; --scan names it.")
+    else:
+        notes.append(f"The scan {plain_text(name)} was not found, or has changed since; --scan names it.")
     return None
 
 
-def _same_file(path: Path, name: str, sha256: object) -> Path | None:
-    """Looks for the file ``name`` with the hash ``sha256`` in the current folder and the volume's; None without one."""
+def _named_file(path: Path, provenance: Mapping[str, object], key: str) -> tuple[str, Path | None]:
+    """Returns a file's name in the provenance, or "", and its path in the current or the volume's folder, or None."""
+    name, sha256 = provenance.get(key), provenance.get(f"{key}_sha256")
+    if not isinstance(name, str) or not name:
+        return "", None
     for place in (Path(name), path.parent / name, path.parent / Path(name).name):
         with suppress(InputError):  # there may be no such file
             if sha256_of(place) == sha256:
-                return place
-    return None
+                return name, place
+    return name, None
 
 
 def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
     """Returns ``count`` preprocessed frames and those computed from the volume; [] if scan or object motion is missing."""
-    if run.scan is None or count < 1:
-        return []
-    if run.deformation is None and "object_motion" in run.stored.provenance:
+    lacks_motion = run.deformation is None and "object_motion" in run.stored.provenance
+    if run.scan is None or count < 1 or lacks_motion:
         return []
     scan, volume = prepared(run.scan, run.preprocessing, rt), run.stored
     chosen = spread_frames(scan.frames, count)
@@ -181,14 +171,12 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
 
 def _named_deformation(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Deformation | None:
     """Reads the deformation file that the provenance names, if it has the stored hash; else returns None with a note."""
-    name = provenance.get("object_motion")
-    if not isinstance(name, str) or not name:
-        return None
-    place = _same_file(path, name, provenance.get("object_motion_sha256"))
+    name, place = _named_file(path, provenance, "object_motion")
     if place is not None:
         return read_deformation(place)
-    words = f"The motion of the object {plain_text(name)} was not found, or has changed since: "
-    notes.append(words + "there are no computed projections, and no motion.")
+    if name:
+        words = f"The motion of the object {plain_text(name)} was not found, or has changed since: "
+        notes.append(words + "there are no computed projections, and no motion.")
     return None
 
 

@@ -134,8 +134,7 @@ def panel_corners(pose: Points, detector_shape: tuple[int, int]) -> Points:
 
 
 def _first_arc(scan: Scan) -> Points:
-    """Returns poses (T, 12), as in ``PoseTable``, evenly over the time in which a fly-scan's first frame is exposed to the
-    beam; of a gantry at rest, its one pose."""
+    """Returns poses (T, 12), evenly over the time in which a fly-scan's first frame is lit; of a gantry at rest, its one."""
     first_s, last_s = scan.shutter.lit_span_s if scan.is_fly else (scan.shutter.middle_s,) * 2
     times_s = scan.frame_start_s[0] + np.linspace(first_s, last_s, _ARC_SAMPLES)
     return with_sources(scan, scan.trajectory.pose(0, times_s))
@@ -157,8 +156,12 @@ def draw_shutter(axes: "Axes", scan: Scan, motion: Motion | None) -> None:
     """Draws when each line is exposed, the run's poses, the durations of exposure and readout, and the gantry's angle."""
     shutter, last = scan.shutter, max(scan.lines - 1, 1)
     draw_windows(axes, shutter, scan.lines)
-    if motion is not None:
-        _draw_samples(axes, scan, motion)
+    times_s, lines = (np.zeros(0), None) if motion is None else pose_times(scan, motion)
+    if lines is not None:
+        axes.plot(times_s, lines, ".", color=SAMPLE, ms=5)
+    else:  # these poses hold for all lines
+        for time_s in times_s:
+            axes.axvline(time_s, color=ACCENT, ls="--", lw=1.2)
     ends = (0.0, float(last))[:: shutter.direction]
     above, below = (5, -14) if ends[0] < ends[1] else (-14, 5)
     _draw_span(axes, (0.0, shutter.exposure_s), ends[0], f"exposure {number(shutter.exposure_s)} s", below)
@@ -196,16 +199,6 @@ def shutter_words(scan: Scan) -> str:
     if shutter.pulse_s is not None:
         words += f", beam on from {number(shutter.pulse_s[0])} s for {number(shutter.pulse_s[1])} s"
     return words
-
-
-def _draw_samples(axes: "Axes", scan: Scan, motion: Motion) -> None:
-    """Draws the times of the run's poses: dots where detector lines have their own, else vertical lines for all."""
-    times_s, lines = pose_times(scan, motion)
-    if lines is not None:
-        axes.plot(times_s, lines, ".", color=SAMPLE, ms=5)
-        return
-    for time_s in times_s:
-        axes.axvline(time_s, color=ACCENT, ls="--", lw=1.2)
 
 
 def pose_times(scan: Scan, motion: Motion) -> tuple[Points, Points | None]:

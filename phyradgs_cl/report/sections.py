@@ -8,20 +8,12 @@ from phyradgs_cl.acquisition import Motion, Scan
 from phyradgs_cl.acquisition.motion import motion_facts, motion_in_words
 from phyradgs_cl.prepare import PREPARED_KEY
 from phyradgs_cl.reconstructors.projected import TIMES_PER_LINE, FramePair
-from phyradgs_cl.report import images
+from phyradgs_cl.report import images, scan_charts
 from phyradgs_cl.report.atlas import has_depth, space
 from phyradgs_cl.report.charts import Chart, convergence_charts, histogram, profile_chart, views_chart
 from phyradgs_cl.report.markup import Markup, element, joined, label, number, shown, unit
 from phyradgs_cl.report.motion import frame_in_motion, object_in_motion
 from phyradgs_cl.report.run import Change, Run
-from phyradgs_cl.report.scan_charts import (
-    frames_chart,
-    orbit_chart,
-    pose_times,
-    shutter_chart,
-    shutter_words,
-    side_chart,
-)
 from phyradgs_cl.report.viewer import stills, viewer
 from phyradgs_cl.text import flattened, to_digits_of
 
@@ -66,11 +58,11 @@ def states_section(run: Run) -> Markup | None:
     if (states := run.stored.states) is None:
         return None
     high = images.windows_of(run.stored.values, run.reference)["result"].high
-    planes = images.planes_of(run.stored.values, None, run.stored.required_grid, images.windows_of(run.stored.values, None))
     parts = [note(f"The volume is the mean of {len(states.times_s)} states. Some of them, in middle slices:")]
     for k in np.unique(np.linspace(0, len(states.times_s) - 1, _STATES).round().astype(int)).tolist():
-        pictures = images.stills_of(planes, states.volumes[k], (0.0, high))
-        parts += [element("h3", f"{number(float(states.times_s[k]))} s"), stills(pictures, f"state {k + 1}", high)]
+        slices = images.middle_slices(states.volumes[k])
+        planes = images.middle_planes(slices, run.stored.required_grid, (0.0, high))
+        parts += [element("h3", f"{number(float(states.times_s[k]))} s"), stills(planes, f"state {k + 1}", high)]
     return section("states", "States", *parts)
 
 
@@ -129,21 +121,21 @@ def geometry_section(scan: Scan) -> Markup:
     above = f"From above: {source} in the middle of every frame"
     above += ", and its arc in the first frame; grey, the panel at the end of the arc." if scan.is_fly else "."
     side = f"From the side: the {beam} of the first frame."
-    return section("geometry", "Geometry", _charts([(above, orbit_chart(scan)), (side, side_chart(scan))]))
+    charts = [(above, scan_charts.orbit_chart(scan)), (side, scan_charts.side_chart(scan))]
+    return section("geometry", "Geometry", _charts(charts))
 
 
 def shutter_section(run: Run, scan: Scan) -> Markup | None:
-    """Shows when a frame's lines are exposed and, for a fly-scan, successive frames. Returns None for a gantry that stops
-    without a stated exposure."""
+    """Shows when a frame's lines are exposed, and successive frames of a fly-scan; None where no exposure is stated."""
     if not scan.is_fly and scan.shutter.exposure_s == 0:
         return None
-    words = shutter_words(scan)
+    words = scan_charts.shutter_words(scan)
     caption = f"{words[0].upper()}{words[1:]}."
     if run.motion is not None:
         caption += f" {_motion_words(scan, run.motion)}"
-    charts, motion = [(caption, shutter_chart(scan, run.motion))], None
+    charts, motion = [(caption, scan_charts.shutter_chart(scan, run.motion))], None
     if scan.is_fly:
-        charts.append(("The first frames on one axis of time.", frames_chart(scan)))
+        charts.append(("The first frames on one axis of time.", scan_charts.frames_chart(scan)))
         motion = element("div", frame_in_motion(scan), class_="scripted-only")
     return section("shutter", "Shutter in space and time", _charts(charts), motion)
 
@@ -267,7 +259,7 @@ def facts_table(facts: Mapping[str, object]) -> Markup:
 
 
 def _motion_words(scan: Scan, motion: Motion) -> str:
-    times_s, lines = pose_times(scan, motion)
+    times_s, lines = scan_charts.pose_times(scan, motion)
     if motion.cells(scan, 0).is_moving:
         words = "dashed lines bound the segments in which Gaussians move"
     elif lines is not None:

@@ -19,15 +19,12 @@ _HELP = (
 
 
 def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
-    """Returns three slices, each with a slider for its plane, controls for what is shown (result, truth, ...), grey values
-    and zoom, and the data of the page's script."""
+    """Returns three slices with sliders, controls for layers, grey values and zoom, and the data of the page's script."""
     sliders = [
-        slider("black", "Black", 0, 255, 0, ""),
-        slider("white", "White", 0, 255, 255, ""),
-        slider("zoom", "Zoom", 1, _MOST_ZOOM, 1, "1×", 0.5),
-        element("button", "Reset", type="button", id="reset"),
+        slider("black", "Black", 0, 255, 0, ""), slider("white", "White", 0, 255, 255, ""),
+        slider("zoom", "Zoom", 1, _MOST_ZOOM, 1, "1×", 0.5), element("button", "Reset", type="button", id="reset"),
     ]
-    choice = _choice(list(windows)) if len(windows) > 1 else None
+    names = {layer: words for layer, words in _LAYER_NAMES.items() if layer in windows}
     figures = element("div", *(_figure(plane) for plane in planes), class_="slices")
     layers = {key: {**vars(w), "decimals": decimals_of((w.most - w.least) / 255)} for key, w in windows.items()}
     colours = base64_of(diverging().tobytes()) if "difference" in windows else None
@@ -35,7 +32,7 @@ def viewer(planes: list[Plane], windows: Mapping[str, Window]) -> Markup:
     first = windows["result"]
     legend = f"Black is {number(first.low, first.high)}, white {number(first.high)} 1/mm."
     return joined(
-        element("div", choice, *sliders, class_="tools"), figures,
+        element("div", choice("layer", "layer", names) if len(names) > 1 else None, *sliders, class_="tools"), figures,
         element("p", element("output", legend, id="reading"), class_="note"),
         element("p", _HELP, class_="note help"),
         json_block("slice-data", {"planes": data, "windows": layers, "colours": colours}),
@@ -52,16 +49,18 @@ def slider(name: str, words: str, low: float, high: float, value: float, shown: 
 
 
 def _figure(plane: Plane) -> Markup:
-    middle, name = plane.middle, f"{plane.name.capitalize()} slice"
-    slider_id, place_id = f"slider-{plane.name}", f"place-{plane.name}"
-    places = {"min": 0, "max": len(plane.indices) - 1, "step": 1, "value": middle}
-    slider = element("input", type="range", id=slider_id, **places, aria_describedby=place_id)
-    caption = element(
-        "figcaption", element("label", f"{name} ({plane.axis})", for_=slider_id),
-        element("output", place(plane, middle), id=place_id, for_=slider_id),
-    )
+    ids, last = (f"slider-{plane.name}", f"place-{plane.name}"), len(plane.indices) - 1
     shown = picture(plane, "volume", canvases=1, has_lines=True)
-    return element("figure", shown, caption, slider, id=f"plane-{plane.name}")
+    return element("figure", shown, *plane_slider(plane, *ids, last, plane.middle), id=f"plane-{plane.name}")
+
+
+def plane_slider(plane: Plane, slider_id: str, place_id: str, last: int, value: int) -> tuple[Markup, Markup]:
+    """Returns the caption of a slice, with its place, and a slider from 0 to ``last`` that moves it."""
+    caption = element(
+        "figcaption", element("label", f"{plane.name.capitalize()} slice ({plane.axis})", for_=slider_id),
+        element("output", place(plane, plane.middle), id=place_id, for_=slider_id),
+    )
+    return caption, element("input", type="range", id=slider_id, min=0, max=last, value=value, aria_describedby=place_id)
 
 
 def stills(planes: list[Plane], of: str, high: float) -> Markup:
@@ -95,18 +94,17 @@ def picture(plane: Plane, of: str, *, canvases: int = 0, has_lines: bool = False
 
 def place(plane: Plane, k: int) -> str:
     """Returns the position of the slice ``plane.indices[k]`` as text, such as "z = 1.5 mm, 17 of 32"."""
-    where = number(plane.position_mm(k), plane.step_mm)
+    where = number(plane.first_mm + plane.indices[k] * plane.step_mm, plane.step_mm)
     return f"{plane.axis} = {where} mm, {plane.indices[k] + 1} of {plane.count}"
 
 
-def _choice(layers: list[str]) -> Markup:
-    def one(layer: str) -> Markup:
-        button = element(
-            "input", type="radio", name="layer", id=f"layer-{layer}", value=layer, checked=layer == "result"
-        )
-        return element("label", button, _LAYER_NAMES[layer])
-
-    return element("fieldset", element("legend", "Show"), *(one(layer) for layer in layers), class_="choice")
+def choice(name: str, prefix: str, words: Mapping[str, str]) -> Markup:
+    """Returns buttons that choose one of the values in ``words``, at first the first."""
+    labels = list[Markup]()
+    for value, text in words.items():
+        button = element("input", type="radio", name=name, id=f"{prefix}-{value}", value=value, checked=not labels)
+        labels.append(element("label", button, text))
+    return element("fieldset", element("legend", "Show"), *labels, class_="choice")
 
 
 def _plane_data(plane: Plane) -> dict[str, object]:

@@ -11,18 +11,11 @@ from phyradgs_cl.acquisition.motion import motion_in_words
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import foreign_suffix
 from phyradgs_cl.fields import MovingTruth
-from phyradgs_cl.io import (
-    Volume,
-    check_writable,
-    deformation_summary,
-    file_kind,
-    holds_deformation,
-    scan_summary,
-    volume_summary,
-)
+from phyradgs_cl.io import check_writable, deformation_summary, holds_deformation, scan_summary
 from phyradgs_cl.io.attenuation import FROM_HU, VALUES
 from phyradgs_cl.io.hdf5 import open_hdf5
 from phyradgs_cl.io.output import refuse_overwriting
+from phyradgs_cl.io.volume import Volume, file_kind, volume_summary
 from phyradgs_cl.prepare.light import read_corrected
 
 _KINDS = {
@@ -110,8 +103,7 @@ def load_reference(path: Path, mu_water_per_mm: float | None = None) -> tuple[Vo
 
 def summary(path: Path) -> dict[str, object]:
     if (form := importers.foreign_volume(path)) is not None:
-        states = [(time_s, _voxel_facts(volume)) for time_s, volume in importers.load_states(path)]
-        if states:
+        if states := [(time_s, _voxel_facts(volume)) for time_s, volume in importers.load_states(path)]:
             return {"kind": f"volumes of an object that moves ({form})", **_facts_of_states(states)}
         return {"kind": f"volume ({form})", **_voxel_facts(importers.load_volume(path))}
     with expecting(path, "scan", "volume", "plain-volume", "deformation"):
@@ -124,10 +116,13 @@ def summary(path: Path) -> dict[str, object]:
         facts = volume_summary(path)
         provenance = dict(facts.pop("provenance", None) or {})
         provenance.pop("record", None)
-        options = provenance.pop("options", None)
+        stated = provenance.pop("options", None)
+        options: Mapping[str, Any] = stated if isinstance(stated, Mapping) else {}
+        motion = motion_in_words(options["motion"]) if isinstance(options.get("motion"), Mapping) else None
+        of_run = {"motion": motion, "iterations_asked": options.get("iterations")}
         moves = deformation_summary(path) if holds_deformation(path) else {}
-        motion = {f"motion_{key}": moves[key] for key in _OF_MOTION if key in moves}
-        return {"kind": "volume", **facts, **motion, **_options_in_words(options), **provenance}
+        of_object = {f"motion_{key}": moves[key] for key in _OF_MOTION if key in moves}
+        return {"kind": "volume", **facts, **of_object, **of_run, **provenance}
     return {"kind": "bare volume", **_voxel_facts(importers.load_volume(path))}
 
 
@@ -144,10 +139,3 @@ def _voxel_facts(volume: Volume) -> dict[str, object]:
     where = {} if grid is None else {"voxel_size_mm": grid.voxel_size_mm, "offset_mm": grid.offset_mm}
     unit = {VALUES: FROM_HU} if volume.provenance.get(VALUES) == FROM_HU else {}
     return {"shape": values.shape, **where, **unit, "minimum": float(values.min()), "maximum": float(values.max())}
-
-
-def _options_in_words(options: object) -> dict[str, object]:
-    """Returns a run's motion model, as text, and its iterations, as far as ``options`` state them."""
-    stated = options if isinstance(options, Mapping) else {}
-    motion, iterations = stated.get("motion"), stated.get("iterations")
-    return {"motion": motion_in_words(motion) if isinstance(motion, Mapping) else None, "iterations_asked": iterations}

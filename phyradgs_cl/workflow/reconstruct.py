@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,17 +17,9 @@ from phyradgs_cl.acquisition import MicroViews, Scan
 from phyradgs_cl.acquisition.geometry import cuts
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.errors import InputError, OutputError, PhyradgsError
-from phyradgs_cl.io import (
-    Volume,
-    hashing,
-    only_run,
-    partial_path,
-    read_checkpoint,
-    read_scan_header,
-    write_checkpoint,
-    write_volume,
-)
-from phyradgs_cl.io.output import checkpoint_path, former_checkpoint_path, refuse_overwriting
+from phyradgs_cl.io import hashing, only_run, read_checkpoint, read_scan_header, write_checkpoint
+from phyradgs_cl.io.output import checkpoint_path, former_checkpoint_path, partial_path, refuse_overwriting
+from phyradgs_cl.io.volume import Volume, write_volume
 from phyradgs_cl.metrics import METRICS, VOXEL_BY_VOXEL, aligned, compare
 from phyradgs_cl.parallel import Communicator
 from phyradgs_cl.reconstructors.result import COMPARED, HELD_OUT
@@ -56,8 +47,7 @@ class _Checkpoints:
         self.path, self.every_s = path, every_s
         self.last_s = time.monotonic()
         self.has_failed = False
-        self.iteration: int | None = None
-        """The iteration of this run's last checkpoint; None before the first."""
+        self.iteration: int | None = None  # of this run's last checkpoint
 
     def __call__(self, progress: methods.Progress) -> None:
         is_due = self.every_s > 0 and time.monotonic() - self.last_s >= self.every_s
@@ -119,8 +109,7 @@ def run_reconstruction(
 
 
 def _slabs_of(plan: methods.RunPlan, slabs: Slabs, scan: Path, ranks: Communicator | None) -> list[tuple[int, int]]:
-    """Returns the slabs of a run; [] reconstructs the whole scan at once. Raises InputError for slabs of an object that
-    moves, with a method that finds motion, for error bars, and on several ranks."""
+    """Returns the slabs of a run; [] reconstructs the whole scan at once. Raises InputError for what needs all rows."""
     if slabs == _ALL_ROWS and surely_fits(scan):
         return []
     with expecting(scan, "scan"):
@@ -166,8 +155,7 @@ def _reconstructed(
         _set_aside(output)
     checkpoints = _Checkpoints(checkpoint_path(output), checkpoint_every_s)
     with checkpoints.mentioned_in_errors():
-        listeners = report.listeners if isinstance(report, methods.Report) else (report,)
-        report = methods.Report(*listeners, checkpoints)
+        report = methods.Report(*methods.Report.of(report).listeners, checkpoints)
         result = methods.reconstruct(scan, plan, rt, report=report, resume=state)
         if not leads:
             return result, {}
@@ -195,7 +183,7 @@ def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
         return held_out
     if scan.moving_truth is not None and result.moves is not None:
         moving = Volume(result.volume, result.grid, deformation=result.deformation, states=result.states)
-        facts: dict[str, Any] = compared_states(moving, scan.moving_truth, scan.grid)
+        facts = compared_states(moving, scan.moving_truth, scan.grid)
         result.facts[COMPARED] = f"mean of {len(facts['states'])} states"
         return {**{name: facts[f"mean_{name}"] for name in METRICS}, **held_out}
     if pair.how != VOXEL_BY_VOXEL:
@@ -216,10 +204,8 @@ def _warn_of_doubts(plan: methods.RunPlan, path: Path, scan: Scan) -> None:
     grid = preprocessing.with_margin(scan.with_grid(preprocessing).grid)
     if grid != scan.grid and hasattr(plan.options, "iterations") and cuts(grid, scan.grid, scan.geometry):
         text = "%s: the grid ends inside the field of view, and --method %s puts the object beyond it into the grid; "
-        if preprocessing.margin_mm is None:
-            text += "--margin-mm reconstructs a margin, and discards it"
-        else:
-            text += "if the object is larger still, widen --margin-mm"
+        has_margin, wider = preprocessing.margin_mm is not None, "if the object is larger still, widen --margin-mm"
+        text += wider if has_margin else "--margin-mm reconstructs a margin, and discards it"
         log.warning(text, path, plan.method_name)
     late = np.flatnonzero(np.diff(scan.frame_start_s) <= 0)
     if scan.is_fly and late.size:

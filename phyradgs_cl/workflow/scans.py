@@ -22,12 +22,10 @@ from phyradgs_cl.simulation import SimulationOptions, simulated_scan
 from phyradgs_cl.text import suggest_name
 from phyradgs_cl.workflow.files import check_output, expecting, load_scan
 
-_TOML = ".toml"
-
 
 def phantom_of(name: str) -> str | EllipsoidPhantom:
     """Reads a phantom from a TOML file; returns a built-in phantom's name unchanged. Raises InputError for other names."""
-    if name.endswith(_TOML):
+    if name.endswith(".toml"):
         return load_beads(Path(name))
     if name not in PHANTOMS:
         remedy = suggest_name(name, PHANTOMS, "or give the path of a .toml file; voxels of a file are --volume")
@@ -46,7 +44,7 @@ def run_simulation(
     InputError and OutputError before any work."""
     if volume is not None and phantom is not None:
         raise InputError("--volume", f"given together with --phantom {phantom}", "one of the two")
-    check_output(output, volume, *inputs, Path(phantom) if phantom and phantom.endswith(_TOML) else None)
+    check_output(output, volume, *inputs, Path(phantom) if phantom and phantom.endswith(".toml") else None)
     with only_run(output):
         of: str | Volume | EllipsoidPhantom = phantom_of(phantom or "foot")
         if volume is not None:

@@ -4,8 +4,8 @@ A slab has the times of its rows: the motion model ``static`` takes the middle o
 
 import logging
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -45,18 +45,19 @@ class Slabs:
     def of(self, scan: Scan) -> list[tuple[int, int]]:
         """Returns a scan's slabs [first, stop); [] reconstructs the whole scan at once. The scan's header is enough. Raises
         InputError for rows that the scan does not have, and for slabs of a cone beam."""
-        rows = scan.geometry.detector_shape[0]
+        rows, columns = scan.geometry.detector_shape
         first, stop = self.rows or (0, rows)
         at_a_time = self.rows_at_a_time
         if self.rows is None and not at_a_time:
-            fit = int(_HOST_SHARE * host_bytes() / (_COPIES * 4 * scan.frames * scan.geometry.detector_shape[1]))
+            fit = int(_HOST_SHARE * host_bytes() / (_COPIES * 4 * scan.frames * columns))
             if fit >= rows or not has_slabs(scan):
                 return []
             at_a_time = max(fit - 2 * HALO_ROWS, 1)
         if self.rows is None:
             check_has_slabs(scan, "--slab", str(at_a_time))
         check_rows(scan, first, stop)
-        return [(a, min(a + (at_a_time or stop - first), stop)) for a in range(first, stop, at_a_time or stop - first)]
+        at_a_time = at_a_time or stop - first
+        return [(a, min(a + at_a_time, stop)) for a in range(first, stop, at_a_time)]
 
 
 def surely_fits(path: Path) -> bool:
@@ -79,10 +80,8 @@ def reconstruct_slabs(
     report: methods.ProgressReport, *, resume: bool,
 ) -> methods.Reconstruction:
     """Returns the volume of all slabs, memory-mapped from a file. Finished slabs are kept in a folder next to ``output``;
-    with ``resume`` they are read from there.
-
-    Raises InputError if these slabs are of another run, or see no slice of the grid, and KeyboardInterrupt if a slab is
-    interrupted."""
+    with ``resume`` they are read from there. Raises InputError if these slabs are of another run, or see no slice of the
+    grid, and KeyboardInterrupt if a slab is interrupted."""
     header = read_scan_header(path)
     grid = header.with_grid(plan.preprocessing).grid
     whole = header.on_grid(grid)
@@ -91,12 +90,13 @@ def reconstruct_slabs(
     parts: list[np.ndarray] = []
     facts: dict[str, object] = {}
     seconds, chosen = 0.0, []
-    for number, (first, stop) in enumerate(slabs):
+    for number, (first, stop) in enumerate(slabs, 1):
         if (slices := slices_of(whole, first, stop)).start == slices.stop:
             continue
         chosen.append(slices)
         if (kept := store.slab(first, stop)) is None:
-            result = _slab(plan, path, whole, (first, stop), rt, _named(report, number, len(slabs), (first, stop)))
+            label = f"slab {number} of {len(slabs)}, rows {first}:{stop}: "
+            result = _slab(plan, path, whole, (first, stop), rt, partial(_pass_on, report, label))
             facts, seconds = result.facts, seconds + float(result.facts["seconds"])
             kept = store.keep(first, stop, result.volume)
         parts.append(kept)
@@ -111,8 +111,7 @@ def reconstruct_slabs(
 def _slab(
     plan: methods.RunPlan, path: Path, whole: Scan, rows: tuple[int, int], rt: Runtime, report: methods.ProgressReport
 ) -> methods.Reconstruction:
-    """Reconstructs the slices that detector rows [first, stop) see. Reads ``HALO_ROWS`` more rows on each side, so that
-    slices at the edge have all their data."""
+    """Reconstructs the slices that detector rows [first, stop) see, from ``HALO_ROWS`` more rows on each side."""
     count, (first, stop) = whole.geometry.detector_shape[0], rows
     near = max(first - HALO_ROWS, 0), min(stop + HALO_ROWS, count)
     scan = load_scan(path, plan.preprocessing.flats, near).on_grid(part_of(whole.grid, slices_of(whole, *rows)))
@@ -127,16 +126,9 @@ def _slab(
     return result
 
 
-def _named(
-    report: methods.ProgressReport, number: int, count: int, rows: tuple[int, int]
-) -> Callable[[methods.Progress], None]:
-    """Returns a function that passes progress on under the slab's name. It drops the state: a slab has no checkpoint."""
-    label = f"slab {number + 1} of {count}, rows {rows[0]}:{rows[1]}: "
-
-    def passed_on(progress: methods.Progress) -> None:
-        report(replace(progress, quantity=label + progress.quantity, state=None))
-
-    return passed_on
+def _pass_on(report: methods.ProgressReport, label: str, progress: methods.Progress) -> None:
+    """Reports a slab's progress under its name, without a state: a slab has no checkpoint."""
+    report(replace(progress, quantity=label + progress.quantity, state=None))
 
 
 class _Store:
@@ -161,18 +153,15 @@ class _Store:
 
     def keep(self, first: int, stop: int, volume: np.ndarray) -> np.ndarray:
         """Writes a finished slab, and returns it memory-mapped, so that it takes no memory."""
-        with written_beside(self.folder / f"{first}-{stop}.npy") as temporary, open(temporary, "wb") as file:
+        path = self.folder / f"{first}-{stop}.npy"
+        with written_beside(path) as temporary, open(temporary, "wb") as file:
             np.save(file, volume)
-        return np.load(self.folder / f"{first}-{stop}.npy", mmap_mode="r")
+        return np.load(path, mmap_mode="r")
 
     def joined(self, parts: list[np.ndarray], shape: tuple[int, int, int]) -> np.ndarray:
         """Joins all slabs to one volume (z, y, x), memory-mapped from a file."""
         volume = np.lib.format.open_memmap(self.folder / "volume.npy", "w+", np.float32, shape)
-        at = 0
-        for part in parts:
-            volume[at : at + len(part)] = part
-            at += len(part)
-        return volume
+        return np.concatenate(parts, out=volume)
 
 
 def remove_slabs(output: Path) -> None:

@@ -28,14 +28,8 @@ from phyradgs_cl.io.output import BusyError, make_folder, shortened
 from phyradgs_cl.io.scan.header import read_header
 from phyradgs_cl.io.tables import read_toml, refuse_unknown
 from phyradgs_cl.metrics import HELD_OUT, METRICS
-from phyradgs_cl.reconstructors import (
-    DEFAULT_METHOD,
-    ProgressReport,
-    RunPlan,
-    ignore_progress,
-    method_name,
-    plan_run,
-)
+from phyradgs_cl.reconstructors import ProgressReport, RunPlan, ignore_progress, plan_run
+from phyradgs_cl.reconstructors.method import DEFAULT_METHOD, method_name
 from phyradgs_cl.runtime import DEVICE_VARIABLE, Runtime, choose_device
 from phyradgs_cl.runtime.device import environment
 from phyradgs_cl.signals import finish_despite_interrupt, keep_finished_work
@@ -57,8 +51,7 @@ runtime_of_process = functools.cache(Runtime)  # one Runtime per process and dev
 
 @dataclass(frozen=True)
 class SweepRun:
-    """One reconstruction of a sweep, ready for a worker. facts: the first entries of the run's line of results; "run" is its
-    name."""
+    """One reconstruction of a sweep. facts: the first entries of the run's line of results, of which "run" is its name."""
 
     scan: Path
     plan: RunPlan
@@ -207,9 +200,8 @@ def _begin(device: str | None, dask_worker: Any) -> None:
 
 
 def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: str | None = None) -> Line:
-    """Makes one run of the sweep and returns its line of results, which has the error if scan, options, numbers that are not
-    finite, or a lack of memory are at fault. Raises all other errors, after which another try may succeed, and
-    KeyboardInterrupt for an interrupted run."""
+    """Makes one run of the sweep and returns its line of results, which has the error if another try would fail too. Raises
+    all other errors, and KeyboardInterrupt for an interrupted run."""
     try:
         rt = runtime_of_process(device)
         result, metrics = resume_or_restart(run.plan, run.scan, run.output, lambda: rt, report, run.checkpoint_every_s)
@@ -226,8 +218,7 @@ def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: st
 
 
 def _failed(run: SweepRun, error: Exception) -> Line:
-    """Returns the line of results of a run that failed or whose workers died. Raises an OutputError other than BusyError,
-    since all runs would meet it."""
+    """Returns the line of results of a failed run. Raises OutputErrors except BusyError, since all runs would meet them."""
     if isinstance(error, OutputError) and not isinstance(error, BusyError):
         raise error
     text = str(error) if isinstance(error, PhyradgsError) else f"{type(error).__name__}: {error}"

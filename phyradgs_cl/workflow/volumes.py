@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,20 +14,9 @@ from phyradgs_cl.fields.grid_choice import voxel_sides_mm
 from phyradgs_cl.io import Volume, read_deformation, written_beside
 from phyradgs_cl.io.attenuation import attenuation_of, words_of_hu
 from phyradgs_cl.io.volume import interruption
-from phyradgs_cl.metrics import (
-    METRICS,
-    VOXEL_BY_VOXEL,
-    Aligned,
-    aligned,
-    compare,
-    coverage,
-    edge_points_mm,
-    in_words,
-    motion_error_mm,
-    overlap,
-    reliability_png,
-    slices_png,
-)
+from phyradgs_cl.metrics import METRICS, VOXEL_BY_VOXEL, Aligned, aligned, compare, in_words, overlap
+from phyradgs_cl.metrics.coverage import coverage, reliability_png
+from phyradgs_cl.metrics.quality import edge_points_mm, motion_error_mm, slices_png
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_picture, load_reference, load_result
@@ -101,7 +91,7 @@ def run_evaluation(
     return {**metrics, **states, **known, **interruption(provenance), **compared, **files}
 
 
-def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dict[str, object]:
+def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dict[str, Any]:
     """Returns PSNR and SSIM at each time at which the truth is known, and their means. If both deformations are known, adds
     the mean and the 95th percentile of the motion's error in mm. Raises InputError for boxes that do not overlap."""
     grid, field = result.required_grid, result.deformation
@@ -112,26 +102,24 @@ def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dic
             found = "nothing of the object in the part that is compared"
             raise InputError(f"state at {time_s:.4g} s", found, "volumes in one place")
         rows.append({"time_s": float(time_s), **compare(pair.volume, pair.reference)})
-    means = {f"mean_{name}": float(np.mean([row[name] for row in rows])) for name in METRICS}
-    if field is None or truth.deformation is None or len(rows) < 2:
-        return {"states": rows, **means}
-    points_mm = edge_points_mm(truth.volumes[0], truth_grid)
-    try:
-        mean_mm, high_mm = motion_error_mm(field, truth.deformation, points_mm, truth.times_s)
-    except InputError as error:  # the deformation has no inverse; other metrics need none
-        log.warning("no error of the motion: %s", error)
-        return {"states": rows, **means}
-    return {"states": rows, **means, "mean_motion_error_mm": mean_mm, "p95_motion_error_mm": high_mm}
+    facts = {"states": rows, **{f"mean_{name}": float(np.mean([row[name] for row in rows])) for name in METRICS}}
+    if field is not None and truth.deformation is not None and len(rows) > 1:
+        points_mm = edge_points_mm(truth.volumes[0], truth_grid)
+        try:
+            mean_mm, high_mm = motion_error_mm(field, truth.deformation, points_mm, truth.times_s)
+            facts |= {"mean_motion_error_mm": mean_mm, "p95_motion_error_mm": high_mm}
+        except InputError as error:  # the deformation has no inverse; other metrics need none
+            log.warning("no error of the motion: %s", error)
+    return facts
 
 
 def _with_our_axes(volume: Volume) -> Volume:
     """Reorders a volume of RTK, whose axes x, y, z are this package's y, z, x."""
-    z, y, x = 1, 2, 0  # where our axes are in RTK's (z, y, x)
-    grid = volume.grid
+    order, grid = [1, 2, 0], volume.grid  # where our axes (z, y, x) are in RTK's (z, y, x)
     if grid is not None:
-        shape, size_mm, at_mm = grid.shape, grid.voxel_size_mm, grid.offset_mm
-        grid = Grid((shape[z], shape[y], shape[x]), (size_mm[z], size_mm[y], size_mm[x]), (at_mm[z], at_mm[y], at_mm[x]))
-    return Volume(volume.values.transpose(z, y, x), grid)
+        shape, size_mm, offset_mm = (np.array(zyx)[order] for zyx in (grid.shape, grid.voxel_size_mm, grid.offset_mm))
+        grid = Grid(triple(shape.tolist()), triple(size_mm.tolist()), triple(offset_mm.tolist()))
+    return Volume(volume.values.transpose(order), grid)
 
 
 def _grid_of(path: Path, reference: np.ndarray, grid: Grid | None, voxel_mm: object, volume_path: Path) -> Grid:
@@ -151,8 +139,7 @@ def _grid_of(path: Path, reference: np.ndarray, grid: Grid | None, voxel_mm: obj
 def _on_one_grid(
     volume_path: Path, reference_path: Path, result: tuple[np.ndarray, Grid], truth: tuple[np.ndarray, Grid]
 ) -> Aligned:
-    """Returns both volumes on one grid. Raises InputError if they have no object in common. Warns of little overlap, unless
-    they have the same voxels or look similar there."""
+    """Returns both volumes on one grid. Raises InputError if they have no object in common, and warns of little overlap."""
     pair = aligned(*result, *truth)
     if pair is None:
         found = f"{in_words(result[1])}, which has no voxel of the reference, {in_words(truth[1])}"

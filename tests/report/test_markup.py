@@ -43,6 +43,6 @@ def test_large_volumes_are_thinned_out_and_small_ones_are_whole() -> None:
     assert planes["y"].indices == [0, 1, 2, 3] and planes["y"].size_mm == (500.0, 300.0)
     kept = planes["x"].indices
     assert kept[0] == 0 and kept[-1] == 499 and len(kept) < 500 and np.ptp(np.diff(kept)) <= 1
-    assert planes["x"].position_mm(0) == -249.5
+    assert planes["x"].first_mm == -249.5
     edges = {"x": (192, 4), "y": (192, 192), "z": (4, 192)}
     assert sum(len(planes[a].indices) * np.prod(edges[a]) for a in "xyz") <= BUDGET_PIXELS
