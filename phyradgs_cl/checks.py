@@ -131,15 +131,16 @@ def rising(subject: str, value: ArrayLike) -> NDArray[np.float64]:
     return times
 
 
-def real_array(subject: str, value: ArrayLike) -> np.ndarray:
-    """Returns ``value`` as an array of its own type. Raises InputError unless it holds plain, unmasked numbers."""
+def real_array(subject: str, value: ArrayLike, kinds: str = "iuf") -> np.ndarray:
+    """Returns ``value`` as an array of its own type. Raises InputError for a masked array, and unless it holds numbers of
+    NumPy's ``kinds``: integers and floats, with "b" also booleans."""
     if np.ma.is_masked(value):
         raise InputError(subject, "a masked array", "a plain array", "give its mask apart: array.data, and mask=array.mask")
     try:
         array = np.asarray(value)
     except ValueError as error:  # NumPy's own message is too long for one line
         raise InputError(subject, "lists of unequal length", "an array of numbers") from error
-    if array.dtype.kind not in "iuf":
+    if array.dtype.kind not in kinds:
         raise InputError(subject, short_repr(value), "numbers")
     return array
 

@@ -35,7 +35,8 @@ def ray_operator(
 
     motion: a motion model of docs/methods.md except ``exact``, or an object of your own class. grid: the voxels; None takes
     the scan's grid. device: what ``--device`` takes, or a Runtime. The result's ``intensity`` is the operator for detectors
-    that average photons instead of line integrals. Joseph, IEEE Trans. Med. Imaging 1 (1982) 192.
+    that average photons instead of line integrals. Where pixels are wider than voxels, a pixel is the mean of several rays
+    (docs/mathematics.md). Joseph, IEEE Trans. Med. Imaging 1 (1982) 192.
 
     Raises InputError for anything but a Scan or a Grid, for an unknown motion, and for one that only splats support."""
     model, voxels = _checked(scan, motion, models.RAYS), scan.grid if grid is None else _a_grid(grid)

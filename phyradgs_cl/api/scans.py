@@ -149,6 +149,7 @@ def _pixels(
     """Converts frames of any quantity to line integrals, with the mask of unusable pixels."""
     checks.kind("geometry", geometry, GEOMETRIES, "a ConeGeometry or a ParallelGeometry")
     panel = geometry.detector_shape
+    mask = None if mask is None else checks.real_array("mask", mask, "biuf")
     values = _stack("frames", frames, panel)
     flat = None if flats is None else _stack("flats", flats, panel)
     dark = None if darks is None else _stack("darks", darks, panel)
@@ -166,7 +167,7 @@ def _pixels(
     integrals = line_integrals("frames", values, ImportOptions(), flats=flat, darks=dark, convention=unit)
     if mask is None:
         return integrals
-    unusable = np.asarray(mask) != 0
+    unusable = mask != 0
     if unusable.shape not in (panel, values.shape):
         raise InputError("mask", f"shape {unusable.shape}", f"{panel} or {values.shape}")
     if unusable.all():
