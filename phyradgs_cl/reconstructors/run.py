@@ -251,9 +251,9 @@ def _size_that_fits(rt: Runtime, scan: Scan, method: str, options: Any) -> int:
     if held is not None:
         free = min(free, _DEVICE_SHARE * rt.ledger.limit_bytes)
         if hasattr(options, "prior"):
-            from phyradgs_cl.reconstructors.voxels.priors import volumes_of  # here, because it loads SciPy
+            from phyradgs_cl.reconstructors.voxels.priors import kind_of  # here, because it loads SciPy
 
-            held += volumes_of(options.prior)
+            held += kind_of(options.prior).volumes
         voxels = (free - _STACKS * scan.projections.nbytes) / (4 * held * states)
         voxels = min(voxels, rt.device.largest_allocation_bytes / (4 * _ONE_BUFFER * states))
     if not 0 < voxels < math.inf:

@@ -12,8 +12,8 @@ On small grids the last 7 of 13 iterations run on smaller voxels, whose means ma
 iterations before them only provide their first volume, so they are coarser: two quick passes each, with more subsets, and
 fewer times in an exposure. They are FISTA's, because POGM diverges with so many subsets.
 
-The calls of a run: ``MethodRun``, ``Stages``, ``Loop``, ``Iterations.step``, ``Fista.step``, ``System``, ``RayOperator``, a
-kernel. ``fista_stage`` already projects before its loop, for the step sizes and the ``PriorWeight``."""
+The calls of a run: ``MethodRun``, ``Stages``, ``fista_stage``; then ``Loop``, ``Iterations.step``, ``Fista.step``,
+``System``, ``RayOperator``, a kernel. ``fista_stage`` projects first, for the ``PriorWeight`` and the step size."""
 
 import logging
 import math
@@ -305,10 +305,10 @@ def fista_stage(
     if is_coarse and scan.is_fly:
         options = replace(options, motion=_few_times(options.motion))
     run = replace(whole, scan=scan, options=options, initial=repeated(volume, parts), resume=None)
-    system = run.system(volumes=_VOLUMES + priors.volumes_of(options.prior), frames=_FRAMES)
+    system = run.system(volumes=_VOLUMES + priors.kind_of(options.prior).volumes, frames=_FRAMES)
     volume_bytes = 4 * math.prod(scan.grid.shape)
     is_on_host = isinstance(system.space, HostSpace)
-    held = _HELD + priors.volumes_of(options.prior)
+    held = _HELD + priors.kind_of(options.prior).volumes
     is_short = is_on_host and system.leave_room(rt, (held + _COPIES) * volume_bytes)
     error, image = frame_error(scan, options.motion), repeated(whole.initial, parts)
     prior_inputs = priors.PriorInputs(
@@ -334,7 +334,7 @@ def _gains_from_subvoxels(run: MethodRun, parts: int) -> bool:
     if math.prod(shape[1:]) > _MOST_DIVIDED:
         return False
     voxels = math.prod(shape) * parts**3
-    sizes_bytes = *[4 * voxels] * (_VOLUMES + 2), 4 * voxels * priors.volumes_of(run.options.prior)
+    sizes_bytes = *[4 * voxels] * (_VOLUMES + 2), 4 * voxels * priors.kind_of(run.options.prior).volumes
     has_room = voxels <= MOST_VOXELS and rt.room().holds(*sizes_bytes)
     if rt.ranks.any(not has_room):
         text = "fista: the device has no room for voxels half as large in the last passes (%.3g MiB): the result is less "

@@ -8,7 +8,7 @@ import math
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -161,9 +161,6 @@ class Prior:
 
     A subclass that starts from its last result keeps that in ``state``. This class is the prior ``none``: only x ≥ 0."""
 
-    VOLUMES: ClassVar[int] = 0
-    """How many more volumes than ``dct`` the prior holds in memory."""
-
     noise_share = 1.0
     """Fraction, 0 to 1, of this pass's weight that is due to noise; the rest is due to the discretisation of edges."""
 
@@ -221,8 +218,6 @@ class TvAndDct(Prior):
 
 class ThenRidge(Prior):
     """The prior ridge: the map of the prior ``before`` and, after every fourth map, a step down the ridge regulariser."""
-
-    VOLUMES = RidgeStep.VOLUMES
 
     def __init__(self, before: Prior, ridge: RidgeStep, noise_factor: float) -> None:
         """Joins both maps. noise_factor: noise that the ridge step assumes, over the part of the weight due to noise."""
@@ -299,12 +294,23 @@ class OwnPrior(Prior):
         return space.array(np.maximum(clean, 0) if nonnegative else clean)
 
 
-PRIORS: dict[str, Callable[[PriorInputs], Prior]] = {
-    "ridge": PriorInputs.dct_then_ridge,
-    "dct": PriorInputs.tv_and_dct,
-    "tv": lambda inputs: inputs.tv(_TV_ALONE),
-    "piccs": Piccs,
-    "none": lambda inputs: Prior(),
+@dataclass(frozen=True)
+class PriorKind:
+    """A prior of ``PRIORS``. make: builds it. volumes: how many more volumes than ``dct`` it holds on the device.
+    subvoxel_share: weight, 0 to 1, of smaller voxels in a result, if the volume is thick enough for the prior."""
+
+    make: Callable[[PriorInputs], Prior]
+    volumes: int = 0
+    subvoxel_share: float = _SUBVOXELS
+
+
+PRIORS = {
+    # large voxels serve to average noise, and ridge leaves less of it
+    "ridge": PriorKind(PriorInputs.dct_then_ridge, RidgeStep.VOLUMES, _SUBVOXELS_WITH_RIDGE),
+    "dct": PriorKind(PriorInputs.tv_and_dct),
+    "tv": PriorKind(lambda inputs: inputs.tv(_TV_ALONE)),
+    "piccs": PriorKind(Piccs),
+    "none": PriorKind(lambda inputs: Prior()),
 }
 
 
@@ -313,24 +319,22 @@ def prior_of(prior: str | Denoiser, inputs: PriorInputs) -> Prior:
 
     Raises InputError for what is neither a name nor a function, and for piccs without an image."""
     if isinstance(prior, str) and prior in PRIORS:
-        return PRIORS[prior](inputs)
+        return PRIORS[prior].make(inputs)
     own = imported(prior, "--prior") if isinstance(prior, str) else prior
     if not callable(own):
         raise InputError("--prior", checks.short_repr(own), "a function (volume, noise)")
     return OwnPrior(own)
 
 
-def volumes_of(prior: str | Denoiser) -> int:
-    """Returns how many more volumes the prior holds on the device than ``dct``."""
-    if prior == "ridge":
-        return ThenRidge.VOLUMES
-    return int(getattr(PRIORS.get(prior), "VOLUMES", 0)) if isinstance(prior, str) else 0
+def kind_of(prior: str | Denoiser) -> PriorKind:
+    """Returns a prior's entry in ``PRIORS``; of a user's function, one without further volumes."""
+    own = PriorKind(lambda inputs: prior_of(prior, inputs))
+    return PRIORS.get(prior, own) if isinstance(prior, str) else own
 
 
 def subvoxel_share(prior: str | Denoiser, shape: tuple[int, int, int]) -> float:
-    """Returns the weight of the smaller voxels in a result, 0 to 1. shape: (nz, ny, nx) of the smaller voxels. The weight is
-    larger with the prior ridge, since large voxels serve to average noise, and ridge leaves less of it."""
-    return _SUBVOXELS_WITH_RIDGE if prior == "ridge" and min(shape) >= RIDGE_EDGE else _SUBVOXELS
+    """Returns the weight of the smaller voxels in a result, 0 to 1. shape: (nz, ny, nx) of the smaller voxels."""
+    return kind_of(prior).subvoxel_share if min(shape) >= RIDGE_EDGE else _SUBVOXELS
 
 
 def axis_weights(grid: Grid) -> tuple[float, float, float]:
