@@ -99,13 +99,11 @@ def test_r2_gaussian(tmp_path, make_truth, assert_same) -> None:
     assert_same(import_scan(path, form="r2"), truth)  # at rest
 
 
-def test_a_slow_frame_rate_is_warned_of_where_a_time_was_stated(tmp_path, make_truth, caplog) -> None:
-    """The files state no time: without one, frames follow each other by convention."""
+@pytest.mark.parametrize("stated", [{}, {"exposure_s": 0.4}])
+def test_frames_that_fill_a_third_of_their_time_are_no_question(tmp_path, make_truth, caplog, stated) -> None:
     path = w.write_phyradgs(tmp_path / "phyradgs", make_truth(**MOVING))
-    import_scan(path)
+    import_scan(path, ImportOptions(**stated))
     assert "fps" not in caplog.text
-    import_scan(path, ImportOptions(exposure_s=0.4))
-    assert "0.8 fps and 25° from frame to frame" in caplog.text
 
 
 def test_data_exchange(tmp_path, make_truth, assert_same) -> None:
