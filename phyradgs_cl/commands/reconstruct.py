@@ -125,7 +125,7 @@ def reconstruct_command(
         say(f"states of the object: {len(times_s)}, {times_s[0]:.4g} to {times_s[-1]:.4g} s; the volume is their mean")
     if result.doubt is not None:
         of_bars = result.facts[DOUBT]
-        mean = f"mean σ of the object {of_bars['mean_per_mm']:.3g} 1/mm"
+        mean = f"mean σ, weighted by density, {of_bars['mean_per_mm']:.3g} 1/mm"
         say(f"error bars: {mean}, the 95 % bar is {of_bars['multiple_95']:.3g} σ")
     if profile:
         say(profile_text(runtimes[-1].kernel_uses(), float(result.facts["seconds"])))

@@ -208,29 +208,40 @@ class Doubter:
         if self.hidden is not None and self.rt.ranks.size == 1:
             facts |= self._against_held_out(results, self.hidden, law)
             sigma *= np.float32(facts["held_out_factor"])
-        facts["mean_per_mm"] = float(sigma[object_voxels(first.volume)].mean())
+        # weighted by density: noise and streaks in air make no object
+        total = float(first.volume.sum(dtype=np.float64))
+        weighted = np.sum(sigma * first.volume, dtype=np.float64) / total if total > 0 else sigma.mean()
+        facts["mean_per_mm"] = float(weighted)
         facts = {DOUBT: facts, "seconds": sum(float(one.facts["seconds"]) for one in results)}
         return replace(first, doubt=sigma, facts={**first.facts, **facts})
 
     def _against_held_out(self, results: list[Reconstruction], hidden: NDArray[np.bool_], law: Law) -> dict[str, float]:
         """Returns the fractions of held-out pixels whose errors are within σ and within the 95 % bar, and the factor of σ,
-        from 1 to 4, with which 68 % would be within σ. A pixel's σ combines its noise with the ``spread`` of the projections
-        around it."""
-        ratios, inside = [], []
+        from 1 to 4, by ``widening``. A pixel's σ combines its noise with the ``spread`` of the projections around it."""
+        pixels, inside = [], []
         for first, one, two in zip(*(self._pairs(result, _CHECKED_FRAMES) for result in results), strict=True):
             held = hidden[first.frame]
             noise, error = noise_map(first.residual, first.valid)[held], first.residual[held]
             bar = spread(first.computed, one.computed, two.computed, law).astype(np.float64)
             bar = np.sqrt(scipy.ndimage.uniform_filter(bar**2, _AROUND))[held]
-            ratios.append((error**2 - noise**2) / np.maximum(bar, 1e-30) ** 2)
+            pixels.append([error, noise, bar])
             wide = np.hypot(_NORMAL_95 * noise, law.multiple_95 * bar)
             inside.append([np.abs(error) <= np.hypot(noise, bar), np.abs(error) <= wide])
-        wanted = float(np.sqrt(max(np.quantile(np.concatenate(ratios), _SHARE), 1.0)))
+        wanted = widening(*np.concatenate(pixels, axis=1))
         if wanted > _WIDEST:
             text = "held-out pixels are %.3g times farther off than the error bars: run 'phyradgs check', and take a box "
             log.warning(text + "around the whole object", wanted)
         within, within_95 = np.mean(np.concatenate(inside, axis=1), axis=1).tolist()
         return {"held_out_within": within, "held_out_within_95": within_95, "held_out_factor": min(wanted, _WIDEST)}
+
+
+def widening(errors: Array, noise: Array, bars: Array) -> float:
+    """Returns the factor of ``bars`` (n,), at least 1, with which 68 % of the errors (n,) would be within noise and bars
+    together. Two standard errors of this fraction are allowed: where bars are far below the noise, chance alone would
+    multiply them."""
+    share = _SHARE - 2 * np.sqrt(_SHARE * (1 - _SHARE) / len(errors))
+    ratios = (errors**2 - noise**2) / np.maximum(bars, 1e-30) ** 2
+    return float(np.sqrt(max(np.quantile(ratios, max(share, 0.0)), 1.0)))
 
 
 def _warn_of(residual_square: float, noise_square: float, square: float, mean: float) -> None:

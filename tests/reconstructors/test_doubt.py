@@ -18,7 +18,7 @@ from phyradgs_cl.io import read_checkpoint, write_checkpoint
 from phyradgs_cl.metrics import coverage
 from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.reconstructors import doubt
-from phyradgs_cl.reconstructors.doubt import Doubter, Law, finer, halves, spread
+from phyradgs_cl.reconstructors.doubt import Doubter, Law, finer, halves, spread, widening
 from phyradgs_cl.reconstructors.projected import held_out
 from phyradgs_cl.reconstructors.result import DOUBT, interrupted
 
@@ -120,6 +120,16 @@ def test_bars_are_wider_with_few_views_for_the_grid() -> None:
     for views, times in ((25, 1.0), (50, 1.0), (10, 1.375), (1, 0.75 + 0.25 * 25 / 6.4)):
         bars = spread(volume, one, two, law.for_views(views, grid))
         np.testing.assert_allclose(bars, times * spread(volume, one, two, law), rtol=1e-6)
+
+
+def test_chance_does_not_widen_bars_below_the_noise_but_other_causes_do() -> None:
+    rng, noise = np.random.default_rng(2), np.ones(900)
+    by_chance = [widening(rng.standard_normal(900), noise, 0.1 * noise) for _ in range(100)]
+    assert np.mean(np.array(by_chance) == 1) > 0.9
+    for factor in (2.0, 3.0):
+        errors = np.hypot(1, factor) * rng.standard_normal(100_000)
+        assert widening(errors, np.ones(100_000), np.ones(100_000)) == pytest.approx(factor, rel=0.05)
+    assert widening(np.array([5.0]), np.ones(1), np.ones(1)) >= 1
 
 
 def test_noise_is_told_from_what_is_smooth_where_pixels_are_valid() -> None:
