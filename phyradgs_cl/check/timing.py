@@ -127,7 +127,8 @@ def check_angles(scan: Scan) -> Finding:
     usual_deg = float(np.median(_steps_deg(scan)))
     widest = np.sort(steps_deg)[::-1]
     is_short = widest[0] > _WIDE * usual_deg
-    covered_deg = turn_deg - float(widest[0]) + (usual_deg if is_short else 0.0)  # a view covers half a step to each side
+    # a view covers half a step to each side
+    covered_deg = turn_deg - float(widest[0]) + usual_deg if is_short else turn_deg
     if is_short and covered_deg < needed_deg - _TOLERATED_DEG:
         text = f"views cover {covered_deg:.4g}°; {of_needed}"
         advice = "expect streaks along the missing directions; check rotation_angle, its unit and its sign"
