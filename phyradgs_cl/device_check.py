@@ -40,7 +40,7 @@ SHAPE, GRID = (9, 12), Grid((5, 7, 6), (0.3, 0.24, 0.28), (0.1, -0.05, 0.1))
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 9, 4.1 / 12), (0.1, 0.2))
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.5))
 PARALLEL = CircularOrbit(ParallelGeometry(SHAPE, (2.6 / 9, 2.7 / 12), (0.1, 0.2)), ConstantSpeed(0.3, 0.5))
-UNIT = 2.0  # line integral that the pixel value 1 stands for, where intensities are averaged
+UNIT = 2.0  # line integral that a pixel of value 1 means to kernels that average intensities exp(−line integral)
 STEP = 1e-6  # central differences take this step to each side
 Comparison = tuple[np.ndarray, np.ndarray, float]
 """Computed, expected, and the largest difference allowed, relative to the largest number expected."""

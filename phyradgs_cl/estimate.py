@@ -118,7 +118,8 @@ class _Trials:
         return float(self.result.facts.get("density_control_seconds", 0.0))
 
     def _rounds_due(self, total: int) -> float:
-        """Returns the rounds of density control in a run of ``total`` iterations, over those in the last trial, or 0."""
+        """Returns how many times as many rounds of density control a run of ``total`` iterations has as the last trial; 0 if
+        that had none."""
         rounds = self.result.facts.get("density_control_rounds", 0)
         return sum(self.plan.options.control.is_due(i, total) for i in range(1, total + 1)) / rounds if rounds else 0.0
 

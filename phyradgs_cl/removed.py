@@ -45,7 +45,8 @@ other methods still have starts with ``--method`` and the method that lost it.""
 
 
 def removal(word: str, subject: str = "") -> InputError | None:
-    """Returns the error for a word in ``REMOVED``, or None for other words. subject: the start of its message."""
+    """Returns the error that says what replaces ``word``, a former option or value in ``REMOVED``; None for other words.
+    subject: the start of its message, as ``--tune``."""
     return InputError(subject or word, "a word of an earlier version", "", REMOVED[word]) if word in REMOVED else None
 
 

@@ -138,7 +138,8 @@ def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np
     cells = (start_s - origin_s) / step_s
     number = np.arange(len(edges_s) - 1) + 0.5
     if abs(cells - round(cells)) < _SAME_TIME:
-        # Times count from frame 0, so that cells of two frames at one time get the same bits: their pose is projected once.
+        # Times count from frame 0: cells of different frames at the same time then have bit-identical times and poses, and
+        # a pose is projected once for all of them.
         start_s, number = origin_s, round(cells) + number
     return np.asarray(start_s + edges_s[0] + number * step_s)
 

@@ -21,13 +21,7 @@ from phyradgs_cl.acquisition.geometry import (
 from phyradgs_cl.acquisition.plot import plot_frame
 from phyradgs_cl.acquisition.scans_from import line_integrals
 from phyradgs_cl.acquisition.shutter import Shutter
-from phyradgs_cl.acquisition.trajectory import (
-    CircularOrbit,
-    Trajectory,
-    behind_axis,
-    checked,
-    is_parallel,
-)
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, behind_axis, checked, is_parallel
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gating, Grid, GridChoice, Metal, MovingTruth
 

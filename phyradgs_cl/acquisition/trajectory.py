@@ -20,8 +20,6 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.text import repr_of_changes
 
-_LEAST_SPAN_S = 1e-6  # least time that ``sampled`` covers in a frame: it needs two times, even if the frame has no duration
-_MOST_SAMPLES = 1024  # ``sampled`` raises an error if a table of more samples per frame than this is not close enough
 _LEAST_INCIDENCE = 1e-6  # least sine of the angle between rays and panel
 _AT_AXIS = 1e-6  # a panel within this fraction of the source-to-axis distance is at the axis
 _AWAY = 2.0  # a panel at the axis is moved so that its distance from the source and its size grow by this factor
@@ -346,38 +344,8 @@ def grid_of_scan(geometry: Geometry, trajectory: Trajectory, frame_start_s: np.n
     """Returns the grid of the field of view (``default_grid``), longer if the gantry travels along z."""
     if isinstance(trajectory, CircularOrbit):
         return default_grid(geometry)
-    poses = [checked(trajectory).pose(f, np.array([t])) for f, t in enumerate(frame_start_s)]
+    poses = [trajectory.pose(f, np.array([t])) for f, t in enumerate(frame_start_s)]
     return default_grid(geometry, np.concatenate(poses))
-
-
-_AS_TABLE = "give it as a PoseTable"
-
-
-def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
-    """Samples a user-defined trajectory into a pose table, over ``span_s`` from each frame's start (F,). The table's poses
-    differ from the trajectory's by at most ``error_mm``.
-
-    Raises InputError if even a fine table is not close enough, as for frames that overlap in time with different poses."""
-    samples = 2
-    while True:
-        offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), samples)
-        times = np.asarray(frame_start_s, np.float64)[:, None] + offsets_s
-        poses = np.concatenate([trajectory.pose(f, t) for f, t in enumerate(times)])
-        time_s, at = np.unique(times.ravel(), return_index=True)  # unique, because frames may overlap in time
-        table = PoseTable(time_s, poses[at], "trajectory", is_parallel(trajectory))
-        between = (time_s[:-1] + time_s[1:]) / 2  # the table is tested between all samples, since frames may overlap
-        inside = [between[(t[0] < between) & (between < t[-1])] for t in times]
-        errors = (np.abs(table.pose(f, t) - trajectory.pose(f, t)).max(initial=0.0) for f, t in enumerate(inside))
-        worst_mm = max(errors)
-        if worst_mm <= error_mm:
-            return table
-        if samples > _MOST_SAMPLES:
-            found = f"poses that {samples} samples per frame miss by {worst_mm:.3g} mm"
-            overlap = np.any(np.sort(times[:, 0])[1:] < np.sort(times[:, -1])[:-1])
-            remedy = "take frames that do not overlap in time: a file has one pose at a time" if overlap else _AS_TABLE
-            raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", remedy)
-        # Halves the intervals between samples.
-        samples = 2 * samples - 1
 
 
 def _checked_table(

@@ -261,8 +261,8 @@ class Search:
     def estimates(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the values (K,) of the determined parameters and their standard deviations (K,), in the fields' units.
 
-        A deviation combines noise and discretisation error, which is half the change since the coarser grid. Both grow where
-        a parameter resembles undetermined ones, which stay as stated, right or wrong."""
+        A deviation combines noise and discretisation error, taken as half the change since the coarser grid. Both are larger
+        for a parameter whose effect resembles that of undetermined ones: these keep their stated values, even wrong ones."""
         if self.reduced is None or not self.determined:
             return np.zeros(0), np.zeros(0)
         values, noise = self.reduced.step(), self.reduced.deviations()

@@ -105,8 +105,8 @@ def _times(name: str, factor: float) -> str:
 
 
 def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Scan:
-    """Returns the coarse scan with pixels ``factor`` times as large, and a fitting grid. keeps_axis: the axis stays in its
-    column."""
+    """Returns ``scan``, whose pixels are binned, with pixels ``factor`` times as large as those of ``stated``, the scan of
+    the file, and a fitting grid. keeps_axis: the rotation axis still projects to the same detector column."""
     v_mm, u_mm = stated.geometry.pixel_size_mm
     off_v_mm, off_u_mm = (offset * (factor if keeps_axis else 1) for offset in stated.geometry.detector_offset_mm)
     pixel_size_mm = (factor * v_mm, factor * u_mm)

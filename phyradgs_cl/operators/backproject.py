@@ -182,10 +182,10 @@ def _defines(power: int) -> dict[str, int]:
 
 
 def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:
-    """Returns how many voxels along z a work-item of the kernels for upright columns takes, and whether columns lean.
+    """Returns how many voxels along z a work-item of the kernels for columns of voxels computes, 0 if the general kernel is
+    needed, and whether the columns lean: whether u or depth (rows 0 and 2 of a matrix) change along a column.
 
-    0 means that the general kernel is needed. In an upright column of voxels, u and depth (rows 0 and 2 of a matrix) do not
-    change with z. All voxels must be in front of the source, also those that a last vector reads beyond the volume."""
+    All voxels must be in front of the source, with those that a work-item's last vector reads beyond the volume."""
     nz, ny, nx = grid.shape
     corners = np.array([[x, y, z, 1] for x in (0, nx - 1) for y in (0, ny - 1) for z in (0, nz - 1 + _WIDEST)])
     depth = matrices[:, 8:12] @ corners.T

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, PoseTable, Scan, Shutter
-from phyradgs_cl.acquisition.trajectory import sampled
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_scan, write_scan
+from phyradgs_cl.io.scan.motion import sampled
 from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
 
 pytestmark = pytest.mark.slow

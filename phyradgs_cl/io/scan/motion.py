@@ -9,7 +9,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, EncoderTable, FrameSweeps, PoseTable, Scan, SpeedRamp
 from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry, towards_source
-from phyradgs_cl.acquisition.trajectory import ConstantSpeed, sampled
+from phyradgs_cl.acquisition.trajectory import ConstantSpeed, Trajectory, is_parallel
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gating
 from phyradgs_cl.io import scan as schema
@@ -21,6 +21,9 @@ _KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # motions o
 _RAMP_ERROR_RAD = 1e-9  # a speed ramp is stored as a table of angles, whose interpolation errs by at most this
 _MOST_RAMP_SAMPLES = 500_000  # rows of the longest such table, about 8 MB; a longer ramp is stored less exactly
 _SUSPECT_RAD = math.radians(5.0)  # encoder table and rotation_angle differ by more only if one has a wrong sign or zero
+_LEAST_SPAN_S = 1e-6  # least time that ``sampled`` covers in a frame: it needs two times, even if the frame has no duration
+_MOST_SAMPLES = 1024  # ``sampled`` raises an error if a table of more samples per frame still misses the trajectory
+_AS_TABLE = "give it as a PoseTable"
 
 
 def has_motion(source: Hdf5Source, entry: str) -> bool:
@@ -73,6 +76,33 @@ def storable(scan: Scan) -> Scan:
         return scan
     error_mm = 1e-4 * min(scan.geometry.pixel_size_mm)
     return replace(scan, trajectory=sampled(path, scan.frame_start_s, scan.shutter.span_s, error_mm))
+
+
+def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
+    """Samples a user-defined trajectory into a pose table, over ``span_s`` from each frame's start (F,). The table's poses
+    differ from the trajectory's by at most ``error_mm``.
+
+    Raises InputError if even a fine table is not close enough, as for frames that overlap in time with different poses."""
+    samples = 2
+    while True:
+        offsets_s = np.linspace(0.0, max(span_s, _LEAST_SPAN_S), samples)
+        times = np.asarray(frame_start_s, np.float64)[:, None] + offsets_s
+        poses = np.concatenate([trajectory.pose(f, t) for f, t in enumerate(times)])
+        time_s, at = np.unique(times.ravel(), return_index=True)  # unique, because frames may overlap in time
+        table = PoseTable(time_s, poses[at], "trajectory", is_parallel(trajectory))
+        between = (time_s[:-1] + time_s[1:]) / 2  # the table is tested between all samples, since frames may overlap
+        inside = [between[(t[0] < between) & (between < t[-1])] for t in times]
+        errors = (np.abs(table.pose(f, t) - trajectory.pose(f, t)).max(initial=0.0) for f, t in enumerate(inside))
+        worst_mm = max(errors)
+        if worst_mm <= error_mm:
+            return table
+        if samples > _MOST_SAMPLES:
+            found = f"poses that {samples} samples per frame miss by {worst_mm:.3g} mm"
+            overlap = np.any(np.sort(times[:, 0])[1:] < np.sort(times[:, -1])[:-1])
+            remedy = "take frames that do not overlap in time: a file has one pose at a time" if overlap else _AS_TABLE
+            raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", remedy)
+        # Halves the intervals between samples.
+        samples = 2 * samples - 1
 
 
 def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:

@@ -250,7 +250,7 @@ def _taps(displacement: np.ndarray) -> Iterator[tuple[tuple[np.ndarray, ...], np
 def moved_rows(rows: np.ndarray, deformation: Deformation, weights: np.ndarray) -> np.ndarray:
     """Returns the parameter rows (11, G) of Gaussians moved from the reference to the state with field weights (R,)."""
     mean = rows[MEAN].T + deformation.inverse_mm(rows[MEAN].T, weights)
-    for _ in range(2):  # Newton's method: central differences of frames need more digits
+    for _ in range(2):  # Newton's steps: tests by central differences of frames need more digits than inverse_mm has
         off = mean + deformation.displacement_mm(mean, weights) - rows[MEAN].T
         pull = np.eye(3) + deformation.jacobian(mean, weights)
         mean = mean - np.linalg.solve(pull, off[..., None])[..., 0]

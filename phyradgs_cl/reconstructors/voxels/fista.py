@@ -296,9 +296,10 @@ def fista_stage(
     now: Callable[[], MethodRun], iterations: int, volume: np.ndarray | None, parts: int = 1, is_coarse: bool = False,
     optimised: int = 0,
 ) -> Iterations:  # fmt: skip
-    """Returns the method of a stage: ``iterations`` from ``volume`` (nz, ny, nx; None: the method's own start), with every
-    voxel's side divided into ``parts``. is_coarse: the iterations only provide the first volume of the next stage.
-    optimised: how many iterations are POGM's."""
+    """Returns a stage's ``iterations`` from ``volume`` (nz, ny, nx; None: the method's own start), on a grid whose voxels
+    are divided into ``parts`` along each side. now: returns the run as it is when the stage starts. is_coarse: the
+    iterations only provide the first volume of the next stage. optimised: how many iterations use POGM; the others use
+    FISTA."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
     options, rt = replace(whole.options, iterations=iterations), whole.rt

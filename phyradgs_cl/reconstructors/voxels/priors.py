@@ -93,7 +93,8 @@ def adjoint_response(system: System) -> tuple[float, float]:
 
 
 class PriorWeight:
-    """The weight of a prior: ``strength`` times the error of the gradient Aᵀ(p − A x), which grows with the density of x."""
+    """The weight of a prior: ``strength`` times the estimated error of the data term's gradient Aᵀ(p − A x). The error comes
+    from noise, and from edges inside voxels, whose part is proportional to the object's density."""
 
     def __init__(self, system: System, error: FrameError, strength: float) -> None:
         self.space, self.error, self.strength = system.space, error, strength
