@@ -214,6 +214,14 @@ def test_a_residual_far_above_the_noise_and_much_noise_are_warned_of(rt, caplog)
         assert ("do not hold soft texture" in caplog.text) == is_noisy
 
 
+def test_the_mean_bar_is_that_of_matter_where_noise_fills_the_air(rt) -> None:
+    scan = simulate("spheres", size=24, detector=32, views=24, noise="tigre", dose=1e3, device=rt)
+    result = reconstruct(scan, "fdk", device=rt, doubt=True, report=False)
+    matter, air = scan.reference > 0.1 * scan.reference.max(), scan.reference == 0
+    mean = result.facts[DOUBT]["mean_per_mm"]
+    assert mean == pytest.approx(result.doubt[matter].mean(), rel=0.25) and mean > 1.3 * result.doubt[air].mean()
+
+
 def test_a_box_has_its_part_of_the_bars_and_a_scan_without_a_method_has_none(rt, scan) -> None:
     result = reconstruct(scan, "fdk", preset="hann", device=rt, report=False, doubt=True)
     part = scan.grid.part((2, 3, 4), (6, 5, 4))
