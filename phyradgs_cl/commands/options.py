@@ -83,6 +83,10 @@ _PRIOR = (
     f"Prior, for fista: {' or '.join(_PRIORS.rsplit(', ', 1))}; MODULE:NAME: a denoiser of your own, a tenth of its change "
     "at 50 × the noise that it is given (docs: methods.md)."
 )
+OF_METHODS: dict[str, Any] = {
+    "prior": _asked(str, _PRIOR, "ridge", metavar="NAME|MODULE:NAME"),
+    "gaussians": _asked(int, "Gaussians at the start, for splats.", "from the grid"),
+}
 _PRESET = "Constants: default, quick, paper (phyradgs); published (r2, naf, sax-nerf); a window (fdk)."
 _CONFIG = "TOML file of options, with underscores for dashes (docs: formats.md); the command line wins."
 _SET = "An option of the method by name: --set tv_weight=0.002 (docs: methods.md)."
@@ -91,8 +95,7 @@ RUN_OPTIONS: dict[str, Any] = {
     "motion": _asked(Literal[tuple(model.name for model in _MODELS)], _MOTION, "per-row"),
     **OF_MOTION,
     "iterations": _asked(int, "Iterations: of voxels all frames each, of splats one frame (then 3000).", "26"),
-    "prior": _asked(str, _PRIOR, "ridge", metavar="NAME|MODULE:NAME"),
-    "gaussians": _asked(int, "Gaussians at the start, for splats.", "from the grid"),
+    **OF_METHODS,
     **{name: kind for name, (kind, _) in OF_FRAMES.items()},
     "seed": _asked(int, "Seed of the random numbers.", "0"),
     "preset": _asked(str, _PRESET, "the method's first"),

@@ -38,8 +38,8 @@ _GROUPS = {
     "Volume": (*(name for name in options.OF_GRID if name != "size"), "initial", "mu_water_per_mm", "rows", "slab"),
     "Motion": ("object_motion", *options.OF_MOTION, "detector_model"),
     "Quality": (
-        "prior", "preset", "assignments", *(name for name in options.OF_FRAMES if name not in options.OF_GRID),
-        "gaussians", "seed",
+        *options.OF_METHODS, "preset", "assignments", *(name for name in options.OF_FRAMES if name not in options.OF_GRID),
+        "seed",
     ),
     "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
 }
