@@ -86,7 +86,8 @@ class MappedTrajectory:
 
 
 def altered_trajectory(scan: Scan) -> AlteredTrajectory:
-    """Returns the scan's trajectory as an ``AlteredTrajectory``, in which ``replace`` can change fields."""
+    """Returns the scan's trajectory as an ``AlteredTrajectory`` whose fields ``dataclasses.replace`` can change. A
+    trajectory of another class becomes its ``base``, as yet unaltered."""
     trajectory = scan.trajectory
     if isinstance(trajectory, AlteredTrajectory):
         return trajectory
@@ -95,7 +96,7 @@ def altered_trajectory(scan: Scan) -> AlteredTrajectory:
 
 
 def with_trajectory(scan: Scan, **changes: Any) -> Scan:
-    """Returns the scan with ``changes`` to the fields of its ``AlteredTrajectory``."""
+    """Returns the scan with ``changes`` to the fields of its ``altered_trajectory``."""
     return replace(scan, trajectory=replace(altered_trajectory(scan), **changes))
 
 
