@@ -11,7 +11,7 @@ from phyradgs_cl.fields import Grid, triple
 
 Values = NDArray[np.floating]
 VOXEL_BY_VOXEL = "voxel by voxel"
-_ROUNDING = 1e-6  # a voxel's centre that is at most this far outside a box, in voxels, counts as inside: it is rounding
+_ROUNDING = 1e-6  # a voxel's centre at most this far outside a box, in voxels, counts as inside, because centres are rounded
 
 
 @dataclass(frozen=True, eq=False)

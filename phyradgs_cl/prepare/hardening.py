@@ -46,7 +46,8 @@ _NONE: Polynomial = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class HardeningOptions(checks.Checked):
-    """Either polynomial or kvp may be stated. With neither, a polynomial is fitted for one material.
+    """Options of the step ``hardening``: a polynomial, or a tube voltage. With neither, a polynomial is fitted for one
+    material.
 
     - polynomial: coefficients of p², p³ and p⁴. kvp: tube voltage in kV, which gives the spectrum; 0: not stated.
     - bone_per_mm: attenuation in 1/mm from which a voxel is bone; 0: candidates are tried.

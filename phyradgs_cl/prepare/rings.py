@@ -3,7 +3,8 @@
 Over a full turn, the mean of all views shows the object averaged around the axis, which is symmetric about it. So a column
 that differs from its mirror image shows an error of the panel. Two independent sets of views both show this error: their
 covariance says whether there are rings, and how strong. Without rings the frames stay unchanged. The pattern is the mean
-over views minus its denoised copy, which keeps the strong cosine coefficients of overlapping blocks: the object's.
+over views minus its denoised copy, which keeps the strong cosine coefficients of overlapping blocks, because these belong to
+the object.
 
 A single column or pixel of wrong gain deviates on one side of the axis only. Its neighbours and their mirror images do not,
 and both sets of views show it. (On an arc the mean is symmetric for a round object only.)"""
@@ -42,7 +43,7 @@ _EQUALLY_FAR = 1.15  # the sources of a full turn are nearly equally far from th
 
 @dataclass(frozen=True)
 class RingOptions(checks.Checked):
-    """window: side in pixels of the blocks of cosines. Patterns wider than a block are not removed."""
+    """Options of the step ``rings``. window: side in pixels of the blocks of cosines. Patterns wider than a block stay."""
 
     PREFIX = "rings."
 

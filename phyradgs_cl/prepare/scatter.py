@@ -41,8 +41,9 @@ _BISECTIONS = 20  # halvings that give the strength for a stated to_primary to 2
 
 @dataclass(frozen=True)
 class ScatterOptions(checks.Checked):
-    """to_primary: ratio of scatter to primary light behind the object; 0: the kernel is fitted to air. reach: standard
-    deviation of the kernel over the panel's longer side; 0: fitted, or 0.18 where to_primary is stated."""
+    """Options of the step ``scatter``. to_primary: ratio of scatter to primary light behind the object; 0: the kernel is
+    fitted to air. reach: standard deviation of the kernel over the panel's longer side; 0: fitted, or 0.18 if to_primary is
+    stated."""
 
     PREFIX = "scatter."
 
@@ -93,9 +94,9 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
 
 
 def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
-    """Returns the kernel with the strength that leaves the least ``unexplained``, or unchanged if that gains little. frames:
-    line integrals (F, v, u), which are first blurred by ``blur`` pixels to fit a coarse model. The corrected frames are
-    shifted so that the median of each frame's ``air``, bool (F, v, u), is 0."""
+    """Returns the kernel with the strength that leaves the least ``unexplained``. Returns it unchanged unless that is below
+    0.65 times what the fitted kernel leaves. frames: line integrals (F, v, u), which are first blurred by ``blur`` pixels to
+    fit a coarse model. The corrected frames are shifted so that the median of each frame's ``air``, bool (F, v, u), is 0."""
     if not kernel:
         return kernel
     coarse = step.smooth(frames, blur)
