@@ -1,4 +1,4 @@
-"""The command line with all commands. An error prints one line on stderr; its kind gives the exit status."""
+"""The command line with all commands. An error prints one line on stderr, and the kind of error gives the exit status."""
 
 import importlib
 from collections import UserDict
@@ -15,7 +15,7 @@ from phyradgs_cl.removed import refuse_removed
 
 _CLICK_ERROR: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 HELP = {"help_option_names": ["-h", "--help"]}
-# Command NAME: the module in commands/ that defines NAME_command, and the help in the list of commands.
+# By command NAME: the module of commands/ that defines NAME_command, and the text about the command in the list of commands.
 COMMANDS = {
     "simulate": ("simulate", "Simulate a fly-scan of a phantom or a volume."),
     "import": ("import_scan", "Turn the scan of another program into a scan file."),

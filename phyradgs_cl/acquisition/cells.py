@@ -16,7 +16,7 @@ _SAME_TIME = 1e-6  # times that differ by less than this fraction of a cell's du
 _NOTHING = 1e-9  # a cell's fraction of a line's exposure below this is a rounding error, and becomes 0
 _INSTANT = 1e-9  # a line's exposure shorter than this fraction of the frame's lit span counts as a single moment
 _OVERHANG = 0.1  # a line leaves out a segment of time if its exposure covers at most this fraction of the segment
-_TURN_SAMPLES = 32  # number of equal intervals of a frame: the highest mean speed in one counts as the gantry's highest
+_TURN_SAMPLES = 32  # equal intervals of a frame's lit span; the highest mean speed in one counts as the gantry's highest
 _TURN_FACTOR = 0.32  # measured relative RMS error of a frame, per squared radian that the gantry turns in a segment
 _HARMLESS_PEAK = 4.0  # up to this line integral, averaging intensities needs no more segments than averaging line integrals
 _MOST_SEGMENTS = 1000  # most segments that ``segments_for`` chooses for a frame
@@ -64,7 +64,8 @@ def centre_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, strips: int,
     sub_intervals: int
 ) -> TimeCells:
-    """Returns the cells of ``micro_view_cells``. Their ``conic_pose`` is the pose of ``static_cells``."""
+    """Returns the cells of ``micro_view_cells`` with a ``conic_pose``, at which the shapes of Gaussians on the panel are
+    computed: the pose of ``static_cells``."""
     table = micro_view_cells(trajectory, shutter, frame, start_s, lines, strips, sub_intervals)
     return replace(table, conic_pose=static_cells(trajectory, shutter, frame, start_s, lines).pose[0])
 
@@ -125,7 +126,7 @@ def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _served_lines(served: np.ndarray) -> Served:
-    """Returns ``Served``: the cells that serve any line, their lines and their order. served: bool (K, lines)."""
+    """Returns the four arrays of ``Served``. served: whether each of K cells serves each line, bool (K, lines)."""
     used = np.flatnonzero(served.any(axis=1))
     line_start = served[used].argmax(axis=1)
     line_stop = served.shape[1] - served[used, ::-1].argmax(axis=1)

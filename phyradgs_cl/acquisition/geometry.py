@@ -163,7 +163,7 @@ def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarr
 
 
 def plain_geometry(pose: np.ndarray, panel: tuple[int, int], is_parallel: bool = False) -> Geometry:
-    """Returns the circular geometry with the mean distances and offsets of poses (F, 12).
+    """Returns the circular geometry with the mean distances and offsets of poses (F, 12), for a panel (rows, columns).
 
     The distance to the detector is measured at right angles to the panel. The offset runs from the point of the panel's
     plane nearest to the source (in a parallel beam, to the origin) to the panel's middle."""

@@ -175,7 +175,8 @@ def _check_opaque(scan: "Scan", subject: str) -> None:
 
 
 def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:
-    """Returns whether the angles (F,) of many frames lie within 2π degrees; then warns that they may be radians."""
+    """Returns whether the angles (F,) of at least 10 frames lie within 2π degrees but differ. Warns then that they may be in
+    radians."""
     span_deg = float(np.ptp(angle_deg))
     looks_so = len(angle_deg) >= _MANY_FRAMES and 0 < span_deg <= 2 * np.pi * (1 + _SLACK)
     if looks_so:

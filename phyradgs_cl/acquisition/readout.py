@@ -9,7 +9,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.errors import InputError
 
-# (readout axis, direction) for each side of the panel, seen from the source, that may be read first.
+# By the side of the panel that is read first, seen from the source: the readout axis and direction.
 FIRST_LINES = {"bottom": ("rows", 1), "top": ("rows", -1), "left": ("columns", 1), "right": ("columns", -1)}
 SIDES = tuple(FIRST_LINES)
 Named = Callable[[str], str]

@@ -304,7 +304,7 @@ def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarr
     """Returns the trajectory of a gantry that rests at ``poses`` (F, 12) in mm, each at its time ``middle_s`` (F,): a
     circular orbit if ``geometry`` has these poses at some angles, else a pose table."""
     is_parallel = isinstance(geometry, ParallelGeometry)
-    side = -1 if is_parallel else 1  # poses begin with the source; in a parallel beam with the rays' direction, away from it
+    side = -1 if is_parallel else 1  # a pose begins with the source or, in a parallel beam, with the direction away from it
     angle_rad = np.arctan2(side * poses[:, 1], side * poses[:, 0])
     if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME_PLACE * np.abs(poses).max()):
         return CircularOrbit(geometry, FrameSweeps(middle_s, 0.0, angle_rad, angle_rad))

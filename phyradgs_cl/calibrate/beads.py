@@ -130,7 +130,7 @@ class _PanelLines:
                 first = first if self.is_parallel else first - source
                 ray = first[:, None] + (pixel[..., None] + along) * self.pixel_step[lines][:, None]
                 starts, rays = np.repeat(source, width, axis=0), ray.reshape(-1, 3)
-                if self.is_parallel:  # integrate from one side of the body to the other
+                if self.is_parallel:  # there is no source: a ray starts and ends outside of the body
                     reach = 2 * (np.abs(rays).max(initial=0.0) + np.abs(body.ends_mm).max() + body.reach_mm)
                     starts, rays = rays - reach * starts, 2 * reach * starts
                 fraction = body.chord_fraction(starts, rays)

@@ -165,7 +165,8 @@ class _Calibrator:
         return replace(calibration, scan=_with_provenance(corrected, self.scan, calibration))
 
     def _start_from_axis(self) -> None:
-        """Starts from the offset that ``check`` finds, because steps reach it from a distance of a few pixels only.
+        """Starts from the offset that ``check`` finds, because Gauss–Newton steps reach the right one from a few pixels away
+        only.
 
         In half a turn of nearly parallel rays, a volume explains most of what an offset changes. The search cannot determine
         the offset there, so ``check``'s answer stands. Its answer also stands if the panel sees few rays twice: a shift

@@ -245,7 +245,8 @@ class Search:
             self.at[name] = estimate.correction
 
     def _step(self, problem: Problem) -> bool:
-        """Moves the determined parameters, each as far as its signal is linear. Returns whether all steps were small."""
+        """Moves the determined parameters by the Gauss–Newton step, each at most as far as its signal is linear. Returns
+        whether all steps were small."""
         assert self.reduced is not None and self.determined is not None
         current = np.array([self.at.get(name, 0.0) for name in self.determined])
         change = self.reduced.step() - current

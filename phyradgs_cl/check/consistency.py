@@ -40,9 +40,9 @@ _NOISY = 1.6  # residual over the noise: round objects had up to 1.3, others 2.3
 _MOST_REFINED = 2  # only this many hypotheses, the best ones, get a refined shift of the panel, which takes time
 _SHIFT_PENALTY = 1.5  # factor on a hypothesis's squared residual per coarse pixel of shift: stated offsets are mostly right
 # A frame is odd if its mean line integral differs from its neighbours' by more than _DEVIATIONS and _LEAST_CHANGE.
-_DEVIATIONS = 12.0  # difference in robust standard deviations of all frames' differences
-_LEAST_CHANGE = 0.75  # difference over the frames' median mean line integral
-_REPEATED = 0.15  # RMS change from a frame to one that repeats it, at most, over the least change between frames nearby
+_DEVIATIONS = 12.0  # the difference over the robust standard deviation of all frames' differences
+_LEAST_CHANGE = 0.75  # the difference over the median of the frames' mean line integrals
+_REPEATED = 0.15  # largest RMS change from a frame to one that repeats it, over the least change between frames nearby
 _JUMP = 2.5  # an order jumps, as the golden angle does, if its median step exceeds that of sorted angles by this factor
 _UNLIKE = 2.0  # least RMS difference of a repeated frame from the next view in angle, over the median of all frames
 _OUTLIER = 4.0  # least RMS residual of an outlier, over the frames' median

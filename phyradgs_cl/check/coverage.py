@@ -19,7 +19,7 @@ _NOISES = 4.0  # noise alone does not exceed this many of its standard deviation
 _OPAQUE = 30.0  # behind larger line integrals no light passes, so they are no line integrals
 _INVERTED = 0.9  # if left and right edges exceed this fraction of the largest value, bright and dark are exchanged
 _BRIGHT = 0.05  # at most this fraction of the pixels may be brighter than the flats, by noise
-_FRAMES = 0.1  # the object may touch a side of the panel in this fraction of the frames
+_FRAMES = 0.1  # the object may touch a side of the panel in up to this fraction of the frames
 _COVERED = 0.1  # a column shows the object if more than this fraction of its rows does
 # A unit is wrong if the grid's width over that of the panel's view, or the object's over the grid's, exceeds this.
 _ANOTHER_SIZE = 5.0
@@ -132,7 +132,8 @@ def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) ->
 
 
 def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
-    """Returns the level of two columns: their largest mean over an eighth of the rows, the 90th percentile over frames."""
+    """Returns the level of two columns: in each frame their largest mean over an eighth of the rows, and over the frames the
+    90th percentile of these."""
     edge = p[:, :, columns]
     weight = valid[:, :, columns].astype(float)
     rows = max(1, edge.shape[1] // 8)

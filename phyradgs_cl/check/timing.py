@@ -38,9 +38,9 @@ def check_timing(scan: Scan) -> Finding:
     """Compares exposure, readout and table times with the frame times, and the angles with the speed.
 
     A line cannot open while it is open, a frame cannot be read while the one before is read, and a gantry has one angle at a
-    time. The value is the worst of these numbers, each over its limit: the exposure and the readout, over the shortest frame
-    period; 1 + the relative difference between the angle steps and the speed within the frames; a table's duration over the
-    scan's."""
+    time. The finding's value is the first of four numbers that exceeds its limit, else the one nearest to its limit. They
+    are the exposure and the readout over the shortest frame period, 1 + the relative difference between the angle steps and
+    the speed within the frames, and a table's duration over the scan's."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     if scan.frames < 2:
         return Finding(_TIMING, OK, 0.0, 1.0, "share", "one frame: nothing to compare")
@@ -149,7 +149,7 @@ def is_full_turn(scan: Scan) -> bool:
 
 
 def _needed_turn(scan: Scan) -> tuple[float, float, str]:
-    """Returns after how many degrees views repeat, how many degrees a volume needs, and these in words."""
+    """Returns after how many degrees views repeat, how many degrees a volume needs, and the latter in words."""
     geometry = scan.geometry
     if isinstance(geometry, ParallelGeometry):
         if has_opposite_views(scan):

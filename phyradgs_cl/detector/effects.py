@@ -25,7 +25,7 @@ NORMAL_FROM = 1e9
 COUNT_FLOOR = 0.5  # least count before the logarithm, which counts of 0 or less lack; no detector records so little
 _LARGEST_EXPONENT = 700.0  # largest exponent: float64 overflows at very negative line integrals, which ringing may cause
 _SPARK_HEIGHT = (0.3, 2.0)  # least and most light that a spark adds, relative to the light without object
-_SCATTER_REACH = 6.0  # the scatter kernel decays over the panel's longer side divided by this
+_SCATTER_REACH = 6.0  # the scatter kernel falls to 1/e over the panel's longer side divided by this
 _SCATTER_POWERS = (0.8, 1.5)  # scattered light is the product of these powers of the primary light and the line integral
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
 

@@ -77,8 +77,9 @@ def _interval_s(scan: Scan) -> tuple[float, float]:
 
 
 def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, int]:
-    """Returns a continuous trajectory through the projections' poses. Also returns how many projections at either end have
-    intervals that the trajectory does not wholly cover."""
+    """Returns a continuous trajectory through the projections' poses, each in the middle of its interval. Also returns how
+    many projections at either end have intervals that the trajectory does not wholly cover. first_s: when the first interval
+    begins. step_s: the length of an interval."""
     middle_s = first_s + (np.arange(scan.frames) + 0.5) * step_s
     own_s = scan.middle_times_s
     if isinstance(scan.trajectory, CircularOrbit):

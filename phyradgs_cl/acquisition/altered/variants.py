@@ -72,7 +72,7 @@ class AlteredTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class MappedTrajectory:
-    """Poses of ``base``, changed by a function ``change``: from a frame's number and poses (..., 12) to other poses."""
+    """Poses of ``base``, changed by a function ``change`` that takes a frame's number and its poses (..., 12)."""
 
     base: Trajectory
     change: Callable[[int, np.ndarray], np.ndarray]
@@ -160,7 +160,8 @@ def mirrored(scan: Scan, axis: str) -> Scan:
 def resized(scan: Scan, factor: float, keeps_axis: bool) -> Scan:
     """Returns a cone beam's scan with pixels ``factor`` times as large.
 
-    keeps_axis: True enlarges the panel about the central ray, as if distances had changed. False: about its middle."""
+    keeps_axis: True enlarges the panel about the central ray, as if distances had changed. False enlarges it about its
+    middle."""
     trajectory = altered_trajectory(scan)
     rows, columns = trajectory.panel
 

@@ -63,7 +63,7 @@ def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> 
     """Reads gantry angles (P,) in rad of frames in ``used``, bool (F,). name: rotation_angle or rotation_angle_end."""
     address = f"{entry}/{schema.SAMPLE}/{name}"
     angle_rad = h5.read_array(source, address, used.shape, h5.ANGLE)[used]
-    # an end angle that does not say whether gantry or sample turns means the same as the start angle
+    # Whether gantry or sample turns, an end angle without @rotates takes from the start angle.
     start = f"{entry}/{schema.SAMPLE}/rotation_angle"
     return angle_rad * _sense(source, address, absent=_sense(source, start, absent=-1.0))
 
@@ -175,7 +175,8 @@ def _read_table_times(source: Hdf5Source, address: str) -> np.ndarray:
 
 
 def _sense(source: Hdf5Source, address: str, absent: float) -> float:
-    """Returns the sign that makes an angle the gantry's: +1 if @rotates is gantry, −1 if sample, ``absent`` if missing."""
+    """Returns the factor that turns a stored angle into the gantry's: +1 if @rotates is gantry, −1 if sample. ``absent`` is
+    returned if the attribute is missing."""
     rotates = h5.read_attribute(source, address, "rotates")
     if rotates is None:
         return absent
