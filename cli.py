@@ -1,4 +1,4 @@
-"""The command line with all commands. An error prints one line on stderr; its kind gives the exit status."""
+"""The command line with all commands. An error prints one line on stderr, and the kind of error gives the exit status."""
 
 import importlib
 from collections import UserDict
@@ -15,7 +15,7 @@ from phyradgs_cl.removed import refuse_removed
 
 _CLICK_ERROR: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 HELP = {"help_option_names": ["-h", "--help"]}
-# Command NAME: the module in commands/ that defines NAME_command, and the help in the list of commands.
+# By command NAME: the module of commands/ that defines NAME_command, and the text about the command in the list of commands.
 COMMANDS = {
     "simulate": ("simulate", "Simulate a fly-scan of a phantom or a volume."),
     "import": ("import_scan", "Turn the scan of another program into a scan file."),
@@ -35,11 +35,11 @@ COMMANDS = {
 
 
 class Interrupted(Exception):
-    """Stands for Ctrl-C. Typer would end the program at KeyboardInterrupt, without a message."""
+    """Replaces the KeyboardInterrupt of Ctrl-C, at which Typer would end the program without a message."""
 
 
 class Loaded(UserDict[str, Any]):
-    """Typer's commands by name. Each is imported only when it is used, since imports take time."""
+    """Maps names of ``COMMANDS`` to Typer commands. Imports a command's module at look-up, because imports take time."""
 
     def __getitem__(self, name: str) -> Any:
         module_name, summary = COMMANDS[name]
@@ -101,7 +101,7 @@ def root(
 
 
 def run(arguments: list[str], program: typer.Typer = app) -> int:
-    """Runs one command of ``program`` and returns the exit status. Prints errors instead of raising them."""
+    """Runs one command of ``program`` and returns the exit status. Prints every expected error instead of raising it."""
     if not takes_part(arguments):
         return 0
     with signals.answer_signals():
@@ -113,7 +113,7 @@ def run(arguments: list[str], program: typer.Typer = app) -> int:
             return complain(str(error), error.exit_code)
         except _CLICK_ERROR as error:
             return complain(usage_text(error, arguments))
-        except OSError as error:  # from a call that no function here handles
+        except OSError as error:  # no function has turned it into a PhyradgsError
             text = f"{error.filename or 'operating system'}: {error.strerror or error}"
             return complain(text, OutputError.exit_code if error.errno in NO_SPACE else 2)
         except SystemExit:  # Typer raises it if the reader of its help closes the pipe, as `| head` does

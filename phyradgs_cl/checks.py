@@ -74,7 +74,8 @@ def fields_within(named: str | Callable[[str], str], options: object) -> None:
 
 
 class Checked:
-    """Base of option dataclasses: checks its fields when it is made. PREFIX: the text before a field's name in messages."""
+    """Base of option dataclasses, which checks the fields of a new instance as ``fields_within`` does. PREFIX: the text
+    before a field's name in messages."""
 
     PREFIX = ""
 

@@ -79,7 +79,8 @@ def check_device(device: str | None = None, **launch_shape: bool | int) -> Verdi
 
 
 def _problem(check: Callable[[Runtime], Iterator[Comparison]], rt: Runtime, agreeing: set[str]) -> str:
-    """Returns the first problem in words, or "" if there is none. Adds kernels that ran without one to ``agreeing``."""
+    """Returns the first problem of ``check`` in words, or "" if there is none. Adds to ``agreeing`` the kernels that had run
+    by the last comparison before it."""
     try:
         for computed, expected, limit in check(rt):
             off = float(np.abs(np.asarray(computed, np.float64) - expected).max() / (np.abs(expected).max() or 1.0))
@@ -232,7 +233,7 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
     yield rt.download(operator.adjoint(rt.upload(frames))), twins.ray_volume(shares, GRID, finer), VALUE
     intensity = operators.IntensityOperator(rt, GRID, SHAPE, [table])
     mean, averaged = (twins.ray_frame(volume, GRID, table, SHAPE, model) for model in ("log", "intensity"))
-    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # at a volume of zeros it averages line integrals
+    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # averages line integrals until ``expected`` is called
     yield rt.download(intensity.expected(on_device))[0], averaged, VALUE
     found = rt.download(intensity.adjoint(rt.upload(frames)))
     yield found, twins.intensity_volume(frames[0], volume, GRID, table), VALUE
@@ -353,7 +354,7 @@ CHECKS = (
     _numbers, _algebra, _binning, _splats, _splats_of_moving_objects, _layered_splats, _plain_splats, _voxels, _rays, _warps,
     _backprojections, _moving_backprojections, _image_terms, _variation, _optimiser,
 )  # fmt: skip
-"""In this order because a kernel that has agreed is not suspected in later checks, which also use it."""
+"""All checks. A kernel that has agreed is not suspected in later checks, so the kernels that others rely on come first."""
 
 
 def _noise(shape: tuple[int, ...], seed: int) -> np.ndarray:

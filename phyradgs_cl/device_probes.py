@@ -28,8 +28,8 @@ def pair_error(rt: Runtime) -> float:
 
 
 def carried(rt: Runtime) -> tuple[bool, bool, bool]:
-    """Returns three tests of the device: whether local memory keeps ints, whether it keeps ints that are stored as floats of
-    the same bits, and whether subnormal floats are kept."""
+    """Returns the results of three tests of the device: whether local memory keeps ints, whether it keeps ints stored as
+    floats of the same bits, and whether subnormal floats are not flushed to 0."""
     numbers, tiny = np.arange(-8, _ITEMS - 8, dtype=np.int32), np.float32(1e-40)
     as_ints, as_floats, twice = rt.zeros(_ITEMS, np.int32), rt.zeros(_ITEMS), rt.zeros(_ITEMS, np.int32)
     kernel = rt.kernel("probes", "probe_numbers", LANES=1, FP64=0)

@@ -24,7 +24,7 @@ from phyradgs_cl.runtime import Runtime
 _SPLAT_TRIALS = (20, 200)  # iterations of the two short runs (trials) of methods with Gaussians
 _TRIALS = (1, 3)  # iterations of the two short runs of other methods, unless their options have ``TRIALS``
 _LEAST_DIFFERENCE_S = 0.3  # below this difference of the two times, timing noise matters: the second trial is prolonged
-_LONGEST_TRIAL = 200  # a trial of this many iterations is not prolonged, or estimating would take too long
+_LONGEST_TRIAL = 200  # a trial of this many iterations is not prolonged, because estimating would take too long
 _FEWEST_BETWEEN = 5  # least number of iterations between rounds of density control in a trial
 
 
@@ -90,7 +90,8 @@ class _Trials:
         self.scan, self.plan, self.rt = scan, plan, rt
 
     def run(self, iterations: int | None) -> float:
-        """Runs that many iterations, or the whole method for None. Returns the seconds that the run took."""
+        """Runs the plan with the given number of ``iterations``; None runs it as a whole. Returns the seconds that it
+        took."""
         options = self.plan.options
         plan = self.plan if iterations is None else replace(self.plan, options=shortened(options, iterations))
         self.rt.reset_peak()
@@ -100,7 +101,8 @@ class _Trials:
         return time.perf_counter() - started
 
     def extrapolated(self, few: int, more: int, total: int) -> tuple[float, float]:
-        """Returns the seconds of ``total`` iterations and of a single one, extrapolated from ``few`` and ``more``."""
+        """Returns the seconds of a run of ``total`` iterations, and those of one iteration. They are extrapolated from runs
+        of ``few`` and ``more`` iterations; the longer run is prolonged if the two differ by less than 0.3 s."""
         first_s = self.run(few) - self._control_s
         again_s = self.run(few) - self._control_s  # the first run also built the kernels, so it took longer
         more = min(more, total)
@@ -118,8 +120,8 @@ class _Trials:
         return float(self.result.facts.get("density_control_seconds", 0.0))
 
     def _rounds_due(self, total: int) -> float:
-        """Returns how many times as many rounds of density control a run of ``total`` iterations has as the last trial; 0 if
-        that had none."""
+        """Returns the number of rounds of density control in a run of ``total`` iterations, over that in the last trial; 0
+        if the trial had none."""
         rounds = self.result.facts.get("density_control_rounds", 0)
         return sum(self.plan.options.control.is_due(i, total) for i in range(1, total + 1)) / rounds if rounds else 0.0
 
@@ -136,7 +138,8 @@ def shortened(options: Any, iterations: int) -> Any:
 
 
 def seconds_around(path: Path, scan: Scan, result: Reconstruction) -> float:
-    """Times what ``reconstruct`` does besides the method: it hashes the scan, compares, and writes the volume."""
+    """Returns the seconds for what ``reconstruct`` does besides the method: it hashes the scan, compares the volume with the
+    truth, if there is one, and writes it."""
     started = time.perf_counter()
     sha256_of(path)
     if scan.reference is not None and result.volume.shape == scan.reference.shape:

@@ -60,7 +60,7 @@ def answer_signals(*, takes_default: bool = True) -> Iterator[StopFlag]:
     replaced = {n: usual for n in _SIGNALS if (usual := signal.getsignal(n)) not in left_alone}
     for number in replaced:
         signal.signal(number, flag)
-        if hasattr(signal, "siginterrupt"):  # an interrupted read makes a driver's compiler fail
+        if hasattr(signal, "siginterrupt"):  # else a signal interrupts reads, and a driver's compiler fails
             signal.siginterrupt(number, False)
     try:
         yield flag

@@ -70,8 +70,9 @@ def repr_of_changes(thing: Any) -> str:
 
 
 def value_text(value: Any, digits: int = 6) -> str:
-    """Returns a value for a reader: numbers with ``digits`` significant digits, tables as "name value, name value". What is
-    None in a table is left out, a table in it gets parentheses, and a long list is told by its count and ends."""
+    """Returns a value for a reader: numbers with ``digits`` significant digits, tables as "name value, name value". Entries
+    of a table that are None are left out, and tables in it get parentheses. A list of more than 8 is told by its count and
+    ends."""
     match value:
         case float():
             return f"{value:.{digits}g}"
@@ -130,8 +131,8 @@ def without_warnings() -> AbstractContextManager[None]:
 
 @contextmanager
 def _filtered(make_filter: Callable[[], Callable[[logging.LogRecord], bool]]) -> Iterator[None]:
-    """Puts a filter before those of every handler of log records while the body runs. It drops the records for which it
-    returns False, before an outer ``each_warning_once`` sees them."""
+    """While the body runs, puts a new filter before the other filters of every log handler. The new filter drops the records
+    for which it returns False before an outer ``each_warning_once`` sees them."""
     handlers = [*logging.getLogger(__package__).handlers, *logging.getLogger().handlers, logging.lastResort]
     filters = [(handler, make_filter()) for handler in handlers if handler is not None]
     for handler, one in filters:

@@ -16,14 +16,15 @@ _SAME_TIME = 1e-6  # times that differ by less than this fraction of a cell's du
 _NOTHING = 1e-9  # a cell's fraction of a line's exposure below this is a rounding error, and becomes 0
 _INSTANT = 1e-9  # a line's exposure shorter than this fraction of the frame's lit span counts as a single moment
 _OVERHANG = 0.1  # a line leaves out a segment of time if its exposure covers at most this fraction of the segment
-_TURN_SAMPLES = 32  # number of equal intervals of a frame: the highest mean speed in one counts as the gantry's highest
+_TURN_SAMPLES = 32  # equal intervals of a frame's lit span; the highest mean speed in one counts as the gantry's highest
 _TURN_FACTOR = 0.32  # measured relative RMS error of a frame, per squared radian that the gantry turns in a segment
 _HARMLESS_PEAK = 4.0  # up to this line integral, averaging intensities needs no more segments than averaging line integrals
 _MOST_SEGMENTS = 1000  # most segments that ``segments_for`` chooses for a frame
 
 
 Served = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Indices of the cells that serve any line, their [first, stop) lines, and the order that sorts them by first line."""
+"""Four arrays about the cells that serve any line: their indices, their first lines, the lines after their last ones, and
+the order that sorts the cells by first line."""
 
 
 def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
@@ -63,7 +64,8 @@ def centre_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int, strips: int,
     sub_intervals: int
 ) -> TimeCells:
-    """Returns the cells of ``micro_view_cells``. Their ``conic_pose`` is the pose of ``static_cells``."""
+    """Returns the cells of ``micro_view_cells`` with a ``conic_pose``, at which the shapes of Gaussians on the panel are
+    computed: the pose of ``static_cells``."""
     table = micro_view_cells(trajectory, shutter, frame, start_s, lines, strips, sub_intervals)
     return replace(table, conic_pose=static_cells(trajectory, shutter, frame, start_s, lines).pose[0])
 
@@ -111,10 +113,10 @@ def common_time_cells(
 
 @lru_cache(maxsize=8)  # the lines' windows are the same in all frames of a scan
 def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray, Served]:
-    """Returns the cells' edges (K + 1,) in s, the part (K, lines) of each line's window in each cell, and ``_served_lines``.
+    """Returns the cells' edges (K + 1,) in s, the fraction (K, lines) of each line's window in each cell, and ``Served``.
 
-    windows: the bytes of the windows (lines, 2) in s after a frame's start; bytes can be a key of the cache. The returned
-    arrays are cached too: do not write to them."""
+    windows: the windows (lines, 2) in s after a frame's start, as bytes, because the cache takes no arrays as keys. The
+    returned arrays stay in the cache: do not write to them."""
     windows_s = np.frombuffer(windows, np.float64).reshape(-1, 2)
     first_s, last_s = float(windows_s.min()), float(windows_s.max())
     step_s = float(np.ptp(windows_s, axis=1).max()) / samples
@@ -124,7 +126,7 @@ def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _served_lines(served: np.ndarray) -> Served:
-    """Returns ``Served``: the cells that serve any line, their lines and their order. served: bool (K, lines)."""
+    """Returns the four arrays of ``Served``. served: whether each of K cells serves each line, bool (K, lines)."""
     used = np.flatnonzero(served.any(axis=1))
     line_start = served[used].argmax(axis=1)
     line_stop = served.shape[1] - served[used, ::-1].argmax(axis=1)
@@ -132,7 +134,8 @@ def _served_lines(served: np.ndarray) -> Served:
 
 
 def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np.ndarray:
-    """Returns the middles (K,) of a frame's cells in s on the scan's clock. edges_s (K + 1,): after the frame's start."""
+    """Returns the middles (K,) of a frame's cells in s on the scan's clock. edges_s (K + 1,): the cells' edges in s after
+    the frame's start."""
     step_s = edges_s[1] - edges_s[0]
     start_s, origin_s = float(frame_start_s[frame]), float(frame_start_s[0])
     cells = (start_s - origin_s) / step_s
@@ -185,7 +188,7 @@ def exact_cells(
 def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     """Returns ``TimeCells.line_times`` (K, 3, lines), for windows (lines, 2) in s and edges (K + 1,) in s of equal segments.
 
-    A window that covers at most ``_OVERHANG`` of the segment at its end counts as outside of it, so that fewer Gaussians
+    A window leaves out its first or last segment if it covers at most ``_OVERHANG`` of that segment, so that fewer Gaussians
     are projected."""
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
@@ -202,9 +205,10 @@ def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
 
 
 def _segments_of_lines(opens: np.ndarray, closes: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the first and last segment (lines,) of every line's window. Times are in units of a segment's length.
+    """Returns the indices (lines,) of the first and last segment of every line's window, as ``_line_times`` counts them.
 
-    A segment at either end is left out if the window covers at most ``_OVERHANG`` of it."""
+    opens, closes (lines,): the ends of the windows, in lengths of a segment after the frame's first light. count: the number
+    of segments."""
     first = np.clip(np.floor(opens), 0, count - 1)
     last = np.clip(np.ceil(closes) - 1, first, count - 1)
     first = np.where((first < last) & (first + 1 - opens <= _OVERHANG), first + 1, first)
@@ -218,11 +222,11 @@ def segments_for(
 ) -> int:
     """Returns how many segments of time, at most 1000, keep a frame's relative RMS error below ``time_error``.
 
-    In a segment, Gaussians move along straight lines and keep their shape. The error is ``_TURN_FACTOR`` times the square
-    of the gantry's turn in a segment, as benchmarks/time_exact.py measured for Gaussians of 0.5 to 4 % of the half-width.
-    intensity_peak: the largest line integral if the detector averages intensities, else 0. Averaging intensities adds an
-    error of half the variance of the line integrals in a segment. Up to a peak of 4 this added error is the smaller one.
-    Larger peaks need more segments."""
+    In a segment, Gaussians move along straight lines and keep their shape. The error is ``_TURN_FACTOR`` times the square of
+    the gantry's turn in a segment, as benchmarks/time_exact.py measured for Gaussians of 0.5 to 4 % of the grid's
+    half-width. intensity_peak: the largest line integral if the detector averages intensities, else 0. Averaging intensities
+    adds an error of half the variance of the line integrals in a segment. Up to a peak of 4 this added error is the smaller
+    one. Larger peaks need more segments."""
     first_s, last_s = shutter.lit_span_s
     pose = trajectory.pose(frame, start_s + np.linspace(first_s, last_s, _TURN_SAMPLES + 1))
     fastest_rad = float(np.max(_turns_rad(pose))) * _TURN_SAMPLES

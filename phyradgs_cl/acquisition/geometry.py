@@ -19,7 +19,8 @@ POSE_LENGTH = 12
 # Largest distance of the source from the axis, in voxels. At this distance float32 displaces rays by 6 % of a voxel, at 1e7
 # voxels by half a voxel.
 _MOST_VOXELS_AWAY = 1e6
-# Least sin² of a central ray's angle to z. A steeper ray counts as having it: where that ray passes the axis is uncertain.
+# Least sin² of the angle between a central ray and z. A steeper ray counts as if it had this angle, because the place where
+# it passes the axis is uncertain.
 _STEEP = 1e-2
 
 
@@ -162,7 +163,7 @@ def pixel_centres(pose: np.ndarray, detector_shape: tuple[int, int]) -> np.ndarr
 
 
 def plain_geometry(pose: np.ndarray, panel: tuple[int, int], is_parallel: bool = False) -> Geometry:
-    """Returns the circular geometry with the mean distances and offsets of poses (F, 12).
+    """Returns the circular geometry with the mean distances and offsets of poses (F, 12), for a panel (rows, columns).
 
     The distance to the detector is measured at right angles to the panel. The offset runs from the point of the panel's
     plane nearest to the source (in a parallel beam, to the origin) to the panel's middle."""
@@ -244,7 +245,7 @@ def _travel_mm(poses: np.ndarray, geometry: Geometry) -> tuple[float, float]:
 
 
 def check_distances(geometry: Geometry, grid: Grid) -> None:
-    """Raises InputError for a source so far away that float32 misplaces its rays."""
+    """Raises InputError for a source more than 1e6 voxels from the axis, at which float32 misplaces rays."""
     if isinstance(geometry, ParallelGeometry):
         return
     source_mm, voxel_mm = geometry.source_to_axis_mm, min(grid.voxel_size_mm)
@@ -285,8 +286,8 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_par
 
 
 def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
-    """Returns how far the panel of a pose (12,) is behind the middle of ``grid``, in mm. If this is less than half the
-    grid's width, the panel stands inside the grid, and rays end there."""
+    """Returns how far the panel of a pose (12,) is behind the middle of ``grid``, in mm; below 0 in front of it. If the
+    distance is less than half the grid's width, the panel stands inside the grid, and rays end there."""
     source, first, step_u, step_v = pose.reshape(4, 3)
     away = np.cross(step_u, step_v)
     away = away * np.sign(away @ (first - source)) / np.linalg.norm(away)
@@ -294,8 +295,8 @@ def panel_behind_mm(grid: Grid, pose: np.ndarray) -> float:
 
 
 def cuts(grid: Grid, whole: Grid, geometry: Geometry) -> bool:
-    """Returns whether ``grid`` leaves out, on any side, more than one of its voxels of the part of ``whole`` that lies in
-    the field of view."""
+    """Returns whether ``grid`` lacks a part of the field of view that ``whole`` contains. A layer of up to one voxel of
+    ``grid`` on a side does not count."""
     low_mm, high_mm = np.clip(whole.box_mm.T, *field_of_view_mm(geometry).T)
     begin_mm, end_mm = grid.box_mm.T
     return bool(np.any((begin_mm - low_mm > grid.voxel_size_mm) | (high_mm - end_mm > grid.voxel_size_mm)))

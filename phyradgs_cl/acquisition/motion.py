@@ -27,7 +27,7 @@ _USUAL_TIMES = 6  # most times at which ``PerRow`` samples an exposure, unless t
 _MOST_TIMES = 100  # most times at which ``PerRow`` samples an exposure, however fast the motion
 _FINE_STEP_VOXELS = 0.3  # most voxels that the volume's rim travels from one time of ``PerRow`` to the next
 _OBJECT_STEP_VOXELS = 0.7  # most voxels that an object's fastest part travels between two times; other parts travel less
-_COARSE_STEP_VOXELS = 3.6  # most voxels that rim or object travels between two times where _USUAL_TIMES are too few
+_COARSE_STEP_VOXELS = 3.6  # most voxels that rim or object travels between two times if _USUAL_TIMES are too few
 _SUB_INTERVALS = "Sub-intervals N of an exposure; for phyradgs means micro-views."
 _WEIGHT_TOLERANCE = 1e-3  # largest difference from 1 of the sum of a line's weights in a user-defined model
 
@@ -135,7 +135,8 @@ class Centres(MicroViews):
     name: str = field(default="centres", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """Returns the ``TimeCells`` of one frame: strips × sub-intervals cells with one ``conic_pose``."""
+        """Returns the ``TimeCells`` of one frame: strips × sub-intervals cells with the ``conic_pose`` that all of them
+        share."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         return cells.centre_cells(*_place(scan, frame), self.strips, self.sub_intervals)
@@ -223,7 +224,7 @@ class Exact(_Model):
 
     def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
         """Returns the ``TimeCells`` of one frame, one per segment. intensity_peak: the largest line integral if the detector
-        averages intensities, else 0."""
+        averages intensities, else 0. More segments are needed above 4."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = _place(scan, frame)
@@ -273,8 +274,8 @@ def motion_in_words(facts: Mapping[str, object]) -> str:
 
 
 def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
-    """Returns the model from the result of ``motion_facts``, or None for a user-defined one. Raises InputError or TypeError
-    for values out of range or of a wrong type."""
+    """Returns the model from the result of ``motion_facts``, or None for a user-defined model. Raises InputError or
+    TypeError for values out of range or of a wrong type."""
     for model in MODELS:
         keys = [f.name for f in fields(model) if f.init]
         if model.name == facts.get("name") and all(key in facts for key in keys):

@@ -23,9 +23,9 @@ _LEAST_DISTANCE_MM = 10.0  # a panel nearer to the source than this is not real,
 _WRONG_UNIT = 100.0  # a readout longer than this many frame times is refused: ms given as s make it some hundreds
 _SHORT_READOUT_S = 0.5e-3  # a shorter readout of at least _MANY_LINES lines causes a warning: real panels take some ms
 _MANY_LINES = 100
-_SLOW_FPS = 2.0  # a lower frame rate causes a warning if the gantry turns more than _LARGE_STEP_DEG between frames
+_SLOW_FPS = 2.0  # a lower frame rate causes a warning if the gantry turns by more than _LARGE_STEP_DEG between frames
 _LARGE_STEP_DEG = 10.0
-_LEAST_LIT = 0.25  # and if exposure and readout fill less than this fraction of the time from frame to frame
+_LEAST_LIT = 0.25  # a low frame rate causes a warning only if exposure and readout fill less of a frame's time than this
 _TIMES = 17  # number of angles sampled in an exposure: no gantry makes half a turn from one to the next
 _SLACK = 1e-3  # relative tolerance, because stated times and angles are rounded
 _MANY_FRAMES = 10  # fewer frames may lie within a few degrees on purpose, so they cause no warning about radians
@@ -84,8 +84,8 @@ def _frame_time_s(scan: "Scan") -> float:
 
 
 def _source_angle_rad(scan: "Scan", first_s: float, last_s: float) -> np.ndarray:
-    """Returns the source's angle (F, T) in rad about the axis, without jumps by a turn. The T times are from ``first_s`` to
-    ``last_s`` after each frame's start."""
+    """Returns the source's angles (F, 17) in rad about the axis, without jumps by a turn, at even times from ``first_s`` to
+    ``last_s`` after each frame's start. In a parallel beam they are the angles against the direction of the rays."""
     delay_s = np.linspace(first_s, last_s, _TIMES)
     poses = np.stack([scan.trajectory.pose(f, t + delay_s) for f, t in enumerate(scan.frame_start_s)])
     source = towards_source(poses, scan.is_parallel)
@@ -175,7 +175,8 @@ def _check_opaque(scan: "Scan", subject: str) -> None:
 
 
 def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:
-    """Returns whether the angles (F,) of many frames lie within 2π degrees; then warns that they may be radians."""
+    """Returns whether the angles (F,) of at least 10 frames lie within 2π degrees but differ. Warns then that they may be in
+    radians."""
     span_deg = float(np.ptp(angle_deg))
     looks_so = len(angle_deg) >= _MANY_FRAMES and 0 < span_deg <= 2 * np.pi * (1 + _SLACK)
     if looks_so:
@@ -230,8 +231,8 @@ def _longer_than_a_frame(subject: str, stated: str, time_s: float, frame_s: floa
 
 
 def _warn_of_slow_frames(scan: "Scan", angle_deg: np.ndarray, subject: str) -> None:
-    """Warns of a low frame rate if the gantry turns far from frame to frame, most of the time in the dark. angle_deg (F,):
-    the frames' angles."""
+    """Warns of fewer than 2 frames per second if the gantry turns by more than 10° between frames and lines are open for
+    less than a quarter of the time. angle_deg (F,): the frames' angles."""
     frame_s, step_deg = _frame_time_s(scan), float(np.median(np.abs(np.diff(angle_deg))))
     is_dark = scan.shutter.span_s < _LEAST_LIT * frame_s
     if is_dark and _SLOW_FPS * frame_s > 1 and step_deg > _LARGE_STEP_DEG:

@@ -98,8 +98,8 @@ class Protocol:
     ) -> CircularOrbit:
         """Returns the trajectory. A stop-and-shoot gantry rests where the same fly-scan would be in the middle of a frame.
 
-        jitter_deg: the standard deviation of random angles, about one per frame and linear in between. They are added to a
-        fly-scan's angles, and the encoder records them. Raises InputError for jitter without an arc or without ``rng``."""
+        jitter_deg: the standard deviation of ``views`` + 1 random angles at even times, linear in between. They are added to
+        a fly-scan's angles, and the encoder records them. Raises InputError for jitter without an arc or without ``rng``."""
         first = self.angle_start_rad()
         arc_rad = self._arc_rad
         if not self.is_fly:
@@ -135,7 +135,8 @@ PROTOCOLS = {
 
 
 def make_protocol(name: str, **changes: Any) -> Protocol:
-    """Returns the protocol ``name`` with ``changes`` to its fields, None ignored. Raises InputError for an unknown name."""
+    """Returns the protocol ``name`` with ``changes`` to its fields; a change to None is ignored. Raises InputError for an
+    unknown name, and for values out of range."""
     if name not in PROTOCOLS:
         raise InputError("protocol", repr(name), f"one of {', '.join(PROTOCOLS)}")
     return replace(PROTOCOLS[name], **{k: v for k, v in changes.items() if v is not None})

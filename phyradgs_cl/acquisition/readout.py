@@ -9,7 +9,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.errors import InputError
 
-# (readout axis, direction) for each side of the panel, seen from the source, that may be read first.
+# By the side of the panel that is read first, seen from the source: the readout axis and direction.
 FIRST_LINES = {"bottom": ("rows", 1), "top": ("rows", -1), "left": ("columns", 1), "right": ("columns", -1)}
 SIDES = tuple(FIRST_LINES)
 Named = Callable[[str], str]
@@ -31,11 +31,11 @@ class Readout:
         return (rows, columns) if self.axis == "rows" else (columns, rows)
 
     def frames(self, frames: np.ndarray) -> np.ndarray:
-        """Returns a view of frames (..., rows, columns) as (..., lines, width). Also converts them back."""
+        """Returns a view of frames (..., rows, columns) as (..., lines, width). A second call converts them back."""
         return frames if self.axis == "rows" else frames.swapaxes(-1, -2)
 
     def poses(self, pose: np.ndarray) -> np.ndarray:
-        """Returns poses (..., 12) for frames in the order (lines, width). Also converts them back."""
+        """Returns poses (..., 12) for frames in the order (lines, width). A second call converts them back."""
         return pose if self.axis == "rows" else transpose_pose(pose)
 
     def spread(self, by_line: np.ndarray) -> np.ndarray:

@@ -61,7 +61,8 @@ class Scan:
       still contain it.
     - saturation: None if raw counts were not examined. title and provenance are stored in files.
 
-    Raises InputError for shapes that do not fit each other, and for line integrals that are not finite."""
+    Raises InputError for fields of a wrong kind or out of range, for shapes that do not fit each other, and for line
+    integrals of unmasked pixels that are not finite."""
 
     projections: np.ndarray
     geometry: "Geometry"
@@ -81,7 +82,7 @@ class Scan:
     gating: Gating | None = None
     metal: Metal | None = None
     _checked: np.ndarray | None = field(default=None, kw_only=True)
-    """Projections already known to be finite: ``dataclasses.replace`` need not check the same array again."""
+    """Projections already known to be finite. ``dataclasses.replace`` passes them on, so the same array is checked once."""
 
     def __post_init__(self) -> None:
         self._check_kinds()
@@ -217,7 +218,8 @@ class Scan:
             self.trajectory.pose(frame, np.array([start_s, start_s + last_s]))
 
     def warn_of_near_panel(self) -> None:
-        """Warns if the panel of a cone beam stands inside the grid as the first frame opens: no ray sees the part behind."""
+        """Warns if, as the first frame opens, the panel of a cone beam stands inside the grid, at its middle or behind. No
+        ray sees the part of the grid behind the panel."""
         if self.is_parallel:  # parallel rays are not taken to end at the panel
             return
         (pose,) = self.trajectory.pose(0, np.array(self.frame_start_s[:1]))

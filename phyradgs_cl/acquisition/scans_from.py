@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 _MOST_RAD = 20 * np.pi  # angles in rad that span more than these ten turns are most likely degrees
-_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # other fields of ``Scan``
+_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # fields of ``Scan`` taken by name
 
 
 def from_poses(
@@ -121,7 +121,7 @@ def check_others(others: Iterable[str], arguments: Iterable[str] = ()) -> None:
 
 
 def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = None) -> None:
-    """Raises InputError for frames that look like raw counts: integers, or many unmasked values above 50."""
+    """Raises InputError for frames that look like raw counts: integers, or more than 1 % of unmasked values above 50."""
     if frames.dtype.kind in "iu":
         raise InputError("frames", f"whole numbers ({frames.dtype}) without flats", "line integrals", remedy)
     opaque, used = frames > OPAQUE, np.ones(frames.shape, bool)
@@ -134,8 +134,8 @@ def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = N
 
 
 def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as ``line_integrals`` does. Raises InputError also for frames that look like raw counts, because nobody
-    stated what quantity they are."""
+    """Returns frames as ``line_integrals`` does. Nobody stated what quantity they are, so frames that look like raw counts
+    raise InputError too."""
     values = checks.real_array("frames", frames)
     check_not_counts(values, "give −ln(counts / flats)", mask)
     return line_integrals(values, mask)

@@ -50,7 +50,9 @@ class Shutter:
             raise InputError("pulse_s", found, expected, "correct the pulse, or leave it out")
 
     def check_resolved(self, frame_start_s: np.ndarray, subject: str = "exposure_s") -> None:
-        """Raises InputError if the exposure is too short for the float64 precision of the frames' opening times (F,)."""
+        """Raises InputError for an exposure above 0 that is less than 1000 float64 roundings of the latest time in the scan.
+
+        frame_start_s (F,): when frames open, in s. subject: what the message names."""
         latest_s = float(np.max(np.abs(frame_start_s), initial=0.0)) + self.span_s
         shortest_s = _STEPS * float(np.spacing(latest_s))
         if 0 < self.exposure_s < shortest_s:
@@ -121,8 +123,8 @@ class Shutter:
         return np.where(seen_s > _DARK * longest_s, seen_s / longest_s, 0.0)
 
     def strip_ranges(self, lines: int, strips: int) -> list[tuple[int, int]]:
-        """Divides lines into ``strips``, and returns the lines [start, stop) of each, in reading order. Strips may be
-        empty."""
+        """Divides lines into ``strips`` that differ by at most one line, and returns the lines [start, stop) of each, in
+        reading order. If there are more strips than lines, some are empty."""
         edges = [checks.ceil_div(strip * lines, strips) for strip in range(strips + 1)]
         ranges = list(zip(edges[:-1], edges[1:], strict=True))
         if self.direction < 0:

@@ -23,7 +23,7 @@ def check_has_slabs(scan: Scan, subject: str, found: str) -> None:
 
 
 def has_slabs(scan: Scan) -> bool:
-    """Returns whether only few detector rows see a slice, as in a parallel beam that turns about z."""
+    """Returns whether few detector rows suffice for a slice: true for a parallel beam on a circular orbit about z."""
     return isinstance(scan.geometry, ParallelGeometry) and isinstance(scan.trajectory, CircularOrbit)
 
 
@@ -59,8 +59,8 @@ def slab(scan: Scan, first: int, stop: int) -> Scan:
 
 
 def slices_of(scan: Scan, first: int, stop: int) -> slice:
-    """Returns the slices of the scan's grid whose centres lie on detector rows [first, stop). Slices beyond the panel belong
-    to its first or last row, so that the slabs of all rows together have every slice."""
+    """Returns the slices of the scan's grid whose centres lie at the height of detector rows [first, stop); they may be
+    none. Slices beyond the panel belong to its first or last row, so that slabs of all rows together have every slice."""
     rows, pitch_mm = scan.geometry.detector_shape[0], scan.geometry.pixel_size_mm[0]
     row = (scan.grid.axes_mm()[0] - scan.geometry.detector_offset_mm[0]) / pitch_mm + (rows - 1) / 2
     number = np.clip(np.floor(row + 0.5), 0, rows - 1)

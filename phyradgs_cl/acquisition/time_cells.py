@@ -27,8 +27,9 @@ class TimeCells:
       lies in the cell. None means 1.
     - end_poses (C, 2, 12) in mm, end_times_s (C, 2) in s: at both ends of moving cells, whose ``weight`` is 1; None for
       still cells. The times are needed if the object moves.
-    - line_times (C, 3, lines): for moving cells, three numbers about the part of each line's exposure in the cell: the
-      part's middle after the cell's mid-time and half-length, both over the cell's length, and its fraction of the exposure.
+    - line_times (C, 3, lines): for moving cells, three numbers about the part of each line's exposure in the cell. They are
+      the part's middle minus the cell's mid-time and the part's half-length, both over the cell's length, and the part's
+      fraction of the exposure.
     - is_parallel: poses begin with the direction of parallel rays.
     - conic_pose (12,): for Gaussians only. Cells then move only the Gaussians' centres on the panel; their shapes and
       densities there are computed for this pose.

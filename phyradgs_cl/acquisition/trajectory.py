@@ -38,7 +38,8 @@ class Trajectory(Protocol):
 
 
 def is_parallel(trajectory: Trajectory) -> bool:
-    """Returns whether the beam is parallel. A user's own trajectory states it by an attribute of this name."""
+    """Returns whether the beam is parallel. A trajectory states it by its attribute ``is_parallel``; without it the beam is
+    a cone."""
     return bool(getattr(trajectory, "is_parallel", False))
 
 
@@ -64,7 +65,7 @@ class UserTrajectory:
 
 
 def checked(trajectory: Trajectory) -> Trajectory:
-    """Returns a trajectory of the package unchanged, and one of the user's as ``UserTrajectory``."""
+    """Returns a trajectory of this package unchanged. Wraps a user-defined one in ``UserTrajectory``."""
     is_own = type(trajectory).__module__.startswith("phyradgs_cl.")
     return trajectory if is_own else UserTrajectory(trajectory)
 
@@ -110,8 +111,8 @@ class SpeedRamp(ConstantSpeed):
 class EncoderTable:
     """Measured θ(t): ``angle_rad_table`` (T,) in rad at ``time_s`` (T,) in s, linear in between.
 
-    Jumps by a whole turn, as an encoder makes at 360°, are removed, unless most steps between samples exceed a quarter
-    turn. Raises InputError for times that do not increase, and for times beyond the table."""
+    Jumps by a whole turn, as an encoder makes at 360°, are removed, unless at least half of the steps between samples are a
+    quarter turn or more. Raises InputError for times that do not increase, and for times beyond the table."""
 
     time_s: np.ndarray
     angle_rad_table: "NDArray[np.float64]"
@@ -138,7 +139,8 @@ class FrameSweeps:
 
     The speed continues through the readout. Equal angles mean a gantry at rest (stop-and-shoot). ``start_s`` (F,): when
     each frame's first line opens, in s. ``exposure_s``: the exposure of a line. ``angle_start_rad``, ``angle_end_rad``
-    (F,) in rad. A jump by a turn between the two angles of a frame, as from 355° to 4°, is removed.
+    (F,) in rad. A jump by a turn between the two angles of a frame, as from 355° to 4°, is removed, unless the gantry
+    turns by a quarter turn or more in at least half of the frames.
 
     Raises InputError for arrays of unequal length, infinite values and NaN."""
 
@@ -185,7 +187,7 @@ def continued(trajectory: Trajectory, by_s: float) -> Trajectory:
 
 def _is_without_jumps(steps_rad: np.ndarray) -> bool:
     """Returns whether no step (N,) of angles counts as a jump by a turn: none exceeds half a turn, or at least half of them
-    exceed a quarter turn."""
+    are a quarter turn or more."""
     size_rad = np.abs(steps_rad)
     return bool(size_rad.max(initial=0) <= np.pi or np.median(size_rad) >= np.pi / 2)
 
@@ -299,9 +301,10 @@ def resting_poses(
 
 
 def resting_trajectory(geometry: Geometry, poses: np.ndarray, middle_s: np.ndarray) -> CircularOrbit | PoseTable:
-    """Returns a circular orbit if ``geometry`` has the poses (F, 12) of a gantry at rest; otherwise a pose table."""
+    """Returns the trajectory of a gantry that rests at ``poses`` (F, 12) in mm, each at its time ``middle_s`` (F,): a
+    circular orbit if ``geometry`` has these poses at some angles, else a pose table."""
     is_parallel = isinstance(geometry, ParallelGeometry)
-    side = -1 if is_parallel else 1  # poses begin with the source; in a parallel beam with the rays' direction, away from it
+    side = -1 if is_parallel else 1  # a pose begins with the source or, in a parallel beam, with the direction away from it
     angle_rad = np.arctan2(side * poses[:, 1], side * poses[:, 0])
     if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME_PLACE * np.abs(poses).max()):
         return CircularOrbit(geometry, FrameSweeps(middle_s, 0.0, angle_rad, angle_rad))

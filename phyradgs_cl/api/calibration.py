@@ -18,7 +18,9 @@ from phyradgs_cl.fields import Gaussians
 from phyradgs_cl.fields.gaussians import ROWS
 from phyradgs_cl.importers import load_beads
 
-_STEP_PX = 0.25  # a difference moves the image's edge so far each way: less is lost in voxels' errors, more is not linear
+# For a central difference the image's edge moves by this many pixels each way. The differences of smaller steps drown in the
+# errors of voxels. Frames are not linear in larger steps.
+_STEP_PX = 0.25
 
 
 @naming_arguments()

@@ -1,4 +1,5 @@
-"""Operators for whole scans: from voxels or Gaussians to frames, and from Gaussians to voxels. PyTorch can use them."""
+"""Operators for whole scans: from voxels or Gaussians to frames, and from Gaussians to voxels. ``as_torch`` passes them to
+PyTorch."""
 
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -33,10 +34,10 @@ def ray_operator(
 ) -> LinearOperator:
     """Returns Joseph's projector of a scan, from volumes (nz, ny, nx) in 1/mm to frames (F, rows, columns), with transpose.
 
-    motion: a motion model of docs/methods.md except ``exact``, or an object of your own class. grid: the voxels; None takes
-    the scan's grid. device: what ``--device`` takes, or a Runtime. The result's ``intensity`` is the operator for detectors
-    that average photons instead of line integrals. Where pixels are wider than voxels, a pixel is the mean of several rays
-    (docs/mathematics.md). Joseph, IEEE Trans. Med. Imaging 1 (1982) 192.
+    motion: a motion model of docs/methods.md except ``exact`` and ``centres``, or an object of your own class. grid: the
+    voxels; None takes the scan's grid. device: what ``--device`` takes, or a Runtime. The result's ``intensity`` is the
+    operator for detectors that average photons instead of line integrals. Where pixels are wider than voxels, a pixel is the
+    mean of several rays (docs/mathematics.md). Joseph, IEEE Trans. Med. Imaging 1 (1982) 192.
 
     Raises InputError for anything but a Scan or a Grid, for an unknown motion, and for one that only splats support."""
     model, voxels = _checked(scan, motion, models.RAYS), scan.grid if grid is None else _a_grid(grid)
@@ -58,7 +59,7 @@ def _rays(engine: RayOperator) -> LinearOperator:
 
 def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
     def at(volume: Values) -> tuple[Values, Map]:
-        own, on_device = copy(engine), isinstance(volume, DeviceArray)  # a copy: later calls leave this derivative alone
+        own, on_device = copy(engine), isinstance(volume, DeviceArray)  # a copy: later calls change the operator's state
 
         def adjoint(frames: Values) -> Values:
             return _in_new_memory(rt, own.adjoint, frames, engine.volume_shape)
@@ -71,7 +72,8 @@ def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
 
 
 def _in_new_memory(rt: Runtime, function: Callable[..., Any], values: Values, shape: tuple[int, ...]) -> Values:
-    """Returns ``function(values)``; on the device in a new array, because the next call overwrites the engine's array."""
+    """Returns ``function(values)``. A result on the device is in a new array of ``shape``, because the next call overwrites
+    the array of the operator."""
     return function(values, rt.empty(shape)) if isinstance(values, DeviceArray) else function(values)
 
 
@@ -202,7 +204,8 @@ def as_torch(operator: Operator) -> Callable[..., Any]:
 
 
 def _checked(scan: Scan, motion: str | Motion, *kinds: str) -> Motion:
-    """Returns the motion model that a name or object stands for. Raises InputError unless scan and operators support it."""
+    """Returns the motion model of a name, or the given model. Raises InputError if it suits none of the ``kinds`` of
+    operator (RAYS, SPLATS, LINE_POSES), or does not fit the scan."""
     check_scan(scan)
     model = models.motion_of(motion)
     models.check_motion(model, models.motions_for(*kinds))

@@ -39,7 +39,7 @@ Device = str | Runtime | None
 
 
 def runtime_of(device: Device) -> Runtime:
-    """Returns the Runtime for the argument ``device``; None is the best device."""
+    """Returns the Runtime for the argument ``device``. None takes the device that ``--device`` takes by default."""
     if isinstance(device, Runtime):
         return device
     return _runtime_by_name(None if device is None else str(device))
@@ -73,7 +73,8 @@ def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Recon
 
     path: the HDF5 file, or a file of ``phyradgs export`` (docs/export.md), which has only a volume and a grid.
     mu_water_per_mm: water's attenuation, for an exported file in Hounsfield units that does not state it. Raises InputError
-    for a wrong value, which it names by its HDF5 path, for Hounsfield units without a scale, and for a scale of 1/mm."""
+    for a wrong value, which it names by its HDF5 path, for Hounsfield units without a scale, and for ``mu_water_per_mm``
+    with a volume file, which is in 1/mm."""
     file = _checked_path(path)
     if foreign_volume(file) is not None:
         volume = attenuation_of(str(file), load_voxels(file, mu_water_per_mm))
@@ -281,7 +282,8 @@ def check_scan(scan: object, subject: str = "scan") -> None:
 
 @contextmanager
 def _reporting(report: ProgressReport | bool) -> Iterator[tuple[ProgressReport, Callable[[str], None]]]:
-    """Yields two functions: one to call with each ``Progress``, and one that ends the terminal's line with a text."""
+    """Yields two functions: one to call with each ``Progress``, and one that ends the progress line with a text. If nothing
+    is shown, or ``report`` is the user's function, the second does nothing."""
     if not isinstance(report, bool):
         yield report, lambda text: None
     elif not (report and has_reader()):

@@ -55,7 +55,8 @@ def fly_scan(
     flats, darks: (n, rows, columns) or (rows, columns), counts without an object, and without a beam (None means 0).
     mask: (rows, columns) or (F, rows, columns), non-zero for pixels that must not be used.
     quantity: what ``frames`` are, "attenuation", "transmission" or "counts"; None takes counts if there are ``flats``.
-    grid: None takes what a full turn sees, as high as the panel sees, in voxels of one pixel's size at the axis.
+    grid: None takes the field of view of a full turn, in a cone beam at most as high as wide. Its voxels have a pixel's size
+    at the axis.
     others: ``detector_model`` ("log", "intensity"), ``reference`` (z, y, x) in 1/mm, ``title``, ``lag``, as in ``Scan``.
 
     Raises InputError for shapes that do not fit, numbers out of range or implausible, contradictory arguments, and angles
@@ -96,8 +97,8 @@ def _arcs_deg(angles_deg: np.ndarray, exposure_deg: float) -> np.ndarray:
     """Returns how far the gantry turns in each frame's exposure (F,), in degrees, with the sign of its turn.
 
     Unwrapped angles (F,) that rise and fall belong to a gantry that swings back and forth. In each frame it turns towards
-    the next frame's angle, but at a reversal it may still turn the other way. With steps too large to show this, all frames
-    turn as ``exposure_deg`` states."""
+    the next frame's angle, but at a reversal it may still turn the other way. Otherwise, and with any step of 90° or more,
+    which cannot show the direction, all frames turn as ``exposure_deg`` states."""
     steps_deg = np.diff(angles_deg)
     arcs_deg = np.full(len(angles_deg), exposure_deg)
     is_clear = (np.abs(steps_deg) < _CLEAR_STEP_DEG).all() and (steps_deg > 0).any() and (steps_deg < 0).any()
@@ -132,7 +133,8 @@ def static_scan(
 
 
 def _warn_of_transmission(frames: np.ndarray) -> None:
-    """Warns of frames (F, rows, columns) that look like transmissions: near 1 at left and right borders, less between."""
+    """Warns of frames (F, rows, columns) that look like transmissions: near 1 at the left and right borders, and at least
+    one pixel darker between them."""
     border, brighter = np.median(frames[..., [0, -1]]), np.count_nonzero(frames > 1 + _AIR_SLACK)
     if abs(border - 1) < _AIR_SLACK and brighter < 0.01 * frames.size and np.min(frames) < 1 - _AIR_SLACK:
         log.warning('frames: 1 at their borders, and less within: are they transmissions? quantity="transmission"')
@@ -146,7 +148,7 @@ def _pixels(
     frames: "ArrayLike", geometry: Geometry, flats: "ArrayLike | None", darks: "ArrayLike | None",
     mask: "ArrayLike | None", quantity: str | None,
 ) -> LineIntegrals:
-    """Converts frames of any quantity to line integrals, with the mask of unusable pixels."""
+    """Converts frames of any quantity to line integrals, with the mask of unusable pixels. Arguments as in ``fly_scan``."""
     checks.kind("geometry", geometry, GEOMETRIES, "a ConeGeometry or a ParallelGeometry")
     panel = geometry.detector_shape
     mask = None if mask is None else checks.real_array("mask", mask, "biuf")
@@ -189,7 +191,8 @@ def _scan(
 
 
 def _stack(name: str, frames: "ArrayLike", panel: tuple[int, int]) -> np.ndarray:
-    """Checks frames (n, rows, columns) of real numbers; one flat or dark alone may be (rows, columns)."""
+    """Returns frames (n, rows, columns) of real numbers; a single flat or dark may be given as (rows, columns). Raises
+    InputError for other shapes, and if there is no frame."""
     stack = checks.real_array(name, frames)
     if stack.ndim == 2 and name != "frames":
         stack = stack[None]

@@ -23,9 +23,9 @@ from phyradgs_cl.calibrate.problem import CoarseFrames, Stage, measured_blocks, 
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
-DENSITY = 6  # a placement is a turn (rotation vector, rad), a shift (mm) and, at this index, the density
-_MARGIN = 1.2  # largest factor by which an oblique panel widens a bead's shadow
-# An exposure is sampled so often that the phantom's edge moves by a pixel between two times, within these limits.
+DENSITY = 6  # a placement (7,) is a turn (rotation vector, rad), a shift (mm) and, at this index, a factor of the density
+_MARGIN = 1.2  # a bead's shadow is taken to be wider by this factor, because an oblique panel widens it
+# An exposure has so many times, within these limits, that the grid's edge moves by at most a pixel from one to the next.
 _FEWEST_TIMES, _MOST_TIMES = 6, 24
 _FEWEST_RAYS = 2  # fewest rays along each side of a pixel, and along a bead's radius: sharp edges need several
 _MOST_RAYS = 6  # rays along each side of a pixel, at most: the time grows with their square
@@ -33,7 +33,7 @@ _MOST_RAYS = 6  # rays along each side of a pixel, at most: the time grows with 
 # rays, half a pixel apart.
 _BLUR_PX = 0.8
 _LEAST_ZEROS = 0.2  # if at least this fraction of the pixels is 0, the noise of air was clipped at 0
-_ZEROS_PX = 5  # the noise of clipped air follows from means of blocks with this many pixels a side
+_ZEROS_PX = 5  # the noise of clipped air is computed from moving means over squares of this many pixels a side
 _BACKGROUND = 4  # cosines along each side of a frame: together they describe holder, scatter and drift of the tube
 _STEP_PX = 0.25  # a central difference moves the frame's edge by this many pixels to each side
 _MOST_PX = 1.5  # most pixels by which one step of the placement moves a frame: beyond, its effect is not linear
@@ -43,10 +43,10 @@ _LINEAR_PX = 0.3  # derivatives are computed again after a step that moves the f
 
 @dataclass(frozen=True, eq=False)
 class BeadOperator:
-    """Computes the frames (F, rows, columns) of a phantom along the lines of ``tables``, for a detector of ``model``.
+    """Computes the frames (F, rows, columns) of a phantom at the poses of ``tables``, the time cells of each frame.
 
-    samples: rays along each side of a pixel. clipped_noise: standard deviation of the noise, if line integrals below 0 were
-    set to 0; else 0."""
+    shape: the panel's (rows, columns). model: what the detector averages, "log" or "intensity". samples: rays along each
+    side of a pixel. clipped_noise: standard deviation of the noise, if line integrals below 0 were set to 0; else 0."""
 
     phantom: EllipsoidPhantom
     tables: Sequence[TimeCells]
@@ -82,7 +82,8 @@ class BeadOperator:
 
 
 def _mean_of_clipped(p: np.ndarray, sigma: float) -> np.ndarray:
-    """Returns the mean of max(p + noise, 0) for normal noise of deviation ``sigma``. Clipping raises it most in air."""
+    """Returns the mean of max(p + noise, 0) for normal noise of standard deviation ``sigma``. Clipping raises the mean, and
+    most in air."""
     ratio = p / sigma
     return p * scipy.special.ndtr(ratio) + sigma * np.exp(-(ratio**2) / 2) / math.sqrt(2 * math.pi)
 
@@ -129,7 +130,7 @@ class _PanelLines:
                 first = first if self.is_parallel else first - source
                 ray = first[:, None] + (pixel[..., None] + along) * self.pixel_step[lines][:, None]
                 starts, rays = np.repeat(source, width, axis=0), ray.reshape(-1, 3)
-                if self.is_parallel:  # integrate from one side of the body to the other
+                if self.is_parallel:  # there is no source: a ray starts and ends outside of the body
                     reach = 2 * (np.abs(rays).max(initial=0.0) + np.abs(body.ends_mm).max() + body.reach_mm)
                     starts, rays = rays - reach * starts, 2 * reach * starts
                 fraction = body.chord_fraction(starts, rays)
@@ -141,8 +142,9 @@ class _PanelLines:
     def _panel_axes(self) -> tuple[tuple[np.ndarray, ...], ...]:
         """Three vectors (N, 3), each with its inner products (N,) with the source and the first pixel, and its length (N,).
 
-        The first measures a point's distance from the source, over that of the panel. The others measure line and pixel of
-        the point's image. In a parallel beam the distance is 1, and the ray through the point makes the image."""
+        The first vector gives a point's distance from the source over the panel's. The other two give the line and the
+        pixel of the point's image. In a parallel beam the distance counts as 1, and the ray through the point makes the
+        image."""
         normal = np.cross(self.line_step, self.pixel_step)
         to_panel = self.source if self.is_parallel else self.first - self.source
         vectors = [normal / np.sum(normal * to_panel, -1, keepdims=True)]
@@ -179,7 +181,9 @@ class _PanelLines:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BeadProblem(CoarseFrames):
-    """A ``CoarseProblem`` for a known phantom, whose placement (7,) replaces the volume. ``start``: a first guess."""
+    """The counterpart of ``CoarseProblem`` for a known phantom, whose placement (7,) replaces the volume.
+
+    start: a first placement. clipped_noise: as in ``BeadOperator``."""
 
     phantom: EllipsoidPhantom
     start: np.ndarray
@@ -262,7 +266,8 @@ class BeadProblem(CoarseFrames):
         return blurred.ravel()
 
     def _units(self) -> np.ndarray:
-        """Returns steps (7,) of a placement: each moves a frame's edge by a pixel; the last adds 1 to the density factor."""
+        """Returns steps (7,) of a placement. Each turn and shift moves the image's edge by about one coarse pixel. The last
+        step adds 1 to the density factor."""
         scan = self.scans[0]
         pixel_mm = self.block * min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
         return np.array([pixel_mm / (max(scan.grid.size_mm) / 2)] * 3 + [pixel_mm] * 3 + [1.0])
@@ -292,8 +297,8 @@ class BeadProblem(CoarseFrames):
 
 
 def _clipped_noise(scans: Sequence[Scan]) -> float:
-    """Returns the standard deviation of noise in air whose values below 0 were set to 0, from means of small blocks. It is
-    0 if few pixels are 0 or some are below 0, because nothing was clipped then."""
+    """Returns the standard deviation of noise in air whose values below 0 were set to 0, from means over small squares. It
+    is 0 if less than a fifth of the pixels are 0, or if any are below 0, because then nothing was clipped."""
     values = np.concatenate([np.asarray(scan.projections, np.float32) for scan in scans])
     valid = np.concatenate([scan.valid for scan in scans])
     if np.mean(values[valid] == 0) < _LEAST_ZEROS or values[valid].min() < 0:
@@ -315,8 +320,8 @@ def _with_spread_of(scan: Scan, times: int) -> Scan:
 
 
 def _moved(placement: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Returns the placement (7,) turned further about the axes of space through the origin, then shifted by ``step``, with
-    its density changed."""
+    """Returns the placement (7,) after a ``step`` (7,): turned about the origin, then shifted, with the step's last number
+    added to the density factor."""
     turn = Rotation.from_rotvec(step[:3])
     turned = (turn * Rotation.from_rotvec(placement[:3])).as_rotvec()
     return np.concatenate([turned, turn.apply(placement[3:DENSITY]) + step[3:DENSITY], placement[DENSITY:] + step[DENSITY:]])

@@ -17,7 +17,8 @@ _STEP_PX = 0.25  # a central difference moves the image's edge by this many pixe
 _TIMING_STEP = 0.1  # a time is changed by at most this fraction of itself in a central difference
 _LARGEST_CUT = 0.7  # the search shortens a time by at most this fraction, so that it stays above 0
 _MOST_TILT_RAD = math.radians(2.0)  # an angle is changed by at most this in a central difference
-# ``Parameter.mismatch`` of effects that change sign after half a turn: errors of voxels do not, so they disturb these less.
+# ``Parameter.mismatch`` of parameters whose effect changes sign after half a turn. Errors of voxels keep their sign, so they
+# disturb such parameters less.
 _SMALL_MISMATCH = 1.3
 # An angle with a larger standard deviation counts as undetermined, because its sine is not linear over such a range.
 _LEAST_KNOWN_RAD = math.radians(10.0)
@@ -28,7 +29,7 @@ _DEGREES = math.degrees(1.0)
 class Parameter:
     """A parameter that can be calibrated. field: the field of ``GeometryCorrection`` that it changes.
 
-    - scale: displayed units per unit of the field.
+    - stated: the scan's own value, in the field's unit. scale: displayed units per unit of the field.
     - object_instead: another object that explains the frames as well, if they do not determine the parameter.
     - pixels: how many pixels a unit of the field moves the image at its edge.
     - mismatch: measured errors (docs/calibrate.md) over errors by noise alone. Voxels, which do not represent objects
@@ -73,13 +74,15 @@ def _pitch_mm(scan: Scan) -> float:
 
 
 def _edge_pixels(scan: Scan, factor: float = 1.0) -> float:
-    """Returns by how many pixels a radian of roll moves the edge farther from the panel's middle, times ``factor``."""
+    """Returns by how many pixels a radian of roll moves those edges of the panel that are farthest from its middle, times
+    ``factor``."""
     return factor * max(_half_mm(scan, 0), _half_mm(scan, 1)) / _pitch_mm(scan)
 
 
 def _tilt_pixels(axis: int) -> Callable[[Scan], float]:
     """Returns a function of the scan: by how many pixels a radian of tilt moves the panel's edge. A tilt magnifies one side,
-    so points move in proportion to the square of their distance from the tilt's axis."""
+    so points move in proportion to the square of their distance from the tilt's axis. axis: 0 for edges along v, 1 along
+    u."""
     return lambda scan: _half_mm(scan, axis) ** 2 / _cone(scan).source_to_detector_mm / _pitch_mm(scan)
 
 
@@ -90,7 +93,7 @@ def _cone(scan: Scan) -> ConeGeometry:
 
 
 def _timing_pixels(scan: Scan) -> float:
-    """Returns by how many pixels the object's edge turns in a second."""
+    """Returns by how many pixels the image of the grid's edge moves in a second as the gantry turns."""
     speed_rad_per_s = exposure_arc_rad(scan) / scan.shutter.exposure_s
     edge_mm = max(scan.grid.size_mm[1:]) / 2 * scan.geometry.magnification
     return max(speed_rad_per_s * edge_mm / _pitch_mm(scan), 1e-12)
@@ -141,7 +144,7 @@ OFFSET_U = "offset-u"
 TURN = Parameter("all angles", "turn_rad", "deg", _TURN, lambda s: 0.0, _edge_pixels, _DEGREES)
 LIFT = Parameter("all heights", "lift_mm", "mm", "a lower object", lambda s: 0.0, lambda s: 1 / _pitch_mm(s), is_axial=True)
 GAUGES = (TURN, LIFT)
-"""Parameters that no frame determines. What a volume leaves of their signals is due to errors of voxels alone."""
+"""Parameters that no frame determines. The part of their effect that no volume explains is due to errors of voxels alone."""
 PARAMETER_GROUPS = {
     "offset": (OFFSET_U, "offset-v"),
     "tilt": ("tilt-v", "tilt-u"),
@@ -217,8 +220,8 @@ def correction_of(values: Mapping[str, float]) -> GeometryCorrection:
 
 
 def in_words(weights: Mapping[str, float]) -> str:
-    """Returns a combination of parameters (weights by name) in words: the one of largest weight first, and only those of at
-    least 0.3 of that weight."""
+    """Returns a combination of parameters (weights by name) in words, with the other object that looks the same. The
+    parameter of largest weight comes first. Those with up to 0.3 of its weight are left out."""
     order = sorted(weights, key=lambda name: -abs(weights[name]))
     largest = abs(weights[order[0]])
     main, *others = [name for name in order if abs(weights[name]) > 0.3 * largest]

@@ -22,10 +22,10 @@ from phyradgs_cl.reconstructors.fits.residuals import AugmentedOperator, ViewPar
 from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.runtime import Runtime
 
-SPLINES = 7  # default number of splines; each is about a seventh of the scan wide
+SPLINES = 7  # default number of cubic splines over the scan's time
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
 _STEP_PX = 0.25  # a central difference moves a frame by this many coarse pixels to each side
-_LEAST_NORM = 0.1  # a signal's norm counts as at least this fraction of its kind's largest, which limits how it is scaled
+_LEAST_NORM = 0.1  # a signal's norm counts as at least this fraction of its kind's largest, so weak signals are scaled less
 _DEG = float(np.rad2deg(1.0))
 # This fraction of a value's change since the next coarser grid counts as its discretisation error. With voxels half as
 # large, 1 suits errors ∝ voxel size, and 1/3 suits errors ∝ its square.
@@ -49,8 +49,8 @@ class PerViewParameters(ABC):
     """Parameters of views: ``values`` (n, K) of K kinds. View f has (``basis`` @ ``values``)[f], (K,), with basis (F, n).
 
     - units (K,): the value of each kind that moves a frame's edge by a pixel.
-    - circle (n, 2): values that vary as cosine and sine of the angle, as far as the basis allows.
-    - MISMATCH: measured errors (docs/calibrate.md) over errors by noise alone, because voxels are not exact.
+    - circle (n, 2): values that vary as cosine and sine of the gantry's angle, as far as the basis allows.
+    - MISMATCH: measured errors (docs/calibrate.md) over errors by noise alone. Voxels, which are not exact, add the rest.
     - RESTARTED: kinds that start from 0 on each grid."""
 
     values: np.ndarray
@@ -184,7 +184,7 @@ def view_step(
     norms = _norms(parameters.basis, signals)
     scale = _strength(operator) / np.maximum(norms, _LEAST_NORM * norms.max(0))
     if not np.array_equal(parameters.basis, np.eye(len(signals))):
-        # several splines act on a view, but its derivative can have only one scale: so all splines share one
+        # Several splines act on a view, but the view's derivative can have only one scale. So all splines share one scale.
         scale = np.broadcast_to(scale.mean(0), scale.shape)
     per_view = parameters.basis @ scale / parameters.basis.sum(1, keepdims=True)
     scaled = (signals * per_view[:, :, None, None]).astype(np.float32)
@@ -220,12 +220,14 @@ def view_deviations(
 
 
 def _norms(basis: np.ndarray, signals: np.ndarray) -> np.ndarray:
-    """Returns the norms (n, K) of the Jacobian's columns d(frames)/d(coefficient). signals: (F, K, rows, columns)."""
+    """Returns the norms (n, K) of the Jacobian's columns d(frames)/d(coefficient). basis: (F, n). signals: (F, K, rows,
+    columns), per pixel of movement of each view."""
     return np.sqrt(basis.T**2 @ np.sum(np.square(signals, dtype=np.float64), (2, 3)))
 
 
 def _strength(operator: RayOperator) -> float:
-    """Estimates the largest singular value of A, in mm. Parameters scaled to it converge as fast as the volume."""
+    """Estimates the largest singular value of the projector, in mm. CGLS then finds parameters that are scaled to it as fast
+    as the volume."""
     lengths = operator.forward(np.ones(operator.volume_shape, np.float32))
     return float(np.linalg.norm(operator.adjoint(lengths)) / np.linalg.norm(lengths))
 

@@ -25,7 +25,7 @@ from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
 _MOST_TIMES = 8  # most times per exposure: each costs a projection
-_VOXELS_PER_TIME = 2.0  # an exposure is sampled so often that the volume's rim moves by this many voxels between two times
+_VOXELS_PER_TIME = 2.0  # the volume's rim moves by at most this many voxels between two times, if _MOST_TIMES suffice
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
@@ -52,20 +52,22 @@ class Stage:
         return ceil_div(max(scan.geometry.detector_shape), self.columns)
 
     def passes(self, parameters: int, asks: bool) -> int:
-        """Returns the most passes through the frames. asks: the stage also tests which parameters the frames determine."""
+        """Returns the largest number of passes through the frames, for a number of ``parameters``. asks: the stage also
+        tests which parameters the frames determine."""
         return self.first - self.again + self.steps * (self.again + self.project * (parameters + (3 if asks else 1)))
 
 
 def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:
-    """Returns the cost of a pass through the scans with at most ``columns`` blocks: rays × voxels along a ray."""
+    """Returns the cost of a pass through the scans, rays × voxels along a ray, with at most ``columns`` blocks of pixels
+    along the panel's longer side and ``most_frames`` frames of each scan."""
     shape = scans[0].geometry.detector_shape
     rows, across = (ceil_div(n, ceil_div(max(shape), columns)) for n in shape)
     return float(sum(min(scan.frames, most_frames) for scan in scans) * rows * across * max(rows, across))
 
 
 class PassCounter:
-    """Counts passes and reports them. plan: number and cost of the passes of each phase, in order. Phases that turn out to
-    be unnecessary leave the plan, so the total falls."""
+    """Counts passes through the frames and reports them. plan: number and cost of the passes of each phase, in order. Phases
+    that turn out to be unnecessary leave the plan, so the reported total falls."""
 
     def __init__(self, report: Report, plan: Mapping[str, Passes]) -> None:
         self.plan = dict(plan)
@@ -99,7 +101,7 @@ class PassCounter:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoarseFrames:
-    """The scans as stated, without pixels and with fewer frames, and their binned measurement.
+    """The scans as stated, with fewer frames and zeros for pixels, and their measurement averaged over blocks of pixels.
 
     measured (F, rows, columns): all scans' frames, in line integrals averaged over blocks of ``block`` × ``block`` pixels.
     valid, of the same shape: pixels to use; None: all. ``count_pass`` is called once per iteration, which projects and
@@ -179,8 +181,8 @@ class CoarseProblem(CoarseFrames):
         return IntensityOperator(self.rt, self.grid, operator.detector_shape, operator.tables).expected(volume)
 
     def reconstruct(self, operator: RayOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
-        """Returns a nonnegative volume (nz, ny, nx) of little total variation, after ``iterations`` from ``start`` (None:
-        zeros)."""
+        """Returns a nonnegative volume (nz, ny, nx) in 1/mm of little total variation, after ``iterations`` of FISTA-TV from
+        ``start`` (None: zeros)."""
         volume = np.zeros(self.grid.shape, np.float32) if start is None else start
         system = System(operator, self.line_integrals(operator, volume), self.valid)
         method = FistaTv(system, _TV, TvProx(self.rt, self.grid.shape, axis_weights(self.grid)))

@@ -48,7 +48,7 @@ class ParameterEstimate:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration:
-    """The corrected ``scan``, in which everything else is unchanged, and how it was found.
+    """The corrected ``scan``, with unchanged frames, and how it was found.
 
     - parameters: an estimate of each. alike: combinations of parameters, in words, that no frame tells from another object.
     - residual_rms: RMS residual before and after correction, in line integrals, on the finest grid. before, after: these

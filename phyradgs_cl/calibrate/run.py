@@ -60,7 +60,7 @@ STAGES = (
 BEAD_STAGES = (Stage(48, first=8, again=4, steps=6, project=0), Stage(128, first=6, again=4, steps=6, project=0))
 _FEWEST_FRAMES = 8  # with fewer frames a scan does not determine its geometry
 _FEWEST_COLUMNS = 12  # with fewer columns a scan does not determine its geometry
-_FEWEST_SPLINES = 4  # a cubic spline of a wobble needs four
+_FEWEST_SPLINES = 4  # cubic splines need at least four coefficients
 # In its best place, the right phantom explains at least this fraction of the frames' sum of squares, before corrections.
 _LEAST_EXPLAINED = 0.3
 _ORDER_ERRORS = 4.0  # least difference of the readout directions' squared residuals in standard errors, as in ``check``
@@ -68,7 +68,7 @@ _ORDER_RATIO = 1.04  # least ratio of the readout directions' squared residuals,
 # An encoder table is continued by this many times a frame's exposure and readout: first steps of the search may ask for
 # times far beyond the table.
 _BEYOND = 1e6
-# Progress expects stages to cost this fraction of their most: few parameters are determined, and few steps are needed.
+# Progress expects stages to cost this fraction of their largest cost, because few parameters are determined in few steps.
 _EXPECTED_SHARE = 0.25
 
 
@@ -165,7 +165,8 @@ class _Calibrator:
         return replace(calibration, scan=_with_provenance(corrected, self.scan, calibration))
 
     def _start_from_axis(self) -> None:
-        """Starts from the offset that ``check`` finds, because steps reach it from a distance of a few pixels only.
+        """Starts from the offset that ``check`` finds, because Gauss–Newton steps reach the right one from a few pixels away
+        only.
 
         In half a turn of nearly parallel rays, a volume explains most of what an offset changes. The search cannot determine
         the offset there, so ``check``'s answer stands. Its answer also stands if the panel sees few rays twice: a shift
@@ -182,8 +183,8 @@ class _Calibrator:
             self.search.fallback = {OFFSET_U: Fallback(shift.pixels * pitch_mm, shift.deviation * pitch_mm, is_significant)}
 
     def _search_common(self) -> None:
-        """Searches for the parameters that all views share. Corrects single views first, because their errors would look
-        like a roll."""
+        """Searches for the parameters that all views share. Where requested, corrects single views first, because their
+        errors would look like a roll."""
         steady = self.ready
         if self.per_view is not None:
             self.passes.begin("views before", "views, before the rest")
@@ -245,7 +246,8 @@ class _Calibrator:
         return placement
 
     def _test_direction(self) -> list[ParameterEstimate]:
-        """Compares the residuals with lines read from either end, and corrects the direction. Returns its line of the table.
+        """Compares the residuals with lines read from either end, and corrects the direction. Returns the table's entry for
+        it.
 
         A correction needs four standard errors and 4 % of the squared residual. The direction is 1 or −1, and its deviation
         is in the same unit."""
@@ -272,7 +274,8 @@ class _Calibrator:
         return problem.residual(operator, problem.reconstruct(operator, None, stage.first))
 
     def _plan(self) -> dict[str, Passes]:
-        """Returns by phase, in order, the largest number of passes through the frames, and their cost."""
+        """Returns the phases in order, each with the largest number of its passes through the frames and their expected
+        cost."""
         second, last = self.stages[min(1, len(self.stages) - 1)], self.stages[-1]
         parameters, views, most_frames = len(self.request.parameters), (0, 0.0), MOST_FRAMES
         if self.per_view is not None:

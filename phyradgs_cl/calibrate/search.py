@@ -2,8 +2,8 @@
 
 On each grid a volume is reconstructed, and each parameter's signal is computed: the change of the frames per unit of the
 parameter. The part of a signal that a change of the volume explains is removed (``reduced``). The parameters step until the
-steps are small, or the stage has no more. On the first grid each step also decides which parameters the frames determine. In
-a ``BeadProblem`` a known object of beads replaces the volume.
+steps are small, or the stage allows no more. On the first grid each step also decides which parameters the frames determine.
+In a ``BeadProblem`` a known object of beads replaces the volume.
 
 The steps are variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413) in Kaufman's form. With A the
 operator at the parameters θ, x the volume and P the projector onto A's range, the Jacobian is J = (I − P) ∂A/∂θ x. The
@@ -30,9 +30,11 @@ LEAST_SHARE = 0.2
 # For a known object (beads) a smaller share is enough: there are no voxels that explain signals by accident.
 LEAST_SHARE_OF_BEADS = 0.02
 _TINY = 1e-9  # added to the diagonal of a matrix before its inverse, because signals may be linearly dependent
-# A determined parameter has at least this many times the share of a turn or lift (``GAUGES``), which errors of voxels leave.
+# A determined parameter has at least this many times the share of a turn or a lift (``GAUGES``). No frame shows these two,
+# so their share is due to errors of voxels alone.
 _GAUGE_FACTOR = 2.0
-# A turn's or lift's share counts as at most this: in a wrong geometry it grows, and no parameter would count as determined.
+# The share of a turn or a lift counts as at most this. It grows in a wrong geometry, where without this limit no parameter
+# would count as determined.
 _MOST_GAUGE = 0.2
 DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
 _MOST_PX = 2.0  # a step moves the image by at most this many coarse pixels at its edge: beyond, its effect is not linear
@@ -67,8 +69,8 @@ class Reduced:
         )
 
     def relative_to_stated(self, at: Mapping[str, float]) -> "Reduced":
-        """Returns the problem, which was linearised at values ``at`` (by name), with steps that count from the stated
-        values."""
+        """Returns the problem with unknowns that count from the stated values instead of the values ``at`` (by name) at
+        which it was linearised."""
         back = np.array([at.get(name, 0.0) for name in self.names]) @ self.jacobian
         return replace(self, residual=self.residual + back)
 
@@ -88,7 +90,7 @@ class Reduced:
         """The fraction (K,) of each parameter's signal that no object explains, 0 to 1.
 
         This is the smaller of two ratios. One is the norm of the unexplained signal over that of the whole signal. The other
-        is the parameter's certainty among all unknowns, over its certainty with a known object."""
+        is the parameter's standard deviation with a known object, over the one with all unknowns."""
         tiny = _TINY * np.eye(len(self.names))
         variance, variance_with_object = (np.diag(np.linalg.inv(gram + tiny)) for gram in (self.gram, self.whole_gram))
         certainty = variance_with_object / variance
@@ -118,10 +120,10 @@ def reduced(
     problem: CoarseProblem | BeadProblem, operator: Any, parameters: Sequence[Parameter], at: Mapping[str, float],
     volume: np.ndarray, iterations: int,
 ) -> Reduced:
-    """Returns the frames linearised at the parameters' values ``at`` (by name) and at the object ``volume``: a volume, or a
-    placement of beads.
+    """Returns the linear problem of ``parameters`` at their values ``at`` (by name) and at the object ``volume``: a volume,
+    or a placement of beads.
 
-    operator: the projector at these values. iterations: how many CGLS makes to remove what a volume explains."""
+    operator: the projector at these values. iterations: those of CGLS that remove what a volume explains."""
     signals = [_signal(problem, one, at, volume) for one in parameters]
     images = [*signals, problem.residual(operator, volume)]
     *jacobian, residual = problem.beyond_object(operator, volume, images, iterations)
@@ -162,8 +164,8 @@ def least_shares(problem: Reduced) -> dict[str, float]:
 
 
 def indistinguishable(problem: Reduced, least: Mapping[str, float]) -> list[dict[str, float]]:
-    """Returns combinations of parameters, as weights by name, that an object explains almost wholly: it leaves a smaller
-    share of their signal than ``least`` has for the parameter with the largest weight."""
+    """Returns combinations of parameters, as weights by name, whose signal another object explains almost wholly. The share
+    that the object leaves is smaller than ``least`` has for the parameter with the largest weight."""
     values, vectors = scipy.linalg.eigh(problem.gram, problem.whole_gram + _TINY * np.eye(len(problem.names)))
     limits = np.array([least[problem.names[k]] for k in np.abs(vectors).argmax(0)])
     return [dict(zip(problem.names, map(float, weights), strict=True)) for weights in vectors[:, values < limits**2].T]
@@ -189,7 +191,8 @@ class Fallback:
 class Search:
     """The state of a search.
 
-    - at: the current values by name. former: the values at the end of the previous grid, which show the error of the voxels.
+    - at: the current values minus the stated ones, by name, in the fields' units. former: those at the end of the previous
+      grid; the difference shows the error of the voxels.
     - determined: the parameters that the frames determine; None before the first step.
     - fallback: estimates from elsewhere, for parameters that are not determined. fixed: the fallbacks in use.
     - held: parameters that are not fitted, because wrong values would fit better.
@@ -208,7 +211,7 @@ class Search:
     reduced: Reduced | None = None
 
     def descend(self, problem: Problem, stage: Stage) -> None:
-        """Steps on one grid until the steps are small, or the stage has no more."""
+        """Moves the parameters on one grid until the steps are small, or the stage allows no more."""
         volume: np.ndarray | None = None
         asks = self.determined is None
         self.former = {} if asks or isinstance(problem, BeadProblem) else dict(self.at)
@@ -242,7 +245,8 @@ class Search:
             self.at[name] = estimate.correction
 
     def _step(self, problem: Problem) -> bool:
-        """Moves the determined parameters, each as far as its signal is linear. Returns whether all steps were small."""
+        """Moves the determined parameters by the Gauss–Newton step, each at most as far as its signal is linear. Returns
+        whether all steps were small."""
         assert self.reduced is not None and self.determined is not None
         current = np.array([self.at.get(name, 0.0) for name in self.determined])
         change = self.reduced.step() - current
@@ -254,7 +258,7 @@ class Search:
         return bool(np.all(np.abs(change) < _SETTLED * self.reduced.deviations()))
 
     def keep_held(self) -> None:
-        """Drops all estimates but those of held parameters."""
+        """Drops all estimates but the fallbacks of held parameters."""
         self.determined = ()
         self.fixed = {name: estimate for name, estimate in self.fixed.items() if name in self.held}
 
@@ -262,7 +266,8 @@ class Search:
         """Returns the values (K,) of the determined parameters and their standard deviations (K,), in the fields' units.
 
         A deviation combines noise and discretisation error, taken as half the change since the coarser grid. Both are larger
-        for a parameter whose effect resembles that of undetermined ones: these keep their stated values, even wrong ones."""
+        for a parameter whose effect resembles that of undetermined ones, because these keep stated values that may be
+        wrong."""
         if self.reduced is None or not self.determined:
             return np.zeros(0), np.zeros(0)
         values, noise = self.reduced.step(), self.reduced.deviations()

@@ -1,7 +1,7 @@
 """Checks whether the frames fit together under the stated order, angles and geometry.
 
 A coarse reconstruction of consistent frames leaves a far smaller residual than one of the same frames in a random order.
-If not, or if another hypothesis leaves less than half the squared residual, something stated is wrong. The steps: remove
+Otherwise, or if another hypothesis leaves less than half the squared residual, something stated is wrong. The steps: remove
 odd frames; choose the sense of rotation and the panel's shift (``orbit.py`` reports them); remove outliers; compare with
 random orders; try hypotheses."""
 
@@ -40,9 +40,9 @@ _NOISY = 1.6  # residual over the noise: round objects had up to 1.3, others 2.3
 _MOST_REFINED = 2  # only this many hypotheses, the best ones, get a refined shift of the panel, which takes time
 _SHIFT_PENALTY = 1.5  # factor on a hypothesis's squared residual per coarse pixel of shift: stated offsets are mostly right
 # A frame is odd if its mean line integral differs from its neighbours' by more than _DEVIATIONS and _LEAST_CHANGE.
-_DEVIATIONS = 12.0  # difference in robust standard deviations of all frames' differences
-_LEAST_CHANGE = 0.75  # difference over the frames' median mean line integral
-_REPEATED = 0.15  # RMS change from a frame to one that repeats it, at most, over the least change between frames nearby
+_DEVIATIONS = 12.0  # the difference over the robust standard deviation of all frames' differences
+_LEAST_CHANGE = 0.75  # the difference over the median of the frames' mean line integrals
+_REPEATED = 0.15  # largest RMS change from a frame to one that repeats it, over the least change between frames nearby
 _JUMP = 2.5  # an order jumps, as the golden angle does, if its median step exceeds that of sorted angles by this factor
 _UNLIKE = 2.0  # least RMS difference of a repeated frame from the next view in angle, over the median of all frames
 _OUTLIER = 4.0  # least RMS residual of an outlier, over the frames' median
@@ -128,8 +128,10 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
 
 
 def _unseen(scan: Scan, as_stated: Scan) -> float:
-    """Returns an RMS residual. If frames in a random order leave less, those of a coarse ``scan`` show no angles."""
-    # The smaller estimate of noise counts: edges raise that from coarse pixels, uneven noise that from full pixels.
+    """Returns the RMS residual below which frames in a random order show that the object looks the same from every angle.
+
+    scan: the coarse scan. as_stated: the full scan."""
+    # The smaller estimate of noise counts. Edges raise the estimate from coarse pixels, uneven noise that from full pixels.
     levels = [noise_level(one.projections, np.broadcast_to(one.valid, one.projections.shape)) for one in (scan, as_stated)]
     noise = min(levels[0], levels[1] / float(np.prod(altered_trajectory(scan).blocks)) ** 0.5)
     return max(_SAME * float(np.asarray(scan.projections, np.float64).std()), _NOISY * noise)
@@ -160,8 +162,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
 
 
 def _random_order(rt: Runtime, scan: Scan) -> float:
-    """Returns the mean squared residuals of the scan's frames in a random order, summed over the frames and averaged over
-    two orders."""
+    """Returns the sum, over the frames, of their mean squared residuals in a random order, averaged over two orders."""
     rng = np.random.default_rng(0)
     orders = [rng.permutation(scan.frames) for _ in range(_RANDOM_ORDERS)]
     return float(np.mean([fit_squares(rt, replace(scan, projections=scan.projections[order])).sum() for order in orders]))
@@ -216,8 +217,8 @@ def _is_consistent(rt: Runtime, scan: Scan) -> bool:
 
 
 def _best_below(rt: Runtime, candidates: Iterable[Hypothesis], stated: Fit, most: float) -> Hypothesis | None:
-    """Returns the hypothesis with the least squared residual; None if that is not below ``most``, or not four standard
-    errors better than ``stated``."""
+    """Returns the hypothesis with the least squared residual among those below ``most`` and better than the fit ``stated``
+    by four standard errors; None without one."""
     best, least = None, most
     for hypothesis in candidates:
         squares = fit_squares(rt, hypothesis.scan())
@@ -236,7 +237,8 @@ def without_odd_frames(scan: Scan) -> tuple[np.ndarray, list[str]]:
 
 
 def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
-    """Returns the indices of the frames of p (F, v, u) whose mean line integral is far from their neighbours' means."""
+    """Returns the indices of the frames of line integrals p (F, v, u) whose mean is far from the means of the two frames
+    before and after. mask (v, u) or (F, v, u): non-zero for pixels not to be used."""
     if len(p) < _FEWEST_FRAMES:
         return []
     valid = 1.0 if mask is None else (np.asarray(mask) == 0).astype(np.float32)

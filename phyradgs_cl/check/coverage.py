@@ -19,12 +19,14 @@ _NOISES = 4.0  # noise alone does not exceed this many of its standard deviation
 _OPAQUE = 30.0  # behind larger line integrals no light passes, so they are no line integrals
 _INVERTED = 0.9  # if left and right edges exceed this fraction of the largest value, bright and dark are exchanged
 _BRIGHT = 0.05  # at most this fraction of the pixels may be brighter than the flats, by noise
-_FRAMES = 0.1  # the object may touch a side of the panel in this fraction of the frames
+_FRAMES = 0.1  # the object may touch a side of the panel in up to this fraction of the frames
 _COVERED = 0.1  # a column shows the object if more than this fraction of its rows does
 # A unit is wrong if the grid's width over that of the panel's view, or the object's over the grid's, exceeds this.
 _ANOTHER_SIZE = 5.0
 _NOISE_FRAMES, _NEAR = 16, 5  # frames in which noise is sought, and the side in pixels of a square of neighbours
-_MOST_NOISE, _NO_OBJECT_FROM = 0.4, 4.0  # noise over mean line integral, above which noise dominates, or is all there is
+# Noise over mean line integral behind the object: above the first value noise dominates, above the second there is no
+# object.
+_MOST_NOISE, _NO_OBJECT_FROM = 0.4, 4.0
 NOISE = "noise"
 NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # findings with these units end the check
 CUT_OFF = "line integral at the border"  # a finding with this unit says that the object reaches beyond the panel
@@ -52,9 +54,10 @@ def check_coverage(scan: Scan) -> Finding:
 
 
 def find_noise(scan: Scan) -> Finding | None:
-    """Returns a finding if noise dominates: if the noise of a pixel behind the object, by ``noise_rms``, exceeds 40 % of
-    the mean line integral there; else None. Pixels lie behind the object where the mean over their neighbours is above a
-    tenth of its largest value. Scans of 1000 photons had at most 0.29, of 30 at least 0.85. Above 4 there is no object."""
+    """Returns a finding if noise dominates: if the noise of a pixel behind the object, by ``noise_rms``, exceeds 40 % of the
+    mean line integral there; else None. Pixels lie behind the object where the mean over their neighbours is above a tenth
+    of its largest value. Scans of 1000 photons had at most 0.29, of 30 at least 0.85. Above 4 returns None too, because
+    ``check_coverage`` finds no object then."""
     some = slice(None, None, ceil_div(scan.frames, _NOISE_FRAMES))
     p, valid = np.asarray(scan.projections[some]), scan.valid[some]
     mean = scipy.ndimage.uniform_filter(np.where(valid, p, 0), (1, _NEAR, _NEAR))
@@ -129,7 +132,8 @@ def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) ->
 
 
 def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
-    """Returns the level of two columns: their largest mean over an eighth of the rows, the 90th percentile over frames."""
+    """Returns the level of two columns: in each frame their largest mean over an eighth of the rows, and over the frames the
+    90th percentile of these."""
     edge = p[:, :, columns]
     weight = valid[:, :, columns].astype(float)
     rows = max(1, edge.shape[1] // 8)

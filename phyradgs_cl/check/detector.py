@@ -31,7 +31,7 @@ _FEWEST_FRAMES = 8  # fewer frames cannot tell a drift from noise
 
 @dataclass
 class CountReader:
-    """Converts counts for ``read_scan`` as ``counts_to_attenuation`` does, and remembers saturated counts.
+    """Converts counts to line integrals for ``read_scan``, as ``counts_to_attenuation`` does, and remembers saturation.
 
     ceiling: the largest count of projections and flats; None for files without counts. at_ceiling: the fraction of the
     projections' pixels that lie in areas at that count."""
@@ -141,8 +141,8 @@ def check_gain(rt: Runtime, scan: Scan) -> Finding:
     """Finds drifts and jumps of the detector's gain, from the constants ("levels") that ``fit`` adds to the frames of a
     coarse ``scan``.
 
-    It fits a ramp, and in turn a step at each frame; the best of these fits counts. A change is suspicious above 1.5 % and
-    five standard deviations. Variation with sine and cosine of the angle is no drift."""
+    A ramp over the scan, or a step at one of the frames, is fitted to the levels; the best of all fits counts. A change is
+    suspicious above 1.5 % and five standard deviations. Variation with sine and cosine of the angle is no drift."""
     if scan.frames < _FEWEST_FRAMES:
         return Finding(GAIN, CANNOT_TELL, 0.0, _LARGEST_DRIFT, "share", f"fewer than {_FEWEST_FRAMES} frames")
     level = fit(rt, scan).level

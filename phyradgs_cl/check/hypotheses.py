@@ -29,7 +29,7 @@ _GAPS = 15  # a missing or repeated frame is looked for at this many frames, eve
 class Hypothesis:
     """What may be wrong in a scan: a description, advice, and a function that returns the scan corrected for it.
 
-    factor: pixel size over stated pixel size. Hypotheses with the same factor above or below 1 differ only by the panel's
+    factor: pixel size over stated pixel size. Hypotheses with the same factor other than 1 differ only by the panel's
     shift."""
 
     text: str
@@ -195,7 +195,8 @@ def nearly_sized(scan: Scan, factor: float) -> Scan:
 
 
 def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses of a missing or a repeated frame, at up to 15 frames: later ones are a step further on, or back."""
+    """Yields hypotheses that a frame is missing, or there twice, at up to 15 places. They move the angles of later frames by
+    a step on, or back."""
     sense = -1.0 if variants.altered_trajectory(scan).is_reversed else 1.0
     step = float(np.median(wrapped(np.diff(_azimuths(scan))))) * sense
     for at in np.unique(np.linspace(1, scan.frames - 1, _GAPS).round().astype(int)):

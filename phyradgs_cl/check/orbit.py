@@ -62,7 +62,8 @@ class Orbit:
     is_reversed: bool = False
 
     def corrected(self, scan: Scan) -> Scan:
-        """Returns a coarse scan with its sense of rotation corrected, and its panel shifted if that is significant."""
+        """Returns a coarse scan with the sense of rotation that was found. The panel is shifted too, if the shift is
+        significant."""
         scan = reversed_rotation(scan) if self.is_reversed else scan
         is_shifted = self.shift.is_found and abs(self.shift.pixels) > self.centre.threshold
         return shifted(scan, self.shift.pixels) if is_shifted else scan

@@ -78,8 +78,8 @@ def check(
     scan: Scan, rt: Runtime, counts: detector.CountReader | None = None,
     report: Report = lambda done, total, question: None,
 ) -> CheckResult:
-    """Returns what is wrong or suspicious in a scan. counts: the reader of the scan's file, if it is known. report: is
-    called with how many questions are answered, how many there are, and the next one.
+    """Returns the findings about a scan. counts: the reader of the scan's file, if it is known. report: is called with how
+    many questions are answered, how many there are, and the next one.
 
     Raises InputError where every pixel is masked, and for NaN or infinity at other pixels."""
     scan = without_lag(_finite(scan))
@@ -142,7 +142,7 @@ def check(
 
 
 def quick_scan(scan: Scan) -> Scan:
-    """Returns the coarse scan for the questions about angles and the axis.
+    """Returns the coarse scan for all questions that need a reconstruction, except that about the readout.
 
     If the axis is near the panel's edge, the grid is cut to the object: with many voxels of air, the few frames of a coarse
     scan would fit under wrong angles too."""

@@ -16,7 +16,7 @@ from phyradgs_cl.runtime import Runtime
 READOUT, EXPOSURE = "sign of readout", "exposure"
 _ERRORS = 4.0  # two hypotheses must differ by this many standard errors
 # The wrong readout order leaves at least this many times the squared residual of the right one. The factor may be small,
-# because both have as many unknowns.
+# because both orders have equally many unknowns.
 _ORDER_RATIO = 1.04
 _OTHER_RATIO = 1.5  # the same factor for another readout axis or time in place of the stated one
 # The same factor for a gantry at rest: a model without blur always fits better, above all with few views.

@@ -37,9 +37,10 @@ _TOLERATED_DEG = 1.0  # coverage may be less by this than half a turn plus fan: 
 def check_timing(scan: Scan) -> Finding:
     """Compares exposure, readout and table times with the frame times, and the angles with the speed.
 
-    A line cannot open while it is open, a frame cannot be read while the one before is read, and a gantry has one angle at
-    a time. The value is the worst of three numbers: exposure and readout over the shortest frame period (at most 1); 1 + the
-    relative difference between the angle steps and the speed within the frames; a table's duration over the scan's."""
+    A line cannot open while it is open, a frame cannot be read while the one before is read, and a gantry has one angle at a
+    time. The finding's value is the first of four numbers that exceeds its limit, else the one nearest to its limit. They
+    are the exposure and the readout over the shortest frame period, 1 + the relative difference between the angle steps and
+    the speed within the frames, and a table's duration over the scan's."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     if scan.frames < 2:
         return Finding(_TIMING, OK, 0.0, 1.0, "share", "one frame: nothing to compare")
@@ -71,8 +72,8 @@ def _share(name: str, consequence: str, share: float) -> Finding:
 
 
 def _table(scan: Scan) -> list[Finding]:
-    """Returns a finding if a table of angles or poses lasts far longer than the scan: its unit of time is then likely to
-    differ from the frames'. Else []."""
+    """Returns a finding if a table of angles or poses lasts over 100 times as long as the scan, which sees less than 5° of
+    it. The units of the two times are then likely to differ. Returns [] otherwise."""
     table = scan.trajectory.kinematics if isinstance(scan.trajectory, CircularOrbit) else scan.trajectory
     if not isinstance(table, EncoderTable | PoseTable):
         return []
@@ -127,7 +128,7 @@ def check_angles(scan: Scan) -> Finding:
     usual_deg = float(np.median(_steps_deg(scan)))
     widest = np.sort(steps_deg)[::-1]
     is_short = widest[0] > _WIDE * usual_deg
-    # a view covers half a step to each side
+    # A view covers half a step to each side, so the views cover one step more than from the first to the last.
     covered_deg = turn_deg - float(widest[0]) + usual_deg if is_short else turn_deg
     if is_short and covered_deg < needed_deg - _TOLERATED_DEG:
         text = f"views cover {covered_deg:.4g}°; {of_needed}"
@@ -148,7 +149,7 @@ def is_full_turn(scan: Scan) -> bool:
 
 
 def _needed_turn(scan: Scan) -> tuple[float, float, str]:
-    """Returns after how many degrees views repeat, how many degrees a volume needs, and these in words."""
+    """Returns after how many degrees views repeat, how many degrees a volume needs, and the latter in words."""
     geometry = scan.geometry
     if isinstance(geometry, ParallelGeometry):
         if has_opposite_views(scan):

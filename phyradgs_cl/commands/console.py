@@ -120,7 +120,7 @@ def scores(metrics: Mapping[str, float | None]) -> str:
 
 
 def told(metrics: Mapping[str, object], *names: Any) -> list[str]:
-    """Returns metrics that are present, as "PSNR 31.2 dB". names: as in ``printed``."""
+    """Returns the metrics that are present as texts such as "PSNR 31.2 dB". names: as in ``printed``."""
     from phyradgs_cl.metrics import printed  # here, as in ``scores``
 
     return [f"{title} {value}" for title, value in printed(metrics, *names)]
@@ -179,7 +179,8 @@ class GroupedCommand(TyperCommand):
 
 
 def takes_part(arguments: Sequence[str]) -> bool:
-    """Returns whether this process takes part in the command. On ranks other than 0, turns off the output."""
+    """Returns whether this process takes part in the command. Under mpiexec, ranks other than 0 take part in ``reconstruct``
+    only, and this function turns off their output."""
     if launched().rank == 0:
         return True
     sys.stdout = sys.stderr = None  # None as in programs without a console: libraries check for it

@@ -115,7 +115,8 @@ def with_run_options(*without: str) -> Callable[[Callable[..., Any]], Callable[.
 
 
 def settings_of(options: dict[str, Any]) -> Settings:
-    """Returns a command's settings from its options; the TOML file ``config`` and the texts ``assignments`` give more."""
+    """Returns a command's settings from its options. Further settings come from the TOML file ``config`` and from the texts
+    NAME=VALUE of ``assignments``."""
     given = {name: None if value is False else value for name, value in options.items()}  # False: flag not given
     config, assignments = given.pop("config"), given.pop("assignments") or []
     return read_settings(config, given, assignments)

@@ -15,7 +15,7 @@ from phyradgs_cl.errors import InputError
 
 PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3  # the codes of NXtomo's image_key
 QUANTITIES = ("attenuation", "transmission", "counts")
-# Least transmission before the logarithm: 16-bit panels resolve no less. Pixels with less are masked.
+# Least transmission before the logarithm: 16-bit panels resolve no less. Pixels at or below it are masked.
 TRANSMISSION_FLOOR = 1e-6
 _LARGEST = float(np.finfo(np.float32).max)  # any float32 is usable as attenuation, by default
 _BLOCK_PIXELS = 1 << 18  # most pixels converted at a time: a float64 copy of a whole scan needs much memory
@@ -93,8 +93,8 @@ def mean_dark(darks: NDArray[np.generic] | None, panel: tuple[int, ...]) -> NDAr
 def minus_log(signal: NDArray[np.float64], gain: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Returns −ln(signal / gain) for arrays of one shape, and where the result must not be used.
 
-    Where the gain is 0 or less the pixel tells nothing, and the result is 0. A pixel without signal becomes −ln
-    ``TRANSMISSION_FLOOR``."""
+    The result is 0 where signal or gain is not finite, and where the gain is 0 or less. A pixel without signal becomes
+    −ln ``TRANSMISSION_FLOOR``."""
     live = np.isfinite(signal) & np.isfinite(gain) & (gain > 0)
     transmission = np.divide(signal, gain, out=np.zeros_like(signal), where=live)
     p = -np.log(np.maximum(transmission, TRANSMISSION_FLOOR))

@@ -22,10 +22,10 @@ from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 Array = NDArray[np.floating]
 # From this mean on, a rounded normal stands for Poisson (skewness off by < 4e-5): NumPy's own sampler fails near 9.2e18.
 NORMAL_FROM = 1e9
-COUNT_FLOOR = 0.5  # counts of 0 and less have no logarithm: this is less than any detector records
+COUNT_FLOOR = 0.5  # least count before the logarithm, which counts of 0 or less lack; no detector records so little
 _LARGEST_EXPONENT = 700.0  # largest exponent: float64 overflows at very negative line integrals, which ringing may cause
 _SPARK_HEIGHT = (0.3, 2.0)  # least and most light that a spark adds, relative to the light without object
-_SCATTER_REACH = 6.0  # the scatter kernel decays over the panel's longer side divided by this
+_SCATTER_REACH = 6.0  # the scatter kernel falls to 1/e over the panel's longer side divided by this
 _SCATTER_POWERS = (0.8, 1.5)  # scattered light is the product of these powers of the primary light and the line integral
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
 
@@ -103,8 +103,8 @@ def lagged(line_integrals: ArrayLike, lag: float) -> NDArray[np.float64]:
 def without_lag(scan: Scan) -> Scan:
     """Returns the scan as a panel without lag would have recorded it. A scan whose lag is 0 is returned itself.
 
-    Transmissions at or below ``TRANSMISSION_FLOOR`` are masked, and values computed from a masked pixel of this frame or the
-    one before. Photon noise returns to its level without lag. Noise added after the panel grows by √(1 + λ²)/(1 − λ)."""
+    Masked are transmissions at or below ``TRANSMISSION_FLOOR``, and values computed from a masked pixel of the same or the
+    previous frame. Photon noise returns to its level without lag. Noise added after the panel grows by √(1 + λ²)/(1 − λ)."""
     if scan.lag == 0:
         return scan
     projections = np.empty(scan.projections.shape, np.float32)
@@ -125,13 +125,15 @@ def without_lag(scan: Scan) -> Scan:
 
 
 def pixel_gains(shape: tuple[int, int], spread: float, rng: np.random.Generator) -> Array:
-    """Draws gains (v, u) about 1 with the standard deviation ``spread``. Whole columns share a quarter of the variance."""
+    """Draws gains (v, u) about 1, at least 0.05, with the standard deviation ``spread``. Whole columns share a quarter of
+    the variance."""
     own, column = rng.standard_normal(shape), rng.standard_normal((1, shape[1]))
     return np.maximum(1 + spread * (np.sqrt(0.75) * own + 0.5 * column), 0.05)
 
 
 def add_sparks(line_integrals: Array, share: float, rng: np.random.Generator) -> tuple[Array, NDArray[np.bool_]]:
-    """Adds light to a fraction ``share`` of the pixels of line integrals (F, v, u). Also returns which were hit, bool."""
+    """Adds light to pixels of line integrals (F, v, u), each with the probability ``share``. Also returns which pixels were
+    hit, bool (F, v, u)."""
     hit = rng.random(line_integrals.shape) < share
     height = rng.uniform(*_SPARK_HEIGHT, int(hit.sum()))
     sparked = np.array(line_integrals)
@@ -149,9 +151,9 @@ def drifting_light(frames: int, largest: float, rng: np.random.Generator) -> Arr
 def add_scatter(line_integrals: Array, to_primary: float) -> Array:
     """Returns line integrals (F, v, u) with scatter, float64.
 
-    A ray with the primary light P scatters P^0.8 p^1.5, as Sun and Star-Lack (Phys. Med. Biol. 55 (2010) 6695) found for
-    water. A kernel exp(−r/ℓ) spreads it, where ℓ is a sixth of the panel's longer side. Behind the object, scatter is
-    ``to_primary`` times the primary light on average."""
+    A ray with the line integral p and the primary light P = exp(−p) scatters P^0.8 p^1.5, as Sun and Star-Lack (Phys. Med.
+    Biol. 55 (2010) 6695) found for water. A kernel exp(−r/ℓ) spreads this light, where ℓ is a sixth of the panel's longer
+    side. Behind the object, scatter is ``to_primary`` times the primary light on average."""
     p = np.asarray(line_integrals, np.float64)
     primary = np.exp(-p)
     lost = primary**_SCATTER_POWERS[0] * np.maximum(p, 0) ** _SCATTER_POWERS[1]

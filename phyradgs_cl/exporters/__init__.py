@@ -70,7 +70,8 @@ def _checked(
     path: Path, to: str, output: str | Path | None, mu_water_per_mm: float | None, labels: DicomLabels | None,
     scale_of: ScaleOf | None,
 ) -> tuple[Path, ScaleOf | None]:  # fmt: skip
-    """Returns the path to write, and the function from the volume to its HU scale, or None."""
+    """Returns the path to write, and the function from the volume to its HU scale, or None. Raises InputError as
+    ``export_volume`` does for arguments that do not fit."""
     checks.one_of("--to", to, (*EXPORTS, OWN))
     if mu_water_per_mm is not None and scale_of is not None:
         raise InputError("--mu-water-per-mm", "given with --hu", "one of the two", "leave one out")
@@ -93,7 +94,8 @@ def _checked(
 
 
 def _in_unit(volume: Volume, scale: Hounsfield | None, unit: str = _PLAIN) -> tuple[Volume, str]:
-    """Returns a volume in float32 and a note of its unit: Hounsfield units if there is a scale, else ``unit``."""
+    """Returns the volume with float32 values, and a note of their unit: Hounsfield units if there is a ``scale``, else
+    ``unit``."""
     values = np.ascontiguousarray(volume.values, np.float32)
     return replace(volume, values=values if scale is None else scale.of(values)), unit if scale is None else scale.note
 

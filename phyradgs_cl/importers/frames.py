@@ -1,5 +1,5 @@
-"""Converts frames of any format to line integrals, with row 0 the lowest and bad pixels masked. Flats and darks that do not
-fit the others are left out; the others' median is used.
+"""Converts frames of any format to line integrals, with row 0 the lowest and bad pixels masked. Flats and darks that are
+unlike most are left out; the median of the rest is used.
 
 Flats of several times, such as before and after the scan, are interpolated linearly over the frames' numbers."""
 
@@ -206,7 +206,8 @@ def line_integrals(
 
 
 def _refuse_logarithms(subject: str, frames: np.ndarray, flat: np.ndarray, options: ImportOptions) -> None:
-    """Raises InputError for flats of ones with frames near 0 at their borders: these are line integrals, not counts."""
+    """Raises InputError if flats are 1 everywhere and frames near 0 at their left and right borders. Such frames hold line
+    integrals, not counts."""
     border = np.concatenate([frames[..., 0].ravel(), frames[..., -1].ravel()])
     if (flat == 1).all() and abs(float(np.median(border))) < _AIR:
         remedy = f"say {options.named('quantity')} attenuation, and leave the flats out"
@@ -221,7 +222,7 @@ def _mask_clipped(
     air: the reason why other clipped pixels count as air, as a text.
 
     Where the flat is clipped too, the integral becomes 0, which is right for air and loses thin parts of the object. Masking
-    these pixels would leave no air: the reconstruction's error was then 2 to 3 times larger than by that loss."""
+    these pixels would leave no air, and made the reconstruction's error 2 to 3 times as large."""
     brighter = flat > saturation.level * (1 + _SAME)
     for frame, bad in zip(frames, unusable, strict=True):
         bad |= (frame == saturation.level) & brighter

@@ -28,7 +28,7 @@ STACKS = ("projections", "flats", "darks", "mask")
 NAMES = (*STACKS, "image_key", "angles", "axes")
 _AXES = ("frame", "v", "u")
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_LIKE = 0.1  # relative difference up to which a file's two pixel sizes agree: on the panel, and at the sample magnified
+_LIKE = 0.1  # relative difference up to which the pixel size on the panel agrees with that at the sample, magnified
 _LEAST_MM = 1e-4  # no pixel is smaller than this: a smaller number without a unit must be in m
 _TIMES = replace(LENGTH, name="magnification", assumed="", factors=MappingProxyType({"": 1.0, "x": 1.0}))
 
@@ -226,8 +226,9 @@ class Lengths:
 def beam(
     source: Hdf5Source, lengths: Lengths, options: ImportOptions, panel: tuple[int, int], axis_columns: float = 0.0
 ) -> Geometry:
-    """Returns the geometry from the options' numbers, else the file's. Without a distance in the options or the source's in
-    the file, it is a parallel beam, with a warning. axis_columns: columns from the axis to the panel's middle, to the right.
+    """Returns the geometry from the options' numbers, else the file's. If the options give no distance and the file has none
+    of the source, the beam is parallel, with a warning. axis_columns: columns from the axis to the panel's middle, positive
+    to the right.
     Raises InputError for wrong lengths."""
     quantity = LENGTH
     for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):

@@ -97,9 +97,9 @@ def read_image(path: Path, state: int | None = None) -> Any:
 
 
 def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
-    """Returns how many bytes of voxels a file holds when unpacked. SimpleITK invents missing voxels of NIfTI and damaged
-    ones of packed MetaImages without an error. Returns None for NRRD, which SimpleITK checks. Raises InputError for data
-    outside the folder or in several files."""
+    """Returns how many bytes of voxels a file holds when unpacked. SimpleITK raises no error for missing voxels of NIfTI and
+    damaged ones of packed MetaImages, but invents values. Returns None for NRRD, which SimpleITK checks. Raises InputError
+    for data outside the folder or in several files."""
     with gzip.open(path) if path.suffix.lower() == ".gz" else open(path, "rb") as file:
         head = file.read(_HEAD_BYTES)
         if reader.HasMetaDataKey("bitpix"):  # NIfTI: SimpleITK turns scaled integers into floats of another size

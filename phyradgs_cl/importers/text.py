@@ -45,7 +45,8 @@ def number_at_start(text: str, comma_is_decimal: bool = False) -> tuple[float, s
 
 
 def commas_are_decimal(texts: list[str]) -> bool:
-    """Returns whether numbers in the texts have decimal commas: a comma that cannot mark thousands, and no point."""
+    """Returns whether numbers in the texts have decimal commas: one has a comma that cannot mark thousands, and none a
+    decimal point."""
     commas = any(_ONE_COMMA.fullmatch(text) and not _EITHER.fullmatch(text) for text in texts)
     return commas and not any(re.fullmatch(r"[-+]?\d*\.\d+", text) for text in texts)
 
@@ -140,7 +141,8 @@ def _column(
 
 
 def file_of_angles(folder: SafeFolder, name: str, *ends: str) -> Path | None:
-    """Tries the ``ends`` in order: returns the file called ``name`` + end, else the only file with that end; or None."""
+    """Returns, for the first of the ``ends`` that a file's name has, the file called ``name`` + end, else the only file with
+    that end. Returns None if no end leads to one file."""
     for end in ends:
         files = folder.glob(f"*{end}")
         own = [file for file in files if file.name.lower() == f"{name}{end}".lower()]
@@ -168,7 +170,8 @@ class Settings(Fields):
         self.comma_is_decimal = comma_is_decimal
 
     def measured(self, key: str, quantity: Quantity, unit: str) -> float:
-        """Returns a number above 0, in the package's unit of ``quantity``. unit: assumed if no known unit follows it."""
+        """Returns a number above 0, in the package's unit of ``quantity``. unit: its unit if no known unit follows it in the
+        text."""
         found = number_at_start(str(self.get(key)), self.comma_is_decimal)
         stated = quantity.factor(found[1]) if found and found[1] else None
         factor = stated or quantity.factor(unit)

@@ -124,8 +124,8 @@ def _header(path: Path) -> tuple[int, tuple[tuple[int, int], np.dtype]]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Yields an open TIFF. Errors of tifffile, while it is open, become InputError. So do pages beyond the file's end, which
-    tifffile only logs and leaves out."""
+    """Yields an open TIFF. Errors of tifffile, while it is open, become InputError. Pages beyond the file's end, which
+    tifffile only logs and leaves out, raise InputError too."""
     regular_file(path, str(path))
     tifffile = checks.package("tifffile", "the package that reads TIFF", "phyradgs-cl[formats]")
     logger, said = logging.getLogger("tifffile"), list[str]()

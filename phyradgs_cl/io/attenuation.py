@@ -72,7 +72,8 @@ def words_of_hu(volumes: Mapping[Path, Volume], mu_water_per_mm: float | None = 
 
 
 def attenuation_of(subject: str, volume: Volume) -> Volume:
-    """Returns ``volume``. Raises InputError about ``subject`` if its values cannot be 1/mm, such as HU."""
+    """Returns ``volume`` unchanged. Raises InputError about ``subject`` if its values cannot be in 1/mm, because they lie
+    below −10 or above 1000, as Hounsfield units do."""
     lowest, highest = float(volume.values.min()), float(volume.values.max())
     if lowest < _LOWEST_PER_MM or highest > _HIGHEST_PER_MM:
         found = f"values from {lowest:g} to {highest:g}, as of Hounsfield units"

@@ -22,7 +22,8 @@ from phyradgs_cl.errors import InputError, OutputError
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
 """Error numbers of a full disk, a file that is too large, and a user's exhausted quota."""
-_LONGEST = 50  # a temporary name has at most this many characters of the target's: it stays below 255 bytes, at 4 bytes each
+# A temporary name has at most this many characters of the target's, so that it stays below 255 bytes at 4 bytes a character.
+_LONGEST = 50
 _LONGEST_BYTES = 255  # longest file name that common file systems allow
 _SPARE_BYTES = 1 << 16  # room on the disk that is reserved for headers, besides the arrays
 _WRITER = re.compile(r"\.([0-9a-f]{8})-(\d{1,9})-[0-9a-f]{8}\.part(\.[a-z.]+)?$")

@@ -184,7 +184,7 @@ def _states_summary(source: Hdf5Source, shape: tuple[int, ...]) -> dict[str, obj
 
 
 def file_kind(path: str | Path) -> str:
-    """Finds the kind of an HDF5 file: "scan", "volume", "plain-volume" (a bare dataset /volume) or "deformation". Raises
+    """Returns the kind of an HDF5 file: "scan", "volume", "plain-volume" (a bare dataset /volume) or "deformation". Raises
     InputError for any other file."""
     with open_hdf5(path) as source:
         if isinstance(source.find(_DATA), h5py.Group):

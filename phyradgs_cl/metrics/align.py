@@ -11,7 +11,7 @@ from phyradgs_cl.fields import Grid, triple
 
 Values = NDArray[np.floating]
 VOXEL_BY_VOXEL = "voxel by voxel"
-_ROUNDING = 1e-6  # a voxel's centre that is at most this far outside a box, in voxels, counts as inside: it is rounding
+_ROUNDING = 1e-6  # a voxel's centre at most this far outside a box, in voxels, counts as inside, because centres are rounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +29,8 @@ class Aligned:
 def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid) -> Aligned | None:
     """Returns both volumes (nz, ny, nx) on one grid; None where their boxes share no voxel centre.
 
-    Where each voxel of the volume is a whole block of the reference's, the reference is averaged over blocks. Otherwise the
-    volume is resampled trilinearly onto the reference's voxels that lie in its box."""
+    If whole blocks of the reference's voxels fill every voxel of the volume, the reference is averaged over these blocks.
+    Otherwise the volume is resampled trilinearly at those voxels of the reference whose centres lie in the volume's box."""
     if grid.is_close(reference_grid):
         return Aligned(volume, reference, grid)
     if (blocks := _blocks(grid, reference_grid)) is not None:

@@ -34,8 +34,8 @@ def coverage(sigma: Array, volume: Array, truth: Array, multiple_95: float) -> d
 
 
 def reliability_png(path: str | Path, sigma: Array, volume: Array, truth: Array, multiple_95: float) -> None:
-    """Draws the size of errors over σ to a PNG file. The object's voxels are sorted by σ and divided into tenths. For each
-    tenth, the 68th percentile of its absolute errors, and the 95th over ``multiple_95``, are drawn over its mean σ. If the
+    """Plots the size of errors against σ in a PNG file. The object's voxels are sorted by σ and divided into tenths. A tenth
+    has two points at its mean σ: the 68th percentile of its absolute errors, and the 95th divided by ``multiple_95``. If the
     error bars are right, the points lie on the dashed line. Arguments are as in ``coverage``."""
     inside = object_voxels(truth)
     size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)

@@ -34,8 +34,8 @@ _LINE = 0.9  # a row or column with more than this fraction of dead pixels is de
 
 @dataclass(frozen=True)
 class SparkOptions(checks.Checked):
-    """threshold: least height of a spark in local standard deviations (``find_sparks``). least: least height in line
-    integrals, dimensionless. pixels: most touching pixels that count as one spark."""
+    """Options of the step ``sparks``. threshold: least height of a spark in local standard deviations (``find_sparks``).
+    least: least height in line integrals, dimensionless. pixels: most touching pixels that count as one spark."""
 
     PREFIX = "sparks."
 
@@ -46,7 +46,8 @@ class SparkOptions(checks.Checked):
 
 @dataclass(frozen=True)
 class DeadOptions(checks.Checked):
-    """deviations: least difference of a pixel from its neighbours, in robust deviations of all pixels of the panel."""
+    """Options of the step ``dead``. deviations: least difference of a dead pixel from its neighbours, in robust standard
+    deviations of this difference over the panel."""
 
     PREFIX = "dead."
 

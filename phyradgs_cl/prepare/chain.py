@@ -37,16 +37,16 @@ DEFAULT_STEPS = "sparks,dead,rings"
 STEPS_HELP = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 PREPARED_KEY = "prepared"
 """The key under which a scan's provenance lists the steps that were applied to it."""
-# Steps to run only once: a second run would subtract from what the first one left. A "result" of theirs tells that a run
-# corrected nothing.
+# Steps to run only once, because a second run would subtract from what the first one left. Where the provenance has a
+# "result" of such a step, it corrected nothing and may run again.
 _ONCE = ("scatter", "hardening", "phase")
 
 
 @dataclass(frozen=True)
 class PrepareOptions:
-    """flats: one of ``light.WAYS``, applied when a file is read. steps: names of ``STEPS``, separated by commas. Each other
-    field has the options of the step of its name. Raises InputError for unknown steps, and for options of steps that are not
-    named."""
+    """The chosen steps and their options. flats: how flats are used when a file is read, one of ``light.WAYS``. steps: names
+    of ``STEPS``, separated by commas. Each other field has the options of the step of its name. Raises InputError for
+    unknown steps, and for options of steps that are not named."""
 
     flats: str = checks.option("mean", words=WAYS)
     steps: str = checks.option("", STEPS_HELP, "none", metavar="NAME,...")

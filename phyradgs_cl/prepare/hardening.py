@@ -35,8 +35,12 @@ _BONE_VOXELS = 128  # a coarse volume is enough to find bone, because its harden
 # Candidates: soft tissue ends, and pure bone begins, at these fractions of the densest voxel (above 1: no voxel is pure).
 _BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in (0.4, 0.7, 1.0) if soft < bone]
 _BETWEEN += [(0.7, 1.0), (0.7, 1.5), (0.8, 1.5)]
-_AS_WELL = 0.1  # of the candidates that gain at most this fraction less over water than the best one, least bone wins
-_NEARLY = 1.02  # bone is corrected even if it leaves 2 % more unexplained than water: a stated voltage means a hardened scan
+# Candidates count as equally good if they improve on water alone by at least 90 % as much as the best one does. Of these
+# the one with least bone wins.
+_AS_WELL = 0.1
+# Bone is corrected even if this leaves up to 2 % more unexplained than water alone does, provided that it leaves less than
+# no correction: who states a voltage expects hardening.
+_NEARLY = 1.02
 _NEWTON = 3  # steps of Newton's method, enough for an error of 1e-12
 _UNIFORM = 0.08  # the object has several materials if path lengths leave a larger relative RMS of line integrals unexplained
 _SHADOW = 0.1  # pixels whose path is longer than this fraction of the longest lie behind the object
@@ -46,7 +50,8 @@ _NONE: Polynomial = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class HardeningOptions(checks.Checked):
-    """Either polynomial or kvp may be stated. With neither, a polynomial is fitted for one material.
+    """Options of the step ``hardening``: a polynomial, or a tube voltage. With neither, a polynomial is fitted for one
+    material.
 
     - polynomial: coefficients of p², p³ and p⁴. kvp: tube voltage in kV, which gives the spectrum; 0: not stated.
     - bone_per_mm: attenuation in 1/mm from which a voxel is bone; 0: candidates are tried.

@@ -24,8 +24,8 @@ from phyradgs_cl.io import ToAttenuation, read_scan
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 WAYS = ("mean", "time", "pca")
-_MOST_COMPONENTS, _CLEAR = 4, 4.0  # most components used; one is noise unless its variance is 4 times their median
-_REWEIGHTINGS = 12
+_MOST_COMPONENTS, _CLEAR = 4, 4.0  # most components used; those with less than 4 times the median variance are noise
+_REWEIGHTINGS = 12  # rounds of least squares, each with new weights
 _LEAST_PIXELS = 20  # with fewer pixels of air in a frame, their median is too noisy
 _AROUND = np.ones((3, 3), bool)
 _MARGIN = 2  # pixels this near to the object are no air, because its edge is blurred
@@ -117,8 +117,8 @@ def _least_variation(frame: np.ndarray, components: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class AirOptions(checks.Checked):
-    """below: pixels are air if they lie below this fraction of the scan's largest line integral and connect to the panel's
-    left or right side. least: least fraction of air in every frame."""
+    """Options of the step ``air``. below: pixels are air if they lie below this fraction of the scan's largest line integral
+    and connect to the panel's left or right side. least: least fraction of air in every frame."""
 
     PREFIX = "air."
 

@@ -22,7 +22,8 @@ _MOST, _OBJECT = 0.5, 0.02  # the shadow may cover half of the object's pixels: 
 
 @dataclass(frozen=True)
 class MetalOptions(checks.Checked):
-    """above_per_mm: attenuation in 1/mm in a first volume from which voxels are metal. 0: six times the main material's."""
+    """Options of the step ``metal``. above_per_mm: attenuation in 1/mm from which voxels of a first volume are metal; 0: six
+    times that of the main material."""
 
     PREFIX = "metal."
 
@@ -53,10 +54,10 @@ def mask_metal(scan: Scan, options: MetalOptions, make_model: MakeModel) -> tupl
 
 
 def _completed(masked: Scan, shadow: np.ndarray, is_metal: np.ndarray, make_model: MakeModel) -> np.ndarray:
-    """Returns the frames (F, v, u) with the shadow filled by the projection of a volume that the other pixels give. That
+    """Returns the frames (F, v, u) with the shadow filled by the projection of a volume that the other pixels give. The
     projection's difference from the frames at the shadow's rim is interpolated across the shadow, so that no edge is left.
 
-    Only masked rays meet the voxels in and next to metal, so they would stay near 0. They get the density around them."""
+    Only masked rays meet the voxels in and next to metal. These voxels would stay near 0, so they get the density around."""
     model, _ = step.coarse_model(masked, make_model, _VOXELS)
     volume = model.regularised(masked.projections)
     factors = np.divide(volume.shape, is_metal.shape)

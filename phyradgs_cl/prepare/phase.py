@@ -25,9 +25,9 @@ _REACHES = 8  # frames are padded by this many decay lengths of the filter: only
 
 @dataclass(frozen=True)
 class PhaseOptions(checks.Checked):
-    """energy_kev: the beam's energy. distance_mm: the distance from object to panel; None takes the distance from axis to
-    panel. delta_beta: δ/β of the object's material. delta, beta: δ and β themselves, in place of their ratio. Raises
-    InputError for values out of range or in contradiction."""
+    """Options of the step ``phase``. energy_kev: the beam's energy. distance_mm: the distance from object to panel; None
+    takes the distance from axis to panel, for a cone beam only. delta_beta: δ/β of the object's material. delta, beta: δ and
+    β themselves, in place of their ratio. Raises InputError for values out of range or in contradiction."""
 
     PREFIX = "phase."
 

@@ -3,7 +3,8 @@
 Over a full turn, the mean of all views shows the object averaged around the axis, which is symmetric about it. So a column
 that differs from its mirror image shows an error of the panel. Two independent sets of views both show this error: their
 covariance says whether there are rings, and how strong. Without rings the frames stay unchanged. The pattern is the mean
-over views minus its denoised copy, which keeps the strong cosine coefficients of overlapping blocks: the object's.
+over views minus its denoised copy, which keeps the strong cosine coefficients of overlapping blocks, because these belong to
+the object.
 
 A single column or pixel of wrong gain deviates on one side of the axis only. Its neighbours and their mirror images do not,
 and both sets of views show it. (On an arc the mean is symmetric for a round object only.)"""
@@ -27,7 +28,7 @@ _LEAST_FRAMES = 8  # fewer views do not average the object enough to show rings:
 _LEAST_PAIRS = 0.25  # columns are compared with their mirror images if at least this fraction of them has one on the panel
 _LEAST_SHARE = 0.25  # a pattern with less than this fraction of the variance of the mean's noise is not worth a correction
 _NEGLIGIBLE = 1e-4  # nobody sees a pattern with a smaller standard deviation in line integrals: gains off by 0.01 %
-_SURE = 12.0  # a pattern is certain if its variance over the noise's exceeds this many standard errors, about 1/√pixels
+_SURE = 12.0  # a pattern is certain if its variance exceeds the noise's times this, over √pixels: about 12 standard errors
 _THRESHOLD = 3.5  # coefficients above this many standard deviations of the pattern belong to the object
 _SHIFTS = 8  # positions of the blocks along each side, over which the result is averaged so that no block edges show
 _DEVIATIONS = 8.0  # a gain is wrong if it is off by more than this many robust standard deviations in both sets of views
@@ -42,7 +43,7 @@ _EQUALLY_FAR = 1.15  # the sources of a full turn are nearly equally far from th
 
 @dataclass(frozen=True)
 class RingOptions(checks.Checked):
-    """window: side in pixels of the blocks of cosines. Patterns wider than a block are not removed."""
+    """Options of the step ``rings``. window: side in pixels of the blocks of cosines. Patterns wider than a block stay."""
 
     PREFIX = "rings."
 
@@ -213,8 +214,8 @@ def _covariance(one: np.ndarray, other: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class SingleGains:
-    """offset: the error (v, u) float32 that wrong gains add to line integrals, 0 elsewhere. columns, pixels: how many
-    columns and single pixels have one."""
+    """Wrong gains of whole columns and single pixels. offset: the error (v, u) float32 that they add to line integrals, 0
+    elsewhere. columns, pixels: how many columns and single pixels have one."""
 
     offset: np.ndarray
     columns: int = 0

@@ -20,29 +20,32 @@ from phyradgs_cl.prepare.light import enough_air, with_air_at_0
 from phyradgs_cl.prepare.step import Facts, MakeModel, Model
 
 Kernel = Mapping[tuple[float, int], float]
-"""Strength of each Gaussian, by its standard deviation over the panel's longer side and the power of the line integral."""
+"""Strength of each Gaussian. Its key has its standard deviation, as a fraction of the panel's longer side, and the power n
+in the light P · (−ln P)ⁿ that it spreads."""
 _POWERS = (1, 2)  # powers of a ray's line integral to which scatter is fitted: the square tells thick rays from thin ones
-# Standard deviations of the fitted Gaussians over the panel's longer side. Narrower ones would fit columns of wrong gain.
+# Standard deviations of the fitted Gaussians, as fractions of the panel's longer side. Narrower ones would fit columns of
+# wrong gain.
 _REACHES = (0.12, 0.18, 0.27, 0.4)
 _PASSES = 6  # rounds that compute scatter from the primary light, then primary light from the scatter
 _LEAST_PRIMARY = 0.05  # an overestimate of scatter leaves at least this fraction of the light: the logarithm stays finite
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
 _FITTED_FRAMES = 24  # the fit uses at most this many frames, evenly spread, to save time
-_USUAL_REACH = 0.18  # where the user states to_primary alone: spread (std) of scatter over the panel's longer side
+_USUAL_REACH = 0.18  # where only to_primary is stated: the kernel's standard deviation over the panel's longer side, a ratio
 _HEIGHT_STEP = 1.25  # each kernel that is tried is stronger than the one before by this factor
 _MOST_STEPS = 8  # at most this many steps make the kernel stronger, up to 6 times the fitted one
 _TRIALS = 6  # most strengths tried in the final search, between the neighbours of the best one
 # A stronger kernel is taken if it leaves less than this fraction of the rest that the fitted kernel leaves unexplained.
 _BETTER = 0.65
-_AS_WELL = 1.05  # no stronger kernel is tried once a kernel leaves this many times the least unexplained rest
+_AS_WELL = 1.05  # no stronger kernel is tried once one leaves over this many times the least rest found so far
 _LARGEST_HEIGHT = 20.0  # no kernel for a stated to_primary is stronger than this
 _BISECTIONS = 20  # halvings that give the strength for a stated to_primary to 2e-5
 
 
 @dataclass(frozen=True)
 class ScatterOptions(checks.Checked):
-    """to_primary: ratio of scatter to primary light behind the object; 0: the kernel is fitted to air. reach: standard
-    deviation of the kernel over the panel's longer side; 0: fitted, or 0.18 where to_primary is stated."""
+    """Options of the step ``scatter``. to_primary: ratio of scatter to primary light behind the object; 0: the kernel is
+    fitted to air. reach: standard deviation of the kernel, as a fraction of the panel's longer side; 0: fitted, or 0.18 if
+    to_primary is stated."""
 
     PREFIX = "scatter."
 
@@ -93,9 +96,9 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
 
 
 def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
-    """Returns the kernel with the strength that leaves the least ``unexplained``, or unchanged if that gains little. frames:
-    line integrals (F, v, u), which are first blurred by ``blur`` pixels to fit a coarse model. The corrected frames are
-    shifted so that the median of each frame's ``air``, bool (F, v, u), is 0."""
+    """Returns the kernel with the strength that leaves the least ``unexplained``. Returns it unchanged unless that is below
+    0.65 times what the fitted kernel leaves. frames: line integrals (F, v, u), which are first blurred by ``blur`` pixels to
+    fit a coarse model. The corrected frames are shifted so that the median of each frame's ``air``, bool (F, v, u), is 0."""
     if not kernel:
         return kernel
     coarse = step.smooth(frames, blur)

@@ -14,7 +14,9 @@ Facts = dict[str, Any]
 """What a step did, as numbers and words by name, for the scan's provenance."""
 _COARSE_VOXELS = 48  # hardening and scatter are smooth, so few voxels along the longest side show them
 _INSIDE = 0.1  # the object is denser than this fraction of the densest voxel
-_SMOOTH = 1 / 24  # blur over the panel's longer side: it leaves hardening and scatter, and removes errors of the grid
+# Blur, as a fraction of the panel's longer side: it keeps the smooth errors of hardening and scatter, and removes the finer
+# ones of the grid.
+_SMOOTH = 1 / 24
 
 
 @dataclass(frozen=True)

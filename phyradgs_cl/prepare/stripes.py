@@ -22,7 +22,7 @@ from phyradgs_cl.prepare.rings import mirror_columns
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 _LEAST_VIEWS = 60  # the method assumes that neighbouring columns record the same values, which takes this many views
-_LEAST = 2e-3  # a stripe that deviates less, by a gain that is 0.2 % off, is left alone
+_LEAST = 2e-3  # a stripe whose line integrals deviate by less is left alone: this is a gain that is off by 0.2 %
 _NEAR = 5  # each side of a column is represented by the median of this many columns
 _FLUCTUATING = 3.0  # a column fluctuates if it changes this many times as much between views as the columns at both sides
 _UNRESPONSIVE = 10.0  # a column does not respond if it varies this many times less than the columns at both sides
@@ -32,7 +32,8 @@ _SMALLEST = 1e-6  # least spread in line integrals, to divide by: that of a stuc
 
 @dataclass(frozen=True)
 class StripeOptions(checks.Checked):
-    """width: columns over which the median is taken; stripes are narrower than half of it. ratio: a stripe deviates this
+    """Options of the step ``stripes``. width: columns over which the median is taken; stripes are narrower than half of it.
+    ratio: a stripe deviates this
     many times as much as the columns at both sides; 0 replaces every column, as the paper does."""
 
     PREFIX = "stripes."

@@ -36,7 +36,7 @@ Image = NDArray[np.float32]
 class Run:
     """A reconstruction, read from its volume file and, if it is found, its scan.
 
-    - scan, scan_path, scan_facts: the scan, on the volume's grid.
+    - scan: on the volume's grid. scan_path: its file. scan_facts: what ``scan_summary`` says about the file.
     - reference (nz, ny, nx) 1/mm: the truth on that grid. compared: how volume and truth were compared. metrics: by name.
     - notes: remarks for the reader of the page. deformation: how the object moved, if the run knew or found it."""
 

@@ -134,7 +134,8 @@ def panel_corners(pose: Points, detector_shape: tuple[int, int]) -> Points:
 
 
 def _first_arc(scan: Scan) -> Points:
-    """Returns poses (T, 12), evenly over the time in which a fly-scan's first frame is lit; of a gantry at rest, its one."""
+    """Returns drawable poses (T, 12) at even times, from the first to the last light of a fly-scan's first frame. For a
+    gantry at rest all are its one pose."""
     first_s, last_s = scan.shutter.lit_span_s if scan.is_fly else (scan.shutter.middle_s,) * 2
     times_s = scan.frame_start_s[0] + np.linspace(first_s, last_s, _ARC_SAMPLES)
     return with_sources(scan, scan.trajectory.pose(0, times_s))

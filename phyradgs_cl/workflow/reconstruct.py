@@ -195,7 +195,7 @@ def _warn_of_doubts(plan: methods.RunPlan, path: Path, scan: Scan) -> None:
     motion, preprocessing = getattr(plan.options, "motion", None), plan.preprocessing
     if scan.detector_model == "intensity" and motion is not None and not hasattr(plan.options, "detector_model"):
         cells = motion.cells(scan, 0)
-        if cells.is_moving or cells.averages:  # with one pose per line, both detector models are the same
+        if cells.is_moving or cells.averages:  # otherwise nothing is averaged: both models agree
             text = "%s averages intensity over an exposure; --method %s averages line integrals"
             log.warning(text, path, plan.method_name)
     if scan.is_fly and isinstance(motion, MicroViews) and motion.strips > scan.lines:

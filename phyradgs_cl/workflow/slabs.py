@@ -37,7 +37,8 @@ _COPIES = 4  # arrays of the frames' size that a method holds at a time
 @dataclass(frozen=True)
 class Slabs:
     """Which detector rows to reconstruct, and how many at a time. rows: [first, stop); None takes all. rows_at_a_time: 0
-    takes stated ``rows`` at once, and of all rows as many as half of this machine's memory holds in four copies."""
+    takes stated ``rows`` at once; without stated ``rows`` it takes as many as half of this machine's memory holds in four
+    copies."""
 
     rows: tuple[int, int] | None = None
     rows_at_a_time: int = 0
@@ -133,7 +134,7 @@ def _pass_on(report: methods.ProgressReport, label: str, progress: methods.Progr
 
 class _Store:
     """The finished slabs of a run: .npy files in a folder next to the output. identity: a text about the run, stored with
-    them. Without ``resume`` earlier slabs are removed; with it, slabs of another run raise InputError."""
+    the slabs. Without ``resume`` earlier slabs are removed; with it, slabs of another run raise InputError."""
 
     def __init__(self, output: Path, identity: str, resume: bool) -> None:
         self.folder = beside(output, ".slabs")

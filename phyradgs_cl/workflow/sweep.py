@@ -218,7 +218,8 @@ def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: st
 
 
 def _failed(run: SweepRun, error: Exception) -> Line:
-    """Returns the line of results of a failed run. Raises OutputErrors except BusyError, since all runs would meet them."""
+    """Returns the line of results of a failed run. An OutputError that is no BusyError is raised instead, because all runs
+    would meet it."""
     if isinstance(error, OutputError) and not isinstance(error, BusyError):
         raise error
     text = str(error) if isinstance(error, PhyradgsError) else f"{type(error).__name__}: {error}"

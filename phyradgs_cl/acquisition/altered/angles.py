@@ -5,7 +5,7 @@ import numpy as np
 from phyradgs_cl.acquisition.scan import Scan
 
 _ACROSS = 1e-3  # a ray is perpendicular to the axis if the cosine of their angle is below this
-_ARC_STEPS = 32  # steps of an exposure whose arc is measured: the gantry turns by less than half a turn in each
+_ARC_STEPS = 32  # steps in which an exposure's arc is measured: a gantry must turn by less than half a turn in each
 
 
 def azimuth_rad(pose: np.ndarray) -> np.ndarray:
@@ -37,7 +37,7 @@ def exposure_arc_rad(scan: Scan) -> float:
     if not scan.is_fly:
         return 0.0
     frame = scan.frames // 2
-    # in small steps, because azimuths at both ends do not tell 270° from 90°
+    # A sum over small steps, because the azimuths at both ends alone do not tell an arc of 270° from one of 90°.
     times_s = float(scan.frame_start_s[frame]) + scan.shutter.exposure_s * np.linspace(0, 1, _ARC_STEPS + 1)
     return abs(float(wrapped(np.diff(azimuth_rad(scan.trajectory.pose(frame, times_s)))).sum()))
 

@@ -21,13 +21,14 @@ _MOST_VOXELS = 64  # most voxels along the grid's longest side, without the marg
 _MARGIN = 1  # voxels of air added on each side: without air around a large object, too small a pixel size would fit better
 _OBJECT_SHARE = 0.02  # a column shows the object if its largest line integral is above this fraction of the scan's largest
 _LEAST_COLUMNS = 12  # least number of blocks from left to right, if the panel has at least as many columns
-_NARROW = 3  # on a panel lower than two blocks, a block's side is divided by this: a single row of blocks tells little
+_NARROW = 3  # a block's side is divided by this on a panel lower than two blocks, because one row of blocks tells little
 
 
 def coarse(scan: Scan, columns: int) -> Scan:
-    """Returns the scan with at most 60 frames, pixels averaged in blocks, a coarse grid, and no reference.
+    """Returns the scan with at most 60 frames, pixels averaged in blocks, a coarse grid, and no true volumes.
 
-    The panel's longer side has at most ``columns`` blocks, or more if the shorter side would have too few blocks."""
+    The panel's longer side has at most ``columns`` blocks. It has more if the panel would else have fewer than 12 blocks
+    from left to right, or fewer than two from bottom to top."""
     shape = scan.geometry.detector_shape
     block = min(math.ceil(max(shape) / columns), max(1, shape[1] // _LEAST_COLUMNS))
     if 2 * block > shape[0]:
@@ -37,10 +38,10 @@ def coarse(scan: Scan, columns: int) -> Scan:
 
 
 def smooth(scan: Scan, pixels: float | tuple[float, float]) -> Scan:
-    """Returns the scan with frames smoothed by a Gaussian, so that averaging blocks does not alias. Masked pixels do not
-    count.
+    """Returns the scan with frames smoothed by a Gaussian, so that averaging blocks does not alias. Masked pixels have no
+    weight.
 
-    pixels: the standard deviation in pixels, or a pair (v, u). Up to 0.5 the scan is returned unchanged."""
+    pixels: the standard deviation in pixels, or a pair (v, u). If neither exceeds 0.5, the scan is returned unchanged."""
     v_px, u_px = pixels if isinstance(pixels, tuple) else (pixels, pixels)
     if max(v_px, u_px) <= 0.5:
         return scan
@@ -61,7 +62,8 @@ def fewer_frames(scan: Scan, most: int) -> Scan:
 
 
 def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
-    """Returns the scan with only the frames of the given indices. Its trajectory finds their poses by their old numbers."""
+    """Returns the scan with only the frames of the given indices. Its trajectory translates new frame numbers to old
+    ones."""
     trajectory = altered_trajectory(scan)
     mask = scan.pixel_mask
     return replace(
@@ -74,10 +76,11 @@ def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
 
 
 def binned(scan: Scan, block: int) -> Scan:
-    """Returns the scan with blocks of ``block`` × ``block`` pixels averaged to one, and without true volumes.
+    """Returns the scan with blocks of ``block`` × ``block`` pixels averaged to one pixel, and without true volumes.
 
-    Only valid pixels are averaged. A block is masked if fewer than half of its pixels are valid. The last rows and columns
-    are dropped if they fill no block. A block of lines opens at the mean of its lines' opening times."""
+    A block is never larger than the panel. Only valid pixels are averaged. A block is masked if fewer than half of its
+    pixels are valid. The last rows and columns are dropped if they fill no block. A block of lines opens at the mean of its
+    lines' opening times."""
     if block == 1:
         return replace(scan, reference=None, moving_truth=None)
     height, width = blocks = tuple(min(block, count) for count in scan.geometry.detector_shape)
@@ -99,8 +102,9 @@ def binned(scan: Scan, block: int) -> Scan:
 
 
 def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
-    """Returns a coarse grid of the same box, with a margin of one voxel. Its voxels are about as large as a pixel of
-    ``geometry`` at the axis, and not finer than those of ``grid``."""
+    """Returns a coarse grid of the same box, with a margin of one voxel on each side. Its voxels are about as large as a
+    pixel of ``geometry``, scaled to the axis. They are not finer than those of ``grid``, nor than 1/64 of its longest
+    side."""
     height_mm, width_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     least_mm = max(max(grid.size_mm) / _MOST_VOXELS, min(grid.voxel_size_mm))
     wanted_mm = (max(height_mm, least_mm), *(max(width_mm, least_mm),) * 2)
@@ -111,10 +115,10 @@ def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
 
 
 def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
-    """Returns a coarse scan whose grid is cut, in y and x, to the object that the frames show.
+    """Returns a coarse scan with its grid cut, in y and x, to the object that the frames show.
 
     A grid of the whole field of view has much air. With few frames, voxels of air let a wrong geometry fit better than the
-    right one. spare_columns: added to the object's radius on the panel, in columns, because the axis may be off by as many.
+    right one. spare_columns: by how many columns the axis may be off; the object's radius on the panel grows by as many.
     A scan whose grid is off the axis, or whose frames show nothing, is returned unchanged."""
     geometry, grid = scan.geometry, scan.grid
     columns = np.where(scan.valid, scan.projections, 0).max((0, 1))
@@ -151,7 +155,7 @@ def _binned_shutter(scan: Scan, block: int) -> tuple[Shutter, float]:
     shutter, lines = scan.shutter, scan.lines
     line_s = shutter.readout_s / max(lines - 1, 1)
     blocks = lines // block
-    dropped = lines - blocks * block if shutter.direction < 0 else 0  # dropped lines at the far end are read first
+    dropped = lines - blocks * block if shutter.direction < 0 else 0  # such a panel reads the dropped lines first
     # a block of lines opens at the mean of its lines' opening times
     later_s = (dropped + (block - 1) / 2) * line_s
     pulse_s = shutter.pulse_s and (shutter.pulse_s[0] - later_s, shutter.pulse_s[1])

@@ -46,7 +46,8 @@ class Views:
 class Sway:
     """A rigid motion of the object: rotations about x, y and z in rad, and shifts along them in mm.
 
-    All six are cubic splines of time from ``start_s`` to ``end_s``, with coefficients (n, 6). They are constant outside."""
+    All six are cubic splines of time from ``start_s`` to ``end_s``, with coefficients (n, 6), n at least 4. Before and after
+    this interval they are constant."""
 
     coefficients: np.ndarray
     start_s: float
@@ -54,7 +55,7 @@ class Sway:
 
     @classmethod
     def none(cls, scan: Scan, count: int) -> "Sway":
-        """Returns a motion of zeros with ``count`` splines over the duration of a scan."""
+        """Returns an object at rest: ``count`` splines, at least 4, over the duration of a scan, with coefficients of 0."""
         starts_s = np.asarray(scan.frame_start_s, np.float64)
         return cls(np.zeros((count, 6)), float(starts_s.min()), float(starts_s.max() + scan.shutter.span_s))
 
@@ -68,7 +69,10 @@ class Sway:
 
 
 def splines(fraction: np.ndarray, count: int) -> np.ndarray:
-    """Returns ``count`` cubic B-splines (..., count), which sum to 1, at fractions (...) from 0 to 1 of their interval."""
+    """Returns the values (..., count) of ``count`` cubic B-splines at fractions (...) of their interval. The values sum to
+    1.
+
+    count: at least 4. Fractions below 0 or above 1 are cut to this range."""
     knots = np.concatenate([np.zeros(3), np.linspace(0, 1, count - 2), np.ones(3)])
     basis: np.ndarray = BSpline.design_matrix(np.clip(np.ravel(fraction), 0, 1), knots, 3).toarray()
     return basis.reshape(*np.shape(fraction), count)

@@ -31,9 +31,9 @@ def sum_frames(
     scan: F projections (F, rows, columns), line integrals. Each projection stands for an interval about its mid-time, as
     long as the time from frame to frame, in which the gantry turns evenly. count: the number of projections in an exposure.
     readout_ratio, readout, readout_direction: how the new panel is read, as in ``fly_scan``. A line whose exposure begins
-    within a projection takes a fraction of it. Frames that would need further projections are left out. Photons, detector
-    and object are the given scan's, so the result tests a motion model on real data. For this test the object must move by
-    less than a pixel from projection to projection.
+    within a projection's interval takes a fraction of that projection. Frames that would need projections which the scan
+    lacks are left out. Photons, detector and object are the given scan's, so the result tests a motion model on real data.
+    For this test the object must move by less than a pixel from projection to projection.
 
     Raises InputError for too few projections for one frame, a rolling shutter or lag in ``scan``, and uneven intervals."""
     if not isinstance(scan, Scan):
@@ -77,8 +77,9 @@ def _interval_s(scan: Scan) -> tuple[float, float]:
 
 
 def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, int]:
-    """Returns a continuous trajectory through the projections' poses. Also returns how many projections at either end have
-    intervals that the trajectory does not wholly cover."""
+    """Returns a continuous trajectory through the projections' poses, each in the middle of its interval. Also returns how
+    many projections at either end have intervals that the trajectory does not wholly cover. first_s: when the first interval
+    begins. step_s: the length of an interval."""
     middle_s = first_s + (np.arange(scan.frames) + 0.5) * step_s
     own_s = scan.middle_times_s
     if isinstance(scan.trajectory, CircularOrbit):

@@ -72,7 +72,7 @@ class AlteredTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class MappedTrajectory:
-    """Poses of ``base``, changed by a function ``change``: from a frame's number and poses (..., 12) to other poses."""
+    """Poses of ``base``, changed by a function ``change`` that takes a frame's number and its poses (..., 12)."""
 
     base: Trajectory
     change: Callable[[int, np.ndarray], np.ndarray]
@@ -86,7 +86,8 @@ class MappedTrajectory:
 
 
 def altered_trajectory(scan: Scan) -> AlteredTrajectory:
-    """Returns the scan's trajectory as an ``AlteredTrajectory``, in which ``replace`` can change fields."""
+    """Returns the scan's trajectory as an ``AlteredTrajectory`` whose fields ``dataclasses.replace`` can change. A
+    trajectory of another class becomes its ``base``, as yet unaltered."""
     trajectory = scan.trajectory
     if isinstance(trajectory, AlteredTrajectory):
         return trajectory
@@ -95,7 +96,7 @@ def altered_trajectory(scan: Scan) -> AlteredTrajectory:
 
 
 def with_trajectory(scan: Scan, **changes: Any) -> Scan:
-    """Returns the scan with ``changes`` to the fields of its ``AlteredTrajectory``."""
+    """Returns the scan with ``changes`` to the fields of its ``altered_trajectory``."""
     return replace(scan, trajectory=replace(altered_trajectory(scan), **changes))
 
 
@@ -159,7 +160,8 @@ def mirrored(scan: Scan, axis: str) -> Scan:
 def resized(scan: Scan, factor: float, keeps_axis: bool) -> Scan:
     """Returns a cone beam's scan with pixels ``factor`` times as large.
 
-    keeps_axis: True enlarges the panel about the central ray, as if distances had changed. False: about its middle."""
+    keeps_axis: True enlarges the panel about the central ray, as if distances had changed. False enlarges it about its
+    middle."""
     trajectory = altered_trajectory(scan)
     rows, columns = trajectory.panel
 

@@ -39,7 +39,7 @@ OPTIONS_OF_TIGRE = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "det
 _NAMES = ("DSO", "DSD", "nDetector", "dDetector", "nVoxel", "dVoxel", "offOrigin", "offDetector", "rotDetector", "COR")
 _SAME = 1e-9  # poses lie on one circle if they differ from it by at most this fraction of their largest entry
 _CLASSES = ("Geometry", "ConeGeometryDefault", "ParallelGeometryDefault")
-_COPIES = 3  # bytes of memory for every byte of the file: the file, its arrays, and line integrals
+_COPIES = 3  # bytes of memory for every byte of the file: for the file itself, its arrays, and line integrals
 
 
 def recognises(path: Path) -> bool:
@@ -223,7 +223,8 @@ def _named(content: dict[object, Any], *words: str) -> Any:
 def _trajectory(
     geo: Any, poses: np.ndarray, angle_rad: np.ndarray, timing: Timing, subject: str
 ) -> tuple[CircularOrbit | PoseTable, Geometry]:
-    """Returns trajectory and geometry: a circular orbit if it has all the poses (F, 12), else a pose table."""
+    """Returns trajectory and geometry. The trajectory is a circular orbit if all ``poses`` (F, 12) lie on it, else a pose
+    table."""
     rows, columns = np.ravel(geo.nDetector).tolist()
     pitch_v, pitch_u = np.ravel(geo.dDetector).tolist()
     off_v, off_u = np.resize(0.0 if geo.offDetector is None else geo.offDetector, 2).tolist()

@@ -27,7 +27,7 @@ from phyradgs_cl.io.tables import read_facts
 
 _log = logging.getLogger(__name__)
 _JITTER = 0.01  # exposures or readouts measured per frame may differ from their median by this fraction of it
-_DEEPEST_ENTRY = 3  # levels of groups in which NXtomo entries and subentries are searched
+_DEEPEST_ENTRY = 3  # NXtomo entries and subentries are searched in groups nested this deep at most
 
 
 @dataclass(frozen=True, eq=False)

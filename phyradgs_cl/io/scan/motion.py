@@ -21,7 +21,7 @@ _KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # motions o
 _RAMP_ERROR_RAD = 1e-9  # a speed ramp is stored as a table of angles, whose interpolation errs by at most this
 _MOST_RAMP_SAMPLES = 500_000  # rows of the longest such table, about 8 MB; a longer ramp is stored less exactly
 _SUSPECT_RAD = math.radians(5.0)  # encoder table and rotation_angle differ by more only if one has a wrong sign or zero
-_LEAST_SPAN_S = 1e-6  # least time that ``sampled`` covers in a frame: it needs two times, even if the frame has no duration
+_LEAST_SPAN_S = 1e-6  # least time that ``sampled`` covers in a frame: a table needs two times, even without any duration
 _MOST_SAMPLES = 1024  # ``sampled`` raises an error if a table of more samples per frame still misses the trajectory
 _AS_TABLE = "give it as a PoseTable"
 
@@ -63,14 +63,15 @@ def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> 
     """Reads gantry angles (P,) in rad of frames in ``used``, bool (F,). name: rotation_angle or rotation_angle_end."""
     address = f"{entry}/{schema.SAMPLE}/{name}"
     angle_rad = h5.read_array(source, address, used.shape, h5.ANGLE)[used]
-    # an end angle that does not say whether gantry or sample turns means the same as the start angle
+    # Whether gantry or sample turns, an end angle without @rotates takes from the start angle.
     start = f"{entry}/{schema.SAMPLE}/rotation_angle"
     return angle_rad * _sense(source, address, absent=_sense(source, start, absent=-1.0))
 
 
 def storable(scan: Scan) -> Scan:
-    """Returns the scan with a trajectory that files can hold. A user's own class of trajectory becomes a pose table that is
-    exact to a ten-thousandth of a pixel. Raises InputError if no table is that exact."""
+    """Returns the scan with a trajectory that files can hold. A user-defined trajectory, or a circular orbit with
+    user-defined kinematics, becomes a pose table that is exact to a ten-thousandth of a pixel. Raises InputError if no table
+    is."""
     path = scan.trajectory
     if isinstance(path, PoseTable) or (isinstance(path, CircularOrbit) and isinstance(path.kinematics, _KINEMATICS)):
         return scan
@@ -136,7 +137,8 @@ def _table_group(entry: h5py.Group, name: str, time_s: np.ndarray) -> h5py.Group
 
 
 def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-    """Returns gantry angles (F,) in rad at start and end of each first line's exposure; at rest both are equal."""
+    """Returns gantry angles (F,) in rad at start and end of the exposure of each frame's first line. For a gantry at rest
+    both are its angle in the middle of the frame."""
     shutter = scan.shutter
     offsets_s = np.array([0.0, shutter.exposure_s] if scan.is_fly else [shutter.middle_s] * 2)
     pairs = np.array([_angles(scan, f, start_s + offsets_s) for f, start_s in enumerate(scan.frame_start_s)])
@@ -173,7 +175,8 @@ def _read_table_times(source: Hdf5Source, address: str) -> np.ndarray:
 
 
 def _sense(source: Hdf5Source, address: str, absent: float) -> float:
-    """Returns the sign that makes an angle the gantry's: +1 if @rotates is gantry, −1 if sample, ``absent`` if missing."""
+    """Returns the factor that turns a stored angle into the gantry's: +1 if @rotates is gantry, −1 if sample. ``absent`` is
+    returned if the attribute is missing."""
     rotates = h5.read_attribute(source, address, "rotates")
     if rotates is None:
         return absent
@@ -212,7 +215,7 @@ def read_gating(source: Hdf5Source, entry: str, used: np.ndarray, middle_s: np.n
 
 def write_gating(extra: h5py.Group, gating: Gating, middle_s: np.ndarray) -> None:
     """Writes the signal, or the phase in cycles, for all stored frames. middle_s (F,): the middle of each frame's time.
-    Warns where the signal has more samples than that."""
+    Warns if the signal has more samples than the file has frames."""
     if len(gating.times_s) > len(middle_s):
         _log.warning("gating: of %d samples a scan file keeps one per frame, %d", len(gating.times_s), len(middle_s))
     group, values = h5.new_group(extra, "gating", "NXcollection"), gating.at(middle_s)
