@@ -65,7 +65,8 @@ class Deformation:
 
         displacements_mm: (T, nz, ny, nx, 3) in mm, x y z, at the voxel centres of ``grid`` and times_s (T,) in s. A singular
         value decomposition makes at most ``rank`` fields of them, with control points ``spacing_mm`` apart. Each field's
-        largest absolute weight is 1. Raises InputError for other shapes, values not finite, and times that do not rise."""
+        largest absolute weight is 1. Raises InputError for other shapes, values not finite, times that do not rise, and a
+        rank or spacing out of range."""
         times_s = checks.numbers("times_s", times_s, (None,))
         dense_mm = checks.numbers("displacements_mm", displacements_mm, (len(times_s), *grid.shape, 3))
         checks.whole("rank", rank, 1, 1000)

@@ -121,8 +121,8 @@ class LineAttentionBlocks(nn.Module):
 class AttenuationNetwork(nn.Module):
     """Maps features (P, inputs) to attenuation (P,) in the unit of ``options.density_bound``.
 
-    middle: the modules between the first and the last layer. skip: the index of the layer whose input also
-    has the features. A leaky ReLU follows each layer but the last, and ``options.last_activation`` the last layer."""
+    middle: the modules between the first and the last layer. skip: the index of the layer whose input also contains the
+    features. A leaky ReLU follows each layer but the last. ``options.last_activation`` follows the last layer."""
 
     def __init__(self, inputs: int, middle: list[nn.Module], skip: int, options: NeuralOptions) -> None:
         super().__init__()
@@ -288,7 +288,7 @@ def _in_rows(
     filled = ceil_div(fast.size, field.segment) * field.segment
     fast = np.concatenate([fast, fast[-1] + fine.voxel_size_mm[2] * np.arange(1, filled - fast.size + 1)])
     slows, middles, fasts = grid.shape
-    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # where each row of points lies, grouped by voxels
+    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # coordinates of each row on the first two axes
     rows[..., 0], rows[..., 1] = slow.reshape(slows, 1, points, 1), middle.reshape(1, middles, 1, points)
     rows = rows.reshape(slows * middles, points**2, 2)
     values = np.empty((slows * middles, fasts), np.float32)
