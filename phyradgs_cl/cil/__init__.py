@@ -151,7 +151,8 @@ def _at_zero(frames: AcquisitionGeometry) -> np.ndarray:
 
 
 def _panel(frames: AcquisitionGeometry, detector: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns a panel's middle, and the steps to the data's next column and row. CIL's origin is the data's first pixel."""
+    """Returns a panel's middle, and the steps to the data's next column and row, x y z. The data start with the pixel in the
+    corner that CIL calls the panel's origin."""
     panel, along_y = frames.config.panel, getattr(detector, "direction_y", _FLAT)
     step_x, step_y = panel.pixel_size[0] * detector.direction_x, panel.pixel_size[1] * along_y
     return detector.position, -step_x if "right" in panel.origin else step_x, -step_y if "top" in panel.origin else step_y

@@ -65,7 +65,7 @@ class Gaussians:
         """Makes a cloud from means (G, 3), covariances (G, 3, 3) and densities (G,). Raises InputError for other shapes, and
         for a covariance that is not positive definite."""
         variance, axes = np.linalg.eigh(checks.numbers("covariance", covariance, (len(np.atleast_1d(mean)), 3, 3)))
-        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # makes a rotation of eigenvectors that form a reflection
+        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # flips an axis of each reflection: then it is a rotation
         x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(axes).as_quat().T
         return cls(mean, np.sqrt(variance), np.stack([w, x, y, z], -1), density)
 

@@ -70,7 +70,7 @@ class Grid:
 
     @property
     def half_longest_mm(self) -> float:
-        """Half the longest side in mm. Inside the reconstruction it is the unit of length."""
+        """Half the longest side in mm: the unit of length in which splatting and neural methods compute."""
         return max(self.size_mm) / 2
 
     @property

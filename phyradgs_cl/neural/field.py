@@ -150,7 +150,8 @@ class AttenuationNetwork(nn.Module):
 def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
     """Returns NAF's linear layers; for ``LineOptions``, line-segment attention replaces the layers in the middle.
 
-    With three or more layers, the middle one gets the encoding again; it stays linear."""
+    With three or more layers, the middle one gets the encoding again, beside the output of the layer before it. It is linear
+    for ``LineOptions`` too."""
     skip, width = options.layers // 2 if options.layers > 2 else 0, options.width
     middle: list[nn.Module] = []
     for number in range(1, options.layers - 1):
@@ -198,7 +199,7 @@ def corners(positions: torch.Tensor, cells: int, size: int) -> tuple[torch.Tenso
     level has ``cells`` grid cells along a side and ``size`` entries."""
     scaled = positions.t() * cells
     low = scaled.floor().clamp_(0, cells - 1)
-    high_share = scaled - low  # part of a cell's side, (3, P)
+    high_share = scaled - low  # distance from the cell's lower corner, in sides of a cell, (3, P)
     low_share = 1 - high_share
     side, whole = cells + 1, low.to(torch.int64)
     is_dense = side**3 <= size

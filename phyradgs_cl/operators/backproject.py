@@ -16,7 +16,7 @@ from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.runtime import Array, DeviceArray, Room, Runtime, SameArray, attempts
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of, unpad_rows
 
-_VIEWS_PER_LAUNCH = 64  # most views of a launch: the few lines of each that a work-item reads should stay in the cache
+_VIEWS_PER_LAUNCH = 64  # most views in a launch, so that the few lines of each that a work-item reads stay in the cache
 _BYTES_A_LAUNCH = 1 << 28  # most bytes of frames that are uploaded together
 _VIEWS_SHARE = 0.25  # fraction of the free device memory for uploaded frames; the volume needs the rest
 # Most voxels along z that a work-item sums in the kernels for upright columns of voxels (see ``_UPRIGHT``).
@@ -177,7 +177,7 @@ def _upright(rt: Runtime, name: str, power: int, block: int, images: Arguments, 
 
 
 def _defines(power: int) -> dict[str, int]:
-    """Returns the build options for ``power``. It is left out for FDK's 2, the kernels' default."""
+    """Returns the kernels' macros for the exponent ``power``. For FDK's 2, their default, it is left out."""
     return {"IMAGE_GUARD": GUARD} if power == 2 else {"IMAGE_GUARD": GUARD, "DISTANCE_POWER": power}
 
 

@@ -2,7 +2,7 @@
 
 Every phantom has ``name``, ``kind`` and ``voxelise(grid)``. An "analytic" phantom also has exact ``line_integrals(source,
 target)``, and a "moving" phantom ``line_integrals(source, target, time_s)``. A "voxel" phantom has ``volume`` and ``grid``.
-Attenuation is divided by half the phantom's size, so that line integrals do not depend on the size."""
+Attenuation is inversely proportional to the phantom's size, so that line integrals do not depend on it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

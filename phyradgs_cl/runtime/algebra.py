@@ -190,7 +190,7 @@ class DeviceSpace:
     def descend(self, x: DeviceArray, y: DeviceArray, step: float) -> DeviceArray:
         """Returns x − ``step`` y/‖y‖, or x if y is all 0. The host need not wait, since ‖y‖ stays on the device."""
         self._sum("dot_parts", self._whole, y, y)
-        # Two floats, the step rounded and the rest, keep its precision on devices without float64.
+        # Two floats, the rounded step and the rest, keep the step's precision on devices without float64.
         high = np.float32(step)
         return self._each("descend", x, y, np.array([high, step - float(high)], np.float32), self._whole)
 

@@ -81,8 +81,8 @@ class Runtime:
         self._kernels: dict[tuple[str, str, tuple[str, ...]], Kernel] = {}
 
     def kernel(self, program: str, name: str, **defines: int | float | bool) -> Kernel:
-        """Declares the kernel ``name`` of ``cl/<program>.cl`` with macros ``defines``. Its first launch builds it. Equal
-        declarations return the same kernel."""
+        """Declares the kernel ``name`` of ``cl/<program>.cl`` with macros ``defines``. Nothing is built before its first
+        launch. Equal declarations return the same kernel."""
         merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
         flags = [f"-D{name}={_literal(value)}" for name, value in sorted(merged.items())]
         key = (program, name, ("-cl-std=CL1.2", "-w", _FUSING, *flags))

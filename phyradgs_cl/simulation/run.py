@@ -136,7 +136,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
     timing = {key: values.pop(key) for key in _TIMING if key in values}
     sheet = {key: values.pop(key, None) for key in _DATA_SHEET}
     timed = make_protocol(protocol, **timing)
-    if given.get("jitter_deg") and not timed.is_fly:  # only a gantry that turns has jitter
+    if given.get("jitter_deg") and not timed.is_fly:  # jitter is only added to a fly-scan's angles
         found, remedy = f"{given['jitter_deg']} with --protocol {protocol}", "leave it out, or choose a fly-scan"
         raise InputError("--jitter-deg", found, "0", remedy)
     unused = [name for name in ("dose", "electronic_noise") if name in given and given.get("noise", "none") == "none"]

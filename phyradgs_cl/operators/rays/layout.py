@@ -18,7 +18,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
 _RAY_CELL_FLOATS = 16  # number of floats of a time cell in ``ray_constants``
-BORDER = 1  # width in voxels of the zeros around a volume in y and z, with which samples at its faces need no test
+BORDER = 1  # width in voxels of the zeros around a volume in y and z, so that samples at its faces need no test
 _UPRIGHT = 1e-6  # a column of pixels counts as upright if it leans by at most this many voxels
 _WIDEST = 16  # number of elements in the widest SIMD vector: tables are padded by as many, since vectors read past the end
 

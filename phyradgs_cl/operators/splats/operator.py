@@ -1,8 +1,8 @@
 """Operators from Gaussians in mm and 1/mm to the frames of a scan or to a grid, with their transposed derivatives.
 
 ``rows.enter`` converts Gaussians to the kernels' layout. The result can be rendered and differentiated any number of times.
-``back`` renders only if intensities are averaged. Otherwise it computes the Gaussians' projections alone, and neither if
-``forward`` has just done so.
+``back`` needs the Gaussians' projections, and their rendering too if intensities are averaged. It computes what it needs,
+unless ``forward`` has just done so.
 
 ``by_pose`` converts dL/d(Gaussians) to dL/d(pose). Rotating the gantry has the effect of rotating the object the other way.
 Shifting the panel shifts the projected centres the other way, and changes the lengths of rays."""

@@ -25,7 +25,7 @@ from phyradgs_cl.runtime.layout import pad_rows
 
 _PEAK_PERCENTILE = 99.9  # percentile of the line integrals that counts as their peak: their maximum would be noise
 _ROWS = 11  # number of a Gaussian's parameters, which are the rows of dL/d(parameters)
-_STATISTICS = 2  # numbers per Gaussian for density control: sum of gradient norms, and number of frames in it
+_STATISTICS = 2  # numbers per Gaussian for density control: a sum of gradient norms, and from how many frames they are
 # Number of rows of ``cloud.gradients``: the 11 of dL/d(parameters), then dL/d(projected centre) along and across a line, in
 # units of half the image's size.
 _DERIVED = 13
