@@ -205,8 +205,8 @@ __kernel void largest_parts(
         parts[get_group_id(0)] = own;
 }
 
-/* result = x − step y/√squares, where squares = ‖y‖²: a step of fixed length against y, or none if y is 0. `step` is given
-   as two floats (high, low). */
+/* result = x − step y/√squares, where squares = ‖y‖²: a step of fixed length against y, or none if y is 0. The length is the
+   sum of the two floats of `step` (high, low). */
 __kernel void descend(
     __global const float *x, __global const float *y, const float2 step, __global const sum_t *squares, const long count,
     __global float *result)

@@ -136,7 +136,7 @@ __kernel void backproject_upright(
         const float shift = start - base;
         for (int z = z_start; z < z_stop; ++z) {
             const float v = shift + step * z;
-            const int row = (int)v; /* rounding may make v slightly negative, which still gives 0 */
+            const int row = (int)v; /* 0 also if rounding has made v slightly negative */
             sum[z] += blended[row] + (v - row) * (blended[row + 1] - blended[row]);
         }
     }
@@ -192,7 +192,7 @@ __kernel void backproject_leaning(
         const float inv_0 = 1.0f / depth_0, per_z = (1.0f / fma((float)count, m[10], depth_0) - inv_0) / (float)count;
         const int is_even = fabs((float)count * m[10]) <= EVEN_DEPTH * depth_0;
         const int rises = m[2] * depth_0 > u_0 * m[10]; /* whether u rises along z */
-        int own = 0;         /* vectors that end before voxel `until` project between this detector column and the next */
+        int own = 0;         /* vectors that end before voxel `until` project between detector columns own and own + 1 */
         float until = -1.0f;
         for (int k = start; k < stop; k += LANES) {
             const float end = (float)(k + LANES - 1);

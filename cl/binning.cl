@@ -1,6 +1,6 @@
-/* Lists the splats in each tile, by a stable counting sort without atomics. The splats are divided into chunks. First each
-   chunk counts its splats per tile, then the counts are summed to positions, then each chunk writes the indices of its
-   splats. A list keeps the order of the splats, so sums over a list always add in the same order.
+/* Lists the splats in each tile, by a stable counting sort. The splats are divided into chunks. First each chunk counts its
+   splats per tile, then the counts are summed to positions, then each chunk writes the indices of its splats to these
+   positions. A list keeps the order of the splats, so sums over a list always add in the same order.
    On CPUs a work-item takes a chunk (bin_count, bin_fill) or a tile (bin_within); bin_starts is one work-item.
    On GPUs (_group) a work-group takes a chunk, with a work-item per splat, or a tile; bin_starts_group is one work-group. */
 #include "common/group_sums.h"
@@ -89,8 +89,8 @@ __kernel void bin_fill(
     }
 }
 
-/* Writes into `boxes` (6, items) the lowest and highest tile of the item's splat along x, y, z; an empty range if the item
-   has no splat. Writes into `around` (6) the range of tiles of all the group's splats. */
+/* Writes into `boxes` (6, items) the lowest and highest tile of the item's splat along x, y, z; an empty range if the splat
+   is not drawn or the item has none. Writes into `around` (6) the range of tiles of all the group's splats. */
 ALWAYS_INLINE void share_box(__global const int *extents, const int stride, const int count, const int g, const int4 tile,
                              __local int *boxes, __local int *around)
 {

@@ -1,7 +1,7 @@
 /* Averages intensities of frames (F, rows, columns) over their time cells, one layer of cells after the other. A layer has
-   line integrals p of one cell per line, whose weight is w. The frames are -log(sum w exp(-p)), and the softmax weights
-   w exp(-p) / sum w exp(-p), computed without overflow. Weights are (F, lines); a line is a row, or a column if `by_row` is 0.
-   A work-item takes one pixel. Twin: detector/attenuation.py. */
+   line integrals p of one cell per line, whose weight is w. Computes the frames, -log(sum w exp(-p)), and the softmax
+   weights, w exp(-p) / sum w exp(-p), without overflow. Weights are (F, lines); a line is a row, or a column if `by_row` is
+   0. A work-item takes one pixel. Twin: detector/attenuation.py. */
 
 #define PIXEL                                                                                              \
     const int u = (int)get_global_id(0), v = (int)get_global_id(1), f = (int)get_global_id(2);             \

@@ -1,6 +1,6 @@
-/* L1 + D-SSIM of one frame and its gradient. SSIM's window is separable: one pass along rows, one along columns.
-   Images are guard floats, then (lines, pitch), with pitch at least width + guard. All after the width is zero, so a window
-   may reach beyond either end. On a CPU a work-item takes all vectors of a line, on a GPU one pixel. Twin:
+/* The loss of one frame, from L1 and 1 - SSIM, and its gradient. SSIM's window is separable: a pass along rows, then
+   columns. Images are guard floats, then (lines, pitch), with pitch at least width + guard. All after the width is zero, so
+   a window may reach beyond either end. On a CPU a work-item takes all vectors of a line, on a GPU one pixel. Twin:
    objective/terms.py. */
 #include "common/lanes.h"
 #include "common/group_sums.h"

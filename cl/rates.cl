@@ -1,8 +1,8 @@
 /* Measures how many multiply-adds on registers the device does per second at best. */
 #include "common/lanes.h"
 
-/* Does 16 LANES `steps` floating-point operations per work-item, in 8 independent chains: a single chain would have to wait
-   for each result. */
+/* Does 16 · LANES · steps floating-point operations per work-item, in 8 independent chains, because a single chain would
+   have to wait for each result. */
 __kernel void multiply_add(const int steps, const float factor, __global float *out)
 {
     const vf a = (vf)(factor), b = (vf)(1.0f - factor);

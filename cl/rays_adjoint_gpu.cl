@@ -9,12 +9,14 @@
 #endif
 #define FEW_CELLS 8    /* with at most this many time cells in a frame, searching would take longer than trying all */
 
-#define SURELY 1.001f  /* voxels by which a coordinate must exceed the others so that it is the main axis of all rays near */
+/* If a voxel is farther from the source along one axis than along the others by more than this, in voxels, that axis is the
+   main one of all rays that touch the voxel. */
+#define SURELY 1.001f
 
 /* Sums the window's pixels of a cell, times the voxel's weight in the samples of their rays on planes across axis a. sure: all
-   rays that touch the voxel have this main axis; else each ray is tested. `of` line v is the line's weight. UPRIGHT: pixels
-   lie in columns along z, so the rays of column p have the same weight across it, unless a is z. 1: lines are rows. 2: lines
-   are columns. */
+   rays that touch the voxel have this main axis; else each ray is tested. of[v]: the weight of line v. UPRIGHT: pixels lie
+   in columns along z, so the rays of column p have the same weight across it, unless a is z. 1: lines are rows. 2: lines are
+   columns. */
 RAY_INLINE float from_planes(__global const float *frame, const int image_pitch, __global const float *of, const window_t w,
                              __global const float *cell, const float4 pitch_mm, const int4 voxel, const int a, const int sure)
 {

@@ -138,8 +138,8 @@ RAY_INLINE void meet_planes(const column_t r, const float sa, const int2 between
     }
 }
 
-/* Adds the part of a detector column on plane p to columns of voxels, which begin at voxel z_first. Column j is summed
-   at sums + (j - b_first) step if b_first <= j < b_stop. Sums of other columns, other work-items' ones, go to `beyond`. */
+/* Adds the part of a detector column on plane p to columns of voxels, which begin at voxel z_first. Column j is summed at
+   sums + (j - b_first) step if b_first <= j < b_stop. Sums of other columns go to `beyond`: other work-items have them. */
 RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p, const int z_first, const int b_first,
                            const int b_stop, float *sums, const int step, float *beyond)
 {
@@ -149,7 +149,7 @@ RAY_INLINE void lines_onto(const column_t r, const planes_t *planes, const int p
 #if LEAN
     const float ahead = planes->ahead[p], first_line = planes->first_line[p], per_voxel = planes->per_voxel[p];
     const float bend = planes->bend[p], start = r.sc - (float)z_first; /* the source's height in the box, in voxels */
-    int j0 = j, j1 = j, next_look = planes->is_between[p] ? stop : from; /* rays pass between two columns up to it */
+    int j0 = j, j1 = j, next_look = planes->is_between[p] ? stop : from; /* up to next_look, rays pass between two columns */
     float *low = COLUMN(j), *high = COLUMN(j + 1), b_from = b_zero - (float)j;
     vf at = V_IOTA + (float)from;
     for (int z = from; z < stop; z += LANES, at += (float)LANES) {

@@ -1,7 +1,7 @@
 /* Draws the splats of all time cells into the merged frame. Every tile sums its list of splats over the cells that serve its
    lines, so that micro-views are accumulated and strips joined (paper, Eq. 3) in one pass.
    splat_forward_rows: a work-item takes some complete lines and adds vectors of pixels (CPUs).
-   splat_forward_pixels: a work-group takes a tile, whose records it reads once; some work-items share a pixel (GPUs).
+   splat_forward_pixels: a work-group takes a tile, whose records it reads once; several work-items share a pixel (GPUs).
    Each pixel is written by one work-item, without atomics. */
 #if BLOCK_PIXEL
 #define SPLAT_SPACE __local

@@ -1,5 +1,6 @@
-/* Anisotropic total variation of a small volume (guard, then (z, y, pitch)), and its gradient: the weighted sum of absolute
-   differences between neighbours along each axis. On a CPU a work-item takes all vectors of a row, on a GPU one voxel. */
+/* Anisotropic total variation of a small volume (guard, then (z, y, pitch)), which is the weighted sum of absolute
+   differences between neighbours along each axis; and its gradient. On a CPU a work-item takes all vectors of a row, on a
+   GPU one voxel. */
 #include "common/lanes.h"
 #include "common/group_sums.h"
 

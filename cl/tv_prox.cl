@@ -32,7 +32,7 @@ __kernel void tv_primal(
 
 __kernel void tv_dual(
     __global const float *volume, const int4 shape, const float4 axis_weight,
-    const float step, const float time_step, /* 1 / (Lipschitz constant · weight): for x, y, z; for time */
+    const float step, const float time_step, /* the dual's steps along x, y, z and in time, divided by the prior's weight */
     const float momentum,
     __global const float *from,       /* `moved` as the last call wrote it; in the first call `dual` */
     __global float *dual, __global float *moved)

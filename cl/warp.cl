@@ -253,7 +253,7 @@ __kernel void warp_adjoint_rows(
    result: a few global atomics per voxel instead of 64. A group whose voxels move too far apart adds to the result at once. */
 __kernel void warp_adjoint_fixed(
     __global const float *values, __global const float *fields, __global const float *shares, const int4 shape,
-    const float scale,     /* the integer that stands for 1, such that no sum overflows */
+    const float scale,     /* the integer that stands for 1: no sum overflows if a coefficient's weights sum to at most 64 */
     const long4 strides,
     __global int *result)  /* laid out like the coefficients, zero before */
 {

@@ -1,7 +1,7 @@
 /* The pixels that a splat covers from one time cell, line by line. The projector and its adjoint both use this. */
 #include "common/splat_moving.h"
 
-/* A splat on one line, with its pixels u_lo..u_hi there. dv: the line minus the splat's centre. */
+/* A splat on line v, with its pixels u_lo..u_hi there. Its centre is at u_whole + u_rest along the line, and at v - dv. */
 typedef struct {
 #if MOVING
     moving_line s;

@@ -4,8 +4,9 @@
 
 #define LEAST_SLOPE 1e-6f /* least distance between lines that counts, in voxels: at the source it is 0 */
 
-/* A detector column and its rays, which lie in a plane. They meet the plane of voxels that is `ahead` planes from the source.
-   There line v has the height c = sc + ahead (dz + v ez) / (da + v ea), and b = sb + across ahead + along (c - sc). */
+/* A detector column and its rays, which lie in a plane. On the plane of voxels that is `ahead` planes from the source, the
+   ray of line v is at the height c = sc + ahead (dz + v ez) / (da + v ea), and at b = sb + across ahead + along (c - sc)
+   along the other axis. */
 typedef struct {
     __global const float *values, *slopes; /* one per line v; slopes (LEAN only): (dz + v ez) / (da + v ea) */
     int is_cut;                     /* whether further lines have the other main axis */
@@ -117,7 +118,7 @@ RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, cons
 #endif
 
 /* Adds to LANES voxels of two columns, if all rays pass between these. under: the source's height minus the voxels'. b: the
-   place of the rays at the voxels' heights, from the first column on. */
+   place of the rays at the voxels' heights, counted from the first column. */
 RAY_INLINE void add_between(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                             const vf b, float *low, float *high)
 {
@@ -128,7 +129,7 @@ RAY_INLINE void add_between(const column_t r, const near_lines_t lines, const in
     V_STORE(V_LOAD(high) + far, high);
 }
 
-/* Adds to LANES voxels of three columns, if rays pass on both sides of the second. b: from the second column on. */
+/* Adds to LANES voxels of three columns, if rays pass on both sides of the second. b: counted from the second column. */
 RAY_INLINE void add_around(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                            const vf b, float *low, float *middle, float *high)
 {
@@ -140,7 +141,7 @@ RAY_INLINE void add_around(const column_t r, const near_lines_t lines, const int
     V_STORE(V_LOAD(high) + after, high);
 }
 
-/* Adds to LANES voxels of one column, if rays pass over more than three columns. b: from this column on. */
+/* Adds to LANES voxels of one column, if rays pass over more than three columns. b: counted from this column. */
 RAY_INLINE void add_across(const column_t r, const near_lines_t lines, const int most, const float ahead, const vf under,
                            const vf b, float *own)
 {

@@ -3,7 +3,7 @@
    LEAN 0: the column is parallel to the volume's z, so all its rays have the same direction in x and y. */
 #include "common/ray.h"
 
-#define SLOT 8         /* ints of a slot: its pose, and the columns and lines [first, stop) that the pose serves */
+#define SLOT 8         /* ints of a slot: its pose, the columns and lines [first, stop) that the pose serves, unused ones */
 #define SLOT_CELL 0
 #define SLOT_U 1
 #define SLOT_U_STOP 2

@@ -3,7 +3,7 @@
 
 typedef struct { vi u_lo, u_hi, v_lo, v_hi; } window_t;
 
-/* Narrows [lo, hi] to the values that (m . p) / depth can have for points p of the box. at: the value in its middle. */
+/* Narrows [lo, hi] to the values that (m . p) / depth can have for points p of a box. at: its value in the box's middle. */
 RAY_INLINE void window_along(const vf at, const vf mx, const vf my, const vf mz, const vf dx, const vf dy, const vf dz,
                              const float4 half_size, const vf widest, const vi ahead, vi *lo, vi *hi)
 {

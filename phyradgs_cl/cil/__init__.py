@@ -17,7 +17,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import triple
 
 _ORDER = ("channel", "angle", "projection", "vertical", "horizontal_y", "horizontal_x", "horizontal")
-_FLAT = np.array([0.0, 0.0, 1e-3])  # step to the next row in 2D, where there is only one: out of the plane, and small
+_FLAT = np.array([0.0, 0.0, 1e-3])  # in 2D the panel has one row; the step to a next row is out of the plane, and small
 
 
 class ProjectionOperator(LinearOperator):
@@ -98,7 +98,8 @@ class _Turning:
         self._middle_s = self.start_s + shutter.middle_s
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
-        """Returns poses (..., 12), see ``PoseTable``, of a frame at times (...) in s."""
+        """Returns poses (..., 12) in mm of a frame at times (...) in s: source or rays' direction, centre of pixel (0, 0),
+        steps to the next column and row, x y z each."""
         angles_rad = self._angles_rad[frame] + self._rad_per_s * (np.asarray(time_s) - self._middle_s[frame])
         return poses_of_astra(_turned(self._at_zero, angles_rad.ravel()), self._panel).reshape(*angles_rad.shape, 12)
 
@@ -150,14 +151,15 @@ def _at_zero(frames: AcquisitionGeometry) -> np.ndarray:
 
 
 def _panel(frames: AcquisitionGeometry, detector: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns a panel's middle, and the steps to the data's next column and row. CIL's origin is the data's first pixel."""
+    """Returns a panel's middle, and the steps to the data's next column and row, x y z. The data start with the pixel in the
+    corner that CIL calls the panel's origin."""
     panel, along_y = frames.config.panel, getattr(detector, "direction_y", _FLAT)
     step_x, step_y = panel.pixel_size[0] * detector.direction_x, panel.pixel_size[1] * along_y
     return detector.position, -step_x if "right" in panel.origin else step_x, -step_y if "top" in panel.origin else step_y
 
 
 def _turned(at_zero: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
-    """Returns ASTRA's vectors (F, 12) at angles (F,) of the object: the vectors ``at_zero`` turned the other way about z."""
+    """Returns ASTRA's vectors (F, 12) for an object at angles (F,) about z: ``at_zero`` turned by minus the angles."""
     (x, y, z), cos, sin = at_zero.T, np.cos(angles_rad)[:, None], np.sin(angles_rad)[:, None]
     return np.stack([cos * x + sin * y, cos * y - sin * x, z + 0 * cos], -1).reshape(-1, 12)
 
@@ -165,7 +167,8 @@ def _turned(at_zero: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
 def _mapped(
     function: Callable[[np.ndarray], np.ndarray], x: DataContainer, of: Any, to: Any, out: DataContainer | None
 ) -> DataContainer:
-    """Applies ``function`` to each channel of data with geometry ``of``; returns data with geometry ``to``."""
+    """Applies ``function`` to each channel of data with geometry ``of``. Returns data with geometry ``to``, in ``out`` if
+    given."""
     channels = np.transpose(x.as_array(), np.argsort(_places(of))).reshape(of.channels, *_shape(of))
     mapped, places = np.stack([function(np.ascontiguousarray(one)) for one in channels]), _places(to)
     out = to.allocate(None) if out is None else out
@@ -174,7 +177,8 @@ def _mapped(
 
 
 def _places(geometry: Any) -> list[int]:
-    """Returns for each of CIL's dimensions its index in our order: channels, frames or slices, rows, columns."""
+    """Returns the index of each of CIL's dimensions among those present, in this package's order: channels, frames or
+    slices, rows, columns."""
     present = [name for name in _ORDER if name in geometry.dimension_labels]
     return [present.index(name) for name in geometry.dimension_labels]
 

@@ -65,12 +65,14 @@ class Deformation:
 
         displacements_mm: (T, nz, ny, nx, 3) in mm, x y z, at the voxel centres of ``grid`` and times_s (T,) in s. A singular
         value decomposition makes at most ``rank`` fields of them, with control points ``spacing_mm`` apart. Each field's
-        largest absolute weight is 1. Raises InputError for other shapes, values not finite, and times that do not rise."""
+        largest absolute weight is 1. Raises InputError for other shapes, values not finite, times that do not rise, and a
+        rank or spacing out of range."""
         times_s = checks.numbers("times_s", times_s, (None,))
         dense_mm = checks.numbers("displacements_mm", displacements_mm, (len(times_s), *grid.shape, 3))
         checks.whole("rank", rank, 1, 1000)
         rows = dense_mm.reshape(len(times_s), -1)
-        squares, vectors = np.linalg.eigh(rows @ rows.T)  # of a matrix (T, T), much smaller than ``rows``
+        # The left singular vectors of ``rows``, at less cost: this matrix is (T, T), and ``rows`` has 3 columns per voxel.
+        squares, vectors = np.linalg.eigh(rows @ rows.T)
         weights = vectors[:, ::-1][:, : min(rank, len(times_s))]
         largest = np.abs(weights).max(0)
         fields_mm = (weights * largest).T @ rows
@@ -94,7 +96,7 @@ class Deformation:
 
     @property
     def reach_mm(self) -> np.ndarray:
-        """The longest control vector of each field, (R,) in mm. At weight 1 the field displaces no point further."""
+        """The length of each field's longest control vector, (R,) in mm. At weight 1 a field displaces no point further."""
         return np.asarray(np.linalg.norm(self.control_mm, axis=-1).max(axis=(1, 2, 3)))
 
     @property
@@ -169,7 +171,7 @@ class Deformation:
         Without a grid, points half a control spacing apart are tested. To save time, weights are rounded to a 16th of each
         field's largest weight, and a point whose slopes stay below 1e-4 counts as having the determinant 1."""
         grid = grid or self._half_spacing_grid()
-        slopes = np.stack([self._slopes(grid, control_mm) for control_mm in self.control_mm])  # of each field, (R, 3, 3, n)
+        slopes = np.stack([self._slopes(grid, control_mm) for control_mm in self.control_mm])  # (R, 3, 3, n)
         largest = np.abs(self.weights).max(axis=0)
         step = np.maximum(largest / _LEVELS, np.finfo(float).tiny)
         states = np.unique(np.round(self.weights / step), axis=0) * step

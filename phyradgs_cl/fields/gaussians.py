@@ -20,8 +20,8 @@ class Gaussians:
     """A cloud of G Gaussians.
 
     mean (G, 3), x y z, and scale (G, 3): in the same unit of length, which is mm outside the reconstruction. quaternion
-    (G, 4): w x y z, of length 1. density (G,): attenuation per unit of length. Raises InputError for other shapes, infinite
-    values or NaN, and for scales that are not above 0."""
+    (G, 4): w x y z, of any length above 0. density (G,): attenuation per unit of length. Raises InputError for other shapes,
+    infinite values or NaN, scales that are not above 0, and quaternions of length 0."""
 
     mean: np.ndarray
     scale: np.ndarray
@@ -48,7 +48,7 @@ class Gaussians:
         return len(self.mean)
 
     def rows(self) -> np.ndarray:
-        """Returns the parameters (11, G) float64, in the order that kernels read: mean, scale, quaternion, density."""
+        """Returns the parameters (11, G) float64, in the order that kernels read: mean, scale, unit quaternion, density."""
         q = self.quaternion
         if self.count:
             q = q / np.linalg.norm(q, axis=1, keepdims=True)
@@ -56,15 +56,16 @@ class Gaussians:
 
     @classmethod
     def from_rows(cls, rows: np.ndarray) -> "Gaussians":
-        """Makes a cloud from rows (11, G). Raises InputError for another shape."""
+        """Makes a cloud from parameter rows (11, G), in the order of ``rows``. Raises InputError for another shape."""
         rows = checks.numbers("rows", rows, (11, None))
         return cls(rows[MEAN].T.copy(), rows[SCALE].T.copy(), rows[QUATERNION].T.copy(), rows[DENSITY].copy())
 
     @classmethod
     def of_covariance(cls, mean: np.ndarray, covariance: np.ndarray, density: np.ndarray) -> "Gaussians":
-        """Makes a cloud from means (G, 3), covariances (G, 3, 3) and densities (G,)."""
+        """Makes a cloud from means (G, 3), covariances (G, 3, 3) and densities (G,). Raises InputError for other shapes, and
+        for a covariance that is not positive definite."""
         variance, axes = np.linalg.eigh(checks.numbers("covariance", covariance, (len(np.atleast_1d(mean)), 3, 3)))
-        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # makes a rotation of eigenvectors that form a reflection
+        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # flips an axis of each reflection: then it is a rotation
         x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(axes).as_quat().T
         return cls(mean, np.sqrt(variance), np.stack([w, x, y, z], -1), density)
 
@@ -90,7 +91,8 @@ class Activation:
         return rows
 
     def invert(self, rows: np.ndarray) -> np.ndarray:
-        """Returns raw rows for parameter rows (11, G). Keeps scales a little inside their bounds for a finite inverse."""
+        """Returns raw rows for parameter rows (11, G). Scales at or outside their bounds count as a little inside, and
+        densities as at least 1e-12: the inverse is infinite at the bounds."""
         raw = np.array(rows, dtype=np.float64)
         span = self.scale_max - self.scale_min
         raw[SCALE] = scipy.special.logit(np.clip((rows[SCALE] - self.scale_min) / span, 1e-4, 1 - 1e-4))

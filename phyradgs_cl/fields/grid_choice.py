@@ -70,7 +70,8 @@ class GridChoice:
 
         With ``roi_mm`` alone, the chosen grid has the voxels of ``grid``, continued outside it, that overlap the box by more
         than a hundredth of a voxel. ``size`` alone keeps the box of ``grid``. ``voxel_mm`` alone keeps that box too, with
-        its sides rounded up to whole voxels. Raises InputError for too many voxels."""
+        its sides rounded up to whole voxels. Raises InputError for too many voxels, and for voxels so large that there is
+        only one."""
         box_mm = self._box_mm(grid)
         sides_mm = box_mm[:, 1] - box_mm[:, 0]
         if self.size is not None:
@@ -108,7 +109,8 @@ class GridChoice:
         return np.maximum(np.round(float(self.size or 1) * proportion / proportion.max()), 1)
 
     def _cut(self, grid: Grid, box_mm: np.ndarray) -> Grid:
-        """Returns the grid of those voxels of ``grid``, continued outside it, that overlap a box (3, 2) in mm."""
+        """Returns the grid of those voxels of ``grid``, continued outside it, that overlap a box (3, 2) in mm by more than a
+        hundredth of a voxel."""
         low, high = (box_mm.T - grid.box_mm[:, 0]) / grid.voxel_size_mm
         start = np.floor(low + _TYPED)
         shape = self._whole(np.maximum(np.ceil(high - _TYPED) - start, 1))

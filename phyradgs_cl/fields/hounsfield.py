@@ -19,7 +19,8 @@ HOUNSFIELD = "hounsfield"
 Box = tuple[float, ...]
 """A box in world coordinates: Z0, Z1, Y0, Y1, X0, X1 in mm."""
 Window = tuple[float, float, int]
-"""A histogram's peak: its attenuations in 1/mm at half of its rise on either side, and the number of voxels in between."""
+"""A peak of the histogram: the attenuations in 1/mm at half its prominence, below and above it, and the number of voxels in
+between."""
 _FEWEST = 100  # least number of voxels of air and of water: the noise of their mean is then a tenth of a voxel's
 # Water's attenuation in 1/mm is 0.0097 at 500 keV and 0.53 at 10 keV. Outside these limits a warning is logged.
 _WATER_PER_MM = (0.009, 0.6)
@@ -107,7 +108,8 @@ def fitted(
 
     Without a box of air, the lowest peak of the histogram is air. Without a box of water, the largest other peak is water.
     insert_hu: the HU of the material in the box ``water``, if it is not water. Raises InputError for fewer than 100 voxels,
-    air that is not below water, and a histogram without two peaks that can be air and water."""
+    air that is not below water, a histogram without two peaks that can be air and water, and values below −10, which are
+    no attenuation."""
     checks.within("--insert-hu", insert_hu, -900, 30_000)
     if values.min() < -10:  # attenuation in 1/mm is never so negative
         raise InputError("--hu", f"values from {values.min():g}, as of Hounsfield units", "attenuation in 1/mm")

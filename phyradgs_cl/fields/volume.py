@@ -29,8 +29,8 @@ def triple(values: Iterable[T]) -> tuple[T, T, T]:
 class Grid:
     """A box of voxels centred at ``offset_mm``. All triples are (z, y, x), like the arrays.
 
-    shape: numbers of voxels. voxel_size_mm: sides of a voxel. Raises InputError for numbers below 1, lengths that are not
-    finite, and sides that are not above 0."""
+    shape: numbers of voxels. voxel_size_mm: sides of a voxel. Raises InputError for numbers that are not whole or below 1,
+    more than ``MOST_VOXELS`` voxels, lengths that are not finite, and sides that are not above 0."""
 
     shape: tuple[int, int, int]
     voxel_size_mm: tuple[float, float, float]
@@ -70,7 +70,7 @@ class Grid:
 
     @property
     def half_longest_mm(self) -> float:
-        """Half the longest side in mm. Inside the reconstruction it is the unit of length."""
+        """Half the longest side in mm: the unit of length in which splatting and neural methods compute."""
         return max(self.size_mm) / 2
 
     @property

@@ -121,8 +121,8 @@ class LineAttentionBlocks(nn.Module):
 class AttenuationNetwork(nn.Module):
     """Maps features (P, inputs) to attenuation (P,) in the unit of ``options.density_bound``.
 
-    middle: the modules between the first and the last layer. skip: the index of the layer whose input also
-    has the features. A leaky ReLU follows each layer but the last, and ``options.last_activation`` the last layer."""
+    middle: the modules between the first and the last layer. skip: the index of the layer whose input also contains the
+    features. A leaky ReLU follows each layer but the last. ``options.last_activation`` follows the last layer."""
 
     def __init__(self, inputs: int, middle: list[nn.Module], skip: int, options: NeuralOptions) -> None:
         super().__init__()
@@ -150,7 +150,8 @@ class AttenuationNetwork(nn.Module):
 def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
     """Returns NAF's linear layers; for ``LineOptions``, line-segment attention replaces the layers in the middle.
 
-    With three or more layers, the middle one gets the encoding again; it stays linear."""
+    With three or more layers, the middle one gets the encoding again, beside the output of the layer before it. It is linear
+    for ``LineOptions`` too."""
     skip, width = options.layers // 2 if options.layers > 2 else 0, options.width
     middle: list[nn.Module] = []
     for number in range(1, options.layers - 1):
@@ -198,7 +199,7 @@ def corners(positions: torch.Tensor, cells: int, size: int) -> tuple[torch.Tenso
     level has ``cells`` grid cells along a side and ``size`` entries."""
     scaled = positions.t() * cells
     low = scaled.floor().clamp_(0, cells - 1)
-    high_share = scaled - low  # part of a cell's side, (3, P)
+    high_share = scaled - low  # distance from the cell's lower corner, in sides of a cell, (3, P)
     low_share = 1 - high_share
     side, whole = cells + 1, low.to(torch.int64)
     is_dense = side**3 <= size
@@ -288,7 +289,7 @@ def _in_rows(
     filled = ceil_div(fast.size, field.segment) * field.segment
     fast = np.concatenate([fast, fast[-1] + fine.voxel_size_mm[2] * np.arange(1, filled - fast.size + 1)])
     slows, middles, fasts = grid.shape
-    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # where each row of points lies, grouped by voxels
+    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # coordinates of each row on the first two axes
     rows[..., 0], rows[..., 1] = slow.reshape(slows, 1, points, 1), middle.reshape(1, middles, 1, points)
     rows = rows.reshape(slows * middles, points**2, 2)
     values = np.empty((slows * middles, fasts), np.float32)

@@ -16,7 +16,7 @@ TORCH_DEVICES = ("auto", "cpu", "cuda", "mps")
 # Densities of grid cells and samples, unless options state them.
 CELLS_PER_VOXEL = 1.0  # grid cells of the encoding's finest level per voxel of the longest side
 SAMPLES_PER_VOXEL = 1.5  # samples along a ray per voxel of the longest side: NAF takes 192 for 128 voxels
-# For a pixel with rays at several times fewer samples per ray are enough, because only the mean over its rays must be exact.
+# If a pixel has rays at several times, fewer samples per ray are enough: only the mean over the rays must be exact.
 SAMPLES_PER_TIME = 1.2
 _FINEST = 2**24  # with more grid cells along a side, float32 coordinates have no fraction within a cell
 
@@ -36,7 +36,8 @@ class NeuralOptions(MotionOptions):
       table_log2 (each level has at most 2^table_log2 entries): sizes of the hash encoding.
     - layers, width, last_activation: the network's shape. A sigmoid reaches at most density_bound, in units of FDK's 99.9th
       percentile. The field starts at first_share of that everywhere.
-    - rate: Adam's learning rate, multiplied by rate_factor every rate_step passes; step 0: once, gradually over the run.
+    - rate: Adam's learning rate. It is multiplied by rate_factor every rate_step passes; rate_step 0: once, gradually over
+      the run.
     - detector_model: what the detector averages over a line's times, or the model that the scan states (scan).
     - torch_device: the device of PyTorch."""
 

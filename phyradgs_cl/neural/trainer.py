@@ -42,7 +42,7 @@ class Trainer:
         self.unit = density_per_mm * scan.grid.half_longest_mm  # internal unit of line integrals
         self.rng = np.random.default_rng(seed)
         motion = options.motion
-        if type(motion) is PerRow:  # rays are evaluated one by one: times that lines share would save nothing
+        if type(motion) is PerRow:  # the field is evaluated for each ray, so sharing times between lines saves nothing
             motion = OwnTimes(motion.of(scan).sub_intervals)
         tables = [motion.cells(scan, frame).still() for frame in range(scan.frames)]
         self.rays = [ExposureRays.of_cells(table, scan.grid) for table in tables]
@@ -174,7 +174,8 @@ class Trainer:
     def _squares(
         self, source: np.ndarray, direction: np.ndarray, shifts: np.ndarray, measured: np.ndarray, times: int
     ) -> torch.Tensor:
-        """Returns the squared errors (R,) of pixels ``measured`` (R,), from rays (R, s, 3) at s of a pixel's K ``times``."""
+        """Returns the squared errors (R,) of R pixels. source, direction (R, s, 3): rays at s of each pixel's K ``times``.
+        shifts (R, s, 1 or samples): what ``sample_shifts`` returns. measured (R,): line integrals in internal units."""
         from_, along, shift = (
             to_tensor(a.reshape(-1, a.shape[-1]).astype(np.float32), self.device)
             for a in (source, direction, shifts)

@@ -17,7 +17,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, beside, brought_to, padded_zeros, pitch_of
 
 EDGE = 4  # voxels along each side of a block
-_SAMPLES = 8  # time of a voxel over the time of a ray's sample; by it launches are divided, since drivers kill long ones
+_SAMPLES = 8  # number of ray samples that take as long as a voxel, so that ``launch`` can divide launches that take too long
 # TURNS[turn][z]: the blocks' shift along y, in voxels, for their shift z along z. Four turns contain all 16 pairs once.
 TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 
@@ -50,7 +50,8 @@ class DctProx:
         voxels, by_voxel = (nx, ny, nz), rt.group(on_cpu=16)
         layout = self._shape4, self._pitch
         rt.launch(self._start, voxels, observed, *layout, self._padded, self._excess, group=by_voxel)
-        # Blocks of one launch do not overlap, so results repeat. A GPU's work-item takes one; a CPU's vectors run along x.
+        # No two work-items of a launch add to the same voxel, so results repeat bit for bit. A GPU's work-item takes one
+        # block. A CPU's takes the blocks at all voxels along x.
         along_x = EDGE if rt.pixel_items else 1
         blocks = ceil_div(nx, EDGE) if rt.pixel_items else 1, ceil_div(ny, EDGE), ceil_div(nz, EDGE)
         for (z, y), x in itertools.product(enumerate(TURNS[turn]), range(along_x)):
@@ -64,7 +65,7 @@ class DctProx:
 
 
 def dct_prox(volume: np.ndarray, threshold: float, turn: int, *, nonnegative: bool) -> np.ndarray:
-    """Returns the shrunk volume (nz, ny, nx) float64: the twin of ``DctProx``, with the same arguments."""
+    """Returns the shrunk volume (nz, ny, nx) float64: the twin of a call of ``DctProx``, whose arguments it takes."""
     volume = np.asarray(volume, np.float64)
     if min(volume.shape) < EDGE:
         return np.asarray(np.maximum(volume, 0) if nonnegative else volume)

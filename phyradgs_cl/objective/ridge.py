@@ -19,7 +19,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, beside, brought_to, move,
 
 EDGE = 5
 """Voxels along each side of a filter."""
-_SAMPLES = 200  # largest time of a voxel over that of a ray's sample; by it launches are divided: drivers kill long ones
+_SAMPLES = 200  # most ray samples that take as long as a voxel, so that ``launch`` can divide launches that take too long
 _SLICES = 2  # slices computed at a time: channels and responses of a whole volume would take 24 volumes of memory
 _RING = _SLICES + 2  # slices kept in memory: correlating two slices needs one more on either side
 
@@ -55,12 +55,13 @@ class Ridge:
 
 @cache
 def learned_ridge() -> Ridge:
-    """Returns the regulariser of ``data/ridge.json``, whose numbers are stored in thousandths
-    (benchmarks/train_ridge.py)."""
+    """Returns the regulariser of ``data/ridge.json``, where benchmarks/train_ridge.py has stored the numbers in
+    thousandths."""
     stored = json.loads((resource("data") / "ridge.json").read_text(encoding="utf-8"))
     first, second, *curves = (np.array(stored[name]) / 1000 for name in Ridge.__dataclass_fields__)
     first, second = first.reshape(-1, 3, 3, 3), second.reshape(len(curves[0]), -1, 3, 3, 3)
-    # The chained filters must sum to 0, so that flat volumes stay; rounding leaves small sums.
+    # The weights of a chained filter must sum to 0, so that flat volumes stay. The stored numbers are rounded, so their
+    # small sums are removed.
     sums = first.sum((1, 2, 3))
     second -= np.multiply.outer(second.sum((2, 3, 4)) @ sums, sums / (27 * sums @ sums))[..., None, None, None]
     return Ridge(*(values.astype(np.float32) for values in (first, second, *curves)))
@@ -108,7 +109,8 @@ class RidgeStep:
         return brought_to(self.rt, volume, result)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
-        """Runs a kernel on slices from ``first`` on, whose result is ``less`` voxels shorter than the volume."""
+        """Runs a kernel for ``_SLICES`` slices of its result from ``first`` on, without those that do not exist. less: how
+        many voxels fewer than the volume the result has along each axis."""
         nz, ny, nx = (count - less for count in self.shape)
         start, stop = max(first, 0), min(first + _SLICES, nz)
         if start < stop:

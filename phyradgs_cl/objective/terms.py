@@ -24,7 +24,8 @@ C2 = 0.03**2  # keeps SSIM finite where variances are 0; for images with values 
 
 
 class ImageLoss:
-    """Computes the loss of a frame of ``lines`` × ``width`` pixels, and its gradient. pitch: floats from line to line."""
+    """Computes the loss of a frame of ``lines`` × ``width`` pixels in padded layout, and its gradient. pitch: floats from
+    line to line. ssim_weight, l1_weight: the factors of 1 − SSIM and of L1."""
 
     def __init__(
         self, rt: Runtime, lines: int, width: int, pitch: int, ssim_weight: float, l1_weight: float = 1.0

@@ -5,8 +5,8 @@ dual (Beck and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weight
 cubes. For an object that changes, the sum of |differences| between successive states is added.
 
 ``TvDescent`` takes steps of a fixed length, as ASD-POCS does (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777), with TIGRE's
-backward differences. A number far below the volume's values is added to the lengths of differences, by which its gradient
-divides."""
+backward differences. TV's gradient divides by the lengths of differences, which may be 0. So a number far below the volume's
+values is added to them."""
 
 import math
 from collections.abc import Callable
@@ -102,8 +102,8 @@ def tv_prox(
 
 
 def differences(volume: np.ndarray, axis_weights: tuple[float, ...]) -> np.ndarray:
-    """Returns weighted forward differences (3, z, y, x) along z, y, x; 0 at the last voxel. For states (K, z, y, x), the
-    differences between states come first."""
+    """Returns weighted forward differences (3, z, y, x) along z, y, x; 0 at the last voxel. For states (K, z, y, x) returns
+    (4, K, z, y, x), with the differences between successive states first."""
     result = np.zeros((volume.ndim, *volume.shape))
     for axis, weight in enumerate(axis_weights):
         inner = tuple(slice(0, -1) if a == axis else slice(None) for a in range(volume.ndim))
@@ -123,7 +123,7 @@ def _primal_of(
 
 
 def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
-    """Returns the lengths of the dual's steps in space and in time: 1/(Lipschitz constant of the differences).
+    """Returns the dual's steps in space and in time: 1/(upper bound of the squared norm of the difference operator).
 
     For states, each step is half as long as it would be alone, so a large weight in time does not shorten that in space."""
     *time, z, y, x = axis_weights

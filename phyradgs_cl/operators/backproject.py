@@ -16,12 +16,12 @@ from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.runtime import Array, DeviceArray, Room, Runtime, SameArray, attempts
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of, unpad_rows
 
-_VIEWS_PER_LAUNCH = 64  # most views of a launch: the few lines of each that a work-item reads should stay in the cache
+_VIEWS_PER_LAUNCH = 64  # most views in a launch, so that the few lines of each that a work-item reads stay in the cache
 _BYTES_A_LAUNCH = 1 << 28  # most bytes of frames that are uploaded together
 _VIEWS_SHARE = 0.25  # fraction of the free device memory for uploaded frames; the volume needs the rest
 # Most voxels along z that a work-item sums in the kernels for upright columns of voxels (see ``_UPRIGHT``).
 _BLOCK_VOXELS = 128
-_COLUMN_ROWS = 512  # most detector rows to which the voxels of a work-item of these kernels may project
+_COLUMN_ROWS = 512  # most detector rows to which the voxels of a work-item of the upright kernels may project
 # A column of voxels along z is upright if over its height u·depth and depth change by at most this fraction of the depth.
 _UPRIGHT = 1e-7
 # Largest lean of the image of a column of voxels, in detector columns per row. Beyond it the general kernel is faster.
@@ -177,15 +177,16 @@ def _upright(rt: Runtime, name: str, power: int, block: int, images: Arguments, 
 
 
 def _defines(power: int) -> dict[str, int]:
-    """Returns the build options for ``power``. It is left out for FDK's 2, the kernels' default."""
+    """Returns the kernels' macros for the exponent ``power``. For FDK's 2, their default, it is left out."""
     return {"IMAGE_GUARD": GUARD} if power == 2 else {"IMAGE_GUARD": GUARD, "DISTANCE_POWER": power}
 
 
 def _upright_block(matrices: np.ndarray, grid: Grid) -> tuple[int, bool]:
-    """Returns how many voxels along z a work-item of the kernels for columns of voxels computes, 0 if the general kernel is
-    needed, and whether the columns lean: whether u or depth (rows 0 and 2 of a matrix) change along a column.
+    """Returns how many voxels along z a work-item of the upright kernels computes, or 0 if the general kernel is needed; and
+    whether columns of voxels lean: whether u or depth (rows 0 and 2 of a matrix) change along them.
 
-    All voxels must be in front of the source, with those that a work-item's last vector reads beyond the volume."""
+    The general kernel is needed if columns lean too much, if v does not change along z, or if a voxel is not in front of the
+    source. Voxels past the volume's end that a work-item's last vector reads count too."""
     nz, ny, nx = grid.shape
     corners = np.array([[x, y, z, 1] for x in (0, nx - 1) for y in (0, ny - 1) for z in (0, nz - 1 + _WIDEST)])
     depth = matrices[:, 8:12] @ corners.T

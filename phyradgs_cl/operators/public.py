@@ -201,7 +201,7 @@ class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy ha
 
     @property
     def T(self) -> "LinearOperator":  # noqa: N802
-        """The exact transpose, from y, as frames (F, rows, columns), to x. It has the same weights as the operator."""
+        """The exact transpose, with the same weights: maps arrays of the shape of y to arrays of the shape of x."""
         return LinearOperator(self.rt, self._range, self._domain, *self._pair[::-1])
 
     def derivative(self, x: Any) -> "LinearOperator":
@@ -217,7 +217,7 @@ class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy ha
     def _transpose(self) -> "LinearOperator":
         return self.T
 
-    _adjoint = _transpose  # for real numbers it is the transpose
+    _adjoint = _transpose  # the same for operators on real numbers
 
 
 def _is_index(number: object, count: int) -> bool:

@@ -110,14 +110,15 @@ class DeviceAdam:
 
 @dataclass(frozen=True)
 class DensityControl(checks.Checked):
-    """When Gaussians are cloned, split and removed, and which. Lengths are in half-sides of the volume, times in fractions
-    of a run.
+    """When Gaussians are cloned, split and removed, and which. Lengths are in half-sides of the volume.
 
-    ``every``: iterations between two rounds of cloning, splitting and removing; 0 keeps the first population. Gaussians
-    whose statistic reaches ``threshold`` are split if their longest scale is above ``split_scale``, else cloned. The parts
-    of a split are smaller by ``split_factor``. Gaussians fainter than ``prune_density`` (in the reference density) are
-    removed, and those whose longest scale is more than ``prune_aspect`` times their shortest (0: never). Such thin sheets
-    and needles lie between the rays, where no measurement constrains them, and are visible in the volume."""
+    ``every``: iterations between two rounds of cloning, splitting and removing; 0 keeps the first population. Rounds begin
+    after ``start_iteration``, end before the fraction ``stop_fraction`` of the run, and add Gaussians up to
+    ``max_gaussians``. Gaussians whose statistic reaches ``threshold`` are split if their longest scale is above
+    ``split_scale``, else cloned. The parts of a split are smaller by ``split_factor``. Gaussians fainter than
+    ``prune_density`` (over FDK's 99.9th percentile) are removed, and those whose longest scale is more than ``prune_aspect``
+    times their shortest (0: never). Such thin sheets and needles lie between the rays, where no measurement constrains them,
+    and are visible in the volume."""
 
     PREFIX = "control."
 
@@ -199,7 +200,8 @@ def prune(
 
 
 def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray:
-    """Returns which statistics reach the threshold, bool (G,). If more than ``room`` reach it, only the largest count."""
+    """Returns which statistics reach the threshold, bool (G,). If more than ``room`` do, only the ``room`` largest are
+    chosen."""
     chosen = statistic >= threshold
     if int(chosen.sum()) > room:
         order = np.argsort(-statistic, kind="stable")[:room]

@@ -1,8 +1,8 @@
 """Phantoms: objects of known attenuation, to simulate scans and to compare reconstructions with. See ``make_phantom``.
 
 Every phantom has ``name``, ``kind`` and ``voxelise(grid)``. An "analytic" phantom also has exact ``line_integrals(source,
-target)``, and a "moving" phantom has exact line integrals at any time. A "voxel" phantom has ``volume`` and ``grid``.
-Attenuation scales with 1 / half-size, so that line integrals do not depend on the size."""
+target)``, and a "moving" phantom ``line_integrals(source, target, time_s)``. A "voxel" phantom has ``volume`` and ``grid``.
+Attenuation is inversely proportional to the phantom's size, so that line integrals do not depend on it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -90,7 +90,7 @@ class Ellipsoid:
     def contains(self, x: Array, y: Array, z: Array) -> NDArray[np.bool_]:
         """Returns whether points, given by coordinates in mm that broadcast, lie inside, bool (...)."""
         cx, cy, cz = self.centre_mm
-        # Each product is formed before broadcasting, so a grid's coordinates stay one-dimensional for as long as possible.
+        # Products are formed before the coordinates are broadcast to each other: this costs far less time than afterwards.
         rows = [m[0] * (x - cx) + m[1] * (y - cy) + m[2] * (z - cz) for m in self.to_unit_ball]
         return rows[0] ** 2 + rows[1] ** 2 + rows[2] ** 2 <= 1.0
 
@@ -187,7 +187,7 @@ class EllipsoidPhantom:
         flat = result.reshape(-1)
         for first in range(0, flat.size, RAYS_PER_CHUNK):
             chunk = slice(first, min(first + RAYS_PER_CHUNK, flat.size))
-            # Copies the points of one chunk only; reshaping the broadcast arrays would copy all.
+            # Only the points of one chunk are copied. A reshape of the broadcast arrays would copy all points.
             where = np.unravel_index(np.arange(chunk.start, chunk.stop), result.shape) if result.ndim else ()
             p = start[where].reshape(-1, 3)
             flat[chunk] = self._segments(p, end[where].reshape(-1, 3) - p)
@@ -208,7 +208,8 @@ class EllipsoidPhantom:
         return total
 
     def voxelise(self, grid: Grid, supersampling: int = 2) -> NDArray[np.float32]:
-        """Returns attenuation (nz, ny, nx) float32 in 1/mm, a mean over ``supersampling``³ points in each voxel."""
+        """Returns attenuation (nz, ny, nx) float32 in 1/mm, a mean over ``supersampling``³ points in each voxel. Raises
+        InputError for a ``supersampling`` below 1."""
         if supersampling < 1:
             raise InputError("supersampling", str(supersampling), "an integer of at least 1")
         volume = np.zeros(grid.shape)

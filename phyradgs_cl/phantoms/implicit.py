@@ -1,6 +1,6 @@
 """Bodies for procedural phantoms: signed distances, smooth unions, band-limited texture.
 
-They are functions of position in the cube [-1, 1]^3, averaged over voxels, so every resolution shows the same object.
+Bodies are functions of position in the cube [-1, 1]^3, averaged over voxels, so every resolution shows the same object.
 Lengths are in half sides of the cube. Distances are negative inside a body. Points are (x, y, z); arrays are (z, y, x),
 float32."""
 

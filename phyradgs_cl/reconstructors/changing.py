@@ -63,7 +63,7 @@ def changing(scan: Scan, options: ChangingOptions, rt: Runtime, **arguments: Any
         prox = TvProx(rt, shape, (options.time_weight, *axis_weights(scan.grid)))
         weight = PriorWeight(system, frame_error(scan, options.motion), options.prior_weight)
         prior, nonnegative = TvPrior(prox, options.tv_iterations), options.nonnegative
-        # a state has few frames: if one frame were a large part of a subset, steps would be too long and diverge
+        # a state has few frames: with few of them in a subset, one frame would make steps too long, and they would diverge
         subsets = min(options.subsets, 2 * scan.frames // len(times_s))
         method = Fista(system, prior, weight, subsets=subsets, nonnegative=nonnegative)
 

@@ -34,7 +34,7 @@ def without_identity(
     if not np.array_equal(state.get(_CHECKSUM, -1), _checksum(arrays)):
         raise InputError("checkpoint", "arrays that do not match their checksum", "a whole checkpoint", _REMEDY)
     both = completed(json.loads(str(arrays.pop(RUN)))), identity
-    then, now = (json.loads(json.dumps(one, default=repr)) for one in both)  # in JSON a tuple is a list
+    then, now = (json.loads(json.dumps(one, default=repr)) for one in both)  # JSON turns the tuples of both into lists
     differences = list(_differences(then, now))
     if differences:
         more = "; and more" if len(differences) > _MOST_DIFFERENCES else ""

@@ -46,14 +46,14 @@ FEWEST_FRAMES = 4  # analytic methods need this many frames: with one in each ha
 _EDGE = 0.8  # standard deviation, in voxels, of the Gaussian whose derivative gives the slope of edges
 _DENSEST = 3.0  # matter denser than this many times the object's mean density counts as this dense
 LEAST = 0.01  # least error bar σ of a voxel, as a fraction of the RMS of σ over the volume
-# A filter along one axis: 1/4 of the slope of the spline of ``finer``, which has the means of all voxels.
+# Filter along one axis. It gives 1/4 of the slope per voxel of the spline whose mean over each voxel is the voxel's value.
 _SLOPES = (0.00387, -0.01443, 0.05385, -0.20096, 0, 0.20096, -0.05385, 0.01443, -0.00387)
 _KEPT = "doubt."  # prefix of the arrays that a state keeps from complete runs
 _PARTS = {"gaussians": Gaussians, "deformation": Deformation, "states": States}
 _CHECKED_FRAMES = 16  # number of frames whose held-out pixels correct σ
-_AROUND = 9  # side in pixels of the squares over which a pixel's bar is averaged: two samples give a rough bar
+_AROUND = 9  # side in pixels of the squares over which a pixel's bar is averaged, because a bar of two samples is rough
 _UNEXPLAINED = 2.0  # a residual above this many times the noise causes a warning; simulations had at most 1.2
-_NOISY = 0.03  # larger noise over line integrals causes a warning: at 0.05 to 0.06, 43 to 59 % of errors were within σ
+_NOISY = 0.03  # larger noise over line integrals causes a warning: at 0.05 to 0.06, σ held 43 to 59 % of errors, not 68 %
 _WIDEST = 4.0  # σ is widened by at most this factor: held-out pixels farther off have other causes
 # Views per voxel along a slice's longer side from which on a law needs no factor for few views: 25 views for 64 voxels.
 _USUAL_VIEWS = 25 / 64
@@ -157,7 +157,7 @@ class Doubter:
         results = _restored({name: arrays.pop(name) for name in list(arrays) if name.startswith(_KEPT)}, self.scan.grid)
         while len(results) < RUNS:
             scan = self.scan_of_run(results[0], len(results)) if results else self.scan
-            half = without_warnings() if results and self.kind == "analytic" else nullcontext()  # about gaps
+            half = without_warnings() if results and self.kind == "analytic" else nullcontext()  # half the views have gaps
             with report.through(partial(_counted, results=results)), half:
                 result = once(scan, arrays or None)
             if result.state is not None:
@@ -208,7 +208,7 @@ class Doubter:
         if self.hidden is not None and self.rt.ranks.size == 1:
             facts |= self._against_held_out(results, self.hidden, law)
             sigma *= np.float32(facts["held_out_factor"])
-        # weighted by density: noise and streaks in air make no object
+        # the mean bar is weighted by density, so that noise and streaks in air do not count
         total = float(first.volume.sum(dtype=np.float64))
         weighted = np.sum(sigma * first.volume, dtype=np.float64) / total if total > 0 else sigma.mean()
         facts["mean_per_mm"] = float(weighted)

@@ -26,7 +26,8 @@ def reconstruct_neural(
     """Returns the volume of a neural field fitted to a scan. The seed draws first parameters, frames, pixels and samples.
 
     ``rt`` computes the FDK volume that sets the unit of attenuation; PyTorch does the rest. ``resume`` continues an
-    interrupted run of the same scan and options from its state. Raises InputError where PyTorch is not installed."""
+    interrupted run of the same scan and options from its state. Raises InputError where PyTorch is not installed, and
+    DeviceError for a device that PyTorch does not have."""
     require_torch(f"--method {method}")
     from phyradgs_cl.neural.field import first_field, torch_device
     from phyradgs_cl.neural.trainer import Trainer
@@ -63,7 +64,7 @@ NAF = Method(partial(reconstruct_neural, method="naf"), NAF_PRESETS)
 
 # SAX-NeRF's released configuration Lineformer/chest_50 is NAF's with 256 samples per ray for 128 voxels per side.
 SAX_PUBLISHED = LineOptions(**{**vars(NAF_PUBLISHED), "samples": 256})
-# No windows of rays by default: they keep the expected gradient of a squared error, but make it noisier.
+# No windows of rays by default: windows keep the expected gradient of a squared error, but make the gradient noisier.
 SAX_PRESETS = {"default": LineOptions(iterations=50, windows=0), "published": SAX_PUBLISHED}
 
 SAX_NERF = Method(partial(reconstruct_neural, method="sax-nerf"), SAX_PRESETS)

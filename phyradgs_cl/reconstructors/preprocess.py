@@ -98,7 +98,7 @@ def reprojection(rt: Runtime | None, scan: Scan) -> Model:
         moving = with_times(PerRow(), scan)
         cells = [moving.cells(scan, frame) for frame in range(scan.frames)]
         whole = RayOperator(rt, scan.grid, scan.geometry.detector_shape, cells, subrays=subrays_of(scan.grid, cells))
-        near = scipy.ndimage.binary_dilation(inside)  # adds rays that meet a voxel's edge, or meet it between two times
+        near = scipy.ndimage.binary_dilation(inside)  # so that rays count that graze a voxel, or meet it between two times
         return whole.forward(near.astype(np.float32)) > 0
 
     return Model(

@@ -101,7 +101,8 @@ class Reconstruction:
         return self
 
     def within(self, grid: Grid) -> "Reconstruction":
-        """Returns the part of the result on ``grid``, with all Gaussians; the result itself if ``grid`` reaches beyond."""
+        """Returns the part of the result on ``grid``, with all Gaussians; the result itself if ``grid`` is no part of its
+        grid."""
         if (part := grid.slices_in(self.grid)) is None:
             return self
         of_all = slice(None), *part

@@ -59,9 +59,10 @@ def reconstruct(
     scan: Scan, plan: RunPlan, rt: Runtime, *, report: ProgressReport = ignore_progress,
     resume: State | None = None,
 ) -> Reconstruction:
-    """Runs a plan on a scan. resume: the state of an interrupted run of the same plan.
+    """Runs a plan on a scan and returns the result. resume: the state of an interrupted run of the same plan.
 
-    The plan's first volume is resampled onto the scan's grid."""
+    The plan's first volume is resampled onto the scan's grid. Raises InputError for a scan or state that the plan cannot
+    take, and OutOfMemoryError where memory is short."""
     run, report = _Prepared(scan, plan, rt, resume), Report.of(report)
     method, state = method_of(plan.method), run.arguments.pop("resume", None)
 
@@ -119,7 +120,8 @@ class _Prepared:
         if self.scan.metal is not None and (self.deformation is not None or plan.method_name == "moving"):
             log.warning("metal: found and masked as in an object at rest, and this one moves: do not trust what is near it")
         self.options = plan.options
-        if hasattr(self.options, "motion") and plan.method_name != "moving":  # ``moving`` finds the object's speed itself
+        # times per exposure depend on the object's speed, which ``moving`` finds only during its run
+        if hasattr(self.options, "motion") and plan.method_name != "moving":
             motion = with_times(self.options.motion, self.scan, self.deformation)
             self.options = replace(self.options, motion=motion)
         self.hidden = held_out(self.scan, preprocessing.holdout) if preprocessing.holdout else None

@@ -16,7 +16,7 @@ from phyradgs_cl.runtime.memory import DeviceArray
 
 A = TypeVar("A")
 Shape = tuple[int, ...]
-_CPU_SPAN = 1 << 14  # least number of elements that a CPU's work-item sums, so that summing outweighs its start
+_CPU_SPAN = 1 << 14  # least number of elements that a CPU's work-item sums, so that its start takes little of its time
 _GPU_GROUP = 256  # largest work-group on a GPU, in work-items
 _GPU_GROUPS = 512  # most work-groups (on a GPU) or work-items (on a CPU) that share a sum
 _ITEMS = 64  # size of a work-group of element-wise kernels on a CPU, in work-items
@@ -50,7 +50,7 @@ class Space(Protocol, Generic[A]):
         """Returns x + ``scale`` y z element by element, clipped at 0 if ``nonnegative``."""
 
     def multiply(self, x: A, y: A) -> A:
-        """Returns x y element by element. y may lack the first axes of x: all of x's parts are then multiplied by it."""
+        """Returns x y element by element. y may lack the first axes of x: it is then repeated along these axes."""
 
     def reciprocal(self, x: A, share: float) -> A:
         """Returns 1/max(x, ``share`` · largest x) where x > 0, else 0, so that small x give no huge result."""
@@ -134,7 +134,7 @@ class DeviceSpace:
     def __init__(self, rt: Runtime) -> None:
         self.rt = rt
         self._unused: dict[int, list[DeviceArray]] = defaultdict(list)
-        # Memory for the sums of work-groups, their total, and a total over several arrays, kept while others are summed.
+        # Memory for the work-groups' sums, the total of an array, and a total to which several arrays are added.
         self._parts, self._whole, self._total = (rt.empty(count, np.float64) for count in (_GPU_GROUPS, 1, 1))
 
     def empty(self, shape: Shape) -> DeviceArray:
@@ -190,7 +190,7 @@ class DeviceSpace:
     def descend(self, x: DeviceArray, y: DeviceArray, step: float) -> DeviceArray:
         """Returns x − ``step`` y/‖y‖, or x if y is all 0. The host need not wait, since ‖y‖ stays on the device."""
         self._sum("dot_parts", self._whole, y, y)
-        # Two floats, the step rounded and the rest, keep its precision on devices without float64.
+        # Two floats, the rounded step and the rest, keep the step's precision on devices without float64.
         high = np.float32(step)
         return self._each("descend", x, y, np.array([high, step - float(high)], np.float32), self._whole)
 
@@ -216,8 +216,8 @@ class DeviceSpace:
         return float(self.rt.download(self._parts).view(np.float32)[:groups].max())
 
     def _each(self, name: str, x: DeviceArray, *others: Any, period: int = 0) -> DeviceArray:
-        """Launches an element-wise kernel with x and the other arguments. period: the size of a second operand that is
-        smaller than x and repeats along x; 0 if all operands have the size of x."""
+        """Returns the result of an element-wise kernel for x and the other arguments. period: the size of a second operand
+        that is smaller than x and repeats along x; 0 if all operands have the size of x."""
         result, count = self.empty(x.shape), period or x.size
         items = ceil_div(count, self.rt.lanes), x.size // max(count, 1)
         kernel = self.rt.kernel("algebra", name)
@@ -231,8 +231,8 @@ class DeviceSpace:
         return float(values[0] if self.rt.fp64 else values.view(np.float32).astype(np.float64).sum())
 
     def _sum(self, name: str, whole: DeviceArray, *arrays: DeviceArray, add: bool = False) -> None:
-        """Writes a sum over arrays to ``whole``, or adds the sum to ``whole``. Kernel ``name`` sums in each work-group, a
-        second kernel over the work-groups."""
+        """Writes the sum that kernel ``name`` computes from ``arrays`` to ``whole``, or adds it there if ``add``. The kernel
+        sums within each work-group, and a second kernel sums over the work-groups."""
         groups = self._reduce(name, *arrays, scratch=8)
         kernel = self.rt.kernel("algebra", "dot_whole")
         group = self.rt.group(1, _GPU_GROUP, kernel)

@@ -23,7 +23,8 @@ log = logging.getLogger(__name__)
 Sides = tuple[int, ...]
 
 LANE_CHOICES = (1, 4, 8, 16)  # numbers of floats that a kernel's vectors may have
-_FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'  # fuses multiply and add; marks sources with float pairs
+# The compiler's option that fuses multiply and add, and the line that marks sources which may use pairs of float32.
+_FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'
 _TILE_ITEMS = 256  # largest work-group that shares a tile of pixels, in work-items
 _FEWEST_ITEMS = 32  # a device whose work-groups must be smaller than this is refused
 
@@ -31,13 +32,16 @@ _FEWEST_ITEMS = 32  # a device whose work-groups must be smaller than this is re
 class Runtime:
     """One OpenCL device and all that runs on it: declare a ``kernel``, make arrays (``empty``, ``upload``), then ``launch``.
 
+    - device: as ``wish`` of ``choose_device``.
     - lanes: the number of floats in a kernel's vectors; None takes the device's width. It is 1 on GPUs, where neighbouring
       work-items do the work of a CPU's vector.
-    - fp64: False makes kernels use pairs of float32 in place of float64.
-    - pixel_items: True gives each work-item one pixel (GPUs, needs ``lanes`` 1), False several lines of pixels (CPUs).
+    - fp64: False makes kernels use pairs of float32 in place of float64, as on devices without float64.
+    - pixel_items: True gives each work-item one pixel (GPUs, needs ``lanes`` 1), False one line of pixels or more (CPUs).
     - memory: the largest sum of the sizes of all buffers, in bytes or as text like 2GiB. profile: True times every kernel.
-    - ranks: the MPI processes that work on the same scan, each with its own Runtime. On a machine with several devices,
-      each rank takes another device."""
+    - ranks: the MPI processes that work on the same scan, each with its own Runtime. On a machine with several equal
+      devices, each rank takes another one.
+
+    Raises DeviceError for a device that does not exist or cannot be opened, and for other ``lanes``."""
 
     # Most samples of rays in one GPU launch: a display driver kills launches of seconds, and these take 0.1 s on a slow GPU.
     most_samples = 2**29
@@ -77,8 +81,8 @@ class Runtime:
         self._kernels: dict[tuple[str, str, tuple[str, ...]], Kernel] = {}
 
     def kernel(self, program: str, name: str, **defines: int | float | bool) -> Kernel:
-        """Declares the kernel ``name`` of ``cl/<program>.cl`` with macros ``defines``. Its first launch builds it. Equal
-        declarations return the same kernel."""
+        """Declares the kernel ``name`` of ``cl/<program>.cl`` with macros ``defines``. Nothing is built before its first
+        launch. Equal declarations return the same kernel."""
         merged: dict[str, int | float | bool] = {"LANES": self.lanes, "FP64": int(self.fp64), **defines}
         flags = [f"-D{name}={_literal(value)}" for name, value in sorted(merged.items())]
         key = (program, name, ("-cl-std=CL1.2", "-w", _FUSING, *flags))
@@ -100,7 +104,8 @@ class Runtime:
 
     @property
     def group_limits(self) -> dict[str, int]:
-        """The largest work-group of each kernel, in work-items; only of kernels for which the driver has been asked."""
+        """The largest work-group that the driver allows, in work-items, by kernel name. Lists only kernels for which the
+        driver has been asked."""
         return {one.function_name: one.most_items for one in self._kernels.values() if one.most_items is not None}
 
     def _build(self, program: str, options: tuple[str, ...]) -> "cl.Program":
@@ -119,13 +124,14 @@ class Runtime:
 
     @staticmethod
     def _allowed(source: str, options: tuple[str, ...]) -> list[str]:
-        """Returns the build options. Programs with float pairs lose the option that fuses multiply and add: it would destroy
-        the pairs' low parts, and some drivers ignore the pragma against fusing."""
+        """Returns the build options for a source. Where it uses pairs of float32, the option that fuses multiply and add is
+        left out: fusing would destroy the pairs' low parts, and some drivers ignore the pragma against it."""
         has_pairs = "-DFP64=0" in options and _PAIRS in source
         return [option for option in options if not (has_pairs and option == _FUSING)]
 
     def empty(self, shape: int | Sequence[int], dtype: np.typing.DTypeLike = np.float32) -> DeviceArray:
-        """Returns an array with undefined values. Raises MemoryShortage if the device or the limit has too little memory."""
+        """Returns an array with undefined values. Raises MemoryShortage if it does not fit into the device's memory or under
+        the limit, and DeviceError for other failures."""
         shape = (int(shape),) if isinstance(shape, (int, np.integer)) else tuple(int(n) for n in shape)
         kind = np.dtype(dtype)
         nbytes = max(int(np.prod(shape, dtype=np.int64)), 1) * kind.itemsize
@@ -240,7 +246,7 @@ class Runtime:
         arrays = [a for a in args if isinstance(a, DeviceArray)]
         nbytes = sum(a.nbytes for a in arrays) if self.profile else 0
         pieces = ceil_div(samples, self.most_samples) if self.pixel_items else 1
-        try:  # not ``naming_failures``: an iteration may have thousands of launches, and its calls would take time
+        try:  # the decorator ``naming_failures`` would add a call to each of an iteration's thousands of launches
             built = self.compile(kernel)
             built.set_args(*map(_argument, args))
             for first, part in _parts(rounded, local, pieces):
@@ -253,7 +259,8 @@ class Runtime:
 
     def _sides(self, items: int, shape: Sides) -> Sides:
         """Returns the sides of a work-group of ``items`` work-items for a launch of ``shape``: (items, 1, ...). On a GPU,
-        items past a short first axis would idle. Factors of 2 of its side then move to another axis that they divide."""
+        work-items past the end of a short first axis would idle. There, factors of 2 move from the group's first side to
+        an axis whose length they divide."""
         sides = [int(items), *([1] * (len(shape) - 1))]
         while self.pixel_items and sides[0] % 2 == 0 and sides[0] // 2 >= shape[0]:
             axis = next((k for k in range(1, len(shape)) if shape[k] % (2 * sides[k]) == 0), None)
@@ -264,7 +271,8 @@ class Runtime:
 
     def group(self, on_cpu: int = 1, on_gpu: int = 64, *kernels: Kernel) -> int:
         """Returns a work-group's size in work-items, ``on_cpu`` or ``on_gpu``. A GPU's size is halved until ``kernels`` can
-        run. Give kernels here whose local memory has the group's size: a later halving by ``launch`` would break them."""
+        run. Name here every kernel whose local memory depends on the size: ``launch`` could halve its groups afterwards,
+        but not its memory."""
         while self.pixel_items and any(on_gpu > self.most_items(kernel) for kernel in kernels):
             on_gpu //= 2
         return on_gpu if self.pixel_items else on_cpu
@@ -280,7 +288,8 @@ class Runtime:
         return int(self.compile(kernel).get_work_group_info(getattr(cl.kernel_work_group_info, name), self.device.handle))
 
     def _fitting(self, kernel: Kernel, group: tuple[int, ...]) -> tuple[int, ...]:
-        """Halves the sides of a work-group until the kernel can run. Raises DeviceError if it allows fewer than 32 items."""
+        """Halves the sides of a work-group until the kernel can run. Raises DeviceError for a group of several work-items if
+        the kernel allows neither the whole group nor 32 of them."""
         if math.prod(group) == 1:
             return group
         most, sides = self.most_items(kernel), list(group)
@@ -293,7 +302,8 @@ class Runtime:
 
     def _tile(self, kernel: Kernel) -> tuple[int, int]:
         """Returns the (width, lines) of the tile of pixels that a GPU's work-group takes. The width is the number of
-        work-items that run in lockstep, within 16 and 64. Device and kernel limit the lines."""
+        work-items that run in lockstep, but at least 16 and at most 64. The lines fill the largest group that the device
+        and the kernel allow, up to 256 work-items."""
         if self._multiple is None:
             rates = self.kernel("rates", "multiply_add")
             self._multiple = min(max(self._asked(rates, "PREFERRED_WORK_GROUP_SIZE_MULTIPLE"), 16), 64)

@@ -21,12 +21,13 @@ DEVICE_VARIABLE = "PHYRADGS_DEVICE"
 _NEVER_BY_DEFAULT = ("oclgrind", "fpga", "emulat")  # parts of the names of devices that are used only if a user names them
 _RIGHT_MESA = 25  # rusticl, the OpenCL of Mesa, computes wrong sums before this major version
 log = logging.getLogger(__name__)
-_targets: dict[int, str | None] = {}  # by a CPU device's address, the processor for which PoCL builds its kernels
+_targets: dict[int, str | None] = {}  # the processor for which PoCL builds kernels, by the address of the CPU device
 
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """One OpenCL device, with the properties by which one is chosen. by_default: may be chosen without being named."""
+    """One OpenCL device, with the properties by which one is chosen. vector_width: floats. by_default: whether it may be
+    chosen where the user names no device."""
 
     index: int
     name: str
@@ -40,12 +41,12 @@ class DeviceInfo:
     has_fp64: bool
     by_default: bool
     handle: "cl.Device"
-    target: str | None = None  # the processor for which PoCL builds kernels
+    target: str | None = None  # the processor for which PoCL builds kernels; None: unknown, or a device not of PoCL
 
     @property
     def rank(self) -> tuple[int, int, int, int, int]:
-        """Numbers that are largest for the best device: whether it may be chosen unnamed, GPU before CPU, whether it has
-        memory of its own, the width of its vectors, its compute units."""
+        """Numbers by which devices are compared, the first one first; the best device has the largest. They are: chosen
+        by default or not, GPU before CPU, memory of its own or not, the width of its vectors, its compute units."""
         kind = {"gpu": 2, "cpu": 1}.get(self.kind, 0)
         unified = bool(self.handle.host_unified_memory)
         return (int(self.by_default), kind, int(not unified), self.vector_width, self.compute_units)
@@ -71,8 +72,9 @@ def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, s
     """Returns the device to use, and the reason in words. Raises DeviceError where no device fits.
 
     wish (or the environment variable PHYRADGS_DEVICE): an index, ``cpu``, ``gpu``, a part of a device's or platform's
-    name, or a list of these with commas. turn: the number k of this process among the processes on this machine. Process k
-    takes entry k of a list. If ``wish`` is no list and no index, process k takes the k-th further device of that name."""
+    name, or a list of these with commas. Without it, the best device is taken. turn: the number k of this process, from 0,
+    among the run's processes on this machine. Process k takes entry k of a list. If ``wish`` is neither a list nor an
+    index, process k takes the k-th device of the same name after the best one. Both counts start again at the end."""
     source = "--device"
     if not wish:
         wish, source = os.environ.get(DEVICE_VARIABLE), DEVICE_VARIABLE
@@ -100,7 +102,7 @@ def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, s
 
 
 def _next_of_name(first: DeviceInfo, devices: list[DeviceInfo], turn: int) -> DeviceInfo:
-    """Returns ``first``, or the ``turn``-th device after it of the same platform and name."""
+    """Returns the ``turn``-th device after ``first`` of the same platform and name. After the last comes the first again."""
     same = [d for d in devices if (d.platform, d.name) == (first.platform, first.name)]
     return same[(same.index(first) + turn) % len(same)]
 

@@ -43,7 +43,7 @@ class DeviceArray:
 
     @property
     def size(self) -> int:
-        return math.prod(self.shape)  # NumPy's takes 20 µs, and a launch asks several arrays
+        return math.prod(self.shape)  # np.prod takes 20 µs, and each launch needs the sizes of several arrays
 
     @property
     def nbytes(self) -> int:
@@ -52,7 +52,7 @@ class DeviceArray:
 
 @dataclass(eq=False)
 class LaterItem:
-    """A number that the device may still be computing, so that the host need not wait for it."""
+    """A number that is copied to the host once the device has computed it. The host need not wait: it asks ``is_here``."""
 
     _values: np.ndarray
     _event: "cl.Event"
@@ -68,7 +68,7 @@ class LaterItem:
 
 
 Array = np.ndarray | DeviceArray
-"""C-contiguous values on host or device. Operators return a NumPy array for a NumPy array, a device array for another."""
+"""C-contiguous values on host or device. Operators return a NumPy array for a NumPy array, else a device array."""
 SameArray = TypeVar("SameArray", bound=Array)
 
 
@@ -196,7 +196,8 @@ def memory_limit(wish: str | int | None) -> int | None:
 
 def bytes_of(wish: str | int, subject: str) -> int:
     """Returns the number of bytes that a text such as 2GiB, 1.5 GB or 512M, or a plain number, means. The letters K, M, G
-    and T alone mean powers of 1024, like KiB; KB means 1000. Raises InputError about ``subject`` for other text."""
+    and T alone mean powers of 1024, like KiB; KB means 1000. Raises InputError about ``subject`` for other text, and for a
+    size of 0 or of 2^63 and more."""
     text = "" if isinstance(wish, bool) else str(wish)
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([A-Za-z]*)\s*", text)
     factor = _UNITS.get(match.group(2).upper()) if match else None
@@ -240,7 +241,8 @@ def attempts(what: str) -> Iterator[Attempt]:
 
 
 def is_cl_array(value: object) -> bool:
-    """Returns whether a value is a pyopencl.array.Array. It cannot be one if nobody has imported that module yet."""
+    """Returns whether a value is a pyopencl.array.Array. Does not import pyopencl.array: until it is imported, there is no
+    such value."""
     module = sys.modules.get("pyopencl.array")
     return module is not None and isinstance(value, module.Array)
 

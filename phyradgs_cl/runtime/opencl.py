@@ -84,8 +84,8 @@ def placed_errors(log: str, source: str) -> list[str]:
 
 
 def naming_failures(work: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorates a method of ``Runtime``: an OpenCL error becomes a DeviceError or MemoryShortage that names ``work``, as
-    "a copy". Drivers only queue work, so a failed launch may show in a later call, which waits for it."""
+    """Decorates a method of ``Runtime``: an OpenCL error becomes a DeviceError or MemoryShortage that names ``work``, such
+    as "a copy". Drivers only queue a launch, so its failure may show in a later call, which waits for it."""
 
     def decorate(method: Callable[P, R]) -> Callable[P, R]:
         @wraps(method)

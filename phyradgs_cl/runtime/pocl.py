@@ -1,8 +1,8 @@
 """Makes PoCL (OpenCL on CPUs) fast and safe: sets its cache and threads, and the processor for which it builds kernels.
 
 PoCL links each kernel with a library of built-in functions (fma, min, vload16, ...). Its wheel has one such library for each
-family of x86 processors. LLVM inlines a function only if the processor that the kernel is built for has all instruction
-sets of the library's. PoCL 3.0 builds for the processor that LLVM 14 takes the host for, which may be another one:
+family of x86 processors. LLVM inlines a function only if the kernel's processor has all instruction sets of the processor
+for which the library was built. PoCL 3.0 builds kernels for the processor that LLVM 14 takes the host for. It may be wrong:
 
 - Ice Lake lacks the instruction CLWB in LLVM's list, so no built-in is inlined, and kernels are 3 times slower.
 - An unknown processor becomes "generic", for which no kernel builds (pocl/pocl issue 1049).
@@ -49,7 +49,7 @@ _LIBRARIES = (
 )
 """PoCL's libraries, as (flags, processor): PoCL takes the first one whose flags are all in /proc/cpuinfo. ``processor`` is
 LLVM's name of the processor for which the library was compiled."""
-_OLDEST_TARGET = "athlon64"  # the processor of PoCL's library for processors with none of these sets of flags
+_OLDEST_TARGET = "athlon64"  # the processor of the library that PoCL takes if none of ``_LIBRARIES`` fits
 THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
 _MOST_THREADS = 1024  # largest POCL_MAX_PTHREAD_COUNT that is accepted
 _NO_CACHE_VARIABLE = "PYOPENCL_NO_CACHE"
@@ -58,7 +58,7 @@ _kept_alive: list[ctypes.Array[ctypes.c_char]] = []
 
 
 def prepare_environment() -> None:
-    """Sets PoCL's kernel cache, to the user's choice or to a folder of this program. Call it before pyopencl loads.
+    """Sets PoCL's kernel cache on Linux, to the user's choice or to a folder of this program. Call it before pyopencl loads.
 
     PoCL names its own cache after LLVM's target, so two unknown processors would share binaries. If the cache cannot be
     written, PoCL finds no device. If it is on a mount with noexec, PoCL ends the process. In both cases a temporary folder
@@ -102,13 +102,14 @@ def _check_threads(wish: str | None) -> None:
 
 
 def unusable_cache() -> Path | None:
-    """Returns the kernel cache that PoCL was to have, if it cannot be used and ``warn_of_cache`` has not yet warned; else
-    None."""
+    """Returns the folder that was to be PoCL's kernel cache but cannot be used. Returns None if the folder can be used, or
+    once ``warn_of_cache`` has warned."""
     return _unusable and _unusable[0]
 
 
 def warn_of_cache() -> None:
-    """Warns once if kernels are kept in the temporary folder. Called when PoCL is used: other drivers need no cache."""
+    """Warns once if the kernel cache had to be replaced by a temporary folder. Called when a PoCL device is listed, as
+    other drivers do not use this cache."""
     global _unusable
     if _unusable is not None:
         text = "PoCL's kernel cache %s cannot be %s: kernels are kept in %s; set %s to a folder that can"

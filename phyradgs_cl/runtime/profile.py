@@ -54,14 +54,16 @@ class Profile:
 
 @dataclass(frozen=True)
 class Rates:
-    """The device's measured rates: bytes copied (read and written both count) and floating-point operations per second."""
+    """The device's measured rates: bytes per second in a copy, where each byte counts twice (read and written), and
+    floating-point operations per second."""
 
     copy_bytes_per_s: float
     flops_per_s: float
 
 
 def profile_text(uses: dict[str, KernelUse], wall_s: float) -> str:
-    """Formats what ``Profile.uses`` returns as a table. Its last line compares the kernels' time with ``wall_s``."""
+    """Formats what ``Profile.uses`` returns as a table. Its last line compares the kernels' time with ``wall_s``, the time
+    of the run in s."""
     busy_s = sum(use.seconds for use in uses.values())
     rows = [("kernel", "launches", "seconds", "share", "ms each", "GB/s")]
     for name, use in uses.items():
@@ -77,7 +79,8 @@ def profile_text(uses: dict[str, KernelUse], wall_s: float) -> str:
 def measure_rates(
     queue: "cl.CommandQueue", multiply_add: "cl.Kernel", lanes: int, units: int, group: int
 ) -> Rates:
-    """Measures the rates of copies and multiply-adds, each as the best of several runs, on a ``queue`` with profiling."""
+    """Measures the rates of copies and multiply-adds, each as the best of 5 runs, on a ``queue`` with profiling. lanes:
+    floats in the kernel's vectors. units: the device's compute units. group: work-items in a work-group."""
     context = queue.context
     source, target = (cl.Buffer(context, cl.mem_flags.READ_WRITE, _COPY_BYTES) for _ in range(2))
     cl.enqueue_fill_buffer(queue, source, np.zeros(1, np.float32), 0, _COPY_BYTES)

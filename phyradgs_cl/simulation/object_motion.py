@@ -13,7 +13,7 @@ from phyradgs_cl.fields import Deformation, Grid, control_points
 from phyradgs_cl.io.tables import Fields, read_toml
 
 _NODES = 40  # weights stored per cycle; linear interpolation between them is then off by 0.3 % at most
-_SETTLING_NODES = 200  # number of times at which drying's weights are stored: its curve is slow
+_SETTLING_NODES = 200  # number of times at which drying's weights are stored: enough for its smooth curve
 _SPACINGS = 8.0  # breathing and drying are smooth, so this many spacings of control points along the longest side are enough
 _SLIDING_SPACINGS = 16.0  # sliding has a sharp edge, which becomes about three control points wide
 _ASIDE = 1 / 3  # breathing moves the object along y, too, by this fraction of its motion along z
@@ -60,7 +60,7 @@ class ObjectMotion(checks.Checked):
     states: int = checks.ranged(10, 1, 1000)
 
     def deformation(self, box: Grid, first_s: float, last_s: float) -> Deformation:
-        """Returns the deformation of an object in ``box``, from a scan's first light to its last.
+        """Returns the deformation of an object in ``box``, from a scan's first light to its last, first_s to last_s in s.
 
         Raises InputError for an amplitude larger than half of the box's shortest side."""
         half_mm = min(box.size_mm) / 2

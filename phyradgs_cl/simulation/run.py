@@ -43,9 +43,9 @@ _LARGEST_PEAK = 1e4  # limit of --peak, a line integral
 _LARGEST_NOISE = 1e9  # limit of --electronic-noise, in counts
 _SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12  # limits of --dose, in photons per pixel
 _LARGEST_DETECTOR = 32_000  # limit of --detector, in pixels along a side of the panel
-_SLACK = 1.001  # largest exposure arc without a warning, over the turn from frame to frame: a larger one is no rounding
+_SLACK = 1.001  # a warning is logged if an exposure's arc over the turn from frame to frame exceeds this; 1 + rounding
 _TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse", "turns")  # options that change the protocol
-_DATA_SHEET = ("first", "fps", "readout_ms")  # options that state readout and frame rate as data sheets do
+_DATA_SHEET = ("first", "fps", "readout_ms")  # options in a data sheet's terms: first line read, frames/s, readout time
 
 
 @dataclass(frozen=True)
@@ -95,10 +95,11 @@ def scanner_for(
     name: str, detector: int | None = None, detector_offset_mm: tuple[float, float] | None = None,
     truncation: float = 0.0
 ) -> Scanner:
-    """Returns a scanner by its name, or from a TOML file.
+    """Returns the scanner called ``name``, or that of a TOML file at this path.
 
     detector: another number of columns, with rows in proportion. detector_offset_mm: the panel's offset (v, u). truncation:
-    the fraction of the columns that is cut off, half of these columns at each side."""
+    the fraction of the columns that is cut off, half of these columns at each side. Raises InputError for an unknown name
+    and for numbers out of range."""
     scanner = load_scanner(name, resource("data"))
     geometry = scanner.geometry
     if detector is not None:
@@ -135,7 +136,7 @@ def scanner_options(scanner: Scanner, protocol: str, **given: Any) -> Simulation
     timing = {key: values.pop(key) for key in _TIMING if key in values}
     sheet = {key: values.pop(key, None) for key in _DATA_SHEET}
     timed = make_protocol(protocol, **timing)
-    if given.get("jitter_deg") and not timed.is_fly:  # only a gantry that turns has jitter
+    if given.get("jitter_deg") and not timed.is_fly:  # jitter is only added to a fly-scan's angles
         found, remedy = f"{given['jitter_deg']} with --protocol {protocol}", "leave it out, or choose a fly-scan"
         raise InputError("--jitter-deg", found, "0", remedy)
     unused = [name for name in ("dose", "electronic_noise") if name in given and given.get("noise", "none") == "none"]
@@ -209,7 +210,8 @@ def simulate(
     """Returns a scan of the object that ``source`` projects, with the noise and effects that ``options`` ask for.
 
     reference (nz, ny, nx): the truth in 1/mm, which ``peak`` scales too. bone: projects the object's bone alone, as a beam
-    of many energies needs it."""
+    of many energies needs it. Raises InputError for ``kvp`` without bone and for ``peak`` with an empty object, and
+    NumericalError for line integrals that are not finite."""
     if options.kvp and bone is None:
         expected = "an object of voxels, whose dense ones are bone: foot, jaw or a volume"
         raise InputError("--kvp", "a phantom in closed form", expected, "leave it out")
@@ -259,7 +261,7 @@ def simulate(
 
 
 def _gating(scan: Scan, scene: Scene) -> Gating:
-    """Returns the motion's state in the middle of every frame: the weight of the deformation's first field; without a
+    """Returns the gating signal at the middle of every frame: the weight of the deformation's first field or, without a
     deformation, the phase of the phantom's period."""
     middle_s = scan.middle_times_s
     if scene.deformation is not None:

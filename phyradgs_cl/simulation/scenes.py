@@ -17,7 +17,8 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.sources import AnalyticSource, DeformedSource, FrameSource, VolumeSource, on_panel
 
 _DENSE = 0.5  # in a beam of many energies, voxels above this fraction of the largest attenuation may be bone
-# Bone begins in a bin of the histogram with at most this fraction of the fullest bin's voxels: no material is cut in two.
+# Bone begins at a bin of the histogram with fewer voxels than this fraction of the fullest bin's, so that no material is cut
+# in two.
 _RARE = 0.2
 log = logging.getLogger(__name__)
 Moves = Callable[[Grid], Deformation]
@@ -63,7 +64,7 @@ def phantom_scene(
 
     Phantoms in closed form are integrated exactly unless they deform. Other phantoms are projected from voxels at twice
     ``size``, and the truth is their block mean. Pixels average ``pixel_samples``² rays over their area; 0 chooses the number
-    by the size of the truth's voxels. axis: the panel's readout axis."""
+    by the size of the truth's voxels. axis: the panel's readout axis. moves: returns the deformation; None: no motion."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
     if isinstance(phantom, MovingPhantom):

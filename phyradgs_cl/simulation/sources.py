@@ -196,7 +196,7 @@ class _Average:
         self._sum: np.ndarray | None = None  # so far: Σ w p in the log model, ln Σ w exp(−p) in the intensity model
 
     def add(self, frame: np.ndarray, share: np.ndarray) -> None:
-        """Adds line integrals (rows, columns). share (lines,): the fraction of each line's weight that their cells have."""
+        """Adds line integrals (rows, columns) of some cells. share (lines,): these cells' part of each line's weight."""
         weight = self._readout.spread(share)
         if self._is_log:
             self._sum = weight * frame + (0.0 if self._sum is None else self._sum)
@@ -215,7 +215,7 @@ class _Average:
 def part_of(cells: TimeCells, members: np.ndarray) -> tuple[TimeCells, np.ndarray]:
     """Returns a table of the cells ``members``, bool (C,), and the fraction (lines,) of each line's weight that they have.
 
-    Weights are rescaled: in the new table a line's weights sum to 1, or are all 0. The cells must be still cells."""
+    Weights are rescaled: in the new table a line's weights sum to 1, or are all 0. Each cell must have a single pose."""
     part = some_cells(cells, np.flatnonzero(members))
     share = part.line_weights()
     factors = np.divide(1.0, share, out=np.zeros_like(share), where=share > 0)

@@ -18,9 +18,9 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
 _RAY_CELL_FLOATS = 16  # number of floats of a time cell in ``ray_constants``
-BORDER = 1  # width in voxels of the zeros around a volume in y and z, with which samples at its faces need no test
+BORDER = 1  # width in voxels of the zeros around a volume in y and z, so that samples at its faces need no test
 _UPRIGHT = 1e-6  # a column of pixels counts as upright if it leans by at most this many voxels
-_WIDEST = 16  # number of elements in the widest vector, which may read beyond the last cell or line
+_WIDEST = 16  # number of elements in the widest SIMD vector: tables are padded by as many, since vectors read past the end
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class RayCells:
     weight_at: DeviceArray
     is_parallel: bool
     is_across: bool
-    upright: int  # whether pixels lie in columns along z, as ``_upright`` tells
+    upright: int  # whether pixels lie in columns along z: 0, 1 or 2, as ``_upright`` returns
     most_per_line: int  # largest number of cells that serve the same line of a frame
 
     @classmethod
@@ -215,7 +215,7 @@ def _parallel_constants(pose: np.ndarray, grid: Grid) -> np.ndarray:
     direction, panel = pose[:, 0:3] / pitch, pose[:, 3:].reshape(-1, 3, 3) / pitch
     panel[:, 0] -= first / pitch
     size = np.abs(direction)
-    # As in the kernels, of components that are equal in float32 the first is the main one. At 135°, two differ in float64.
+    # The kernels take the first of components that are equal in float32. At 135°, for example, two differ in float64 only.
     main = np.argmax((size / size.max(axis=1, keepdims=True)).astype(np.float32), axis=1)
     cell = np.arange(len(pose))
     direction /= direction[cell, main][:, None]
@@ -266,6 +266,7 @@ def some_cells(table: TimeCells, cells: Sequence[int] | np.ndarray) -> TimeCells
 
 
 def _empty(table: TimeCells) -> TimeCells:
-    """Returns a table whose only cell serves no line, for frames without a cell: a table must not be empty."""
+    """Returns a table with one cell, taken from ``table``, that serves no line. It stands for a frame without cells in a
+    layer, because a table must not be empty."""
     one = some_cells(table, [0])
     return replace(one, line_stop=one.line_start.copy(), weight=np.zeros(1))

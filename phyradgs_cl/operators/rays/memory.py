@@ -120,7 +120,7 @@ class RayMemory:
             self._volume = self.rt.zeros(self.layout.of(largest).volume_floats)
             self._bordered = largest.shape
         layout = self.layout.of(brick)
-        if brick.shape != self._bordered:  # in another shape, the border lies where the last brick had voxels
+        if brick.shape != self._bordered:  # another shape has its border where the last brick had voxels
             self._bordered = None
         return layout, DeviceArray(self._volume.buffer, (layout.volume_floats,), self._volume.dtype)
 

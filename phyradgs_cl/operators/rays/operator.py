@@ -4,9 +4,9 @@ Each frame has a table of time cells: poses, the detector lines that each pose s
 average of the line integrals from the poses that serve its line. Frames are projected in batches. A volume that does not fit
 on the device is projected in parts, called bricks (``RayMemory``).
 
-Two sets of kernels compute the same samples. The general kernels follow each ray (``general.py``). They serve GPUs, and
-scans whose detector columns are not along z. Otherwise, CPUs use the upright kernels: they project each pose once, into its
-own buffer ("slot"), and average these buffers to frames (``upright.py``, ``slots.py``)."""
+Two sets of kernels compute the same samples. The general kernels follow each ray (``general.py``). They serve GPUs, and CPUs
+where ``upright_of`` refuses the scan. Otherwise, CPUs use the upright kernels, for detector columns nearly along z: they
+project each pose once, into its own buffer ("slot"), and average slots to frames (``upright.py``, ``slots.py``)."""
 
 from collections.abc import Iterator, Sequence
 from copy import copy

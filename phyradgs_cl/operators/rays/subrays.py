@@ -70,8 +70,8 @@ def spread(frames: np.ndarray, subrays: tuple[int, int]) -> np.ndarray:
 def launch_means(
     rt: Runtime, fine: DeviceArray, strides: Sequence[int], subrays: tuple[int, int], frames: DeviceArray, part: slice
 ) -> None:
-    """Writes the means over sub-rays, B y, of padded frames y, ``fine``, to the frames ``part`` of ``frames`` (F, rows,
-    columns)."""
+    """Writes the means over sub-rays, B y, to the frames ``part`` of ``frames`` (F, rows, columns). fine: padded frames y.
+    strides: their ``RayLayout.pixel_strides``."""
     _, rows, columns = frames.shape
     rt.launch(
         rt.kernel("subrays", "subray_means"), (columns, rows, part.stop - part.start), fine, np.array(strides, np.int64),
@@ -83,8 +83,8 @@ def launch_means(
 def launch_spread(
     rt: Runtime, frames: DeviceArray, part: slice, subrays: tuple[int, int], fine: DeviceArray, strides: Sequence[int]
 ) -> None:
-    """Writes Bᵀ y, each sub-ray's part of its pixel, of the frames ``part`` of ``frames`` (F, rows, columns) to padded
-    ``fine``."""
+    """Writes each sub-ray's part of its pixel, Bᵀ y, to the padded frames ``fine``. y: the frames ``part`` of ``frames`` (F,
+    rows, columns). strides: the ``RayLayout.pixel_strides`` of ``fine``."""
     _, rows, columns = frames.shape
     rt.launch(
         rt.kernel("subrays", "spread_subrays"), (columns, rows, part.stop - part.start), frames, np.int32(part.start),

@@ -139,7 +139,7 @@ def launch_upright_adjoint(
 
 def _owned(shape: tuple[int, int, int], units: int) -> tuple[tuple[int, int, int], tuple[int, ...]]:
     """Returns the box of voxels (x, y, z) that each work-item of the adjoint sums, and the number of work-items along x, y,
-    z. Takes the first box of ``_OWNED`` that keeps all compute units (``units``) busy."""
+    z. Takes the first box of ``_OWNED`` that keeps all ``units`` compute units busy, or else the last."""
     for owned in _OWNED:
         items = tuple(ceil_div(n, own) for n, own in zip(shape[::-1], owned, strict=True))
         if math.prod(items) >= _ITEMS_PER_UNIT * units:

@@ -12,7 +12,8 @@ _MANY_COUNTS = 1 << 22  # above this many counts, tiles × work-groups, counting
 _SCANNED = 64  # number of counts that a work-group adds at a time when it sums counts to positions
 _SLACK = 1.5  # new lists get memory for this many times the entries needed, because clouds grow
 _NEAR = 1.25  # lists with memory for less than this many times the entries needed are replaced before they overflow
-# Most tests of a splat at a pixel in a launch whose lists overflow, which tests every splat: a second on a fast GPU.
+# A launch whose lists overflow tests every splat at every pixel. Above this many tests, a second on a fast GPU, the host
+# waits for the lists' size instead.
 _MOST_CHECKS = 2**38
 _MOST_ENTRIES = 2**31 - 1  # most entries of all lists together: kernels use 32-bit indices
 

@@ -146,7 +146,7 @@ def cell_constants(
 ) -> np.ndarray:
     """Returns the table (C, 24) float32 that cl/common/splat.h describes, for cells with a pose (C, 12), weight (C,) and
     layer (C,)."""
-    if is_parallel:  # kernels take the direction as origin − source
+    if is_parallel:  # kernels take minus the direction for the source, and the origin for pixel (0, 0)
         pose = np.concatenate([-pose[:, 0:3], np.zeros((len(pose), 3)), pose[:, 6:]], 1)
     source, d00 = pose[:, 0:3], pose[:, 3:6] - pose[:, 0:3]
     eu, ev = pose[:, 6:9], pose[:, 9:12]

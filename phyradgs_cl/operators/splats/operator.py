@@ -1,7 +1,8 @@
 """Operators from Gaussians in mm and 1/mm to the frames of a scan or to a grid, with their transposed derivatives.
 
 ``rows.enter`` converts Gaussians to the kernels' layout. The result can be rendered and differentiated any number of times.
-``back`` does not render: it only computes the Gaussians' projections, unless ``forward`` has just done so.
+``back`` needs the Gaussians' projections, and their rendering too if intensities are averaged. It computes what it needs,
+unless ``forward`` has just done so.
 
 ``by_pose`` converts dL/d(Gaussians) to dL/d(pose). Rotating the gantry has the effect of rotating the object the other way.
 Shifting the panel shifts the projected centres the other way, and changes the lengths of rays."""
@@ -233,7 +234,7 @@ class SplatProjection(GaussianOperator):
             turn, along, across = by_pose(rows[:, : cloud.count], by_rows)
             shifts = [across / (self._projector.lines / 2), along / (self._projector.width / 2)]
             found[number] = turn, *(shifts[::-1] if self._images.turned else shifts)
-            if not (self._affine or cells.is_parallel):  # with these, all rays count as equally long
+            if not (self._affine or cells.is_parallel):  # in these two projections, a shift does not change rays' lengths
                 found[number, 1:] += by_length(self._poses[self._chosen[number]], weighed[number])
         return found
 

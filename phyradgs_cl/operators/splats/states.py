@@ -15,7 +15,7 @@ from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 
 STATE_ROWS = 12  # numbers of a Gaussian in a state: its centre x, y, z, and the 3 × 3 matrix that deforms its shape
 _PROBED_SIDE = 9  # number of points along each axis of the grid at which the inverse of a field is checked
-_PROBED_STATES = 16  # number of even times at which a field's inverse is checked, besides those of largest displacement
+_PROBED_STATES = 16  # number of evenly spread times at which a field's inverse is checked, besides those of most motion
 _WRONG = 0.01  # largest accepted error of a field's inverse, in voxels
 _BEND = 0.25  # largest deviation of a point's path in a segment from a straight line, in voxels; the blur is 0.3 times this
 _MOST_SEGMENTS = 32  # most segments of a frame, even if paths then deviate by more than _BEND
@@ -71,7 +71,7 @@ class CloudStates:
         mean = np.stack(np.meshgrid(x, y, z, indexing="ij")).reshape(3, -1)
         rows = np.ones((11, mean.shape[1]))
         rows[:3] = mean
-        # The inverse is tested in the states in which each field moves most, and at some even times.
+        # The inverse is tested in the states in which each field moves most, and in some spread evenly over the times.
         ends = np.concatenate([self.deformation.weights.argmax(0), self.deformation.weights.argmin(0)])
         chosen = np.linspace(0, len(self.deformation.times_s) - 1, _PROBED_STATES).astype(int)
         weights = self.deformation.weights[np.unique([*ends, *chosen])]

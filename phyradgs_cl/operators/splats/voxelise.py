@@ -13,8 +13,8 @@ from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, 
 
 RECORD_FLOATS = 20  # number of floats that ``voxel_prepare`` writes for each Gaussian
 SUM_FLOATS = 16  # number of floats for a Gaussian's sums over its voxels
-_TILE = 8  # side of a tile in voxels; on a CPU along y and z alone
-_DEPTH = 2  # voxels along z of a GPU's work-item; DEPTH in cl/voxel_forward.cl
+_TILE = 8  # side of a tile in voxels; a CPU's tile spans whole rows along x
+_DEPTH = 2  # number of voxels along z that a GPU's work-item computes; DEPTH in cl/voxel_forward.cl
 _DEFAULT_BRICK_BYTES = 1 << 28  # most bytes of voxels that are computed at a time, by default
 
 

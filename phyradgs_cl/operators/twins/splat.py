@@ -134,7 +134,7 @@ _NODES = 12  # number of Gauss–Legendre nodes in each interval
 @dataclass(frozen=True)
 class _Segment:
     """One Gaussian in one segment of time, in pixels (u, v): average centre and path (2,), conic (2, 2), coefficients b (2,)
-    and c (2, 2) of Q. amplitude: the peak value divided by the length of the ray."""
+    and c (2, 2) of Q = 1 + 2 bᵀδ + δᵀcδ at the offset δ from the centre. amplitude: the peak value over the ray's length."""
 
     centre: np.ndarray
     path: np.ndarray

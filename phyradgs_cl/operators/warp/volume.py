@@ -12,12 +12,12 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
 
 # Width in voxels around the volume in which coefficients are kept, as in cl/warp.cl: beyond, they are below 3e-3 of a voxel.
 _BORDER = 4
-_MOST_OWNED = 8  # most slices that a CPU's work-item sums: voxels near the ends of this block are computed twice
+_MOST_OWNED = 8  # most slices that a CPU's work-item sums; several, as voxels near the ends of a block are computed twice
 _ITEMS_PER_UNIT = 4  # wanted work-items per compute unit, so that none waits long for the last
 _HEADROOM = 64  # largest sum of weights that a voxel may receive: 4³, where a field contracts by 4 along each axis
 _TOGETHER = 8, 8, 4  # box of voxels (x, y, z) that a GPU's work-group adds up in local memory
-_SAMPLES = 16  # time to read the 4³ coefficients of a voxel, over the time of a ray's sample
-_ADDED = 64  # time to add to the 4³ coefficients of a voxel, over the time of a ray's sample
+_SAMPLES = 16  # number of ray samples that take as long as reading a voxel's 4³ coefficients
+_ADDED = 64  # number of ray samples that take as long as adding to a voxel's 4³ coefficients
 _ROUNDING = 1e-3  # bounds of displacements along z are widened by this many voxels, to allow for rounding in float32
 
 

@@ -293,8 +293,8 @@ def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _measured(scan: Scan) -> np.ndarray:
-    """Returns the numbers (n,) of all frames that are not masked for the most part. The views beside a masked frame stand
-    for its angle. If all frames are masked, returns all numbers."""
+    """Returns the numbers (n,) of the frames with more than half as many valid pixels as the best frame. The views beside
+    another frame stand for its angle. If no pixel is valid, returns all numbers."""
     if np.asarray(scan.pixel_mask).ndim == 3 and (valid := scan.valid.mean(axis=(1, 2))).any():
         return np.flatnonzero(valid > valid.max() / 2)
     return np.arange(scan.frames)

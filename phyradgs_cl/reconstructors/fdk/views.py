@@ -38,7 +38,7 @@ _LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the p
 _NO_LEAN_DEG = 10.0
 _ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: there densities are 0.1 % too low
 _NO_ROLL_DEG = 10.0  # larger angles of the rows are refused: here densities are 1.5 % too low, at 90° they are 0
-_UNLIKE = 0.1  # a warning comes if the ends of the fan differ among the views by more than this fraction of it
+_UNLIKE = 0.1  # a warning comes if the fan's ends differ among the views by more than this fraction of the fan
 _LEAST_OVERLAP = 2.0  # a displaced panel must reach this many columns beyond the axis, or a warning comes
 # A smaller missing angle causes no warning: nearly parallel rays have so narrow a fan that half a turn is enough.
 _TOLERATED_RAD = np.deg2rad(0.5)
@@ -139,7 +139,8 @@ def _steps(ahead: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _filled_rad(ahead: np.ndarray) -> float:
-    """Returns the sum in rad by which wide gaps among (K,) exceed the larger of the median and both neighbours."""
+    """Returns by how much, in rad, wide gaps exceed the largest of the median gap and their neighbours, summed over the wide
+    gaps. ahead (K,): the gap from each view to the next."""
     usual = np.maximum(np.median(ahead) if ahead.size else 0.0, np.maximum(np.roll(ahead, 1), np.roll(ahead, -1)))
     return float((ahead - usual)[ahead > np.maximum(SHORT_SCAN_GAP * usual, _NAMED_RAD)].sum())
 
@@ -159,7 +160,7 @@ def _filled_cells(ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
 
 
 def distinct_views(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns each view's index (F,) into the K distinct angles, and these in rad, ascending within a turn."""
+    """Returns each view's index (F,) into the K distinct angles, and these angles (K,) in rad, ascending within a turn."""
     turned = np.mod(np.asarray(angle_rad, np.float64), 2 * np.pi)
     order = np.argsort(turned, kind="stable")
     tolerance = _SAME_VIEW * 2 * np.pi / turned.size
@@ -282,7 +283,8 @@ def check_beam(method: str, pose: np.ndarray, is_parallel: bool) -> None:
 
 
 def _check_directions(pose: np.ndarray) -> None:
-    """Checks that parallel rays run nearly at right angles to the axis: otherwise no filter along detector rows is right."""
+    """Raises InputError, or warns, if parallel rays or detector rows are off the plane of the rotation: a filter along the
+    rows is then wrong."""
     rise_deg = np.rad2deg(np.arcsin(np.clip(np.abs(pose[..., 2]), 0, 1)))
     worst_deg = float(max(rise_deg.max(), _row_lean_deg(pose).max()))
     remedy = "take an iterative or splatting method: they take any orbit"
@@ -300,7 +302,7 @@ def _row_lean_deg(pose: np.ndarray) -> np.ndarray:
 
 
 def _check_rows(pose: np.ndarray) -> None:
-    """Checks that a cone's detector rows, along which FDK filters, run nearly in the plane of the rotation."""
+    """Raises InputError, or warns, if a cone's detector rows, along which FDK filters, are off the plane of the rotation."""
     roll_deg = float(_row_lean_deg(pose).max())
     if roll_deg > _NO_ROLL_DEG:
         found = f"detector rows {roll_deg:.1f}° off the plane of the rotation"

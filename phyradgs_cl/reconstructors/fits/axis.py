@@ -139,7 +139,8 @@ def opposite_shift(scan: Scan) -> AxisShift:
     shifts, weight = shifts[is_found], information[is_found] / information[is_found].sum()
     shift = float(weight @ shifts)
     noise, scatter = 1 / information[is_found].sum(), float(weight**2 @ (shifts - shift) ** 2)
-    return AxisShift(shift, math.sqrt(2 * max(noise, scatter) + _BIAS_PX**2), np.empty(0))  # 2, as each pair counts twice
+    # the variance is doubled, because most pairs of a view and its opposite are in ``pairs`` twice, once from each side
+    return AxisShift(shift, math.sqrt(2 * max(noise, scatter) + _BIAS_PX**2), np.empty(0))
 
 
 def _pairs(scan: Scan) -> list[_Pair]:

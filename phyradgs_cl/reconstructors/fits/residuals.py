@@ -133,7 +133,7 @@ class Fit:
 
 
 def fit(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> Fit:
-    """Reconstructs a coarse scan by CGLS with every line at its own times, and finds the errors of its flats with it."""
+    """Reconstructs a coarse scan by CGLS with every line at its own times, together with the errors of its flats."""
     times = min(max(2, math.ceil(rim_travel_voxels(scan))), _MOST_TIMES)
     system = System.of_scan(rt, scan, PerRow(times), fewest_lines=FEWEST_LINES)
     flats = FlatErrors.beside(system.operator)

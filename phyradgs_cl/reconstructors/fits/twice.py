@@ -26,7 +26,7 @@ _MOST_ROWS = 32  # most rows that are compared, to save time
 _MOST_PAIRS = 48  # most pairs of opposite rays that are compared in a row, to save time
 _LEAST_PX = 1.0  # the axis must lie this far inside the middle of the outer column, in pixels, or no ray has an opposite
 _BLOCKS = 12  # the jackknife leaves out one of this many blocks of views at a time
-_BIAS_PX = 0.05  # error (std) of the shift in pixels without noise, measured with half-fans, features of two pixels
+_BIAS_PX = 0.05  # error (std) of the shift in pixels without noise, as half-fan scans of features of two pixels showed
 
 
 def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:

@@ -57,7 +57,7 @@ _FREE_KNOTS = 6  # number of intervals between spline knots in time, if weights 
 _AT_REST = "no motion found"
 # One in five iterations is a round of the search for the field: of the default 33, 7 rounds, then 26 passes of fista.
 _ITERATIONS_PER_ROUND = 5
-_STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")  # arrays in a state
+_STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")  # names in saved states
 
 
 def coarse_scan(scan: Scan, most_frames: int = _MOST_FRAMES) -> Scan:

@@ -146,7 +146,7 @@ def reconstruct_splats(
     report: ProgressReport = ignore_progress, resume: State | None = None, initial: np.ndarray | None = None,
     deformation: Deformation | None = None,
 ) -> Reconstruction:
-    """Runs a splatting method under its name ``phyradgs`` or ``r2``.
+    """Runs a splatting method and returns its result. method: its name in the facts, ``phyradgs`` or ``r2``.
 
     resume: continues an interrupted run of the same scan and options from its state. initial: the volume (nz, ny, nx) in
     1/mm from which the cloud is drawn; None: an FDK volume. deformation: how the object moves; the cloud and the volume then

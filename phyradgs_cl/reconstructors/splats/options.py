@@ -92,7 +92,7 @@ class SplatOptions(MotionOptions):
 
     @property
     def asks_for_gaussians(self) -> bool:
-        """Whether the user, not a preset or the grid, chose the number of Gaussians at the start."""
+        """Whether the user chose the number of Gaussians at the start. A number that a preset has counts as the preset's."""
         return self.gaussians not in {0, *(preset.gaussians for preset in (*PRESETS.values(), R2_PUBLISHED))}
 
 

@@ -25,7 +25,7 @@ from phyradgs_cl.runtime.layout import pad_rows
 
 _PEAK_PERCENTILE = 99.9  # percentile of the line integrals that counts as their peak: their maximum would be noise
 _ROWS = 11  # number of a Gaussian's parameters, which are the rows of dL/d(parameters)
-_STATISTICS = 2  # numbers per Gaussian for density control: sum of gradient norms, and number of frames in it
+_STATISTICS = 2  # numbers per Gaussian for density control: a sum of gradient norms, and from how many frames they are
 # Number of rows of ``cloud.gradients``: the 11 of dL/d(parameters), then dL/d(projected centre) along and across a line, in
 # units of half the image's size.
 _DERIVED = 13
@@ -71,8 +71,8 @@ class DeviceCloud:
         return Population(self.rt.download(self.raw)[:, :count], self.rt.download(self.moments)[:, :, :count])
 
     def read_statistics(self) -> np.ndarray:
-        """Returns (2, count) float32 for each Gaussian: the norms of dL/d(projected centre), summed over frames, and the
-        number of frames in which they are above 0."""
+        """Returns two numbers per Gaussian, (2, count) float32: the norm of dL/d(projected centre), summed over frames, and
+        the number of frames in which this norm is above 0."""
         return self.rt.download(self.statistics)[:, : self.count]
 
     def write_statistics(self, statistics: np.ndarray) -> None:
@@ -155,7 +155,7 @@ class Batch:
 
 
 class FrameStep:
-    """Computes the gradient of the objective for one frame of a scan at a time, in internal units. grid: of the volume.
+    """Computes the gradient of the objective for one frame of a scan at a time. grid: the volume's, in internal units.
     deformation: how the object moves, in mm."""
 
     def __init__(

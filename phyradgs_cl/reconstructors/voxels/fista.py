@@ -43,7 +43,7 @@ from phyradgs_cl.runtime.algebra import HostSpace
 log = logging.getLogger(__name__)
 _VOLUMES = 16  # volumes that a run with the prior ``dct`` holds in memory at one time
 _FRAMES = 3  # arrays of all frames that a run holds in memory at one time
-_HELD = 9  # volumes that the prior ``dct`` keeps on the device
+_HELD = 9  # volumes that the maps of the prior ``dct`` keep on the device, even if the run's arrays are on the host
 _COPIES = 2  # volumes on the device, input and result, while a prior maps a volume of the host
 # These values were chosen by measurement: docs/results/settings.md.
 _COARSE_SHARE = 6 / 13  # fraction of the iterations that are coarse: those before voxels are divided

@@ -306,7 +306,7 @@ class PriorKind:
 
 
 PRIORS = {
-    # large voxels serve to average noise, and ridge leaves less of it
+    # the larger voxels serve to average noise; ridge leaves less noise, so the smaller voxels get more weight
     "ridge": PriorKind(PriorInputs.dct_then_ridge, RidgeStep.VOLUMES, _SUBVOXELS_WITH_RIDGE),
     "dct": PriorKind(PriorInputs.tv_and_dct),
     "tv": PriorKind(lambda inputs: inputs.tv(_TV_ALONE)),

@@ -72,7 +72,8 @@ class Algorithm:
         self.volume = volume
 
     def step(self) -> float:
-        """Does one iteration, which replaces ``volume``. Returns a norm of p − A x; each subclass says for which x."""
+        """Does one iteration, which replaces ``volume``. Returns the norm of the residual p − A x, or p − I(x) in the
+        intensity model. The subclass's docstring says at which volume x."""
         raise NotImplementedError
 
     def state(self) -> dict[str, np.ndarray]:
@@ -159,7 +160,8 @@ def voxel_method(
 
 
 class Iterations:
-    """Runs an algorithm step by step for a ``Loop``, and keeps the residual and the change of its last iteration."""
+    """Runs an algorithm step by step for a ``Loop``. Keeps two measures of the last iteration: ``residual``, ‖p − A x‖/‖p‖,
+    and ``change``, ‖x − x'‖/‖x‖ with the volume x' before."""
 
     quantity = "residual"
 
