@@ -122,7 +122,7 @@ class AttenuationNetwork(nn.Module):
     """Maps features (P, inputs) to attenuation (P,) in the unit of ``options.density_bound``.
 
     middle: the modules between the first and the last layer. skip: the index of the layer whose input also contains the
-    features. A leaky ReLU follows each layer but the last. ``options.last_activation`` follows the last layer."""
+    features; −1: of none. A leaky ReLU follows each layer but the last. ``options.last_activation`` follows the last layer."""
 
     def __init__(self, inputs: int, middle: list[nn.Module], skip: int, options: NeuralOptions) -> None:
         super().__init__()
@@ -152,7 +152,7 @@ def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
 
     With three or more layers, the middle one gets the encoding again, beside the output of the layer before it. It is linear
     for ``LineOptions`` too."""
-    skip, width = options.layers // 2 if options.layers > 2 else 0, options.width
+    skip, width = options.layers // 2 if options.layers > 2 else -1, options.width
     middle: list[nn.Module] = []
     for number in range(1, options.layers - 1):
         if isinstance(options, LineOptions) and number != skip:

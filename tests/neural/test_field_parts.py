@@ -97,7 +97,10 @@ def test_attention_stays_within_segments_and_is_its_definition() -> None:
     assert changed[:segment].all() and not changed[segment:].any()
 
 
-@pytest.mark.parametrize("options", [NeuralOptions(), LineOptions(segment=4)], ids=["naf", "sax-nerf"])
+FIELDS = {"naf": NeuralOptions(), "two layers": NeuralOptions(layers=2), "sax-nerf": LineOptions(segment=4)}
+
+
+@pytest.mark.parametrize("options", FIELDS.values(), ids=FIELDS)
 def test_bricks_of_voxels_do_not_matter_and_voxels_lie_where_the_grid_says(options) -> None:
     field = first_field(options, 16, 0)
     grid = Grid((3, 5, 6), (0.2, 0.2, 0.3))  # half the longest side is 0.9
