@@ -41,10 +41,9 @@ __kernel void extrapolate(
     __global const float *x, const float scale, __global const float *y, const long count, __global float *result)
 {
     const long at = (long)get_global_id(0) * LANES, rest = count - at;
-    if (rest <= 0)
-        return;
     const vf here = load_some(x + at, rest);
-    store_some(here + scale * (here - load_some(y + at, rest)), result + at, rest);
+    if (rest > 0)
+        store_some(here + scale * (here - load_some(y + at, rest)), result + at, rest);
 }
 
 /* result = max(x + scale y z, least) */
@@ -53,10 +52,9 @@ __kernel void add_product(
     const long count, __global float *result)
 {
     const long at = (long)get_global_id(0) * LANES, rest = count - at;
-    if (rest <= 0)
-        return;
     const vf product = scale * load_some(y + at, rest) * load_some(z + at, rest);
-    store_some(fmax(load_some(x + at, rest) + product, (vf)(least)), result + at, rest);
+    if (rest > 0)
+        store_some(fmax(load_some(x + at, rest) + product, (vf)(least)), result + at, rest);
 }
 
 /* result = x y. y has `count` elements and repeats along x; global index 1 counts the repeats. */
@@ -72,10 +70,9 @@ __kernel void multiply(
 __kernel void reciprocal(__global const float *x, const float least, const long count, __global float *result)
 {
     const long at = (long)get_global_id(0) * LANES, rest = count - at;
-    if (rest <= 0)
-        return;
     const vf value = load_some(x + at, rest);
-    store_some(V_PICK(0.0f, 1.0f / fmax(value, (vf)(least)), value > 0.0f), result + at, rest);
+    if (rest > 0)
+        store_some(V_PICK(0.0f, 1.0f / fmax(value, (vf)(least)), value > 0.0f), result + at, rest);
 }
 
 #if FP64
@@ -130,9 +127,9 @@ static inline float share_of(const float2 step, const sum_t squares)
 }
 #endif
 
-/* Combines the results `own` of a work-group's items in pairs, in a fixed order. Item 0 gets the result. The group's size
-   must be a power of 2. */
-#define TREE(scratch, own, combined)                                                       \
+/* Combines the results `own` of a work-group's items in pairs, in a fixed order. Item 0 gets the result and writes it to
+   `target`. The group's size must be a power of 2. */
+#define TREE(scratch, own, combined, target)                                                       \
     if (get_local_size(0) > 1) {                                                           \
         const int item = (int)get_local_id(0);                                             \
         scratch[item] = own;                                                               \
@@ -143,7 +140,9 @@ static inline float share_of(const float2 step, const sum_t squares)
         }                                                                                  \
         if (item == 0)                                                                     \
             own = scratch[0];                                                              \
-    }
+    }                                                                                      \
+    if (get_local_id(0) == 0)                                                              \
+        target = own;
 
 /* parts = Σ x y, one sum per work-group. Work-item k adds the vectors at k first_by, k first_by + step, ..., up to
    k first_by + span. */
@@ -156,9 +155,7 @@ __kernel void dot_parts(
     for (long at = first; at < stop; at += step)
         sum = plus_product(sum, load_some(x + at, count - at), load_some(y + at, count - at));
     sum_t own = sum_of_lanes(sum);
-    TREE(scratch, own, sum_add)
-    if (get_local_id(0) == 0)
-        parts[get_group_id(0)] = own;
+    TREE(scratch, own, sum_add, parts[get_group_id(0)])
 }
 
 /* parts = Σ (x - y) (y - z), one sum per work-group, over the same elements as dot_parts. */
@@ -173,9 +170,7 @@ __kernel void turn_parts(
         sum = plus_product(sum, load_some(x + at, count - at) - middle, middle - load_some(z + at, count - at));
     }
     sum_t own = sum_of_lanes(sum);
-    TREE(scratch, own, sum_add)
-    if (get_local_id(0) == 0)
-        parts[get_group_id(0)] = own;
+    TREE(scratch, own, sum_add, parts[get_group_id(0)])
 }
 
 /* One work-group adds all `parts` and writes their sum to `whole`, or adds it there if `add`. */
@@ -185,7 +180,7 @@ __kernel void dot_whole(
     sum_t own = SUM_OF(0.0f);
     for (int k = (int)get_local_id(0); k < count; k += (int)get_local_size(0))
         own = sum_add(own, parts[k]);
-    TREE(scratch, own, sum_add)
+    TREE(scratch, own, sum_add, own)
     if (get_local_id(0) == 0)
         whole[0] = add ? sum_add(whole[0], own) : own;
 }
@@ -200,9 +195,7 @@ __kernel void largest_parts(
     for (long at = first; at < stop; at += step)
         for (long k = at; k < min(at + LANES, count); ++k)
             own = fmax(own, absolute ? fabs(x[k]) : x[k]);
-    TREE(scratch, own, fmax)
-    if (get_local_id(0) == 0)
-        parts[get_group_id(0)] = own;
+    TREE(scratch, own, fmax, parts[get_group_id(0)])
 }
 
 /* result = x − step y/√squares, where squares = ‖y‖²: a step of fixed length against y, or none if y is 0. The length is the
@@ -212,8 +205,7 @@ __kernel void descend(
     __global float *result)
 {
     const long at = (long)get_global_id(0) * LANES, rest = count - at;
-    if (rest <= 0)
-        return;
     const float share = share_of(step, squares[0]);
-    store_some(load_some(x + at, rest) - share * load_some(y + at, rest), result + at, rest);
+    if (rest > 0)
+        store_some(load_some(x + at, rest) - share * load_some(y + at, rest), result + at, rest);
 }
