@@ -246,11 +246,11 @@ class _Calibrator:
         return placement
 
     def _test_direction(self) -> list[ParameterEstimate]:
-        """Compares the residuals with lines read from either end, and corrects the direction. Returns the table's entry for
-        it.
+        """Compares the residuals for lines read from either end. Reverses the direction if the other end fits better.
+        Returns the table's entry for the direction.
 
-        A correction needs four standard errors and 4 % of the squared residual. The direction is 1 or −1, and its deviation
-        is in the same unit."""
+        Only squared residuals that differ by four standard errors and by 4 % decide. The direction is 1 or −1. Its deviation
+        is 2, the difference of these, over the number of standard errors."""
         self.passes.begin("order", "which line is read first")
         stage = self.stages[min(1, len(self.stages) - 1)]
         reverse = [reversed_readout(scan) for scan in self.ready]

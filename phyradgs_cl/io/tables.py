@@ -176,7 +176,7 @@ class Fields:
         return value
 
     def tables(self, key: str) -> "Iterator[Fields]":
-        """Returns the tables in a list, which must have at least one entry."""
+        """Yields the tables of the list at ``key``. Raises InputError, when called, for no list and for an empty one."""
         entries = self.get(key)
         if not isinstance(entries, list) or not entries:
             raise self.error(key, described(entries), "a list with at least one entry")

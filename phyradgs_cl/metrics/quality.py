@@ -106,7 +106,8 @@ def checked_pair(result: ArrayLike, reference: ArrayLike, data_range: float | No
 
 
 def ssim(result: ArrayLike, reference: ArrayLike, data_range: float | None = None) -> float:
-    """Returns the mean structural similarity, at most 1, of two volumes (z, y, x). Slices with an empty truth do not count.
+    """Returns the mean structural similarity, at most 1, of two volumes (z, y, x): the mean over slices across each axis, of
+    the three axes. Slices that are 0 throughout in the reference do not count.
 
     ``data_range``: L in C1 = (0.01 L)², C2 = (0.03 L)², by default the reference's maximum. Raises InputError for arrays
     that are not 3D, shapes that differ, NaN or infinity, an empty reference, and a range that is not positive."""

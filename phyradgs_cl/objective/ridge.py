@@ -26,10 +26,11 @@ _RING = _SLICES + 2  # slices kept in memory: correlating two slices needs one m
 
 @dataclass(frozen=True, eq=False)
 class Ridge:
-    """A regulariser's numbers, float32. first (4, 3, 3, 3), second (16, 4, 3, 3, 3): its filters, with axes z, y, x.
+    """The float32 numbers of a regulariser Σ_i Σ_p ψ_i((W_i x)_p) of a volume x with noise σ. Filter W_i correlates with
+    ``first`` (4, 3, 3, 3) and then with ``second[i]`` (16, 4, 3, 3, 3), axes z, y, x.
 
-    ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i] clip(t, ±σ knot_down[i]). Slopes and knots (16,) are not
-    below 0."""
+    A potential's slope at the filter response t: ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i] clip(t, ±σ
+    knot_down[i]). Slopes and knots (16,) are at least 0."""
 
     first: np.ndarray
     second: np.ndarray

@@ -31,7 +31,7 @@ from phyradgs_cl.parallel import Launch, launched
 log = logging.getLogger(__name__)
 
 _RECORD_BYTES = 2048  # number of bytes of PoCL's device record that are searched for the name
-_LONGEST_TEXT = 64  # a text to which the record points is read up to this many bytes
+_LONGEST_TEXT = 64  # most bytes of a text that are read at an address in PoCL's record of a device
 _TRIPLE = re.compile(rb"x86_64-[a-z0-9_]+-linux-gnu\Z")
 _PROCESSOR = re.compile(rb"[a-z0-9][a-z0-9.-]*\Z")
 _USER_SPACE = 1 << 47  # addresses of a process on x86-64 are below this

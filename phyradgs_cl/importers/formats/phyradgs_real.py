@@ -65,7 +65,8 @@ class Circle:
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a .json file of no other format, or a folder with such a file and TIFF frames."""
+    """Returns whether ``path`` is a .json file other than R2-Gaussian's descriptions, or a folder with such a file, none of
+    these descriptions, and TIFF frames or a folder of projections."""
     others = (synthetic.META, synthetic.META_WITH_TIMES)
     if not path.is_dir():
         return path.suffix.lower() == ".json" and path.name not in others

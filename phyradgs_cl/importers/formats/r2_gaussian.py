@@ -28,7 +28,7 @@ ROW_0 = "top"
 OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 OPTIONS_WITH_TIMES = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
 _KEYS = ("first_line_start", "first_line_end", "last_line_end")
-_SAME = 1e-3  # largest difference between frames in readout over exposure, relative for ratios above 1
+_SAME = 1e-3  # largest difference of frames in the ratio of readout to exposure; beyond ratios of 1, over the largest ratio
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,11 +17,12 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 @dataclass(frozen=True)
 class AsdPocsOptions(SartOptions):
-    """Options of ASD-POCS. tv_steps: TV steps per iteration. tv_share: α, the first length of a TV step over the change by
-    the first SART pass.
+    """Options of ASD-POCS. tv_steps: TV steps per iteration. tv_share: α. The first TV steps are α times as long as the
+    change by the first SART pass.
 
-    tv_reduction: factor on a TV step's length if TV changes the volume by more than ``tv_ratio`` (r_max) times as much as
-    the SART pass, and the residual is above ε. residual_share: ε, the residual to aim at, over that of the FDK volume."""
+    tv_reduction: factor on the length of TV steps after an iteration whose TV steps change the volume by more than
+    ``tv_ratio`` (r_max) times the SART pass's change, while the residual is above ε. residual_share: ε as a fraction of the
+    FDK volume's residual."""
 
     iterations: int = 10
     relaxation_reduction: float = 0.9999

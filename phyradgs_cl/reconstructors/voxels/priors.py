@@ -30,7 +30,7 @@ from phyradgs_cl.runtime import Runtime, Space
 _SPREAD = 2.83
 _EDGES = 0.09  # error of a ray's path length at the edges of the object, which voxels cannot show, over a voxel's side
 _LEAST = 1e-4  # least weight of the prior, as a fraction of the largest value of Aᵀp: without noise it would be 0
-# Factors on the option ``prior_weight`` in a prior's maps, measured (docs/results/settings.md).
+# Settings of the priors, measured (docs/results/settings.md). A weight or threshold is a factor on the prior's weight.
 _TV_ALONE = 1.6  # weight of TV in the prior ``tv``
 _TV_BEFORE_DCT = 0.8  # weight of TV in the prior ``dct``
 _DCT = 1.5  # threshold of the block cosine transforms in the prior ``dct``

@@ -238,8 +238,8 @@ class OrderedSubsets:
         self._systems = [self.system.subset(range(first, frames, count)) for first in spread_order(count)]
 
     def join_if_diverging(self, residual: float) -> bool:
-        """Joins subsets two by two if the ``residual`` of a pass shows that their steps diverge. Returns whether they were
-        joined."""
+        """Joins subsets two by two if their steps diverge: if the ``residual`` of a pass exceeds ``_GROWTH`` times the least
+        one so far. Returns whether they were joined."""
         diverges = residual > _GROWTH * self.least_residual and len(self) > 1
         if diverges:
             self.split(ceil_div(len(self), 2))
