@@ -122,7 +122,7 @@ class AttenuationNetwork(nn.Module):
     """Maps features (P, inputs) to attenuation (P,) in the unit of ``options.density_bound``.
 
     middle: the modules between the first and the last layer. skip: the index of the layer whose input also contains the
-    features; −1: of none. A leaky ReLU follows each layer but the last. ``options.last_activation`` follows the last layer."""
+    features; −1 for none. Leaky ReLUs follow the layers but the last, which ``options.last_activation`` follows."""
 
     def __init__(self, inputs: int, middle: list[nn.Module], skip: int, options: NeuralOptions) -> None:
         super().__init__()

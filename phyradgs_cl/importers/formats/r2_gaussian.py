@@ -28,7 +28,7 @@ ROW_0 = "top"
 OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 OPTIONS_WITH_TIMES = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
 _KEYS = ("first_line_start", "first_line_end", "last_line_end")
-_SAME = 1e-3  # largest difference of frames in the ratio of readout to exposure; beyond ratios of 1, over the largest ratio
+_SAME = 1e-3  # largest difference of frames in readout over exposure time; of ratios above 1, as a fraction of the largest
 
 
 @dataclass(frozen=True, eq=False)
