@@ -2,6 +2,7 @@
 
 import logging
 import math
+import threading
 import time
 import warnings
 import weakref
@@ -79,6 +80,7 @@ class Runtime:
         self._profile = Profile()
         self._programs: dict[tuple[str, tuple[str, ...]], cl.Program] = {}
         self._kernels: dict[tuple[str, str, tuple[str, ...]], Kernel] = {}
+        self._launching = threading.Lock()  # a kernel keeps one set of arguments, and Python threads may launch the same one
 
     def kernel(self, program: str, name: str, **defines: int | float | bool) -> Kernel:
         """Declares the kernel ``name`` of ``cl/<program>.cl`` with macros ``defines``. Nothing is built before its first
@@ -248,12 +250,13 @@ class Runtime:
         pieces = ceil_div(samples, self.most_samples) if self.pixel_items else 1
         try:  # the decorator ``naming_failures`` would add a call to each of an iteration's thousands of launches
             built = self.compile(kernel)
-            built.set_args(*map(_argument, args))
-            for first, part in _parts(rounded, local, pieces):
-                event = cl.enqueue_nd_range_kernel(self.queue, built, part, local, first)
-                self._record(kernel.function_name, event, nbytes if first is None or not any(first) else 0)
-                if first is not None:
-                    self.queue.flush()  # without it the driver may give the GPU several launches at once
+            with self._launching:
+                built.set_args(*map(_argument, args))
+                for first, part in _parts(rounded, local, pieces):
+                    event = cl.enqueue_nd_range_kernel(self.queue, built, part, local, first)
+                    self._record(kernel.function_name, event, nbytes if first is None or not any(first) else 0)
+                    if first is not None:
+                        self.queue.flush()  # without it the driver may give the GPU several launches at once
         except cl.Error as error:
             raise self.ledger.error(f"a launch of {kernel.function_name}", error, self.queue) from error
 

@@ -5,6 +5,7 @@ import math
 import os
 import re
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -114,10 +115,12 @@ class MemoryLedger:
         self.held_bytes = 0
         self.peak_bytes = 0
         self.reserved_bytes = 0
+        self._counting = threading.RLock()  # arrays of any Python thread; collecting one may interrupt a count
 
     def count(self, nbytes: int) -> None:
-        self.held_bytes += nbytes
-        self.peak_bytes = max(self.peak_bytes, self.held_bytes)
+        with self._counting:
+            self.held_bytes += nbytes
+            self.peak_bytes = max(self.peak_bytes, self.held_bytes)
 
     @contextmanager
     def reserved(self, nbytes: int) -> Iterator[None]:

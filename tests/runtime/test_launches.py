@@ -3,6 +3,8 @@
 tests/test_device_check.py asks every kernel so."""
 
 import math
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from phyradgs_cl.acquisition.cells import per_line_cells
 from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.splats import binning
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.runtime import DeviceSpace, Runtime, context
 
 GPU = {"lanes": 1, "pixel_items": True}
 
@@ -29,6 +31,21 @@ def test_a_kernel_that_allows_hardly_any_items_is_named(monkeypatch) -> None:
     monkeypatch.setattr(Runtime, "_asked", lambda *_: 8)
     with pytest.raises(DeviceError, match="kernel multiply_add on .*at most 8 work-items; expected 32 or more"):
         rt.launch(rt.kernel("rates", "multiply_add"), 64, 3, 0.5, rt.zeros(64), group=64)
+
+
+def test_threads_launch_the_same_kernel_with_their_own_arguments(rt, monkeypatch) -> None:
+    """Each launch waits between its arguments and its start, so that another thread could set its own in between."""
+    cut = context._parts
+    monkeypatch.setattr(context, "_parts", lambda *given: time.sleep(0.001) or cut(*given))
+
+    def is_right(number: float) -> bool:
+        own, space = rt.upload(np.full(64, number, np.float32)), DeviceSpace(rt)
+        return all(np.all(rt.download(space.add(own, own, 1.0)) == 2 * number) for _ in range(10))
+
+    before = rt.ledger.held_bytes
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(is_right, range(1, 5)))
+    assert rt.ledger.held_bytes == before
 
 
 @pytest.mark.parametrize(
