@@ -21,7 +21,7 @@ SILENT_S = 10.0  # longest time in s between two reports of a run with slow iter
 
 
 class Stepwise(Protocol):
-    """What ``Loop`` needs of an iterative method, between its start and its result. iterations: number in a whole run."""
+    """What ``Loop`` needs of an iterative method between its start and its result. iterations: how many a whole run has."""
 
     iterations: int
 

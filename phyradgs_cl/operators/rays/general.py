@@ -38,7 +38,8 @@ def launch_adjoint(
     rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, frames: DeviceArray,
     volume: DeviceArray, *, add: bool = False,
 ) -> None:
-    """Backprojects padded frames, those numbered ``frame_list``, to a padded volume. add: adds to its values."""
+    """Backprojects padded frames, those numbered ``frame_list``, to a padded volume. add: adds to the volume's values; else
+    overwrites them."""
     owned, kernel = _owners(rt, layout, cells)
     nz, ny, nx = layout.brick.shape
     columns, rows, slices = (ceil_div(n, side) for n, side in zip((nx, ny, nz), owned, strict=True))

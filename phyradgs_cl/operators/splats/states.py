@@ -91,7 +91,7 @@ class CloudStates:
 def segments_for_object(deformation: Deformation, lit_s: np.ndarray, voxel_mm: float) -> int:
     """Returns how many segments of time, up to ``_MOST_SEGMENTS``, a frame needs that is exposed from lit_s[0] to lit_s[1].
 
-    Splats move straight in a segment, so in it no point of the object may deviate from a straight path by over 1/4 voxel."""
+    Splats move straight in a segment. So in a segment no point of the object may leave a straight path by over 1/4 voxel."""
     for count in range(1, _MOST_SEGMENTS):
         weights = deformation.weights_at(np.linspace(lit_s[0], lit_s[1], 2 * count + 1))
         bend_mm = np.abs(weights[1::2] - (weights[:-1:2] + weights[2::2]) / 2) @ deformation.reach_mm

@@ -13,7 +13,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import weights
 
 # A gap between views stands out if it is this many times as wide as another gap; one lost view makes a gap of 2 steps.
-# The widest gap is compared with the second widest: by the median, uneven views of a full turn would be a short scan.
+# The widest gap is compared with the second widest: compared with the median, uneven full turns would look like short scans.
 # Any gap wider than _WIDE_RAD is compared with both of its neighbours.
 SHORT_SCAN_GAP = 2.5
 _SAME_VIEW = 0.05  # views nearer to each other than this fraction of the mean gap count as one repeated view
@@ -30,14 +30,14 @@ _FILL_REACH = 0.5
 log = logging.getLogger(__name__)
 
 # Limits of an orbit, in pairs. Beyond the first a warning is logged; beyond the second, _NO_…, InputError is raised.
-_CIRCLE = 0.05  # distance of source or panel from a circle about z, divided by that from source to panel
+_CIRCLE = 0.05  # (distance of source or panel from a circle about z)/(distance from source to panel)
 _NO_CIRCLE = 0.5
 _PLANE_DEG = 10.0  # elevation of the source above the plane z = 0, seen from the origin
 _NO_PLANE_DEG = 45.0
 _LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the plane of the rotation
 _NO_LEAN_DEG = 10.0
-_ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: there densities are 0.1 % too low
-_NO_ROLL_DEG = 10.0  # larger angles of the rows are refused: here densities are 1.5 % too low, at 90° they are 0
+_ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: at 3° densities are 0.1 % too low
+_NO_ROLL_DEG = 10.0  # at 10° densities are 1.5 % too low, at 90° they are 0
 _UNLIKE = 0.1  # a warning comes if the fan's ends differ among the views by more than this fraction of the fan
 _LEAST_OVERLAP = 2.0  # a displaced panel must reach this many columns beyond the axis, or a warning comes
 # A smaller missing angle causes no warning: nearly parallel rays have so narrow a fan that half a turn is enough.
@@ -139,8 +139,8 @@ def _steps(ahead: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _filled_rad(ahead: np.ndarray) -> float:
-    """Returns by how much, in rad, wide gaps exceed the largest of the median gap and their neighbours, summed over the wide
-    gaps. ahead (K,): the gap from each view to the next."""
+    """Returns the sum over wide gaps of (gap − usual gap), in rad. A gap's usual gap is the largest of the median gap and
+    both its neighbours. ahead (K,): the gap from each view to the next."""
     usual = np.maximum(np.median(ahead) if ahead.size else 0.0, np.maximum(np.roll(ahead, 1), np.roll(ahead, -1)))
     return float((ahead - usual)[ahead > np.maximum(SHORT_SCAN_GAP * usual, _NAMED_RAD)].sum())
 

@@ -201,8 +201,8 @@ def _few_rows(scan: Scan, frame: int) -> np.ndarray:
 
 
 def _rough_shift(pairs: list[_Pair]) -> float:
-    """Returns the shift in pixels, in steps of 1/2, at which views and mirror images differ least where they overlap: by the
-    squared difference over the sum of squares."""
+    """Returns the shift in pixels, in steps of 1/2, at which (sum of squared differences)/(sum of squares) of views and
+    mirror images is least where they overlap."""
     columns = pairs[0].view.shape[1]
     # a shift moves the view and the mirror image against each other, by twice its size
     lags = np.arange(1 - columns, columns)  # column of the mirror image minus column of the view
