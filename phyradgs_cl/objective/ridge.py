@@ -19,7 +19,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, beside, brought_to, move,
 
 EDGE = 5
 """Voxels along each side of a filter."""
-_SAMPLES = 200  # a voxel's longest time, as a number of ray samples: ``launch`` divides launches that take too long
+_SAMPLES = 200  # a voxel takes at most as long as this many ray samples, by which ``launch`` divides long launches
 _SLICES = 2  # slices computed at a time: channels and responses of a whole volume would take 24 volumes of memory
 _RING = _SLICES + 2  # slices kept in memory: correlating two slices needs one more on either side
 

@@ -21,7 +21,7 @@ _BYTES_A_LAUNCH = 1 << 28  # most bytes of frames that are uploaded together
 _VIEWS_SHARE = 0.25  # fraction of the free device memory for uploaded frames; the volume needs the rest
 # Most voxels along z that a work-item sums in the kernels for upright columns of voxels (see ``_UPRIGHT``).
 _BLOCK_VOXELS = 128
-_COLUMN_ROWS = 512  # most detector rows to which the voxels of a work-item of the upright kernels may project
+_COLUMN_ROWS = 512  # in the upright kernels, a work-item's voxels project to at most this many detector rows
 # A column of voxels along z is upright if u·depth and depth change along it by at most this fraction of the least depth.
 _UPRIGHT = 1e-7
 # Largest lean of the image of a column of voxels, in detector columns per row. Beyond it the general kernel is faster.

@@ -148,7 +148,7 @@ class Runtime:
         return array
 
     def room(self) -> Room:
-        """Returns the device memory that an operator may use now, in all and in one buffer, in bytes."""
+        """Returns how many bytes of device memory an operator may use now: in all buffers together, and in one."""
         return self.ledger.room(self.device.largest_allocation_bytes)
 
     @property

@@ -160,7 +160,8 @@ def _breathing_mm(places: list[Array], height: Array) -> list[Array]:
 
 
 def _drying_mm(places: list[Array], height: Array) -> list[Array]:
-    """Returns two sets of control vectors of unit amplitude: downwards, growing with height, and towards the z axis."""
+    """Returns two sets of control vectors of unit amplitude: downwards, growing with height, and towards the z axis.
+    places and height: as in ``_sliding_mm`` and ``_breathing_mm``."""
     _, y, x = places
     return [_vectors(z=height), _vectors(x=x / 2, y=y / 2)]
 

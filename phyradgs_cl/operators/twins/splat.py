@@ -22,7 +22,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 
 
 def precision_matrices(rows: np.ndarray) -> np.ndarray:
-    """Returns Σ⁻¹ (G, 3, 3) of parameter rows (11, G)."""
+    """Returns the precision matrices Σ⁻¹ (G, 3, 3) of parameter rows (11, G)."""
     turn = Rotation.from_quat(rows[[7, 8, 9, 6]].T).as_matrix()
     return np.asarray(np.einsum("gij,gj,gkj->gik", turn, 1 / rows[3:6].T ** 2, turn))
 

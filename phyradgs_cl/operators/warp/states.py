@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl.fields import Deformation, Grid
 
 MOST_STATES = 12  # most states that represent a motion, by default
-_SPACING = 0.6  # largest RMS distance of moving voxels from where their state has them, in voxels, if states are blended
+_SPACING = 0.6  # largest RMS distance, in voxels, of moving voxels from where the nearest state has them, with blends
 _SPACING_OF_NEAREST = 0.3  # like _SPACING, if each time takes the nearest state, without a blend
 _MOVES = 0.1  # a voxel counts as moving if its squared displacement is at least this fraction of the largest one
 

@@ -23,7 +23,7 @@ _NAMED_RAD = np.deg2rad(5)
 _WIDE_RAD = np.deg2rad(10)
 # A misaligned panel measures a strip of rays once only. Gaps up to this width are filled, so that the strip counts fully.
 _FILLED_RAD = np.deg2rad(15)
-# The same for a panel displaced on purpose, whose strip is wide: beyond, a short scan's weights were 0.2 to 10 dB better.
+# The same for a panel displaced on purpose, whose strip is wide. In wider gaps, short-scan weights were 0.2 to 10 dB better.
 _FILLED_ASIDE_RAD = np.deg2rad(65)
 # Views nearer to a filled gap than this fraction of its width stand for it: more views smear, fewer draw streaks.
 _FILL_REACH = 0.5
@@ -123,8 +123,9 @@ def _stand_out(ahead: np.ndarray) -> np.ndarray:
 
 
 def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Returns which wide gaps (K,) of at most 15° have a wide gap on the opposite side too, bool (K,). Such gaps have no
-    opposite rays, so the views at both sides fill them. The widest gap is never among them."""
+    """Returns which ``wide`` gaps ``ahead`` (K,) of at most 15° have a wide gap on the opposite side too, bool (K,). Such
+    gaps have no opposite rays, so the views at both sides fill them. The widest gap is never among them. centre (K,): angles
+    of the views."""
     narrow = wide & (ahead <= _FILLED_RAD) & (np.arange(ahead.size) != np.argmax(ahead))
     opposite = centre + ahead / 2 + np.pi
     before = np.searchsorted(centre, np.mod(opposite - centre[0], 2 * np.pi) + centre[0], side="right") - 1
@@ -132,8 +133,8 @@ def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.nd
 
 
 def _steps(ahead: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles (K,) in rad from each view to the next, and from the view before to each. Beside a gap, the step on
-    the view's other side is used."""
+    """Returns the steps (K,) in rad from each view to the next, and from the view before to each: the gaps ``ahead`` (K,).
+    For a gap that is ``wide``, bool (K,), the step on the view's other side is used."""
     forward = np.where(wide, np.roll(ahead, 1), ahead)
     return forward, np.roll(np.where(wide, np.roll(ahead, -1), ahead), 1)
 
@@ -147,7 +148,7 @@ def _filled_rad(ahead: np.ndarray) -> float:
 
 def _filled_cells(ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
     """Returns the angle (K,) in rad for which each view of a full turn stands. A wide gap is divided among the views near
-    it, the nearer the more."""
+    it, the nearer the more. ahead, wide: as in ``_steps``."""
     forward, back = _steps(ahead, wide)
     known = (forward + back) / 2
     cells = known.copy()
@@ -235,7 +236,7 @@ def _redundancy(view: int, angle_rad: np.ndarray, arc: Arc, fan: weights.Fan) ->
     if len(arc.parts_rad) > 1:
         return weights.parted_weight(progress_rad, angle_rad, arc.parts_rad)
     if not arc.is_full:
-        # A view stands for an angular step. If it is wide against the arc beyond half a turn, its middle is not enough.
+        # A view stands for an angular step. If it is wide against the arc beyond half a turn, weights are averaged over it.
         is_coarse = gap_rad > (arc.coverage_rad - np.pi) / 2 > 0
         within = gap_rad * (np.arange(_PARTS) - (_PARTS - 1) / 2) / _PARTS if is_coarse else (0.0,)
         at_rad = np.clip(progress_rad + np.asarray(within), 0, arc.coverage_rad)

@@ -11,7 +11,7 @@ import numpy as np
 # (Width of the transition from rays measured twice to rays measured once)/(overhang of the panel's longer side).
 # Wang's transition covers all rays that are measured twice: it was up to 15 % noisier, with no fewer artefacts.
 TRANSITION = 1.0
-_SYMMETRIC = 0.01  # a panel whose two sides differ by less, in pixels, is symmetric about the axis
+_SYMMETRIC = 0.01  # a panel whose two sides differ by at most this, in pixels, is symmetric about the axis
 # A panel less asymmetric than this fraction of the fan was not displaced on purpose, and sees both sides of the object.
 _ASIDE = 0.1
 

@@ -175,8 +175,8 @@ def vertex(at: np.ndarray, squares: np.ndarray) -> tuple[float, float]:
     frames.
 
     at (3,): evenly spaced, ascending values of a parameter. squares (3, F): each frame's squared residual there. The minimum
-    is limited to 3 steps from ``at[1]``, and NaN if the parabola has none; the deviation is NaN if half of the resamplings
-    have none."""
+    is limited to 3 steps from ``at[1]``, and NaN if the parabola has none. The deviation is NaN if half of the resamplings
+    or more have no minimum."""
     frames = squares.shape[1]
     draws = np.random.default_rng(0).integers(0, frames, (_DRAWS, frames))
     drawn = np.array([_minimum(at, squares[:, draw].sum(1)) for draw in draws])
