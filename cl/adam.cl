@@ -35,7 +35,7 @@ __kernel void chain_activations(
     const float scale_min, const float scale_max,
     const float density_weight,      /* the term's weight divided by the number of Gaussians */
     __global float *gradients,       /* (13, stride): dL/d(the 11 parameters), dL/d(centre u, v) */
-    __global float *statistics)      /* (2, stride): |dL/d(centre u, v)| summed over frames; number of frames with one > 0 */
+    __global float *statistics)      /* (2, stride): |dL/d(centre u, v)| summed over frames; in how many frames it is > 0 */
 {
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)

@@ -144,8 +144,8 @@ static inline float share_of(const float2 step, const sum_t squares)
     if (get_local_id(0) == 0)                                                              \
         target = own;
 
-/* parts = Σ x y, one sum per work-group. Work-item k adds the vectors at k first_by, k first_by + step, ..., up to
-   k first_by + span. */
+/* parts = Σ x y, one sum per work-group. Work-item k adds the vectors of LANES elements that begin at k first_by,
+   k first_by + step, ..., below k first_by + span. */
 __kernel void dot_parts(
     __global const float *x, __global const float *y, const long count, const long first_by, const long step, const long span,
     __local sum_t *scratch, __global sum_t *parts)

@@ -128,7 +128,7 @@ __kernel void bin_count_group(
     __global const int *extents,
     const int stride, const int count, const int chunk, const int chunks,
     const int4 tile, const int4 tiles,
-    __global int *counts,            /* (tiles, chunks), zero before */
+    __global int *counts,            /* (tiles, chunks); must be 0 before the launch */
     __local int *boxes)              /* (6, chunk): tiles lo and hi along x, y, z of each splat */
 {
     __local int around[6];

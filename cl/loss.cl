@@ -12,8 +12,8 @@ static inline vf masked(__global const float *image, __global const float *mask,
     return V_LOAD(image + at) * V_LOAD(mask + at);
 }
 
-/* Pass along rows: weighted means of x, y, xx, yy and xy over the window, with x rendered and y measured. Both are 0 where
-   the mask is. */
+/* Pass along rows: weighted means of x, y, xx, yy and xy over the window. x is the rendered and y the measured image, both 0
+   where the mask is 0. */
 __kernel void ssim_moments(
     __global const float *rendered, __global const float *measured, __global const float *mask,
     __constant float *window, const int lines, const int width, const int pitch,

@@ -77,7 +77,7 @@ __kernel void splat_chain(
     __global float *gradients,            /* (13, stride); DEFORMED: without the rows of the mean */
     __global const float *states,         /* DEFORMED: (S, STATE_ROWS, stride) */
     __global const int *cell_states,      /* (C, POSES): the state of the object at each pose */
-    __global float *by_states)            /* DEFORMED: like states, zero before; dL/d(states) is added */
+    __global float *by_states)            /* DEFORMED: laid out like states; dL/d(states) is added to it */
 {
     const int first = (int)get_global_id(0) * LANES;
     if (first >= stride)

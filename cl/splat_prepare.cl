@@ -180,8 +180,8 @@ ALWAYS_INLINE void times_of_lines(__global const float *times, const int pitch, 
     *late = V_LOAD(to);
 }
 
-/* The squared cutoff distance from the path, in widths of the splat. It is `slack` times cutoff2, because Q changes along
-   the path: 0.75 is the longest time from the middle, 1.1 and 1.2 are margins. */
+/* The squared cutoff distance from the path, in standard deviations of the splat. It is `slack` times cutoff2, because Q
+   changes along the path: 0.75 is the longest time from the middle, 1.1 and 1.2 are margins. */
 ALWAYS_INLINE vf reach2_of(const splat_view s, const cutoff_ellipse e, const centre_path path, const vf speed, const float cutoff2)
 {
     const vf tilt = fabs(s.b1) * (fabs(e.u) + e.half_u + 0.75f * fabs(path.u))
@@ -218,7 +218,7 @@ __kernel void splat_prepare_moving(
         const centre_path path = path_of(matrix + 12, end_means, &centre);
         const splat_view s = view_splat(g, cells + c * CELL, centre.depth);
         vi is_drawn = exists & s.is_drawn & path.is_in_front;
-        /* The path in widths of the splat: its length and direction. */
+        /* The path in standard deviations of the splat: its length and direction. */
         const vf wide_u = s.l11 * path.u + s.l12 * path.v, wide_v = s.l22 * path.v;
         const vf speed = sqrt(wide_u * wide_u + wide_v * wide_v);
         const vi moves = speed > 1e-6f; /* a splat at rest may have any direction */

@@ -255,7 +255,7 @@ __kernel void warp_adjoint_fixed(
     __global const float *values, __global const float *fields, __global const float *shares, const int4 shape,
     const float scale,     /* the integer that stands for 1: no sum overflows if a coefficient's weights sum to at most 64 */
     const long4 strides,
-    __global int *result)  /* laid out like the coefficients, zero before */
+    __global int *result)  /* laid out like the coefficients; must be 0 before the launch */
 {
     __local int slab[SLAB], low[3], high[3]; /* smallest and largest first coefficient of the group along x, y, z */
     const int3 at = (int3)((int)get_global_id(0), (int)get_global_id(1), (int)get_global_id(2));

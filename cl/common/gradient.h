@@ -4,7 +4,7 @@
 #include "common/gaussian.h"
 
 #define ROW_STATISTIC 11 /* first of the two rows dL/d(centre on the detector) */
-#define ROUND 4e-6f      /* scales whose difference over their sum is below this may differ by rounding only */
+#define ROUND 4e-6f      /* scales s2 and s3 may differ by rounding only if |s3 - s2| / (s3 + s2) is below this */
 
 /* The factor s3 / s2 - s2 / s3 in the torque about an axis across scales s2 and s3. It is set to 0 if the scales differ by
    rounding only: the torque would be a rounding error, of which Adam would make a step of full length. */

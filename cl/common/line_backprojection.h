@@ -17,9 +17,9 @@ static inline float line_sample(__global const float *line, const float u, const
     return line[column] + (u - column) * (line[column + (width > 1)] - line[column]);
 }
 
-/* Finds the line r onto which its own pose projects the voxel: v(pose of line r) = r. Returns the line below, by Newton's
-   method from `line` on; v is linear from line to line. t: the fraction of the way to the next line. speed: the rate at
-   which the readout crosses the voxel's image, in lines per line. depth, next_depth: of the voxel in the poses of both. */
+/* Finds the line r onto which its own pose projects the voxel: v(pose of line r) = r. Returns the line below r, by Newton's
+   method from `line` on; v is linear from line to line. t: r minus this line. speed: 1 - (shift of the voxel's image from
+   this line's pose to the next line's, in lines). depth, next_depth: the voxel's depth in these two poses. */
 static inline int line_seeing(
     __global const float *table, /* (lines, 12): a matrix for the pose of each line */
     const int lines, int line, const float x, const float y, const float z,

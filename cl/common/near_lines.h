@@ -13,7 +13,7 @@ typedef struct {
     int v_first, v_stop, last_start; /* last_start: the last line from which two vectors can be loaded */
     float sb, sc, da, ea, dz, ez;
     float inv;                      /* 1 / da; if LEAN, 1 / (da ez - dz ea) */
-    float bend, per_along;          /* bend: 4 |ea / da|, how much denser lines beyond the ends are; 1 / |along| */
+    float bend, per_along;          /* 4 |ea / da|: how much denser lines beyond the ends are; 1 / |along| */
     float across, along;
     float first, last;              /* slopes of the first and the last line */
     float dense;                    /* largest number of lines per voxel, multiplied by `ahead` */
@@ -100,7 +100,7 @@ RAY_INLINE int2 bases_of_halves(const column_t r, const near_lines_t lines, cons
         v1 = V_PICK(0.0f, v1, VI_IOTA + (lines.base + LANES) < r.v_stop);                                  \
     }
 
-/* Runs `body` for all lines that may touch LANES voxels, with `value` of the line, and `off`, its height over the voxel. */
+/* Runs `body` for all lines that may touch LANES voxels. `value`: of the line. `off`: the ray's height minus the voxel's. */
 #define OF_LINES(value_of, slope_of, next, body)                                                           \
     for (int m = 0; m < most; ++m, next) {                                                                 \
         const vf value = value_of, off = fma(slope_of, (vf)(ahead), under);                                \

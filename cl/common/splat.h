@@ -44,7 +44,7 @@
 #define REC_ALONG_V 1
 #define REC_ACROSS_V 2
 #define REC_ACROSS_U 15
-#define REC_SPEED 16      /* length of the path in the segment, in widths of the splat */
+#define REC_SPEED 16      /* length of the path in the segment, in standard deviations of the splat along it */
 #define REC_REACH2 17     /* limit of |(along, across)|^2 within the cutoff, for the largest Q */
 #endif
 

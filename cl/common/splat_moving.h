@@ -28,8 +28,8 @@ typedef struct {
     int rule;
 } moving_line;
 
-/* The fastest rule that is accurate enough. path: during the line's exposure, in widths of the splat. limits: the longest
-   paths for 1, 2 and 3 times. */
+/* The fastest rule that is accurate enough. path: its length in the line's exposure, in standard deviations of the splat.
+   limits: the longest paths for 1, 2 and 3 times. */
 ALWAYS_INLINE int moving_rule(const float path, const float4 limits)
 {
     return path <= limits.x ? 1 : (path <= limits.y ? 2 : (path <= limits.z ? 3 : CLOSED));
@@ -61,7 +61,7 @@ ALWAYS_INLINE moving_line moving_on_line(SPLAT_SPACE const float *splat_record, 
 }
 
 /* A pixel relative to the splat. fall: the factor of squares in the exponent of 2. c2: across^2. d2: |d|^2, or 1 if AFFINE.
-   drawn: whether it is within the cutoff. */
+   drawn: whether the pixel is within the cutoff. */
 typedef struct { vf z, across, b, q, rq, fall, c2, d2; vi drawn; } moving_pixel;
 
 #if AFFINE

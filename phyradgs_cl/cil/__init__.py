@@ -177,8 +177,8 @@ def _mapped(
 
 
 def _places(geometry: Any) -> list[int]:
-    """Returns the index of each of CIL's dimensions among those present, in this package's order: channels, frames or
-    slices, rows, columns."""
+    """Returns the place of each of the geometry's dimensions, which are in CIL's order, in this package's order: channels,
+    frames or slices, rows, columns."""
     present = [name for name in _ORDER if name in geometry.dimension_labels]
     return [present.index(name) for name in geometry.dimension_labels]
 

@@ -25,7 +25,7 @@ _FEWEST = 100  # least number of voxels of air and of water: the noise of their 
 # Water's attenuation in 1/mm is 0.0097 at 500 keV and 0.53 at 10 keV. Outside these limits a warning is logged.
 _WATER_PER_MM = (0.009, 0.6)
 _AIR_BELOW = 0.25  # a lowest peak above this fraction of water's attenuation is not air; it may be fat
-_ONE_MATERIAL = 0.4  # a box whose standard deviation is above this fraction of water minus air may hold two materials
+_ONE_MATERIAL = 0.4  # a box whose standard deviation exceeds this times (water − air) may hold two materials
 _BINS = 512  # number of bins of the histogram
 _SMOOTH_BINS = 2.0  # standard deviation of the Gaussian that smooths the histogram, in bins
 _PROMINENT = 0.1  # a peak must rise above its surroundings by this fraction of its smoothed count

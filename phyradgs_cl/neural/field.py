@@ -42,7 +42,7 @@ def torch_device(name: str) -> torch.device:
 @contextmanager
 def repeatable(device: torch.device) -> Iterator[None]:
     """Makes PyTorch on CUDA use algorithms that give the same bits in every run. On CPUs this package sums in a fixed order
-    anyway, and the switch would only slow it down."""
+    anyway, and PyTorch's switch would only slow it down."""
     if device.type != "cuda":
         yield
         return
@@ -122,7 +122,7 @@ class AttenuationNetwork(nn.Module):
     """Maps features (P, inputs) to attenuation (P,) in the unit of ``options.density_bound``.
 
     middle: the modules between the first and the last layer. skip: the index of the layer whose input also contains the
-    features; −1 for none. Leaky ReLUs follow the layers but the last, which ``options.last_activation`` follows."""
+    features; −1 for none. ``options.last_activation`` follows the last layer, a leaky ReLU every other layer."""
 
     def __init__(self, inputs: int, middle: list[nn.Module], skip: int, options: NeuralOptions) -> None:
         super().__init__()

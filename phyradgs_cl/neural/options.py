@@ -35,9 +35,9 @@ class NeuralOptions(MotionOptions):
     - levels (0: until the finest has one cell per voxel), features, base_resolution (cells along a side), level_growth,
       table_log2 (each level has at most 2^table_log2 entries): sizes of the hash encoding.
     - layers, width, last_activation: the network's shape. A sigmoid reaches at most density_bound, in units of FDK's 99.9th
-      percentile. The field starts at first_share of that everywhere.
-    - rate: Adam's learning rate. It is multiplied by rate_factor every rate_step passes; rate_step 0: once, gradually over
-      the run.
+      percentile. The field starts everywhere at first_share × density_bound.
+    - rate: Adam's learning rate. It is multiplied by rate_factor after every rate_step passes. With rate_step 0 it falls
+      smoothly over the run, to rate × rate_factor.
     - detector_model: what the detector averages over a line's times, or the model that the scan states (scan).
     - torch_device: the device of PyTorch."""
 

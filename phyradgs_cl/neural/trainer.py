@@ -20,7 +20,7 @@ from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 _BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's decay rates of both moments, and the constant in its denominator
 _POINTS_ON_CPU = 2**14  # a CPU evaluates the field at this many points at once: its cache holds them
 _POINTS_ELSEWHERE = 2**20  # another device evaluates more points at once: the memory of a GPU holds them
-_BEYOND_VOLUME = 2.0  # parallel rays begin this far from the volume's middle, in longest half-sides: beyond every corner
+_BEYOND_VOLUME = 2.0  # parallel rays begin this far from the volume's middle, in halves of its longest side: beyond corners
 Field = Callable[[torch.Tensor], torch.Tensor]
 
 
@@ -153,7 +153,7 @@ class Trainer:
         return scattered_pixels(usable, options.rays, self.rng)
 
     def _loss_and_gradient(self, frame: int, pixels: np.ndarray) -> float:
-        """Returns the mean squared error in internal units, and adds its gradient to the parameters'."""
+        """Returns the mean squared error in internal units. Adds its gradient to the gradients of the field's parameters."""
         exposure = self.rays[frame]
         times = chosen_times(len(pixels), exposure.times, self.times, self.rng)
         shifts = sample_shifts(times.size, self.samples, self.options.jitter, self.rng)
@@ -323,7 +323,7 @@ def box_span(
 
 
 def sample_shifts(rays: int, samples: int, jitter: str, rng: np.random.Generator) -> np.ndarray:
-    """Returns the places of samples in their intervals, 0 to 1: (R, 1) if a ray's samples share one, else (R, samples)."""
+    """Returns the places of samples in their intervals, 0 to 1: (R, samples), or (R, 1) if all of a ray have the same."""
     if jitter == "none":
         return np.full((rays, 1), 0.5, np.float32)
     return rng.random((rays, samples if jitter == "sample" else 1), np.float32)

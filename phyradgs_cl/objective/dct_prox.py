@@ -1,8 +1,8 @@
 """Shrinks the cosine transforms of all blocks of 4³ voxels: a prior that keeps textures, which total variation flattens.
 
-For each shift s of the blocks, B_s takes the transforms of a volume v. The result is the average of B_sᵀ T(B_s v) over the
-shifts (Coifman and Donoho, "Translation-invariant de-noising", 1995; block DCT: Guleryuz, IEEE Trans. Image Process. 16
-(2007) 3020). T is a soft threshold that keeps each block's mean. Only blocks that lie inside the volume count.
+B_s v are the cosine transforms of the blocks of a volume v if the blocks are shifted by s. The result is the average of
+B_sᵀ T(B_s v) over all s (Coifman and Donoho, "Translation-invariant de-noising", 1995; block DCT: Guleryuz, IEEE Trans.
+Image Process. 16 (2007) 3020). T is a soft threshold that keeps each block's mean. Only blocks inside the volume count.
 
 Each call takes a quarter of the shifts, in turn. Over iterations the average is the same (cycle spinning; Kamilov, Bostan
 and Unser, IEEE Signal Process. Lett. 21 (2014) 1326)."""
@@ -17,7 +17,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, beside, brought_to, padded_zeros, pitch_of
 
 EDGE = 4  # voxels along each side of a block
-_SAMPLES = 8  # number of ray samples that take as long as a voxel, so that ``launch`` can divide launches that take too long
+_SAMPLES = 8  # a voxel takes as long as this many ray samples, by which ``launch`` divides long launches
 # TURNS[turn][z]: the blocks' shift along y, in voxels, for their shift z along z. Four turns contain all 16 pairs once.
 TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 

@@ -19,7 +19,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, beside, brought_to, move,
 
 EDGE = 5
 """Voxels along each side of a filter."""
-_SAMPLES = 200  # most ray samples that take as long as a voxel, so that ``launch`` can divide launches that take too long
+_SAMPLES = 200  # a voxel takes at most as long as this many ray samples, by which ``launch`` divides long launches
 _SLICES = 2  # slices computed at a time: channels and responses of a whole volume would take 24 volumes of memory
 _RING = _SLICES + 2  # slices kept in memory: correlating two slices needs one more on either side
 
@@ -110,8 +110,8 @@ class RidgeStep:
         return brought_to(self.rt, volume, result)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
-        """Runs a kernel for ``_SLICES`` slices of its result from ``first`` on, without those that do not exist. less: how
-        many voxels fewer than the volume the result has along each axis."""
+        """Runs a kernel for those of the ``_SLICES`` slices from ``first`` on that its result has. The result has ``less``
+        voxels fewer than the volume along each axis. sources, ends: the kernel's first and last arguments."""
         nz, ny, nx = (count - less for count in self.shape)
         start, stop = max(first, 0), min(first + _SLICES, nz)
         if start < stop:
@@ -122,7 +122,7 @@ class RidgeStep:
 
 
 def ridge_gradient(volume: np.ndarray, sigma: float, ridge: Ridge) -> np.ndarray:
-    """Returns the regulariser's gradient ∇R at a volume (nz, ny, nx), float64. sigma: its noise, in its unit."""
+    """Returns the regulariser's gradient ∇R at a volume (nz, ny, nx), float64. sigma: the volume's noise, in its unit."""
     volume = np.asarray(volume, np.float64)
     if min(volume.shape) < EDGE:
         return np.zeros_like(volume)

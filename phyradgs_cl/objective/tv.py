@@ -6,7 +6,7 @@ cubes. For an object that changes, the sum of |differences| between successive s
 
 ``TvDescent`` takes steps of a fixed length, as ASD-POCS does (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777), with TIGRE's
 backward differences. TV's gradient divides by the lengths of differences, which may be 0. So a number far below the volume's
-values is added to them."""
+values is added to the lengths."""
 
 import math
 from collections.abc import Callable
@@ -123,16 +123,16 @@ def _primal_of(
 
 
 def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
-    """Returns the dual's steps in space and in time: 1/(upper bound of the squared norm of the difference operator).
-
-    For states, each step is half as long as it would be alone, so a large weight in time does not shorten that in space."""
+    """Returns the dual's steps in space and in time: 1/(upper bound of the squared norm of the differences in space, or in
+    time). For states both are halved. A common step for all differences would be short in space if the weight in time is
+    large."""
     *time, z, y, x = axis_weights
     in_space = 1 / (4 * (z * z + y * y + x * x))
     return (in_space / 2, 1 / (8 * time[0] ** 2)) if any(time) else (in_space, 0.0)
 
 
-# TV's gradient divides by the length of differences, which may be 0, plus the larger of _SMALLEST and _NOTHING.
-_SMALLEST = 1e-6  # fraction of the volume's RMS, so that units do not matter
+# TV's gradient divides by (length of differences, which may be 0) + max(_SMALLEST · RMS of the volume, _NOTHING).
+_SMALLEST = 1e-6  # relative to the RMS, so that units do not matter
 _NOTHING = 1e-30  # in 1/mm, for a volume of zeros, whose RMS is 0
 
 

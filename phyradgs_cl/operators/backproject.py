@@ -21,12 +21,12 @@ _BYTES_A_LAUNCH = 1 << 28  # most bytes of frames that are uploaded together
 _VIEWS_SHARE = 0.25  # fraction of the free device memory for uploaded frames; the volume needs the rest
 # Most voxels along z that a work-item sums in the kernels for upright columns of voxels (see ``_UPRIGHT``).
 _BLOCK_VOXELS = 128
-_COLUMN_ROWS = 512  # most detector rows to which the voxels of a work-item of the upright kernels may project
-# A column of voxels along z is upright if over its height u·depth and depth change by at most this fraction of the depth.
+_COLUMN_ROWS = 512  # in the upright kernels, a work-item's voxels project to at most this many detector rows
+# A column of voxels along z is upright if u·depth and depth change along it by at most this fraction of the least depth.
 _UPRIGHT = 1e-7
 # Largest lean of the image of a column of voxels, in detector columns per row. Beyond it the general kernel is faster.
 _MOST_LEAN = 0.25
-LINE_SAMPLES = 4  # time that a voxel takes with one pose per line, over its time with one pose per view
+LINE_SAMPLES = 4  # time of a voxel with one pose per line, divided by its time with one pose per view
 _WIDEST = 16  # number of voxels along z in the widest vector, which may reach beyond the volume
 Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
@@ -35,11 +35,12 @@ def backproject(
     rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid, *, is_parallel: bool = False,
     power: int = 2,
 ) -> SameArray:
-    """Returns Σ_f weight_f / z^power · frame_f(u, v) at every voxel centre. z is the voxel's depth over the detector's.
+    """Returns Σ_f weight_f / z^power · frame_f(u, v) at every voxel centre. z = (voxel's depth)/(detector's depth), 1 in a
+    parallel beam.
 
     frames (F, rows, columns) are interpolated bilinearly, and 0 outside; pose (F, 12) mm; weight (F,). power: 2 for FDK's
-    distance weight, or 1. In a parallel beam z is 1. The volume (nz, ny, nx) float32 is on the device if ``frames`` are,
-    else on the host. Raises OutOfMemoryError if not even the smallest part of the volume fits."""
+    distance weight, or 1. The volume (nz, ny, nx) float32 is on the device if ``frames`` are, else on the host. Raises
+    OutOfMemoryError if not even the smallest part of the volume fits."""
     matrices = voxel_matrices(pose, grid, is_parallel)
     block, leans = (0, False) if rt.pixel_items else _upright_block(matrices, grid)
     views = Views(frames, bool(block), matrices, weight)

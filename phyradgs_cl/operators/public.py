@@ -1,4 +1,5 @@
-"""Operators as user programs see them: y = A(x), transposes, some frames, SciPy; for arrays on host or device."""
+"""Operators as user programs see them: y = A(x) for arrays on host or device, A's transpose or derivative, A for some of the
+frames only, and A as an operator of SciPy."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -185,8 +186,8 @@ class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy ha
     ``A.T`` is the exact transpose. For SciPy, ``A.shape`` is (size of y, size of x), and vectors are flat, float32, in C
     order: ``scipy.sparse.linalg.lsqr(A, y.ravel())``, ``A @ x.ravel()``, ``A.T @ A``.
 
-    rt, domain, range_, parts: as for ``Operator``. forward, adjoint: the functions from x to y and from y to x. Raises
-    InputError as ``Operator`` does."""
+    rt, domain, range_, and frames and intensity in ``parts``: as for ``Operator``. forward, adjoint: the functions from x
+    to y and from y to x. Raises InputError as ``Operator`` does."""
 
     def __init__(
         self, rt: Runtime, domain: tuple[str, Shape], range_: tuple[str, Shape], forward: Map, adjoint: Map,

@@ -20,8 +20,8 @@ _RANGE = (1e-12, 10)  # least and largest learning rate: 0 could not decay by a 
 class Rates(checks.Checked):
     """The (first, last) learning rate of each kind of parameter, in internal units (half-sides of the volume).
 
-    The default rates are four to ten times the published ones, which are made for 20,000 iterations and more. In 3,000
-    iterations, the published rates end 1 to 2 dB lower (docs/results/settings.md)."""
+    The default rates are four to ten times the published ones, which are made for 20,000 iterations and more. After 3,000
+    iterations at the published rates, the PSNR is 1 to 2 dB lower (docs/results/settings.md)."""
 
     PREFIX = "rates."
 
@@ -45,20 +45,22 @@ PUBLISHED_RATES = Rates(
 
 
 BETA1, BETA2 = 0.9, 0.999  # Adam's decay rates of the first and second moments, as in its paper
-EPSILON = 1e-15  # keeps Adam from dividing by a second moment of 0
+EPSILON = 1e-15  # added to the root of the second moment, which may be 0, before Adam divides by it
 
 
 def folded_rates(rates: np.ndarray, step: int) -> np.ndarray:
     """Returns the learning rates (11,) times both of Adam's bias corrections. step: the number t of the step, from 1.
 
-    m̂/√v̂ = m/√v · √(1−β2^t)/(1−β1^t). This scales ε as well, which does not matter at 1e-15."""
+    With the moments m and v, and m̂ and v̂ after bias correction, m̂/√v̂ = m/√v · √(1−β2^t)/(1−β1^t). The factor scales ε as
+    well, which does not matter at 1e-15."""
     return np.asarray(rates * np.sqrt(1 - BETA2**step) / (1 - BETA1**step))
 
 
 def adam_step(
     raw: np.ndarray, gradients: np.ndarray, moments: np.ndarray, rates: np.ndarray, step: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the raw parameters (11, G) and moments (2, 11, G) after one step: the float64 twin of ``DeviceAdam.step``."""
+    """Returns raw parameters (11, G) and moments (2, 11, G) after one step down ``gradients`` (11, G): the float64 twin of
+    ``DeviceAdam.step``."""
     first = BETA1 * moments[0] + (1 - BETA1) * gradients
     second = BETA2 * moments[1] + (1 - BETA2) * gradients**2
     stepped = raw - folded_rates(rates, step)[:, None] * first / (np.sqrt(second) + EPSILON)
@@ -86,8 +88,8 @@ class DeviceAdam:
         self, raw: DeviceArray, parameters: DeviceArray, gradients: DeviceArray, statistics: DeviceArray,
         count: int, stride: int, *, density_weight: float,
     ) -> None:
-        """Turns dL/d(parameters) in ``gradients`` into dL/d(raw), including the penalty on the mean density, and adds to
-        density control's ``statistics``."""
+        """Turns dL/d(parameters) in ``gradients`` into dL/d(raw). Adds the gradient of ``density_weight`` times the mean
+        density there, and this iteration's part to density control's ``statistics``."""
         share = 1.0 / max(count, 1)
         self.rt.launch(
             self._chain, stride // self.rt.lanes, raw, parameters, count, stride,
@@ -114,11 +116,11 @@ class DensityControl(checks.Checked):
 
     ``every``: iterations between two rounds of cloning, splitting and removing; 0 keeps the first population. Rounds begin
     after ``start_iteration``, end before the fraction ``stop_fraction`` of the run, and add Gaussians up to
-    ``max_gaussians``. Gaussians whose statistic reaches ``threshold`` are split if their longest scale is above
-    ``split_scale``, else cloned. The parts of a split are smaller by ``split_factor``. Gaussians fainter than
-    ``prune_density`` (over FDK's 99.9th percentile) are removed, and those whose longest scale is more than ``prune_aspect``
-    times their shortest (0: never). Such thin sheets and needles lie between the rays, where no measurement constrains them,
-    and are visible in the volume."""
+    ``max_gaussians``. A Gaussian whose statistic (``control_density``) reaches ``threshold`` is split if its longest scale
+    exceeds ``split_scale``, else cloned. A split divides its scales by ``split_factor``. Gaussians fainter than
+    ``prune_density`` times the FDK volume's 99.9th percentile are removed, and those whose longest scale is more than
+    ``prune_aspect`` times their shortest (0: never). Such thin sheets and needles lie between the rays, where no measurement
+    constrains them, and are visible in the volume."""
 
     PREFIX = "control."
 
@@ -211,7 +213,7 @@ def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray
 
 
 def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:
-    """Draws one child (11, S) of each Gaussian (11, S): smaller, half as dense, its centre drawn from the parent."""
+    """Draws one child of each Gaussian, both (11, S): smaller, half as dense, its centre drawn from the parent's density."""
     child: np.ndarray = rows.copy()
     child[g.MEAN] += rotate(rows[g.QUATERNION], rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE])
     child[g.SCALE] /= control.split_factor

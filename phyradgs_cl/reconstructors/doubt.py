@@ -53,9 +53,10 @@ _PARTS = {"gaussians": Gaussians, "deformation": Deformation, "states": States}
 _CHECKED_FRAMES = 16  # number of frames whose held-out pixels correct σ
 _AROUND = 9  # side in pixels of the squares over which a pixel's bar is averaged, because a bar of two samples is rough
 _UNEXPLAINED = 2.0  # a residual above this many times the noise causes a warning; simulations had at most 1.2
-_NOISY = 0.03  # larger noise over line integrals causes a warning: at 0.05 to 0.06, σ held 43 to 59 % of errors, not 68 %
+# A larger quotient noise/(line integrals) causes a warning: at 0.05 to 0.06, σ held 43 to 59 % of errors, not 68 %.
+_NOISY = 0.03
 _WIDEST = 4.0  # σ is widened by at most this factor: held-out pixels farther off have other causes
-# Views per voxel along a slice's longer side from which on a law needs no factor for few views: 25 views for 64 voxels.
+# Number of views per voxel of a slice's longer side from which on a law needs no factor for few views: 25 for 64 voxels.
 _USUAL_VIEWS = 25 / 64
 _FEWEST_VIEWS = 0.1  # fewer views per voxel count as this many, because no law was measured there
 _SHARE, _NORMAL_95 = 0.68, 1.96  # fraction of errors within σ; standard deviations that hold 95 % of normal noise
@@ -65,8 +66,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Law:
-    """Fitted factors with which ``spread`` computes σ: of its parts shape, noise, density and slope. near: smoothing (std)
-    in voxels. multiple_95: the 95 % bar over σ. sparse: how much σ grows if the scan has few views for its grid."""
+    """Fitted factors with which ``spread`` computes σ: of its parts shape, noise, density and slope. near: the smoothing's
+    standard deviation in voxels. multiple_95: (95 % bar)/σ. sparse: how much σ grows if views are few (``factor``)."""
 
     shape: float
     noise: float
@@ -127,8 +128,9 @@ def finer(volume: Array) -> NDArray[np.float32]:
 def halves(scan: Scan) -> tuple[Array, Array]:
     """Returns the frame numbers of both halves of a scan: every second view in the order of angles, and the others.
 
-    Views of one angle go to the same half: if both halves had them, their streaks would not differ. An orbit that travels
-    along the axis is divided in the order of time, because each turn sees another height."""
+    Views of one angle go to the same half: if both halves had them, their streaks would not differ. Frames are divided in
+    the order of time if there are fewer than 4 angles, or if the orbit travels along the axis: each turn then sees another
+    height."""
     pose = middle_poses(scan)
     view, angles_rad = distinct_views(azimuth_rad(pose))
     if len(angles_rad) < FEWEST_FRAMES or travels(pose[:, None, None], scan.projections.shape[1], scan.is_parallel):

@@ -21,7 +21,7 @@ SILENT_S = 10.0  # longest time in s between two reports of a run with slow iter
 
 
 class Stepwise(Protocol):
-    """What ``Loop`` needs of an iterative method, between its start and its result. iterations: number in a whole run."""
+    """What ``Loop`` needs of an iterative method between its start and its result. iterations: how many a whole run has."""
 
     iterations: int
 
@@ -113,7 +113,7 @@ class Loop:
         """Records and reports the step that began at iteration ``before``. Returns True if the report asks to stop. Raises
         NumericalError if the method's ``quantity`` is not finite."""
         is_recorded = self._reaches(self.record_every, before)
-        is_slow = time.perf_counter() - self._reported > SILENT_S and self.ranks.size == 1  # each rank has its own clock
+        is_slow = time.perf_counter() - self._reported > SILENT_S and self.ranks.size == 1  # ranks have clocks of their own
         is_reported = self._reaches(self.report_every, before) or (is_slow and self.method.iteration > before)
         if not (is_recorded or is_reported):
             return False

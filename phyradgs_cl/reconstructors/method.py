@@ -187,7 +187,8 @@ def method_name(method: object) -> str:
 
 
 def check_able(option: str, method: object, ability: str, kind: str, remedy: str = "choose one of them") -> None:
-    """Raises InputError about ``option`` if the method lacks ``ability``, a field of ``Method``, which the option needs."""
+    """Raises InputError about ``option`` if the method lacks ``ability``, a field of ``Method``, which the option needs.
+    kind: what the error calls the methods that have the ability."""
     if not getattr(method_of(method), ability):
         names = ", ".join(name for name, one in METHODS.items() if getattr(one, ability))
         raise InputError(option, f"--method {method_name(method)}", f"{kind}: {names}", remedy)

@@ -147,8 +147,9 @@ def _having(option: str) -> str:
 
 
 def _converted(current: Any, value: Any, subject: str) -> Any:
-    """Returns ``value`` in the type of ``current``: number, word, tuple or nested table. None leaves it unchanged."""
-    if current is None:  # the option's type is unknown, so the options check it
+    """Returns ``value`` in the type of ``current``: number, word, tuple or nested table. Raises InputError about ``subject``
+    for a value that does not fit. A ``current`` of None or of another type accepts every value."""
+    if current is None:  # the option's type is unknown: its dataclass checks the value
         return value.item() if isinstance(value, np.generic) else value
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
@@ -160,7 +161,7 @@ def _converted(current: Any, value: Any, subject: str) -> Any:
         if not isinstance(value, (list, tuple)) or len(value) != len(current):
             raise InputError(subject, checks.short_repr(value), f"a list of {len(current)} numbers")
         return tuple(_converted(c, v, subject) for c, v in zip(current, value, strict=True))
-    if type(current) not in _EXPECTED:  # a user's own options, which check themselves
+    if type(current) not in _EXPECTED:  # a type that only a user's own options have: their dataclass must check the value
         return value
     expected, fits = _EXPECTED[type(current)]
     if not fits(value):
@@ -183,7 +184,7 @@ _EXPECTED: dict[type, tuple[str, Callable[[Any], bool]]] = {
 
 @dataclass(frozen=True, eq=False)
 class InitialVolume:
-    """A volume (nz, ny, nx) in 1/mm from which a method starts, and its grid. facts: the file it came from."""
+    """A volume (nz, ny, nx) in 1/mm from which a method starts, and its grid. facts: the file from which it came."""
 
     values: np.ndarray
     grid: Grid
@@ -192,7 +193,7 @@ class InitialVolume:
 
 @dataclass(frozen=True, eq=False)
 class ObjectMotion:
-    """How the object moves during the scan. facts: the file it came from."""
+    """How the object moves during the scan. facts: the file from which ``deformation`` came."""
 
     deformation: Deformation
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -204,7 +205,7 @@ class RunPlan:
     options, checked. preprocessing: changes of the frames before the method.
 
     Raises InputError for a seed out of range, for an object that moves with a method for objects at rest, and for error bars
-    if their runs cannot differ."""
+    with a first volume or with 0 iterations, because their runs would not differ as they should."""
 
     method: "str | Callable[..., Any]"
     options: Any

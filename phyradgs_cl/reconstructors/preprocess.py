@@ -48,7 +48,7 @@ class Preprocessing(PrepareOptions, GridChoice):
         return {**stated, **self.step_facts()}
 
     def check_written(self) -> None:
-        """Raises InputError for options that mean nothing for a scan that is written to a file."""
+        """Raises InputError for ``holdout`` and ``doubt``, which mean nothing for a scan that is written to a file."""
         for one in (one for one in fields(self) if "of_method" in one.metadata and getattr(self, one.name)):
             found, remedy = "a scan that is prepared, without a method", "give it to the reconstruction instead"
             raise InputError(flag_of(one.name), found, "a reconstruction", remedy)

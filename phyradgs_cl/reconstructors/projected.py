@@ -45,7 +45,7 @@ class FramePair:
 
     @property
     def relative(self) -> float:
-        """``rms`` over the root mean square of the measured frame."""
+        """``rms`` divided by the root mean square of the measured frame's valid pixels, or by 1 if these are all 0."""
         return self.rms / (_rms(self.measured[self.valid]) or 1.0)
 
 
@@ -87,7 +87,8 @@ def frame_pairs(
 
 
 def held_out(scan: Scan, percent: float) -> np.ndarray:
-    """Draws about ``percent`` % of the valid pixels, bool (F, v, u), the same in every run. Raises InputError for none."""
+    """Draws about ``percent`` % of the valid pixels, bool (F, v, u), the same in every run. Raises InputError if it draws
+    none."""
     drawn = np.random.default_rng(_HOLDOUT_SEED).random(scan.projections.shape, np.float32) < percent / 100
     held: np.ndarray = drawn & scan.valid
     if not held.any():

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 VolumeMap = Callable[[np.ndarray, Grid], tuple[np.ndarray, Grid]]
 """A function from a volume and its grid to another volume and grid."""
 HELD_OUT = "held_out"
-"""Key of a result's facts, as are the next ones: the error on held-out pixels."""
+"""Key of a result's facts: the errors on held-out pixels, as ``holdout_errors`` returns them."""
 COMPARED = "compared"
 """Key of facts: how the volume was compared with the scan's reference, if not voxel by voxel."""
 MOTION_FOUND = "motion_found"
@@ -153,7 +153,7 @@ class Reconstruction:
         """Returns a figure: the three middle slices in 1/mm with a scale bar in mm, and the convergence if it is recorded.
 
         scan: the scan of the result. It adds a frame, the frame's residual and, if the scan has a reference (nz, ny, nx) in
-        1/mm, the truth and the difference. device: where the volume is projected for the residual.
+        1/mm, this reference and the difference. device: where the volume is projected for the residual.
 
         Raises InputError if ``scan`` is no Scan or has no such frame."""
         from phyradgs_cl.reconstructors.plot import plot_result

@@ -172,8 +172,8 @@ def _with_defaults(identity: dict[str, Any]) -> dict[str, Any]:
 
 
 def _initial(plan: RunPlan, initial: InitialVolume, grid: Grid) -> np.ndarray:
-    """Returns the first volume, resampled onto the scan's ``grid``. Raises InputError for a method that cannot start from
-    one."""
+    """Returns the first volume, resampled onto the scan's ``grid``. Raises InputError for a method that cannot start from a
+    volume, and for a volume that does not meet the grid."""
     check_able("--initial", plan.method, "takes_initial", "a method that starts from a volume", "leave --initial out")
     if initial.grid == grid:
         return initial.values
@@ -204,7 +204,8 @@ def _check_margin(plan: RunPlan) -> None:
 
 
 def _within(volume: np.ndarray, grid: Grid, box: Grid) -> tuple[np.ndarray, Grid]:
-    """Returns the part of a volume (nz, ny, nx) that lies in the box. Voxels may be coarser than those of the box."""
+    """Returns the part of a volume (nz, ny, nx) that lies in ``box``, and the part's grid. Voxels may be coarser than those
+    of ``box``."""
     if (part := shared_slices(grid, box)) is None:
         return volume, grid
     inner = volume[part]

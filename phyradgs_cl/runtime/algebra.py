@@ -16,9 +16,9 @@ from phyradgs_cl.runtime.memory import DeviceArray
 
 A = TypeVar("A")
 Shape = tuple[int, ...]
-_CPU_SPAN = 1 << 14  # least number of elements that a CPU's work-item sums, so that its start takes little of its time
+_CPU_SPAN = 1 << 14  # least number of array elements that a CPU's work-item sums: starting a work-item then costs little
 _GPU_GROUP = 256  # largest work-group on a GPU, in work-items
-_GPU_GROUPS = 512  # most work-groups (on a GPU) or work-items (on a CPU) that share a sum
+_GPU_GROUPS = 512  # most parts into which a sum is divided: work-groups on a GPU, work-items on a CPU
 _ITEMS = 64  # size of a work-group of element-wise kernels on a CPU, in work-items
 
 
@@ -34,8 +34,8 @@ class Space(Protocol, Generic[A]):
     def full(self, shape: Shape, value: float) -> A: ...
 
     def place(self, shape: Shape) -> A | None:
-        """Returns device memory for an operator's result, its argument ``out``. Returns None on the host, where operators
-        allocate their results."""
+        """Returns uninitialised device memory, to pass to an operator as ``out``, where it writes its result. Returns None
+        on the host, where operators allocate their results."""
 
     def take(self, x: A, chosen: Sequence[int]) -> A:
         """Returns the entries of ``x`` with the indices ``chosen`` along its first axis, in the order of ``chosen``."""
@@ -138,7 +138,8 @@ class DeviceSpace:
         self._parts, self._whole, self._total = (rt.empty(count, np.float64) for count in (_GPU_GROUPS, 1, 1))
 
     def empty(self, shape: Shape) -> DeviceArray:
-        """Returns uninitialised memory. Queued work may still read it, which does no harm: the queue is in order."""
+        """Returns uninitialised memory, of a released array if one of this size is left. Queued work may still read that
+        array: the queue is in order, so what is written to the new array comes later."""
         unused = self._unused[int(np.prod(shape, dtype=np.int64))]
         memory = unused.pop() if unused else self.rt.empty(shape)
         array = DeviceArray(memory.buffer, tuple(shape), memory.dtype)

@@ -24,10 +24,10 @@ log = logging.getLogger(__name__)
 Sides = tuple[int, ...]
 
 LANE_CHOICES = (1, 4, 8, 16)  # numbers of floats that a kernel's vectors may have
-# The compiler's option that fuses multiply and add, and the line that marks sources which may use pairs of float32.
+# The compiler's option that fuses multiply and add, and the line of a source that includes arithmetic on pairs of float32.
 _FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'
 _TILE_ITEMS = 256  # largest work-group that shares a tile of pixels, in work-items
-_FEWEST_ITEMS = 32  # a device whose work-groups must be smaller than this is refused
+_FEWEST_ITEMS = 32  # least work-group, in work-items, that a kernel must allow if its launch asks for one as large or larger
 
 
 class Runtime:
@@ -37,12 +37,14 @@ class Runtime:
     - lanes: the number of floats in a kernel's vectors; None takes the device's width. It is 1 on GPUs, where neighbouring
       work-items do the work of a CPU's vector.
     - fp64: False makes kernels use pairs of float32 in place of float64, as on devices without float64.
-    - pixel_items: True gives each work-item one pixel (GPUs, needs ``lanes`` 1), False one line of pixels or more (CPUs).
+    - pixel_items: True gives each work-item one pixel (needs ``lanes`` 1), False one line of pixels or more (for CPUs). None
+      takes False on a CPU, else True.
     - memory: the largest sum of the sizes of all buffers, in bytes or as text like 2GiB. profile: True times every kernel.
     - ranks: the MPI processes that work on the same scan, each with its own Runtime. On a machine with several equal
       devices, each rank takes another one.
 
-    Raises DeviceError for a device that does not exist or cannot be opened, and for other ``lanes``."""
+    Raises DeviceError for a device that does not exist or cannot be opened, and for ``lanes`` other than 1, 4, 8 or 16, or
+    other than 1 with ``pixel_items``. Raises InputError for a ``memory`` that is no size."""
 
     # Most samples of rays in one GPU launch: a display driver kills launches of seconds, and these take 0.1 s on a slow GPU.
     most_samples = 2**29
@@ -91,7 +93,7 @@ class Runtime:
         return self._kernels.setdefault(key, Kernel(*key))
 
     def compile(self, kernel: Kernel) -> "cl.Kernel":
-        """Returns the kernel in built form. Building a program builds all of its kernels."""
+        """Returns pyopencl's built kernel. The first call for a program and its options builds all of its kernels."""
         if kernel.built is None:
             key = (kernel.program, kernel.options)
             if key not in self._programs:
@@ -126,8 +128,8 @@ class Runtime:
 
     @staticmethod
     def _allowed(source: str, options: tuple[str, ...]) -> list[str]:
-        """Returns the build options for a source. Where it uses pairs of float32, the option that fuses multiply and add is
-        left out: fusing would destroy the pairs' low parts, and some drivers ignore the pragma against it."""
+        """Returns ``options``, without fusing of multiply and add if the source uses pairs of float32 in place of float64.
+        Fusing would destroy the pairs' low parts, and some drivers ignore the pragma against it."""
         has_pairs = "-DFP64=0" in options and _PAIRS in source
         return [option for option in options if not (has_pairs and option == _FUSING)]
 
@@ -148,12 +150,12 @@ class Runtime:
         return array
 
     def room(self) -> Room:
-        """Returns the device memory that an operator may use now, in all and in one buffer, in bytes."""
+        """Returns how many bytes of device memory an operator may use now: in all buffers together, and in one."""
         return self.ledger.room(self.device.largest_allocation_bytes)
 
     @property
     def peak_bytes(self) -> int:
-        """The most device memory in use at one time, since the start or the last ``reset_peak``."""
+        """The most device memory in use at one time, in bytes, since the start or the last ``reset_peak``."""
         return self.ledger.peak_bytes
 
     def reset_peak(self) -> None:
@@ -349,8 +351,9 @@ def default_lanes(device: DeviceInfo) -> int:
 
 
 def _parts(items: Sides, group: Sides, pieces: int) -> Iterator[tuple[Sides | None, Sides]]:
-    """Divides a launch of ``items`` into ``pieces`` or more, each of whole work-groups; into fewer if there are too few
-    groups. Yields each piece's first item and its number of items per axis. An undivided launch's first item is None."""
+    """Divides a launch of ``items`` work-items per axis into at least ``pieces`` parts of whole work-groups. With fewer
+    groups than ``pieces``, each group is a part. Yields (first item, number of items) of each part, both per axis. The
+    first item of an undivided launch is None."""
     if pieces <= 1:
         yield None, items
         return

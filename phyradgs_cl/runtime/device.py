@@ -26,8 +26,8 @@ _targets: dict[int, str | None] = {}  # the processor for which PoCL builds kern
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """One OpenCL device, with the properties by which one is chosen. vector_width: floats. by_default: whether it may be
-    chosen where the user names no device."""
+    """One OpenCL device, with the properties by which a device is chosen. vector_width: the number of floats in its native
+    vectors. by_default: whether it may be chosen where the user names no device."""
 
     index: int
     name: str
@@ -45,8 +45,8 @@ class DeviceInfo:
 
     @property
     def rank(self) -> tuple[int, int, int, int, int]:
-        """Numbers by which devices are compared, the first one first; the best device has the largest. They are: chosen
-        by default or not, GPU before CPU, memory of its own or not, the width of its vectors, its compute units."""
+        """The key by which devices are compared: the best device has the largest. Entries: 1 if it may be chosen by default;
+        2 for a GPU, 1 for a CPU; 1 if it has memory of its own; floats in its vectors; its compute units."""
         kind = {"gpu": 2, "cpu": 1}.get(self.kind, 0)
         unified = bool(self.handle.host_unified_memory)
         return (int(self.by_default), kind, int(not unified), self.vector_width, self.compute_units)
@@ -74,7 +74,7 @@ def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, s
     wish (or the environment variable PHYRADGS_DEVICE): an index, ``cpu``, ``gpu``, a part of a device's or platform's
     name, or a list of these with commas. Without it, the best device is taken. turn: the number k of this process, from 0,
     among the run's processes on this machine. Process k takes entry k of a list. If ``wish`` is neither a list nor an
-    index, process k takes the k-th device of the same name after the best one. Both counts start again at the end."""
+    index, process k takes the k-th device of the same name after the best one. After the last comes the first again."""
     source = "--device"
     if not wish:
         wish, source = os.environ.get(DEVICE_VARIABLE), DEVICE_VARIABLE
@@ -160,7 +160,8 @@ def warn_of_fault(device: DeviceInfo) -> None:
 
 
 def environment(device: DeviceInfo) -> dict[str, Any]:
-    """Returns the versions of program, interpreter and libraries, the device, and the time."""
+    """Returns what is stored with a result: versions of the program, Python and libraries, the device's and processor's
+    names, the numbers of compute units and of cores, and the time in UTC."""
     return {
         "version": __version__, "python": platform.python_version(), "numpy": np.__version__,
         "pyopencl": _installed("pyopencl"), "pocl": _installed("pocl-binary-distribution"),

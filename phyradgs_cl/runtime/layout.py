@@ -41,7 +41,8 @@ def move(
     rt: Runtime, source: tuple[DeviceArray, Strides], target: tuple[DeviceArray, Strides],
     shape: Sequence[int], *, turned: bool = False,
 ) -> None:
-    """Copies (nz, ny, nx) floats on the device, from one array and layout to another. turned: transposes to (nz, nx, ny)."""
+    """Copies floats of ``shape`` (nz, ny, nx) on the device from ``source`` to ``target``, each an array and its strides.
+    turned: transposes to (nz, nx, ny)."""
     nz, ny, nx = (int(n) for n in shape)
     (from_array, from_strides), (to_array, to_strides) = source, target
     ends = from_array, from_strides.vector(), to_array, to_strides.vector(), np.int32(ny), np.int32(nx)

@@ -253,7 +253,7 @@ def is_cl_array(value: object) -> bool:
 def adopted(name: str, array: Any, queue: "cl.CommandQueue") -> DeviceArray:
     """Returns pyopencl's float32 Array (C order) as a DeviceArray on the same memory. An Array with an offset is copied.
 
-    Raises InputError about ``name`` for an Array of another context, queue or type."""
+    Raises InputError about ``name`` for an Array of another context, queue, type or order."""
     remedy = "make it with the operator's to_device, or on its queue"
     if array.context != queue.context:
         raise InputError(name, "an Array of another OpenCL context", "the operator's context", remedy)
@@ -267,7 +267,7 @@ def adopted(name: str, array: Any, queue: "cl.CommandQueue") -> DeviceArray:
 
 
 def lent(array: DeviceArray, queue: "cl.CommandQueue") -> Any:
-    """Returns a DeviceArray as pyopencl's Array on the same memory, which counts as used until the Array is released."""
+    """Returns a DeviceArray as pyopencl's Array on the same memory, which counts as used while the Array exists."""
     import pyopencl.array
 
     shared = pyopencl.array.Array(queue, array.shape, array.dtype, data=array.buffer)

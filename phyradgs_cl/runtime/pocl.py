@@ -30,7 +30,7 @@ from phyradgs_cl.parallel import Launch, launched
 
 log = logging.getLogger(__name__)
 
-_RECORD_BYTES = 2048  # number of bytes of PoCL's device record that are searched for the name
+_RECORD_BYTES = 2048  # number of bytes of PoCL's record of a device that are searched for the processor's name
 _LONGEST_TEXT = 64  # most bytes of a text that are read at an address in PoCL's record of a device
 _TRIPLE = re.compile(rb"x86_64-[a-z0-9_]+-linux-gnu\Z")
 _PROCESSOR = re.compile(rb"[a-z0-9][a-z0-9.-]*\Z")
@@ -160,7 +160,7 @@ def _temporary_cache() -> Path:
 
 
 def library_target() -> str | None:
-    """Returns LLVM's name of the processor for which the library that PoCL uses here was compiled; None if not x86-64."""
+    """Returns LLVM's name of the processor for which PoCL's library for this machine was compiled. None: not x86-64."""
     if platform.machine() not in ("x86_64", "AMD64"):
         return None
     flags = _cpu_flags()
@@ -168,7 +168,7 @@ def library_target() -> str | None:
 
 
 def use_library_target(device_address: int) -> str | None:
-    """Writes the name of the library's processor into a PoCL 3.0 CPU device's record, and returns it.
+    """Writes the name of the library's processor into PoCL 3.0's record of a CPU device, and returns this name.
 
     The record has a pointer to LLVM's target triple and, next to it, one to the processor's name. If the two are not found,
     nothing is changed and None is returned. PoCL 3.1 and later name the library's processor themselves."""

@@ -10,7 +10,7 @@ from phyradgs_cl.runtime.opencl import cl
 
 _FOLD_AT = 20_000  # number of events that are kept before their times are added up: adding up waits for the device
 _COPY_BYTES = 1 << 26  # size of the copy that measures the memory's rate: larger than most caches
-_STEPS = 20_000  # length of each chain of multiply-adds that measures the arithmetic rate
+_STEPS = 20_000  # multiply-adds in each chain that measures the arithmetic rate; a quarter of them if ``lanes`` is 1
 _REPEATS = 5  # number of runs of each measurement; the fastest counts
 
 
@@ -62,8 +62,8 @@ class Rates:
 
 
 def profile_text(uses: dict[str, KernelUse], wall_s: float) -> str:
-    """Formats what ``Profile.uses`` returns as a table. Its last line compares the kernels' time with ``wall_s``, the time
-    of the run in s."""
+    """Returns a table of the kernels' ``uses``. Its last line compares the sum of their seconds with ``wall_s``, the run's
+    time in s."""
     busy_s = sum(use.seconds for use in uses.values())
     rows = [("kernel", "launches", "seconds", "share", "ms each", "GB/s")]
     for name, use in uses.items():

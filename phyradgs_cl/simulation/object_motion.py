@@ -17,7 +17,7 @@ _SETTLING_NODES = 200  # number of times at which drying's weights are stored: e
 _SPACINGS = 8.0  # breathing and drying are smooth, so this many spacings of control points along the longest side are enough
 _SLIDING_SPACINGS = 16.0  # sliding has a sharp edge, which becomes about three control points wide
 _ASIDE = 1 / 3  # breathing moves the object along y, too, by this fraction of its motion along z
-_PERIODS = (0.5, 1.5)  # a random breath lasts at least the first and at most the second number of mean periods
+_PERIODS = (0.5, 1.5)  # least and largest duration of a random breath, in mean periods
 _FADE = 3.0  # beyond the box, motion falls to 0 over this many amplitudes: with a slope of a third, the field cannot fold
 _MOST_CYCLES = 100_000  # most cycles of breathing or sliding in a scan: more would mean a wrong unit of time
 _COMMON = ("kind", "amplitude_mm", "amplitude", "states")
@@ -38,10 +38,10 @@ class ObjectMotion(checks.Checked):
     surroundings at rest.
 
     - amplitude_mm: the limit of the displacement along z. None takes ``amplitude`` times half of the box's shortest side.
-    - period_s: the time of a breath, or of sliding up and down. jitter: spread (std) of a breath's period over ``period_s``.
+    - period_s: the time of a breath, or of sliding up and down. jitter: (standard deviation of breaths' periods)/period_s.
     - hysteresis: the delay of the motion along y, in periods.
     - settling_s: the time in which drying goes 63 % of its way. None takes a third of the scan.
-    - radius: the sliding cylinder's radius, over half of the shortest side. seed: the seed of the jitter's random numbers.
+    - radius: (radius of the sliding cylinder)/(half of the box's shortest side). seed: of the jitter's random numbers.
     - states: at how many times the true volume is stored.
 
     Raises InputError for an unknown kind and for numbers out of range."""
@@ -95,8 +95,8 @@ class ObjectMotion(checks.Checked):
 
     def _sliding_mm(self, places: list[Array], height: Array) -> list[Array]:
         """Returns the control vectors of a cylinder about the z axis that moves along z, for unit amplitude. Its edge is
-        about three control points wide. places: z, y, x of control points from the box's middle, over half its shortest
-        side."""
+        about three control points wide. places: z, y, x of control points from the box's middle, in units of half its
+        shortest side."""
         _, y, x = places
         return [_vectors(z=(np.hypot(x, y) < self.radius).astype(float))]
 
@@ -148,7 +148,7 @@ def load_object_motion(path: str | Path) -> ObjectMotion:
 
 
 def _breath(phase: Array) -> Array:
-    """Returns a breath's displacement over its amplitude at a phase in cycles: 0 at whole numbers, 1 half-way between."""
+    """Returns (displacement)/(amplitude) of a breath at a phase in cycles: 0 at whole numbers, 1 half-way between."""
     return np.asarray(1 - np.cos(np.pi * phase) ** 4)
 
 
@@ -160,7 +160,8 @@ def _breathing_mm(places: list[Array], height: Array) -> list[Array]:
 
 
 def _drying_mm(places: list[Array], height: Array) -> list[Array]:
-    """Returns two sets of control vectors of unit amplitude: downwards, growing with height, and towards the z axis."""
+    """Returns two sets of control vectors of unit amplitude: downwards, growing with height, and towards the z axis.
+    places and height: as in ``_sliding_mm`` and ``_breathing_mm``."""
     _, y, x = places
     return [_vectors(z=height), _vectors(x=x / 2, y=y / 2)]
 

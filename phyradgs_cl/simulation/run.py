@@ -43,7 +43,7 @@ _LARGEST_PEAK = 1e4  # limit of --peak, a line integral
 _LARGEST_NOISE = 1e9  # limit of --electronic-noise, in counts
 _SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12  # limits of --dose, in photons per pixel
 _LARGEST_DETECTOR = 32_000  # limit of --detector, in pixels along a side of the panel
-_SLACK = 1.001  # a warning is logged if an exposure's arc over the turn from frame to frame exceeds this; 1 + rounding
+_SLACK = 1.001  # a warning is logged if (exposure's arc)/(turn from frame to frame) exceeds this: 1, and room for rounding
 _TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse", "turns")  # options that change the protocol
 _DATA_SHEET = ("first", "fps", "readout_ms")  # options in a data sheet's terms: first line read, frames/s, readout time
 
@@ -155,10 +155,11 @@ def simulated_scan(
     size: int | None = None, pixel_samples: int = 0, name: str = "volume",
     report: Callable[[int, int], None] = lambda done, total: None
 ) -> Scan:
-    """Returns a scanner's scan of a phantom (given by name or as an object) or of a volume. The truth is its reference.
+    """Returns a scanner's scan of a phantom (given by name or as an object) or of a volume. The scan's ``reference`` is the
+    true volume.
 
     name: the volume's name, for titles. size: voxels along the longest side of grid and reference; None: the scanner's or
-    the volume's. pixel_samples: rays along each side of a pixel; 0 chooses them by the size of the truth's voxels. report:
+    the volume's. pixel_samples: rays along each side of a pixel; 0 chooses them by the size of the grid's voxels. report:
     called with the numbers of frames done and in all. Warns of an inverse crime (``Scene.warn_of_inverse_crime``)."""
     if size is not None:
         checks.within("--size", size, 1 if isinstance(of, Volume) else _SMALLEST_PHANTOM, _LARGEST_GRID)
@@ -209,9 +210,9 @@ def simulate(
 ) -> Scan:
     """Returns a scan of the object that ``source`` projects, with the noise and effects that ``options`` ask for.
 
-    reference (nz, ny, nx): the truth in 1/mm, which ``peak`` scales too. bone: projects the object's bone alone, as a beam
-    of many energies needs it. Raises InputError for ``kvp`` without bone and for ``peak`` with an empty object, and
-    NumericalError for line integrals that are not finite."""
+    reference (nz, ny, nx): the object's true volume in 1/mm, which ``peak`` scales too. bone: projects the object's bone
+    alone, as a beam of many energies needs it. Raises InputError for ``kvp`` without bone and for ``peak`` if no line
+    integral is above 0, and NumericalError for line integrals that are not finite."""
     if options.kvp and bone is None:
         expected = "an object of voxels, whose dense ones are bone: foot, jaw or a volume"
         raise InputError("--kvp", "a phantom in closed form", expected, "leave it out")
@@ -270,8 +271,8 @@ def _gating(scan: Scan, scene: Scene) -> Gating:
 
 
 def default_time_samples(protocol: Protocol, grid: Grid, fastest_mm_per_s: float = 0.0) -> int:
-    """Returns at how many times, limited to 8 to 128, an exposure is sampled. From one time to the next, the volume's edge
-    and the fastest part of a moving object go at most half a voxel."""
+    """Returns at how many times, 8 to 128, an exposure is sampled. From one time to the next, the volume's edge and the
+    fastest part of a moving object go at most half a voxel, unless this would take more than 128 times."""
     path_mm = np.deg2rad(protocol.exposure_deg) * max(grid.size_mm[1:]) / 2
     path_mm = max(path_mm, fastest_mm_per_s * protocol.exposure_s)
     return int(np.clip(np.ceil(2 * path_mm / min(grid.voxel_size_mm)), 8, 128))

@@ -1,4 +1,4 @@
-"""Scenes: an object that may move, ready to be projected, with its grid and the truth."""
+"""Scenes: an object that may move, ready to be projected, with the grid to reconstruct on and the true volume."""
 
 import logging
 from collections.abc import Callable
@@ -47,7 +47,7 @@ class Scene:
     fastest_mm_per_s: float = 0.0
 
     def warn_of_inverse_crime(self) -> None:
-        """Warns where the projected voxels are no finer than the grid, which makes reconstructions look too good."""
+        """Warns if the projected voxels are not finer than the grid along any axis: reconstructions then look too good."""
         shape = self.source_shape
         if shape is None or any(n > m for n, m in zip(shape, self.grid.shape, strict=True)):
             return
@@ -63,8 +63,9 @@ def phantom_scene(
     """Returns the scene of a phantom, given as an object or by name, in the scanner's box, with ``size`` voxels per side.
 
     Phantoms in closed form are integrated exactly unless they deform. Other phantoms are projected from voxels at twice
-    ``size``, and the truth is their block mean. Pixels average ``pixel_samples``² rays over their area; 0 chooses the number
-    by the size of the truth's voxels. axis: the panel's readout axis. moves: returns the deformation; None: no motion."""
+    ``size``, and the reference is their block mean. Pixels average ``pixel_samples``² rays over their area; 0 chooses the
+    number by the size of the grid's voxels. axis: the panel's readout axis. moves: returns the deformation; None: no
+    motion."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
     if isinstance(phantom, MovingPhantom):
@@ -124,7 +125,7 @@ def _voxel_scene(
     rt: Runtime, volume: np.ndarray, fine: Grid, grid: Grid, title: str, deformation: Deformation | None,
     geometry: Geometry, axis: str, pixel_samples: int,
 ) -> Scene:
-    """Returns the scene of a volume (nz, ny, nx) on the grid ``fine``. The truth is its block means on ``grid``."""
+    """Returns the scene of a volume (nz, ny, nx) on the grid ``fine``. The reference is its block means on ``grid``."""
 
     def source_of(values: np.ndarray) -> FrameSource:
         return on_panel(geometry, grid, pixel_samples, lambda panel: on_one_panel(values, panel))

@@ -22,8 +22,8 @@ def launch_forward(
     rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, volume: DeviceArray,
     frames: DeviceArray, *, add: bool = False,
 ) -> None:
-    """Projects a padded volume, or a part of one (brick), to padded frames, those numbered ``frame_list``. add: adds to
-    these frames, as all bricks after the first must; else overwrites them."""
+    """Projects a padded volume, or a part of one (brick), to the padded frames numbered ``frame_list``. add: adds to these
+    frames, as all bricks after the first must; else overwrites them."""
     blocks = ceil_div(layout.width, rt.lanes)
     kernel = rt.kernel("rays", "rays_forward", **_defines(layout, cells))
     items = blocks, layout.lines, frame_list.size
@@ -38,7 +38,8 @@ def launch_adjoint(
     rt: Runtime, layout: RayLayout, cells: RayCells, frame_list: DeviceArray, frames: DeviceArray,
     volume: DeviceArray, *, add: bool = False,
 ) -> None:
-    """Backprojects padded frames, those numbered ``frame_list``, to a padded volume. add: adds to its values."""
+    """Backprojects the padded frames numbered ``frame_list`` to a padded volume. add: adds to the volume's values; else
+    overwrites them."""
     owned, kernel = _owners(rt, layout, cells)
     nz, ny, nx = layout.brick.shape
     columns, rows, slices = (ceil_div(n, side) for n, side in zip((nx, ny, nz), owned, strict=True))

@@ -27,8 +27,9 @@ class IntensityOperator:
     """Computes frames I(x), and the derivative J and Jᵀ at the volume x last given to ``expected``. Before that x is 0,
     where J averages line integrals.
 
-    Arguments and arrays are those of ``RayOperator``. The cells of a frame are divided into layers in which every line has
-    at most one cell. Softmax weights (F, rows, columns) are kept for each layer. projector: makes a layer's operator A_k."""
+    Arguments and arrays are those of ``RayOperator``. The cells of a frame are divided into layers k in which every line has
+    at most one cell. The softmax weights w_k exp(−p_k) / Σ_j w_j exp(−p_j), (F, rows, columns), are kept for each layer;
+    w_k: weights of its cells, p_k = A_k x. projector: makes a layer's operator A_k."""
 
     def __init__(
         self, rt: Runtime, grid: Grid, detector_shape: tuple[int, int], tables: Sequence[TimeCells],

@@ -19,7 +19,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, pitch_of
 
 _RAY_CELL_FLOATS = 16  # number of floats of a time cell in ``ray_constants``
 BORDER = 1  # width in voxels of the zeros around a volume in y and z, so that samples at its faces need no test
-_UPRIGHT = 1e-6  # a column of pixels counts as upright if it leans by at most this many voxels
+_UPRIGHT = 1e-6  # a column of pixels counts as upright if it leans by at most this many voxels over all lines
 _WIDEST = 16  # number of elements in the widest SIMD vector: tables are padded by as many, since vectors read past the end
 
 
@@ -96,7 +96,7 @@ class RayLayout:
         return (strides.start, *steps, strides.slice)
 
     def column_floats(self, axis: str) -> int:
-        """Returns how many floats a padded frame takes, stored column by column, of a panel that is read along ``axis``."""
+        """Returns the number of floats of a padded frame that is stored column by column. axis: along which it is read."""
         return (self.turned if axis == "rows" else self).frames_strides.slice
 
     def inside(self, flat: np.ndarray) -> np.ndarray:
@@ -142,7 +142,7 @@ class RayCells:
     def upload(
         cls, rt: Runtime, grid: Grid, tables: Sequence[TimeCells], rows_across: int | None = None
     ) -> "RayCells":
-        """Uploads the tables of all frames. rows_across: the number of rows with ``RayLayout.is_across``, else None."""
+        """Uploads the tables of all frames. rows_across: the panel's rows if ``RayLayout.is_across``, else None."""
         starts = np.concatenate([[0], np.cumsum([table.count for table in tables])])
         pose = np.concatenate([table.readout.poses(table.pose) for table in tables])
         weights = [table.weights_of(cell) for table in tables for cell in range(table.count)]

@@ -16,7 +16,7 @@ from phyradgs_cl.runtime import Array, DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pad_rows, unpad_rows
 
 _FRAMES_SHARE = 0.25  # fraction of the free device memory for a batch of frames if the volume does not fit as a whole
-_SLOTS_SHARE = 0.125  # fraction of the free device memory for slots
+_SLOTS_SHARE = 0.125  # fraction of the free device memory for slots, the line integrals of single poses
 _MOST_SLOT_FLOATS = 2**26  # most floats that all slots take at one time: more was not faster
 
 
@@ -25,8 +25,9 @@ class RayMemory:
     then.
 
     A volume that does not fit is cut into bricks, as large as fit together with some frames. slot_floats: the floats of
-    one frame's slots, 0 without slots. With slots the volume is also stored transposed, with z along rows, if both fit.
-    Several operators may share one memory if they run one after the other, since no call needs values of an earlier call."""
+    one frame's slots (line integrals of single poses), 0 without slots. With slots the volume is also stored transposed,
+    with z along rows, if both fit. Several operators may share one memory if they run one after the other, since no call
+    needs values of an earlier call."""
 
     def __init__(self, rt: Runtime, layout: RayLayout, most_frames: int, slot_floats: int = 0) -> None:
         self.rt, self.layout, self.most_frames = rt, layout, most_frames

@@ -16,7 +16,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pitch_of
 
 _SLOT_INTS, _SHARE_INTS = 8, 4  # integers per slot (cl/common/ray_column.h) and per share (cl/rays_slots.cl)
-_SAME_POSE = 10  # decimals to which two poses, divided by the largest number in any, must agree to count as the same
+_SAME_POSE = 10  # decimals to which two poses must agree to be one, after division by the largest number in all poses
 
 
 @dataclass(frozen=True, eq=False)

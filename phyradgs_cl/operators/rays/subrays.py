@@ -16,8 +16,9 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 SINGLE = (1, 1)
 _WIDEST = 1.25  # largest distance between neighbouring sub-rays in the grid's middle, in voxels
 _FARTHEST = 1.45
-"""Largest distance of rays, in voxels, without sub-rays. A common scanner with as many voxels as pixels has 1.43. The volume
-of least norm that fits such rays loses 4 % of its density at 1.5, 16 % at 1.9, and half at 2, where rays may miss voxels."""
+"""Largest distance between rays in the grid's middle, in voxels, for one ray per pixel. A common scanner with as many voxels
+as pixels has 1.43. The volume of least norm that fits the rays loses 4 % of its density at a distance of 1.5, 16 % at 1.9,
+and half at 2, where rays may miss voxels."""
 # Largest distance between rays, in voxels, if a method begins with the object's density: voxels without a ray keep it.
 _FARTHEST_OF_DENSE = 2.0
 _ROUNDING = 1e-3  # a distance may exceed its limit by this fraction, so that rounding does not add rays
@@ -42,9 +43,9 @@ def subrays_of(grid: Grid, tables: Sequence[TimeCells], *, is_dense: bool = Fals
 
 
 def _depth(grid: Grid, pose: np.ndarray, *, is_nearest: bool) -> np.ndarray:
-    """Returns the depth (F,) of the grid's middle from the source, as a fraction of the panel's; 0 if behind the source.
+    """Returns the depth (F,) of the grid's middle from the source, as a fraction of the panel's depth; 0 behind the source.
 
-    is_nearest: takes the nearest point of the ellipsoid that the grid's box contains, in place of the middle."""
+    is_nearest: takes the nearest point of the largest ellipsoid in the grid's box, in place of the middle."""
     normal = np.cross(pose[:, 6:9], pose[:, 9:12])
     to_panel = np.einsum("fi,fi->f", pose[:, 3:6] - pose[:, :3], normal)
     to_middle = np.einsum("fi,fi->f", np.array(grid.offset_mm[::-1]) - pose[:, :3], normal)

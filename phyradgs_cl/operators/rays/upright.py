@@ -50,8 +50,8 @@ def upright_of(
 
     The upright kernels need poses that serve several lines each, rays whose main axis is x or y, and detector columns
     nearly along z. If columns lean in a cone beam, the volume must lie between source and panel. fewest_lines: the number
-    of lines that a pose must serve on average, by default the width of a vector and at least ``FEWEST_LINES``. It has no
-    effect if the panel is read column by column, for which ``FEWEST_LINES`` or all lines suffice."""
+    of lines that a pose must serve on average, by default ``lanes``, the width of a vector, and at least ``FEWEST_LINES``.
+    If the panel is read column by column, that number is ``FEWEST_LINES``, or all lines of a panel with fewer."""
     served = sum(int((table.line_stop - table.line_start).sum()) for table in tables)
     lines = tables[0].lines
     fewest = fewest_lines or max(lanes, FEWEST_LINES)

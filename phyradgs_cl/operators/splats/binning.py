@@ -48,8 +48,8 @@ class TileLists:
         return self.splat_ids.size * int(np.prod(self.tile[:3], dtype=np.int64))
 
     def build(self, extents: DeviceArray, count: int, stride: int, cells: int = 1) -> None:
-        """Fills ``tile_offsets`` (tiles + 1,) and ``splat_ids`` from extents (6, stride) of ``count`` splats. cells: the
-        number of time cells from which each splat was projected.
+        """Fills ``tile_offsets`` (tiles + 1,) and ``splat_ids`` for ``count`` splats. extents (6, stride): a splat's first
+        and last pixel or voxel along x, y, z. cells: the number of time cells from which each splat was projected.
 
         Raises MemoryShortage for 2^31 list entries or more, since a smaller part of a volume may have fewer."""
         rt = self.rt

@@ -60,7 +60,7 @@ class DeviceCells:
     steps of its poses exchanged, so lines are always rows of the image.
 
     - matrices: one pose per cell. If ``moving``, three: the middle and both ends.
-    - line_times (C, 3, time_pitch): the integration times of the lines if ``moving``, else one element.
+    - line_times (C, 3, time_pitch): ``TimeCells.line_times`` with padded lines if ``moving``, else one element.
     - layers: number of layers for averaging intensities. layer_weights (layers, lines): weights of the cells in each.
     - fixed_conic: ``cells`` describe the pose that gives splats their shape; ``matrices`` have that pose, then the cell's.
     - shares (S, R), cell_states (C, poses): for an object that moves, the weights of its R displacement fields in S states,
@@ -173,7 +173,8 @@ class Layers:
         self._split = rt.kernel("intensity", "intensity_split", IMAGE_GUARD=GUARD)
 
     def images(self, cells: DeviceCells) -> DeviceArray:
-        """Returns memory for the layers of ``cells``. Each is GUARD zeros and an image (lines, pitch), then GUARD zeros."""
+        """Returns memory for the layers of ``cells``: for each layer GUARD zeros and an image (lines, pitch); GUARD zeros at
+        the end."""
         if cells.layers > self._count:
             self._count = cells.layers
             self._drawn, self._shares, self._by_layers = (

@@ -152,8 +152,8 @@ class SplatProjection(GaussianOperator):
 
     tables: the time cells of each frame in mm, all read along one axis. length_mm: the kernels' unit of length, in which
     the scene should have a size of about 1. intensity: averages intensities over the cells of a line, else line integrals.
-    average: makes the operator that averages intensities, for the frames with given numbers. An operator and its parts
-    share all memory: use them one at a time."""
+    average: makes the operator that averages intensities, for the frames with given numbers. affine, cutoff_sigma,
+    time_error: as for ``SplatProjector``. An operator and its parts share all memory: use them one at a time."""
 
     _instead = f"of_densities(gaussians) is linear in densities; {Operator._instead}"
 
@@ -219,8 +219,8 @@ class SplatProjection(GaussianOperator):
         self._projector.backward(point.gaussians, cells, by_image, gradients)
 
     def by_poses(self, gaussians: Any, by_frames: Any) -> np.ndarray:
-        """Returns dL/d(gantry angle in rad, panel shifts along columns and rows in pixels), (F, 3), from dL/dframes (F,
-        rows, columns). Raises InputError for an operator that averages intensities."""
+        """Returns dL/d(gantry angle in rad; panel shift along v, along u in pixels), (F, 3), from dL/d(frames), (F, rows,
+        columns). Raises InputError for an operator that averages intensities."""
         if self._is_layered:
             raise InputError("by_poses", "averages of intensity", "averages of line integrals")
         point = self._entered(self._to_array(self._domain, gaussians))

@@ -34,7 +34,8 @@ def items_by_gaussian(rt: Runtime, count: int) -> tuple[tuple[int, int], tuple[i
 
 
 def path_limits(time_error: float) -> tuple[float, float, float]:
-    """Returns how far a splat may move during a line's exposure, in widths of the splat, if that has 1, 2 or 3 sample times.
+    """Returns the longest path of a splat during a line's exposure, in the splat's standard deviations, for which 1, 2 or 3
+    sample times suffice.
 
     The exposure is integrated by Gauss–Legendre rules. Their errors are at most path²/24, path⁴/1440 and path⁶/134400 of the
     peak, because the 2nd, 4th and 6th derivatives of exp(−x²/2) are at most 1, 3 and 15. An error of 2 ``time_error`` in the

@@ -17,7 +17,7 @@ STATE_ROWS = 12  # numbers of a Gaussian in a state: its centre x, y, z, and the
 _PROBED_SIDE = 9  # number of points along each axis of the grid at which the inverse of a field is checked
 _PROBED_STATES = 16  # number of evenly spread times at which a field's inverse is checked, besides those of most motion
 _WRONG = 0.01  # largest accepted error of a field's inverse, in voxels
-_BEND = 0.25  # largest deviation of a point's path in a segment from a straight line, in voxels; the blur is 0.3 times this
+_BEND = 0.25  # largest deviation of a point's path in a segment from a straight line, in voxels: its RMS is 0.3 times this
 _MOST_SEGMENTS = 32  # most segments of a frame, even if paths then deviate by more than _BEND
 
 
@@ -91,7 +91,7 @@ class CloudStates:
 def segments_for_object(deformation: Deformation, lit_s: np.ndarray, voxel_mm: float) -> int:
     """Returns how many segments of time, up to ``_MOST_SEGMENTS``, a frame needs that is exposed from lit_s[0] to lit_s[1].
 
-    Splats move straight in a segment, so in it no point of the object may deviate from a straight path by over 1/4 voxel."""
+    Splats move straight in a segment. So in a segment no point of the object may leave a straight path by over 1/4 voxel."""
     for count in range(1, _MOST_SEGMENTS):
         weights = deformation.weights_at(np.linspace(lit_s[0], lit_s[1], 2 * count + 1))
         bend_mm = np.abs(weights[1::2] - (weights[:-1:2] + weights[2::2]) / 2) @ deformation.reach_mm

@@ -17,7 +17,7 @@ from phyradgs_cl.fields.gaussians import MEAN
 from phyradgs_cl.operators.rays.layout import some_cells
 from phyradgs_cl.operators.twins.splat import moving_frame, precision_matrices, splat_frame
 
-_REACH = 2  # distance in voxels up to which a spline coefficient acts; points further outside the volume have the value 0
+_REACH = 2  # distance in voxels up to which a spline coefficient acts: points further than this outside the volume get 0
 _BORDER = 4  # width in voxels around the volume in which spline coefficients are kept
 Volume = np.ndarray
 
@@ -85,7 +85,8 @@ def intensity_volume(frame: np.ndarray, volume: np.ndarray, grid: Grid, table: T
 def _shares(
     volume: np.ndarray, grid: Grid, table: TimeCells, detector_shape: tuple[int, ...]
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Yields each cell, and the fraction (rows, columns) of a pixel's light that falls in it; 0 on lines of other cells."""
+    """Yields each cell's number and the fractions (rows, columns) of the pixels' light that arrive in it: 0 on lines that
+    the cell does not serve."""
     shape = (detector_shape[0], detector_shape[1])
     total = np.exp(-ray_frame(volume, grid, table, shape, "intensity"))
     for cell in range(table.count):
@@ -186,7 +187,8 @@ def _seen(
     frame: np.ndarray, u: np.ndarray, ahead: np.ndarray, depth: np.ndarray, power: int, speed_power: int
 ) -> float:
     """Returns what a frame adds to one voxel. u, ahead, depth (lines,), in the pose of each line: the voxel's pixel along
-    the line, the line onto which it is projected minus the pose's own line, and its depth."""
+    the line, the line onto which it is projected minus the pose's own line, and its depth. power, speed_power: exponents of
+    the depth, and of the rate at which the readout crosses the voxel's image."""
     crossing = np.flatnonzero((ahead[:-1] >= 0) & (ahead[1:] <= 0))
     if crossing.size == 0 or depth.min() <= 0:
         return 0.0

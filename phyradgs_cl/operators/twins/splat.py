@@ -8,8 +8,8 @@ line, for Gaussians in front of the source. The kernel works in detector coordin
 In motion, the definition is integrated over time numerically. In a segment a splat keeps the conic, amplitude and
 perspective factor Q of the middle time, while its centre moves on the panel along a straight line at constant speed. The
 length and direction of this line come from the mean μ projected by the two end poses. The centre at mid-time is the average
-of the parabola through the projections at both ends and in the middle. Conic and Q come from the difference C − b bᵀ, which
-loses digits: float32 has too few for it."""
+of the parabola through the projections at both ends and in the middle. The conic comes from the difference c − b bᵀ (see
+``_Segment``), for which float32 has too few digits."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 
 
 def precision_matrices(rows: np.ndarray) -> np.ndarray:
-    """Returns Σ⁻¹ (G, 3, 3) of parameter rows (11, G)."""
+    """Returns the precision matrices Σ⁻¹ (G, 3, 3) of parameter rows (11, G)."""
     turn = Rotation.from_quat(rows[[7, 8, 9, 6]].T).as_matrix()
     return np.asarray(np.einsum("gij,gj,gkj->gik", turn, 1 / rows[3:6].T ** 2, turn))
 
@@ -134,7 +134,7 @@ _NODES = 12  # number of Gauss–Legendre nodes in each interval
 @dataclass(frozen=True)
 class _Segment:
     """One Gaussian in one segment of time, in pixels (u, v): average centre and path (2,), conic (2, 2), coefficients b (2,)
-    and c (2, 2) of Q = 1 + 2 bᵀδ + δᵀcδ at the offset δ from the centre. amplitude: the peak value over the ray's length."""
+    and c (2, 2) of Q = 1 + 2 bᵀδ + δᵀcδ at the offset δ from the centre. amplitude: (peak value)/(length of the ray)."""
 
     centre: np.ndarray
     path: np.ndarray

@@ -21,8 +21,8 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD
 
 _MOST_STEPS = 100  # most iterations to invert a displacement field
-_PROBED = 500  # most voxels at which the inverse is checked
-_WRONG = 0.1  # largest accepted error of the inverse, in voxels
+_PROBED = 500  # most voxels at which the inverse of a displacement field is checked
+_WRONG = 0.1  # largest accepted error of the inverse of a displacement field, in voxels
 _HELD_STATES = 3  # most states whose displacements are kept on the device, each in the memory of three volumes
 
 

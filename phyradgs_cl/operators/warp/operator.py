@@ -37,7 +37,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 _FRAMES_PER_STATE = 12
 _REACH = 2  # a cubic spline's coefficient acts up to this far, in voxels, as in cl/warp.cl
 _BORDER = 4  # width in voxels around the volume in which coefficients are kept, as in cl/warp.cl
-_SETTLES = 8  # width in voxels of the zero padding around that border, over which coefficients decay to 3e-5
+_SETTLES = 8  # width in voxels of the zero padding around ``_BORDER``, over which coefficients decay to 3e-5
 
 
 class WarpedOperator:

@@ -10,7 +10,7 @@ import numpy as np
 from phyradgs_cl.fields import Deformation, Grid
 
 MOST_STATES = 12  # most states that represent a motion, by default
-_SPACING = 0.6  # largest RMS distance of moving voxels from where their state has them, in voxels, if states are blended
+_SPACING = 0.6  # largest RMS distance, in voxels, of moving voxels from where the nearest state has them, with blends
 _SPACING_OF_NEAREST = 0.3  # like _SPACING, if each time takes the nearest state, without a blend
 _MOVES = 0.1  # a voxel counts as moving if its squared displacement is at least this fraction of the largest one
 
@@ -35,8 +35,9 @@ class MotionStates:
         cls, deformation: Deformation, grid: Grid, times_s: np.ndarray, least_voxels: float = 0.0, blends: bool = True,
         most: int = MOST_STATES,
     ) -> "MotionStates":  # fmt: skip
-        """Chooses at most ``most`` states for times (T,) in s. The next state is always the object at the time at which it
-        differs most from all states so far, until at all times a state is near enough.
+        """Chooses at most ``most`` states for times (T,) in s. The first is the object at the time at which its weights are
+        nearest to their mean. Each further one is the object when it differs most from all states so far, until at every
+        time a state is near enough.
 
         least_voxels: a change of a weight by 1 counts as at least this displacement, so that fields of zeros get several
         states too."""

@@ -10,9 +10,10 @@ from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
 
-# Width in voxels around the volume in which coefficients are kept, as in cl/warp.cl: beyond, they are below 3e-3 of a voxel.
+# Width in voxels around the volume in which spline coefficients are kept, as in cl/warp.cl. Farther out they would be below
+# 3e-3 of the voxels' values.
 _BORDER = 4
-_MOST_OWNED = 8  # most slices that a CPU's work-item sums; several, as voxels near the ends of a block are computed twice
+_MOST_OWNED = 8  # most slices that a CPU's work-item sums: with fewer, more voxels would be computed by two work-items
 _ITEMS_PER_UNIT = 4  # wanted work-items per compute unit, so that none waits long for the last
 _HEADROOM = 64  # largest sum of weights that a voxel may receive: 4³, where a field contracts by 4 along each axis
 _TOGETHER = 8, 8, 4  # box of voxels (x, y, z) that a GPU's work-group adds up in local memory

@@ -56,7 +56,7 @@ _SAME_POSE = 1e-9
 _BLOCK_BYTES = 1 << 26  # frames are filtered in blocks of at most this many bytes, to limit memory
 _WORKERS = -1  # tells SciPy's Fourier transforms to use all cores
 
-# Windows of the ramp filter, as functions of frequency over Nyquist frequency. All are 1 at 0, so they keep the mean.
+# Windows of the ramp filter, as functions of (frequency)/(Nyquist frequency). All are 1 at 0, so they keep the mean.
 WINDOWS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "ram-lak": np.ones_like,
     "shepp-logan": lambda share: np.sinc(share / 2),
@@ -84,8 +84,8 @@ class FdkOptions(MotionOptions):
 
 @dataclass(frozen=True)
 class FbpOptions(FdkOptions):
-    """Options of FBP, with those of FDK. deblur: removes a fly-scan's motion blur along the angle. The value is the power of
-    noise over that of the signal, such as 0.01; 0: off. circle: sets voxels to 0 outside the circle about the axis that the
+    """Options of FBP, with those of FDK. deblur: removes a fly-scan's motion blur along the angle. The value is (power of
+    noise)/(power of signal), such as 0.01; 0: off. circle: sets voxels to 0 outside the circle about the axis that the
     panel's wider side sees, unless rows are extrapolated."""
 
     METHOD: ClassVar[str] = "fbp"
@@ -131,8 +131,8 @@ def fdk(
 
 
 def _without_dark_sides(scan: Scan, frames: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns frames (F, rows, columns) and poses without the columns at both sides that are masked in all frames. Their
-    values would be guesses of an object that the panel does not see. A narrower panel instead has its own ray weights."""
+    """Returns frames (F, rows, columns) and poses without the columns at both sides that are masked in all frames. Values
+    there would be guesses, while a narrower panel gets ray weights of its own. A scan with metal keeps all columns."""
     seen = np.flatnonzero(scan.valid.any(axis=(0, 1)))
     if scan.metal is not None or len(seen) in (0, frames.shape[2]):
         return frames, pose
@@ -293,8 +293,8 @@ def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _measured(scan: Scan) -> np.ndarray:
-    """Returns the numbers (n,) of the frames with more than half as many valid pixels as the best frame. The views beside
-    another frame stand for its angle. If no pixel is valid, returns all numbers."""
+    """Returns the numbers (n,) of the frames with more than half as many valid pixels as the best frame. Neighbouring views
+    stand for the angles of the others. Returns all numbers if all frames have one mask, or if no pixel is valid."""
     if np.asarray(scan.pixel_mask).ndim == 3 and (valid := scan.valid.mean(axis=(1, 2))).any():
         return np.flatnonzero(valid > valid.max() / 2)
     return np.arange(scan.frames)

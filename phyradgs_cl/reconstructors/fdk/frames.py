@@ -9,9 +9,9 @@ Rows continue so that the filter does not ring where they are cut off. Only the 
 
 Deblurring: in a parallel beam, an exposure over an arc Δθ averages the sinogram with a box along the angle. A pixel sees the
 mean of p(θ, s) over [θ − Δθ/2, θ + Δθ/2], whatever the object. Along the views this is a convolution, which a Wiener filter
-inverts: with H(f) = sinc(f Δθ) it multiplies by (1 + λ) H / (H² + λ). λ is the power of noise over that of the signal;
-without it, noise would grow without bound at the zeros of H. Rows that open later see the same box at other angles. A full
-turn is periodic; after half a turn the frames repeat, mirrored at the axis."""
+inverts: with H(f) = sinc(f Δθ) it multiplies by (1 + λ) H / (H² + λ), where λ = (power of noise)/(power of signal). With
+λ = 0, noise would grow without bound at the zeros of H. Rows that open later see the same box at other angles. A full turn
+is periodic; after half a turn the frames repeat, mirrored at the axis."""
 
 from dataclasses import replace
 
@@ -35,8 +35,8 @@ WAYS = ("none", "cosine", "cylinder", "reprojected")
 _SHARE = 0.5  # "cosine" and "cylinder" extend rows at each side by this fraction of the panel's columns
 _SLOPE_PIXELS = 5  # the slope at a row's end is taken over this many pixels, to lower its noise
 _NOISE = 0.01  # a row that ends below this fraction of the line integrals' 99.9th percentile ends in air
-_UNEVEN = 0.02  # largest deviation of an angular step from the median, as a fraction, in evenly spaced views
-_REACH = 8  # the end views of an arc are repeated over this many exposures' arcs, so that the filter meets no edge
+_UNEVEN = 0.02  # views are evenly spaced if no angular step differs from the median step by more than this fraction
+_REACH = 8  # the end views of an arc are repeated over this many times an exposure's arc, so that the filter meets no edge
 _FULL_TURN = 1.5  # if a gap is wider than this many median steps, the views cover less than a full turn
 
 
@@ -133,7 +133,7 @@ def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: boo
         ahead = ((first - corners) * normal).sum(-1) / (source * normal).sum(-1)
         hit = corners + ahead[..., None] * source - first
     else:
-        depth = ((corners - source) * normal).sum(-1) / ((first - source) * normal).sum(-1)  # over the panel's depth
+        depth = ((corners - source) * normal).sum(-1) / ((first - source) * normal).sum(-1)  # divided by the panel's depth
         hit = (corners - source) / np.maximum(depth, 1e-6)[..., None] - (first - source)
     across = np.cross(step_v, normal)
     column = (hit * across).sum(-1) / (step_u * across).sum(-1)
@@ -143,9 +143,9 @@ def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: boo
 
 def deblurred(scan: Scan, frames: np.ndarray, angle_rad: np.ndarray, noise: float) -> np.ndarray:
     """Returns frames (F, rows, columns) float32 without motion blur along the angle, as if the gantry stopped for each view.
-    angle_rad (F,): gantry angles at the frames' middles. noise: the power of noise over that of the signal.
+    angle_rad (F,): gantry angles at the frames' middles. noise: (power of noise)/(power of signal).
 
-    Raises InputError unless the views, in any order, are evenly spaced in angle."""
+    Raises InputError unless the views, in any order, are evenly spaced in angle, apart from one gap."""
     arc_rad = exposure_arc_rad(scan)
     if arc_rad == 0:
         return frames

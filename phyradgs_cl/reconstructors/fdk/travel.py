@@ -31,8 +31,8 @@ Backproject = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def travels(pose: np.ndarray, rows: int, is_parallel: bool) -> bool:
-    """Returns whether poses (F, r, c, 12) travel along the axis so far that voxels miss some views: the origin's image moves
-    over more than one row and 5 % of the rows."""
+    """Returns whether poses (F, r, c, 12) travel along the axis so far that voxels miss some views: whether the origin's
+    image moves by more than one row and by more than 5 % of the rows."""
     middle = pose[:, pose.shape[1] // 2, pose.shape[2] // 2]
     first, across = middle[:, 3:6], np.cross(middle[:, 6:9], middle[:, 9:12])
     source = middle[:, :3]

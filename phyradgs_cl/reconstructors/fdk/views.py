@@ -13,7 +13,7 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import weights
 
 # A gap between views stands out if it is this many times as wide as another gap; one lost view makes a gap of 2 steps.
-# The widest gap is compared with the second widest: by the median, uneven views of a full turn would be a short scan.
+# The widest gap is compared with the second widest: compared with the median, uneven full turns would look like short scans.
 # Any gap wider than _WIDE_RAD is compared with both of its neighbours.
 SHORT_SCAN_GAP = 2.5
 _SAME_VIEW = 0.05  # views nearer to each other than this fraction of the mean gap count as one repeated view
@@ -23,21 +23,21 @@ _NAMED_RAD = np.deg2rad(5)
 _WIDE_RAD = np.deg2rad(10)
 # A misaligned panel measures a strip of rays once only. Gaps up to this width are filled, so that the strip counts fully.
 _FILLED_RAD = np.deg2rad(15)
-# The same for a panel displaced on purpose, whose strip is wide: beyond, a short scan's weights were 0.2 to 10 dB better.
+# The same for a panel displaced on purpose, whose strip is wide. In wider gaps, short-scan weights were 0.2 to 10 dB better.
 _FILLED_ASIDE_RAD = np.deg2rad(65)
 # Views nearer to a filled gap than this fraction of its width stand for it: more views smear, fewer draw streaks.
 _FILL_REACH = 0.5
 log = logging.getLogger(__name__)
 
 # Limits of an orbit, in pairs. Beyond the first a warning is logged; beyond the second, _NO_…, InputError is raised.
-_CIRCLE = 0.05  # distance of source or panel from a circle about z, divided by that from source to panel
+_CIRCLE = 0.05  # (distance of source or panel from a circle about z)/(distance from source to panel)
 _NO_CIRCLE = 0.5
 _PLANE_DEG = 10.0  # elevation of the source above the plane z = 0, seen from the origin
 _NO_PLANE_DEG = 45.0
 _LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the plane of the rotation
 _NO_LEAN_DEG = 10.0
-_ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: there densities are 0.1 % too low
-_NO_ROLL_DEG = 10.0  # larger angles of the rows are refused: here densities are 1.5 % too low, at 90° they are 0
+_ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: at 3° densities are 0.1 % too low
+_NO_ROLL_DEG = 10.0  # at 10° densities are 1.5 % too low, at 90° they are 0
 _UNLIKE = 0.1  # a warning comes if the fan's ends differ among the views by more than this fraction of the fan
 _LEAST_OVERLAP = 2.0  # a displaced panel must reach this many columns beyond the axis, or a warning comes
 # A smaller missing angle causes no warning: nearly parallel rays have so narrow a fan that half a turn is enough.
@@ -123,8 +123,9 @@ def _stand_out(ahead: np.ndarray) -> np.ndarray:
 
 
 def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Returns which wide gaps (K,) of at most 15° have a wide gap on the opposite side too, bool (K,). Such gaps have no
-    opposite rays, so the views at both sides fill them. The widest gap is never among them."""
+    """Returns which ``wide`` gaps ``ahead`` (K,) of at most 15° have a wide gap on the opposite side too, bool (K,). Such
+    gaps have no opposite rays, so the views at both sides fill them. The widest gap is never among them. centre (K,): angles
+    of the views."""
     narrow = wide & (ahead <= _FILLED_RAD) & (np.arange(ahead.size) != np.argmax(ahead))
     opposite = centre + ahead / 2 + np.pi
     before = np.searchsorted(centre, np.mod(opposite - centre[0], 2 * np.pi) + centre[0], side="right") - 1
@@ -132,22 +133,22 @@ def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.nd
 
 
 def _steps(ahead: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the angles (K,) in rad from each view to the next, and from the view before to each. Beside a gap, the step on
-    the view's other side is used."""
+    """Returns the steps (K,) in rad from each view to the next, and from the view before to each: the gaps ``ahead`` (K,).
+    For a gap that is ``wide``, bool (K,), the step on the view's other side is used."""
     forward = np.where(wide, np.roll(ahead, 1), ahead)
     return forward, np.roll(np.where(wide, np.roll(ahead, -1), ahead), 1)
 
 
 def _filled_rad(ahead: np.ndarray) -> float:
-    """Returns by how much, in rad, wide gaps exceed the largest of the median gap and their neighbours, summed over the wide
-    gaps. ahead (K,): the gap from each view to the next."""
+    """Returns the sum over wide gaps of (gap − usual gap), in rad. A gap's usual gap is the largest of the median gap and
+    both its neighbours. ahead (K,): the gap from each view to the next."""
     usual = np.maximum(np.median(ahead) if ahead.size else 0.0, np.maximum(np.roll(ahead, 1), np.roll(ahead, -1)))
     return float((ahead - usual)[ahead > np.maximum(SHORT_SCAN_GAP * usual, _NAMED_RAD)].sum())
 
 
 def _filled_cells(ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
     """Returns the angle (K,) in rad for which each view of a full turn stands. A wide gap is divided among the views near
-    it, the nearer the more."""
+    it, the nearer the more. ahead, wide: as in ``_steps``."""
     forward, back = _steps(ahead, wide)
     known = (forward + back) / 2
     cells = known.copy()
@@ -235,7 +236,7 @@ def _redundancy(view: int, angle_rad: np.ndarray, arc: Arc, fan: weights.Fan) ->
     if len(arc.parts_rad) > 1:
         return weights.parted_weight(progress_rad, angle_rad, arc.parts_rad)
     if not arc.is_full:
-        # A view stands for an angular step. If it is wide against the arc beyond half a turn, its middle is not enough.
+        # A view stands for an angular step. If it is wide against the arc beyond half a turn, weights are averaged over it.
         is_coarse = gap_rad > (arc.coverage_rad - np.pi) / 2 > 0
         within = gap_rad * (np.arange(_PARTS) - (_PARTS - 1) / 2) / _PARTS if is_coarse else (0.0,)
         at_rad = np.clip(progress_rad + np.asarray(within), 0, arc.coverage_rad)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Width of the transition from rays measured twice to rays measured once, over the overhang of the panel's longer side.
+# (Width of the transition from rays measured twice to rays measured once)/(overhang of the panel's longer side).
 # Wang's transition covers all rays that are measured twice: it was up to 15 % noisier, with no fewer artefacts.
 TRANSITION = 1.0
-_SYMMETRIC = 0.01  # a panel whose two sides differ by less, in pixels, is symmetric about the axis
+_SYMMETRIC = 0.01  # a panel whose two sides differ by at most this, in pixels, is symmetric about the axis
 # A panel less asymmetric than this fraction of the fan was not displaced on purpose, and sees both sides of the object.
 _ASIDE = 0.1
 
@@ -69,7 +69,7 @@ class Fan:
     """The fan angles that every view sees; in a parallel beam distances in mm from the axis (see ``fan_angle``).
 
     missing_columns: columns that would make the panel symmetric about the axis, at its two ends. pixel_rad: the width of the
-    pixel at the shorter end. unlike: by how much its ends differ among the views, over its width."""
+    pixel at the shorter end. unlike: (largest change of an end of the fan among the views)/(width of the fan)."""
 
     low_rad: float
     high_rad: float

@@ -32,7 +32,7 @@ _LEAST_OVERLAP = 0.25  # a view and its mirrored opposite must overlap in this f
 _LEAST_ENERGY = 0.2  # an overlap whose sum of squares is below this fraction of the largest shows air alone
 _STEPS = 12  # most steps of Gauss–Newton
 _SETTLED_PX = 1e-3  # Gauss–Newton ends after a step shorter than this, in pixels
-_BIAS_PX = 0.02  # error (std) of a shift that is due to interpolated views
+_BIAS_PX = 0.02  # standard deviation of the error of a shift, in pixels, that the interpolation of views causes
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +201,8 @@ def _few_rows(scan: Scan, frame: int) -> np.ndarray:
 
 
 def _rough_shift(pairs: list[_Pair]) -> float:
-    """Returns the shift in pixels, in steps of 1/2, at which views and mirror images differ least where they overlap: by the
-    squared difference over the sum of squares."""
+    """Returns the shift in pixels, in steps of 1/2, at which (sum of squared differences)/(sum of squares) of views and
+    mirror images is least where they overlap."""
     columns = pairs[0].view.shape[1]
     # a shift moves the view and the mirror image against each other, by twice its size
     lags = np.arange(1 - columns, columns)  # column of the mirror image minus column of the view
@@ -225,7 +225,7 @@ def _correlation(mirrored: np.ndarray, view: np.ndarray) -> np.ndarray:
 
 def _refined_shift(pair: _Pair, shift_px: float) -> tuple[float, float]:
     """Returns the shift in pixels near ``shift_px`` with the least squared difference, by Gauss–Newton, and 1/variance. The
-    shift is NaN if the steps lead away."""
+    shift is NaN if the steps lead over 2 pixels away, or until too few columns overlap."""
     last = pair.view.shape[1] - 1
     columns = np.arange(last + 1)
     view, mirrored = (CubicSpline(columns, image, axis=1) for image in (pair.view, pair.mirrored))

@@ -156,8 +156,8 @@ def fit_squares(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> np.nd
 def t_statistic(stated: np.ndarray, other: np.ndarray) -> float:
     """Returns by how many standard errors the stated hypothesis explains the frames better than the other hypothesis.
 
-    stated, other (F,): mean squared residuals of each frame. The sample is their difference over their sum, one value per
-    frame. Returns 0 with fewer than three frames, or if all differences are equal."""
+    stated, other (F,): mean squared residuals of each frame. The sample has a value (other − stated)/(other + stated) for
+    each frame. Returns 0 with fewer than three frames, or if all values are equal."""
     difference = (other - stated) / np.maximum(stated + other, _TINY)
     if difference.size < 3:
         return 0.0
@@ -166,7 +166,7 @@ def t_statistic(stated: np.ndarray, other: np.ndarray) -> float:
 
 
 def residual_ratio(stated: np.ndarray, other: np.ndarray) -> float:
-    """Returns the ratio of squared residuals, other hypothesis over stated hypothesis, from each frame's squares (F,)."""
+    """Returns Σ other / Σ stated. stated, other (F,): squared residuals of each frame under two hypotheses."""
     return float(other.sum() / max(float(stated.sum()), _TINY))
 
 
@@ -175,8 +175,8 @@ def vertex(at: np.ndarray, squares: np.ndarray) -> tuple[float, float]:
     frames.
 
     at (3,): evenly spaced, ascending values of a parameter. squares (3, F): each frame's squared residual there. The minimum
-    is limited to 3 steps from ``at[1]``, and NaN if the parabola has none; the deviation is NaN if half of the resamplings
-    have none."""
+    is limited to 3 steps from ``at[1]``, and NaN if the parabola has none. The deviation is NaN if half of the resamplings
+    or more have no minimum."""
     frames = squares.shape[1]
     draws = np.random.default_rng(0).integers(0, frames, (_DRAWS, frames))
     drawn = np.array([_minimum(at, squares[:, draw].sum(1)) for draw in draws])

@@ -26,7 +26,7 @@ _MOST_ROWS = 32  # most rows that are compared, to save time
 _MOST_PAIRS = 48  # most pairs of opposite rays that are compared in a row, to save time
 _LEAST_PX = 1.0  # the axis must lie this far inside the middle of the outer column, in pixels, or no ray has an opposite
 _BLOCKS = 12  # the jackknife leaves out one of this many blocks of views at a time
-_BIAS_PX = 0.05  # error (std) of the shift in pixels without noise, as half-fan scans of features of two pixels showed
+_BIAS_PX = 0.05  # standard deviation of the shift without noise, in pixels, in half-fan scans of features two pixels wide
 
 
 def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
@@ -75,7 +75,8 @@ def _binned(frames: np.ndarray, pose: np.ndarray, block: int) -> tuple[np.ndarra
 
 
 def _best(scan: Scan, turned: np.ndarray, frames: np.ndarray, pose: np.ndarray, shifts_px: np.ndarray) -> AxisShift:
-    """Returns the best of the shifts, in pixels of ``frames``, refined by a parabola; NaN if it is the first or last."""
+    """Returns the best of the shifts, in pixels of ``frames``, refined by a parabola. NaN if it is the first or last, or if
+    fewer than three shifts give rays an opposite."""
     scores, shifts = [], []
     row, columns = np.array([(scan.projections.shape[1] - 1) / 2]), np.arange(frames.shape[2])
     for shift_px in shifts_px:

@@ -23,7 +23,7 @@ from phyradgs_cl.reconstructors.moving.signal import Bending, TemporalSplines
 from phyradgs_cl.runtime import Runtime
 
 _CG_STEPS = 8  # iterations of conjugate gradients for one step of the control vectors
-_DAMPING = 1e-3  # Levenberg damping over the mean diagonal of JᵀJ (J: derivative of frames), for control points without rays
+_DAMPING = 1e-3  # (Levenberg damping)/(mean diagonal of JᵀJ), J: derivative of frames; needed by control points without rays
 _ROUGHNESS = 1e-2  # β, weight of the roughness in time, relative to the mean diagonal of JᵀJ (J: derivative of frames)
 _SHORTER = (1.0, 0.5, 0.25)  # backtracking line search: fractions of a step, tried in turn until one lowers the misfit
 _LEAST_DETERMINANT = 0.1  # least det(I + ∂w/∂y) of the displacement w(y) after a step: at 0 matter folds

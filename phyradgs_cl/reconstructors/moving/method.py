@@ -193,7 +193,8 @@ def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:
 
 
 def _difference(one: MotionField, other: MotionField) -> float:
-    """Returns the relative change of control vectors and weights in a round: the root of the sum of both changes squared."""
+    """Returns √(a² + b²) for the relative changes a of the control vectors and b of the coefficients in time, in a round.
+    Arrays whose shape has changed, or that are all 0, do not count."""
     pairs = [(one.control_mm, other.control_mm), (one.temporal, other.temporal)]
     parts: list[Any] = [
         sum_squares(new - old) / sum_squares(new) for new, old in pairs if new.shape == old.shape and new.any()

@@ -75,7 +75,8 @@ class TemporalSplines:
 
 
 class Bending:
-    """Half the gradient of the bending energy Σ ‖∂²U/∂i∂j‖² of control vectors U, by differences between neighbours.
+    """Half the gradient of the bending energy Σ ‖∂²U/∂i∂j‖² + ``_STRETCH`` Σ ‖∂U/∂i‖² of control vectors U, by differences
+    between neighbours.
 
     counts: (cz, cy, cx) of the control points."""
 
@@ -235,7 +236,7 @@ def load_gating(path: str, scan: Scan) -> Gating:
 def signal_of(gating: Gating, scan: Scan, subject: str) -> MotionSignal:
     """Returns the motion signal of stated values or phases. Its period comes from the phases, or from ``period_of``.
 
-    Raises InputError, which names ``subject``, for times that miss the scan and for values that do not change."""
+    Raises InputError, which names ``subject``, for times that do not cover the scan and for values that do not change."""
     times_s, values = gating.times_s, gating.values
     advance = float(gating.steps.sum()) if gating.is_phase else 0.0
     if advance == 0 and (gating.is_phase or np.ptp(values) == 0):

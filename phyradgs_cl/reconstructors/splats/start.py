@@ -17,7 +17,7 @@ _REFERENCE_PERCENTILE = 99.9  # percentile of the first volume that is the unit 
 
 def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:
     """Returns the internal units: half the longest side in mm, and the 99.9th percentile of an FDK volume in 1/mm. If the
-    percentile is not positive, one over the half side replaces it. Raises NumericalError if it is not finite."""
+    percentile is not positive, 1/(half the longest side) replaces it. Raises NumericalError if it is not finite."""
     reference = float(np.percentile(fdk, _REFERENCE_PERCENTILE))
     if not np.isfinite(reference):
         raise NumericalError("projections", "values that overflow in FDK", "line integrals of order 1")
@@ -51,8 +51,8 @@ def initial_cloud(
     """Draws up to ``count`` isotropic Gaussians at different voxels above ``threshold``, all in internal units.
 
     volume (nz, ny, nx). A Gaussian's density is ``density_share`` of the voxel's value. Its scale is ``scale_factor`` × the
-    RMS distance to its three nearest neighbours, within ``scale_bounds``. An empty volume still gives one faint Gaussian in
-    the middle, so that there is something to optimise."""
+    RMS distance to its three nearest neighbours, within ``scale_bounds``. If no voxel is above ``threshold``, draws one
+    faint Gaussian in the middle, so that there is something to optimise."""
     candidates = np.flatnonzero(volume.ravel() > threshold)
     if candidates.size == 0:
         log.warning(

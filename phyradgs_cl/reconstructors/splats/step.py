@@ -146,8 +146,8 @@ def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[floa
 @dataclass(frozen=True)
 class Batch:
     """The frames of one step by number. corners: for each frame, the first voxel of the sub-volume whose total variation
-    counts; None if that has no weight. ``late``: whether the iteration has reached ``parameter_terms_from``, from which the
-    density term applies."""
+    counts; None if total variation has no weight. ``late``: whether the iteration has reached ``parameter_terms_from``, from
+    which on the density term applies."""
 
     frames: list[int]
     corners: list[Corner | None]
@@ -187,7 +187,7 @@ class FrameStep:
             self.projector.time_error = getattr(motion, "time_error", DEFAULT_TIME_ERROR)
 
     def draw_corner(self, rng: np.random.Generator) -> Corner | None:
-        """Draws the corner (z, y, x) of a sub-volume for total variation; None if that has no weight."""
+        """Draws the first voxel (z, y, x) of a sub-volume for total variation; None if total variation has no weight."""
         if self.options.tv_weight == 0:
             return None
         room = (n - edge + 1 for n, edge in zip(self.grid.shape, self.crop.shape, strict=True))

@@ -48,8 +48,8 @@ _COPIES = 2  # volumes on the device, input and result, while a prior maps a vol
 # These values were chosen by measurement: docs/results/settings.md.
 _COARSE_SHARE = 6 / 13  # fraction of the iterations that are coarse: those before voxels are divided
 _COARSE_PASSES = 2  # number of passes in a coarse iteration: they cost little, and scans with few views or photons need many
-_COARSE_SUBSETS = 1.6  # number of subsets in a coarse pass, over the option ``subsets``
-_COARSE_TIMES = 1 / 3  # times per exposure in a coarse pass, over those of other passes; at least two
+_COARSE_SUBSETS = 1.6  # (number of subsets in a coarse pass)/(option ``subsets``)
+_COARSE_TIMES = 1 / 3  # (times per exposure in a coarse pass)/(times in another pass); a coarse pass has at least two
 # On smaller voxels a map of the prior takes as long as the rays of a subset. So one map serves _STEPS_PER_MAP steps,
 # until the last _FULL_PASSES passes. In these every step has its map, which removes the noise of the passes before.
 _STEPS_PER_MAP = 3
@@ -106,7 +106,8 @@ class FistaOptions(IterativeOptions):
 class Accelerated(Algorithm):
     """A proximal gradient method with FISTA's momentum, which restarts when it has overshot a minimum.
 
-    The restart is the gradient scheme of O'Donoghue and Candès, Found. Comput. Math. 15 (2015) 715."""
+    The restart is the gradient scheme of O'Donoghue and Candès, Found. Comput. Math. 15 (2015) 715. has_long_steps: takes a
+    smaller Lipschitz constant, found by one more pass, so that steps are longer."""
 
     ARRAYS: ClassVar[tuple[str, ...]] = ("volume", "previous")
     NUMBERS: ClassVar[tuple[str, ...]] = ("momentum",)

@@ -26,9 +26,9 @@ from phyradgs_cl.reconstructors.result import function_name
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime, Space
 
-# Length of a path over the standard deviation of five positions on it, at even times from its start to its end.
+# (Length of a path)/(standard deviation of five positions on it, at even times from its start to its end).
 _SPREAD = 2.83
-_EDGES = 0.09  # error of a ray's path length at the edges of the object, which voxels cannot show, over a voxel's side
+_EDGES = 0.09  # (error of a ray's path length in the object, as voxels cannot show the object's edges)/(voxel's side)
 _LEAST = 1e-4  # least weight of the prior, as a fraction of the largest value of Aᵀp: without noise it would be 0
 # Settings of the priors, measured (docs/results/settings.md). A weight or threshold is a factor on the prior's weight.
 _TV_ALONE = 1.6  # weight of TV in the prior ``tv``
@@ -36,12 +36,12 @@ _TV_BEFORE_DCT = 0.8  # weight of TV in the prior ``dct``
 _DCT = 1.5  # threshold of the block cosine transforms in the prior ``dct``
 _TV_AT_REST = 0.5  # weight of TV before ridge steps, for scans that stop for each projection
 _DCT_AT_REST = 1.35  # threshold of the block cosine transforms before ridge steps, for scans that stop
-_RIDGE_NOISE = 17.0  # noise that a ridge step assumes, relative to the prior's weight, for fly-scans
-_RIDGE_NOISE_AT_REST = 20.0  # noise that a ridge step assumes, relative to the prior's weight, for scans that stop
+_RIDGE_NOISE = 17.0  # (noise that a ridge step assumes)/(part of the prior's weight that is due to noise), for fly-scans
+_RIDGE_NOISE_AT_REST = 20.0  # the same quotient for scans that stop for each projection
 _RIDGE_LENGTH = 0.5  # length of a ridge step: factor on the regulariser's gradient
 _RIDGE_EVERY = 4  # number of maps of the prior ``dct`` for each ridge step
-# _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals. For other noise, _TV_AT_REST is multiplied by
-# the sixth root of the other noise over this one, and _RIDGE_NOISE_AT_REST is divided by that root.
+# _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals. For another noise, _TV_AT_REST is multiplied,
+# and _RIDGE_NOISE_AT_REST divided, by (noise/_USUAL_NOISE)^(1/6).
 _USUAL_NOISE = 0.01
 _LEAST_NOISE = 0.001  # least noise of line integrals that the prior ``ridge`` assumes, because some scans have none
 _LEAST_NOISE_SHARE = 0.1  # least fraction of the prior's weight that a ridge step takes as noise: some scans have none
@@ -53,8 +53,8 @@ _SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels with the prior ``ri
 class FrameError:
     """The error of a pixel that no volume on the grid explains.
 
-    noise: standard deviation of its line integral. edges_mm: discretisation error at edges, over the density (1/mm)
-    there."""
+    noise: standard deviation of its line integral. edges_mm: (discretisation error of a line integral at edges)/(density
+    there in 1/mm)."""
 
     noise: float
     edges_mm: float = 0.0
@@ -197,7 +197,7 @@ class TvPrior(Prior):
 class TvAndDct(Prior):
     """The prior dct: total variation, then a shrinkage of block cosine transforms, which works best on a smooth volume.
 
-    share: threshold of the shrinkage over the prior's weight."""
+    share: (threshold of the shrinkage)/(weight of the prior)."""
 
     def __init__(self, tv: TvPrior, shrink: DctProx, share: float) -> None:
         self.tv, self.shrink, self.share, self.turn = tv, shrink, share, 0
@@ -221,7 +221,7 @@ class ThenRidge(Prior):
     """The prior ridge: the map of the prior ``before`` and, after every fourth map, a step down the ridge regulariser."""
 
     def __init__(self, before: Prior, ridge: RidgeStep, noise_factor: float) -> None:
-        """Joins both maps. noise_factor: noise that the ridge step assumes, over the part of the weight due to noise."""
+        """Joins both maps. noise_factor: (noise that the ridge step assumes)/(part of the weight that is due to noise)."""
         self.before, self.ridge, self.noise_factor = before, ridge, noise_factor
         self.maps = 0  # number of maps since the last ridge step
 

@@ -161,7 +161,7 @@ def voxel_method(
 
 class Iterations:
     """Runs an algorithm step by step for a ``Loop``. Keeps two measures of the last iteration: ``residual``, ‖p − A x‖/‖p‖,
-    and ``change``, ‖x − x'‖/‖x‖ with the volume x' before."""
+    and ``change``, ‖x − x'‖/‖x‖, where x' is the volume before the iteration."""
 
     quantity = "residual"
 
