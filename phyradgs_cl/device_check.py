@@ -43,7 +43,7 @@ PARALLEL = CircularOrbit(ParallelGeometry(SHAPE, (2.6 / 9, 2.7 / 12), (0.1, 0.2)
 UNIT = 2.0  # line integral that a pixel of value 1 means to kernels that average intensities exp(−line integral)
 STEP = 1e-6  # central differences take this step to each side
 Comparison = tuple[np.ndarray, np.ndarray, float]
-"""Computed, expected, and the largest difference allowed, relative to the largest number expected."""
+"""The computed and the expected numbers, and the largest difference allowed, relative to the largest expected number."""
 
 
 @dataclass(frozen=True)

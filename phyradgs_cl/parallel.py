@@ -220,7 +220,8 @@ def exact_sum(ranks: Communicator, parts: Sequence[np.ndarray], shape: tuple[int
 
 
 def _largest_exponents(ranks: Communicator, parts: Sequence[np.ndarray], rows: int) -> np.ndarray:
-    """Returns the least e with |values| < 2^e over all ranks, (rows,) int64, or ``_NOT_FINITE``."""
+    """Returns, for each row, the least e ≥ −300 with |values| < 2^e on all ranks, (rows,) int64; ``_NOT_FINITE`` for a row
+    with NaN or infinity."""
     exponents = np.full(rows, -300, np.int64)
     for part in parts:
         largest = np.abs(part).max(axis=1, initial=0.0).astype(np.float64)  # NaN for a row with a NaN

@@ -12,11 +12,11 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames, is_parallel
 
-_SAME_TIME = 1e-6  # times that differ by less than this fraction of a cell's duration are equal
+_SAME_TIME = 1e-6  # two times that differ by less than this fraction of a cell's duration count as equal
 _NOTHING = 1e-9  # a cell's fraction of a line's exposure below this is a rounding error, and becomes 0
 _INSTANT = 1e-9  # a line's exposure shorter than this fraction of the frame's lit span counts as a single moment
-_OVERHANG = 0.1  # a line leaves out a segment of time if its exposure covers at most this fraction of the segment
-_TURN_SAMPLES = 32  # equal intervals of a frame's lit span; the highest mean speed in one counts as the gantry's highest
+_OVERHANG = 0.1  # a line leaves out its first or last segment of time if its exposure covers at most this fraction of it
+_TURN_SAMPLES = 32  # the gantry's highest speed is taken from the mean speeds in this many intervals of a frame's lit span
 _TURN_FACTOR = 0.32  # measured relative RMS error of a frame, per squared radian that the gantry turns in a segment
 _HARMLESS_PEAK = 4.0  # up to this line integral, averaging intensities needs no more segments than averaging line integrals
 _MOST_SEGMENTS = 1000  # most segments that ``segments_for`` chooses for a frame

@@ -67,7 +67,7 @@ class ConeGeometry:
 
     @property
     def magnification(self) -> float:
-        """Source-to-detector over source-to-axis distance: how large an object at the axis appears, over its size."""
+        """source_to_detector_mm / source_to_axis_mm: the factor by which the panel shows an object at the axis enlarged."""
         return self.source_to_detector_mm / self.source_to_axis_mm
 
 
@@ -113,8 +113,8 @@ GEOMETRIES = (ConeGeometry, ParallelGeometry)
 
 
 def _check_panel(geometry: Geometry) -> None:
-    """Converts the panel's fields to tuples, so that geometries can be compared. Raises InputError for shapes, lengths and
-    offsets out of range."""
+    """Converts the panel's fields to tuples, so that geometries can be compared. Raises InputError for counts that are
+    not whole or below 1, pixel sizes not above 0, and offsets that are not finite."""
     counts = checks.numbers("detector_shape", geometry.detector_shape, (2,))
     if (counts < 1).any() or (counts != np.floor(counts)).any():
         raise InputError("detector_shape", str(geometry.detector_shape), "two counts (rows, columns) of at least 1")

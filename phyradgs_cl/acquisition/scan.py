@@ -51,7 +51,7 @@ class Scan:
     - trajectory: anything with ``pose(frame, time_s)``, also a user-defined class.
     - frame_start_s (F,): when each frame's first line opens, in s.
     - is_fly: False if the gantry stops for every frame (stop-and-shoot), whatever the exposure time.
-    - detector_model: what the detector averages over an exposure, "log" (line integrals) or "intensity".
+    - detector_model: the quantity that the detector averages over an exposure, "log" (line integrals) or "intensity".
     - pixel_mask (nv, nu) or (F, nv, nu): non-zero for pixels not to be used. Lines that a pulsed beam misses are masked too.
     - reference (nz, ny, nx): the true volume in 1/mm on ``grid``. moving_truth: true volumes and motion of a simulated
       object that moves.

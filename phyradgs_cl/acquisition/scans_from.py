@@ -134,8 +134,8 @@ def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = N
 
 
 def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as ``line_integrals`` does. Nobody stated what quantity they are, so frames that look like raw counts
-    raise InputError too."""
+    """Returns frames as ``line_integrals`` does. Raises InputError also for frames that look like raw counts, because the
+    caller does not state their quantity."""
     values = checks.real_array("frames", frames)
     check_not_counts(values, "give −ln(counts / flats)", mask)
     return line_integrals(values, mask)
@@ -226,8 +226,8 @@ def _counts(geo: Any, name: str, length: int) -> np.ndarray:
 
 
 def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.ndarray:
-    """Returns an attribute of a TIGRE geometry, given for all frames or per frame, as (F, length). A missing attribute
-    counts as ``absent``. Raises InputError if DSO or DSD is missing, and for other shapes."""
+    """Returns the attribute ``name`` of a TIGRE geometry, which has ``length`` numbers for all frames or for each, as (F,
+    length). A missing attribute counts as ``absent``. Raises InputError if DSO or DSD is missing, and for other shapes."""
     value = _of(geo, name) if name in ("DSO", "DSD") else getattr(geo, name, None)
     table = checks.numbers(f"geo.{name}", absent if value is None else value)
     per_frame = (frames,) if length == 1 else (frames, length)

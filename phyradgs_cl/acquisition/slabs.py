@@ -59,8 +59,8 @@ def slab(scan: Scan, first: int, stop: int) -> Scan:
 
 
 def slices_of(scan: Scan, first: int, stop: int) -> slice:
-    """Returns the slices of the scan's grid whose centres lie at the height of detector rows [first, stop); they may be
-    none. Slices beyond the panel belong to its first or last row, so that slabs of all rows together have every slice."""
+    """Returns the range of the grid's slices whose centres lie at the height of detector rows [first, stop); it may be
+    empty. Slices beyond the panel belong to its first or last row, so that slabs of all rows together have every slice."""
     rows, pitch_mm = scan.geometry.detector_shape[0], scan.geometry.pixel_size_mm[0]
     row = (scan.grid.axes_mm()[0] - scan.geometry.detector_offset_mm[0]) / pitch_mm + (rows - 1) / 2
     number = np.clip(np.floor(row + 0.5), 0, rows - 1)

@@ -30,8 +30,8 @@ _ARGUMENTS = {
     "readout_axis": "readout",
     "source_to_axis_mm": "geometry.source_to_axis_mm", "source_to_detector_mm": "geometry.source_to_detector_mm",
 }  # fmt: skip
-_SLACK = 1e-3  # relative tolerance of steps and arcs, since users round angles
-_AIR_SLACK = 0.2  # noise may move a transmission in air this far from 1
+_SLACK = 1e-3  # relative tolerance of the angle between frames and of an exposure's arc, since users round angles
+_AIR_SLACK = 0.2  # largest difference of a transmission from 1 that noise in air may cause
 _CLEAR_STEP_DEG = 90.0  # between views this far apart or more, the gantry may have turned either way
 
 

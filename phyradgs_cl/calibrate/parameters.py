@@ -32,8 +32,8 @@ class Parameter:
     - stated: the scan's own value, in the field's unit. scale: displayed units per unit of the field.
     - object_instead: another object that explains the frames as well, if they do not determine the parameter.
     - pixels: how many pixels a unit of the field moves the image at its edge.
-    - mismatch: measured errors (docs/calibrate.md) over errors by noise alone. Voxels, which do not represent objects
-      exactly, add the rest.
+    - mismatch: (measured errors) / (errors by noise alone), see docs/calibrate.md. Voxels cause the difference, because
+      they do not represent objects exactly.
     - is_axial: the parameter moves the image along the axis, like ``LIFT``. The others move it across, like ``TURN``."""
 
     name: str

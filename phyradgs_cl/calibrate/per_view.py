@@ -25,7 +25,7 @@ from phyradgs_cl.runtime import Runtime
 SPLINES = 7  # default number of cubic splines over the scan's time
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
 _STEP_PX = 0.25  # a central difference moves a frame by this many coarse pixels to each side
-_LEAST_NORM = 0.1  # a signal's norm counts as at least this fraction of its kind's largest, so weak signals are scaled less
+_LEAST_NORM = 0.1  # a signal is divided by its norm, or by this fraction of the largest norm of its kind if that is larger
 _DEG = float(np.rad2deg(1.0))
 # This fraction of a value's change since the next coarser grid counts as its discretisation error. With voxels half as
 # large, 1 suits errors ∝ voxel size, and 1/3 suits errors ∝ its square.
@@ -50,7 +50,7 @@ class PerViewParameters(ABC):
 
     - units (K,): the value of each kind that moves a frame's edge by a pixel.
     - circle (n, 2): values that vary as cosine and sine of the gantry's angle, as far as the basis allows.
-    - MISMATCH: measured errors (docs/calibrate.md) over errors by noise alone. Voxels, which are not exact, add the rest.
+    - MISMATCH: (measured errors) / (errors by noise alone), see docs/calibrate.md. Errors of voxels cause the difference.
     - RESTARTED: kinds that start from 0 on each grid."""
 
     values: np.ndarray

@@ -35,22 +35,22 @@ _CLEAR = 0.5  # a hypothesis must leave less than this fraction of the stated sc
 _NEARLY = 1.5  # a rough fit is refined unless its squared residual exceeds this many times the least one
 _ERRORS = 4.0  # a hypothesis must be better than the stated scan by this many standard errors
 # The frames look the same from every angle if a random order leaves a residual below _SAME or _NOISY.
-_SAME = 0.03  # residual over the standard deviation of the line integrals
-_NOISY = 1.6  # residual over the noise: round objects had up to 1.3, others 2.3 or more
+_SAME = 0.03  # RMS residual / standard deviation of the line integrals
+_NOISY = 1.6  # RMS residual / standard deviation of the noise: round objects had up to 1.3, others 2.3 or more
 _MOST_REFINED = 2  # only this many hypotheses, the best ones, get a refined shift of the panel, which takes time
 _SHIFT_PENALTY = 1.5  # factor on a hypothesis's squared residual per coarse pixel of shift: stated offsets are mostly right
 # A frame is odd if its mean line integral differs from its neighbours' by more than _DEVIATIONS and _LEAST_CHANGE.
-_DEVIATIONS = 12.0  # the difference over the robust standard deviation of all frames' differences
-_LEAST_CHANGE = 0.75  # the difference over the median of the frames' mean line integrals
-_REPEATED = 0.15  # largest RMS change from a frame to one that repeats it, over the least change between frames nearby
+_DEVIATIONS = 12.0  # limit of the difference / robust standard deviation of all frames' differences
+_LEAST_CHANGE = 0.75  # limit of the difference / median of the frames' mean line integrals
+_REPEATED = 0.15  # a frame repeats the last one if its change is below this fraction of the least change of frames nearby
 _JUMP = 2.5  # an order jumps, as the golden angle does, if its median step exceeds that of sorted angles by this factor
-_UNLIKE = 2.0  # least RMS difference of a repeated frame from the next view in angle, over the median of all frames
-_OUTLIER = 4.0  # least RMS residual of an outlier, over the frames' median
+_UNLIKE = 2.0  # least RMS difference of a repeated frame from the next view in angle, as a multiple of all frames' median
+_OUTLIER = 4.0  # least RMS residual of an outlier, as a multiple of the frames' median RMS residual
 # Both ends of an arc may fit badly if their residuals differ by less than this factor: right frames had 1.4, odd ones 2.3.
 _ALIKE = 1.7
 # Both ends must also leave less than this fraction of the residual in a random order: right ones had 0.2, odd mostly 0.3.
 _AT_BOTH_ENDS = 0.25
-_MOST_OUTLIERS = 0.2  # this many outliers, as a fraction of the frames, have a common cause: then none counts as one
+_MOST_OUTLIERS = 0.2  # if this fraction of the frames or more are outliers, they have a common cause, and none is removed
 _EXCHANGED = 0.5  # two frames were exchanged if the opposite order leaves less than this fraction of the squared residual
 
 
@@ -85,7 +85,8 @@ class _CoarseFit:
 def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
     """Finds frames and hypotheses that explain why the frames of a coarse ``scan`` do not fit together.
 
-    The finding's value is the residual's norm in the stated order over that in a random order. as_stated: the full scan."""
+    The finding's value is (residual in the stated order) / (residual in a random order), both RMS. as_stated: the full
+    scan."""
     pixels = float(scan.valid.sum()) / scan.frames
     if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"

@@ -21,11 +21,11 @@ _INVERTED = 0.9  # if left and right edges exceed this fraction of the largest v
 _BRIGHT = 0.05  # at most this fraction of the pixels may be brighter than the flats, by noise
 _FRAMES = 0.1  # the object may touch a side of the panel in up to this fraction of the frames
 _COVERED = 0.1  # a column shows the object if more than this fraction of its rows does
-# A unit is wrong if the grid's width over that of the panel's view, or the object's over the grid's, exceeds this.
+# A unit is wrong if (grid's width / width of the panel's view) or (object's width / grid's width) exceeds this.
 _ANOTHER_SIZE = 5.0
 _NOISE_FRAMES, _NEAR = 16, 5  # frames in which noise is sought, and the side in pixels of a square of neighbours
-# Noise over mean line integral behind the object: above the first value noise dominates, above the second there is no
-# object.
+# Limits of noise / mean line integral behind the object: above the first one noise dominates, above the second one there is
+# no object.
 _MOST_NOISE, _NO_OBJECT_FROM = 0.4, 4.0
 NOISE = "noise"
 NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # findings with these units end the check

@@ -31,7 +31,7 @@ _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie beh
 
 
 def tigre_counts(line_integrals: ArrayLike, dose: float) -> tuple[Array, float]:
-    """Returns expected counts dose · exp(−p/m) for p (F, v, u), and m: the largest p, or 1 for an empty scan."""
+    """Returns expected counts dose · exp(−p/m) for p (F, v, u), and m: the largest p, or 1 if no p is above 0."""
     p = np.asarray(line_integrals, dtype=np.float64)
     largest = float(p.max(initial=0.0))
     scale = largest if largest > 0 else 1.0

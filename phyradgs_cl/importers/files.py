@@ -26,8 +26,8 @@ def check_room(subject: str, needed_bytes: int) -> None:
 
 @contextmanager
 def naming_damage(path: Path, found: str, expected: str, remedy: str = "") -> Iterator[None]:
-    """Turns any exception of the body but MemoryError into InputError about ``path``, because libraries raise all kinds for
-    damaged files."""
+    """Turns any exception of the body but InputError and MemoryError into InputError about ``path``, because libraries raise
+    all kinds for damaged files. found, expected, remedy: words of the message."""
     try:
         yield
     except (InputError, MemoryError):

@@ -1,5 +1,5 @@
-"""Reads and writes deformations, alone or in a scan file, and the truth of simulated scans: a reference volume, and of an
-object that moves its deformation and its volumes (states) at several times."""
+"""Reads and writes deformations, alone or in a scan file. Also reads and writes a simulated scan's true volume and, if the
+object moves, its deformation and its true volumes (states) at several times."""
 
 from pathlib import Path
 

@@ -1,5 +1,5 @@
 """Tests the error bars of voxels (standard deviations σ in 1/mm) against a true volume: the fraction of errors within the
-bars, and the mean σ over the RMS error."""
+bars, and the ratio mean σ / RMS error."""
 
 from pathlib import Path
 
@@ -25,8 +25,8 @@ def object_voxels(truth: Array) -> NDArray[np.bool_]:
 
 
 def coverage(sigma: Array, volume: Array, truth: Array, multiple_95: float) -> dict[str, float]:
-    """Returns the fractions of errors within σ and within ``multiple_95`` σ in the object's voxels, and the mean σ over the
-    RMS error. sigma, volume, truth: (nz, ny, nx) in 1/mm. multiple_95: the 95 % bar over σ."""
+    """Returns the fractions of errors within σ and within ``multiple_95`` σ in the object's voxels, and the ratio mean σ /
+    RMS error there. sigma, volume, truth: (nz, ny, nx) in 1/mm. multiple_95: the 95 % bar / σ."""
     inside = object_voxels(truth)
     size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)
     over_error = float(bar.mean() / (np.sqrt(np.mean(size**2)) or np.inf))

@@ -1,8 +1,8 @@
 """Corrects beam hardening: returns the line integrals that a beam would give if every layer attenuated as a thin one does.
 
 - Polynomial: the user has measured it with a wedge.
-- One material: a polynomial is fitted to line integrals over the path through the segmented volume (Krumm, Kasperl and
-  Franz, NDT & E Int. 41 (2008) 242).
+- One material: a polynomial of the path through the segmented volume is fitted to line integrals (Krumm, Kasperl and Franz,
+  NDT & E Int. 41 (2008) 242).
 - Tube voltage: bone in a reconstruction is projected, and the spectrum gives the soft tissue that remains (Joseph and
   Spital, J. Comput. Assist. Tomogr. 2 (1978) 100). This is repeated with the better volume.
 

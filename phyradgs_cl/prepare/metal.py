@@ -72,7 +72,7 @@ def _completed(masked: Scan, shadow: np.ndarray, is_metal: np.ndarray, make_mode
 
 def _main_level(volume: np.ndarray) -> float:
     """Returns the main material's attenuation in a volume (z, y, x): voxels above it make up half of the total attenuation.
-    Infinity for an empty volume."""
+    Infinity if no voxel is above 0."""
     rising = np.sort(volume[volume > 0])
     if rising.size == 0:
         return float("inf")

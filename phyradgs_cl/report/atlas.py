@@ -79,7 +79,8 @@ def _controls(threshold: int, cloud: Gaussians | None) -> list[Markup]:
 
 
 def _centres(cloud: Gaussians, grid: Grid) -> dict[str, str]:
-    """Returns evenly chosen centres inside the box in base64: x, y, z as 16-bit fractions of it, and densities in 8 bits."""
+    """Returns evenly chosen centres inside the grid's box and their densities, in base64: x, y, z as 16-bit fractions of the
+    box's sides, densities in 8 bits."""
     some = np.unique(np.linspace(0, cloud.count - 1, min(cloud.count, MOST_CENTRES)).round().astype(int))
     low_mm, size_mm = (np.array(three[::-1]) for three in (np.array(grid.box_mm)[:, 0], grid.size_mm))
     share = (cloud.mean[some] - low_mm) / size_mm

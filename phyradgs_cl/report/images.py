@@ -127,8 +127,8 @@ class Plane:
         return len(self.indices) // 2
 
 def windows_of(volume: Volume, reference: Volume | None, doubt: Volume | None = None) -> dict[str, Window]:
-    """Returns the grey values of each layer: "result", "truth", "difference", "doubt" (the error bars). Result and truth
-    share the truth's range, so that a wrong scale of the result shows."""
+    """Returns the grey values of each layer: "result", "truth" (``reference``), "difference", "doubt" (the error bars).
+    Result and truth share the reference's range, so that a wrong scale of the result shows."""
     if doubt is not None:
         return {**windows_of(volume, reference), "doubt": Window.of(*grey_range(doubt), doubt)}
     if reference is None or not float(reference.max()) > 0:

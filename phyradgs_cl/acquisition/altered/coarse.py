@@ -102,9 +102,9 @@ def binned(scan: Scan, block: int) -> Scan:
 
 
 def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
-    """Returns a coarse grid of the same box, with a margin of one voxel on each side. Its voxels are about as large as a
-    pixel of ``geometry``, scaled to the axis. They are not finer than those of ``grid``, nor than 1/64 of its longest
-    side."""
+    """Returns a coarse grid of the box of ``grid``, with a margin of one voxel on each side. The coarse voxels are about as
+    large as a pixel of ``geometry`` scaled to the axis, but never smaller than the voxels of ``grid``, nor than 1/64 of the
+    box's longest side."""
     height_mm, width_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     least_mm = max(max(grid.size_mm) / _MOST_VOXELS, min(grid.voxel_size_mm))
     wanted_mm = (max(height_mm, least_mm), *(max(width_mm, least_mm),) * 2)
@@ -115,10 +115,10 @@ def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
 
 
 def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
-    """Returns a coarse scan with its grid cut, in y and x, to the object that the frames show.
+    """Returns a coarse scan with its grid cut, in y and x, to a box around the object that the frames show.
 
     A grid of the whole field of view has much air. With few frames, voxels of air let a wrong geometry fit better than the
-    right one. spare_columns: by how many columns the axis may be off; the object's radius on the panel grows by as many.
+    right one. spare_columns: by how many columns the axis may be off. The object's radius on the panel grows by as many.
     A scan whose grid is off the axis, or whose frames show nothing, is returned unchanged."""
     geometry, grid = scan.geometry, scan.grid
     columns = np.where(scan.valid, scan.projections, 0).max((0, 1))

@@ -63,7 +63,7 @@ def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> 
     """Reads gantry angles (P,) in rad of frames in ``used``, bool (F,). name: rotation_angle or rotation_angle_end."""
     address = f"{entry}/{schema.SAMPLE}/{name}"
     angle_rad = h5.read_array(source, address, used.shape, h5.ANGLE)[used]
-    # Whether gantry or sample turns, an end angle without @rotates takes from the start angle.
+    # Without @rotates, an end angle is of the gantry or of the sample as the start angle is.
     start = f"{entry}/{schema.SAMPLE}/rotation_angle"
     return angle_rad * _sense(source, address, absent=_sense(source, start, absent=-1.0))
 
