@@ -233,7 +233,7 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
     yield rt.download(operator.adjoint(rt.upload(frames))), twins.ray_volume(shares, GRID, finer), VALUE
     intensity = operators.IntensityOperator(rt, GRID, SHAPE, [table])
     mean, averaged = (twins.ray_frame(volume, GRID, table, SHAPE, model) for model in ("log", "intensity"))
-    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # averages line integrals until ``expected`` is called
+    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # before ``expected`` it averages line integrals
     yield rt.download(intensity.expected(on_device))[0], averaged, VALUE
     found = rt.download(intensity.adjoint(rt.upload(frames)))
     yield found, twins.intensity_volume(frames[0], volume, GRID, table), VALUE

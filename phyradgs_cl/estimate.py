@@ -23,7 +23,7 @@ from phyradgs_cl.runtime import Runtime
 
 _SPLAT_TRIALS = (20, 200)  # iterations of the two short runs (trials) of methods with Gaussians
 _TRIALS = (1, 3)  # iterations of the two short runs of other methods, unless their options have ``TRIALS``
-_LEAST_DIFFERENCE_S = 0.3  # below this difference of the two times, timing noise matters: the second trial is prolonged
+_LEAST_DIFFERENCE_S = 0.3  # if the trials' times differ by less, timing noise matters: the second trial is prolonged
 _LONGEST_TRIAL = 200  # a trial of this many iterations is not prolonged, because estimating would take too long
 _FEWEST_BETWEEN = 5  # least number of iterations between rounds of density control in a trial
 

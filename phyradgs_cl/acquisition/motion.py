@@ -172,7 +172,7 @@ class PerRow(_Model):
         return replace(self, sub_intervals=min(max(1, min(fine, _USUAL_TIMES), coarse), _MOST_TIMES))
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """Returns the ``TimeCells`` of one frame: cells of exposure / sub-intervals each, from first light to last."""
+        """Returns the ``TimeCells`` of one frame, from first light to last: cells of length exposure / sub-intervals."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = scan.trajectory, scan.shutter, frame, scan.frame_start_s, scan.lines

@@ -39,7 +39,7 @@ class Readout:
         return pose if self.axis == "rows" else transpose_pose(pose)
 
     def spread(self, by_line: np.ndarray) -> np.ndarray:
-        """Returns a view of values (..., lines) that broadcasts with frames (..., rows, columns)."""
+        """Returns values (..., lines), one for each line, as a view that broadcasts with frames (..., rows, columns)."""
         return by_line[..., :, None] if self.axis == "rows" else by_line[..., None, :]
 
 
@@ -77,7 +77,7 @@ def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named 
 
 
 def check_readout(readout_ms: float | None, readout_ratio: float | None, fps: float | None, named: Named = str) -> None:
-    """Raises InputError for a readout ratio or time out of range, if both are given, and for a time in ms without fps."""
+    """Raises InputError for a ratio outside 0 to 1000 or a time below 0, for both together, and for a time without fps."""
     if readout_ratio is not None:
         checks.within(named("readout_ratio"), readout_ratio, 0, 1000)
     if readout_ms is None:

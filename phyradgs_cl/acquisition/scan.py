@@ -213,14 +213,14 @@ class Scan:
         """Raises InputError for a trajectory that does not cover every frame, poses that are not finite, and an exposure too
         short for the precision of the scan's times."""
         self.shutter.check_resolved(self.frame_start_s)
-        last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # at rest, a frame has one pose
+        last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # a frame at rest has one pose, in its middle
         for frame, start_s in enumerate(self.frame_start_s):
             self.trajectory.pose(frame, np.array([start_s, start_s + last_s]))
 
     def warn_of_near_panel(self) -> None:
         """Warns if, as the first frame opens, the panel of a cone beam stands inside the grid, at its middle or behind. No
         ray sees the part of the grid behind the panel."""
-        if self.is_parallel:  # parallel rays are not taken to end at the panel
+        if self.is_parallel:  # parallel rays are not cut off at the panel
             return
         (pose,) = self.trajectory.pose(0, np.array(self.frame_start_s[:1]))
         behind_mm, half_mm = panel_behind_mm(self.grid, pose), min(self.grid.size_mm[1:]) / 2

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 _MOST_RAD = 20 * np.pi  # angles in rad that span more than these ten turns are most likely degrees
-_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # fields of ``Scan`` taken by name
+_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # fields of ``Scan``
 
 
 def from_poses(
@@ -155,7 +155,8 @@ def line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
 
 
 def poses_of_astra(vectors: ArrayLike, panel: tuple[int, int]) -> np.ndarray:
-    """Returns the poses (F, 12) in mm of ASTRA's vectors (F, 12) in mm, for a panel (rows, columns)."""
+    """Converts ASTRA's vectors (F, 12) in mm, which state the centre of a panel (rows, columns), to poses (F, 12) in mm,
+    which state its first pixel."""
     table = checks.numbers("vectors", vectors, (None, POSE_LENGTH))
     pose: np.ndarray = table.copy()
     pose[:, 3:6] -= _to_middle(pose, panel)

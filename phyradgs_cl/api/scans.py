@@ -24,7 +24,7 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.removed import refuse_removed
 
 log = logging.getLogger(__name__)
-# For messages: the arguments of ``fly_scan``, by the names under which a Scan's checks know the same values.
+# For messages: the name of a value in the checks of a Scan, and the argument of ``fly_scan`` that states this value.
 _ARGUMENTS = {
     "angles": "angles_deg", "exposure_s": "exposure_deg", "frame_time_s": "exposure_s", "readout_s": "readout_ratio",
     "readout_axis": "readout",

@@ -232,8 +232,8 @@ class BeadProblem(CoarseFrames):
         return float(1 - residual @ residual / max(float(whole @ whole), 1e-30)) if placement[DENSITY] > 0 else 0.0
 
     def reconstruct(self, operator: BeadOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
-        """Returns the placement (7,) that fits best, by at most ``iterations`` Gauss–Newton steps from ``start`` (None: the
-        problem's own)."""
+        """Returns the placement (7,) that fits best, by at most ``iterations`` Gauss–Newton steps from ``start``; None
+        starts from the placement ``self.start``."""
         placement = self.start if start is None else start
         inverse = None
         for _ in range(iterations):

@@ -74,8 +74,8 @@ def _pitch_mm(scan: Scan) -> float:
 
 
 def _edge_pixels(scan: Scan, factor: float = 1.0) -> float:
-    """Returns by how many pixels a radian of roll moves those edges of the panel that are farthest from its middle, times
-    ``factor``."""
+    """Returns ``factor`` times the number of pixels by which a roll of 1 rad moves the panel's edges farthest from its
+    middle."""
     return factor * max(_half_mm(scan, 0), _half_mm(scan, 1)) / _pitch_mm(scan)
 
 
@@ -214,7 +214,7 @@ def _turns(scan: Scan) -> bool:
 
 
 def correction_of(values: Mapping[str, float]) -> GeometryCorrection:
-    """Returns the correction with ``values`` by the parameters' names, in the fields' units."""
+    """Returns the correction that has the parameters' ``values`` (by name, in the fields' units), and else zeros."""
     fields = {**PARAMETERS, **{gauge.name: gauge for gauge in GAUGES}}
     return GeometryCorrection(**{fields[name].field: float(value) for name, value in values.items()})
 

@@ -32,7 +32,7 @@ _DEG = float(np.rad2deg(1.0))
 DISCRETISATION = 0.5
 _STEPS = 3  # Gauss–Newton steps on each grid; the next grid continues from there
 _ITERATIONS = 20  # iterations of CGLS for each step and each standard deviation
-_DEVIATIONS = 3.0  # a kind is corrected only if its RMS over the views exceeds this many standard deviations
+_DEVIATIONS = 3.0  # a kind of parameter is corrected only if its RMS over the views exceeds this many standard deviations
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class MotionParameters(PerViewParameters):
 
     @classmethod
     def of(cls, scan: Scan, count: int = SPLINES) -> "MotionParameters":
-        """Returns a motion of zeros, as ``count`` splines."""
+        """Returns an object at rest: ``count`` splines of time with coefficients of 0."""
         still = Sway.none(scan, count)
         basis = still.basis(np.asarray(scan.frame_start_s) + scan.shutter.middle_s)
         shift_mm = scan.geometry.pixel_size_mm[1] / scan.geometry.magnification
@@ -226,7 +226,7 @@ def _norms(basis: np.ndarray, signals: np.ndarray) -> np.ndarray:
 
 
 def _strength(operator: RayOperator) -> float:
-    """Estimates the largest singular value of the projector, in mm. CGLS then finds parameters that are scaled to it as fast
+    """Estimates the largest singular value of the projector, in mm. If parameters are scaled to it, CGLS finds them as fast
     as the volume."""
     lengths = operator.forward(np.ones(operator.volume_shape, np.float32))
     return float(np.linalg.norm(operator.adjoint(lengths)) / np.linalg.norm(lengths))

@@ -43,7 +43,7 @@ def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> lis
     smooth = gaussian_filter(volume, _SMOOTH * radius_mm / np.array(grid.voxel_size_mm))
     spots_mm = _peaks_mm(smooth, grid, int(_PEAKS_PER_BEAD * len(beads_mm)) + FEWEST_BEADS)
     within_mm = _TOLERANCE_VOXELS * max(grid.voxel_size_mm)
-    matches: list[tuple[int, float, np.ndarray]] = []  # number of beads found (negative), mean distance, placement
+    matches: list[tuple[int, float, np.ndarray]] = []  # −(number of beads found), mean distance in mm, placement
     for three, corners in _matching_triangles(beads_mm, spots_mm, within_mm):
         place = _rigid(beads_mm[list(three)], spots_mm[corners])
         for _ in range(2):  # first from three beads, then from all beads that are near

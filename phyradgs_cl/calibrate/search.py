@@ -147,7 +147,7 @@ def _signal(
     for sign in (1, -1):
         correction = correction_of({**at, one.name: at.get(one.name, 0.0) + sign * step})
         operator: Any = problem.operator(correction)
-        ends.append(operator.forward(volume) - problem.measured)  # minus measured, to lose fewer digits in float32
+        ends.append(operator.forward(volume) - problem.measured)  # small numbers, whose difference is exact in float32
     return problem.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 
@@ -176,7 +176,8 @@ Problem = CoarseProblem | BeadProblem
 
 @dataclass(frozen=True)
 class Fallback:
-    """An estimate from outside of the search: value minus stated value, in the field's unit, and its standard deviation."""
+    """An estimate that the search did not make. value: estimate minus stated value, in the field's unit. deviation: its
+    standard deviation. is_significant: whether the value is applied."""
 
     value: float
     deviation: float
@@ -229,7 +230,8 @@ class Search:
                 return
 
     def _decide_determined(self, linear: Reduced) -> None:
-        """Decides which parameters the frames determine: those with a large enough share and a useful deviation."""
+        """Decides which parameters the frames determine: those with a large enough share and, of angles, those with a
+        standard deviation below 10°."""
         has_gauges = GAUGES[0].name in linear.names
         least = least_shares(linear) if has_gauges else dict.fromkeys(linear.names, LEAST_SHARE_OF_BEADS)
         linear = linear.only([one.name for one in self.parameters])
@@ -258,14 +260,14 @@ class Search:
         return bool(np.all(np.abs(change) < _SETTLED * self.reduced.deviations()))
 
     def keep_held(self) -> None:
-        """Drops all estimates but the fallbacks of held parameters."""
+        """Drops all estimates except those of held parameters, which the search did not make (``fallback``)."""
         self.determined = ()
         self.fixed = {name: estimate for name, estimate in self.fixed.items() if name in self.held}
 
     def estimates(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the values (K,) of the determined parameters and their standard deviations (K,), in the fields' units.
 
-        A deviation combines noise and discretisation error, taken as half the change since the coarser grid. Both are larger
+        A deviation combines noise and discretisation error, taken as half the change since the coarser grid. It is larger
         for a parameter whose effect resembles that of undetermined ones, because these keep stated values that may be
         wrong."""
         if self.reduced is None or not self.determined:

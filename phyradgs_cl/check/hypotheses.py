@@ -195,8 +195,8 @@ def nearly_sized(scan: Scan, factor: float) -> Scan:
 
 
 def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses that a frame is missing, or there twice, at up to 15 places. They move the angles of later frames by
-    a step on, or back."""
+    """Yields hypotheses that a frame is missing, or there twice, at up to 15 places. They move the angles of later frames
+    one step forwards or backwards."""
     sense = -1.0 if variants.altered_trajectory(scan).is_reversed else 1.0
     step = float(np.median(wrapped(np.diff(_azimuths(scan))))) * sense
     for at in np.unique(np.linspace(1, scan.frames - 1, _GAPS).round().astype(int)):

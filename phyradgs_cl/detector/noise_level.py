@@ -24,7 +24,7 @@ _TOUCHING = 0.5  # saturation covers areas: pixels at an extreme are clipped if 
 _SAME = 1e-3  # flats and the largest count that differ by less than this fraction are equally bright: such pixels may be air
 _MOST_FRAMES = 8  # noise outside saturated pixels is sought in at most this many frames
 _LONGEST_EDGE = 1024  # of larger frames only the middle, this many pixels a side, is searched for noise
-_ROUNDING = 0.5  # rounding of counts alone causes an estimate up to this, in counts
+_ROUNDING = 0.5  # rounding of counts alone causes an estimated noise of up to this, in counts
 _RELATIVE = 2e-5  # an estimated noise up to this fraction of the largest count is too small to show that there is noise
 # An estimate along both axes shows noise if it is at least this fraction of the estimate along rows. Structure gives less.
 _WHITE = 0.5
@@ -99,7 +99,8 @@ def noise_map(residual: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
 
 
 def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
-    """Returns ``noise_rms`` behind the object, from some of the frames. line_integrals and valid: (F, v, u).
+    """Returns the root mean square of the noise behind the object, dimensionless, from some frames. line_integrals, valid:
+    (F, v, u).
 
     Air is left out: its noise is lower, and in some files clipped at 0."""
     some = slice(None, None, max(1, len(line_integrals) // _FRAMES))
