@@ -180,9 +180,10 @@ def launched_ranks() -> Communicator:
 
 @contextmanager
 def failing_together(ranks: Communicator, report_error: Callable[[BaseException], int]) -> Iterator[None]:
-    """Lets an exception of the body pass if all ranks have one. If only some fail, reports it and ends all ranks.
+    """Lets an exception of the body pass if all ranks have one. If only some fail, reports it and ends all ranks,
+    because the others would wait for ever.
 
-    Otherwise the other ranks would wait for ever. ``report_error`` prints the error and returns the exit status."""
+    ``report_error`` prints the error and returns the exit status."""
     try:
         yield
     except BaseException as error:

@@ -39,7 +39,7 @@ def read_deformation(path: str | Path) -> Deformation:
 
 
 def holds_deformation(path: str | Path) -> bool:
-    """Returns whether a file has a deformation at ``DEFORMATION``, as volumes of moving objects may have."""
+    """Returns whether a file has a deformation at /entry/deformation, as volumes of moving objects may have."""
     with open_hdf5(path) as source:
         return source.find(DEFORMATION) is not None
 

@@ -20,7 +20,7 @@ _OBJECT, _AROUND = 0.01, 2  # errors count where the truth is above 1 % of its m
 
 
 def object_voxels(truth: Array) -> NDArray[np.bool_]:
-    """Returns which voxels (nz, ny, nx) count: the object, and two voxels around it."""
+    """Returns the voxels, bool (nz, ny, nx), whose errors count: those of the object, and two voxels around it."""
     return np.asarray(scipy.ndimage.binary_dilation(truth > _OBJECT * truth.max(), iterations=_AROUND))
 
 

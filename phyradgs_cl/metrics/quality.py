@@ -1,4 +1,4 @@
-"""Compares a volume with a reference by peak signal-to-noise ratio and structural similarity, and a motion with the truth.
+"""Compares a volume with a reference by PSNR and structural similarity (SSIM), and a motion with the true motion.
 
 SSIM (Z. Wang et al., IEEE Trans. Image Process. 13(4), 600-612, 2004) is taken in 2D, with an 11×11 Gaussian window of sigma
 1.5 and zeros beyond the border. As in the published tables of radiative Gaussian splatting, it is averaged over the slices
@@ -206,7 +206,7 @@ def _scores(result: Floats, reference: Floats) -> str:
 
 
 def draw_slices(figure: "FigureBase", volume: Floats, truth: Floats | None, grid: Grid | None) -> None:
-    """Draws the three middle slices of a volume (z, y, x) in 1/mm; with a truth, also its slices and the difference."""
+    """Draws the three middle slices of a volume (z, y, x) in 1/mm; with a ``truth``, also its slices and the difference."""
     if truth is not None:
         checks.shape("reference", truth, volume.shape)
         checks.finite("reference", truth)

@@ -115,8 +115,8 @@ def surround_evenly(scan: Scan) -> bool:
 
 
 def _means(frames: np.ndarray, full_turn: bool) -> np.ndarray:
-    """Returns the means (2, v, u) of two independent sets of views: even and odd ones; on an arc its two halves, which show
-    the object differently."""
+    """Returns the means (2, v, u) of two independent sets of views: even and odd ones or, on an arc, the first and the
+    second half, in which the object looks different."""
     half = (len(frames) + 1) // 2
     sets = (frames[::2], frames[1::2]) if full_turn else (frames[:half], frames[half:])
     return np.stack([part.mean(axis=0, dtype=np.float64) for part in sets])
@@ -152,7 +152,8 @@ def _blockwise(
     image: np.ndarray, guide: np.ndarray, share_of: Callable[[np.ndarray], np.ndarray], window: int
 ) -> np.ndarray:
     """Multiplies the cosine coefficients of overlapping blocks by ``share_of`` the coefficients of ``guide``, and averages
-    blocks. Each block keeps its mean value. A block of fewer remaining coefficients has less noise and weighs more."""
+    blocks where they overlap. Each block keeps its mean value. A block of fewer remaining coefficients has less noise and
+    weighs more."""
     width = [(window, window + (-n) % window) for n in image.shape]
     padded, guiding = (np.pad(part, width, mode="symmetric") for part in (image, guide))
     total, weight = np.zeros_like(padded), np.zeros_like(padded)

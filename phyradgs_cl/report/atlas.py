@@ -10,7 +10,7 @@ from phyradgs_cl.report.images import Window, base64_of, block_means, bytes_of, 
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 from phyradgs_cl.report.viewer import choice, decimals_of, slider
 
-MOST_EDGE = 128  # larger volumes are averaged over blocks to this many voxels along each side
+MOST_EDGE = 128  # larger volumes are averaged over blocks to at most this many voxels along each side
 MOST_TEXT = 2_000_000  # limit of base64 characters for voxels and centres together, so that the page stays small
 MOST_CENTRES = 20_000  # the centres of at most this many Gaussians are shown, evenly chosen
 MOST_ZOOM = 8

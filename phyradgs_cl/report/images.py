@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.fields import Grid
 
-LONGEST_EDGE = 192  # larger slices are averaged over blocks to this many pixels along each side
+LONGEST_EDGE = 192  # larger slices are averaged over blocks to at most this many pixels along each side
 BUDGET_PIXELS = 16_000_000  # pixels of all slices together: pure noise, the worst case, makes a page of some 20 MB
 # Plane, index and letter of the axis across it, and the world axes to the right and up in the picture.
 PLANES = (("axial", 0, "z", "x", "y"), ("coronal", 1, "y", "x", "z"), ("sagittal", 2, "x", "y", "z"))

@@ -39,7 +39,7 @@ class Quantity:
 
     @property
     def accepted(self) -> str:
-        """The short unit names, for messages."""
+        """The units' names of up to four ASCII characters, for messages."""
         return ", ".join(name for name in self.factors if len(name) <= 4 and name.isascii())
 
 
