@@ -15,7 +15,7 @@ from phyradgs_cl.removed import refuse_removed
 
 _CLICK_ERROR: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 HELP = {"help_option_names": ["-h", "--help"]}
-# By command NAME: the module of commands/ that defines NAME_command, and the text about the command in the list of commands.
+# For each command NAME: the module of commands/ that defines NAME_command, and the command's text in the list of commands.
 COMMANDS = {
     "simulate": ("simulate", "Simulate a fly-scan of a phantom or a volume."),
     "import": ("import_scan", "Turn the scan of another program into a scan file."),
@@ -113,7 +113,7 @@ def run(arguments: list[str], program: typer.Typer = app) -> int:
             return complain(str(error), error.exit_code)
         except _CLICK_ERROR as error:
             return complain(usage_text(error, arguments))
-        except OSError as error:  # no function has turned it into a PhyradgsError
+        except OSError as error:  # an error of the system that became no PhyradgsError
             text = f"{error.filename or 'operating system'}: {error.strerror or error}"
             return complain(text, OutputError.exit_code if error.errno in NO_SPACE else 2)
         except SystemExit:  # Typer raises it if the reader of its help closes the pipe, as `| head` does

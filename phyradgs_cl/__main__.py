@@ -23,7 +23,7 @@ def main() -> None:
     """Runs the command line and exits with its status. Ctrl-C prints one line instead of a traceback, with status 130."""
     try:
         status = load_cli().run(sys.argv[1:])
-    except KeyboardInterrupt:  # pressed while libraries load; later the command line handles it
+    except KeyboardInterrupt:  # Ctrl-C while libraries load; later the command line handles Ctrl-C
         sys.stderr.write("phyradgs: interrupted, nothing written\n")
         status = 130
     for number in (signal.SIGINT, signal.SIGTERM):  # a signal while the interpreter ends would print a traceback

@@ -84,7 +84,7 @@ class Checked:
 
 
 def kind(subject: str, value: object, allowed: Any, expected: str, remedy: str = "") -> None:
-    """Raises InputError unless ``value`` is of a type in ``allowed``, which is what isinstance takes."""
+    """Raises InputError unless isinstance(``value``, ``allowed``). ``expected`` and ``remedy`` are words of the message."""
     if not isinstance(value, allowed):
         raise InputError(subject, short_repr(value), expected, remedy)
 
@@ -125,7 +125,7 @@ def numbers(subject: str, value: ArrayLike, expected: Sequence[int | None] | Non
 
 
 def rising(subject: str, value: ArrayLike) -> NDArray[np.float64]:
-    """Returns times (n,) as float64. Raises InputError for no time, and for one that is not later than the one before."""
+    """Returns times (n,) as float64. Raises InputError for n = 0, and for a time that is not later than the one before."""
     times = numbers(subject, value, (None,))
     if len(times) == 0 or (np.diff(times) <= 0).any():
         raise InputError(subject, short_repr(times.tolist()), "at least one time, rising")

@@ -43,7 +43,7 @@ PARALLEL = CircularOrbit(ParallelGeometry(SHAPE, (2.6 / 9, 2.7 / 12), (0.1, 0.2)
 UNIT = 2.0  # line integral that a pixel of value 1 means to kernels that average intensities exp(−line integral)
 STEP = 1e-6  # central differences take this step to each side
 Comparison = tuple[np.ndarray, np.ndarray, float]
-"""Computed, expected, and the largest difference allowed, relative to the largest number expected."""
+"""The computed and the expected numbers, and the largest difference allowed, relative to the largest expected number."""
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
     yield rt.download(operator.adjoint(rt.upload(frames))), twins.ray_volume(shares, GRID, finer), VALUE
     intensity = operators.IntensityOperator(rt, GRID, SHAPE, [table])
     mean, averaged = (twins.ray_frame(volume, GRID, table, SHAPE, model) for model in ("log", "intensity"))
-    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # averages line integrals until ``expected`` is called
+    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # before ``expected`` it averages line integrals
     yield rt.download(intensity.expected(on_device))[0], averaged, VALUE
     found = rt.download(intensity.adjoint(rt.upload(frames)))
     yield found, twins.intensity_volume(frames[0], volume, GRID, table), VALUE

@@ -23,7 +23,7 @@ from phyradgs_cl.runtime import Runtime
 
 _SPLAT_TRIALS = (20, 200)  # iterations of the two short runs (trials) of methods with Gaussians
 _TRIALS = (1, 3)  # iterations of the two short runs of other methods, unless their options have ``TRIALS``
-_LEAST_DIFFERENCE_S = 0.3  # below this difference of the two times, timing noise matters: the second trial is prolonged
+_LEAST_DIFFERENCE_S = 0.3  # if the trials' times differ by less, timing noise matters: the second trial is prolonged
 _LONGEST_TRIAL = 200  # a trial of this many iterations is not prolonged, because estimating would take too long
 _FEWEST_BETWEEN = 5  # least number of iterations between rounds of density control in a trial
 
@@ -120,8 +120,8 @@ class _Trials:
         return float(self.result.facts.get("density_control_seconds", 0.0))
 
     def _rounds_due(self, total: int) -> float:
-        """Returns the number of rounds of density control in a run of ``total`` iterations, over that in the last trial; 0
-        if the trial had none."""
+        """Returns (rounds of density control in a run of ``total`` iterations) / (rounds in the last trial); 0 if the trial
+        had none."""
         rounds = self.result.facts.get("density_control_rounds", 0)
         return sum(self.plan.options.control.is_due(i, total) for i in range(1, total + 1)) / rounds if rounds else 0.0
 
@@ -139,7 +139,7 @@ def shortened(options: Any, iterations: int) -> Any:
 
 def seconds_around(path: Path, scan: Scan, result: Reconstruction) -> float:
     """Returns the seconds for what ``reconstruct`` does besides the method: it hashes the scan, compares the volume with the
-    truth, if there is one, and writes it."""
+    scan's ``reference`` if both have one shape, and writes the volume."""
     started = time.perf_counter()
     sha256_of(path)
     if scan.reference is not None and result.volume.shape == scan.reference.shape:

@@ -180,9 +180,10 @@ def launched_ranks() -> Communicator:
 
 @contextmanager
 def failing_together(ranks: Communicator, report_error: Callable[[BaseException], int]) -> Iterator[None]:
-    """Lets an exception of the body pass if all ranks have one. If only some fail, reports it and ends all ranks.
+    """Lets an exception of the body pass if all ranks have one. If only some fail, reports it and ends all ranks,
+    because the others would wait for ever.
 
-    Otherwise the other ranks would wait for ever. ``report_error`` prints the error and returns the exit status."""
+    ``report_error`` prints the error and returns the exit status."""
     try:
         yield
     except BaseException as error:
@@ -220,7 +221,8 @@ def exact_sum(ranks: Communicator, parts: Sequence[np.ndarray], shape: tuple[int
 
 
 def _largest_exponents(ranks: Communicator, parts: Sequence[np.ndarray], rows: int) -> np.ndarray:
-    """Returns the least e with |values| < 2^e over all ranks, (rows,) int64, or ``_NOT_FINITE``."""
+    """Returns, for each row, the least e ≥ −300 with |values| < 2^e on all ranks, (rows,) int64; ``_NOT_FINITE`` for a row
+    with NaN or infinity."""
     exponents = np.full(rows, -300, np.int64)
     for part in parts:
         largest = np.abs(part).max(axis=1, initial=0.0).astype(np.float64)  # NaN for a row with a NaN

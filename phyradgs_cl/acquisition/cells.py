@@ -12,19 +12,19 @@ from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames, is_parallel
 
-_SAME_TIME = 1e-6  # times that differ by less than this fraction of a cell's duration are equal
+_SAME_TIME = 1e-6  # two times that differ by less than this fraction of a cell's duration count as equal
 _NOTHING = 1e-9  # a cell's fraction of a line's exposure below this is a rounding error, and becomes 0
 _INSTANT = 1e-9  # a line's exposure shorter than this fraction of the frame's lit span counts as a single moment
-_OVERHANG = 0.1  # a line leaves out a segment of time if its exposure covers at most this fraction of the segment
-_TURN_SAMPLES = 32  # equal intervals of a frame's lit span; the highest mean speed in one counts as the gantry's highest
-_TURN_FACTOR = 0.32  # measured relative RMS error of a frame, per squared radian that the gantry turns in a segment
+_OVERHANG = 0.1  # a line leaves out its first or last segment of time if its exposure covers at most this fraction of it
+_TURN_SAMPLES = 32  # the gantry's highest speed is taken from the mean speeds in this many intervals of a frame's lit span
+_TURN_FACTOR = 0.32  # measured (relative RMS error of a frame) / (gantry's turn in a segment, in rad)²
 _HARMLESS_PEAK = 4.0  # up to this line integral, averaging intensities needs no more segments than averaging line integrals
 _MOST_SEGMENTS = 1000  # most segments that ``segments_for`` chooses for a frame
 
 
 Served = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Four arrays about the cells that serve any line: their indices, their first lines, the lines after their last ones, and
-the order that sorts the cells by first line."""
+"""Four arrays about the time cells that serve at least one line: the cells' indices, their first lines, the lines after
+their last lines, and the order that sorts the cells by first line."""
 
 
 def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
@@ -113,7 +113,7 @@ def common_time_cells(
 
 @lru_cache(maxsize=8)  # the lines' windows are the same in all frames of a scan
 def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray, Served]:
-    """Returns the cells' edges (K + 1,) in s, the fraction (K, lines) of each line's window in each cell, and ``Served``.
+    """Returns the edges (K + 1,) in s of cells, the fraction (K, lines) of each line's window in each cell, and ``Served``.
 
     windows: the windows (lines, 2) in s after a frame's start, as bytes, because the cache takes no arrays as keys. The
     returned arrays stay in the cache: do not write to them."""
@@ -126,7 +126,8 @@ def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _served_lines(served: np.ndarray) -> Served:
-    """Returns the four arrays of ``Served``. served: whether each of K cells serves each line, bool (K, lines)."""
+    """Returns the indices of the cells that serve any line, their first lines, the lines after their last lines, and the
+    order by first line. served: whether each of K cells serves each line, bool (K, lines)."""
     used = np.flatnonzero(served.any(axis=1))
     line_start = served[used].argmax(axis=1)
     line_stop = served.shape[1] - served[used, ::-1].argmax(axis=1)
@@ -154,7 +155,7 @@ def _shares(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     length_s = closes - opens
     overlap = np.minimum(closes, edges_s[1:, None]) - np.maximum(opens, edges_s[:-1, None])
     share = np.maximum(overlap, 0) / np.where(length_s > 0, length_s, 1)
-    # A window of length 0 has no overlap with any cell: it counts to the cell that contains it.
+    # A window of length 0 overlaps no cell. It belongs wholly to the cell that contains it.
     moment = np.clip(np.searchsorted(edges_s, opens, side="right") - 1, 0, len(edges_s) - 2)
     share[:, length_s <= 0] = 0
     share[moment[length_s <= 0], np.flatnonzero(length_s <= 0)] = 1
@@ -186,13 +187,14 @@ def exact_cells(
 
 
 def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
-    """Returns ``TimeCells.line_times`` (K, 3, lines), for windows (lines, 2) in s and edges (K + 1,) in s of equal segments.
+    """Returns three numbers for each segment and line (``TimeCells.line_times``), (K, 3, lines), from the lines' windows
+    (lines, 2) in s and the edges (K + 1,) in s of K equal segments.
 
     A window leaves out its first or last segment if it covers at most ``_OVERHANG`` of that segment, so that fewer Gaussians
     are projected."""
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
-    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in lengths of a segment after the frame's first light
+    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in segments after the frame's first light
     first, last = _segments_of_lines(opens, closes, count)
     index = np.arange(count)[:, None]
     start = np.where(index == first, opens, index)

@@ -67,7 +67,7 @@ class ConeGeometry:
 
     @property
     def magnification(self) -> float:
-        """Source-to-detector over source-to-axis distance: how large an object at the axis appears, over its size."""
+        """source_to_detector_mm / source_to_axis_mm: the factor by which the panel shows an object at the axis enlarged."""
         return self.source_to_detector_mm / self.source_to_axis_mm
 
 
@@ -113,8 +113,8 @@ GEOMETRIES = (ConeGeometry, ParallelGeometry)
 
 
 def _check_panel(geometry: Geometry) -> None:
-    """Converts the panel's fields to tuples, so that geometries can be compared. Raises InputError for shapes, lengths and
-    offsets out of range."""
+    """Converts the panel's fields to tuples, so that geometries can be compared. Raises InputError for counts that are
+    not whole or below 1, pixel sizes not above 0, and offsets that are not finite."""
     counts = checks.numbers("detector_shape", geometry.detector_shape, (2,))
     if (counts < 1).any() or (counts != np.floor(counts)).any():
         raise InputError("detector_shape", str(geometry.detector_shape), "two counts (rows, columns) of at least 1")
@@ -127,8 +127,8 @@ def _check_panel(geometry: Geometry) -> None:
 
 
 def _panel_at(geometry: Geometry, angle_rad: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the unit vector (..., 3) from the axis to the source, and the last 9 numbers (..., 9) of poses in mm, for a
-    panel whose plane contains the axis."""
+    """Returns the unit vector (..., 3) from the axis to the source. Also returns first pixel, column step and row step
+    (..., 9) in mm of a panel whose plane contains the axis."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
     u_hat = np.stack([-sin, cos, zero], -1)
@@ -227,7 +227,7 @@ def default_grid(geometry: Geometry, poses: np.ndarray | None = None) -> Grid:
     middle_mm = (first_mm + last_mm) / 2
     if last_mm - first_mm >= high_mm:
         high += math.ceil((last_mm - first_mm) / high_mm)
-    elif abs(middle_mm - at_axis_mm) < high_mm:  # less than a voxel is a wobble of the gantry
+    elif abs(middle_mm - at_axis_mm) < high_mm:  # a shift of less than a voxel is a wobble of the gantry
         middle_mm = at_axis_mm
     return Grid((high, wide, wide), (high_mm, wide_mm, wide_mm), (middle_mm + beside_mm, 0.0, 0.0))
 
@@ -257,7 +257,7 @@ def check_distances(geometry: Geometry, grid: Grid) -> None:
 
 
 def misses(grid: Grid, geometry: Geometry) -> bool:
-    """Returns whether no voxel of ``grid`` lies in the field of view."""
+    """Returns whether the box of ``grid`` lies wholly outside the box of a full turn's field of view."""
     (low_mm, high_mm), (first_mm, last_mm) = grid.box_mm.T, field_of_view_mm(geometry).T
     return bool(np.any((low_mm >= last_mm) | (high_mm <= first_mm)))
 

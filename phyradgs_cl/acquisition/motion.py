@@ -23,11 +23,11 @@ from phyradgs_cl.fields import Deformation
 
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator that a model may suit: projectors of voxels, of Gaussians, and filtered backprojection."""
-_USUAL_TIMES = 6  # most times at which ``PerRow`` samples an exposure, unless the motion is fast
+_USUAL_TIMES = 6  # most times at which ``PerRow`` samples an exposure, if they are at most _COARSE_STEP_VOXELS apart
 _MOST_TIMES = 100  # most times at which ``PerRow`` samples an exposure, however fast the motion
 _FINE_STEP_VOXELS = 0.3  # most voxels that the volume's rim travels from one time of ``PerRow`` to the next
 _OBJECT_STEP_VOXELS = 0.7  # most voxels that an object's fastest part travels between two times; other parts travel less
-_COARSE_STEP_VOXELS = 3.6  # most voxels that rim or object travels between two times if _USUAL_TIMES are too few
+_COARSE_STEP_VOXELS = 3.6  # most voxels that rim or object travels between two times, of which it may need more than six
 _SUB_INTERVALS = "Sub-intervals N of an exposure; for phyradgs means micro-views."
 _WEIGHT_TOLERANCE = 1e-3  # largest difference from 1 of the sum of a line's weights in a user-defined model
 
@@ -72,7 +72,7 @@ class _Model(checks.Checked):
 
     operators: ClassVar[tuple[str, ...]]  # which methods take the model: some of RAYS, SPLATS, LINE_POSES
     poses: ClassVar[str] = ""  # a frame's poses in words, for the help of --motion; "" hides the model from the command line
-    counts: ClassVar[str] = ""  # the model's numbers in words, appended to its name
+    counts: ClassVar[str] = ""  # format string of the model's fields, whose text is appended to its name in reports
     is_implied: ClassVar[bool] = True  # whether giving one of its numbers, such as --strips, chooses the model
 
 
@@ -172,7 +172,7 @@ class PerRow(_Model):
         return replace(self, sub_intervals=min(max(1, min(fine, _USUAL_TIMES), coarse), _MOST_TIMES))
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """Returns the ``TimeCells`` of one frame: cells of exposure / sub-intervals each, from first light to last."""
+        """Returns the ``TimeCells`` of one frame, from first light to last: cells of length exposure / sub-intervals."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = scan.trajectory, scan.shutter, frame, scan.frame_start_s, scan.lines
@@ -234,7 +234,7 @@ class Exact(_Model):
 
 MODELS = (Static, StaticStart, MicroViews, Centres, PerRow, OwnTimes, Exact, LineMiddles)
 MOTIONS = tuple(dict.fromkeys(model.name for model in MODELS))
-"""The names of all models."""
+"""The names of the motion models of this package, each once."""
 
 
 def motions_for(*operators: str) -> tuple[Motion, ...]:

@@ -20,12 +20,12 @@ FEW = 0.01  # fraction of pixels above OPAQUE that is ignored, since some pixels
 _WIDEST_DEG = 120.0  # a fan or cone angle above this is refused: dental scanners have 30°, nano-CT 60°
 _LARGEST_PITCH_MM = 5.0  # pixels larger than this are not real, so they are named as the cause of too wide a fan
 _LEAST_DISTANCE_MM = 10.0  # a panel nearer to the source than this is not real, so distances are named as the cause
-_WRONG_UNIT = 100.0  # a readout longer than this many frame times is refused: ms given as s make it some hundreds
+_WRONG_UNIT = 100.0  # a readout longer than this many frame times is refused: one stated in ms as if in s lasts hundreds
 _SHORT_READOUT_S = 0.5e-3  # a shorter readout of at least _MANY_LINES lines causes a warning: real panels take some ms
 _MANY_LINES = 100
 _SLOW_FPS = 2.0  # a lower frame rate causes a warning if the gantry turns by more than _LARGE_STEP_DEG between frames
 _LARGE_STEP_DEG = 10.0
-_LEAST_LIT = 0.25  # a low frame rate causes a warning only if exposure and readout fill less of a frame's time than this
+_LEAST_LIT = 0.25  # a low frame rate causes a warning only if exposure + readout is below this fraction of a frame's time
 _TIMES = 17  # number of angles sampled in an exposure: no gantry makes half a turn from one to the next
 _SLACK = 1e-3  # relative tolerance, because stated times and angles are rounded
 _MANY_FRAMES = 10  # fewer frames may lie within a few degrees on purpose, so they cause no warning about radians
@@ -34,7 +34,7 @@ _ASIDE = 0.1  # a panel off centre by more than this fraction of its width was d
 
 def summary(scan: "Scan") -> str:
     """Returns a line about a scan's timing, a line about its sizes and, for a fly-scan, a line about its blur. Values that
-    nobody stated, as the provenance lists them, are marked "(assumed)"."""
+    the provenance lists as assumed are marked "(assumed)"."""
     return "\n".join(filter(None, (_timing(scan), _sizes(scan), blur_line(scan))))
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from phyradgs_cl.acquisition.scan import Scan
 
-_MOST_CORNERS = 129  # most points on either side of the exposures' outline, because a panel may have thousands of lines
+_MOST_CORNERS = 129  # most lines whose opening and closing make the outline of the exposures: a panel may have thousands
 
 
 def plot_frame(scan: "Scan", frame: int = 0) -> "Figure":

@@ -14,7 +14,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.text import flag_of
 
 _PULSE = "When the beam is on, in exposures after a frame's start."
-_FEWEST_TURNS = 1e-3  # least number of turns, in either direction
+_FEWEST_TURNS = 1e-3  # least number of turns of a scan, counterclockwise or clockwise
 _MOST_TURNS = 10_000
 
 

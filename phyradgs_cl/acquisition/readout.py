@@ -9,7 +9,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import transpose_pose
 from phyradgs_cl.errors import InputError
 
-# By the side of the panel that is read first, seen from the source: the readout axis and direction.
+# The readout axis and direction for each side of the panel, seen from the source, at which the readout may begin.
 FIRST_LINES = {"bottom": ("rows", 1), "top": ("rows", -1), "left": ("columns", 1), "right": ("columns", -1)}
 SIDES = tuple(FIRST_LINES)
 Named = Callable[[str], str]
@@ -39,15 +39,15 @@ class Readout:
         return pose if self.axis == "rows" else transpose_pose(pose)
 
     def spread(self, by_line: np.ndarray) -> np.ndarray:
-        """Returns a view of values (..., lines) that broadcasts with frames (..., rows, columns)."""
+        """Returns values (..., lines), one for each line, as a view that broadcasts with frames (..., rows, columns)."""
         return by_line[..., :, None] if self.axis == "rows" else by_line[..., None, :]
 
 
 def readout_order(
     first: str | None, axis: str | None, direction: int | None, named: Named = str
 ) -> tuple[str | None, int | None]:
-    """Returns the readout axis and direction. ``first``, a key of ``FIRST_LINES``, states both; without it ``axis`` and
-    ``direction`` count. Raises InputError if the arguments contradict each other."""
+    """Returns the readout axis and direction. ``first``, a key of ``FIRST_LINES``, states both. If it is None, ``axis`` and
+    ``direction`` are returned. Raises InputError for another ``first``, and if the other arguments contradict it."""
     if first is None:
         return axis, direction
     checks.one_of(named("first"), first, FIRST_LINES)
@@ -59,8 +59,8 @@ def readout_order(
 
 
 def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = str) -> float | None:
-    """Returns the seconds between frames, from ``fps`` or else ``frame_time_s``; None without either. Raises InputError if
-    both are given and differ."""
+    """Returns the seconds between frames: 1/``fps``, or ``frame_time_s`` if fps is None. Raises InputError for fps not above
+    0, and if both are given and differ."""
     if fps is None:
         return frame_time_s
     checks.positive(named("fps"), fps)
@@ -68,8 +68,8 @@ def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = 
 
 
 def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named = str) -> float | None:
-    """Returns a time in s, from ``in_ms`` or else ``in_s``; None without either. Raises InputError if both are given and
-    differ. word: "exposure" or "readout", for the message."""
+    """Returns a time in s: ``in_ms``/1000, or ``in_s`` if ``in_ms`` is None. Raises InputError for ``in_ms`` below 0, and if
+    both are given and differ. word: "exposure" or "readout", for the message."""
     if in_ms is None:
         return in_s
     checks.at_least(named(f"{word}_ms"), in_ms, 0)
@@ -77,7 +77,7 @@ def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named 
 
 
 def check_readout(readout_ms: float | None, readout_ratio: float | None, fps: float | None, named: Named = str) -> None:
-    """Raises InputError for a readout ratio or time out of range, if both are given, and for a time in ms without fps."""
+    """Raises InputError for a ratio outside 0 to 1000 or a time below 0, for both together, and for a time without fps."""
     if readout_ratio is not None:
         checks.within(named("readout_ratio"), readout_ratio, 0, 1000)
     if readout_ms is None:

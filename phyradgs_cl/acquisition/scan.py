@@ -51,7 +51,7 @@ class Scan:
     - trajectory: anything with ``pose(frame, time_s)``, also a user-defined class.
     - frame_start_s (F,): when each frame's first line opens, in s.
     - is_fly: False if the gantry stops for every frame (stop-and-shoot), whatever the exposure time.
-    - detector_model: what the detector averages over an exposure, "log" (line integrals) or "intensity".
+    - detector_model: the quantity that the detector averages over an exposure, "log" (line integrals) or "intensity".
     - pixel_mask (nv, nu) or (F, nv, nu): non-zero for pixels not to be used. Lines that a pulsed beam misses are masked too.
     - reference (nz, ny, nx): the true volume in 1/mm on ``grid``. moving_truth: true volumes and motion of a simulated
       object that moves.
@@ -213,14 +213,14 @@ class Scan:
         """Raises InputError for a trajectory that does not cover every frame, poses that are not finite, and an exposure too
         short for the precision of the scan's times."""
         self.shutter.check_resolved(self.frame_start_s)
-        last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # at rest, a frame has one pose
+        last_s = self.shutter.span_s if self.is_fly else self.shutter.middle_s  # a frame at rest has one pose, in its middle
         for frame, start_s in enumerate(self.frame_start_s):
             self.trajectory.pose(frame, np.array([start_s, start_s + last_s]))
 
     def warn_of_near_panel(self) -> None:
         """Warns if, as the first frame opens, the panel of a cone beam stands inside the grid, at its middle or behind. No
         ray sees the part of the grid behind the panel."""
-        if self.is_parallel:  # parallel rays are not taken to end at the panel
+        if self.is_parallel:  # parallel rays are not cut off at the panel
             return
         (pose,) = self.trajectory.pose(0, np.array(self.frame_start_s[:1]))
         behind_mm, half_mm = panel_behind_mm(self.grid, pose), min(self.grid.size_mm[1:]) / 2

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 _MOST_RAD = 20 * np.pi  # angles in rad that span more than these ten turns are most likely degrees
-_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # fields of ``Scan`` taken by name
+_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # fields of ``Scan``
 
 
 def from_poses(
@@ -134,8 +134,8 @@ def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = N
 
 
 def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as ``line_integrals`` does. Nobody stated what quantity they are, so frames that look like raw counts
-    raise InputError too."""
+    """Returns frames as ``line_integrals`` does. Raises InputError also for frames that look like raw counts, because the
+    caller does not state their quantity."""
     values = checks.real_array("frames", frames)
     check_not_counts(values, "give −ln(counts / flats)", mask)
     return line_integrals(values, mask)
@@ -155,7 +155,8 @@ def line_integrals(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
 
 
 def poses_of_astra(vectors: ArrayLike, panel: tuple[int, int]) -> np.ndarray:
-    """Returns the poses (F, 12) in mm of ASTRA's vectors (F, 12) in mm, for a panel (rows, columns)."""
+    """Converts ASTRA's vectors (F, 12) in mm, which state the centre of a panel (rows, columns), to poses (F, 12) in mm,
+    which state its first pixel."""
     table = checks.numbers("vectors", vectors, (None, POSE_LENGTH))
     pose: np.ndarray = table.copy()
     pose[:, 3:6] -= _to_middle(pose, panel)
@@ -226,8 +227,8 @@ def _counts(geo: Any, name: str, length: int) -> np.ndarray:
 
 
 def _each(geo: Any, name: str, frames: int, length: int, absent: float) -> np.ndarray:
-    """Returns an attribute of a TIGRE geometry, given for all frames or per frame, as (F, length). A missing attribute
-    counts as ``absent``. Raises InputError if DSO or DSD is missing, and for other shapes."""
+    """Returns the attribute ``name`` of a TIGRE geometry, which has ``length`` numbers for all frames or for each, as (F,
+    length). A missing attribute counts as ``absent``. Raises InputError if DSO or DSD is missing, and for other shapes."""
     value = _of(geo, name) if name in ("DSO", "DSD") else getattr(geo, name, None)
     table = checks.numbers(f"geo.{name}", absent if value is None else value)
     per_frame = (frames,) if length == 1 else (frames, length)

@@ -9,7 +9,7 @@ from phyradgs_cl.acquisition.readout import FIRST_LINES, Readout
 from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")
-_STEPS = 1000  # an exposure is at least this many times the rounding of float64 times: its parts are exact to a thousandth
+_STEPS = 1000  # least exposure / rounding of float64 times: parts of an exposure are then exact to a thousandth
 _DARK = 1e-9  # a line lit for less than this fraction of the longest lit time counts as missed by the pulsed beam
 
 
@@ -61,7 +61,7 @@ class Shutter:
 
     @property
     def readout(self) -> Readout:
-        """Converts frames and poses to the order (lines, width) in which the panel is read, and back."""
+        """The converter of frames and poses to the order (lines, width) in which the panel is read, and back."""
         return Readout(self.axis)
 
     @property
@@ -82,7 +82,7 @@ class Shutter:
 
     @property
     def middle_s(self) -> float:
-        """The middle of ``lit_span_s`` in s after the frame's start: the best time for a single pose."""
+        """The middle between a frame's first and last light, in s after its start: the best time for a single pose."""
         first_s, last_s = self.lit_span_s
         return first_s + (last_s - first_s) / 2
 
@@ -124,7 +124,7 @@ class Shutter:
 
     def strip_ranges(self, lines: int, strips: int) -> list[tuple[int, int]]:
         """Divides lines into ``strips`` that differ by at most one line, and returns the lines [start, stop) of each, in
-        reading order. If there are more strips than lines, some are empty."""
+        reading order. If there are more strips than lines, some have no line."""
         edges = [checks.ceil_div(strip * lines, strips) for strip in range(strips + 1)]
         ranges = list(zip(edges[:-1], edges[1:], strict=True))
         if self.direction < 0:

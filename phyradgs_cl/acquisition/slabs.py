@@ -11,12 +11,12 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 
 HALO_ROWS = 4
-"""Rows that are read beyond each side of a slab: a slice between two rows needs both rows, and priors compare neighbours."""
+"""Number of rows read beyond each side of a slab. A slice between two rows needs both, and priors compare near slices."""
 
 
 def check_has_slabs(scan: Scan, subject: str, found: str) -> None:
-    """Raises InputError if ``has_slabs`` is False: slices then need rows of the whole panel. subject: the option that asked
-    for a slab. found: the option's value."""
+    """Raises InputError for anything but a parallel beam on a circular orbit: slices then need rows of the whole panel.
+    subject: the option that asked for a slab. found: the option's value."""
     if not has_slabs(scan):
         expected = "all rows: only in a parallel beam about z does a slice need few of them"
         raise InputError(subject, found, expected, "take --roi-mm, with --margin-mm")
@@ -28,7 +28,7 @@ def has_slabs(scan: Scan) -> bool:
 
 
 def check_rows(scan: Scan, first: int, stop: int) -> None:
-    """Raises InputError for rows [first, stop) that the panel does not have, or if ``has_slabs`` is False."""
+    """Raises InputError for rows [first, stop) that the panel lacks, and for a scan whose slices need all rows."""
     rows, found = scan.geometry.detector_shape[0], f"{first}:{stop}"
     check_has_slabs(scan, "--rows", found)
     if not 0 <= first < stop <= rows:
@@ -38,7 +38,7 @@ def check_rows(scan: Scan, first: int, stop: int) -> None:
 def slab(scan: Scan, first: int, stop: int) -> Scan:
     """Returns the scan with only the detector rows [first, stop), which keep their times. The grid stays the same.
 
-    Raises InputError as ``check_rows`` does."""
+    Raises InputError for rows that the panel lacks, and for a scan whose slices need all rows."""
     check_rows(scan, first, stop)
     geometry, shutter, rows = scan.geometry, scan.shutter, scan.geometry.detector_shape[0]
     pitch_v_mm, (offset_v_mm, offset_u_mm) = geometry.pixel_size_mm[0], geometry.detector_offset_mm
@@ -59,8 +59,8 @@ def slab(scan: Scan, first: int, stop: int) -> Scan:
 
 
 def slices_of(scan: Scan, first: int, stop: int) -> slice:
-    """Returns the slices of the scan's grid whose centres lie at the height of detector rows [first, stop); they may be
-    none. Slices beyond the panel belong to its first or last row, so that slabs of all rows together have every slice."""
+    """Returns the range of the grid's slices whose centres lie at the height of detector rows [first, stop); it may be
+    empty. Slices beyond the panel belong to its first or last row, so that slabs of all rows together have every slice."""
     rows, pitch_mm = scan.geometry.detector_shape[0], scan.geometry.pixel_size_mm[0]
     row = (scan.grid.axes_mm()[0] - scan.geometry.detector_offset_mm[0]) / pitch_mm + (rows - 1) / 2
     number = np.clip(np.floor(row + 0.5), 0, rows - 1)

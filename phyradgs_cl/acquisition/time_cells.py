@@ -28,8 +28,7 @@ class TimeCells:
     - end_poses (C, 2, 12) in mm, end_times_s (C, 2) in s: at both ends of moving cells, whose ``weight`` is 1; None for
       still cells. The times are needed if the object moves.
     - line_times (C, 3, lines): for moving cells, three numbers about the part of each line's exposure in the cell. They are
-      the part's middle minus the cell's mid-time and the part's half-length, both over the cell's length, and the part's
-      fraction of the exposure.
+      (part's middle − cell's mid-time) / cell's length, part's half-length / cell's length, and part's length / exposure.
     - is_parallel: poses begin with the direction of parallel rays.
     - conic_pose (12,): for Gaussians only. Cells then move only the Gaussians' centres on the panel; their shapes and
       densities there are computed for this pose.
@@ -77,7 +76,7 @@ class TimeCells:
 
     @property
     def readout(self) -> Readout:
-        """Converts frames and poses to the order (lines, width) in which the panel is read, and back."""
+        """The converter of frames and poses to the order (lines, width) in which the panel is read, and back."""
         return Readout(self.axis)
 
     @property
@@ -87,7 +86,7 @@ class TimeCells:
 
     @property
     def averages(self) -> bool:
-        """Whether any line averages over several cells. Such cells have different ``layer_numbers``."""
+        """Whether any line averages over several cells, which then belong to different layers (``layer_numbers``)."""
         return bool(self.layer_numbers.any())
 
     def scaled(self, factor: float) -> "TimeCells":
@@ -161,7 +160,7 @@ class TimeCells:
 
     @cached_property
     def layer_weights(self) -> np.ndarray:
-        """The weight (layers, lines) of the cell that serves a line in each layer of ``layer_numbers``; 0 if none does."""
+        """For each layer and line, (layers, lines): the weight of the layer's cell that serves the line; 0 without one."""
         weights = np.zeros((int(self.layer_numbers.max(initial=-1)) + 1, self.lines))
         for cell, lines in enumerate(self.ranges):
             weights[self.layer_numbers[cell], lines] = self.weights_of(cell)

@@ -354,8 +354,8 @@ def grid_of_scan(geometry: Geometry, trajectory: Trajectory, frame_start_s: np.n
 def _checked_table(
     subject: str, times: np.ndarray, rows: np.ndarray, row: tuple[int, ...], what: str, expected: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns times (T,) and rows (T, *row) as float64. Raises InputError for times that do not increase, and for rows of
-    another shape or not finite."""
+    """Returns times (T,) and rows (T, *row), T at least 2, as float64. ``subject``, ``what`` and ``expected`` are words of
+    messages. Raises InputError for times that do not increase, other shapes, and numbers that are not finite."""
     time_s, table = checks.numbers(f"{subject} times", times), checks.numbers(f"{subject} {what}", rows)
     if time_s.ndim != 1 or time_s.size < 2 or table.shape != (time_s.size, *row):
         raise InputError(subject, f"shapes {time_s.shape} and {table.shape}", expected)

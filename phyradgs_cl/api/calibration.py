@@ -18,8 +18,8 @@ from phyradgs_cl.fields import Gaussians
 from phyradgs_cl.fields.gaussians import ROWS
 from phyradgs_cl.importers import load_beads
 
-# For a central difference the image's edge moves by this many pixels each way. The differences of smaller steps drown in the
-# errors of voxels. Frames are not linear in larger steps.
+# A central difference moves the image's edge by this many pixels to each side. The frames' change by a smaller step is lost
+# in errors of voxels. Their change by a larger step is not linear.
 _STEP_PX = 0.25
 
 

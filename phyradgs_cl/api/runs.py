@@ -146,11 +146,11 @@ def simulate(
     detector: int | None = None, detector_offset_mm: tuple[float, float] | None = None,
     truncation: float = 0.0, pixel_samples: int = 0, device: Device = None, **options: Any,
 ) -> Scan:
-    """Simulates a fly-scan of a phantom, or with ``protocol="static"`` a stop-and-shoot scan; ``reference`` is the truth.
+    """Simulates a fly-scan of a phantom, or with ``protocol="static"`` a stop-and-shoot scan, with its true ``reference``.
 
     phantom: a name, or the path of a volume file (docs/formats.md), (z, y, x) in 1/mm, or of a .toml of beads and wires.
     scanner: a name, or a TOML file. protocol: "rapid", "standard" or "static".
-    size: voxels along the longest side of grid and truth. detector: number of columns; rows are in proportion.
+    size: voxels along the longest side of the grid, which the true volume shares. detector: columns; rows in proportion.
     detector_offset_mm: position of the panel's centre (v, u). truncation: fraction of the columns that are cut off, half at
     each side. pixel_samples: rays along each side of a pixel; 0 chooses them by the voxels' size. device: what
     ``--device`` takes, or a Runtime. options: of ``phyradgs simulate``, with underscores (views, exposure_deg,

@@ -24,14 +24,14 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.removed import refuse_removed
 
 log = logging.getLogger(__name__)
-# For messages: the arguments of ``fly_scan``, by the names under which a Scan's checks know the same values.
+# For messages: the name of a value in the checks of a Scan, and the argument of ``fly_scan`` that states this value.
 _ARGUMENTS = {
     "angles": "angles_deg", "exposure_s": "exposure_deg", "frame_time_s": "exposure_s", "readout_s": "readout_ratio",
     "readout_axis": "readout",
     "source_to_axis_mm": "geometry.source_to_axis_mm", "source_to_detector_mm": "geometry.source_to_detector_mm",
 }  # fmt: skip
-_SLACK = 1e-3  # relative tolerance of steps and arcs, since users round angles
-_AIR_SLACK = 0.2  # noise may move a transmission in air this far from 1
+_SLACK = 1e-3  # relative tolerance of the angle between frames and of an exposure's arc, since users round angles
+_AIR_SLACK = 0.2  # largest difference of a transmission from 1 that noise in air may cause
 _CLEAR_STEP_DEG = 90.0  # between views this far apart or more, the gantry may have turned either way
 
 

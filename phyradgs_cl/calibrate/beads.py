@@ -25,7 +25,7 @@ from phyradgs_cl.phantoms import EllipsoidPhantom
 
 DENSITY = 6  # a placement (7,) is a turn (rotation vector, rad), a shift (mm) and, at this index, a factor of the density
 _MARGIN = 1.2  # a bead's shadow is taken to be wider by this factor, because an oblique panel widens it
-# An exposure has so many times, within these limits, that the grid's edge moves by at most a pixel from one to the next.
+# Fewest and most times of an exposure. Within these limits the grid's edge moves by at most a pixel from time to time.
 _FEWEST_TIMES, _MOST_TIMES = 6, 24
 _FEWEST_RAYS = 2  # fewest rays along each side of a pixel, and along a bead's radius: sharp edges need several
 _MOST_RAYS = 6  # rays along each side of a pixel, at most: the time grows with their square
@@ -36,9 +36,9 @@ _LEAST_ZEROS = 0.2  # if at least this fraction of the pixels is 0, the noise of
 _ZEROS_PX = 5  # the noise of clipped air is computed from moving means over squares of this many pixels a side
 _BACKGROUND = 4  # cosines along each side of a frame: together they describe holder, scatter and drift of the tube
 _STEP_PX = 0.25  # a central difference moves the frame's edge by this many pixels to each side
-_MOST_PX = 1.5  # most pixels by which one step of the placement moves a frame: beyond, its effect is not linear
-_SETTLED_PX = 0.01  # the search ends when a step moves the frame by less than this
-_LINEAR_PX = 0.3  # derivatives are computed again after a step that moves the frame by more than this
+_MOST_PX = 1.5  # most pixels by which one step of the placement moves a frame: a larger step's effect is not linear
+_SETTLED_PX = 0.01  # the search ends when a step moves the frame by fewer pixels
+_LINEAR_PX = 0.3  # derivatives are computed again after a step that moves the frame by more pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +142,9 @@ class _PanelLines:
     def _panel_axes(self) -> tuple[tuple[np.ndarray, ...], ...]:
         """Three vectors (N, 3), each with its inner products (N,) with the source and the first pixel, and its length (N,).
 
-        The first vector gives a point's distance from the source over the panel's. The other two give the line and the
-        pixel of the point's image. In a parallel beam the distance counts as 1, and the ray through the point makes the
-        image."""
+        The first vector gives the ratio of two distances from the source along the panel's normal: a point's to the panel's.
+        The other two give the line and the pixel of the point's image. In a parallel beam the ratio counts as 1, and the
+        ray through the point makes the image."""
         normal = np.cross(self.line_step, self.pixel_step)
         to_panel = self.source if self.is_parallel else self.first - self.source
         vectors = [normal / np.sum(normal * to_panel, -1, keepdims=True)]
@@ -157,8 +157,8 @@ class _PanelLines:
         return tuple((v, *both, np.linalg.norm(v, axis=-1)) for v, both in zip(vectors, products, strict=True))
 
     def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:
-        """Returns the lines (n,) that may see a body, the first pixel (n,) of its shadow on each, and the width in pixels of
-        the widest shadow."""
+        """Returns the lines (n,) that may see a body, the first pixel (n,) of its shadow on each, and the widest shadow's
+        width in pixels. The body lies within ``reach_mm`` of the line between its two ``ends_mm`` (2, 3)."""
         (depth, depth_of_source, *_), *axes = self._panel_axes
         lowest, highest = [], []
         for end_mm in ends_mm:
@@ -225,15 +225,15 @@ class BeadProblem(CoarseFrames):
         return float(np.std(residual if self.valid is None else residual[self.valid]))
 
     def explained(self, operator: BeadOperator, placement: np.ndarray) -> float:
-        """Returns the fraction of the compared values' sum of squares that the phantom explains; 0 if its density is
-        negative."""
+        """Returns the fraction of the compared values' sum of squares that the phantom explains; 0 unless the placement's
+        density factor is above 0."""
         residual = self.compared(self.residual(operator, placement))
         whole = self.compared(self.masked(self.measured))
         return float(1 - residual @ residual / max(float(whole @ whole), 1e-30)) if placement[DENSITY] > 0 else 0.0
 
     def reconstruct(self, operator: BeadOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:
-        """Returns the placement (7,) that fits best, by at most ``iterations`` Gauss–Newton steps from ``start`` (None: the
-        problem's own)."""
+        """Returns the placement (7,) that fits best, by at most ``iterations`` Gauss–Newton steps from ``start``; None
+        starts from the placement ``self.start``."""
         placement = self.start if start is None else start
         inverse = None
         for _ in range(iterations):
@@ -328,7 +328,7 @@ def _moved(placement: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 
 def _cosines(count: int) -> np.ndarray:
-    """Returns the slowest cosines (count, n) along a side of ``count`` pixels, orthonormal."""
+    """Returns the n slowest cosines (count, n) along a side of ``count`` pixels, orthonormal; n is at most 4."""
     order = np.arange(min(_BACKGROUND, count))
     waves = np.cos(np.pi * order * (np.arange(count)[:, None] + 0.5) / count)
     return waves / np.linalg.norm(waves, axis=0)

@@ -32,8 +32,8 @@ class Parameter:
     - stated: the scan's own value, in the field's unit. scale: displayed units per unit of the field.
     - object_instead: another object that explains the frames as well, if they do not determine the parameter.
     - pixels: how many pixels a unit of the field moves the image at its edge.
-    - mismatch: measured errors (docs/calibrate.md) over errors by noise alone. Voxels, which do not represent objects
-      exactly, add the rest.
+    - mismatch: (measured errors) / (errors by noise alone), see docs/calibrate.md. Voxels cause the difference, because
+      they do not represent objects exactly.
     - is_axial: the parameter moves the image along the axis, like ``LIFT``. The others move it across, like ``TURN``."""
 
     name: str
@@ -74,8 +74,8 @@ def _pitch_mm(scan: Scan) -> float:
 
 
 def _edge_pixels(scan: Scan, factor: float = 1.0) -> float:
-    """Returns by how many pixels a radian of roll moves those edges of the panel that are farthest from its middle, times
-    ``factor``."""
+    """Returns ``factor`` times the number of pixels by which a roll of 1 rad moves the panel's edges farthest from its
+    middle."""
     return factor * max(_half_mm(scan, 0), _half_mm(scan, 1)) / _pitch_mm(scan)
 
 
@@ -214,7 +214,7 @@ def _turns(scan: Scan) -> bool:
 
 
 def correction_of(values: Mapping[str, float]) -> GeometryCorrection:
-    """Returns the correction with ``values`` by the parameters' names, in the fields' units."""
+    """Returns the correction that has the parameters' ``values`` (by name, in the fields' units), and else zeros."""
     fields = {**PARAMETERS, **{gauge.name: gauge for gauge in GAUGES}}
     return GeometryCorrection(**{fields[name].field: float(value) for name, value in values.items()})
 

@@ -25,14 +25,14 @@ from phyradgs_cl.runtime import Runtime
 SPLINES = 7  # default number of cubic splines over the scan's time
 TURN, SHIFT_V, SHIFT_U = 0, 1, 2
 _STEP_PX = 0.25  # a central difference moves a frame by this many coarse pixels to each side
-_LEAST_NORM = 0.1  # a signal's norm counts as at least this fraction of its kind's largest, so weak signals are scaled less
+_LEAST_NORM = 0.1  # a signal is divided by its norm, or by this fraction of the largest norm of its kind if that is larger
 _DEG = float(np.rad2deg(1.0))
 # This fraction of a value's change since the next coarser grid counts as its discretisation error. With voxels half as
 # large, 1 suits errors ∝ voxel size, and 1/3 suits errors ∝ its square.
 DISCRETISATION = 0.5
 _STEPS = 3  # Gauss–Newton steps on each grid; the next grid continues from there
 _ITERATIONS = 20  # iterations of CGLS for each step and each standard deviation
-_DEVIATIONS = 3.0  # a kind is corrected only if its RMS over the views exceeds this many standard deviations
+_DEVIATIONS = 3.0  # a kind of parameter is corrected only if its RMS over the views exceeds this many standard deviations
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class PerViewParameters(ABC):
 
     - units (K,): the value of each kind that moves a frame's edge by a pixel.
     - circle (n, 2): values that vary as cosine and sine of the gantry's angle, as far as the basis allows.
-    - MISMATCH: measured errors (docs/calibrate.md) over errors by noise alone. Voxels, which are not exact, add the rest.
+    - MISMATCH: (measured errors) / (errors by noise alone), see docs/calibrate.md. Errors of voxels cause the difference.
     - RESTARTED: kinds that start from 0 on each grid."""
 
     values: np.ndarray
@@ -131,7 +131,7 @@ class MotionParameters(PerViewParameters):
 
     @classmethod
     def of(cls, scan: Scan, count: int = SPLINES) -> "MotionParameters":
-        """Returns a motion of zeros, as ``count`` splines."""
+        """Returns an object at rest: ``count`` splines of time with coefficients of 0."""
         still = Sway.none(scan, count)
         basis = still.basis(np.asarray(scan.frame_start_s) + scan.shutter.middle_s)
         shift_mm = scan.geometry.pixel_size_mm[1] / scan.geometry.magnification
@@ -226,7 +226,7 @@ def _norms(basis: np.ndarray, signals: np.ndarray) -> np.ndarray:
 
 
 def _strength(operator: RayOperator) -> float:
-    """Estimates the largest singular value of the projector, in mm. CGLS then finds parameters that are scaled to it as fast
+    """Estimates the largest singular value of the projector, in mm. If parameters are scaled to it, CGLS finds them as fast
     as the volume."""
     lengths = operator.forward(np.ones(operator.volume_shape, np.float32))
     return float(np.linalg.norm(operator.adjoint(lengths)) / np.linalg.norm(lengths))

@@ -17,8 +17,8 @@ _SMOOTH = 0.5  # standard deviation of the smoothing, in radii of a bead: a bead
 _PEAKS_PER_BEAD = 2.0  # this many bright spots per bead are compared with the beads, because some spots are no beads
 _TOLERANCE_VOXELS = 1.5  # a bead lies at most this far from its bright spot, in voxels
 _TRIANGLES = 40  # this many random triangles of beads are looked for among the spots: one that fits gives a placement
-_APART = 0.05  # placements whose turns differ by less, in rad, are the same
-_MOST = 6  # a nearly symmetric phantom fits equally well in several placements: this many are tried
+_APART = 0.05  # placements whose turns differ by at most this, in rad, count as one
+_MOST = 6  # a nearly symmetric phantom fits equally well in several placements: at most this many are tried
 
 
 def bead_centres_mm(phantom: EllipsoidPhantom) -> np.ndarray:
@@ -43,7 +43,7 @@ def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> lis
     smooth = gaussian_filter(volume, _SMOOTH * radius_mm / np.array(grid.voxel_size_mm))
     spots_mm = _peaks_mm(smooth, grid, int(_PEAKS_PER_BEAD * len(beads_mm)) + FEWEST_BEADS)
     within_mm = _TOLERANCE_VOXELS * max(grid.voxel_size_mm)
-    matches: list[tuple[int, float, np.ndarray]] = []  # number of beads found (negative), mean distance, placement
+    matches: list[tuple[int, float, np.ndarray]] = []  # −(number of beads found), mean distance in mm, placement
     for three, corners in _matching_triangles(beads_mm, spots_mm, within_mm):
         place = _rigid(beads_mm[list(three)], spots_mm[corners])
         for _ in range(2):  # first from three beads, then from all beads that are near

@@ -31,7 +31,7 @@ Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
 _LEAST_SHARE = 0.1  # progress counts a phase's remaining passes at no less than this fraction of their full cost
 Passes = tuple[int, float]
-"""How many passes may still come at most, and their expected total cost."""
+"""The largest number of passes through the frames that may still come, and their expected total cost."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class PassCounter:
         self._say()
 
     def counter(self, cost: float) -> Callable[[], None]:
-        """Returns a function that counts one pass of this cost at each call."""
+        """Returns a function that counts one pass through the frames, of the given cost, at each call."""
 
         def count() -> None:
             passes, remaining = self._current

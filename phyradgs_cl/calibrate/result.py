@@ -37,7 +37,7 @@ class ParameterEstimate:
 
     @property
     def words(self) -> str:
-        """The value found, with two digits of its standard deviation; "-" without one."""
+        """The value found, with two digits of its standard deviation; "-" if no value was found."""
         if self.found is None or self.deviation is None:
             return "-"
         return " ± ".join(to_digits_of(number, self.deviation) for number in (self.found, self.deviation))
@@ -76,7 +76,7 @@ class Calibration:
         return [one for one in self.parameters if one.verdict == CORRECTED]
 
     def facts(self) -> dict[str, object]:
-        """Returns everything but scan and images, as plain values."""
+        """Returns all fields but scan and residuals as numbers, texts, lists and dicts."""
         before, after = self.residual_rms
         return {
             "parameters": [one.facts() for one in self.parameters],

@@ -170,7 +170,7 @@ class _Calibrator:
 
         In half a turn of nearly parallel rays, a volume explains most of what an offset changes. The search cannot determine
         the offset there, so ``check``'s answer stands. Its answer also stands if the panel sees few rays twice: a shift
-        under which even fewer rays are seen twice fits better, whatever the truth."""
+        under which even fewer rays are seen twice fits better, even if it is wrong."""
         if self.phantom is None and has_axis_near_edge(self.ready[0]):
             self.search.held = (OFFSET_U,)
         quick, pitch_mm = coarse(self.ready[0], QUICK_COLUMNS), self.scan.geometry.pixel_size_mm[1]
@@ -250,7 +250,7 @@ class _Calibrator:
         Returns the table's entry for the direction.
 
         Only squared residuals that differ by four standard errors and by 4 % decide. The direction is 1 or −1. Its deviation
-        is 2, the difference of these, over the number of standard errors."""
+        is 2 (the difference between 1 and −1) divided by the number of standard errors."""
         self.passes.begin("order", "which line is read first")
         stage = self.stages[min(1, len(self.stages) - 1)]
         reverse = [reversed_readout(scan) for scan in self.ready]

@@ -25,7 +25,7 @@ from phyradgs_cl.calibrate.per_view import DISCRETISATION
 from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, ParameterEstimate
 
-# Frames determine a parameter if object and other parameters leave this fraction of its signal unexplained, or more.
+# Frames determine a parameter if object and other parameters leave at least this fraction of its signal unexplained.
 LEAST_SHARE = 0.2
 # For a known object (beads) a smaller share is enough: there are no voxels that explain signals by accident.
 LEAST_SHARE_OF_BEADS = 0.02
@@ -36,8 +36,8 @@ _GAUGE_FACTOR = 2.0
 # The share of a turn or a lift counts as at most this. It grows in a wrong geometry, where without this limit no parameter
 # would count as determined.
 _MOST_GAUGE = 0.2
-DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more standard deviations
-_MOST_PX = 2.0  # a step moves the image by at most this many coarse pixels at its edge: beyond, its effect is not linear
+DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more than this many standard deviations
+_MOST_PX = 2.0  # a step moves the image's edge by at most this many coarse pixels: a larger step's effect is not linear
 _SETTLED = 0.1  # the steps on a grid end when every parameter's step is below this many of its standard deviations
 
 
@@ -47,7 +47,7 @@ class Reduced:
 
     - jacobian (K, N): the part of each signal that no volume explains, per unit of the parameter's field.
     - residual (N,): the part of the residual that no volume explains.
-    - sizes (K,): norms of the whole signals. whole_gram (K, K): inner products of the whole signals, each over its norm.
+    - sizes (K,): norms of the whole signals. whole_gram (K, K): inner products of the whole signals divided by their norms.
     - noise: standard deviation of a pixel. mismatch (K,): factors on the deviations, for errors other than noise."""
 
     names: tuple[str, ...]
@@ -76,7 +76,7 @@ class Reduced:
 
     @property
     def unit(self) -> np.ndarray:
-        """The part of each signal that no volume explains, over the norm of the whole signal, (K, N)."""
+        """The part of each signal that no volume explains, divided by the norm of the whole signal, (K, N)."""
         return self.jacobian / self.sizes[:, None]
 
     @property
@@ -89,8 +89,8 @@ class Reduced:
     def shares(self) -> np.ndarray:
         """The fraction (K,) of each parameter's signal that no object explains, 0 to 1.
 
-        This is the smaller of two ratios. One is the norm of the unexplained signal over that of the whole signal. The other
-        is the parameter's standard deviation with a known object, over the one with all unknowns."""
+        This is the smaller of two ratios. One is (norm of the unexplained signal) / (norm of the whole signal). The other is
+        (standard deviation for a known object) / (standard deviation for an unknown object) of the parameter."""
         tiny = _TINY * np.eye(len(self.names))
         variance, variance_with_object = (np.diag(np.linalg.inv(gram + tiny)) for gram in (self.gram, self.whole_gram))
         certainty = variance_with_object / variance
@@ -147,7 +147,7 @@ def _signal(
     for sign in (1, -1):
         correction = correction_of({**at, one.name: at.get(one.name, 0.0) + sign * step})
         operator: Any = problem.operator(correction)
-        ends.append(operator.forward(volume) - problem.measured)  # minus measured, to lose fewer digits in float32
+        ends.append(operator.forward(volume) - problem.measured)  # small numbers, whose difference is exact in float32
     return problem.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 
@@ -164,8 +164,8 @@ def least_shares(problem: Reduced) -> dict[str, float]:
 
 
 def indistinguishable(problem: Reduced, least: Mapping[str, float]) -> list[dict[str, float]]:
-    """Returns combinations of parameters, as weights by name, whose signal another object explains almost wholly. The share
-    that the object leaves is smaller than ``least`` has for the parameter with the largest weight."""
+    """Returns combinations of parameters, as weights by name, whose signal another object explains almost wholly: the share
+    that no object explains is below the limit in ``least`` for the parameter with the largest weight."""
     values, vectors = scipy.linalg.eigh(problem.gram, problem.whole_gram + _TINY * np.eye(len(problem.names)))
     limits = np.array([least[problem.names[k]] for k in np.abs(vectors).argmax(0)])
     return [dict(zip(problem.names, map(float, weights), strict=True)) for weights in vectors[:, values < limits**2].T]
@@ -176,7 +176,8 @@ Problem = CoarseProblem | BeadProblem
 
 @dataclass(frozen=True)
 class Fallback:
-    """An estimate from outside of the search: value minus stated value, in the field's unit, and its standard deviation."""
+    """An estimate that the search did not make. value: estimate minus stated value, in the field's unit. deviation: its
+    standard deviation. is_significant: whether the value is applied."""
 
     value: float
     deviation: float
@@ -229,7 +230,8 @@ class Search:
                 return
 
     def _decide_determined(self, linear: Reduced) -> None:
-        """Decides which parameters the frames determine: those with a large enough share and a useful deviation."""
+        """Decides which parameters the frames determine: those with a large enough share and, of angles, those with a
+        standard deviation below 10°."""
         has_gauges = GAUGES[0].name in linear.names
         least = least_shares(linear) if has_gauges else dict.fromkeys(linear.names, LEAST_SHARE_OF_BEADS)
         linear = linear.only([one.name for one in self.parameters])
@@ -258,14 +260,14 @@ class Search:
         return bool(np.all(np.abs(change) < _SETTLED * self.reduced.deviations()))
 
     def keep_held(self) -> None:
-        """Drops all estimates but the fallbacks of held parameters."""
+        """Drops all estimates except those of held parameters, which the search did not make (``fallback``)."""
         self.determined = ()
         self.fixed = {name: estimate for name, estimate in self.fixed.items() if name in self.held}
 
     def estimates(self) -> tuple[np.ndarray, np.ndarray]:
         """Returns the values (K,) of the determined parameters and their standard deviations (K,), in the fields' units.
 
-        A deviation combines noise and discretisation error, taken as half the change since the coarser grid. Both are larger
+        A deviation combines noise and discretisation error, taken as half the change since the coarser grid. It is larger
         for a parameter whose effect resembles that of undetermined ones, because these keep stated values that may be
         wrong."""
         if self.reduced is None or not self.determined:

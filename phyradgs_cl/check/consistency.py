@@ -27,36 +27,36 @@ from phyradgs_cl.runtime import Runtime
 CONSISTENCY = "consistency"
 # Consistent frames leave less than this fraction of their residual in a random order: correct scans have 0.02 to 0.23.
 _LARGEST = 0.35
-_DOUBTFUL = 0.1  # above this fraction of the residual in a random order, missing and repeated frames are tried
-_RANDOM_ORDERS = 2  # the residual in a random order is averaged over this many orders
+_DOUBTFUL = 0.1  # missing and repeated frames are tried if the residual exceeds this fraction of that in a random order
+_RANDOM_ORDERS = 2  # the squared residual in a random order is the mean over this many random orders
 _FEWEST_FRAMES = 5  # fewer frames cannot tell one order from another
 _FEWEST_PIXELS = 32  # fewer valid coarse pixels per frame cannot tell one order from another
 _CLEAR = 0.5  # a hypothesis must leave less than this fraction of the stated scan's squared residual
 _NEARLY = 1.5  # a rough fit is refined unless its squared residual exceeds this many times the least one
 _ERRORS = 4.0  # a hypothesis must be better than the stated scan by this many standard errors
-# The frames look the same from every angle if a random order leaves a residual below _SAME or _NOISY.
-_SAME = 0.03  # residual over the standard deviation of the line integrals
-_NOISY = 1.6  # residual over the noise: round objects had up to 1.3, others 2.3 or more
+# The object looks the same from every angle if a random order leaves an RMS residual below _SAME or _NOISY times a scale.
+_SAME = 0.03  # times the standard deviation of the line integrals
+_NOISY = 1.6  # times the standard deviation of the noise: round objects had up to 1.3, others 2.3 or more
 _MOST_REFINED = 2  # only this many hypotheses, the best ones, get a refined shift of the panel, which takes time
 _SHIFT_PENALTY = 1.5  # factor on a hypothesis's squared residual per coarse pixel of shift: stated offsets are mostly right
-# A frame is odd if its mean line integral differs from its neighbours' by more than _DEVIATIONS and _LEAST_CHANGE.
-_DEVIATIONS = 12.0  # the difference over the robust standard deviation of all frames' differences
-_LEAST_CHANGE = 0.75  # the difference over the median of the frames' mean line integrals
-_REPEATED = 0.15  # largest RMS change from a frame to one that repeats it, over the least change between frames nearby
+# A frame is odd if its mean line integral differs from the median of its neighbours' means by more than both limits:
+_DEVIATIONS = 12.0  # times the robust standard deviation of all frames' differences
+_LEAST_CHANGE = 0.75  # times the median of the frames' mean line integrals
+_REPEATED = 0.15  # a frame repeats the last one if its change is below this fraction of the least change of frames nearby
 _JUMP = 2.5  # an order jumps, as the golden angle does, if its median step exceeds that of sorted angles by this factor
-_UNLIKE = 2.0  # least RMS difference of a repeated frame from the next view in angle, over the median of all frames
-_OUTLIER = 4.0  # least RMS residual of an outlier, over the frames' median
+_UNLIKE = 2.0  # least RMS difference of a repeated frame from the next view in angle, as a multiple of all frames' median
+_OUTLIER = 4.0  # least RMS residual of an outlier, as a multiple of the frames' median RMS residual
 # Both ends of an arc may fit badly if their residuals differ by less than this factor: right frames had 1.4, odd ones 2.3.
 _ALIKE = 1.7
 # Both ends must also leave less than this fraction of the residual in a random order: right ones had 0.2, odd mostly 0.3.
 _AT_BOTH_ENDS = 0.25
-_MOST_OUTLIERS = 0.2  # this many outliers, as a fraction of the frames, have a common cause: then none counts as one
+_MOST_OUTLIERS = 0.2  # if this fraction of the frames or more are outliers, they have a common cause, and none is removed
 _EXCHANGED = 0.5  # two frames were exchanged if the opposite order leaves less than this fraction of the squared residual
 
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """The ``finding`` about whether frames fit together. frames (n,): indices of the frames that do. is_sound: whether
+    """The ``finding`` about whether frames fit together. frames (n,): indices of the frames that fit. is_sound: whether
     further questions make sense. sees_angles: whether the object looks different from different angles."""
 
     finding: Finding
@@ -85,7 +85,8 @@ class _CoarseFit:
 def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
     """Finds frames and hypotheses that explain why the frames of a coarse ``scan`` do not fit together.
 
-    The finding's value is the residual's norm in the stated order over that in a random order. as_stated: the full scan."""
+    The finding's value is (residual in the stated order) / (residual in a random order), both RMS. as_stated: the full
+    scan."""
     pixels = float(scan.valid.sum()) / scan.frames
     if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
@@ -131,7 +132,7 @@ def _unseen(scan: Scan, as_stated: Scan) -> float:
     """Returns the RMS residual below which frames in a random order show that the object looks the same from every angle.
 
     scan: the coarse scan. as_stated: the full scan."""
-    # The smaller estimate of noise counts. Edges raise the estimate from coarse pixels, uneven noise that from full pixels.
+    # The smaller of two estimates is taken: edges raise the one from coarse pixels, uneven noise the one from full pixels.
     levels = [noise_level(one.projections, np.broadcast_to(one.valid, one.projections.shape)) for one in (scan, as_stated)]
     noise = min(levels[0], levels[1] / float(np.prod(altered_trajectory(scan).blocks)) ** 0.5)
     return max(_SAME * float(np.asarray(scan.projections, np.float64).std()), _NOISY * noise)

@@ -13,19 +13,19 @@ from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.detector import noise_level
 from phyradgs_cl.detector.noise_level import noise_rms
 
-_LARGEST_SHARE = 0.1  # air lies below this fraction of the largest line integral: more at the panel's sides is the object
+_LARGEST_SHARE = 0.1  # at the panel's sides, values above this fraction of the largest line integral are not air
 _DISPLACED = 0.1  # a panel that is off centre by this fraction of its width was displaced on purpose
-_NOISES = 4.0  # noise alone does not exceed this many of its standard deviations: more is the object
-_OPAQUE = 30.0  # behind larger line integrals no light passes, so they are no line integrals
-_INVERTED = 0.9  # if left and right edges exceed this fraction of the largest value, bright and dark are exchanged
-_BRIGHT = 0.05  # at most this fraction of the pixels may be brighter than the flats, by noise
+_NOISES = 4.0  # values above this many standard deviations of the noise belong to the object
+_OPAQUE = 30.0  # larger values are no line integrals, because no light would pass
+_INVERTED = 0.9  # bright and dark are exchanged if the edges' median exceeds this fraction of the largest value
+_BRIGHT = 0.05  # at most this fraction of the pixels may be brighter than the flats by more than the noise
 _FRAMES = 0.1  # the object may touch a side of the panel in up to this fraction of the frames
 _COVERED = 0.1  # a column shows the object if more than this fraction of its rows does
-# A unit is wrong if the grid's width over that of the panel's view, or the object's over the grid's, exceeds this.
+# A unit is wrong if (grid's width / width of the panel's view) or (object's width / grid's width) exceeds this.
 _ANOTHER_SIZE = 5.0
-_NOISE_FRAMES, _NEAR = 16, 5  # frames in which noise is sought, and the side in pixels of a square of neighbours
-# Noise over mean line integral behind the object: above the first value noise dominates, above the second there is no
-# object.
+_NOISE_FRAMES, _NEAR = 16, 5  # most frames in which noise is sought, and side in pixels of a square around a pixel
+# Limits of noise / mean line integral behind the object: above the first one noise dominates, above the second one there is
+# no object.
 _MOST_NOISE, _NO_OBJECT_FROM = 0.4, 4.0
 NOISE = "noise"
 NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # findings with these units end the check
@@ -132,8 +132,8 @@ def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) ->
 
 
 def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
-    """Returns the level of two columns: in each frame their largest mean over an eighth of the rows, and over the frames the
-    90th percentile of these."""
+    """Returns the level of the line integrals p (F, v, u) in some ``columns``: in each frame the largest of their means over
+    an eighth of the rows, and of these the 90th percentile over the frames."""
     edge = p[:, :, columns]
     weight = valid[:, :, columns].astype(float)
     rows = max(1, edge.shape[1] // 8)

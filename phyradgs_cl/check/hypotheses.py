@@ -18,7 +18,7 @@ from phyradgs_cl.reconstructors.fits import axis
 SIZE_FACTORS = (10.0, 0.1, 1e3, 1e-3)
 LEAST_REDUNDANCY = 0.5  # frames fit any pixel size if a smaller fraction of columns has rays that are measured twice
 _UNITS = {10.0: " (in cm, read as mm?)", 1e3: " (in m, read as mm?)", 1e-3: " (in µm, read as mm?)"}
-_FANS = (0.02, 3.0)  # real scanners have a panel's width over its distance from the source in this range
+_FANS = (0.02, 3.0)  # range of (panel's width / panel's distance from the source) in real scanners
 _GRID_FACTOR = 3.0  # a grid this many times wider or narrower than the panel's view is replaced: it is as wrong as the sizes
 _SAME_PLACE = 1.0  # shifts of the panel that differ by less, in coarse pixels, look the same
 _ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)  # changes of the angle between views, in percent, that are tried
@@ -29,8 +29,8 @@ _GAPS = 15  # a missing or repeated frame is looked for at this many frames, eve
 class Hypothesis:
     """What may be wrong in a scan: a description, advice, and a function that returns the scan corrected for it.
 
-    factor: pixel size over stated pixel size. Hypotheses with the same factor other than 1 differ only by the panel's
-    shift."""
+    factor: (pixel size of the hypothesis) / (stated pixel size). Hypotheses with the same factor other than 1 differ only by
+    the panel's shift."""
 
     text: str
     advice: str
@@ -75,8 +75,8 @@ def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
 
 
 def _other_units(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses of pixel sizes or distances in other units. The fan angle depends on the ratio of the two alone. The
-    panel's offset may decide which of the two is wrong."""
+    """Yields hypotheses of pixel sizes or distances in other units. The fan angle shows only the ratio of pixel size to
+    distance. The panel's offset may decide whether pixel sizes or distances are wrong."""
     geometry = stated.geometry
     if isinstance(geometry, ParallelGeometry):
         return  # in a parallel beam, other sizes only scale the object
@@ -195,8 +195,8 @@ def nearly_sized(scan: Scan, factor: float) -> Scan:
 
 
 def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses that a frame is missing, or there twice, at up to 15 places. They move the angles of later frames by
-    a step on, or back."""
+    """Yields hypotheses that a frame is missing, or there twice, at up to 15 places. They move the angles of later frames
+    one step forwards or backwards."""
     sense = -1.0 if variants.altered_trajectory(scan).is_reversed else 1.0
     step = float(np.median(wrapped(np.diff(_azimuths(scan))))) * sense
     for at in np.unique(np.linspace(1, scan.frames - 1, _GAPS).round().astype(int)):

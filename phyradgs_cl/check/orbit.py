@@ -38,17 +38,17 @@ OTHER_CAUSE = "pixels, if pixel sizes are right"  # unit of an offset that wrong
 UNVERIFIED = "neither pixel sizes nor distances are verified by these frames"
 _ERRORS = 4.0  # two hypotheses must differ by this many standard errors; else the answer is "cannot tell"
 _SIGN_RATIO = 1.2  # the wrong sense of rotation leaves at least this many times the squared residual of the right one
-_CLEAR_RATIO = 3.0  # if the squared residuals of both senses' rough fits have this ratio, they need no refined shifts
+_CLEAR_RATIO = 3.0  # shifts are not refined if the squared residuals of both senses' rough fits differ by this factor
 _TOLERATED_PX = 1 / 3  # a shift of the panel by this many pixels is always tolerated
 _DEVIATIONS = 4.0  # a shift by this many of its standard deviations is always tolerated
 _BIAS_FULL_TURN = 0.003  # measured error of the axis in scans of a full turn, in coarse pixels
 _BIAS_HALF_TURN = 0.04  # measured error of the axis in coarse pixels, if some rays are measured only once
 _WHOLE_PIXELS = 2  # if full pixels were compared, the answer "ok" needs a threshold of at most this many pixels
-_LEAST_REDUNDANCY = 0.1  # least value of ``twice`` to divide by: it is below 0 if the axis misses the panel
+_LEAST_REDUNDANCY = 0.1  # least fraction of rays measured twice to divide by: it is below 0 if the axis misses the panel
 _NO_SIGN = "parallel rays show an object that turns one way and its mirror image that turns the other way alike"
 _SIGN_ADVICE = "look for a feature whose side is known: a mirror image would fit as well"
-_OTHER_SIZES = (0.8, 1.25)  # distances are "ok" if the fan with its width times either factor fits worse
-_SIZE_RATIO = 1.05  # a fan fits worse if its squared residual, over that of the stated fan, reaches this ratio
+_OTHER_SIZES = (0.8, 1.25)  # factors on the fan's width: distances are "ok" if both other fans fit worse than the stated fan
+_SIZE_RATIO = 1.05  # another fan fits worse if its squared residual is at least this many times that of the stated fan
 
 
 @dataclass(frozen=True, eq=False)

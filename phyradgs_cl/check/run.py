@@ -48,7 +48,7 @@ class CheckResult:
 
 
 class _Answers:
-    """Collects the findings, and reports each at once."""
+    """Collects the findings, and reports the progress after each."""
 
     def __init__(self, questions: list[str], report: Report) -> None:
         self.findings: list[Finding] = []

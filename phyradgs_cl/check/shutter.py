@@ -27,7 +27,7 @@ _OTHER_WAY, _AT_REST = "the other way", "all at once, the gantry at rest"
 _NEEDED_RATIO = {_OTHER_WAY: _ORDER_RATIO, _AT_REST: _REST_RATIO}
 # An exposure is suspicious if half of it leaves at most this fraction of the squared residual: correct scans have ≥ 0.8.
 _HALF_RATIO = 0.6
-_WORSE_RATIO = 1.05  # an exposure fits worse if its squared residual, over that of the stated exposure, reaches this ratio
+_WORSE_RATIO = 1.05  # another exposure fits worse if its squared residual is at least this many times the stated exposure's
 
 
 def check_readout(rt: Runtime, scan: Scan) -> Finding:
@@ -61,8 +61,8 @@ def check_readout(rt: Runtime, scan: Scan) -> Finding:
 
 
 def _compared(hypothesis: str, stated: np.ndarray, other: np.ndarray) -> tuple[str, float, float]:
-    """Returns a sentence about another readout, by how many standard errors the stated readout fits better, and the ratio of
-    squared residuals, other over stated."""
+    """Returns a sentence about another readout, the number of standard errors by which the stated readout fits better, and
+    (squared residual of the other readout) / (squared residual of the stated one)."""
     ratio, errors = residual_ratio(stated, other), t_statistic(stated, other)
     return f"{hypothesis}, the squared residual is {ratio:.4g} times as large ({errors:+.1f} standard errors)", errors, ratio
 
@@ -128,7 +128,8 @@ def _fits_worse(stated: np.ndarray, other: np.ndarray | None) -> bool:
 
 
 def _twice_as_long(rt: Runtime, scan: Scan) -> np.ndarray | None:
-    """Returns squared residuals (F,) with twice the exposure; None where the table of poses or angles ends too early."""
+    """Returns the frames' mean squared residuals (F,) with twice the exposure; None if a table of poses or angles ends too
+    early."""
     try:
         return _squares_exposed(rt, scan, 2.0)
     except InputError:
@@ -136,5 +137,6 @@ def _twice_as_long(rt: Runtime, scan: Scan) -> np.ndarray | None:
 
 
 def _squares_exposed(rt: Runtime, scan: Scan, factor: float) -> np.ndarray:
-    """Returns squared residuals (F,) with lines that open as stated and stay open ``factor`` times as long."""
+    """Returns the frames' mean squared residuals (F,) with lines that open as stated and stay open ``factor`` times as
+    long."""
     return fit_squares(rt, replace(scan, shutter=replace(scan.shutter, exposure_s=factor * scan.shutter.exposure_s)))

@@ -26,12 +26,12 @@ _TIMING, _ANGLES = "timing", "angles"
 _ROUNDING = 1e-3  # relative tolerance: files round times and angles
 _SPEED_TOLERANCE = 0.02  # largest relative difference of the speeds between and within frames: gantries vary less
 _LONGEST_TABLE = 100.0  # a table that lasts this many times as long as the scan belongs to more than one scan
-_FEW_RAD = math.radians(5)  # if frames see a smaller arc of a long table of angles, its times may be in another unit
+_FEW_RAD = math.radians(5)  # the times of a long table may be in another unit if the frames see a smaller arc of it
 _MILLISECONDS = (900.0, 3000.0)  # if a table lasts this many times as long as the scan, it is in ms and the frames are in s
 _WIDE = 3.0  # a gap between views is wide above this multiple of the median gap
 _SAME_VIEW = 0.05  # views nearer to each other than this fraction of the mean step are repeats whose angles jitter
 _SAME_RAD = 1e-6  # views nearer to each other than this have the same angle
-_TOLERATED_DEG = 1.0  # coverage may be less by this than half a turn plus fan: nearly parallel rays need half a turn only
+_TOLERATED_DEG = 1.0  # views may cover this much less than half a turn plus the fan, which nearly parallel rays do not need
 
 
 def check_timing(scan: Scan) -> Finding:
@@ -39,8 +39,8 @@ def check_timing(scan: Scan) -> Finding:
 
     A line cannot open while it is open, a frame cannot be read while the one before is read, and a gantry has one angle at a
     time. The finding's value is the first of four numbers that exceeds its limit, else the one nearest to its limit. They
-    are the exposure and the readout over the shortest frame period, 1 + the relative difference between the angle steps and
-    the speed within the frames, and a table's duration over the scan's."""
+    are exposure / shortest frame period, readout / shortest frame period, 1 + the relative difference between the angle
+    steps and the speed within the frames, and (a table's duration) / (the scan's duration)."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     if scan.frames < 2:
         return Finding(_TIMING, OK, 0.0, 1.0, "share", "one frame: nothing to compare")
@@ -149,7 +149,7 @@ def is_full_turn(scan: Scan) -> bool:
 
 
 def _needed_turn(scan: Scan) -> tuple[float, float, str]:
-    """Returns after how many degrees views repeat, how many degrees a volume needs, and the latter in words."""
+    """Returns after how many degrees views repeat, how many degrees of views a volume needs, and the need in words."""
     geometry = scan.geometry
     if isinstance(geometry, ParallelGeometry):
         if has_opposite_views(scan):

@@ -121,7 +121,7 @@ def scores(metrics: Mapping[str, float | None]) -> str:
 
 def told(metrics: Mapping[str, object], *names: Any) -> list[str]:
     """Returns the metrics that are present as texts such as "PSNR 31.2 dB". names: as in ``printed``."""
-    from phyradgs_cl.metrics import printed  # here, as in ``scores``
+    from phyradgs_cl.metrics import printed  # here, because it loads SciPy, which takes time
 
     return [f"{title} {value}" for title, value in printed(metrics, *names)]
 

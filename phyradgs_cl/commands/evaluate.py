@@ -1,4 +1,4 @@
-"""The command evaluate: compares a volume with the truth."""
+"""The command evaluate: compares a volume with a reference, such as a scan's true volume."""
 
 import json
 from pathlib import Path
@@ -35,7 +35,7 @@ def evaluate_command(
     facts = run_evaluation(
         volume, reference, picture or usual, reference_voxel_mm, object_motion, rtk_reference, mu_water_per_mm
     )
-    if as_json:  # JSON has no infinity, the PSNR of equal volumes, which becomes null
+    if as_json:  # JSON has no infinity, so the PSNR of equal volumes becomes null
         finite = json.loads(json.dumps(facts), parse_constant=lambda name: None if name == "Infinity" else float(name))
         say(json.dumps(finite))
         return

@@ -117,7 +117,7 @@ def with_run_options(*without: str) -> Callable[[Callable[..., Any]], Callable[.
 def settings_of(options: dict[str, Any]) -> Settings:
     """Returns a command's settings from its options. Further settings come from the TOML file ``config`` and from the texts
     NAME=VALUE of ``assignments``."""
-    given = {name: None if value is False else value for name, value in options.items()}  # False: flag not given
+    given = {name: None if value is False else value for name, value in options.items()}  # False means "not given"
     config, assignments = given.pop("config"), given.pop("assignments") or []
     return read_settings(config, given, assignments)
 

@@ -17,7 +17,7 @@ PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3  # the codes of NXtomo's image_key
 QUANTITIES = ("attenuation", "transmission", "counts")
 # Least transmission before the logarithm: 16-bit panels resolve no less. Pixels at or below it are masked.
 TRANSMISSION_FLOOR = 1e-6
-_LARGEST = float(np.finfo(np.float32).max)  # any float32 is usable as attenuation, by default
+_LARGEST = float(np.finfo(np.float32).max)  # by default every finite float32 is a usable line integral
 _BLOCK_PIXELS = 1 << 18  # most pixels converted at a time: a float64 copy of a whole scan needs much memory
 Array = NDArray[np.floating]
 _ENERGY_KEV = np.array([15.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0, 100.0, 150.0])
@@ -27,7 +27,7 @@ _BONE = np.array([9.032, 4.001, 1.331, 0.6655, 0.4242, 0.3148, 0.2229, 0.1855, 0
 _ALUMINIUM = np.array([7.955, 3.441, 1.128, 0.5685, 0.3681, 0.2778, 0.2018, 0.1704, 0.1378])
 _ALUMINIUM_G_PER_CM3 = 2.699
 _STEP_KEV = 2.0  # step of SpekPy's energies: finer steps change a half-value layer by less than a thousandth
-LOWEST_KVP, HIGHEST_KVP = 30.0, 150.0  # tube voltages in kV that these tables cover
+LOWEST_KVP, HIGHEST_KVP = 30.0, 150.0  # range of tube voltages in kV that the tables above cover
 FILTER_MM = 5.0
 
 

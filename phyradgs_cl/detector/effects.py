@@ -22,7 +22,7 @@ from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 Array = NDArray[np.floating]
 # From this mean on, a rounded normal stands for Poisson (skewness off by < 4e-5): NumPy's own sampler fails near 9.2e18.
 NORMAL_FROM = 1e9
-COUNT_FLOOR = 0.5  # least count before the logarithm, which counts of 0 or less lack; no detector records so little
+COUNT_FLOOR = 0.5  # smaller counts are raised to this before the logarithm, which 0 lacks; no detector records so little
 _LARGEST_EXPONENT = 700.0  # largest exponent: float64 overflows at very negative line integrals, which ringing may cause
 _SPARK_HEIGHT = (0.3, 2.0)  # least and most light that a spark adds, relative to the light without object
 _SCATTER_REACH = 6.0  # the scatter kernel falls to 1/e over the panel's longer side divided by this
@@ -31,7 +31,7 @@ _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie beh
 
 
 def tigre_counts(line_integrals: ArrayLike, dose: float) -> tuple[Array, float]:
-    """Returns expected counts dose · exp(−p/m) for p (F, v, u), and m: the largest p, or 1 for an empty scan."""
+    """Returns expected counts dose · exp(−p/m) for p (F, v, u), and m: the largest p, or 1 if no p is above 0."""
     p = np.asarray(line_integrals, dtype=np.float64)
     largest = float(p.max(initial=0.0))
     scale = largest if largest > 0 else 1.0

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from phyradgs_cl.acquisition import Saturation
 from phyradgs_cl.checks import ceil_div
 
-NORMAL_MAD = 1.4826  # standard deviation of a normal variable over its median absolute deviation
-_MEDIAN_OF_NORMAL = 0.6745  # median of |x| over the standard deviation of a normal variable x with mean 0
+NORMAL_MAD = 1.4826  # standard deviation / median absolute deviation of a normal variable
+_MEDIAN_OF_NORMAL = 0.6745  # median of |x| / standard deviation of x, for a normal variable x with mean 0
 _FILTER_NORM = 1.5**0.5  # factor by which the filter (-1/2, 1, -1/2) multiplies white noise
 _LARGEST_SAMPLE = 1_000_000  # the median of about this many pixels is exact enough
 _TENTHS = 10  # noise grows with attenuation: it is estimated in this many equally large classes of line integrals
@@ -24,11 +24,11 @@ _TOUCHING = 0.5  # saturation covers areas: pixels at an extreme are clipped if 
 _SAME = 1e-3  # flats and the largest count that differ by less than this fraction are equally bright: such pixels may be air
 _MOST_FRAMES = 8  # noise outside saturated pixels is sought in at most this many frames
 _LONGEST_EDGE = 1024  # of larger frames only the middle, this many pixels a side, is searched for noise
-_ROUNDING = 0.5  # rounding of counts alone causes an estimate up to this, in counts
+_ROUNDING = 0.5  # rounding of counts alone causes an estimated noise of up to this, in counts
 _RELATIVE = 2e-5  # an estimated noise up to this fraction of the largest count is too small to show that there is noise
-# Noise estimated along both axes is white if it is at least this fraction of noise estimated along rows; else structure.
+# An estimate along both axes shows noise if it is at least this fraction of the estimate along rows. Structure gives less.
 _WHITE = 0.5
-_ROOT_OF_NORMAL = 0.8222  # mean of √|x| over the root of the standard deviation of a normal x with mean 0
+_ROOT_OF_NORMAL = 0.8222  # mean of √|x| / √(standard deviation of x), for a normal variable x with mean 0
 _NEAR = 9  # the noise of a pixel is estimated from a square of this side around it
 
 
@@ -99,7 +99,8 @@ def noise_map(residual: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
 
 
 def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) -> float:
-    """Returns ``noise_rms`` behind the object, from some of the frames. line_integrals and valid: (F, v, u).
+    """Returns the root mean square of the noise behind the object, dimensionless, from some frames. line_integrals, valid:
+    (F, v, u).
 
     Air is left out: its noise is lower, and in some files clipped at 0."""
     some = slice(None, None, max(1, len(line_integrals) // _FRAMES))

@@ -60,7 +60,8 @@ def export_volume(
 
 
 def hu_scale(volume: Volume, air: Box | None = None, water: Box | None = None, insert_hu: float = 0.0) -> Hounsfield | None:
-    """Returns the volume's scale of Hounsfield units, or one fitted to ``air`` and ``water``, boxes in mm, if given."""
+    """Returns the scale of Hounsfield units that the volume states, or one fitted to boxes of ``air`` and ``water`` in mm,
+    if any is given. insert_hu: the Hounsfield units of the material in ``water``; a value other than 0 fits a scale too."""
     if (stored := volume.scale) is not None and air is None and water is None and insert_hu == 0:
         return replace(stored, fitted=f"{stored.line}, as stored")
     return volume.hounsfield(air, water, insert_hu).scale

@@ -74,7 +74,7 @@ def write_dicom(path: Path, volume: Volume, note: str, labels: DicomLabels) -> N
     unit = "HU" if of_note(note)[0] else "1/mm"
     slope, grid = _rescale_slope(volume.values, unit), volume.required_grid
     content = volume.values.tobytes() + repr((grid.voxel_size_mm[::-1], grid.first_centre_mm[::-1])).encode()
-    content += repr(labels.given).encode() if labels.given else b""  # other labels are another study with other UIDs
+    content += repr(labels.given).encode() if labels.given else b""  # other labels make another study, with other UIDs
     seed, generate = hashlib.sha256(content).hexdigest(), pydicom.uid.generate_uid
     uid = {n: generate(entropy_srcs=[seed, unit, n]) for n in ("study", "series", "frame")}
     with folder_written_beside(path) as folder:

@@ -100,7 +100,7 @@ def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None, unit: str =
             shape, name = tuple((np.array(before.shape) // step).tolist()), f"s{len(levels)}"
             level = group.create_array(
                 name, shape=shape, chunks=tuple(min(n, _CHUNK) for n in shape), dtype="float32",
-                dimension_names=list("zyx"), config={"write_empty_chunks": True},  # else a lost chunk reads as zeros
+                dimension_names=list("zyx"), config={"write_empty_chunks": True},  # else a lost chunk would read as zeros
             )  # fmt: skip
             for start in range(0, shape[0], _CHUNK):
                 stop = min(start + _CHUNK, shape[0])

@@ -29,7 +29,7 @@ Length = float | Callable[[], float]
 Pitch = tuple[float, float] | Callable[[], tuple[float, float]]
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
 _VIEW_DIGITS = 5  # views are equal if cosine and sine of their angles, or their scaled poses, agree to this many decimals
-_SLACK = 1e-6  # pose tables are extended by this fraction of a frame's duration, so that rounding leaves no time outside
+_SLACK = 1e-6  # pose tables are extended by this fraction of a frame's duration, so that rounded times stay in the table
 
 
 @dataclass(frozen=True, eq=False)

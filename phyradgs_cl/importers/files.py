@@ -26,8 +26,8 @@ def check_room(subject: str, needed_bytes: int) -> None:
 
 @contextmanager
 def naming_damage(path: Path, found: str, expected: str, remedy: str = "") -> Iterator[None]:
-    """Turns any exception of the body but MemoryError into InputError about ``path``, because libraries raise all kinds for
-    damaged files."""
+    """Turns any exception of the body but InputError and MemoryError into InputError about ``path``, because libraries raise
+    all kinds for damaged files. found, expected, remedy: words of the message."""
     try:
         yield
     except (InputError, MemoryError):
@@ -92,7 +92,7 @@ class SafeFolder:
 
     def glob(self, pattern: str, *suffixes: str) -> list[Path]:
         """Returns the files that match a pattern, upper case or lower, in natural order. If ``suffixes`` are given,
-        wildcards match only files with one of them, and no hidden files."""
+        wildcards match only files with one of these suffixes, and no hidden files."""
         name = PurePosixPath(pattern).name.lower()
         paths = [path for path in _files((self.root / pattern).parent) if fnmatchcase(path.name.lower(), name)]
         is_plain = not suffixes or not set(name) & set("*?[")
@@ -103,7 +103,7 @@ class SafeFolder:
         return [path for path in _files(self.root) if _is_one_of(path, suffixes)]
 
     def only(self, what: str, *suffixes: str) -> Path:
-        """Returns the only file with one of the suffixes. Raises InputError for none or several, and calls the file
+        """Returns the only file with one of the suffixes. Raises InputError for none or several; its message calls the file
         ``what``."""
         paths = self.matching(*suffixes)
         if len(paths) != 1:

@@ -40,7 +40,7 @@ _SAME = 1e-3  # flats up to this fraction above the saturation level are clipped
 @dataclass(frozen=True, eq=False)
 class Light:
     """Flats (G, v, u) at G times, and the dark (1, v, u) or None. place (P,): the time of each projection, counted in
-    flats: 0.5 is halfway from the first to the second. used: how many flats and darks were used. said: a text about them."""
+    flats: 0.5 is halfway from the first to the second. used: how many flats and darks were used. said: this as a text."""
 
     flats: np.ndarray
     dark: np.ndarray | None
@@ -104,7 +104,7 @@ def _times(
 
 
 def _levels(stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns evenly chosen pixels (n, k) float64 of n frames, and the frames' medians (n,). NaN and infinity become 0."""
+    """Returns k evenly chosen pixels (n, k) float64 of n frames, and the frames' medians (n,). NaN and infinity become 0."""
     pixels = stack.reshape(len(stack), -1)
     some = np.nan_to_num(pixels[:, :: -(-pixels.shape[1] // _PIXELS)].astype(np.float64), posinf=0.0, neginf=0.0)
     return some, np.median(some, axis=1)
@@ -114,9 +114,10 @@ def _fitting(
     kind: str, stack: np.ndarray, group: np.ndarray, tolerance: float, subject: str, light: float,
     names: Mapping[str, Sequence[str]],
 ) -> np.ndarray:
-    """Returns which frames, bool (k,), are like most in median and pattern. group (k,): the frames' indices in ``stack``.
-    tolerance: largest difference of medians, as a fraction of ``light``, the flats' median counts. Keeps all if there is no
-    majority. Warns of each frame that it leaves out."""
+    """Returns which of k flats or darks, bool (k,), are like most of them in median and pattern. group (k,): their indices
+    in ``stack`` (n, v, u). tolerance: largest difference of medians, as a fraction of ``light``, the flats' median counts.
+    kind ("flats" or "darks"), subject, names: words of messages. Keeps all if there is no majority. Warns of each frame that
+    it leaves out."""
     some, level = _levels(stack[group])
     usual = float(np.median(level))
     is_odd = np.abs(level - usual) > tolerance * light

@@ -153,7 +153,8 @@ class Places:
         return np.full(frames, schema.PROJECTION)
 
     def angles_rad(self, used: np.ndarray, options: ImportOptions, usual: str = "", unit: str = "deg") -> np.ndarray:
-        """Reads angles in rad, sign as stored, of the frames in ``used``, bool (F,). unit: if the file states none."""
+        """Reads angles in rad, sign as stored, of the frames in ``used``, bool (F,), unless the options state them. usual:
+        the format's address of angles. unit: the angles' unit if the file states none."""
         quantity = replace(ANGLE, assumed=unit)
         asked = [options.angles] if options.angles and is_address(options.angles) else self.stated.get("angles", ())
         for text in asked:
@@ -265,7 +266,7 @@ def beam(
         _log.warning("%s: no source distance: a parallel beam", source.name(lengths.source))
         sides = options.taken("pixel_size_mm", pitch_mm)
         return parallel(options, panel, sides, (0.0, axis_columns * sides[1]))
-    # abs, since NeXus files have the source's distance below 0
+    # abs, since NeXus files state the source's distance as a negative number
     to_axis_mm = options.taken("source_to_axis_mm", lambda: abs(h5.read_number(source, lengths.source, quantity)))
     if to_axis_mm == 0:
         raise source.error(lengths.source, "0", "a length other than 0", "remove it: without one the beam is parallel")

@@ -137,9 +137,9 @@ _WORD_OF = {
 }  # fmt: skip
 _DEFAULTS = {item.name: item.default for item in fields(ImportOptions) if item.name != "named"}
 WORDS = {item.name: item.metadata["words"] for item in fields(ImportOptions) if "words" in item.metadata}
-"""The words that an option accepts, by its name."""
+"""The words that an import option accepts, by the option's name."""
 FIELDS = tuple(_DEFAULTS)
-"""The names of all options."""
+"""The names of all import options."""
 
 # Groups of options, for formats whose files lack these values.
 TIMING = (

@@ -170,8 +170,8 @@ class Settings(Fields):
         self.comma_is_decimal = comma_is_decimal
 
     def measured(self, key: str, quantity: Quantity, unit: str) -> float:
-        """Returns a number above 0, in the package's unit of ``quantity``. unit: its unit if no known unit follows it in the
-        text."""
+        """Returns a number above 0, in the package's unit of ``quantity``. unit: the number's unit, unless a known unit
+        follows the number in the text."""
         found = number_at_start(str(self.get(key)), self.comma_is_decimal)
         stated = quantity.factor(found[1]) if found and found[1] else None
         factor = stated or quantity.factor(unit)

@@ -14,8 +14,8 @@ from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.volume import Volume
 from phyradgs_cl.text import plain_text
 
-_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # values beyond are HU: no noise goes lower, no metal higher
-_USUAL_PER_MM = 10.0  # where the user states water's attenuation, values beyond this are HU, not 1/mm
+_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # a value outside these limits is in HU: no noise is lower, no metal higher
+_USUAL_PER_MM = 10.0  # where the user states water's attenuation, a value of larger size means HU, not 1/mm
 VALUES = "values"
 """The provenance's key for the note that another program's file has about its values."""
 FROM_HU = "1/mm, from HU"

@@ -1,5 +1,5 @@
-"""Reads and writes deformations, alone or in a scan file, and the truth of simulated scans: a reference volume, and of an
-object that moves its deformation and its volumes (states) at several times."""
+"""Reads and writes deformations, alone or in a scan file. Also reads and writes a simulated scan's true volume and, if the
+object moves, its deformation and its true volumes (states) at several times."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ def read_deformation(path: str | Path) -> Deformation:
 
 
 def holds_deformation(path: str | Path) -> bool:
-    """Returns whether a file has a deformation at ``DEFORMATION``, as volumes of moving objects may have."""
+    """Returns whether a file has a deformation at /entry/deformation, as volumes of moving objects may have."""
     with open_hdf5(path) as source:
         return source.find(DEFORMATION) is not None
 

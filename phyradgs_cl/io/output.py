@@ -170,7 +170,7 @@ def _is_dead(process: int) -> bool:
     try:
         os.kill(process, 0)
     except OSError as error:
-        return isinstance(error, ProcessLookupError)  # any other error: another user's process, alive
+        return isinstance(error, ProcessLookupError)  # any other error: the process lives, as another user's
     return False
 
 

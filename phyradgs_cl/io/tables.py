@@ -31,7 +31,7 @@ PROVENANCE: dict[str, tuple[type, ...]] = {
     "seconds": (int, float),
     "record": (list,),
 }
-"""Types of the fields in a volume's provenance."""
+"""Allowed types of some fields in a volume's provenance, by the field's name."""
 
 
 def read_toml(path: Path, subject: str = "") -> dict[str, Any]:
@@ -121,7 +121,7 @@ class Fields:
         return value
 
     def length(self, key: str) -> float:
-        """Returns a number from 1e-9 to 1e9, in the file's unit: no scanner has lengths outside."""
+        """Returns a number from 1e-9 to 1e9, in the file's unit: no scanner has lengths outside this range."""
         value = self.number(key, highest=LARGEST_LENGTH)
         if value < 1 / LARGEST_LENGTH:
             raise self.error(key, f"{value:g}", "a number above 0")

@@ -1,4 +1,4 @@
-"""Brings a volume and its truth to one grid, by one rule for every PSNR."""
+"""Brings a volume and its reference, the true volume, to one grid, by one rule for every PSNR."""
 
 import math
 from dataclasses import dataclass
@@ -83,7 +83,7 @@ def in_words(grid: Grid) -> str:
 
 def _blocks(grid: Grid, finer: Grid) -> tuple[tuple[int, int, int], tuple[slice, slice, slice]] | None:
     """Returns how many voxels (z, y, x) of ``finer`` fill one of ``grid``, and the slices of ``finer`` that fill ``grid``;
-    None if a voxel would be cut or is outside of ``finer``."""
+    None if a voxel of ``finer`` would be cut, or a voxel of ``grid`` lies outside ``finer``."""
     factors = triple(max(1, round(d / f)) for d, f in zip(grid.voxel_size_mm, finer.voxel_size_mm, strict=True))
     counts = triple(n * factor for n, factor in zip(grid.shape, factors, strict=True))
     if any(n > most for n, most in zip(counts, finer.shape, strict=True)):

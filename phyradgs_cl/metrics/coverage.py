@@ -1,5 +1,5 @@
 """Tests the error bars of voxels (standard deviations σ in 1/mm) against a true volume: the fraction of errors within the
-bars, and the mean σ over the RMS error."""
+bars, and the ratio mean σ / RMS error."""
 
 from pathlib import Path
 
@@ -20,13 +20,13 @@ _OBJECT, _AROUND = 0.01, 2  # errors count where the truth is above 1 % of its m
 
 
 def object_voxels(truth: Array) -> NDArray[np.bool_]:
-    """Returns which voxels (nz, ny, nx) count: the object, and two voxels around it."""
+    """Returns the voxels, bool (nz, ny, nx), whose errors count: those of the object, and two voxels around it."""
     return np.asarray(scipy.ndimage.binary_dilation(truth > _OBJECT * truth.max(), iterations=_AROUND))
 
 
 def coverage(sigma: Array, volume: Array, truth: Array, multiple_95: float) -> dict[str, float]:
-    """Returns the fractions of errors within σ and within ``multiple_95`` σ in the object's voxels, and the mean σ over the
-    RMS error. sigma, volume, truth: (nz, ny, nx) in 1/mm. multiple_95: the 95 % bar over σ."""
+    """Returns the fractions of errors within σ and within ``multiple_95`` σ in the object's voxels, and the ratio mean σ /
+    RMS error there. sigma, volume, truth: (nz, ny, nx) in 1/mm. multiple_95: the 95 % bar / σ."""
     inside = object_voxels(truth)
     size, bar = np.abs(volume.astype(np.float64) - truth)[inside], sigma[inside].astype(np.float64)
     over_error = float(bar.mean() / (np.sqrt(np.mean(size**2)) or np.inf))

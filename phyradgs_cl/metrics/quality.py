@@ -1,8 +1,8 @@
-"""Compares a volume with the truth by peak signal-to-noise ratio and structural similarity, and a motion with the true one.
+"""Compares a volume with a reference by PSNR and structural similarity (SSIM), and a motion with the true motion.
 
 SSIM (Z. Wang et al., IEEE Trans. Image Process. 13(4), 600-612, 2004) is taken in 2D, with an 11×11 Gaussian window of sigma
 1.5 and zeros beyond the border. As in the published tables of radiative Gaussian splatting, it is averaged over the slices
-across each axis whose truth is not empty, then over the axes."""
+across each axis, except those that are 0 throughout in the reference, and then over the axes."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -70,7 +70,7 @@ def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Returns psnr_db in dB, ssim (of slices across all three axes) and data_range, the maximum of ``reference``. volume,
     reference: (z, y, x) in the same unit.
 
-    Raises InputError for an empty reference, shapes that differ, NaN and infinity."""
+    Raises InputError for a reference without a value above 0, shapes that differ, NaN and infinity."""
     for name, values in {"volume": volume, "reference": reference}.items():
         if not isinstance(values, np.ndarray):
             remedy = "of a result or scan: its .volume or .reference"
@@ -110,7 +110,7 @@ def ssim(result: ArrayLike, reference: ArrayLike, data_range: float | None = Non
     the three axes. Slices that are 0 throughout in the reference do not count.
 
     ``data_range``: L in C1 = (0.01 L)², C2 = (0.03 L)², by default the reference's maximum. Raises InputError for arrays
-    that are not 3D, shapes that differ, NaN or infinity, an empty reference, and a range that is not positive."""
+    that are not 3D, shapes that differ, NaN or infinity, a reference of zeros, and a range that is not positive."""
     a, b, peak = checked_pair(result, reference, data_range)
     checks.shape("reference", b, (None, None, None))
     return float(np.mean([_along_axis(a, b, peak, axis) for axis in range(3)]))
@@ -129,7 +129,8 @@ def ssim_map(result: ArrayLike, reference: ArrayLike, data_range: float) -> Arra
 
 
 def _along_axis(result: Floats, reference: Floats, peak: float, axis: int) -> float:
-    """Returns the mean SSIM of the slices across ``axis``, leaving out those that are empty in the reference."""
+    """Returns the mean SSIM of the slices across ``axis``, without slices that are 0 throughout in the reference. Raises
+    InputError for a reference of zeros."""
     a, b = np.moveaxis(result, axis, 0), np.moveaxis(reference, axis, 0)
     full = np.flatnonzero(b.any(axis=(1, 2)))
     if full.size == 0:
@@ -141,7 +142,7 @@ def _along_axis(result: Floats, reference: Floats, peak: float, axis: int) -> fl
 
 
 def _blur(images: Array) -> Array:
-    """Applies SSIM's Gaussian window, whose weights sum to 1, over the last two axes, with zeros outside."""
+    """Applies SSIM's Gaussian window, whose weights sum to 1, over the last two axes, with zeros beyond the images."""
     offsets = np.arange(WINDOW) - WINDOW // 2
     weights = np.exp(-0.5 * (offsets / SIGMA) ** 2)
     weights /= weights.sum()
@@ -183,9 +184,9 @@ def motion_error_mm(
 
 
 def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike, title: str) -> None:
-    """Writes a PNG of middle slices: a row for each axis, and columns for result, truth and difference. z and y point up.
+    """Writes a PNG of middle slices: a row for each axis; columns for result, reference and difference. z and y point up.
 
-    Grey values extend over the truth's range, so that a wrong gain shows. The difference has its own scale, symmetric about
+    Grey values extend over the reference's range, so that a wrong gain shows. The difference has a scale symmetric about
     0. result, reference: (z, y, x). ``title``: the heading's first line. Raises InputError for shapes that differ, NaN and
     infinity, and OutputError for a file that cannot be written."""
     volume, truth = np.asarray(result), np.asarray(reference)
@@ -205,7 +206,7 @@ def _scores(result: Floats, reference: Floats) -> str:
 
 
 def draw_slices(figure: "FigureBase", volume: Floats, truth: Floats | None, grid: Grid | None) -> None:
-    """Draws the three middle slices of a volume (z, y, x) in 1/mm; with a truth, also its slices and the difference."""
+    """Draws the three middle slices of a volume (z, y, x) in 1/mm; with a ``truth``, also its slices and the difference."""
     if truth is not None:
         checks.shape("reference", truth, volume.shape)
         checks.finite("reference", truth)

@@ -1,8 +1,8 @@
 """Corrects beam hardening: returns the line integrals that a beam would give if every layer attenuated as a thin one does.
 
 - Polynomial: the user has measured it with a wedge.
-- One material: a polynomial is fitted to line integrals over the path through the segmented volume (Krumm, Kasperl and
-  Franz, NDT & E Int. 41 (2008) 242).
+- One material: a polynomial of the path through the segmented volume is fitted to line integrals (Krumm, Kasperl and Franz,
+  NDT & E Int. 41 (2008) 242).
 - Tube voltage: bone in a reconstruction is projected, and the spectrum gives the soft tissue that remains (Joseph and
   Spital, J. Comput. Assist. Tomogr. 2 (1978) 100). This is repeated with the better volume.
 
@@ -31,7 +31,7 @@ BoneIn = Callable[[np.ndarray], np.ndarray]
 """Maps a volume (z, y, x) to the attenuation of the bone in each voxel."""
 _LARGEST = 1e3  # larger coefficients and attenuations must be mistakes
 _PASSES = 2  # rounds in which bone is taken from a volume and frames are corrected for it: the second round has better bone
-_BONE_VOXELS = 128  # a coarse volume is enough to find bone, because its hardening is smooth: voxels along the longest side
+_BONE_VOXELS = 128  # voxels along the longest side of the volume in which bone is found: its hardening is smooth
 # Candidates: soft tissue ends, and pure bone begins, at these fractions of the densest voxel (above 1: no voxel is pure).
 _BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in (0.4, 0.7, 1.0) if soft < bone]
 _BETWEEN += [(0.7, 1.0), (0.7, 1.5), (0.8, 1.5)]

@@ -17,7 +17,7 @@ _DENSER = 6.0  # metal attenuates 6 times as much as the main material: bone has
 _FEWEST = 4  # fewer touching voxels than this are noise, not metal
 _BLIND = 2  # voxels this near to metal, in voxels, are filled from outside: all rays through them are masked
 _VOXELS = 128  # the volume that fills the shadow has at most this many voxels along its longest side, to save time
-_MOST, _OBJECT = 0.5, 0.02  # the shadow may cover half of the object's pixels: those above 0.02 of the frames' largest value
+_MOST, _OBJECT = 0.5, 0.02  # the shadow may cover at most half of the pixels above 0.02 of the frames' largest value
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def _completed(masked: Scan, shadow: np.ndarray, is_metal: np.ndarray, make_mode
 
 def _main_level(volume: np.ndarray) -> float:
     """Returns the main material's attenuation in a volume (z, y, x): voxels above it make up half of the total attenuation.
-    Infinity for an empty volume."""
+    Infinity if no voxel is above 0."""
     rising = np.sort(volume[volume > 0])
     if rising.size == 0:
         return float("inf")

@@ -28,7 +28,7 @@ _LEAST_FRAMES = 8  # fewer views do not average the object enough to show rings:
 _LEAST_PAIRS = 0.25  # columns are compared with their mirror images if at least this fraction of them has one on the panel
 _LEAST_SHARE = 0.25  # a pattern with less than this fraction of the variance of the mean's noise is not worth a correction
 _NEGLIGIBLE = 1e-4  # nobody sees a pattern with a smaller standard deviation in line integrals: gains off by 0.01 %
-_SURE = 12.0  # a pattern is certain if its variance exceeds the noise's times this, over √pixels: about 12 standard errors
+_SURE = 12.0  # a pattern is certain if its variance exceeds this / √pixels times the noise's variance: 12 standard errors
 _THRESHOLD = 3.5  # coefficients above this many standard deviations of the pattern belong to the object
 _SHIFTS = 8  # positions of the blocks along each side, over which the result is averaged so that no block edges show
 _DEVIATIONS = 8.0  # a gain is wrong if it is off by more than this many robust standard deviations in both sets of views
@@ -38,7 +38,7 @@ _NEAR = 21  # the usual deviation near a pixel is the median over this many colu
 _AXIS = 3  # near the axis an object's edges stay in one column, like rings: this many columns on each side are left alone
 _UNEQUAL = 0.25  # the two sets of views may differ about a wrong gain by this fraction, plus 2 standard deviations
 _OBJECT = 0.5  # a pixel whose mirror image deviates by more than this fraction of its own deviation is left alone
-_EQUALLY_FAR = 1.15  # the sources of a full turn are nearly equally far from their mean: largest over smallest distance
+_EQUALLY_FAR = 1.15  # in a full turn, (largest distance / smallest distance) of the sources from their mean is below this
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,8 @@ def surround_evenly(scan: Scan) -> bool:
 
 
 def _means(frames: np.ndarray, full_turn: bool) -> np.ndarray:
-    """Returns the means (2, v, u) of two independent sets of views: even and odd ones; on an arc its two halves, which show
-    the object differently."""
+    """Returns the means (2, v, u) of two independent sets of views: even and odd ones or, on an arc, the first and the
+    second half, in which the object looks different."""
     half = (len(frames) + 1) // 2
     sets = (frames[::2], frames[1::2]) if full_turn else (frames[:half], frames[half:])
     return np.stack([part.mean(axis=0, dtype=np.float64) for part in sets])
@@ -152,7 +152,8 @@ def _blockwise(
     image: np.ndarray, guide: np.ndarray, share_of: Callable[[np.ndarray], np.ndarray], window: int
 ) -> np.ndarray:
     """Multiplies the cosine coefficients of overlapping blocks by ``share_of`` the coefficients of ``guide``, and averages
-    blocks. Each block keeps its mean value. A block of fewer remaining coefficients has less noise and weighs more."""
+    blocks where they overlap. Each block keeps its mean value. A block of fewer remaining coefficients has less noise and
+    weighs more."""
     width = [(window, window + (-n) % window) for n in image.shape]
     padded, guiding = (np.pad(part, width, mode="symmetric") for part in (image, guide))
     total, weight = np.zeros_like(padded), np.zeros_like(padded)
@@ -195,8 +196,8 @@ def mirror_columns(columns: int, axis_column: float | None) -> np.ndarray:
 
 
 def _antisymmetric(mean: np.ndarray, axis_column: float | None) -> np.ndarray:
-    """Returns a mean over views (v, u) minus its mirror image, over √2, so that white noise keeps its variance. Where few
-    columns have a mirror image it returns the mean itself."""
+    """Returns (mean over views (v, u) − its mirror image) / √2, in which white noise keeps its variance. If fewer than a
+    quarter of the columns have a mirror image, returns the mean itself."""
     mirrored = mirror_columns(mean.shape[1], axis_column)
     if len(mirrored) < _LEAST_PAIRS * mean.shape[1]:
         return mean

@@ -27,10 +27,10 @@ _POWERS = (1, 2)  # powers of a ray's line integral to which scatter is fitted: 
 # wrong gain.
 _REACHES = (0.12, 0.18, 0.27, 0.4)
 _PASSES = 6  # rounds that compute scatter from the primary light, then primary light from the scatter
-_LEAST_PRIMARY = 0.05  # an overestimate of scatter leaves at least this fraction of the light: the logarithm stays finite
+_LEAST_PRIMARY = 0.05  # overestimated scatter leaves at least this fraction of the light, so that its logarithm is finite
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
 _FITTED_FRAMES = 24  # the fit uses at most this many frames, evenly spread, to save time
-_USUAL_REACH = 0.18  # where only to_primary is stated: the kernel's standard deviation over the panel's longer side, a ratio
+_USUAL_REACH = 0.18  # kernel's standard deviation / panel's longer side, where only to_primary is stated
 _HEIGHT_STEP = 1.25  # each kernel that is tried is stronger than the one before by this factor
 _MOST_STEPS = 8  # at most this many steps make the kernel stronger, up to 6 times the fitted one
 _TRIALS = 6  # most strengths tried in the final search, between the neighbours of the best one
@@ -38,7 +38,7 @@ _TRIALS = 6  # most strengths tried in the final search, between the neighbours 
 _BETTER = 0.65
 _AS_WELL = 1.05  # no stronger kernel is tried once one leaves over this many times the least rest found so far
 _LARGEST_HEIGHT = 20.0  # no kernel for a stated to_primary is stronger than this
-_BISECTIONS = 20  # halvings that give the strength for a stated to_primary to 2e-5
+_BISECTIONS = 20  # halvings of an interval of 20, which give the strength for a stated to_primary to within 2e-5
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def _height_for(frames: np.ndarray, to_primary: float, reach: float) -> float:
 
 
 def _ratio(before: np.ndarray, after: np.ndarray) -> float:
-    """Returns scatter over primary light behind the object, from line integrals before and after the removal of scatter."""
+    """Returns scatter / primary light behind the object, from line integrals before and after the removal of scatter."""
     shadow = after > _SHADOW * float(np.percentile(after, 99.9))
     primary = float(np.exp(-after[shadow].astype(np.float64)).sum())
     return float(np.exp(-before[shadow].astype(np.float64)).sum()) / max(primary, 1e-20) - 1

@@ -33,8 +33,8 @@ _SMALLEST = 1e-6  # least spread in line integrals, to divide by: that of a stuc
 @dataclass(frozen=True)
 class StripeOptions(checks.Checked):
     """Options of the step ``stripes``. width: columns over which the median is taken; stripes are narrower than half of it.
-    ratio: a stripe deviates this
-    many times as much as the columns at both sides; 0 replaces every column, as the paper does."""
+    ratio: a stripe deviates this many times as much as the columns at both sides; 0 replaces every column, as the paper
+    does."""
 
     PREFIX = "stripes."
 

@@ -10,7 +10,7 @@ from phyradgs_cl.report.images import Window, base64_of, block_means, bytes_of, 
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
 from phyradgs_cl.report.viewer import choice, decimals_of, slider
 
-MOST_EDGE = 128  # larger volumes are averaged over blocks to this many voxels along each side
+MOST_EDGE = 128  # larger volumes are averaged over blocks to at most this many voxels along each side
 MOST_TEXT = 2_000_000  # limit of base64 characters for voxels and centres together, so that the page stays small
 MOST_CENTRES = 20_000  # the centres of at most this many Gaussians are shown, evenly chosen
 MOST_ZOOM = 8
@@ -79,7 +79,8 @@ def _controls(threshold: int, cloud: Gaussians | None) -> list[Markup]:
 
 
 def _centres(cloud: Gaussians, grid: Grid) -> dict[str, str]:
-    """Returns evenly chosen centres inside the box in base64: x, y, z as 16-bit fractions of it, and densities in 8 bits."""
+    """Returns evenly chosen centres inside the grid's box and their densities, in base64: x, y, z as 16-bit fractions of the
+    box's sides, densities in 8 bits."""
     some = np.unique(np.linspace(0, cloud.count - 1, min(cloud.count, MOST_CENTRES)).round().astype(int))
     low_mm, size_mm = (np.array(three[::-1]) for three in (np.array(grid.box_mm)[:, 0], grid.size_mm))
     share = (cloud.mean[some] - low_mm) / size_mm

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from phyradgs_cl.fields import Grid
 
-LONGEST_EDGE = 192  # larger slices are averaged over blocks to this many pixels along each side
+LONGEST_EDGE = 192  # larger slices are averaged over blocks to at most this many pixels along each side
 BUDGET_PIXELS = 16_000_000  # pixels of all slices together: pure noise, the worst case, makes a page of some 20 MB
 # Plane, index and letter of the axis across it, and the world axes to the right and up in the picture.
 PLANES = (("axial", 0, "z", "x", "y"), ("coronal", 1, "y", "x", "z"), ("sagittal", 2, "x", "y", "z"))
@@ -127,8 +127,8 @@ class Plane:
         return len(self.indices) // 2
 
 def windows_of(volume: Volume, reference: Volume | None, doubt: Volume | None = None) -> dict[str, Window]:
-    """Returns the grey values of each layer: "result", "truth", "difference", "doubt" (the error bars). Result and truth
-    share the truth's range, so that a wrong scale of the result shows."""
+    """Returns the grey values of each layer: "result", "truth" (``reference``), "difference", "doubt" (the error bars).
+    Result and truth share the reference's range, so that a wrong scale of the result shows."""
     if doubt is not None:
         return {**windows_of(volume, reference), "doubt": Window.of(*grey_range(doubt), doubt)}
     if reference is None or not float(reference.max()) > 0:

@@ -37,7 +37,8 @@ class Run:
     """A reconstruction, read from its volume file and, if it is found, its scan.
 
     - scan: on the volume's grid. scan_path: its file. scan_facts: what ``scan_summary`` says about the file.
-    - reference (nz, ny, nx) 1/mm: the truth on that grid. compared: how volume and truth were compared. metrics: by name.
+    - reference (nz, ny, nx) 1/mm: the true volume, if it is on the volume's grid. metrics: by name. compared: how volume and
+      true volume came onto one grid, in words.
     - notes: remarks for the reader of the page. deformation: how the object moved, if the run knew or found it."""
 
     path: Path

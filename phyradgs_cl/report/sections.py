@@ -26,7 +26,7 @@ _ABSURD = 1e9  # larger parameters come from damaged files and are not rounded
 
 
 def slices_section(run: Run) -> Markup:
-    """Shows slices of the volume, and of the truth if the scan has one."""
+    """Shows slices of the volume, and of the true volume if the scan has one."""
     stored, grid = run.stored, run.stored.required_grid
     windows = images.windows_of(stored.values, run.reference, stored.doubt)
     planes = images.planes_of(stored.values, run.reference, grid, windows, stored.doubt)
@@ -40,7 +40,7 @@ def slices_section(run: Run) -> Markup:
 
 
 def doubt_section(run: Run) -> Markup | None:
-    """Shows a profile through the volume's middle with its error bars, and the truth if the scan has one."""
+    """Shows a profile through the volume's middle with its error bars, and the true volume's profile if the scan has one."""
     stored = run.stored
     if stored.doubt is None:
         return None
@@ -90,7 +90,7 @@ def volume_section(run: Run) -> Markup | None:
 
 
 def metrics_section(run: Run, views: Sequence[FramePair]) -> Markup | None:
-    """Shows errors of the volume against the truth, and of computed frames, if any, against the measured ones."""
+    """Shows errors of the volume against the true volume, and of computed frames, if any, against the measured ones."""
     facts: dict[str, object] = dict(run.metrics)
     if run.reference is not None:
         error = run.stored.values.astype(np.float64) - run.reference

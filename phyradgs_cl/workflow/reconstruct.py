@@ -41,7 +41,7 @@ _ALL_ROWS = Slabs()
 
 class _Checkpoints:
     """Writes checkpoints; call it with each progress report. It writes at most every ``every_s`` seconds, never for 0. A
-    killed run leaves its last complete checkpoint. One that cannot be written gives one warning, and no error."""
+    killed run leaves its last complete checkpoint. A failure to write gives a warning, once, and no error."""
 
     def __init__(self, path: Path, every_s: float) -> None:
         self.path, self.every_s = path, every_s
@@ -172,7 +172,7 @@ def _reconstructed(
 
 def _metrics(scan: Scan, result: methods.Reconstruction) -> dict[str, float]:
     """Returns the metrics against the scan's true volume, on the grid of ``metrics.aligned``, and metrics on held-out
-    pixels. If the object moves or changes, they are means over the times at which the truth is known. Removes the held-out
+    pixels. If the object moves or changes, they are means over the times of the scan's true volumes. Removes the held-out
     metrics from the result's facts, and adds there how volumes were compared, unless voxel by voxel."""
     held_out = result.facts.pop(HELD_OUT, {})
     if scan.reference is None:

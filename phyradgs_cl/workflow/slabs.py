@@ -62,7 +62,7 @@ class Slabs:
 
 
 def surely_fits(path: Path) -> bool:
-    """Returns whether a file is so small that its frames surely fit into memory, even counts of 2 bytes that become 4. A
+    """Returns whether a file is so small that its frames surely fit into memory, even if its 2-byte counts become 4 bytes. A
     missing file counts as small, since reading it gives the right error."""
     return not path.is_file() or 2 * _COPIES * path.stat().st_size < _HOST_SHARE * host_bytes()
 
@@ -134,7 +134,7 @@ def _pass_on(report: methods.ProgressReport, label: str, progress: methods.Progr
 
 class _Store:
     """The finished slabs of a run: .npy files in a folder next to the output. identity: a text about the run, stored with
-    the slabs. Without ``resume`` earlier slabs are removed; with it, slabs of another run raise InputError."""
+    the slabs. Without ``resume``, earlier slabs are removed; with ``resume``, slabs of another run raise InputError."""
 
     def __init__(self, output: Path, identity: str, resume: bool) -> None:
         self.folder = beside(output, ".slabs")

@@ -22,7 +22,7 @@ from phyradgs_cl.text import plain_text
 from phyradgs_cl.workflow.files import check_picture, load_reference, load_result
 
 log = logging.getLogger(__name__)
-_LITTLE = 0.5 - 1e-6  # boxes that share less than this fraction of either often have a wrong size or offset
+_LITTLE = 0.5 - 1e-6  # if two boxes share less than this fraction of one of them, a size or offset is often wrong
 # Volumes that overlap little get a warning if they correlate less than this: with wrong sizes 0.6 at most, with right ones
 # 0.55 to 0.9.
 _ALIKE = 0.65
@@ -38,7 +38,7 @@ def run_evaluation(
     voxel.
 
     reference_voxel_mm: voxel sides of a reference that does not state them, one length or (z, y, x).
-    object_motion: the file of a deformation, which moves the volume to each time at which a scan has the truth; None takes
+    object_motion: the file of a deformation, which moves the volume to the time of each true volume of a scan; None takes
     the volume's own, if it has one. reference_of_rtk: the reference has RTK's axes. mu_water_per_mm: water's attenuation,
     for files in Hounsfield units that do not state it. Raises InputError for impossible sides, files that do not fit each
     other, and water's attenuation for files in 1/mm."""
@@ -92,8 +92,8 @@ def run_evaluation(
 
 
 def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dict[str, Any]:
-    """Returns PSNR and SSIM at each time at which the truth is known, and their means. If both deformations are known, adds
-    the mean and the 95th percentile of the motion's error in mm. Raises InputError for boxes that do not overlap."""
+    """Returns PSNR and SSIM at each time of ``truth``, and their means. If the deformations of result and truth are known,
+    adds the mean and the 95th percentile of the motion's error in mm. Raises InputError for boxes that do not overlap."""
     grid, field = result.required_grid, result.deformation
     rows: list[dict[str, float]] = []
     for time_s, state in zip(truth.times_s, truth.volumes, strict=True):
@@ -123,7 +123,8 @@ def _with_our_axes(volume: Volume) -> Volume:
 
 
 def _grid_of(path: Path, reference: np.ndarray, grid: Grid | None, voxel_mm: object, volume_path: Path) -> Grid:
-    """Returns the reference's grid, or voxels of ``voxel_mm`` centred on the axis. Raises InputError for both or neither."""
+    """Returns the reference's ``grid`` or, without one, a grid with voxels of ``voxel_mm``, centred on the axis. Raises
+    InputError if both or none of the two are given."""
     if voxel_mm is not None:
         if grid is not None:
             expected = f"a reference without a scale; {path} has {in_words(grid)}"

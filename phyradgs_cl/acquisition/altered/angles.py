@@ -15,19 +15,20 @@ def azimuth_rad(pose: np.ndarray) -> np.ndarray:
 
 
 def start_azimuths_rad(scan: Scan) -> np.ndarray:
-    """Returns the ``azimuth_rad`` (F,) of each frame's pose when its first line opens."""
+    """Returns the angle (F,) in rad about +z, −π to π, of the source when each frame's first line opens; in a parallel beam,
+    of the rays' direction."""
     starts = [scan.trajectory.pose(f, scan.frame_start_s[f : f + 1]) for f in range(scan.frames)]
     return azimuth_rad(np.concatenate(starts))
 
 
 def middle_poses(scan: Scan) -> np.ndarray:
-    """Returns the poses (F, 12) in the middle of each frame (``Shutter.middle_s``)."""
+    """Returns the poses (F, 12) midway between each frame's first and last light."""
     times_s = scan.middle_times_s
     return np.stack([scan.trajectory.pose(f, times_s[f : f + 1])[0] for f in range(scan.frames)])
 
 
 def has_opposite_views(scan: Scan) -> bool:
-    """Returns whether views half a turn apart are mirror images: rays are parallel and at right angles to the axis."""
+    """Returns whether views half a turn apart are mirror images: if rays are parallel and at right angles to the axis."""
     return scan.is_parallel and bool((np.abs(middle_poses(scan)[:, 2]) < _ACROSS).all())
 
 

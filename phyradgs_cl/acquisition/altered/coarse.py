@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import scipy  # its parts load when they are used
+import scipy  # SciPy's parts load when they are used
 
 from phyradgs_cl.acquisition.altered.variants import altered_trajectory, with_trajectory
 from phyradgs_cl.acquisition.geometry import ConeGeometry, Geometry
@@ -18,7 +18,7 @@ FINE_COLUMNS = 32  # most blocks of pixels along the panel's longer side, for fi
 SMOOTHING = 0.8  # standard deviation, in blocks, of the Gaussian that smooths frames before pixels are averaged
 _LEAST_VALID = 0.5  # a block with a smaller fraction of valid pixels is masked
 _MOST_VOXELS = 64  # most voxels along the grid's longest side, without the margin
-_MARGIN = 1  # voxels of air added on each side: without air around a large object, too small a pixel size would fit better
+_MARGIN = 1  # voxels of air added on each side: without them a large object fits best with too small a pixel size
 _OBJECT_SHARE = 0.02  # a column shows the object if its largest line integral is above this fraction of the scan's largest
 _LEAST_COLUMNS = 12  # least number of blocks from left to right, if the panel has at least as many columns
 _NARROW = 3  # a block's side is divided by this on a panel lower than two blocks, because one row of blocks tells little
@@ -62,8 +62,8 @@ def fewer_frames(scan: Scan, most: int) -> Scan:
 
 
 def some_frames(scan: Scan, frames: np.ndarray) -> Scan:
-    """Returns the scan with only the frames of the given indices. Its trajectory translates new frame numbers to old
-    ones."""
+    """Returns the scan with only the frames whose indices are in ``frames``. Its trajectory translates the new frame numbers
+    to the old ones."""
     trajectory = altered_trajectory(scan)
     mask = scan.pixel_mask
     return replace(
@@ -102,9 +102,9 @@ def binned(scan: Scan, block: int) -> Scan:
 
 
 def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
-    """Returns a coarse grid of the same box, with a margin of one voxel on each side. Its voxels are about as large as a
-    pixel of ``geometry``, scaled to the axis. They are not finer than those of ``grid``, nor than 1/64 of its longest
-    side."""
+    """Returns a coarse grid of the box of ``grid``, with a margin of one voxel on each side. The coarse voxels are about as
+    large as a pixel of ``geometry`` scaled to the axis, but never smaller than the voxels of ``grid``, nor than 1/64 of the
+    box's longest side."""
     height_mm, width_mm = (pitch / geometry.magnification for pitch in geometry.pixel_size_mm)
     least_mm = max(max(grid.size_mm) / _MOST_VOXELS, min(grid.voxel_size_mm))
     wanted_mm = (max(height_mm, least_mm), *(max(width_mm, least_mm),) * 2)
@@ -115,10 +115,10 @@ def coarse_grid(grid: Grid, geometry: Geometry) -> Grid:
 
 
 def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
-    """Returns a coarse scan with its grid cut, in y and x, to the object that the frames show.
+    """Returns a coarse scan with its grid cut, in y and x, to a box around the object that the frames show.
 
     A grid of the whole field of view has much air. With few frames, voxels of air let a wrong geometry fit better than the
-    right one. spare_columns: by how many columns the axis may be off; the object's radius on the panel grows by as many.
+    right one. spare_columns: by how many columns the axis may be off. The object's radius on the panel grows by as many.
     A scan whose grid is off the axis, or whose frames show nothing, is returned unchanged."""
     geometry, grid = scan.geometry, scan.grid
     columns = np.where(scan.valid, scan.projections, 0).max((0, 1))
@@ -139,8 +139,8 @@ def around_object(scan: Scan, spare_columns: float = 0.0) -> Scan:
 
 
 def _binned_panel(geometry: Geometry, height: int, width: int) -> Geometry:
-    """Returns the panel with blocks of ``height`` × ``width`` as pixels. Rows and columns that fill no block are dropped,
-    which moves the panel's middle."""
+    """Returns the geometry of a panel whose pixels are blocks of ``height`` × ``width`` pixels. The last rows and columns
+    are dropped if they fill no block, which moves the panel's middle."""
     (rows, columns), (pitch_v_mm, pitch_u_mm) = geometry.detector_shape, geometry.pixel_size_mm
     offset_v_mm, offset_u_mm = geometry.detector_offset_mm
     offset_mm = offset_v_mm - rows % height / 2 * pitch_v_mm, offset_u_mm - columns % width / 2 * pitch_u_mm

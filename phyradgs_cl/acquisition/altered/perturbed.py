@@ -94,7 +94,8 @@ class PerturbedTrajectory:
 
     @cached_property
     def _turn(self) -> np.ndarray:
-        """The panel's rotation (3, 3) by roll and tilts. Its columns: the new u, v and normal in the stated panel's axes."""
+        """The panel's rotation (3, 3) by roll and tilts. Its columns are the new u, v and normal in the stated panel's
+        axes."""
         angles_rad = [self.correction.tilt_u_rad, self.correction.tilt_v_rad, self.correction.roll_rad]
         return np.asarray(Rotation.from_rotvec(angles_rad).as_matrix())
 
@@ -170,6 +171,6 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
 
 
 def scan_course(scan: Scan) -> np.ndarray:
-    """Returns when each frame begins, (F,), as a fraction of the scan from −1/2 (first frame) to 1/2 (last frame)."""
+    """Returns (t − t_first) / (t_last − t_first) − 1/2, (F,), where t is the time at which a frame begins."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     return np.asarray((starts_s - starts_s.min()) / max(np.ptp(starts_s), 1e-30) - 0.5)

@@ -20,7 +20,7 @@ from phyradgs_cl.acquisition.trajectory import (
 from phyradgs_cl.errors import InputError
 
 log = logging.getLogger(__name__)
-_UNEVEN = 0.01  # intervals between frames are uneven if their range exceeds this fraction of their mean
+_UNEVEN = 0.01  # frames are unevenly spaced if (longest interval − shortest interval) / mean interval exceeds this
 
 
 def sum_frames(
@@ -98,8 +98,8 @@ def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, i
 
 
 def _shares(delay: np.ndarray, count: int) -> np.ndarray:
-    """Returns for which fraction of each projection's interval each line is exposed, (projections, lines). count: the
-    exposure in intervals. delay (lines,): when each line opens, in intervals after the frame's start."""
+    """Returns the fraction of each projection's interval in which each line is exposed, (projections, lines). delay
+    (lines,): the number of intervals from the frame's start to a line's opening. count: the exposure in intervals."""
     number = np.arange(int(np.ceil(delay.max() - 1e-9)) + count)[:, None]
     overlap = np.minimum(number + 1, delay + count) - np.maximum(number, delay)
     return np.where(overlap > 1e-9, overlap, 0.0)

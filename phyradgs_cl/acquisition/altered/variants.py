@@ -140,7 +140,7 @@ def stretched(scan: Scan, v: float, u: float) -> Scan:
         pose[..., _ROW_STEP] *= v
         return pose
 
-    half_mm = columns * scan.geometry.pixel_size_mm[1] / 2 + abs(scan.geometry.detector_offset_mm[1])  # to the farther edge
+    half_mm = columns * scan.geometry.pixel_size_mm[1] / 2 + abs(scan.geometry.detector_offset_mm[1])  # far edge
     share = max(scan.grid.size_mm[1:]) * scan.geometry.magnification / (2 * u * half_mm)
     grows = abs(math.log(share * u)) < abs(math.log(share))
     z, y, x = scan.grid.voxel_size_mm

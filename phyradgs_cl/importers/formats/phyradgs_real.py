@@ -56,8 +56,8 @@ class Circle:
         return cls(centre[:2], circle.length("radius"), z, angles)
 
     def at(self, view: int, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns a view's angles (T,) in rad and points (T, 3) in mm at times ``share`` (T,), in exposures after the
-        opening of its first line."""
+        """Returns a view's angles (T,) in rad and points (T, 3) on the circle in mm. share (T,): times after the opening of
+        the view's first line, in units of the exposure."""
         start, closed, _ = self.angle_rad[view]
         angle = start + (closed - start) * share
         x, y = (self.centre[:, None] + self.radius * np.stack([np.cos(angle), np.sin(angle)])).tolist()

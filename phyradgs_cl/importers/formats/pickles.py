@@ -115,7 +115,7 @@ class PlainUnpickler(pickle.Unpickler):
     """An unpickler that calls none of the functions that a file names. A few functions of our own take their place."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Returns our function for an allowed name. Raises InputError for any other name."""
+        """Returns this module's function that replaces an allowed one. Raises InputError for any other name."""
         functions: dict[str, Any] = {  # new functions at each call, since a pickle may change a function's attributes
             "numpy.ndarray": object,  # only passed to _reconstruct, which ignores it
             "numpy.dtype": lambda code, *_: _Type(code),

@@ -28,7 +28,7 @@ ROW_0 = "top"
 OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 OPTIONS_WITH_TIMES = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
 _KEYS = ("first_line_start", "first_line_end", "last_line_end")
-_SAME = 1e-3  # largest difference of frames in readout over exposure time; of ratios above 1, as a fraction of the largest
+_SAME = 1e-3  # the frames' ratios (readout time / exposure time) differ by at most this × max(1, largest ratio)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +124,8 @@ def read_grid(scanner: Fields, unit_mm: float) -> Grid:
 
 
 def _pitches(scanner: Fields, what: str, counts: tuple[int, ...]) -> np.ndarray:
-    """Returns a pixel's or voxel's size along each axis, from the key d + ``what``. Without it, takes the total size, key
-    s + ``what``, over the count. what: "Detector" or "Voxel"."""
+    """Returns a pixel's or voxel's size along each axis, from the key d + ``what``. If this key is missing, divides the
+    total sizes, key s + ``what``, by ``counts``. what: "Detector" or "Voxel"."""
     if scanner.has(f"d{what}"):
         return scanner.lengths(f"d{what}", len(counts))
     return scanner.lengths(f"s{what}", len(counts)) / np.array(counts)
@@ -143,8 +143,8 @@ def _offset(scanner: Fields, key: str, count: int) -> np.ndarray:
 
 
 def turned_volume(subject: str, volume: np.ndarray, grid: Grid, per_mm: float) -> np.ndarray:
-    """Converts a stored volume [x, y, z], times the factor ``per_mm``, to (nz, ny, nx) float32 in 1/mm. Raises
-    InputError for a shape other than the grid's, and for values that are not finite in float32."""
+    """Returns a stored volume [x, y, z], whose unit is ``per_mm`` 1/mm, as (nz, ny, nx) float32 in 1/mm. Raises InputError
+    about ``subject`` for a shape other than the grid's, and for values that are not finite in float32."""
     checks.shape(subject, volume, grid.shape[::-1])
     checks.finite(subject, volume)
     turned = np.transpose(volume, (2, 1, 0)).astype(np.float64) * per_mm
@@ -192,7 +192,7 @@ def exposure_of_blurred_s(options: ImportOptions) -> float:
 
 
 def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarray) -> float:
-    """Returns readout time over exposure time, from the gantry's arcs (F,) in rad during both. Raises InputError for a ratio
+    """Returns readout time / exposure time, from the gantry's arcs (F,) in rad during each. Raises InputError for a ratio
     below 0, or one that differs between frames, and for exposures without a turn or with turns of both signs."""
     if np.any(exposure_arc == 0) or np.any(np.sign(exposure_arc) != np.sign(exposure_arc[0])):
         found = f"arcs from {exposure_arc.min():.6g} to {exposure_arc.max():.6g} rad"

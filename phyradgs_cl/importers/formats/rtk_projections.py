@@ -104,5 +104,5 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         index = image.GetLargestPossibleRegion().GetIndex()  # above 0 where RTK has cropped the image
         places_mm = tuple(image.TransformIndexToPhysicalPoint(index)), tuple(image.GetSpacing())
         stack = stack_of(np.array(itk.array_from_image(image)), *places_mm, direction, str(path))
-    options = replace(options, flat_value=None)  # RTK has already divided by it
+    options = replace(options, flat_value=None)  # RTK has already divided by the flat value
     return scan_of(geometry, stack, options, (str(description), str(path)), description.stem, str(path))

@@ -29,7 +29,7 @@ OWN_TABLES = {
     "timing": ("exposure_s", "readout_s", "frame_time_s", "start_s", "detector_model"),
 }
 _PER_FRAME, _ANGLES = ("values_deg", "file"), ("step_deg", "last_deg", "values_deg", "file")
-_KEYS = {  # option: the TOML's key for the same value
+_KEYS = {  # by import option: the TOML's key for the same value
     **{name: f"[timing] {name}" for name in ("exposure_s", "readout_s", "frame_time_s")},
     **{name: f"[readout] {name}" for name in ("first", "fps", "readout_ms")},
     **{name: f"[frames] {name}" for name in ("quantity", "flat_value", "row_0", "column_0")},

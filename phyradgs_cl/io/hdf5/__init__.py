@@ -24,7 +24,7 @@ _CLOSE = 0.8  # a name this similar to another (0 to 1, by difflib) is a misspel
 LINKED = "--linked-folder"
 _UNLOCK = "set HDF5_USE_FILE_LOCKING=FALSE"
 BEING_WRITTEN = "a file that another program has open for writing"
-_REASONS = {  # words in HDF5's message: (what was found, remedy)
+_REASONS = {  # by words in HDF5's message: what our message says was found, and its remedy
     "truncated": ("a truncated HDF5 file", "copy or write it again"),
     "signature not found": ("a file that is not HDF5", "check the path or convert it"),
     **{f"unable to lock file, errno = {number}": (BEING_WRITTEN,

@@ -39,7 +39,7 @@ class Quantity:
 
     @property
     def accepted(self) -> str:
-        """The short unit names, for messages."""
+        """The units' names of up to four ASCII characters, for messages."""
         return ", ".join(name for name in self.factors if len(name) <= 4 and name.isascii())
 
 
@@ -136,7 +136,8 @@ def read_number(
 
 
 def read_length(source: Hdf5Source, address: str, quantity: Quantity) -> float:
-    """Reads a required number above 0 from a dataset of one element, in the package's unit."""
+    """Reads a required number from a dataset of one element, in the package's unit. Raises InputError for a number below
+    1 / ``quantity.largest``, such as 0."""
     value = read_number(source, address, quantity)
     if value < 1 / quantity.largest:
         raise source.error(address, str(value), f"a {quantity.name} above 0, of a real scanner", "correct the value")
@@ -144,7 +145,7 @@ def read_length(source: Hdf5Source, address: str, quantity: Quantity) -> float:
 
 
 def read_integers(source: Hdf5Source, address: str, shape: Sequence[int | None]) -> np.ndarray:
-    """Reads a required dataset of whole numbers as int64."""
+    """Reads a required dataset of whole numbers as int64. Raises InputError for another shape or type."""
     dataset = source.dataset(address)
     checks.shape(source.name(address), dataset, shape)
     return read_values(source, address, dataset, kinds="iu").astype(np.int64)

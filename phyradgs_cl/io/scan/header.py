@@ -26,7 +26,7 @@ from phyradgs_cl.io.scan.motion import has_motion, read_gating, read_trajectory
 from phyradgs_cl.io.tables import read_facts
 
 _log = logging.getLogger(__name__)
-_JITTER = 0.01  # exposures or readouts measured per frame may differ from their median by this fraction of it
+_JITTER = 0.01  # exposures or readouts measured per frame may differ from their median by this fraction of the median
 _DEEPEST_ENTRY = 3  # NXtomo entries and subentries are searched in groups nested this deep at most
 
 

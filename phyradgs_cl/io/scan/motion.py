@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 _KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # motions of a circular orbit that files can hold
 _RAMP_ERROR_RAD = 1e-9  # a speed ramp is stored as a table of angles, whose interpolation errs by at most this
 _MOST_RAMP_SAMPLES = 500_000  # rows of the longest such table, about 8 MB; a longer ramp is stored less exactly
-_SUSPECT_RAD = math.radians(5.0)  # encoder table and rotation_angle differ by more only if one has a wrong sign or zero
+_SUSPECT_RAD = math.radians(5.0)  # encoder table and rotation_angle differ by more only if a sign or a zero is wrong
 _LEAST_SPAN_S = 1e-6  # least time that ``sampled`` covers in a frame: a table needs two times, even without any duration
 _MOST_SAMPLES = 1024  # ``sampled`` raises an error if a table of more samples per frame still misses the trajectory
 _AS_TABLE = "give it as a PoseTable"
@@ -63,15 +63,15 @@ def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> 
     """Reads gantry angles (P,) in rad of frames in ``used``, bool (F,). name: rotation_angle or rotation_angle_end."""
     address = f"{entry}/{schema.SAMPLE}/{name}"
     angle_rad = h5.read_array(source, address, used.shape, h5.ANGLE)[used]
-    # Whether gantry or sample turns, an end angle without @rotates takes from the start angle.
+    # Without @rotates, an end angle is of the gantry or of the sample as the start angle is.
     start = f"{entry}/{schema.SAMPLE}/rotation_angle"
     return angle_rad * _sense(source, address, absent=_sense(source, start, absent=-1.0))
 
 
 def storable(scan: Scan) -> Scan:
     """Returns the scan with a trajectory that files can hold. A user-defined trajectory, or a circular orbit with
-    user-defined kinematics, becomes a pose table that is exact to a ten-thousandth of a pixel. Raises InputError if no table
-    is."""
+    user-defined kinematics, becomes a pose table that is exact to a ten-thousandth of a pixel. Raises InputError if no
+    table is so exact."""
     path = scan.trajectory
     if isinstance(path, PoseTable) or (isinstance(path, CircularOrbit) and isinstance(path.kinematics, _KINEMATICS)):
         return scan
@@ -148,13 +148,13 @@ def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 def _angles(scan: Scan, frame: int, time_s: np.ndarray) -> np.ndarray:
     if isinstance(scan.trajectory, CircularOrbit):
         return scan.trajectory.angle_rad(frame, time_s)
-    source = towards_source(scan.trajectory.pose(frame, time_s), scan.is_parallel)  # its azimuth serves as the angle
+    source = towards_source(scan.trajectory.pose(frame, time_s), scan.is_parallel)  # the source's azimuth is the angle
     return np.unwrap(np.arctan2(source[:, 1], source[:, 0]))
 
 
 def _angle_table(scan: Scan, kinematics: EncoderTable | SpeedRamp) -> tuple[np.ndarray, np.ndarray]:
     """Returns times (T,) in s and angles (T,) in rad: the encoder's, or samples of a speed ramp. The samples are dense
-    enough for linear interpolation to ``_RAMP_ERROR_RAD``, up to ``_MOST_RAMP_SAMPLES``."""
+    enough for linear interpolation to err by at most 1e-9 rad, but at most 500,000."""
     if isinstance(kinematics, EncoderTable):
         return kinematics.time_s, kinematics.angle_rad_table
     first_s, last_s = float(np.min(scan.frame_start_s)), float(np.max(scan.frame_start_s)) + scan.shutter.span_s

@@ -196,7 +196,8 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
 
 @contextmanager
 def _copied(source: str | Path, target: str | Path, entry: str) -> Iterator[h5py.Group]:
-    """Yields the group ``entry``, with the group ``EXTRA``, of a copy of ``source``. On success it replaces ``target``."""
+    """Yields the group ``entry`` of a copy of ``source``, in which the group ``EXTRA`` is made if it is missing. On success
+    the copy replaces ``target``."""
     with written_beside(target) as temporary:
         shutil.copyfile(source, temporary)
         with h5py.File(temporary, "r+") as file:
