@@ -69,6 +69,7 @@ RAY_SAMPLES_SHARP = 0.05  # of the norm, one draw: a step in an interval counts 
 BACKPROJECTION = 2e-5  # bilinear positions to some 1e-6 pixels in float32, samples of order 1
 FDK_MEAN = 0.02  # mean inside a sphere: 90 views, 32³ voxels, a cone of ±10°, samples of the edge
 FDK_PARTIAL = 0.012  # the same at 120 views, displaced and short (0.0075); wrong weights leave 0.024 to 0.4
+FDK_ENDS = 0.1  # relative RMS where some views miss voxels, against a panel that all views see
 FDK_LINES = 1.08  # error of a rolling scan over that of a gantry at rest (0.99 to 1.05)
 RAMP = 1e-5  # float32 result of a float64 FFT
 

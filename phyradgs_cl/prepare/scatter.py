@@ -37,6 +37,7 @@ _TRIALS = 6  # most strengths tried in the final search, between the neighbours 
 # A stronger kernel is taken if it leaves less than this fraction of the rest that the fitted kernel leaves unexplained.
 _BETTER = 0.65
 _AS_WELL = 1.05  # no stronger kernel is tried once one leaves over this many times the least rest found so far
+_LEAST_RATIO = 0.01  # less scatter than this, over primary light behind the object, is not told from none
 _LARGEST_HEIGHT = 20.0  # no kernel for a stated to_primary is stronger than this
 _BISECTIONS = 20  # halvings of an interval of 20, which give the strength for a stated to_primary to within 2e-5
 
@@ -62,9 +63,9 @@ def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel)
         air = enough_air(frames, 0.05, 0.01, "scatter", "state scatter.to_primary")
         fitted = fit_scatter(frames, air, options.reach)
         kernel = raised(fitted, frames, air, *step.coarse_model(scan, make_model))
-        if not kernel:
-            return scan, {"result": "no scatter found in the light beside the object: the projections stay as they are"}
     clean = remove_scatter(frames, kernel)
+    if options.to_primary == 0 and _ratio(frames, clean) < _LEAST_RATIO:
+        return scan, {"result": "no scatter found in the light beside the object: the projections stay as they are"}
     terms = {"reach": [reach for reach, _ in kernel], "power": [power for _, power in kernel]}
     facts = {**terms, "height": list(kernel.values()), "to_primary": _ratio(frames, clean)}
     return replace(scan, projections=clean), facts

@@ -38,8 +38,13 @@ def test_a_clean_file_says_what_was_done_to_it(cli, simulated, tmp_path, capsys)
     assert [step["step"] for step in direct.provenance["prepared"]] == ["sparks", "dead", "rings"]
 
 
-def test_a_step_that_finds_nothing_says_so_and_may_be_asked_again(cli, simulated, tmp_path, capsys) -> None:
-    source, clean = simulated(*SPOILT[:-6], "--noise", "none"), tmp_path / "clean.h5"  # no scatter in it
+WEAK = ("--phantom", "foot", "--size", "24", "--detector", "32", "--views", "20", "--scatter", "0.3", "--noise", "none")
+
+
+# no scatter, and scatter of an object so weak that little of it reaches the light beside it
+@pytest.mark.parametrize("words", [(*SPOILT[:-6], "--noise", "none"), WEAK])
+def test_a_step_that_finds_nothing_says_so_and_may_be_asked_again(cli, simulated, tmp_path, capsys, words) -> None:
+    source, clean = simulated(*words), tmp_path / "clean.h5"
     assert cli.run(["prepare", str(source), "-o", str(clean), "--steps", "scatter"]) == 0
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("scatter")]
     assert line.split(maxsplit=1)[1] == NO_SCATTER

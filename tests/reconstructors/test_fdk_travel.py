@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from balls import balls, frames_of, levels
-from tolerances import FDK_PARTIAL
+from tolerances import FDK_ENDS, FDK_PARTIAL
 
 from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Scan
 from phyradgs_cl.fields import Grid
@@ -70,6 +70,34 @@ def test_displaced_panels_count_both_sides_apart(rt, is_parallel) -> None:
     circle = reconstructed(rt, poses_of(ANGLE[::3], 0 * ANGLE[::3], **more), is_parallel=is_parallel)
     found = reconstructed(rt, helix(4, 0.25, **more), is_parallel=is_parallel)
     np.testing.assert_allclose(found, circle, atol=FDK_PARTIAL)
+
+
+# balls at the ends of what a panel of SHAPE sees: 0.32 mm from the middle at the axis, where its outermost row ends
+AT_ENDS = balls(((0.3, 0, 0.3), 0.22), ((-0.25, 0.3, -0.3), 0.22), ((-0.2, -0.3, 0.3), 0.2))
+TALL, THIN = (48, SHAPE[1]), Grid((33, 26, 26), (0.02, 0.06, 0.06))  # a panel that sees all, and its slices
+
+
+@pytest.mark.parametrize("axis", ["still", "rows", "columns"])
+@pytest.mark.parametrize("is_parallel", [False, True])
+def test_voxels_at_the_ends_have_the_mean_of_the_views_that_see_them(rt, axis, is_parallel) -> None:
+    """They had half their density or none, and a single row reached only the slice in its own plane."""
+    lines = {"still": 0, "rows": TALL[0], "columns": TALL[1]}[axis]
+    along = "rows" if axis == "still" else axis
+    pose = helix(1, 0.0, lines, 0.02, is_parallel=is_parallel)
+    pose[..., 3:6] -= (TALL[0] - SHAPE[0]) / 2 * pose[..., 9:12]
+    frames = frames_of(AT_ENDS, pose, TALL, along, is_parallel)
+
+    def volume(rows: slice) -> np.ndarray:
+        part = pose[:, rows] if axis == "rows" else pose
+        moved = part.copy()
+        moved[..., 3:6] += rows.start * part[..., 9:12]
+        return fdk_volume(rt, frames[:, rows], moved, THIN, axis=along, is_parallel=is_parallel)
+
+    whole, (z, y, x) = volume(slice(0, 48)), np.meshgrid(*THIN.axes_mm(), indexing="ij")
+    for rows, middle_mm in ((slice(16, 32), 0.31), (slice(31, 32), 0.3)):  # the two slices, and the three, at their edges
+        at = (np.hypot(y, x) < 0.6) & (np.abs(z - middle_mm) < 0.021)
+        found, expected = volume(rows)[at], whole[at]
+        assert np.linalg.norm(found - expected) < FDK_ENDS * np.linalg.norm(expected)
 
 
 def test_a_feed_that_leaves_voxels_with_less_than_half_a_turn_is_named(rt, caplog) -> None:

@@ -197,7 +197,9 @@ def fdk_volume(
     filtered = _filtered(frames, ray_weight(canonical, shape, arc, fan, is_parallel), missing, window)
     pose = widened(pose, axis, missing)
 
-    def of_views(images: np.ndarray, views: np.ndarray, power: int = 2) -> np.ndarray:
+    def of_views(
+        images: np.ndarray, views: np.ndarray, grid: Grid = grid, pose: np.ndarray = pose, power: int = 2
+    ) -> np.ndarray:
         share, one = 0.5 * arc.gap_rad[views], pose[views]  # 0.5, because a full turn measures every ray twice
         if moving is not None and power == 2:
             return moving.of_views(views)(images, one, share, grid, axis, is_parallel=is_parallel)
@@ -205,16 +207,19 @@ def fdk_volume(
             return backproject(rt, images, one, share, grid, is_parallel=is_parallel, power=power)
         return backproject_lines(rt, images, one, share, grid, axis, is_parallel=is_parallel, power=power)
 
+    counted = opposite_weight(canonical, shape, arc, is_parallel)
+    seen_mm = fan.half_rad if is_parallel else np.linalg.norm(canonical[0, 0, 0, :2]) * np.sin(fan.half_rad)
     if travel.travels(by_pixel, shape[0], is_parallel):
-        counted = opposite_weight(canonical, shape, arc, is_parallel)
         volume = travel.seen_volume(
             filtered, pose, axis, grid, fan.is_displaced, is_parallel, counted, of_views, partial(of_views, power=1)
         )
     else:
         volume = of_views(filtered, np.arange(len(filtered)))
+        if moving is None:
+            travel.complete_ends(volume, filtered, pose, axis, grid, float(seen_mm), is_parallel, counted, of_views)
     if circle:
         _, y_mm, x_mm = grid.axes_mm()
-        radius_mm = fan.half_rad + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # up to the edge of the last pixel
+        radius_mm = seen_mm + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # up to the edge of the last pixel
         volume[:, np.hypot(y_mm[:, None], x_mm) > radius_mm] = 0
     return volume
 

@@ -1,5 +1,7 @@
-"""FDK of helices and other orbits that move along z: each voxel is computed only from the views that see it.
+"""FDK where views miss voxels: at the ends of a volume, and of helices and other orbits that move along z. Each voxel is
+computed only from the views that see it.
 
+At the ends of a volume (``complete_ends``) a voxel takes the mean of the views that see it. An orbit that moves along z:
 Neighbouring voxels along z are seen by different views, some of their rays twice, others once. The rays' directions about z
 are sorted into overlapping classes. In each class a voxel takes the mean of the views that see it, weighted by the width of
 the class. A view's weight falls towards the panel's first and last rows. After K. Stierstorfer et al., Phys. Med. Biol. 49
@@ -11,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.reconstructors.fdk import weights
 from phyradgs_cl.reconstructors.fdk.views import pose_of_pixels, view_angles
 
@@ -26,6 +29,11 @@ _LEAST_ROW = 0.02  # least weight of a row: some voxels are seen by the outermos
 _LEAST_SHARE = 0.01  # a class counts fully for a voxel that is seen from at least this fraction of its directions
 _NAMED = 0.01  # a warning comes if more than this fraction of the voxels lack views from some directions
 _FEW_VIEWS = 24  # fewer views per turn cause a warning: with 24, densities of balls are within 2 %
+_ENOUGH = 0.5  # a voxel that a smaller fraction of a turn's views see has incomplete data: its density fades
+_AROUND = 32  # number of points on the rim of the field of view that tell which slices all views see
+_BLOCK_BYTES = 1 << 26  # frames are backprojected to the ends in blocks of at most this many bytes, to limit memory
+_SAME_ROW = 1e-4  # a voxel that lies so little beyond the outermost row, in slices, lies on it
+_ENDLESS = 1e4  # height of a row, in rows, by which every voxel projects into it
 Backproject = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """A function from frames (n, rows, columns) and the numbers (n,) of their views to a volume (z, y, x)."""
 
@@ -89,6 +97,74 @@ def seen_volume(
         covered += np.minimum(seen / _LEAST_SHARE, 1)
     _warn_if_unseen(covered / classes, name, "a" if is_displaced else "half a")
     return volume * np.divide(classes, covered, out=np.zeros_like(covered), where=covered > 0)
+
+
+def complete_ends(
+    volume: np.ndarray, frames: np.ndarray, pose: np.ndarray, axis: str, grid: Grid, radius_mm: float, is_parallel: bool,
+    counted: Callable[[int], np.ndarray | float], backproject: Callable[..., np.ndarray],
+) -> None:  # fmt: skip
+    """Computes again, in place, the slices of ``volume`` (nz, ny, nx) in which views miss voxels within ``radius_mm`` of the
+    axis. The mean of the views that see a voxel stands for all. Rows count less and less up to one row beyond the panel.
+
+    frames (F, rows, columns), filtered; pose (F, 12) or (F, lines, 12) mm; counted: as in ``seen_volume``. ``backproject``
+    takes frames, numbers of views, a grid and poses."""
+    views, rows, width = frames.shape
+    taller = pose if pose.ndim == 2 or axis == "columns" else np.pad(pose, ((0, 0), (1, 1), (0, 0)), mode="edge")
+    one = pose if pose.ndim == 2 or axis == "columns" else pose[:, rows // 2]
+    first, last = _seen_by_all(pose, axis, rows, grid, radius_mm, is_parallel)
+    count = max(1, _BLOCK_BYTES // (4 * (rows + 2) * width))
+    for start, stop in ((0, first), (last, grid.shape[0])):
+        if start >= stop:
+            continue
+        slab = grid.part((start, 0, 0), (stop - start, *grid.shape[1:]))
+        values, seen, of_all = np.zeros((3, *slab.shape), np.float32)
+        for begin in range(0, views, count):
+            block = np.arange(begin, min(begin + count, views))
+            weight = np.ones((len(block), rows, width), np.float32)
+            for i, view in enumerate(block.tolist()):
+                weight[i] *= counted(view)
+            beyond = ((0, 0), (1, 1), (0, 0))
+            higher = _with_rows(taller, -1.0, 1.0)
+            values += backproject(np.pad(frames[block], beyond), block, slab, higher)
+            seen += backproject(np.pad(weight, beyond), block, slab, higher)
+            middle = np.repeat(weight[:, [rows // 2]], 3, axis=1)
+            of_all += backproject(middle, block, slab, _with_rows(one, (rows - 1) / 2 - _ENDLESS, _ENDLESS))
+        enough = np.maximum(seen, _ENOUGH * of_all)
+        volume[start:stop] = values * np.divide(of_all, enough, out=np.zeros_like(seen), where=enough > 0)
+
+
+def _with_rows(pose: np.ndarray, first: float, height: float) -> np.ndarray:
+    """Returns poses (..., 12) of a panel with other rows: row 0 at ``first`` and rows of ``height``, in the panel's rows."""
+    other = pose.copy()
+    other[..., 3:6] += first * pose[..., 9:12]
+    other[..., 9:12] *= height
+    return other
+
+
+def _seen_by_all(
+    pose: np.ndarray, axis: str, rows: int, grid: Grid, radius_mm: float, is_parallel: bool
+) -> tuple[int, int]:
+    """Returns the slices [first, last) in which every view sees every voxel within ``radius_mm`` of the axis."""
+    ends = pose if pose.ndim == 2 else np.concatenate([pose[:, 0], pose[:, -1]])
+    at_rad = 2 * np.pi * np.arange(_AROUND) / _AROUND
+    rim_mm = radius_mm * np.stack([np.cos(at_rad), np.sin(at_rad)])
+    x, y = (
+        (np.clip(rim, *grid.box_mm[k]) - grid.first_centre_mm[k]) / grid.voxel_size_mm[k]
+        for k, rim in zip((2, 1), rim_mm, strict=True)
+    )
+    m = voxel_matrices(ends, grid, is_parallel)[:, :, None]
+    # v · depth and depth are linear in z: their values in slice 0, (F, rim), and their changes from slice to slice, (F, 1)
+    (v, v_step), (depth, depth_step) = ((m[:, i] * x + m[:, i + 1] * y + m[:, i + 3], m[:, i + 2]) for i in (4, 8))
+    low, high = -np.inf, np.inf
+    for start, step in ((v, v_step), ((rows - 1) * depth - v, (rows - 1) * depth_step - v_step)):  # each is at least 0
+        root = -start / np.where(step == 0, np.inf, step)
+        low = max(low, np.max(root, initial=-np.inf, where=step > 0))
+        high = min(high, np.min(root, initial=np.inf, where=step < 0))
+        if np.any((step == 0) & (start < 0)):
+            high = -np.inf
+    first, last = np.ceil(low - _SAME_ROW), np.floor(high + _SAME_ROW) + 1
+    first = int(np.clip(first, 0, grid.shape[0]))
+    return first, int(np.clip(last, first, grid.shape[0]))
 
 
 def _directions(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool) -> tuple[np.ndarray, np.ndarray]:

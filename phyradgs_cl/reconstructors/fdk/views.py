@@ -123,9 +123,8 @@ def _stand_out(ahead: np.ndarray) -> np.ndarray:
 
 
 def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Returns which ``wide`` gaps ``ahead`` (K,) of at most 15° have a wide gap on the opposite side too, bool (K,). Such
-    gaps have no opposite rays, so the views at both sides fill them. The widest gap is never among them. centre (K,): angles
-    of the views."""
+    """Returns which ``wide`` gaps ``ahead`` (K,) of at most 15° have a wide gap on the opposite side too, bool (K,). Views
+    at both sides fill these gaps, which have no opposite rays. The widest is none of them. centre (K,): views' angles."""
     narrow = wide & (ahead <= _FILLED_RAD) & (np.arange(ahead.size) != np.argmax(ahead))
     opposite = centre + ahead / 2 + np.pi
     before = np.searchsorted(centre, np.mod(opposite - centre[0], 2 * np.pi) + centre[0], side="right") - 1
@@ -140,8 +139,7 @@ def _steps(ahead: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def _filled_rad(ahead: np.ndarray) -> float:
-    """Returns the sum over wide gaps of (gap − usual gap), in rad. A gap's usual gap is the largest of the median gap and
-    both its neighbours. ahead (K,): the gap from each view to the next."""
+    """Returns the sum in rad over wide gaps of (gap − largest of the median gap and both neighbours). ahead (K,): gaps."""
     usual = np.maximum(np.median(ahead) if ahead.size else 0.0, np.maximum(np.roll(ahead, 1), np.roll(ahead, -1)))
     return float((ahead - usual)[ahead > np.maximum(SHORT_SCAN_GAP * usual, _NAMED_RAD)].sum())
 
@@ -284,8 +282,7 @@ def check_beam(method: str, pose: np.ndarray, is_parallel: bool) -> None:
 
 
 def _check_directions(pose: np.ndarray) -> None:
-    """Raises InputError, or warns, if parallel rays or detector rows are off the plane of the rotation: a filter along the
-    rows is then wrong."""
+    """Raises InputError, or warns, if parallel rays or detector rows are off the plane of rotation: the filter is wrong."""
     rise_deg = np.rad2deg(np.arcsin(np.clip(np.abs(pose[..., 2]), 0, 1)))
     worst_deg = float(max(rise_deg.max(), _row_lean_deg(pose).max()))
     remedy = "take an iterative or splatting method: they take any orbit"
