@@ -15,6 +15,7 @@ import scipy
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare import step
 from phyradgs_cl.prepare.light import enough_air, with_air_at_0
 from phyradgs_cl.prepare.step import Facts, MakeModel, Model
@@ -38,8 +39,9 @@ _TRIALS = 6  # most strengths tried in the final search, between the neighbours 
 _BETTER = 0.65
 _AS_WELL = 1.05  # no stronger kernel is tried once one leaves over this many times the least rest found so far
 _LEAST_RATIO = 0.01  # less scatter than this, over primary light behind the object, is not told from none
-_LARGEST_HEIGHT = 20.0  # no kernel for a stated to_primary is stronger than this
-_BISECTIONS = 20  # halvings of an interval of 20, which give the strength for a stated to_primary to within 2e-5
+_LARGEST_HEIGHT = 1000.0  # no kernel for a stated to_primary is stronger than this
+_BISECTIONS = 26  # halvings of an interval of 1000, which give the strength for a stated to_primary to within 2e-5
+_SAME_RATIO = 0.25  # a kernel gives a stated to_primary if its ratio differs by at most this fraction
 
 
 @dataclass(frozen=True)
@@ -64,10 +66,15 @@ def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel)
         fitted = fit_scatter(frames, air, options.reach)
         kernel = raised(fitted, frames, air, *step.coarse_model(scan, make_model))
     clean = remove_scatter(frames, kernel)
-    if options.to_primary == 0 and _ratio(frames, clean) < _LEAST_RATIO:
+    ratio = _ratio(frames, clean)
+    if options.to_primary == 0 and ratio < _LEAST_RATIO:
         return scan, {"result": "no scatter found in the light beside the object: the projections stay as they are"}
+    if options.to_primary > 0 and abs(ratio - options.to_primary) > _SAME_RATIO * options.to_primary:
+        # a thin object scatters little in this model: with its strength the ratio jumps to nearly all light
+        expected = f"a ratio that the kernel gives, here {ratio:.2g}"
+        raise InputError("scatter.to_primary", f"{options.to_primary:g}", expected, "leave thin objects without this step")
     terms = {"reach": [reach for reach, _ in kernel], "power": [power for _, power in kernel]}
-    facts = {**terms, "height": list(kernel.values()), "to_primary": _ratio(frames, clean)}
+    facts = {**terms, "height": list(kernel.values()), "to_primary": ratio}
     return replace(scan, projections=clean), facts
 
 
@@ -137,7 +144,7 @@ def _height_for(frames: np.ndarray, to_primary: float, reach: float) -> float:
         middle = (low + high) / 2
         is_low = _ratio(some, remove_scatter(some, {(reach, 1): middle})) < to_primary
         low, high = (middle, high) if is_low else (low, middle)
-    return (low + high) / 2
+    return low
 
 
 def _ratio(before: np.ndarray, after: np.ndarray) -> float:
