@@ -116,8 +116,9 @@ def complete_ends(
     for start, stop in ((0, first), (last, grid.shape[0])):
         if start >= stop:
             continue
-        slab = grid.part((start, 0, 0), (stop - start, *grid.shape[1:]))
-        values, seen, of_all = np.zeros((3, *slab.shape), np.float32)
+        slab, one_slice = (grid.part((start, 0, 0), (n, *grid.shape[1:])) for n in (stop - start, 1))
+        values, seen = np.zeros((2, *slab.shape), np.float32)
+        of_all = np.zeros(one_slice.shape, np.float32)  # its slices differ only where the panel leans, and then little
         for begin in range(0, views, count):
             block = np.arange(begin, min(begin + count, views))
             weight = np.ones((len(block), rows, width), np.float32)
@@ -128,7 +129,7 @@ def complete_ends(
             values += backproject(np.pad(frames[block], beyond), block, slab, higher)
             seen += backproject(np.pad(weight, beyond), block, slab, higher)
             middle = np.repeat(weight[:, [rows // 2]], 3, axis=1)
-            of_all += backproject(middle, block, slab, _with_rows(one, (rows - 1) / 2 - _ENDLESS, _ENDLESS))
+            of_all += backproject(middle, block, one_slice, _with_rows(one, (rows - 1) / 2 - _ENDLESS, _ENDLESS))
         enough = np.maximum(seen, _ENOUGH * of_all)
         volume[start:stop] = values * np.divide(of_all, enough, out=np.zeros_like(seen), where=enough > 0)
 
