@@ -194,8 +194,14 @@ def fdk_volume(
     warn_if_incomplete(arc, fan, canonical, grid, is_parallel)
     # only a full turn has the opposite rays that complete a displaced detector
     missing = fan.missing_columns if arc.is_full else (0, 0)
-    filtered = _filtered(frames, ray_weight(canonical, shape, arc, fan, is_parallel), missing, window)
-    pose = widened(pose, axis, missing)
+    counted = opposite_weight(canonical, shape, arc, is_parallel)
+    seen_mm = fan.half_rad if is_parallel else float(np.linalg.norm(canonical[0, 0, 0, :2]) * np.sin(fan.half_rad))
+    travels = travel.travels(by_pixel, shape[0], is_parallel)
+    ends = [] if travels or moving is not None else travel.ends(pose, shape[0], grid, seen_mm, is_parallel)
+    filtered = _filtered(frames, ray_weight(canonical, shape, arc, fan, is_parallel), missing, window, 1 if ends else 0)
+    of_frames = pose = widened(pose, axis, missing)
+    if ends:
+        pose = travel.with_rows(pose, axis, 1)
 
     def of_views(
         images: np.ndarray, views: np.ndarray, grid: Grid = grid, pose: np.ndarray = pose, power: int = 2
@@ -207,16 +213,17 @@ def fdk_volume(
             return backproject(rt, images, one, share, grid, is_parallel=is_parallel, power=power)
         return backproject_lines(rt, images, one, share, grid, axis, is_parallel=is_parallel, power=power)
 
-    counted = opposite_weight(canonical, shape, arc, is_parallel)
-    seen_mm = fan.half_rad if is_parallel else np.linalg.norm(canonical[0, 0, 0, :2]) * np.sin(fan.half_rad)
-    if travel.travels(by_pixel, shape[0], is_parallel):
+    if travels:
         volume = travel.seen_volume(
             filtered, pose, axis, grid, fan.is_displaced, is_parallel, counted, of_views, partial(of_views, power=1)
         )
     else:
         volume = of_views(filtered, np.arange(len(filtered)))
-        if moving is None:
-            travel.complete_ends(volume, filtered, pose, axis, grid, float(seen_mm), is_parallel, counted, of_views)
+        middle = of_frames if of_frames.ndim == 2 else of_frames[:, of_frames.shape[1] // 2]
+        weight = np.array([np.mean(counted(view)) for view in range(len(filtered))]) if ends else np.empty(0)
+        for start, stop in ends:
+            slab = grid.part((start, 0, 0), (stop - start, *grid.shape[1:]))
+            volume[start:stop] *= travel.all_over_seen(middle, shape, weight, slab, of_views)
     if circle:
         _, y_mm, x_mm = grid.axes_mm()
         radius_mm = seen_mm + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # up to the edge of the last pixel
@@ -241,20 +248,22 @@ def _seen(
     return by_pixel, canonical, fan, view_arc(angle_rad, filled_gap_rad(fan))
 
 
-def _filtered(frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], window: str) -> np.ndarray:
+def _filtered(
+    frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], window: str, spare: int = 0
+) -> np.ndarray:
     """Returns weighted and filtered frames (F, rows, columns + missing) float32. weight: gives a view's weights (rows,
     columns). missing: numbers of columns added at both ends. They make a displaced detector symmetric, because the filter's
-    response continues beyond its rows."""
+    response continues beyond its rows. spare: number of rows of zeros added at both ends."""
     views, rows, columns = frames.shape
     width = columns + sum(missing)
-    filtered = np.empty((views, rows, width), np.float32)
+    filtered = np.zeros((views, rows + 2 * spare, width), np.float32)
     count = max(1, _BLOCK_BYTES // (4 * rows * width))
     for first in range(0, views, count):
         block = np.zeros((min(count, views - first), rows, width), np.float32)
         for i, frame in enumerate(frames[first : first + count]):
             measured = block[i, :, missing[0] : missing[0] + columns]
             np.multiply(frame, weight(first + i), out=measured, casting="same_kind")
-        filtered[first : first + count] = ramp_filter(block, 1.0, window)
+        filtered[first : first + count, spare : spare + rows] = ramp_filter(block, 1.0, window)
     return filtered
 
 

@@ -1,7 +1,7 @@
 """FDK where views miss voxels: at the ends of a volume, and of helices and other orbits that move along z. Each voxel is
 computed only from the views that see it.
 
-At the ends of a volume (``complete_ends``) a voxel takes the mean of the views that see it. An orbit that moves along z:
+At the ends of a volume (``all_over_seen``) a voxel takes the mean of the views that see it. An orbit that moves along z:
 Neighbouring voxels along z are seen by different views, some of their rays twice, others once. The rays' directions about z
 are sorted into overlapping classes. In each class a voxel takes the mean of the views that see it, weighted by the width of
 the class. A view's weight falls towards the panel's first and last rows. After K. Stierstorfer et al., Phys. Med. Biol. 49
@@ -31,9 +31,8 @@ _NAMED = 0.01  # a warning comes if more than this fraction of the voxels lack v
 _FEW_VIEWS = 24  # fewer views per turn cause a warning: with 24, densities of balls are within 2 %
 _ENOUGH = 0.5  # a voxel that a smaller fraction of a turn's views see has incomplete data: its density fades
 _AROUND = 32  # number of points on the rim of the field of view that tell which slices all views see
-_BLOCK_BYTES = 1 << 26  # frames are backprojected to the ends in blocks of at most this many bytes, to limit memory
 _SAME_ROW = 1e-4  # a voxel that lies so little beyond the outermost row, in slices, lies on it
-_ENDLESS = 1e4  # height of a row, in rows, by which every voxel projects into it
+_ENDLESS = 1e4  # side of a pixel, in pixels, by which every voxel projects into it
 Backproject = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """A function from frames (n, rows, columns) and the numbers (n,) of their views to a volume (z, y, x)."""
 
@@ -99,61 +98,49 @@ def seen_volume(
     return volume * np.divide(classes, covered, out=np.zeros_like(covered), where=covered > 0)
 
 
-def complete_ends(
-    volume: np.ndarray, frames: np.ndarray, pose: np.ndarray, axis: str, grid: Grid, radius_mm: float, is_parallel: bool,
-    counted: Callable[[int], np.ndarray | float], backproject: Callable[..., np.ndarray],
-) -> None:  # fmt: skip
-    """Computes again, in place, the slices of ``volume`` (nz, ny, nx) in which views miss voxels within ``radius_mm`` of the
-    axis. The mean of the views that see a voxel stands for all. Rows count less and less up to one row beyond the panel.
-
-    frames (F, rows, columns), filtered; pose (F, 12) or (F, lines, 12) mm; counted: as in ``seen_volume``. ``backproject``
-    takes frames, numbers of views, a grid and poses."""
-    views, rows, width = frames.shape
-    taller = pose if pose.ndim == 2 or axis == "columns" else np.pad(pose, ((0, 0), (1, 1), (0, 0)), mode="edge")
-    one = pose if pose.ndim == 2 or axis == "columns" else pose[:, rows // 2]
-    first, last = _seen_by_all(pose, axis, rows, grid, radius_mm, is_parallel)
-    count = max(1, _BLOCK_BYTES // (4 * (rows + 2) * width))
-    for start, stop in ((0, first), (last, grid.shape[0])):
-        if start >= stop:
-            continue
-        slab, one_slice = (grid.part((start, 0, 0), (n, *grid.shape[1:])) for n in (stop - start, 1))
-        values, seen = np.zeros((2, *slab.shape), np.float32)
-        of_all = np.zeros(one_slice.shape, np.float32)  # its slices differ only where the panel leans, and then little
-        for begin in range(0, views, count):
-            block = np.arange(begin, min(begin + count, views))
-            weight = np.ones((len(block), rows, width), np.float32)
-            for i, view in enumerate(block.tolist()):
-                weight[i] *= counted(view)
-            beyond = ((0, 0), (1, 1), (0, 0))
-            higher = _with_rows(taller, -1.0, 1.0)
-            values += backproject(np.pad(frames[block], beyond), block, slab, higher)
-            seen += backproject(np.pad(weight, beyond), block, slab, higher)
-            middle = np.repeat(weight[:, [rows // 2]], 3, axis=1)
-            of_all += backproject(middle, block, one_slice, _with_rows(one, (rows - 1) / 2 - _ENDLESS, _ENDLESS))
-        enough = np.maximum(seen, _ENOUGH * of_all)
-        volume[start:stop] = values * np.divide(of_all, enough, out=np.zeros_like(seen), where=enough > 0)
+def with_rows(pose: np.ndarray, axis: str, count: int) -> np.ndarray:
+    """Returns the poses (F, 12), or (F, lines, 12) along ``axis``, of a panel with ``count`` more rows at both ends."""
+    if pose.ndim == 3 and axis == "rows":
+        pose = np.pad(pose, ((0, 0), (count, count), (0, 0)), mode="edge")
+    moved = pose.copy()
+    moved[..., 3:6] -= count * pose[..., 9:12]
+    return moved
 
 
-def _with_rows(pose: np.ndarray, first: float, height: float) -> np.ndarray:
-    """Returns poses (..., 12) of a panel with other rows: row 0 at ``first`` and rows of ``height``, in the panel's rows."""
-    other = pose.copy()
-    other[..., 3:6] += first * pose[..., 9:12]
-    other[..., 9:12] *= height
-    return other
+def all_over_seen(
+    pose: np.ndarray, shape: tuple[int, int], weight: np.ndarray, grid: Grid, backproject: Callable[..., np.ndarray]
+) -> np.ndarray:
+    """Returns the factor (nz, ny, nx) for voxels that some views miss: the sum of all views' weights over that of the views
+    which see the voxel, at most 2. Rows count less and less up to one row beyond the panel.
+
+    pose (F, 12) in mm of a panel of ``shape``; weight (F,). ``backproject`` takes frames, their numbers, a grid and poses."""
+    views, (rows, columns) = np.arange(len(pose)), shape
+    wide = pose.copy()  # three columns so wide that every voxel projects into them
+    wide[:, 3:6] += ((columns - 1) / 2 - _ENDLESS) * pose[:, 6:9]
+    wide[:, 6:9] *= _ENDLESS
+    ones = np.broadcast_to(weight[:, None, None], (len(pose), rows, 3))
+    padded = np.pad(ones, ((0, 0), (1, 1), (0, 0))).astype(np.float32)
+    seen = backproject(padded, views, grid, with_rows(wide, "rows", 1))
+    high = wide.copy()
+    high[:, 3:6] += ((rows - 1) / 2 - _ENDLESS) * wide[:, 9:12]
+    high[:, 9:12] *= _ENDLESS
+    one_slice = grid.part((0, 0, 0), (1, *grid.shape[1:]))  # slices differ only where the panel leans, and then little
+    of_all = backproject(np.repeat(ones[:, :1], 3, axis=1).astype(np.float32), views, one_slice, high)
+    enough = np.maximum(seen, _ENOUGH * of_all)
+    return np.divide(of_all, enough, out=np.zeros_like(seen), where=enough > 0)
 
 
-def _seen_by_all(
-    pose: np.ndarray, axis: str, rows: int, grid: Grid, radius_mm: float, is_parallel: bool
-) -> tuple[int, int]:
-    """Returns the slices [first, last) in which every view sees every voxel within ``radius_mm`` of the axis."""
-    ends = pose if pose.ndim == 2 else np.concatenate([pose[:, 0], pose[:, -1]])
+def ends(pose: np.ndarray, rows: int, grid: Grid, radius_mm: float, is_parallel: bool) -> list[tuple[int, int]]:
+    """Returns the slices [start, stop) at both ends of the grid in which a view misses a voxel within ``radius_mm`` of the
+    axis. pose (F, 12) mm, or (F, lines, 12)."""
+    pose = pose if pose.ndim == 2 else np.concatenate([pose[:, 0], pose[:, -1]])
     at_rad = 2 * np.pi * np.arange(_AROUND) / _AROUND
     rim_mm = radius_mm * np.stack([np.cos(at_rad), np.sin(at_rad)])
     x, y = (
         (np.clip(rim, *grid.box_mm[k]) - grid.first_centre_mm[k]) / grid.voxel_size_mm[k]
         for k, rim in zip((2, 1), rim_mm, strict=True)
     )
-    m = voxel_matrices(ends, grid, is_parallel)[:, :, None]
+    m = voxel_matrices(pose, grid, is_parallel)[:, :, None]
     # v · depth and depth are linear in z: their values in slice 0, (F, rim), and their changes from slice to slice, (F, 1)
     (v, v_step), (depth, depth_step) = ((m[:, i] * x + m[:, i + 1] * y + m[:, i + 3], m[:, i + 2]) for i in (4, 8))
     low, high = -np.inf, np.inf
@@ -163,9 +150,10 @@ def _seen_by_all(
         high = min(high, np.min(root, initial=np.inf, where=step < 0))
         if np.any((step == 0) & (start < 0)):
             high = -np.inf
-    first, last = np.ceil(low - _SAME_ROW), np.floor(high + _SAME_ROW) + 1
-    first = int(np.clip(first, 0, grid.shape[0]))
-    return first, int(np.clip(last, first, grid.shape[0]))
+    slices = grid.shape[0]
+    first = int(np.clip(np.ceil(low - _SAME_ROW), 0, slices))
+    last = int(np.clip(np.floor(high + _SAME_ROW) + 1, first, slices))
+    return [(start, stop) for start, stop in ((0, first), (last, slices)) if start < stop]
 
 
 def _directions(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool) -> tuple[np.ndarray, np.ndarray]:
