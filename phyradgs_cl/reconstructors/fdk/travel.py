@@ -113,7 +113,7 @@ def all_over_seen(
     """Returns the factor (nz, ny, nx) for voxels that some views miss: the sum of all views' weights over that of the views
     which see the voxel, at most 2. Rows count less and less up to one row beyond the panel.
 
-    pose (F, 12) in mm of a panel of ``shape``; weight (F,). ``backproject`` takes frames, their numbers, a grid and poses."""
+    pose (F, 12) in mm of a panel of ``shape``; weight (F,). ``backproject`` takes frames, their numbers, grid and poses."""
     views, (rows, columns) = np.arange(len(pose)), shape
     wide = pose.copy()  # three columns so wide that every voxel projects into them
     wide[:, 3:6] += ((columns - 1) / 2 - _ENDLESS) * pose[:, 6:9]
