@@ -24,7 +24,7 @@ def main() -> None:
     try:
         status = load_cli().run(sys.argv[1:])
     except KeyboardInterrupt:  # Ctrl-C while libraries load; later the command line handles Ctrl-C
-        sys.stderr.write("phyradgs: interrupted, nothing written\n")
+        sys.stderr.write("phyradgs: interrupted, nothing new written\n")
         status = 130
     for number in (signal.SIGINT, signal.SIGTERM):  # a signal while the interpreter ends would print a traceback
         signal.signal(number, signal.SIG_IGN)

@@ -13,7 +13,7 @@ from types import FrameType
 
 from phyradgs_cl.errors import DeviceError
 
-NOTHING = "interrupted, nothing written"
+NOTHING = "interrupted, nothing new written"
 COMPLETE = "interrupted, the output is complete"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _SAME_PRESS_S = 1.0  # wrappers such as timeout and uv repeat a signal: within this time both count as one

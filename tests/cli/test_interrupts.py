@@ -21,7 +21,7 @@ from phyradgs_cl.simulation import run as simulation_run
 from phyradgs_cl.workflow import reconstruct, scans, volumes
 
 pytestmark = pytest.mark.slow
-NOTHING = "phyradgs: interrupted, nothing written\n"
+NOTHING = "phyradgs: interrupted, nothing new written\n"
 COMPLETE = "phyradgs: interrupted, the output is complete\n"
 
 

@@ -84,7 +84,7 @@ def test_the_last_words_of_a_rank(monkeypatch, capfd) -> None:
         for error, words, status in (
             (InputError("scan.h5", "nothing", "a scan"), "scan.h5: found nothing; expected a scan\n", 2),
             (OutputError("volume.h5", "no room"), "volume.h5: found no room\n", 4),
-            (KeyboardInterrupt(), "interrupted, nothing written\n", 130),
+            (KeyboardInterrupt(), "interrupted, nothing new written\n", 130),
         ):
             assert commands.last_words(error) == status
             assert capfd.readouterr().err == f"phyradgs: {name}{words}"
