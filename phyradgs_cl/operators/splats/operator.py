@@ -311,9 +311,9 @@ def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, floa
 
 
 def by_length(pose: np.ndarray, weighed: np.ndarray) -> np.ndarray:
-    """Returns the part (2,) of dL/d(panel shift), per pixel along v and u, that comes from the lengths of rays.
-
-    Line integrals are proportional to these lengths. pose (12,) mm; weighed (rows, columns): frame × dL/d(frame)."""
+    """Returns the part (2,) of dL/d(panel shift along v, along u), for shifts in pixels, that comes from the changed distances
+    between source and pixels. Line integrals are proportional to them. pose (12,) mm; weighed (rows, columns): frame ×
+    dL/d(frame)."""
     source, first, column, row = pose.reshape(4, 3)
     v, u = (np.arange(n, dtype=np.float64) for n in weighed.shape)
     ray = first - source + v[:, None, None] * row + u[:, None] * column

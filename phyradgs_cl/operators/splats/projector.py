@@ -18,7 +18,7 @@ from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pad_rows, padded_zeros, pitch_of, unpad_rows
 
 RECORD_FLOATS = {False: 16, True: 20}  # number of floats in a splat's record for a time cell; True: splats move in the cell
-DEFAULT_TIME_ERROR = 0.005  # largest relative RMS error of averages over an exposure in moving cells, by default
+DEFAULT_TIME_ERROR = 0.005  # default of the largest relative RMS error of a frame whose pose moves within time cells
 # Distance in standard deviations beyond which a Gaussian counts as 0: there it has fallen to 0.1 % of its peak.
 DEFAULT_CUTOFF_SIGMA = 3.7
 _BAND_LINES = 8  # number of detector lines of a tile on a CPU
