@@ -149,7 +149,7 @@ class AttenuationNetwork(nn.Module):
 
 def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
     """Returns NAF's linear layers. For ``LineOptions`` line-segment attention replaces all layers but the first, the last
-    and the skip layer: number layers // 2, counted from 0, of three or more. It gets the encoding beside the output before."""
+    and the skip layer: number layers // 2, counted from 0, of three or more. Its input contains the encoding too."""
     skip, width = options.layers // 2 if options.layers > 2 else -1, options.width
     middle: list[nn.Module] = []
     for number in range(1, options.layers - 1):

@@ -155,7 +155,7 @@ def _general(rt: Runtime, power: int, images: Arguments, brick: Brick, volume: D
 
 
 def _lines(rt: Runtime, power: int, is_turned: bool, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
-    """Launches the kernel for frames with a pose for each line. A work-item computes neighbouring voxels along z if lines are
+    """Launches the kernel for frames with a pose per line. A work-item computes neighbouring voxels along z if lines are
     detector columns (``is_turned``), else along x. images: the arguments for the frames; power: of the distance weight."""
     nz, ny, nx = brick.shape
     along_z = {"ALONG_Z": 1} if is_turned and rt.lanes > 1 else {}

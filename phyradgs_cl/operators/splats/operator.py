@@ -311,7 +311,7 @@ def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, floa
 
 
 def by_length(pose: np.ndarray, weighed: np.ndarray) -> np.ndarray:
-    """Returns the part (2,) of dL/d(panel shift along v, along u), for shifts in pixels, that comes from the changed distances
+    """Returns the part (2,) of dL/d(panel shift along v, along u), for shifts in pixels, that comes from changed distances
     between source and pixels. Line integrals are proportional to them. pose (12,) mm; weighed (rows, columns): frame ×
     dL/d(frame)."""
     source, first, column, row = pose.reshape(4, 3)

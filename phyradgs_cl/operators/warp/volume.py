@@ -85,7 +85,8 @@ class VolumeWarp:
         return result
 
     def moved(self) -> DeviceArray:
-        """Returns memory for the volume (nz, ny, nx) of one state. Zeros follow, which vectors may read."""
+        """Returns the memory for the volume (nz, ny, nx) of one state, the same in every call. Vectors may read beyond its
+        end, where zeros are."""
         if self._moved is None:
             self._moved = self.rt.zeros(int(np.prod(self.shape)) + GUARD)
         return DeviceArray(self._moved.buffer, self.shape, self._moved.dtype)
@@ -199,7 +200,8 @@ class StateStack:
         return self.moved()
 
     def moved(self) -> DeviceArray:
-        """Returns memory for the volume (nz, ny, nx) of one state. Zeros follow, which vectors may read."""
+        """Returns the memory for the volume (nz, ny, nx) of one state, the same in every call. Vectors may read beyond its
+        end, where zeros are."""
         return DeviceArray(self._one.buffer, self._one_shape, self._one.dtype)
 
     def zeros(self) -> DeviceArray:
