@@ -71,7 +71,9 @@ class PerViewParameters(ABC):
         """Returns values (n, K) without the part that another object would explain exactly."""
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
-        """Returns the indices of the kinds to estimate in stage ``number`` of ``count``. A subclass may leave some out."""
+        """Returns the indices of the kinds of parameters that stage ``number`` (from 0) of ``count`` estimates. Grids become
+        finer from stage to stage. Turns need fine detail, so only the last two stages estimate them. Both start turns from 0,
+        so that the difference between the two shows their error."""
         return range(len(self.KINDS))
 
     def operator(
