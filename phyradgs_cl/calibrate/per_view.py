@@ -71,9 +71,7 @@ class PerViewParameters(ABC):
         """Returns values (n, K) without the part that another object would explain exactly."""
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
-        """Returns the indices of the kinds of parameters that stage ``number`` (from 0) of ``count`` estimates. Grids become
-        finer from stage to stage. Turns need fine detail, so only the last two stages estimate them. Both start turns from 0,
-        so that the difference between the two shows their error."""
+        """Returns the indices of the kinds to estimate in stage ``number`` of ``count``. A subclass may leave some out."""
         return range(len(self.KINDS))
 
     def operator(
@@ -113,8 +111,8 @@ class WobbleParameters(PerViewParameters):
         return rest
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
-        """Returns the indices of the kinds of parameters that stage ``number`` (from 0) of ``count`` estimates. Grids become
-        finer from stage to stage. Turns need fine detail, so only the last two stages estimate them. Both start turns from 0, so that the
+        """Returns the indices of the kinds to estimate in stage ``number`` of ``count``; grids become finer from stage to
+        stage. Turns need fine detail, so only the last two stages estimate them. Both start turns from 0, so that the
         difference between the two shows their error."""
         return (TURN, SHIFT_V, SHIFT_U) if number >= count - 2 else (SHIFT_V, SHIFT_U)
 
