@@ -135,15 +135,35 @@ def rising(subject: str, value: ArrayLike) -> NDArray[np.float64]:
 def real_array(subject: str, value: ArrayLike, kinds: str = "iuf") -> np.ndarray:
     """Returns ``value`` as an array of its own type. Raises InputError for a masked array, and unless it holds numbers of
     NumPy's ``kinds``: integers and floats, with "b" also booleans."""
-    if np.ma.is_masked(value):
-        raise InputError(subject, "a masked array", "a plain array", "give its mask apart: array.data, and mask=array.mask")
+    unmasked(subject, value)
     try:
         array = np.asarray(value)
     except ValueError as error:  # NumPy's own message is too long for one line
         raise InputError(subject, "lists of unequal length", "an array of numbers") from error
+    except (BufferError, RuntimeError, TypeError) as error:  # arrays on a device, as of CuPy and PyTorch
+        raise not_on_host(subject, value, error) from error
     if array.dtype.kind not in kinds:
         raise InputError(subject, short_repr(value), "numbers")
     return array
+
+
+def unmasked(subject: str, value: object) -> None:
+    """Raises InputError for a NumPy array with masked elements, or a list of such arrays: NumPy would drop the mask."""
+    parts = value if isinstance(value, list | tuple) else [value]
+    if any(isinstance(one, np.ma.MaskedArray) and np.ma.is_masked(one) for one in parts):
+        remedy = "give array.filled(0), or array.data and its mask apart where there is an argument mask"
+        raise InputError(subject, "a masked array", "a plain array", remedy)
+
+
+def not_on_host(subject: str, value: object, error: Exception) -> InputError:
+    """Returns the InputError about an array that NumPy cannot read. error: what the array's library says."""
+    found, expected = f"{type(value).__name__} ({error})", "an array of real numbers on the host"
+    return InputError(subject, found, expected, "copy it there: array.get(), or of tensors detach().cpu()")
+
+
+def flag(subject: str, value: object) -> None:
+    """Raises InputError for anything but True and False: other values would count as true."""
+    kind(subject, value, bool | np.bool_, "True or False")
 
 
 def whole(subject: str, value: float, lowest: int, highest: int) -> None:

@@ -113,6 +113,11 @@ def read_settings(
     return Settings(values, origins, config, device, memory)
 
 
+def runtime_for(device: str | None, memory: str | None = None) -> Runtime:
+    """Returns the Runtime that a command's --device and --memory ask for. Raises errors that name these options."""
+    return read_settings(None, {"device": device, "memory": memory}).runtime()
+
+
 def _initial_volume(path: Path, mu_water_per_mm: float | None) -> methods.InitialVolume:
     volume = attenuation_of(str(path), load_volume(path, mu_water_per_mm))
     if volume.grid is None:

@@ -106,6 +106,7 @@ class Scan:
             if not isinstance(getattr(self, name), kinds):
                 wanted = " or ".join(f"a {kind.__name__}" for kind in kinds)
                 raise InputError(name, checks.short_repr(getattr(self, name)), wanted)
+        checks.flag("is_fly", self.is_fly)
         if not isinstance(self.title, str):
             raise InputError("title", checks.short_repr(self.title), "text")
         if self.detector_model not in DETECTOR_MODELS:
@@ -132,6 +133,7 @@ class Scan:
         if self.moving_truth is not None and self.moving_truth.volumes.shape[1:] != self.grid.shape:
             found = f"states of shape {self.moving_truth.volumes.shape[1:]}"
             raise InputError("moving_truth", found, f"the grid's {self.grid.shape}")
+        checks.unmasked("pixel_mask", self.pixel_mask)
         if self.pixel_mask is not None and np.shape(self.pixel_mask) not in (expected, expected[1:]):
             raise InputError("pixel_mask", f"shape {np.shape(self.pixel_mask)}", f"{expected[1:]} or {expected}")
 

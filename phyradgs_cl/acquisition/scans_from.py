@@ -48,6 +48,7 @@ def from_poses(
     detector_model, pixel_mask, reference, title, lag and provenance of ``Scan``.
 
     Raises InputError for shapes that do not fit, raw counts, and poses from which no ray meets the grid."""
+    checks.flag("is_parallel", is_parallel)
     values = _uncounted(frames, others.get("pixel_mask"))
     checks.shape("frames", values, (None, None, None))
     table = checks.numbers("poses", poses, (len(values), POSE_LENGTH))
@@ -76,7 +77,7 @@ def from_astra(
     (F, 12) in mm: source, centre of the panel, step to the next column, step to the next row. is_parallel: the vectors are
     those of ``parallel3d_vec``, which begin with the direction of the rays. grid, others: as in ``from_poses``. Raises
     InputError for shapes that do not fit."""
-    values, table = _uncounted(frames, others.get("pixel_mask")), np.asarray(vectors)
+    values, table = _uncounted(frames, others.get("pixel_mask")), checks.real_array("vectors", vectors)
     checks.shape("vectors", table, (None, POSE_LENGTH))
     if values.ndim == 3 and len(values) != len(table) == values.shape[1]:
         remedy = "ASTRA's order is (rows, frames, columns): give frames.swapaxes(0, 1)"
@@ -176,7 +177,7 @@ def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[i
     features that a ``Scan`` lacks: a turned panel, a second or third Euler angle, a volume that moves."""
     if getattr(geo, "mode", None) not in (None, "cone", "parallel"):
         raise InputError("geo.mode", checks.short_repr(geo.mode), "'cone' or 'parallel'")
-    angles = np.asarray(angles_rad)
+    angles = checks.real_array("angles", angles_rad)
     angles = checks.numbers("angles", angles_rad, (None, 3) if angles.ndim == 2 else (None,))
     if angles.ndim == 2:
         _refuse("angles", angles[:, 1:], "turns about z only: (F,), or (F, 3) with zeros behind the first")

@@ -251,6 +251,7 @@ class PoseTable:
     __repr__ = repr_of_changes
 
     def __post_init__(self) -> None:
+        checks.flag("is_parallel", self.is_parallel)
         expected, row = "times (T,) and poses (T, 12), T at least 2", (POSE_LENGTH,)
         time_s, table = _checked_table(self.subject, self.time_s, self.table, row, "poses", expected)
         normal = np.cross(table[:, 6:9], table[:, 9:12])

@@ -63,10 +63,11 @@ def move_views(scan: Scan, views: np.ndarray, *, without_gauges: bool = False) -
     views: (F, 3), for each view the gantry's turn about the axis in rad, counterclockwise seen from above, and the panel's
     shifts along v and u in mm. They hold for all times of a view. without_gauges: leaves out the part of ``views`` that a
     turned or shifted object explains as well (docs/calibrate.md). If frames overlap in time, ``save_scan`` refuses the
-    result, because a file has one pose at a time.
+    result, because a file has one pose at a time. It stores exposures that touch shorter by two billionths.
 
     Raises InputError for anything but a Scan, and for ``views`` of another shape or with numbers that are not finite."""
     check_scan(scan)
+    checks.flag("without_gauges", without_gauges)
     numbers = checks.numbers("views", views, (scan.frames, 3))
     if without_gauges:
         numbers = WobbleParameters.of(scan).without_gauges(numbers)

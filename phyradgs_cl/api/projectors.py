@@ -84,15 +84,17 @@ def splat_operator(
 ) -> SplatProjection:
     """Returns a scan's projector Φ (PhyRadGS, Eq. 3), from ``Gaussians`` or rows (11, G) to frames (F, rows, columns).
 
-    The rows are mean x y z and three scales in mm, quaternion w x y z of any length, density in 1/mm. motion: a model of
-    docs/methods.md that splats support. affine: use R2-Gaussian's approximation of the projection. cutoff_sigma: the
-    Mahalanobis radius at which a Gaussian ends; 0 never cuts. device: what ``--device`` takes, or a Runtime. The result's
-    ``of_densities(gaussians)`` is its linear part, from densities (G,) to frames.
+    The rows are mean x y z and three scales in mm, quaternion w x y z of a length from 1e-12 to 1e12, density in 1/mm.
+    motion: a model of docs/methods.md that splats support. affine: use R2-Gaussian's approximation of the projection.
+    cutoff_sigma: the Mahalanobis radius at which a Gaussian ends; 0 never cuts. device: what ``--device`` takes, or a
+    Runtime. The result's ``of_densities(gaussians)`` is its linear part, from densities (G,) to frames.
 
-    Raises InputError for anything but a Scan, for an unknown motion, and for a cutoff out of range."""
+    Raises InputError for anything but a Scan, an unknown motion, an ``affine`` that is neither True nor False, and a cutoff
+    out of range. The operator does so for rows out of range on the host; it does not look at Arrays on the device."""
     model = _checked(scan, motion, models.RAYS, models.SPLATS)
     if type(model) is PerRow:  # splats cannot share poses between lines by weights, so each line gets its own
         model = OwnTimes(model.of(scan).sub_intervals)
+    checks.flag("affine", affine)
     _check_cutoff(cutoff_sigma)
     rt = runtime_of(device)
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import lru_cache
 from inspect import signature
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -42,9 +43,11 @@ def runtime_of(device: Device) -> Runtime:
     """Returns the Runtime for the argument ``device``. None takes the device that ``--device`` takes by default."""
     if isinstance(device, Runtime):
         return device
-    return _runtime_by_name(None if device is None else str(device))
+    with _opening:
+        return _runtime_by_name(None if device is None else str(device))
 
 
+_opening = Lock()  # threads that start together would open a Runtime each, whose arrays the others' operators refuse
 _runtime_by_name = lru_cache(maxsize=4)(Runtime)  # one Runtime per device, so that kernels are built only once
 
 
@@ -123,6 +126,7 @@ def save_volume(
     Raises InputError for anything but a result, a suffix that cannot be written, ``hu`` without a scale or for Gaussians,
     and metrics for another format; OutputError if the file cannot be written."""
     checks.kind("result", result, Reconstruction, "a Reconstruction", "for an array, Reconstruction(volume, grid)")
+    checks.flag("hu", hu)
     file = _checked_path(path)
     if hu and result.scale is None:
         raise InputError("hu", "a result without a scale", "a scale", "result.hounsfield(air, water) fits one")

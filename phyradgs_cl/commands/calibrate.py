@@ -14,9 +14,10 @@ from phyradgs_cl.commands.options import Device, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import load_beads
 from phyradgs_cl.io import only_run, written_beside
+from phyradgs_cl.io.scan.motion import overlaps
 from phyradgs_cl.io.scan.writer import copy_with_motion
 from phyradgs_cl.progress import Ticker
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.settings import runtime_for
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import check_output, check_picture, load_scan
 
@@ -60,7 +61,7 @@ def calibrate_command(
         if output is not None:
             _check_storable(loaded, [word.strip() for word in (what or "").split(",")])
         report = lambda done, total, phase, share: ticker.show(done, total, f"  {phase}", share)  # noqa: E731
-        result = calibrate(loaded, Runtime(device), what, others, report, shape, splines, ticker.note)
+        result = calibrate(loaded, runtime_for(device), what, others, report, shape, splines, ticker.note)
     written, lines = {}, []
     if output is not None:
         with only_run(output), finish_despite_interrupt():
@@ -80,8 +81,8 @@ def _check_storable(scan: Loaded, names: list[str]) -> None:
     """Raises InputError for a wobble of frames that overlap in time, since a scan file has one pose at a time."""
     if WOBBLE not in names:
         return
-    period_s = float(np.diff(np.sort(scan.frame_start_s)).min(initial=np.inf))
-    if scan.is_fly and period_s <= scan.shutter.span_s:
+    if scan.is_fly and overlaps(scan):
+        period_s = float(np.diff(np.sort(scan.frame_start_s)).min())
         frames = f"frames of {scan.shutter.span_s:.4g} s that begin every {period_s:.4g} s"
         expected = "frames that do not overlap in time, because a file has one pose at a time"
         remedy = "leave -o out, or use api.calibrate, whose result need not be a file"

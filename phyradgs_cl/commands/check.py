@@ -13,7 +13,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import only_run, read_scan
 from phyradgs_cl.io.scan.writer import copy_with_offset
 from phyradgs_cl.progress import Ticker
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.settings import runtime_for
 from phyradgs_cl.signals import finish_despite_interrupt
 from phyradgs_cl.workflow.files import check_output, expecting
 
@@ -45,7 +45,7 @@ def check_command(
         ticker.stage(f"reading {scan.name}")
         with expecting(scan, "scan"):
             loaded = read_scan(scan, counts)
-        result = check(loaded, Runtime(device), counts, lambda done, total, name: ticker.show(done, total, f"  {name}"))
+        result = check(loaded, runtime_for(device), counts, lambda done, total, name: ticker.show(done, total, f"  {name}"))
     say(_as_json(result, scan, blur_facts(loaded)) if as_json else _as_text(result, blur_line(loaded)))
     suspicious = {finding.question for finding in result.suspicious}
     if output is not None:

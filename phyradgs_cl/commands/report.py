@@ -7,7 +7,7 @@ from phyradgs_cl.commands.console import file_argument, file_option, option, say
 from phyradgs_cl.commands.options import Device, Output
 from phyradgs_cl.report import view_volume, write_report
 from phyradgs_cl.report.page import DEFAULT_VIEWS
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.settings import runtime_for
 
 EXAMPLES = {
     "report": "Example: phyradgs report volume.h5 -o report.html",
@@ -24,7 +24,7 @@ def report_command(
     views: Annotated[int, option(_VIEWS, min=0, max=MOST_VIEWS)] = DEFAULT_VIEWS, device: Device = None,
 ) -> None:
     """Write one HTML page about a reconstruction: slices, convergence, projections, scan, provenance."""
-    write_report(run, output, lambda: Runtime(device), scan=scan, views=views)
+    write_report(run, output, lambda: runtime_for(device), scan=scan, views=views)
     say(f"{output}: {output.stat().st_size / 1e6:.3g} MB")
 
 

@@ -9,7 +9,7 @@ from phyradgs_cl.commands.options import Device, First, Memory, Output, lengths,
 from phyradgs_cl.importers.options import DETECTOR_OFFSET
 from phyradgs_cl.phantoms import PHANTOMS
 from phyradgs_cl.progress import Ticker
-from phyradgs_cl.runtime import Runtime
+from phyradgs_cl.settings import runtime_for
 from phyradgs_cl.simulation import SimulationOptions, scanner_for, scanner_options
 from phyradgs_cl.workflow import run_simulation
 
@@ -64,8 +64,8 @@ def simulate_command(
     inputs = [Path(one) for one in (of_scanner, given["motion_of_object"]) if one is not None]
     with Ticker("frame") as ticker:
         scan = run_simulation(
-            output, described, options, Runtime(device, memory=memory), ticker.show, phantom=phantom, volume=volume,
-            size=size, pixel_samples=pixel_samples, inputs=inputs,
+            output, described, options, runtime_for(device, memory), ticker.show, phantom=phantom, volume=volume, size=size,
+            pixel_samples=pixel_samples, inputs=inputs,
         )
     frames, rows, columns = scan.projections.shape
     say(f"{output}: {frames} frames of {rows}×{columns}, largest line integral {scan.projections.max():.3g}")

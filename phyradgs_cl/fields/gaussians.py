@@ -29,7 +29,7 @@ class Gaussians:
     density: np.ndarray
 
     def __post_init__(self) -> None:
-        count = len(np.atleast_1d(self.mean))
+        count = len(np.atleast_1d(checks.real_array("Gaussians' mean", self.mean)))
         shapes = {"mean": (count, 3), "scale": (count, 3), "quaternion": (count, 4), "density": (count,)}
         for name, shape in shapes.items():
             checks.numbers(f"Gaussians' {name}", getattr(self, name), shape)
@@ -51,6 +51,7 @@ class Gaussians:
         """Returns the parameters (11, G) float64, in the order that kernels read: mean, scale, unit quaternion, density."""
         q = self.quaternion
         if self.count:
+            q = np.ldexp(q, -np.frexp(np.abs(q).max(axis=1, keepdims=True))[1])  # exact; then no square is 0 or infinite
             q = q / np.linalg.norm(q, axis=1, keepdims=True)
         return np.concatenate([self.mean.T, self.scale.T, q.T, self.density[None]]).astype(np.float64)
 
@@ -64,7 +65,8 @@ class Gaussians:
     def of_covariance(cls, mean: np.ndarray, covariance: np.ndarray, density: np.ndarray) -> "Gaussians":
         """Makes a cloud from means (G, 3), covariances (G, 3, 3) and densities (G,). Raises InputError for other shapes, and
         for a covariance that is not positive definite."""
-        variance, axes = np.linalg.eigh(checks.numbers("covariance", covariance, (len(np.atleast_1d(mean)), 3, 3)))
+        count = len(np.atleast_1d(checks.real_array("Gaussians' mean", mean)))
+        variance, axes = np.linalg.eigh(checks.numbers("covariance", covariance, (count, 3, 3)))
         axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # flips an axis of each reflection: then it is a rotation
         x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(axes).as_quat().T
         return cls(mean, np.sqrt(variance), np.stack([w, x, y, z], -1), density)

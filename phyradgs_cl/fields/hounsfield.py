@@ -147,7 +147,7 @@ def _mean(name: str, voxels: np.ndarray, is_peak: bool) -> tuple[float, str]:
 
 def _inside(option: str, values: np.ndarray, grid: Grid, box: Box) -> np.ndarray:
     """Returns the voxels whose centres lie in a box. Raises InputError unless the box is six numbers that rise in pairs."""
-    ends_mm = checks.numbers(option, np.asarray(box), (6,)).reshape(3, 2)
+    ends_mm = checks.numbers(option, box, (6,)).reshape(3, 2)
     if (ends_mm[:, 0] >= ends_mm[:, 1]).any():
         raise InputError(option, checks.short_repr(box), "Z0 below Z1, Y0 below Y1, X0 below X1")
     z, y, x = (slice(*np.searchsorted(axis, ends)) for axis, ends in zip(grid.axes_mm(), ends_mm, strict=True))

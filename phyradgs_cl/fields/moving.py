@@ -72,6 +72,7 @@ class Gating:
     is_phase: bool = False
 
     def __post_init__(self) -> None:
+        checks.flag("gating is_phase", self.is_phase)
         times_s = checks.rising("gating times_s", self.times_s)
         object.__setattr__(self, "times_s", times_s)
         object.__setattr__(self, "values", checks.numbers("gating values", self.values, times_s.shape))

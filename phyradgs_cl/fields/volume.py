@@ -139,4 +139,4 @@ class Metal:
     grid: Grid
 
     def __post_init__(self) -> None:
-        checks.shape("metal", self.values, self.grid.shape)
+        checks.shape("metal", checks.real_array("metal", self.values), self.grid.shape)

@@ -70,11 +70,12 @@ def compare(volume: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """Returns psnr_db in dB, ssim (of slices across all three axes) and data_range, the maximum of ``reference``. volume,
     reference: (z, y, x) in the same unit.
 
-    Raises InputError for a reference without a value above 0, shapes that differ, NaN and infinity."""
+    Raises InputError for a reference without a value above 0, shapes that differ, masked arrays, NaN and infinity."""
     for name, values in {"volume": volume, "reference": reference}.items():
         if not isinstance(values, np.ndarray):
             remedy = "of a result or scan: its .volume or .reference"
             raise InputError(name, f"a {type(values).__name__}", "an array (z, y, x)", remedy)
+        checks.unmasked(name, values)
     peak = float(reference.max(initial=0.0))
     if peak <= 0:
         raise InputError("reference", f"a maximum of {peak:g}", "a volume with something in it")
@@ -94,7 +95,8 @@ def psnr(result: ArrayLike, reference: ArrayLike, data_range: float | None = Non
 
 def checked_pair(result: ArrayLike, reference: ArrayLike, data_range: float | None) -> tuple[Floats, Floats, float]:
     """Returns both arrays with at least one axis, and the data range. Raises InputError as ``psnr`` does."""
-    a, b = np.atleast_1d(np.asarray(result)), np.atleast_1d(np.asarray(reference))
+    pair = {"result": result, "reference": reference}
+    a, b = (np.atleast_1d(checks.real_array(name, values, "biuf")) for name, values in pair.items())
     checks.shape("result", a, b.shape)
     if b.size == 0:
         raise InputError("reference", f"shape {b.shape}", "at least one voxel")
@@ -189,7 +191,7 @@ def slices_png(path: str | Path, result: ArrayLike, reference: ArrayLike, title:
     Grey values extend over the reference's range, so that a wrong gain shows. The difference has a scale symmetric about
     0. result, reference: (z, y, x). ``title``: the heading's first line. Raises InputError for shapes that differ, NaN and
     infinity, and OutputError for a file that cannot be written."""
-    volume, truth = np.asarray(result), np.asarray(reference)
+    volume, truth, _ = checked_pair(result, reference, 1.0)
     figure = new_figure(3 * _INCH * 1.25, 3 * _INCH + 0.6)
     figure.suptitle(plain_text(f"{title}\n{_scores(volume, truth)}"), parse_math=False)  # a dollar sign is text, not TeX
     draw_slices(figure, volume, truth, None)

@@ -40,7 +40,8 @@ def computed(rt: Runtime, on_device: bool, function: Callable[[Any], Values], va
 
 def on_host(name: str, values: Any) -> np.ndarray:
     """Returns an array on the host as NumPy's float32 in C order. Arrays of other libraries are read by DLPack, without a
-    copy. Raises InputError about ``name`` for anything else."""
+    copy. Raises InputError about ``name`` for masked arrays and for anything else."""
+    checks.unmasked(name, values)
     has_dlpack = hasattr(values, "__dlpack__") and not isinstance(values, np.ndarray)
     try:
         array = np.from_dlpack(values) if has_dlpack else np.asarray(values)
@@ -48,8 +49,7 @@ def on_host(name: str, values: Any) -> np.ndarray:
             raise TypeError(f"numbers of type {array.dtype}")
         return np.ascontiguousarray(array, np.float32)
     except (BufferError, RuntimeError, TypeError, ValueError) as error:
-        expected = "an array of real numbers on the host, or pyopencl's"
-        raise InputError(name, f"{type(values).__name__} ({error})", expected, "of tensors: detach().cpu()") from error
+        raise checks.not_on_host(name, values, error) from error
 
 
 class Operator:
@@ -208,6 +208,11 @@ class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy ha
     def derivative(self, x: Any) -> "LinearOperator":
         """Returns the operator itself, because it is linear."""
         return self
+
+    def dot(self, x: Any) -> Any:
+        """Returns SciPy's product, also of ``@``. Raises InputError for masked arrays, whose mask SciPy would drop."""
+        checks.unmasked(self._domain[0], x)
+        return ScipyOperator.dot(self, x)
 
     def _matvec(self, x: np.ndarray) -> Any:
         return self(np.reshape(x, self.domain_shape)).ravel()

@@ -142,7 +142,7 @@ def _changed(options: Any, changes: Mapping[str, Any], subject: str) -> Any:
 def _having(option: str) -> str:
     """Returns the advice to use a method that has ``option``; "" if none has it."""
     usual = {name: next(iter(one.presets.values())) for name, one in METHODS.items()}
-    having = [name for name, options in usual.items() if hasattr(options, option)]
+    having = [name for name, options in usual.items() if option in (f.name for f in fields(options))]
     return f"--method {' or '.join(having)} has it" if having else ""
 
 

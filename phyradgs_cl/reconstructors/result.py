@@ -65,6 +65,8 @@ class Reconstruction:
             raise InputError("grid", checks.short_repr(self.grid), "a Grid")
         object.__setattr__(self, "volume", checks.real_array("volume", self.volume))
         checks.shape("volume", self.volume, self.grid.shape)
+        if self.doubt is not None:
+            checks.shape("doubt", checks.real_array("doubt", self.doubt), self.grid.shape)
         if self.states is not None:
             checks.shape("states", self.states.volumes, (None, *self.grid.shape))
 
@@ -138,6 +140,8 @@ class Reconstruction:
         has them, with times in s.
 
         Raises InputError for a scale or states that the result does not have, and if xarray is not installed."""
+        checks.flag("hu", hu)
+        checks.flag("states", states)
         scale, of_times = self.scale, self.states
         if hu and scale is None:
             raise InputError("hu", "a result without a scale", "a scale", "result.hounsfield(air, water) fits one")

@@ -57,7 +57,7 @@ class Runtime:
         limit_bytes = memory_limit(memory)
         self.ranks = Communicator() if ranks is None else ranks
         self.device: DeviceInfo
-        self.device, self.reason = choose_device(device, self.ranks.local_rank)
+        self.device, self.reason = choose_device(device, self.ranks.local_rank, "device")
         warn_of_fault(self.device)
         self.ledger = MemoryLedger(self.device, limit_bytes)
         self.traffic = Traffic()

@@ -68,14 +68,15 @@ def list_devices() -> list[DeviceInfo]:
     return infos
 
 
-def choose_device(wish: str | None = None, turn: int = 0) -> tuple[DeviceInfo, str]:
+def choose_device(wish: str | None = None, turn: int = 0, option: str = "--device") -> tuple[DeviceInfo, str]:
     """Returns the device to use, and the reason in words. Raises DeviceError where no device fits.
 
     wish (or the environment variable PHYRADGS_DEVICE): an index, ``cpu``, ``gpu``, a part of a device's or platform's
     name, or a list of these with commas. Without it, the best device is taken. turn: the number k of this process, from 0,
     among the run's processes on this machine. Process k takes entry k of a list. If ``wish`` is neither a list nor an
-    index, process k takes the k-th device of the same name after the best one. After the last comes the first again."""
-    source = "--device"
+    index, process k takes the k-th device of the same name after the best one. After the last comes the first again.
+    option: what messages call ``wish``."""
+    source = option
     if not wish:
         wish, source = os.environ.get(DEVICE_VARIABLE), DEVICE_VARIABLE
     devices = list_devices()

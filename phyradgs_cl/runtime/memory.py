@@ -125,11 +125,13 @@ class MemoryLedger:
     @contextmanager
     def reserved(self, nbytes: int) -> Iterator[None]:
         """Makes ``room`` leave ``nbytes`` free in the body of a ``with``, for buffers that are made later."""
-        self.reserved_bytes += nbytes
+        with self._counting:
+            self.reserved_bytes += nbytes
         try:
             yield
         finally:
-            self.reserved_bytes -= nbytes
+            with self._counting:
+                self.reserved_bytes -= nbytes
 
     def room(self, largest_bytes: int) -> Room:
         """Returns what operators may use of the memory that is left, in buffers of at most ``largest_bytes``: nine tenths,
@@ -192,7 +194,7 @@ def memory_limit(wish: str | int | None) -> int | None:
     """Returns the limit in bytes that ``wish`` or the environment variable PHYRADGS_MEMORY sets; None if neither does.
     Raises InputError for text that is no size."""
     if wish is not None:
-        return bytes_of(wish, "--memory")
+        return bytes_of(wish, "memory")
     text = os.environ.get(MEMORY_VARIABLE)
     return bytes_of(text, MEMORY_VARIABLE) if text else None
 

@@ -60,6 +60,32 @@ def fly(frames: Any = FRAMES, geometry: Any = CONE, angles: Any = ANGLES, **more
 GOOD, STILL = fly(), api.static_scan(FRAMES, CONE, ANGLES)
 BACKWARDS = replace(GOOD, trajectory=api.PoseTable([0.0, 9.0], EXCHANGED))
 FLAT = np.zeros((11, 2))
+MASKED = np.ma.masked_equal(FRAMES, 0)
+
+
+class OnDevice:
+    """An array as CuPy's, which NumPy cannot read."""
+
+    shape, dtype, ndim = FRAMES.shape, FRAMES.dtype, 3
+
+    def __array__(self, *_: Any, **__: Any) -> np.ndarray:
+        raise TypeError("Implicit conversion to a NumPy array is not allowed.")
+
+    def __dlpack__(self, **_: Any) -> Any:
+        raise BufferError("on cuda")
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        return 2, 0
+
+
+AWAY = OnDevice()
+
+
+def turned_by(length: float) -> np.ndarray:
+    """Rows (11, 2) of Gaussians, of which one has a quaternion of that length."""
+    rows = np.ones((11, 2))
+    rows[6:10, 1] *= length / 2
+    return rows
 
 
 @cache
@@ -150,7 +176,13 @@ def still(**changes: Any) -> api.Deformation:
 CASES: list[tuple[str, str, Callable[[], object]]] = [
     ("fly_scan", "pixels", lambda: fly(NAN)), ("fly_scan", "readout direction", lambda: fly(readout_direction=0)),
     ("fly_scan", "flats", lambda: fly(quantity="counts")), ("fly_scan", "flats, darks", lambda: fly(darks=FRAMES)),
-    ("static_scan", "frames", lambda: api.static_scan(np.ma.masked_equal(FRAMES, FRAMES.max()), CONE, ANGLES)),
+    *(("static_scan", "frames", partial(api.static_scan, one, CONE, ANGLES)) for one in (MASKED, list(MASKED), AWAY)),
+    *(("fly_scan", name, partial(fly, **{name: AWAY})) for name in ("frames", "flats", "mask")),
+    *(("Scan", name, partial(replace, GOOD, **{name: MASKED})) for name in ("projections", "pixel_mask")),
+    ("Scan", "is_fly", lambda: replace(GOOD, is_fly="no")), ("Scan", "vectors", lambda: Scan.from_astra(FRAMES, AWAY)),
+    ("Scan", "vectors", lambda: Scan.from_astra(FRAMES, np.ma.masked_less(POSES, 0))),
+    ("Scan", "is_parallel", lambda: Scan.from_poses(FRAMES, POSES, is_parallel="no")),
+    ("Scan", "angles", lambda: from_tigre(geometry(), AWAY)),
     ("static_scan", "angles_deg", lambda: api.static_scan(FRAMES, CONE, ANGLES[:2])),
     ("Scan", "geo.mode", lambda: from_tigre(geometry(mode="fan"))),
     ("Scan", "geo.DSD", lambda: from_tigre(geometry(DSD=None))),
@@ -176,6 +208,7 @@ CASES: list[tuple[str, str, Callable[[], object]]] = [
     *(("EncoderTable", "encoder", partial(api.EncoderTable, times, [0, 1])) for times in ([0], [1, 0], [0, np.nan])),
     ("FrameSweeps", "angle_start_rad", lambda: api.FrameSweeps([0.0, 1.0], 1.0, [0.0], [1.0])),
     ("PoseTable", "pose table", lambda: api.PoseTable([0.0, 1.0], np.zeros((2, 12)))),
+    ("PoseTable", "is_parallel", lambda: api.PoseTable(range(4), POSES, is_parallel="no")),
     ("PoseTable", "pose table", lambda: api.PoseTable(range(4), POSES[:, :11])),
     ("PoseTable", "pose table", lambda: reconstruct(BACKWARDS, "fdk")),
     ("TimeCells", "motion OnePose: pose", lambda: reconstruct(GOOD, "sirt", motion=ONE_POSE)),
@@ -192,6 +225,7 @@ CASES: list[tuple[str, str, Callable[[], object]]] = [
     *(("Grid", "grid voxel_size", partial(Grid, (2, 3, 4), size)) for size in ((1.0, 1.0), (1, 0, 1), (1, np.nan, 1))),
     ("Gating", "gating", lambda: replace(GOOD, gating=np.zeros(4))),
     ("Gating", "gating times_s", lambda: api.Gating([0, 0], [0, 0])),
+    ("Gating", "gating is_phase", lambda: api.Gating([0, 1], [0, 1], is_phase="no")),
     *(("Gating", "gating values", partial(api.Gating, np.arange(3.0), wrong)) for wrong in (np.zeros(2), 3 * [np.nan])),
     ("States", "times of states", lambda: api.States([2.0, 1.0], np.zeros((2, 3, 3, 3)))),
     ("States", "states", lambda: api.States([1.0], np.zeros((2, 3, 3, 3)))),
@@ -202,7 +236,7 @@ CASES: list[tuple[str, str, Callable[[], object]]] = [
         ("origin_mm", (0.0, 1.0)), ("spacing_mm", 0.0), ("weights", np.full((2, 1), np.nan)),
     )),
     ("Deformation", "weights", lambda: still().displacement_mm(np.zeros((1, 3)), [1.0, 2.0])),
-    ("deformed", "volume", lambda: api.deformed(FRAMES, GRID, still(), [1.0])),
+    *(("deformed", "volume", partial(api.deformed, one, GRID, still(), [1.0])) for one in (FRAMES, MASKED, AWAY)),
     ("deformed", "weights", lambda: api.deformed(np.zeros(GRID.shape), GRID, still(), [1.0, 2.0])),
     ("deformed", "deformation", lambda: api.deformed(np.zeros(GRID.shape), GRID, "field.h5", [1.0])),
     ("load_deformation", "nowhere.h5", lambda: api.load_deformation("nowhere.h5")),
@@ -211,6 +245,8 @@ CASES: list[tuple[str, str, Callable[[], object]]] = [
     ("ObjectMotion", "motion of the object: amplitude", lambda: api.ObjectMotion("sliding", 2).deformation(GRID, 0, 1)),
     ("Gaussians", "rows", lambda: Gaussians.from_rows(np.zeros((10, 5)))),
     ("Gaussians", "Gaussians' quaternion", lambda: cloud(quaternion=np.ones((1, 3)))),
+    ("Gaussians", "Gaussians' mean", lambda: cloud(mean=AWAY)),
+    ("Gaussians", "Gaussians' mean", lambda: Gaussians.of_covariance(AWAY, np.eye(3)[None], ONE)),
     ("Gaussians", "Gaussians' quaternion", lambda: cloud(quaternion=np.zeros((1, 4)))),
     ("Gaussians", "covariance", lambda: Gaussians.of_covariance(np.zeros((1, 3)), np.eye(3), ONE)),
     ("Gaussians", "Gaussians' scale", lambda: cloud(scale=np.full((1, 3), -2.0))),
@@ -218,6 +254,8 @@ CASES: list[tuple[str, str, Callable[[], object]]] = [
     ("Reconstruction", "volume", lambda: api.Reconstruction(np.zeros((2, 2, 2)), VOLUME.grid)),
     ("Reconstruction", "volume", lambda: api.Reconstruction(np.zeros(VOLUME.grid.shape, complex), VOLUME.grid)),
     ("Reconstruction", "grid", lambda: api.Reconstruction(np.zeros((2, 2, 2)), 2.0)),
+    *(("Reconstruction", "doubt", partial(replace, VOLUME, doubt=one)) for one in (MASKED, FRAMES)),
+    *(("Reconstruction", name, partial(VOLUME.to_xarray, **{name: "no"})) for name in ("hu", "states")),
     ("Reconstruction", "scan", lambda: VOLUME.plot("scan.h5")),
     ("Reconstruction", "states", lambda: replace(VOLUME, states=api.States([1.0], np.zeros((1, 3, 3, 3))))),
     ("calibrate", "scan", lambda: api.calibrate("scan.h5")),
@@ -242,17 +280,26 @@ CASES: list[tuple[str, str, Callable[[], object]]] = [
     ("save_scan", "scan", lambda: api.save_scan("s.h5", VOLUME)),
     ("save_volume", "result", lambda: api.save_volume("v.h5", VOLUME.volume)),
     ("save_volume", "path", lambda: api.save_volume("v.png", VOLUME)),
+    ("save_volume", "hu", lambda: api.save_volume("v.nii", VOLUME, hu="no")),
     ("save_volume", "path", lambda: api.save_volume("v.raw", VOLUME)),
     ("save_volume", "result:/entry/gaussians", lambda: api.save_volume("v.ply", VOLUME)),
     ("save_volume", "metrics", lambda: api.save_volume("v.nii", VOLUME, {"psnr_db": 3.0})),
     ("save_volume", "volume", lambda: api.save_volume("v.npy", replace(VOLUME, volume=VOLUME.volume * np.nan))),
     ("compare", "result", lambda: api.compare(np.ones((2, 2, 2)), np.ones((3, 3, 3)))),
     ("compare", "result", lambda: api.compare(np.full((4, 4, 4), np.nan), VOLUME.volume + 1)),
-    *(("compare", "reference", partial(api.compare, VOLUME.volume, other)) for other in (GOOD, VOLUME.volume)),
+    *(("compare", "reference", partial(api.compare, VOLUME.volume, other)) for other in (GOOD, VOLUME.volume, MASKED)),
+    ("compare", "volume", lambda: api.compare(MASKED, FRAMES + 1)),
     ("compare", "reference", lambda: api.compare(np.ones((4, 4)), np.ones((4, 4)))),
     ("ray_operator", "motion", lambda: ray_operator(GOOD, "exact")),
     ("ray_operator", "scan", lambda: ray_operator("scan.h5")),
     ("splat_operator", "motion", lambda: splat_operator(GOOD, "quick")),
+    ("splat_operator", "affine", lambda: splat_operator(GOOD, affine="no")),
+    *(("splat_operator", "rows", partial(call, turned_by(length)))
+      for length in (0, 1e-30, 1e-15, 1e15, 1e30)
+      for call in (lambda x: splats()(x), lambda x: splats().derivative(x), lambda x: splats().of_densities(x))),
+    *(("voxel_operator", "rows", lambda length=length: api.voxel_operator(GRID)(turned_by(length)))
+      for length in (1e-15, 1e15)),
+    ("splat_operator", "rows", lambda: splats()(np.ma.masked_equal(FLAT, 0))),
     ("splat_operator", "rows", lambda: splats()(np.zeros((10, 3)))),
     ("splat_operator", "rows", lambda: splats()(FLAT)), ("splat_operator", "rows", lambda: splats()(FLAT * np.nan)),
     ("splat_operator", "SplatProjection", lambda: splats().T(FRAMES)),
@@ -266,7 +313,10 @@ CASES: list[tuple[str, str, Callable[[], object]]] = [
     ("initial_gaussians", "scan", lambda: api.initial_gaussians(FRAMES)),
     ("Operator", "frames", lambda: rays().frames([4])), ("Operator", "frames", lambda: rays().frames(2)),
     ("Operator", "intensity", lambda: rays().intensity.intensity),
-    ("Operator", "values", lambda: rays().to_device("x")),
+    *(("Operator", "values", lambda one=one: rays().to_device(one)) for one in ("x", MASKED, AWAY)),
+    *(("Operator", "frames", lambda one=one: rays().T(one)) for one in (MASKED, list(MASKED), AWAY)),
+    ("LinearOperator", "volume", lambda: rays() @ np.ma.masked_equal(np.zeros(rays().shape[1]), 0)),
+    ("LinearOperator", "volume", lambda: rays().intensity.vjp(np.ma.masked_equal(np.zeros(rays().domain_shape), 0))),
     ("Operator", "values", lambda: rays().to_device(FRAMES[:, 0])),
     ("Operator", "frames", lambda: rays().T(FRAMES[:1])), ("LinearOperator", "volume", lambda: rays()(FRAMES)),
     ("LinearOperator", "volume", lambda: rays()(on_device(other_context=True))),
@@ -274,6 +324,7 @@ CASES: list[tuple[str, str, Callable[[], object]]] = [
     ("LinearOperator", "volume", lambda: rays()(rays().to_device(np.zeros(rays().domain_shape)).astype(float))),
     ("move_views", "views", lambda: api.move_views(GOOD, np.zeros((2, 3)))),
     ("move_views", "scan", lambda: api.move_views(FRAMES, np.zeros((4, 3)))),
+    ("move_views", "without_gauges", lambda: api.move_views(GOOD, np.zeros((4, 3)), without_gauges="no")),
     ("pose_gradient", "x", lambda: api.pose_gradient(GOOD, FLAT, FRAMES)),
     ("pose_gradient", "by_frames", lambda: api.pose_gradient(GOOD, Gaussians.from_rows(FLAT + 1), NAN)),
     ("pose_gradient", "by_poses", lambda: splats().intensity.by_poses(Gaussians.from_rows(FLAT + 1), FRAMES)),

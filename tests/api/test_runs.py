@@ -3,8 +3,10 @@
 import json
 import sys
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ from matplotlib.figure import Figure
 
 from phyradgs_cl import api
 from phyradgs_cl.__main__ import load_cli
-from phyradgs_cl.api import Reconstruction, Shutter, reconstruct
+from phyradgs_cl.api import Reconstruction, Shutter, reconstruct, runs
 from phyradgs_cl.errors import InputError
 
 pytestmark = pytest.mark.slow
@@ -32,6 +34,23 @@ def test_a_reconstruction_goes_to_a_file_of_each_suffix_and_back(rt, scan, tmp_p
         assert (tmp_path / f"v{suffix}").read_bytes().startswith(start), suffix
     api.save_volume(tmp_path / "v.h5", replace(result, gaussians=None), api.compare(result.volume, scan.reference))
     assert api.load_volume(tmp_path / "v.h5").gaussians is None
+
+
+def test_threads_have_the_bits_of_runs_alone(scan) -> None:
+    def run(weight: float) -> np.ndarray:
+        return reconstruct(scan, "fista-tv", iterations=4, size=16, tv_weight=weight, report=False).volume
+
+    weights = [1e-3, 1e-2]
+    alone = [run(weight) for weight in weights]
+    with ThreadPoolExecutor(2) as pool:
+        for found, expected in zip(pool.map(run, 3 * weights), 3 * alone, strict=True):
+            np.testing.assert_array_equal(found, expected)
+
+
+def test_threads_that_start_together_share_a_device(monkeypatch) -> None:
+    monkeypatch.setattr(runs, "_runtime_by_name", lru_cache(lambda name: (time.sleep(0.05), object())[1]))
+    with ThreadPoolExecutor(4) as pool:
+        assert len(set(pool.map(runs.runtime_of, 4 * [None]))) == 1
 
 
 def test_hounsfield_units_are_kept_by_files(rt, scan, tmp_path) -> None:

@@ -41,7 +41,7 @@ RECONSTRUCT = {
     "--holdout": ("--holdout 60",), "--resume": ("--resume",), "--set": ("--set tv_weight", "--set 'x y=3'"),
     "tv_weight": ("--set tv_weigth=3", "--set tv_weight=much"), "magic": ("--set method=magic",),
     "--size": ("--size a,b,c", "--size 4 --voxel-mm 1 --roi -1,1,-1,1,-1,1"), "--voxel-mm": ("--voxel-mm -1",),
-    "--roi-mm": ("--roi 1,-1,-1,1,-1,1", "--roi 90,91,-1,1,-1,1"),
+    "--roi-mm": ("--roi 1,-1,-1,1,-1,1", "--roi 90,91,-1,1,-1,1"), "--device: found '99'": ("--device 99",),
 }  # fmt: skip
 # the same of `simulate --size 8 --detector 8`
 SIMULATE = {
@@ -52,11 +52,13 @@ SIMULATE = {
     "views": ("--views 1000000000", "--views many", f"--views {'9' * 5000}"), "--device": ("--device ' '",),
     "--size": ("--size 100000", f"--size {DIGITS}"), "--detector": (f"--detector {DIGITS}",),
     "--detector-offset": ("--detector-offset left", "--detector-offset 1,2,3"), "exposure": ("--exposure-deg=1e300",),
-    "--readout-ms": ("--readout-ms 62", "--fps 15 --readout-ms 62000"),
+    "--readout-ms": ("--readout-ms 62", "--fps 15 --readout-ms 62000"), "--device: found '99'": ("--device 99",),
+    "--memory: found 'much'": ("--memory much",),
 }  # fmt: skip
 OTHERS = {
     "none.h5": ("reconstruct {tmp}/none.h5",), "text.h5": ("reconstruct {text}",),
     "--size": ("import {scan} --size 0",), "SCAN": ("reconstruct '' --method fdk",),
+    "--device: found '99'": ("calibrate {scan} --device 99", "check {scan} --fix-offset --device 99"),
 }  # fmt: skip
 
 

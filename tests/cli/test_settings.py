@@ -79,3 +79,5 @@ def test_a_prior_is_for_methods_that_have_one() -> None:
     assert plan_of(None, {"prior": "tv"}, ["prior=dct"]).options.prior == "tv"
     with pytest.raises(InputError, match="^--prior: found no such option of --method sirt.*fista or moving has it$"):
         plan_of(None, {"prior": "tv", "method": "sirt"})
+    with pytest.raises(InputError, match="noise_stop=1.1: .*; --method sart or os-sart or cgls or asd-pocs has it$"):
+        plan_of(None, {"method": "sirt"}, ["noise_stop=1.1"])

@@ -1,5 +1,7 @@
 """Activations of Gaussians and clouds averaged over voxels."""
 
+from dataclasses import replace
+
 import numpy as np
 from tolerances import ACTIVATION_INVERSE, ACTIVATION_MARGIN, FLOAT32, FLOAT64
 
@@ -33,6 +35,16 @@ def test_any_raw_numbers_give_valid_parameters(make_cloud) -> None:
     assert np.all(np.isfinite(raw)) and np.abs(raw[3:6]).max() < 10
     bounded, margin = np.clip(rows[3:6], 0.01, 0.5), ACTIVATION_MARGIN * 0.49
     np.testing.assert_allclose(ACTIVATION.apply(raw)[3:6], bounded, rtol=0, atol=margin)
+
+
+def test_quaternions_of_any_length_are_rotations(make_cloud) -> None:
+    rows = make_cloud(9, 86)
+    cloud = Gaussians.from_rows(rows)
+    for length in (1e-300, 1e-200, 1e-9, 3.0, 1e200, 1e307):
+        np.testing.assert_allclose(replace(cloud, quaternion=cloud.quaternion * length).rows(), rows, rtol=FLOAT32)
+    for length in (1e-30, 1e30):
+        short = np.float32(length) * cloud.quaternion.astype(np.float32)
+        np.testing.assert_allclose(replace(cloud, quaternion=short).rows(), rows, rtol=1e-6, atol=1e-7)
 
 
 def test_gaussians_and_rows_are_the_same_cloud(make_cloud) -> None:

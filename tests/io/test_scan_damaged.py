@@ -83,6 +83,9 @@ CASES: dict[str, list[Damage]] = {
     f"{EXTRA}/kinematics/angle_deg": [renamed("angle_degs"), changed(lambda t: t[1:])],
     f"{EXTRA}/poses/pose": [all_changed(lambda t: t[:-1]), changed(lambda p: p[:, 1:]), poked((2, slice(6, 12)), 1.0)],
     GATING: [replaced(np.full(4, np.nan)), replaced(np.zeros(5)), replaced(np.zeros(4, "S4"))],
+    f"{EXTRA}/gating/time_s": [
+        lambda f, a: f.__setitem__(a, [0.0, 2.0, 1.0, 3.0]), lambda f, a: f.__setitem__(a, np.zeros((4, 1))),
+    ],
     f"{EXTRA}/gating/phase": [lambda file, address: file.move(GATING, f"{EXTRA}/gating/phases")],
 }
 

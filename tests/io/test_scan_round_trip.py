@@ -83,11 +83,36 @@ def test_fields_come_back(path, make_scan) -> None:
     same_poses(scan, again)
 
 
-def test_a_signal_faster_than_the_frames_is_cut_with_a_warning(path, make_scan, caplog) -> None:
-    scan = make_scan()
-    times_s = np.linspace(scan.frame_start_s[0], scan.frame_start_s[-1] + scan.shutter.span_s, 50)
-    again = again_of(path, replace(scan, gating=Gating(times_s, np.sin(times_s))))
-    assert len(again.gating.times_s) == scan.frames and "of 50 samples a scan file keeps one per frame" in caplog.text
+FRAME_TIMES = {
+    "starts": lambda scan: scan.frame_start_s, "middles": lambda scan: scan.middle_times_s,
+    "ends": lambda scan: scan.frame_start_s + scan.shutter.span_s,
+    "jitter": lambda scan: scan.frame_start_s + [0, 0.1, 0, 0.2],
+    "many": lambda scan: np.linspace(scan.frame_start_s[0], 6.0, 50), "few": lambda scan: np.array([0.0, 7.0]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("is_phase", [False, True])
+@pytest.mark.parametrize("times", FRAME_TIMES)
+def test_a_signal_keeps_its_values_and_times(path, make_scan, times, is_phase) -> None:
+    pulsed = Shutter(0.8, 0.3, "columns", -1, pulse_s=(0.1, 0.5))
+    for scan in (make_scan(), make_scan(shutter=pulsed), make_scan(is_fly=False)):
+        times_s = FRAME_TIMES[times](scan)
+        values = np.random.default_rng(0).uniform(size=len(times_s))
+        again = again_of(path, replace(scan, gating=Gating(times_s, values, is_phase)))
+        assert again.gating.is_phase == is_phase
+        np.testing.assert_array_equal(again.gating.times_s, times_s)
+        np.testing.assert_array_equal(again.gating.values, values)
+
+
+def test_a_signal_of_poses_at_rest_moves_with_them(path, make_scan) -> None:
+    """They are stored without exposure, so that the start of a frame stands for its middle."""
+    scan = on("poses", make_scan(is_fly=False))
+    for times_s in (scan.middle_times_s, scan.frame_start_s):
+        gated = replace(scan, gating=Gating(times_s, np.arange(4.0)))
+        write_scan(path, gated)
+        again = again_of(path)
+        np.testing.assert_allclose(again.gating.at(again.middle_times_s), gated.gating.at(scan.middle_times_s), atol=1e-9)
+        np.testing.assert_array_equal(again.gating.values, gated.gating.values)
 
 
 @pytest.mark.parametrize("is_phase", [False, True])

@@ -5,7 +5,7 @@ import pytest
 from tolerances import FLOAT32
 
 from phyradgs_cl.operators.splats.layout import pad_columns
-from phyradgs_cl.operators.splats.operator import PlainImages, PlainRows
+from phyradgs_cl.operators.splats.operator import QUATERNION_LENGTHS, PlainImages, PlainRows
 from phyradgs_cl.runtime.layout import pad_rows, unpad_rows
 
 LENGTH_MM = 12.5
@@ -16,7 +16,7 @@ def test_rows_there_and_gradients_back(any_rt, make_cloud, line_integrals) -> No
     rows = make_cloud(21, spread=LENGTH_MM).astype(np.float32)
     units = np.ones((11, 21))
     units[:6], units[10] = 1 / LENGTH_MM, LENGTH_MM if line_integrals else 1.0
-    units[6:10] = 1 / np.linspace(0.2, 3.0, 21)  # one over the quaternions' norms
+    units[6:10] = 1 / np.geomspace(*QUATERNION_LENGTHS, 21)  # one over the quaternions' norms
     given = rows.copy()
     given[6:10] /= units[6:10]
     plain = PlainRows(any_rt, LENGTH_MM, line_integrals=line_integrals)

@@ -27,6 +27,13 @@ def test_sizes() -> None:
             bytes_of(text, "--memory")
 
 
+def test_python_names_its_arguments() -> None:
+    for argument, value in (("memory", "abc"), ("memory", -1), ("device", "no such device")):
+        with pytest.raises(InputError) as caught:
+            Runtime(**{argument: value})
+        assert caught.value.subject == argument and "--" not in str(caught.value)
+
+
 def test_the_limit_holds_for_all_buffers_together() -> None:
     rt = Runtime(memory="64KiB")
     first = rt.empty(10_000)

@@ -15,7 +15,7 @@ STATES, STATE_TIMES = f"{REFERENCE}/states", f"{REFERENCE}/state_times"
 DEFORMATION = f"{REFERENCE}/deformation"
 METAL = f"{EXTRA}/metal"
 GATING = f"{EXTRA}/gating"
-SIGNAL, PHASE = f"{GATING}/signal", f"{GATING}/phase"
+SIGNAL, PHASE, GATING_TIMES = f"{GATING}/signal", f"{GATING}/phase", f"{GATING}/time_s"
 
 PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3
 QUANTITIES = ("attenuation", "transmission", "counts")

@@ -21,6 +21,7 @@ _KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # motions o
 _RAMP_ERROR_RAD = 1e-9  # a speed ramp is stored as a table of angles, whose interpolation errs by at most this
 _MOST_RAMP_SAMPLES = 500_000  # rows of the longest such table, about 8 MB; a longer ramp is stored less exactly
 _SUSPECT_RAD = math.radians(5.0)  # encoder table and rotation_angle differ by more only if a sign or a zero is wrong
+_GAP = 1e-9  # fraction of an exposure, see ``_gap_s``
 _LEAST_SPAN_S = 1e-6  # least time that ``sampled`` covers in a frame: a table needs two times, even without any duration
 _MOST_SAMPLES = 1024  # ``sampled`` raises an error if a table of more samples per frame still misses the trajectory
 _AS_TABLE = "give it as a PoseTable"
@@ -70,13 +71,45 @@ def read_angles(source: Hdf5Source, entry: str, name: str, used: np.ndarray) -> 
 
 def storable(scan: Scan) -> Scan:
     """Returns the scan with a trajectory that files can hold. A user-defined trajectory, or a circular orbit with
-    user-defined kinematics, becomes a pose table that is exact to a ten-thousandth of a pixel. Raises InputError if no
-    table is so exact."""
-    path = scan.trajectory
+    user-defined kinematics, becomes a pose table that is exact to a ten-thousandth of a pixel. Where poses jump between
+    frames that touch in time, exposures become shorter by two billionths. Raises InputError if no table is so exact."""
+    path, start_s = scan.trajectory, scan.frame_start_s
     if isinstance(path, PoseTable) or (isinstance(path, CircularOrbit) and isinstance(path.kinematics, _KINEMATICS)):
         return scan
     error_mm = 1e-4 * min(scan.geometry.pixel_size_mm)
-    return replace(scan, trajectory=sampled(path, scan.frame_start_s, scan.shutter.span_s, error_mm))
+    if not scan.is_fly:  # a frame at rest has one pose, in its middle
+        middle_s = scan.middle_times_s - _LEAST_SPAN_S / 2
+        return replace(scan, trajectory=sampled(path, middle_s, 0.0, error_mm))
+    if _jumps(scan, error_mm):
+        shorter_s = scan.shutter.exposure_s - 2 * _gap_s(scan)
+        scan = replace(scan, shutter=replace(scan.shutter, exposure_s=shorter_s))
+    return replace(scan, trajectory=sampled(path, start_s, scan.shutter.span_s, error_mm))
+
+
+def overlaps(scan: Scan) -> bool:
+    """Returns whether frames share times. Frames of which one ends as the next begins do not."""
+    return bool(np.diff(np.sort(scan.frame_start_s)).min(initial=np.inf) < scan.shutter.span_s - _gap_s(scan))
+
+
+def _gap_s(scan: Scan) -> float:
+    """Returns half of the time in s that ``storable`` puts between frames: a billionth of an exposure, or 16 roundings of
+    float64 times."""
+    latest_s = float(np.abs(scan.frame_start_s).max()) + scan.shutter.span_s
+    return max(_GAP * scan.shutter.exposure_s, 16 * float(np.spacing(latest_s)))
+
+
+def _jumps(scan: Scan, error_mm: float) -> bool:
+    """Returns whether the pose jumps by more than ``error_mm`` where a frame ends and the next begins, as after
+    ``move_views``. A table has one pose at a time."""
+    order, path = np.argsort(scan.frame_start_s, kind="stable"), scan.trajectory
+    first_s = scan.frame_start_s[order]
+    touches = np.abs(np.diff(first_s) - scan.shutter.span_s) <= _gap_s(scan)
+    for k in np.flatnonzero(touches):
+        before = path.pose(int(order[k]), first_s[k : k + 1] + scan.shutter.span_s)
+        after = path.pose(int(order[k + 1]), first_s[k + 1 : k + 2])
+        if np.abs(after - before).max() > error_mm:
+            return True
+    return False
 
 
 def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, error_mm: float) -> PoseTable:
@@ -194,29 +227,41 @@ def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, firs
 
 
 def read_gating(source: Hdf5Source, entry: str, used: np.ndarray, middle_s: np.ndarray) -> Gating | None:
-    """Reads the gating signal or phase of the projections; None if the file has neither. used, bool (F,): which stored
-    frames are projections. middle_s (P,): the middle of each projection's time. Raises InputError for a signal and a phase
-    together, and for frames at equal times."""
+    """Reads the gating signal or phase; None if the file has neither. Without times of their own, the values belong to the
+    middles of the frames. used, bool (F,): which stored frames are projections. middle_s (P,): the middle of each
+    projection's time. Raises InputError for a signal and a phase together, and for equal times."""
     if source.optional_group(f"{entry}/{schema.GATING}") is None:
         return None
-    signal, phase = f"{entry}/{schema.SIGNAL}", f"{entry}/{schema.PHASE}"
-    is_phase = source.optional(phase) is not None
+    signal, phase, times = (f"{entry}/{name}" for name in (schema.SIGNAL, schema.PHASE, schema.GATING_TIMES))
+    is_phase, has_times = (source.optional(address) is not None for address in (phase, times))
     if is_phase and source.optional(signal) is not None:
         raise source.error(signal, "a signal beside a phase", "one of the two", "remove one of them")
     address = phase if is_phase else signal
-    values = h5.read_array(source, address, used.shape, h5.PHASE if is_phase else None)[used]
-    order = np.argsort(middle_s, kind="stable")
+    times_s = h5.read_array(source, times, (None,), h5.TIME) if has_times else middle_s
+    values = h5.read_array(source, address, times_s.shape if has_times else used.shape, h5.PHASE if is_phase else None)
+    order = np.arange(len(times_s)) if has_times else np.argsort(middle_s, kind="stable")
     try:
-        return Gating(middle_s[order], values[order], is_phase)
+        return Gating(times_s[order], values[order] if has_times else values[used][order], is_phase)
     except InputError as error:
-        expected = "frames at different times"
-        raise source.error(address, f"{error.subject}: {error.found}", expected, "correct frame_start_time") from error
+        found = f"{error.subject}: {error.found}"
+        if has_times:
+            raise source.error(times, found, "times that rise", "sort the samples by time") from error
+        raise source.error(address, found, "frames at different times", "correct frame_start_time") from error
 
 
-def write_gating(extra: h5py.Group, gating: Gating, middle_s: np.ndarray) -> None:
-    """Writes the signal, or the phase in cycles, for all stored frames. middle_s (F,): the middle of each frame's time.
-    Warns if the signal has more samples than the file has frames."""
-    if len(gating.times_s) > len(middle_s):
-        _log.warning("gating: of %d samples a scan file keeps one per frame, %d", len(gating.times_s), len(middle_s))
-    group, values = h5.new_group(extra, "gating", "NXcollection"), gating.at(middle_s)
+def write_gating(extra: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
+    """Writes the signal, or the phase in cycles: a value for each stored frame if they belong to the middles of the frames,
+    else all samples and their times. frame_of (F,): the projection whose value each stored frame gets."""
+    gating = scan.gating
+    if gating is None:
+        return
+    # poses at rest are stored without exposure: the start of a frame then stands for its middle, as in ``write_poses``
+    rests = not scan.is_fly and isinstance(scan.trajectory, PoseTable)
+    times_s = gating.times_s - (scan.shutter.middle_s if rests else 0.0)
+    middle_s = scan.frame_start_s + (0.0 if rests else scan.shutter.span_s / 2)
+    group, values = h5.new_group(extra, "gating", "NXcollection"), gating.values
+    if np.array_equal(times_s, np.sort(middle_s)):
+        values = values[np.searchsorted(times_s, middle_s)][frame_of]
+    else:
+        h5.write_number(group, "time_s", times_s, "s")
     h5.write_number(group, "phase" if gating.is_phase else "signal", values, "cycle" if gating.is_phase else None)

@@ -133,8 +133,7 @@ def _write_extra(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
         h5.write_grid(group, scan.metal.grid)
         packed = group.create_dataset("volume", data=scan.metal.values, compression="gzip", shuffle=True)
         packed.attrs["units"] = "1/mm"
-    if scan.gating is not None:
-        write_gating(extra, scan.gating, (np.asarray(scan.frame_start_s) + scan.shutter.span_s / 2)[frame_of])
+    write_gating(extra, scan, frame_of)
 
 
 def _write_links(entry: h5py.Group) -> None:
@@ -190,6 +189,9 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
                 _replace(detector, "detector_readout_time", 0.0, "s")
                 _replace(detector, "frame_start_time", np.asarray(scan.frame_start_s)[frame_of], "s")
             write_poses(entry, scan)
+        if scan.shutter != stated.shutter or not scan.is_fly:  # the middles of the file's frames may have moved
+            _remove(entry, schema.GATING)
+            write_gating(entry[schema.EXTRA], scan, frame_of)
         _remove(entry, f"{schema.EXTRA}/provenance")
         entry[schema.EXTRA]["provenance"] = json.dumps(scan.provenance, default=str)
 

@@ -27,6 +27,7 @@ from phyradgs_cl.operators.splats.voxelise import Voxeliser
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of
 
+QUATERNION_LENGTHS = 1e-12, 1e12  # kernels square them in float32, from 1e-38 to 3e38
 _FRAMES, _VOLUME, _ROWS, _DENSITY = "frames", "volume", "rows", "density"
 
 
@@ -39,8 +40,8 @@ class SplatPoint:
 
 
 class PlainRows:
-    """Converts parameter rows (11, G), in mm and 1/mm with quaternions of any length, to the kernels' rows: lengths in units
-    of ``length_mm``, and unit quaternions.
+    """Converts parameter rows (11, G), in mm and 1/mm with quaternions of ``QUATERNION_LENGTHS``, to the kernels' rows:
+    lengths in units of ``length_mm``, and unit quaternions.
 
     line_integrals: densities become 1/``length_mm``, so that line integrals have no unit. Else they stay in 1/mm."""
 
@@ -293,8 +294,13 @@ class VoxelOperator(GaussianOperator):
 
 def _check_rows(rows: np.ndarray) -> None:
     checks.finite(_ROWS, rows)
-    if (rows[SCALE] <= 0).any() or not rows[QUATERNION].any(axis=0).all():
-        raise InputError(_ROWS, "a scale or a quaternion's length of 0 or less", "scales and lengths above 0")
+    if (rows[SCALE] <= 0).any():
+        raise InputError(_ROWS, f"a scale of {rows[SCALE].min():g}", "scales above 0", "of logarithms: np.exp(scale)")
+    lengths = np.linalg.norm(rows[QUATERNION].astype(np.float64), axis=0)
+    shortest, longest = QUATERNION_LENGTHS
+    if (wrong := (lengths < 0.99 * shortest) | (lengths > 1.01 * longest)).any():  # float32 has rounded them
+        found = f"a quaternion of length {lengths[wrong][0]:g}"
+        raise InputError(_ROWS, found, f"lengths from {shortest:g} to {longest:g}", "divide it by its length")
 
 
 def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, float]:
