@@ -13,8 +13,9 @@ from PIL import Image
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan
+from phyradgs_cl.importers.angles import read_angles_rad
 from phyradgs_cl.importers.series import flat_places, series_of
-from phyradgs_cl.importers.text import number_at_start, read_angles_rad
+from phyradgs_cl.importers.text import number_at_start
 
 pytestmark = pytest.mark.slow
 
@@ -176,6 +177,59 @@ def test_files_of_angles(tmp_path) -> None:
             read_angles_rad(tmp_path / "a.txt", 3)
 
 
+LINE = {"index": "{i} {a}", "index behind": "{a} {i}", "time": "{t} {a}", "time and more": "{t} {a} 7", "alone": "{a}"}
+NAMED = {  # by what a line has: names above it, and units in a turn of their angles
+    "index": {
+        **dict.fromkeys(("frame angle", "Projection Angle", "no. angle", "proj stage_deg", "Proj # Angle (°)"), 360),
+        **dict.fromkeys(("frame gantry", "rotation angle", "# index omega", "# made by\n# frame theta\n# -- --"), 360),
+        **dict.fromkeys(("frame angle_mrad", "frame angle (mrad)", "frame\tangle\n#\tmrad", "# in mrad"), 2000 * np.pi),
+    },
+    "index behind": {"angle index": 360, "Winkel [Grad], Nr": 360, "angle_rad no": 2 * np.pi},
+    "time": {"time rot": 360, "dose rot": 360, "temp_degC srot": 360, "s_rad angle": 360, "time,angle\ns,rad": 2 * np.pi},
+    "time and more": {"x rot y": 360, "time rotation (gon) dose": 400, "Time(s) Angle(deg) rot_speed": 360},
+    "alone": {
+        **{"rotation angle": 360, "θ/°": 360, "angle (decimal degrees)": 360, "anglerad": 2 * np.pi, "arcmin": 21600},
+        **{"angle_mdeg": 360e3, "mRad": 2e3 * np.pi, "Angle(µrad)": 2e6 * np.pi, "arcsec": 1296e3, "turns": 1, "rot_rev": 1},
+        **{"# angle [rad]\n# made by x": 2 * np.pi, "# angle of 3.11.\n# angle [mrad]\n# of 3.11.": 2000 * np.pi},
+    },
+}  # fmt: skip
+CONTRADICTED = {
+    "index": {
+        **dict.fromkeys(("rot frame", "Angle table", "theta beta"), "column .*numbers that count; .*tabs or commas"),
+        **{"frame dose": "'dose'", "frame angle (counts)": "'counts' in 'angle.counts.'"},
+    },
+    "time": {"my table": "one angle a line", "angle theta": "one angle a line", "a table of theta": "one angle a line"},
+    "time and more": {"time position temp_degC": "one angle a line", "angles": "one angle a line"},
+    "alone": {
+        **{"angle [0.01 deg]": "'0.01 deg'", "# angle [0.01 deg]": "'0.01 deg'", "encoder_counts": "'counts'"},
+        **{"angle (deg/s)": "deg/s", "angleMilliRad": "Milli", "angle [grad]": "'grad' .*mrad", "time_s": "'time' and 's'"},
+        **{"degrees, then rad": "'degrees' and 'rad'", "rot [arc sec]": "'arc sec'", "angle [°x100]": "'°x100'"},
+    },
+}  # fmt: skip
+
+
+def table_of_angles(path: Path, what: str, names: str, turn: float) -> Path:
+    lines = [LINE[what].format(i=i, t=0.5 * i + 3, a=turn * i / 24) for i in range(6)]
+    path.write_text("\n".join([names, *lines]), "utf-8")
+    return path
+
+
+def test_names_above_a_table_say_which_column_has_the_angles_and_their_unit(tmp_path) -> None:
+    for what, turns in NAMED.items():
+        for names, turn in turns.items():
+            found = read_angles_rad(table_of_angles(tmp_path / "a.txt", what, names, turn), 6)
+            np.testing.assert_allclose(found, np.deg2rad(15 * np.arange(6)), atol=1e-9, err_msg=f"{what}: {names}")
+    for what, errors in CONTRADICTED.items():
+        for names, said in errors.items():
+            with pytest.raises(InputError, match=said):
+                read_angles_rad(table_of_angles(tmp_path / "a.txt", what, names, 360), 6)
+                pytest.fail(f"taken: {names!r}")
+    path = table_of_angles(tmp_path / "a.txt", "index", "frame,angle", 360)
+    with pytest.raises(InputError, match="found 6 angles; expected 12"):  # not a list of twelve
+        read_angles_rad(path, 12)
+    assert read_angles_rad(table_of_angles(path, "alone", "angle (counts)", 400), 6, "gon")[1] == pytest.approx(np.pi / 12)
+
+
 def test_numbers_in_texts() -> None:
     read = {"0,25 mm": (0.25, "mm"), "1.234,5": (1234.5, ""), "2,500.5um": (2500.5, "um"), "12 week": (12.0, "week")}
     read["-3E-2"] = (-0.03, "")
@@ -232,6 +286,14 @@ def test_nikon_s_measured_angles_are_used_in_whatever_order_they_are_listed(tmp_
         angle_deg = [np.rad2deg(scan.trajectory.angle_rad(i, scan.frame_start_s[i])) for i in range(6)]
         np.testing.assert_allclose(angle_deg, measured, atol=1e-3)
     assert "scan.ang: these measured angles are used; they differ from equal steps by 0.6°" in caplog.text
+    for number, names in enumerate(("Projection Time(s) Angle(deg)", "Projection\tTime(s)\tAngle(rad)"), 3):
+        path = lab.write_nikon(tmp_path / str(number), truth)
+        listed = np.deg2rad(measured) if "rad" in names else measured
+        lines = "".join(f"{i + 1} {0.5 * i} {a:.6f}\n" for i, a in enumerate(listed))
+        (path / "_ctdata.txt").write_text(f"nProjs nFrames\n6 1\n{names}\n{lines}")
+        scan = import_scan(path)
+        angle_deg = [np.rad2deg(scan.trajectory.angle_rad(i, scan.frame_start_s[i])) for i in range(6)]
+        np.testing.assert_allclose(angle_deg, measured, atol=1e-3)
 
 
 def test_more_and_fewer_files_than_a_description_states(tmp_path, make_truth, caplog) -> None:

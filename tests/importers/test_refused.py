@@ -114,7 +114,7 @@ MISTAKES: dict[str, dict[str, Damage]] = {  # by format: the field, or what a me
     },
     "data-exchange": {
         "/exchange/theta": on("exchange/theta", value(np.zeros(3))),
-        "gon": on("exchange/theta", attribute("units", "gon")),
+        "grad": on("exchange/theta", attribute("units", "grad")),
         "data_white": on("exchange/data_white", value(np.ones((1, 2, 3)))),
         "no usable value": on("exchange/data_white", value(np.zeros((1, 10, 14)))),
         "what the pixels hold": on("exchange/data_white", removed),

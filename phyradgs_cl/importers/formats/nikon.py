@@ -13,19 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.importers.angles import file_of_angles, measured_angles_rad, read_angles_rad
 from phyradgs_cl.importers.assemble import RotaryStage, cone, scan_on_stage
 from phyradgs_cl.importers.files import SafeFolder, checked_name
 from phyradgs_cl.importers.frames import gantry_sign
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
-from phyradgs_cl.importers.text import (
-    Settings,
-    file_of_angles,
-    measured_angles_rad,
-    read_angles_rad,
-    read_settings,
-    say_missing,
-    white_level,
-)
+from phyradgs_cl.importers.text import Settings, read_settings, say_missing, white_level
 from phyradgs_cl.importers.tiff import read_numbered
 from phyradgs_cl.io.hdf5.datasets import LENGTH
 
