@@ -7,6 +7,7 @@ import pytest
 
 from phyradgs_cl import api
 from phyradgs_cl.api import ConeGeometry, ParallelGeometry, fly_scan, reconstruct, simulate, static_scan
+from phyradgs_cl.errors import InputError
 
 pytestmark = pytest.mark.slow
 
@@ -75,6 +76,8 @@ def test_what_looks_like_radians_transmissions_or_percent_is_said(caplog) -> Non
         (lambda: static_scan(transmission, cone, turn_deg, quantity="transmission"), ""),
         (lambda: static_scan(2 - transmission, cone, turn_deg), ""),  # an object wider than the panel
     ]
+    with pytest.raises(InputError, match="^quantity: found line integrals down to -4.61, 100 % of pixels"):
+        static_scan(100 * transmission, cone, turn_deg, quantity="transmission")
     for number, (make, words) in enumerate(cases):
         caplog.clear()
         make()

@@ -113,6 +113,31 @@ def test_what_flats_and_darks_name_is_no_projection_and_odd_files_do_not_matter(
         import_scan(folder)
 
 
+OTHER_THAN_STATED = {  # by what the TOML says: frames that are something else, made of line integrals
+    "quantity = 'transmission'": [lambda p: 100 * np.exp(-p), lambda p: 255 * np.exp(-p), lambda p: 65535 * np.exp(-p)],
+    "flat_value = 100.0": [lambda p: 40000 * np.exp(-p)], "quantity = 'attenuation'": [lambda p: -3 * p],
+    "flat_value = 40000.0": [lambda p: np.exp(-p), lambda p: p], "flats = 'white_*.tif'": [lambda p: np.exp(-p)],
+}  # fmt: skip
+
+
+def test_pixels_that_are_not_what_is_stated_are_refused(tmp_path) -> None:
+    """Percents, other flats, a reversed sign; and what was divided by the air, beside thousands of counts."""
+    p = np.broadcast_to(np.linspace(0, 1.5, 9, dtype=np.float32), (6, 8, 9))
+    for number, (text, frames) in enumerate(OTHER_THAN_STATED.items()):
+        stated = text if "quantity" in text else f"quantity = 'counts'\n{text}"
+        for kind, frames_of in enumerate(frames):
+            folder = toml_folder(tmp_path / f"{number}{kind}", list(np.float32(frames_of(p))), white=[shot(40000)])
+            toml = (folder / "scan.toml").read_text().replace("quantity = 'counts'", stated)
+            (folder / "scan.toml").write_text(toml)
+            if "white" not in text:
+                (folder / "white_000.tif").unlink()
+            said = "quantity: found " + ("fractions" if "40" in text or "white" in text else "line integrals down to")
+            with pytest.raises(InputError, match=said):
+                import_scan(folder)
+    (folder / "scan.toml").write_text(toml.replace("'counts'", "'transmission'"))
+    np.testing.assert_allclose(import_scan(folder).projections, p[:, ::-1], atol=1e-6)
+
+
 def test_a_flat_or_dark_unlike_the_others_is_named_and_left_out(tmp_path, caplog) -> None:
     frames = [shot(20000, i) for i in range(6)]
     good = {"white": [shot(40000, i) for i in range(5)], "dark": [shot(60, i) for i in range(4)]}
@@ -296,6 +321,12 @@ def test_nikon_s_measured_angles_are_used_in_whatever_order_they_are_listed(tmp_
         np.testing.assert_allclose(angle_deg, measured, atol=1e-3)
 
 
+def renumber(folder: Path, by: int) -> None:
+    for file in sorted(folder.glob("scan_*0*.tif"), reverse=by > 0):
+        digits = file.stem[5:]
+        file.rename(folder / f"scan_{int(digits) + by:0{len(digits)}d}.tif")
+
+
 def test_more_and_fewer_files_than_a_description_states(tmp_path, make_truth, caplog) -> None:
     truth = make_truth(geometry=CENTRED)
     for form, digits in (("nikon", 4), ("skyscan", 8)):
@@ -305,6 +336,11 @@ def test_more_and_fewer_files_than_a_description_states(tmp_path, make_truth, ca
         beyond.write_bytes(last.read_bytes())
         whole = import_scan(path)
         assert whole.frames == 6 and f"left out: {beyond.name}" in caplog.text
+        other = {"nikon": -1, "skyscan": 1}[form]  # from another number on any file may be the surplus one
+        renumber(path, other)
+        with pytest.raises(InputError, match=r"found 7 files, scan_0*[01].tif to scan_0*[67].tif; expected 6"):
+            import_scan(path)
+        renumber(path, -other)
         beyond.unlink()
         (path / f"scan_{int(last.stem[5:]) - 2:0{digits}d}.tif").unlink()
         with pytest.raises(InputError, match="5 files .* say frames found"):
@@ -316,6 +352,19 @@ def test_more_and_fewer_files_than_a_description_states(tmp_path, make_truth, ca
             (i, scan.frame_start_s[i]) for i in frames
         )]  # fmt: skip
         np.testing.assert_allclose(angles[:5], angles[5:])
+
+
+@pytest.mark.parametrize("form", ["nikon", "skyscan"])
+def test_images_that_the_scanner_has_divided_by_the_air(tmp_path, make_truth, form) -> None:
+    truth = make_truth(geometry=CENTRED)
+    path = written(form, tmp_path / form, truth)
+    whole = import_scan(path)
+    for file in path.glob("scan_*0*.tif"):
+        tifffile.imwrite(file, np.float32(tifffile.imread(file) / lab.WHITE))
+    with pytest.raises(InputError, match="quantity: found fractions, .* air at 60000 counts; .* Say quantity transmission"):
+        import_scan(path)
+    shares = import_scan(path, ImportOptions(quantity="transmission"))
+    np.testing.assert_allclose(shares.projections, whole.projections, atol=1e-6)
 
 
 def test_xradia_s_scans_that_stopped_early_and_have_several_references(tmp_path, make_truth, caplog) -> None:

@@ -62,7 +62,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     angle_rad = gantry_sign(options, "gantry") * options.angle_rad(len(at), lambda: _angles(scan, measured, count)[at])
     say_missing(scan, {"InitialAngle": "0", "ObjectTilt": "0", "Units": "mm"})
     remedy = f"correct it, or say {options.named('flat_value')}"
-    white = None if options.flat_value else white_level(scan, "WhiteLevel", frames, remedy)
+    is_stated = options.flat_value or options.quantity not in (None, "counts")
+    white = None if is_stated else white_level(scan, "WhiteLevel", frames, remedy)
     turned = frames, ("top", "right"), angle_rad, at, names, said
     return scan_on_stage(stage, options, description, description.stem, *turned, flat_value=white)
 

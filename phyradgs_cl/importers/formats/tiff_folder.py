@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.plausible import question_unit
 from phyradgs_cl.acquisition.readout import frame_time_of, seconds_of
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import hdf5, tiff
@@ -67,6 +68,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     geometry = with_options(options, scanner.geometry)
     timing = make_timing(str(description), frames, options, _stored_timing(tables, scanner))
     angle_rad = options.angle_rad(frames, lambda: _angles_rad(folder, tables["angles"], used, options))
+    question_unit(angle_rad, options.called("angles", {"angles": tables["angles"].subject}), "deg")
     if stored is None:
         integrals = _line_integrals(files, series, combined, tables["frames"], str(description))
     else:
