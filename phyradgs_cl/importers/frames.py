@@ -34,7 +34,7 @@ _BLOCK_BYTES = 1 << 26  # memory of a block of rows whose median is taken: a flo
 Mask = np.ndarray | None
 TAKEN = "taken"
 """The provenance's key of a text that says which frames and flats were used."""
-_AIR = 0.2  # a median line integral up to this size at the frames' borders is air
+_AIR = 0.2  # a median line integral up to this size at the frames' borders is air, as is a transmission so near to 1
 _DIVIDED, _MANY_COUNTS = 2.0, 1000.0  # frames up to this value, with air of so many counts or more, are divided already
 _SAME = 1e-3  # flats up to this fraction above the saturation level are clipped too
 
@@ -193,6 +193,8 @@ def line_integrals(
             _refuse_no_counts(subject, frames, flat, options)
         if not is_corrected and (darks is None or len(darks) == 0):
             _log.warning("%s: counts without darks: an offset of the panel stays in the line integrals", subject)
+    if quantity == "attenuation":
+        _warn_of_transmission(subject, frames, options)
     flats, darks, place = (light.flats, light.dark, light.place) if light else (None, None, None)
     integrals, unusable = frames_to_attenuation(frames, quantity, flats, darks, LARGEST_LINE_INTEGRAL, place)
     if quantity == "attenuation" and unusable.any():
@@ -206,6 +208,17 @@ def line_integrals(
     if light is not None and has_flats:
         applied[TAKEN] = light.said
     return LineIntegrals(integrals, compact(unusable), saturation, applied)
+
+
+def _warn_of_transmission(subject: str, frames: np.ndarray, options: ImportOptions) -> None:
+    """Warns of frames (P, v, u) that look like transmissions: near 1 at the left and right borders, and at least one pixel
+    darker between them."""
+    with np.errstate(over="ignore"):
+        border = float(np.median(frames[..., [0, -1]]))
+    brighter = sum(np.count_nonzero(frame > 1 + _AIR) for frame in frames)
+    if abs(border - 1) < _AIR and brighter < FEW * frames.size and np.min(frames) < 1 - _AIR:
+        text = "%s: 1 at their borders, and less within: are they transmissions? Say %s transmission"
+        _log.warning(text, subject, options.named("quantity"))
 
 
 def _refuse_no_counts(subject: str, frames: np.ndarray, flat: np.ndarray, options: ImportOptions) -> None:

@@ -72,7 +72,7 @@ def test_what_looks_like_radians_transmissions_or_percent_is_said(caplog) -> Non
         (lambda: static_scan(frames[:9], cone, np.deg2rad(turn_deg[:9])), ""),
         (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=9.0, readout_ratio=2.0), ""),
         (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=9.0, readout_ratio=86), "_ratio: .* 43 times"),
-        (lambda: static_scan(transmission, cone, turn_deg), "frames: 1 at their borders.* quantity="),
+        (lambda: static_scan(transmission, cone, turn_deg), "frames: 1 at their borders.* Say quantity trans"),
         (lambda: static_scan(transmission, cone, turn_deg, quantity="transmission"), ""),
         (lambda: static_scan(2 - transmission, cone, turn_deg), ""),  # an object wider than the panel
     ]

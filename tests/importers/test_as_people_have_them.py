@@ -120,7 +120,7 @@ OTHER_THAN_STATED = {  # by what the TOML says: frames that are something else, 
 }  # fmt: skip
 
 
-def test_pixels_that_are_not_what_is_stated_are_refused(tmp_path) -> None:
+def test_pixels_that_are_not_what_is_stated_are_refused(tmp_path, caplog) -> None:
     """Percents, other flats, a reversed sign; and what was divided by the air, beside thousands of counts."""
     p = np.broadcast_to(np.linspace(0, 1.5, 9, dtype=np.float32), (6, 8, 9))
     for number, (text, frames) in enumerate(OTHER_THAN_STATED.items()):
@@ -136,6 +136,11 @@ def test_pixels_that_are_not_what_is_stated_are_refused(tmp_path) -> None:
                 import_scan(folder)
     (folder / "scan.toml").write_text(toml.replace("'counts'", "'transmission'"))
     np.testing.assert_allclose(import_scan(folder).projections, p[:, ::-1], atol=1e-6)
+    assert "transmissions?" not in caplog.text
+    folder = toml_folder(tmp_path / "air", list(np.exp(-np.abs(p - 0.75).max() + np.abs(p - 0.75))))
+    (folder / "scan.toml").write_text((folder / "scan.toml").read_text().replace("'counts'", "'attenuation'"))
+    import_scan(folder)
+    assert "1 at their borders, and less within: are they transmissions? Say [frames] quantity transmission" in caplog.text
 
 
 def test_a_flat_or_dark_unlike_the_others_is_named_and_left_out(tmp_path, caplog) -> None:
