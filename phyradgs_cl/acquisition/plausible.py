@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 OPAQUE = 50.0  # no panel can measure a larger line integral
+_BRIGHT, _MANY = 5.0, 0.1  # more than this fraction of the pixels cannot be so many times as bright as air
 FEW = 0.01  # fraction of pixels above OPAQUE that is ignored, since some pixels of a panel may be broken
 _WIDEST_DEG = 120.0  # a fan or cone angle above this is refused: dental scanners have 30°, nano-CT 60°
 _LARGEST_PITCH_MM = 5.0  # pixels larger than this are not real, so they are named as the cause of too wide a fan
@@ -28,6 +29,7 @@ _LARGE_STEP_DEG = 10.0
 _LEAST_LIT = 0.25  # a low frame rate causes a warning only if exposure + readout is below this fraction of a frame's time
 _TIMES = 17  # number of angles sampled in an exposure: no gantry makes half a turn from one to the next
 _SLACK = 1e-3  # relative tolerance, because stated times and angles are rounded
+_MOST_RAD = 20 * np.pi  # angles that span more than these ten turns are most likely in another unit
 _MANY_FRAMES = 10  # fewer frames may lie within a few degrees on purpose, so they cause no warning about radians
 _ASIDE = 0.1  # a panel off centre by more than this fraction of its width was displaced for a wider field of view
 
@@ -138,7 +140,8 @@ def _joined(values: tuple[float, ...]) -> str:
 
 
 def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> None:
-    """Raises InputError for sizes and times that no scanner has, and for line integrals so large that they must be counts.
+    """Raises InputError for sizes and times that no scanner has, and for line integrals so large that they must be counts,
+    or so far below 0 that they must be of percents, or of wrong flats.
 
     Warns of times that are probably in a wrong unit, angles that look like radians, and line integrals that may be counts.
     named: translates ``source_to_axis_mm``, ``source_to_detector_mm``, ``pixel_size_mm``, ``grid``, ``readout_s``,
@@ -156,6 +159,20 @@ def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> 
         if is_timed:
             _warn_of_slow_frames(scan, angle_deg, named("frame_time_s"))
     _check_opaque(scan, named("quantity"))
+    check_brightness(scan.projections, scan.valid, named("quantity"))
+
+
+def check_brightness(projections: np.ndarray, valid: np.ndarray, subject: str) -> None:
+    """Raises InputError for line integrals (F, v, u) of which more than a tenth say a pixel 5 times as bright as air.
+    valid: True where they count, in an array that broadcasts."""
+    pairs = [(frame, ok) for frame, ok in zip(projections, np.broadcast_to(valid, projections.shape), strict=True)]
+    bright = sum(np.count_nonzero((frame < -math.log(_BRIGHT)) & ok) for frame, ok in pairs)
+    share = bright / max(1, sum(np.count_nonzero(ok) for _, ok in pairs))
+    if share > _MANY:
+        least = min(float(np.min(frame, where=ok, initial=0.0)) for frame, ok in pairs)
+        found = f"line integrals down to {least:.3g}, {100 * share:.3g} % of pixels over {_BRIGHT:g} times as bright as air"
+        remedy = "divide percents by 100; of counts correct the flats or the flat value; or reverse the sign"
+        raise InputError(subject, found, "−ln(transmission), which is 0 in air", remedy)
 
 
 def _check_opaque(scan: "Scan", subject: str) -> None:
@@ -183,6 +200,16 @@ def _warn_of_radians(angle_deg: np.ndarray, subject: str) -> bool:
         text = "%s: %d frames within %.4g°: are they radians? Give degrees"
         log.warning(text, subject, len(angle_deg), span_deg)
     return looks_so
+
+
+def question_unit(angle_rad: np.ndarray, subject: str, unit: str) -> None:
+    """Warns of angles (F,) in rad that span more than ten turns, and so may not be in their ``unit``, "deg" or "rad"."""
+    span_rad = float(np.ptp(angle_rad)) if len(angle_rad) else 0.0
+    if span_rad > _MOST_RAD:
+        over = f"{span_rad:.4g} rad: are they degrees? np.deg2rad(angles)"
+        if unit == "deg":
+            over = f"{np.rad2deg(span_rad):.4g}°: are they in degrees? Else convert them, or name their unit"
+        log.warning("%s: %d frames over %s", subject, len(angle_rad), over)
 
 
 def _check_panel(geometry: Geometry, named: Named) -> None:

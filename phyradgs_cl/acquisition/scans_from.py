@@ -6,7 +6,6 @@ ASTRA's ``cone_vec`` (F, 12) is source, centre of the panel, step to the next co
 triples (z, y, x). ``COR`` shifts source and panel in the direction of the columns. In both packages the rotation axis is
 z."""
 
-import logging
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +20,7 @@ from phyradgs_cl.acquisition.geometry import (
     default_grid,
     plain_geometry,
 )
-from phyradgs_cl.acquisition.plausible import FEW, OPAQUE
+from phyradgs_cl.acquisition.plausible import FEW, OPAQUE, question_unit
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.trajectory import resting_trajectory, unit_directions
 from phyradgs_cl.errors import InputError
@@ -31,8 +30,6 @@ from phyradgs_cl.text import suggest_name
 if TYPE_CHECKING:
     from phyradgs_cl.acquisition.scan import Scan
 
-log = logging.getLogger(__name__)
-_MOST_RAD = 20 * np.pi  # angles in rad that span more than these ten turns are most likely degrees
 _OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # fields of ``Scan``
 
 
@@ -170,8 +167,8 @@ def _to_middle(pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
     return np.asarray((columns - 1) / 2 * pose[:, 6:9] + (rows - 1) / 2 * pose[:, 9:12])
 
 
-def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[int, int], Grid]:
-    """Returns poses (F, 12), the panel (rows, columns) and the grid of a TIGRE geometry.
+def poses_of_tigre(geo: Any, angles_rad: ArrayLike, subject: str = "") -> tuple[np.ndarray, tuple[int, int], Grid]:
+    """Returns poses (F, 12), the panel (rows, columns) and the grid of a TIGRE geometry. Warnings begin with ``subject``.
 
     angles_rad: (F,), or Euler angles (F, 3). Raises InputError for attributes that are missing or no numbers, and for
     features that a ``Scan`` lacks: a turned panel, a second or third Euler angle, a volume that moves."""
@@ -182,9 +179,7 @@ def poses_of_tigre(geo: Any, angles_rad: ArrayLike) -> tuple[np.ndarray, tuple[i
     if angles.ndim == 2:
         _refuse("angles", angles[:, 1:], "turns about z only: (F,), or (F, 3) with zeros behind the first")
         angles = angles[:, 0]
-    if angles.size and np.ptp(angles) > _MOST_RAD:
-        text = "angles: %d frames over %.4g rad: are they degrees? np.deg2rad(angles)"
-        log.warning(text, len(angles), np.ptp(angles))
+    question_unit(angles, f"{subject}angles", "rad")
     frames = len(angles)
     _refuse("geo.rotDetector", _each(geo, "rotDetector", frames, 3, 0.0), "zeros: a panel that is not turned")
     offset_mm = _each(geo, "offOrigin", frames, 3, 0.0)

@@ -31,7 +31,6 @@ _ARGUMENTS = {
     "source_to_axis_mm": "geometry.source_to_axis_mm", "source_to_detector_mm": "geometry.source_to_detector_mm",
 }  # fmt: skip
 _SLACK = 1e-3  # relative tolerance of the angle between frames and of an exposure's arc, since users round angles
-_AIR_SLACK = 0.2  # largest difference of a transmission from 1 that noise in air may cause
 _CLEAR_STEP_DEG = 90.0  # between views this far apart or more, the gantry may have turned either way
 
 
@@ -132,14 +131,6 @@ def static_scan(
     return _scan(pixels, orbit, Shutter(0.0), start_s, grid, False, others)
 
 
-def _warn_of_transmission(frames: np.ndarray) -> None:
-    """Warns of frames (F, rows, columns) that look like transmissions: near 1 at the left and right borders, and at least
-    one pixel darker between them."""
-    border, brighter = np.median(frames[..., [0, -1]]), np.count_nonzero(frames > 1 + _AIR_SLACK)
-    if abs(border - 1) < _AIR_SLACK and brighter < 0.01 * frames.size and np.min(frames) < 1 - _AIR_SLACK:
-        log.warning('frames: 1 at their borders, and less within: are they transmissions? quantity="transmission"')
-
-
 def _keywords(function: Callable[..., Scan]) -> list[str]:
     return [one.name for one in signature(function).parameters.values() if one.kind is one.KEYWORD_ONLY]
 
@@ -165,7 +156,6 @@ def _pixels(
         raise InputError("flats, darks", f"some together with {unit}", expected, "leave them out")
     if quantity is None and flat is None:
         check_not_counts(values, 'give flats=, or quantity="attenuation"', mask)
-        _warn_of_transmission(values)
     integrals = line_integrals("frames", values, ImportOptions(), flats=flat, darks=dark, convention=unit)
     if mask is None:
         return integrals

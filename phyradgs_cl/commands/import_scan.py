@@ -79,7 +79,8 @@ def import_command(
         remark(f"no pixel can be used in {len(unusable)} frames (from 0): {', '.join(map(str, unusable[:10]))}")
     facts = [f"{frames} frames of {rows}×{columns}", *_applied_in_words(scan), "fly-scan" if scan.is_fly else "at rest"]
     facts.append(f"{np.count_nonzero(bad)} pixels masked")
-    say(f"{output}: {format_name}, {', '.join(facts)}\n{scan.provenance[TAKEN]}\n{scan.summary()}")
+    lines = f"{output}: {format_name}, {', '.join(facts)}", str(scan.provenance[TAKEN]), scan.summary()
+    say("\n".join(filter(None, lines)))
 
 
 import_command.__doc__ = f"Import a scan: {', '.join(dict.fromkeys(whose for _, whose in FORMATS.values()))}."

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, PoseTable, Scan, Shutter
 from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry, plain_geometry
-from phyradgs_cl.acquisition.plausible import check_plausible
+from phyradgs_cl.acquisition.plausible import check_plausible, question_unit
 from phyradgs_cl.acquisition.trajectory import grid_of_scan, resting_poses, unwrapped
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -294,6 +294,7 @@ class RotaryStage:
     ) -> tuple[CircularOrbit | PoseTable, Geometry]:
         """Returns the trajectory of gantry angles (F,) in rad, and the nearest circular geometry. The trajectory is a
         circular orbit where the axis crosses the central ray at a right angle, else a pose table."""
+        question_unit(angle_rad, f"{subject} angles", "deg")
         if self.axis_u_mm == self.roll_rad == self.tilt_rad == 0 and self.shift_mm is None:
             return turning(self.geometry, angle_rad, timing), self.geometry
         turned_rad = unwrapped(angle_rad)

@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 
 from phyradgs_cl.acquisition import Saturation
+from phyradgs_cl.acquisition.plausible import FEW
 from phyradgs_cl.acquisition.scan import applied_facts
 from phyradgs_cl.detector.attenuation import frames_to_attenuation
 from phyradgs_cl.detector.noise_level import find_saturation
@@ -33,7 +34,8 @@ _BLOCK_BYTES = 1 << 26  # memory of a block of rows whose median is taken: a flo
 Mask = np.ndarray | None
 TAKEN = "taken"
 """The provenance's key of a text that says which frames and flats were used."""
-_AIR = 0.2  # a median line integral up to this size at the frames' borders is air
+_AIR = 0.2  # a median line integral up to this size at the frames' borders is air, as is a transmission so near to 1
+_DIVIDED, _MANY_COUNTS = 2.0, 1000.0  # frames up to this value, with air of so many counts or more, are divided already
 _SAME = 1e-3  # flats up to this fraction above the saturation level are clipped too
 
 
@@ -162,8 +164,8 @@ def line_integrals(
     - convention: the quantity of the format or file; the options' comes first. Without both, frames with flats or a flat
       value are counts. is_corrected: the scanner has subtracted the darks.
 
-    Raises InputError for a quantity that nothing states, counts without flats, flats or darks of another size, flats of ones
-    for frames that look like line integrals, and frames without a usable pixel."""
+    Raises InputError for a quantity that nothing states, counts without flats, flats or darks of another size, frames that
+    cannot be counts beside such flats, and frames without a usable pixel."""
     has_flats = flats is not None and len(flats) > 0
     quantity = options.quantity or convention or ("counts" if has_flats or options.flat_value is not None else None)
     if quantity is None:
@@ -188,9 +190,11 @@ def line_integrals(
             light = light_of(subject, flats, darks, len(frames), options, flats_at, names)
             flat = light.flats.mean(axis=0)
             saturation = find_saturation(frames, flat)
-        _refuse_logarithms(subject, frames, flat, options)
+            _refuse_no_counts(subject, frames, flat, options)
         if not is_corrected and (darks is None or len(darks) == 0):
             _log.warning("%s: counts without darks: an offset of the panel stays in the line integrals", subject)
+    if quantity == "attenuation":
+        _warn_of_transmission(subject, frames, options)
     flats, darks, place = (light.flats, light.dark, light.place) if light else (None, None, None)
     integrals, unusable = frames_to_attenuation(frames, quantity, flats, darks, LARGEST_LINE_INTEGRAL, place)
     if quantity == "attenuation" and unusable.any():
@@ -206,9 +210,25 @@ def line_integrals(
     return LineIntegrals(integrals, compact(unusable), saturation, applied)
 
 
-def _refuse_logarithms(subject: str, frames: np.ndarray, flat: np.ndarray, options: ImportOptions) -> None:
-    """Raises InputError if flats are 1 everywhere and frames near 0 at their left and right borders. Such frames hold line
-    integrals, not counts."""
+def _warn_of_transmission(subject: str, frames: np.ndarray, options: ImportOptions) -> None:
+    """Warns of frames (P, v, u) that look like transmissions: near 1 at the left and right borders, and at least one pixel
+    darker between them."""
+    with np.errstate(over="ignore"):
+        border = float(np.median(frames[..., [0, -1]]))
+    brighter = sum(np.count_nonzero(frame > 1 + _AIR) for frame in frames)
+    if abs(border - 1) < _AIR and brighter < FEW * frames.size and np.min(frames) < 1 - _AIR:
+        text = "%s: 1 at their borders, and less within: are they transmissions? Say %s transmission"
+        _log.warning(text, subject, options.named("quantity"))
+
+
+def _refuse_no_counts(subject: str, frames: np.ndarray, flat: np.ndarray, options: ImportOptions) -> None:
+    """Raises InputError for line integrals: flats are 1 everywhere and frames near 0 at their left and right borders. Raises
+    it for transmissions too: fractions of at most 2 in 99 % of the pixels, while the flats have a thousand counts."""
+    air, may_be = float(np.median(flat)), frames.dtype.kind == "f"
+    if may_be and air >= _MANY_COUNTS and sum(map(np.count_nonzero, (f > _DIVIDED for f in frames))) <= FEW * frames.size:
+        found = f"fractions, at most {_DIVIDED:g}, and air at {air:g} counts"
+        remedy = f"were they divided by the air already? Say {options.named('quantity')} transmission, or attenuation"
+        raise InputError(f"{subject} quantity", found, "counts that reach those of air", remedy)
     border = np.concatenate([frames[..., 0].ravel(), frames[..., -1].ravel()])
     if (flat == 1).all() and abs(float(np.median(border))) < _AIR:
         remedy = f"say {options.named('quantity')} attenuation, and leave the flats out"

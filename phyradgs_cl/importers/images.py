@@ -35,8 +35,10 @@ _HEAD_BYTES = 1 << 16  # a header is read from this many bytes at the file's sta
 # Bytes of memory per voxel for which there must be room while a file is read: as much as two copies in float32.
 _VOXEL_BYTES = 8
 _NOTE = "ITK_FileNotes"  # SimpleITK's name for a file's comment, which is NIfTI's field descrip
-_READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", ".nrrd": "Nrrd"}
+_NRRD = (".nrrd", ".nhdr")
+_READERS = {".nii": "Nifti", ".gz": "Nifti", ".mha": "Meta", ".mhd": "Meta", **dict.fromkeys(_NRRD, "Nrrd")}
 _DATA_FILE = re.compile(rb"^(?:ElementDataFile *=|data ?file:) *(\S.*?)\s*$", re.M)
+_LIKE = 1e-3  # relative difference up to which two statements of a voxel's size agree
 _OBLIQUE = 1e-3  # an axis that is tilted by less than this (the sine of 0.06°) counts as straight
 
 
@@ -105,7 +107,7 @@ def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
         if reader.HasMetaDataKey("bitpix"):  # NIfTI: SimpleITK turns scaled integers into floats of another size
             stored = file.seek(0, os.SEEK_END) - int(float(reader.GetMetaData("vox_offset")))
             return stored * voxel_bytes * 8 // int(reader.GetMetaData("bitpix"))
-    is_nrrd = path.suffix.lower() == ".nrrd"
+    is_nrrd = path.suffix.lower() in _NRRD
     found = _DATA_FILE.search(head)
     name, start = (found[1].decode("latin-1"), head.find(b"\n", found.end(1)) + 1) if found else ("LOCAL", 0)
     if name.startswith("LIST") or "%" in name:  # several files: SimpleITK returns undefined voxels if one is missing
@@ -126,12 +128,13 @@ def read_image_volume(path: Path, state: int | None = None) -> Volume:
     subject, image = str(path), read_image(path, state)
     note = image.GetMetaData(_NOTE) if image.HasMetaDataKey(_NOTE) else ""
     sitk = checks.package("SimpleITK", "the package that reads this file", "phyradgs-cl[formats]")
-    header = _nrrd_header(path) if path.suffix.lower() == ".nrrd" else {}
+    header = _nrrd_header(path) if path.suffix.lower() in _NRRD else {}
     if header and not {"space directions", "spacings"} & set(header):
         return Volume(finite_float32(subject, shares_of_maximum(sitk.GetArrayFromImage(image))), None)
     units = set(header.get("space units", '"mm"').replace('"', " ").split())
     if len(units) != 1 or (unit_mm := LENGTH.factor(*units)) is None:
         raise InputError(f"{subject} space units", header["space units"][:40], LENGTH.accepted)
+    _resize_by_sform(subject, image)
     image = sitk.DICOMOrient(image, "LPS")
     if not np.allclose(np.reshape(image.GetDirection(), (3, 3)), np.eye(3), rtol=0, atol=_OBLIQUE):
         found = f"directions {np.round(image.GetDirection(), 4).tolist()}"
@@ -148,6 +151,24 @@ def read_image_volume(path: Path, state: int | None = None) -> Volume:
     values = finite_float32(subject, sitk.GetArrayFromImage(image))
     grid = Grid(triple(values.shape), triple(size_mm[::-1].tolist()), triple(centre_mm[::-1].tolist()))
     return Volume(values, grid, {VALUES: note} if of_note(note)[0] else {})
+
+
+def _resize_by_sform(subject: str, image: Any) -> None:
+    """Gives a NIfTI image the voxel sizes of its sform, if that alone states its place: SimpleITK always takes those of
+    pixdim, which belong to the qform. Raises InputError where both are stated and differ."""
+    codes = {form: float(image.GetMetaData(key)) for form in "sq" if image.HasMetaDataKey(key := f"{form}form_code")}
+    if codes.get("s", 0) <= 0:
+        return
+    rows = [image.GetMetaData(f"srow_{axis}").split()[:3] for axis in "xyz"]
+    sides = np.linalg.norm(np.array(rows, np.float64), axis=0)
+    stated = np.array([float(image.GetMetaData(f"pixdim[{axis}]")) for axis in (1, 2, 3)])
+    if np.allclose(sides, stated, rtol=_LIKE, atol=0):
+        return
+    if codes.get("q", 0) > 0:
+        found = f"{sides.round(6).tolist()} by the sform and {stated.round(6).tolist()} by the qform (x, y, z)"
+        remedy = "set the code of the wrong one to 0, as nibabel's set_qform(None, 0)"
+        raise InputError(f"{subject}: voxel sizes", found, "one size", remedy)
+    image.SetSpacing((np.array(image.GetSpacing()) * sides / stated).tolist())
 
 
 def _nrrd_header(path: Path) -> dict[str, str]:

@@ -33,6 +33,10 @@ _KINDS = {
     ("dcm", "dicom", "ima"): (
         "DICOM", "convert a volume with SimpleITK to NIfTI (its Hounsfield units: --mu-water-per-mm); projections to TIFF"
     ),
+    ("hdr",): (
+        "a header with its numbers in another file, as in NIfTI's pairs",
+        "save a NIfTI as one file: nibabel.save(nibabel.load('v.hdr'), 'v.nii'); others as in Fiji: File > Import > Raw"
+    ),
     ("mat",): ("a file of MATLAB", "save its array as .npy or TIFF: scipy.io.loadmat and tifffile.imwrite"),
     ("fit", "fits"): ("FITS", "convert them to TIFF: astropy.io.fits and tifffile.imwrite"),
     ("xrm", "txm"): ("single images or a volume of Xradia", "import the scan's .txrm, or export TIFFs"),
@@ -211,7 +215,7 @@ _READERS: dict[str, tuple[str, Callable[[Path], Volume]]] = {
     **dict.fromkeys((".mha", ".mhd"), ("MetaImage", read_image_volume)),
     **dict.fromkeys((".nii", ".nii.gz"), ("NIfTI", read_image_volume)),
     **dict.fromkeys(tiff.SUFFIXES, ("TIFF", _read_tiff)),
-    **{".nrrd": ("NRRD", read_image_volume), ".npy": ("NumPy", _read_npy)},
+    **dict.fromkeys((".nrrd", ".nhdr"), ("NRRD", read_image_volume)), ".npy": ("NumPy", _read_npy),
     ".zarr": ("OME-Zarr", lambda path: _on_grid(path, *read_zarr(path))),
 }
 

@@ -13,7 +13,7 @@ from phyradgs_cl.acquisition.readout import SIDES, Named, frame_time_of, readout
 from phyradgs_cl.acquisition.scan import DETECTOR_MODELS
 from phyradgs_cl.acquisition.shutter import AXES
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.text import read_angles_rad
+from phyradgs_cl.importers.angles import read_angles_rad
 from phyradgs_cl.io.files import regular_file
 from phyradgs_cl.text import flag_of
 

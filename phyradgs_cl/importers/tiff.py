@@ -63,7 +63,8 @@ def read_numbered(
     numbers (F,) from 0 on, and a text about which were taken. shape: the expected (F, v, u), None where any size fits.
     subject: what states the shape, or each of its sizes, for messages. first: the number of the first frame, needed if that
     frame is missing. pattern: the form of numbers. Files beyond the stated count are left out, with a warning. Raises
-    InputError for fewer, unless the options say to take those found, and for images of another size."""
+    InputError if they do not begin with ``first``, so that any file may be the surplus one, for fewer than stated, unless
+    the options say to take those found, and for images of another size."""
     subjects = [subject] * 3 if isinstance(subject, str) else subject
     name = re.compile(re.escape(prefix) + pattern, re.I)
     paths = [path for path in folder.matching(*SUFFIXES) if name.fullmatch(path.stem)]
@@ -75,6 +76,9 @@ def read_numbered(
         expected = f"{stated}, one for every projection" if stated else "at least one"
         raise InputError(subjects[0], found, expected, remedy if paths else "copy the missing files")
     if len(paths) > stated:
+        if int(paths[0].stem[len(prefix) :]) != first:
+            found = f"{len(paths)} files, {paths[0].name} to {paths[-1].name}"
+            raise InputError(subjects[0], found, f"{stated}", "take those out that are no projections")
         text = "%s: %d files, and %d are stated: left out: %s"
         _log.warning(text, subjects[0], len(paths), stated, ", ".join(path.name for path in paths[stated:][:8]))
     numbers = np.array([int(path.stem[len(prefix) :]) for path in paths[:stated]])

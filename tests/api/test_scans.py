@@ -7,6 +7,7 @@ import pytest
 
 from phyradgs_cl import api
 from phyradgs_cl.api import ConeGeometry, ParallelGeometry, fly_scan, reconstruct, simulate, static_scan
+from phyradgs_cl.errors import InputError
 
 pytestmark = pytest.mark.slow
 
@@ -71,10 +72,12 @@ def test_what_looks_like_radians_transmissions_or_percent_is_said(caplog) -> Non
         (lambda: static_scan(frames[:9], cone, np.deg2rad(turn_deg[:9])), ""),
         (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=9.0, readout_ratio=2.0), ""),
         (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=9.0, readout_ratio=86), "_ratio: .* 43 times"),
-        (lambda: static_scan(transmission, cone, turn_deg), "frames: 1 at their borders.* quantity="),
+        (lambda: static_scan(transmission, cone, turn_deg), "frames: 1 at their borders.* Say quantity trans"),
         (lambda: static_scan(transmission, cone, turn_deg, quantity="transmission"), ""),
         (lambda: static_scan(2 - transmission, cone, turn_deg), ""),  # an object wider than the panel
     ]
+    with pytest.raises(InputError, match="^quantity: found line integrals down to -4.61, 100 % of pixels"):
+        static_scan(100 * transmission, cone, turn_deg, quantity="transmission")
     for number, (make, words) in enumerate(cases):
         caplog.clear()
         make()

@@ -99,6 +99,31 @@ def test_nibabel_s_frames_types_and_scales(exported, stored, tmp_path, forms) ->
     assert_same(tmp_path / "t.nii", stored, atol=0.09 / 32767)
 
 
+@pytest.mark.parametrize("order", ["RAS", "PIL"])
+def test_the_sform_alone_states_sizes_that_pixdim_does_not(exported, stored, tmp_path, order) -> None:
+    first = nibabel.as_closest_canonical(nibabel.load(exported("v.nii")))
+    image = first.as_reoriented(nibabel.orientations.axcodes2ornt(order))
+    image.header["pixdim"][1:4], image.header["qform_code"], image.header["sform_code"] = 1, 0, 2
+    nibabel.save(image, tmp_path / "t.nii")
+    assert_same(tmp_path / "t.nii", stored)
+    image.header["qform_code"] = 1
+    nibabel.save(image, tmp_path / "t.nii")
+    with pytest.raises(InputError, match=r"t.nii: voxel sizes: found .* by the sform and \[1.0, 1.0, 1.0\] by the qform"):
+        load_volume(tmp_path / "t.nii")
+
+
+def test_nrrd_s_detached_header_and_the_half_of_a_pair(exported, stored, tmp_path) -> None:
+    sitk.WriteImage(sitk.ReadImage(str(exported("v.mha"))), str(tmp_path / "t.nhdr"))
+    assert_same(tmp_path / "t.nhdr", stored)
+    text = (tmp_path / "t.nhdr").read_text()
+    (tmp_path / "t.nhdr").write_text(re.sub("data ?file: .*", "data file: /etc/passwd", text))
+    with pytest.raises(InputError, match="inside the folder"):
+        load_volume(tmp_path / "t.nhdr")
+    nibabel.save(nibabel.load(exported("v.nii")), tmp_path / "t.hdr")
+    with pytest.raises(InputError, match=r"numbers in another file, .* \(.hdr\), which is not read; .* as one file"):
+        load_volume(tmp_path / "t.hdr")
+
+
 def test_bare_values_have_no_grid_and_integers_are_shares(tmp_path, stored) -> None:
     counts = np.arange(24, dtype=np.uint8).reshape(2, 3, 4)
     np.save(tmp_path / "t.npy", counts)

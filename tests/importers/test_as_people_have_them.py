@@ -13,8 +13,9 @@ from PIL import Image
 from phyradgs_cl.acquisition import ConeGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan
+from phyradgs_cl.importers.angles import read_angles_rad
 from phyradgs_cl.importers.series import flat_places, series_of
-from phyradgs_cl.importers.text import number_at_start, read_angles_rad
+from phyradgs_cl.importers.text import number_at_start
 
 pytestmark = pytest.mark.slow
 
@@ -112,6 +113,36 @@ def test_what_flats_and_darks_name_is_no_projection_and_odd_files_do_not_matter(
         import_scan(folder)
 
 
+OTHER_THAN_STATED = {  # by what the TOML says: frames that are something else, made of line integrals
+    "quantity = 'transmission'": [lambda p: 100 * np.exp(-p), lambda p: 255 * np.exp(-p), lambda p: 65535 * np.exp(-p)],
+    "flat_value = 100.0": [lambda p: 40000 * np.exp(-p)], "quantity = 'attenuation'": [lambda p: -3 * p],
+    "flat_value = 40000.0": [lambda p: np.exp(-p), lambda p: p], "flats = 'white_*.tif'": [lambda p: np.exp(-p)],
+}  # fmt: skip
+
+
+def test_pixels_that_are_not_what_is_stated_are_refused(tmp_path, caplog) -> None:
+    """Percents, other flats, a reversed sign; and what was divided by the air, beside thousands of counts."""
+    p = np.broadcast_to(np.linspace(0, 1.5, 9, dtype=np.float32), (6, 8, 9))
+    for number, (text, frames) in enumerate(OTHER_THAN_STATED.items()):
+        stated = text if "quantity" in text else f"quantity = 'counts'\n{text}"
+        for kind, frames_of in enumerate(frames):
+            folder = toml_folder(tmp_path / f"{number}{kind}", list(np.float32(frames_of(p))), white=[shot(40000)])
+            toml = (folder / "scan.toml").read_text().replace("quantity = 'counts'", stated)
+            (folder / "scan.toml").write_text(toml)
+            if "white" not in text:
+                (folder / "white_000.tif").unlink()
+            said = "quantity: found " + ("fractions" if "40" in text or "white" in text else "line integrals down to")
+            with pytest.raises(InputError, match=said):
+                import_scan(folder)
+    (folder / "scan.toml").write_text(toml.replace("'counts'", "'transmission'"))
+    np.testing.assert_allclose(import_scan(folder).projections, p[:, ::-1], atol=1e-6)
+    assert "transmissions?" not in caplog.text
+    folder = toml_folder(tmp_path / "air", list(np.exp(-np.abs(p - 0.75).max() + np.abs(p - 0.75))))
+    (folder / "scan.toml").write_text((folder / "scan.toml").read_text().replace("'counts'", "'attenuation'"))
+    import_scan(folder)
+    assert "1 at their borders, and less within: are they transmissions? Say [frames] quantity transmission" in caplog.text
+
+
 def test_a_flat_or_dark_unlike_the_others_is_named_and_left_out(tmp_path, caplog) -> None:
     frames = [shot(20000, i) for i in range(6)]
     good = {"white": [shot(40000, i) for i in range(5)], "dark": [shot(60, i) for i in range(4)]}
@@ -176,6 +207,59 @@ def test_files_of_angles(tmp_path) -> None:
             read_angles_rad(tmp_path / "a.txt", 3)
 
 
+LINE = {"index": "{i} {a}", "index behind": "{a} {i}", "time": "{t} {a}", "time and more": "{t} {a} 7", "alone": "{a}"}
+NAMED = {  # by what a line has: names above it, and units in a turn of their angles
+    "index": {
+        **dict.fromkeys(("frame angle", "Projection Angle", "no. angle", "proj stage_deg", "Proj # Angle (°)"), 360),
+        **dict.fromkeys(("frame gantry", "rotation angle", "# index omega", "# made by\n# frame theta\n# -- --"), 360),
+        **dict.fromkeys(("frame angle_mrad", "frame angle (mrad)", "frame\tangle\n#\tmrad", "# in mrad"), 2000 * np.pi),
+    },
+    "index behind": {"angle index": 360, "Winkel [Grad], Nr": 360, "angle_rad no": 2 * np.pi},
+    "time": {"time rot": 360, "dose rot": 360, "temp_degC srot": 360, "s_rad angle": 360, "time,angle\ns,rad": 2 * np.pi},
+    "time and more": {"x rot y": 360, "time rotation (gon) dose": 400, "Time(s) Angle(deg) rot_speed": 360},
+    "alone": {
+        **{"rotation angle": 360, "θ/°": 360, "angle (decimal degrees)": 360, "anglerad": 2 * np.pi, "arcmin": 21600},
+        **{"angle_mdeg": 360e3, "mRad": 2e3 * np.pi, "Angle(µrad)": 2e6 * np.pi, "arcsec": 1296e3, "turns": 1, "rot_rev": 1},
+        **{"# angle [rad]\n# made by x": 2 * np.pi, "# angle of 3.11.\n# angle [mrad]\n# of 3.11.": 2000 * np.pi},
+    },
+}  # fmt: skip
+CONTRADICTED = {
+    "index": {
+        **dict.fromkeys(("rot frame", "Angle table", "theta beta"), "column .*numbers that count; .*tabs or commas"),
+        **{"frame dose": "'dose'", "frame angle (counts)": "'counts' in 'angle.counts.'"},
+    },
+    "time": {"my table": "one angle a line", "angle theta": "one angle a line", "a table of theta": "one angle a line"},
+    "time and more": {"time position temp_degC": "one angle a line", "angles": "one angle a line"},
+    "alone": {
+        **{"angle [0.01 deg]": "'0.01 deg'", "# angle [0.01 deg]": "'0.01 deg'", "encoder_counts": "'counts'"},
+        **{"angle (deg/s)": "deg/s", "angleMilliRad": "Milli", "angle [grad]": "'grad' .*mrad", "time_s": "'time' and 's'"},
+        **{"degrees, then rad": "'degrees' and 'rad'", "rot [arc sec]": "'arc sec'", "angle [°x100]": "'°x100'"},
+    },
+}  # fmt: skip
+
+
+def table_of_angles(path: Path, what: str, names: str, turn: float) -> Path:
+    lines = [LINE[what].format(i=i, t=0.5 * i + 3, a=turn * i / 24) for i in range(6)]
+    path.write_text("\n".join([names, *lines]), "utf-8")
+    return path
+
+
+def test_names_above_a_table_say_which_column_has_the_angles_and_their_unit(tmp_path) -> None:
+    for what, turns in NAMED.items():
+        for names, turn in turns.items():
+            found = read_angles_rad(table_of_angles(tmp_path / "a.txt", what, names, turn), 6)
+            np.testing.assert_allclose(found, np.deg2rad(15 * np.arange(6)), atol=1e-9, err_msg=f"{what}: {names}")
+    for what, errors in CONTRADICTED.items():
+        for names, said in errors.items():
+            with pytest.raises(InputError, match=said):
+                read_angles_rad(table_of_angles(tmp_path / "a.txt", what, names, 360), 6)
+                pytest.fail(f"taken: {names!r}")
+    path = table_of_angles(tmp_path / "a.txt", "index", "frame,angle", 360)
+    with pytest.raises(InputError, match="found 6 angles; expected 12"):  # not a list of twelve
+        read_angles_rad(path, 12)
+    assert read_angles_rad(table_of_angles(path, "alone", "angle (counts)", 400), 6, "gon")[1] == pytest.approx(np.pi / 12)
+
+
 def test_numbers_in_texts() -> None:
     read = {"0,25 mm": (0.25, "mm"), "1.234,5": (1234.5, ""), "2,500.5um": (2500.5, "um"), "12 week": (12.0, "week")}
     read["-3E-2"] = (-0.03, "")
@@ -232,6 +316,20 @@ def test_nikon_s_measured_angles_are_used_in_whatever_order_they_are_listed(tmp_
         angle_deg = [np.rad2deg(scan.trajectory.angle_rad(i, scan.frame_start_s[i])) for i in range(6)]
         np.testing.assert_allclose(angle_deg, measured, atol=1e-3)
     assert "scan.ang: these measured angles are used; they differ from equal steps by 0.6°" in caplog.text
+    for number, names in enumerate(("Projection Time(s) Angle(deg)", "Projection\tTime(s)\tAngle(rad)"), 3):
+        path = lab.write_nikon(tmp_path / str(number), truth)
+        listed = np.deg2rad(measured) if "rad" in names else measured
+        lines = "".join(f"{i + 1} {0.5 * i} {a:.6f}\n" for i, a in enumerate(listed))
+        (path / "_ctdata.txt").write_text(f"nProjs nFrames\n6 1\n{names}\n{lines}")
+        scan = import_scan(path)
+        angle_deg = [np.rad2deg(scan.trajectory.angle_rad(i, scan.frame_start_s[i])) for i in range(6)]
+        np.testing.assert_allclose(angle_deg, measured, atol=1e-3)
+
+
+def renumber(folder: Path, by: int) -> None:
+    for file in sorted(folder.glob("scan_*0*.tif"), reverse=by > 0):
+        digits = file.stem[5:]
+        file.rename(folder / f"scan_{int(digits) + by:0{len(digits)}d}.tif")
 
 
 def test_more_and_fewer_files_than_a_description_states(tmp_path, make_truth, caplog) -> None:
@@ -243,6 +341,11 @@ def test_more_and_fewer_files_than_a_description_states(tmp_path, make_truth, ca
         beyond.write_bytes(last.read_bytes())
         whole = import_scan(path)
         assert whole.frames == 6 and f"left out: {beyond.name}" in caplog.text
+        other = {"nikon": -1, "skyscan": 1}[form]  # from another number on any file may be the surplus one
+        renumber(path, other)
+        with pytest.raises(InputError, match=r"found 7 files, scan_0*[01].tif to scan_0*[67].tif; expected 6"):
+            import_scan(path)
+        renumber(path, -other)
         beyond.unlink()
         (path / f"scan_{int(last.stem[5:]) - 2:0{digits}d}.tif").unlink()
         with pytest.raises(InputError, match="5 files .* say frames found"):
@@ -254,6 +357,19 @@ def test_more_and_fewer_files_than_a_description_states(tmp_path, make_truth, ca
             (i, scan.frame_start_s[i]) for i in frames
         )]  # fmt: skip
         np.testing.assert_allclose(angles[:5], angles[5:])
+
+
+@pytest.mark.parametrize("form", ["nikon", "skyscan"])
+def test_images_that_the_scanner_has_divided_by_the_air(tmp_path, make_truth, form) -> None:
+    truth = make_truth(geometry=CENTRED)
+    path = written(form, tmp_path / form, truth)
+    whole = import_scan(path)
+    for file in path.glob("scan_*0*.tif"):
+        tifffile.imwrite(file, np.float32(tifffile.imread(file) / lab.WHITE))
+    with pytest.raises(InputError, match="quantity: found fractions, .* air at 60000 counts; .* Say quantity transmission"):
+        import_scan(path)
+    shares = import_scan(path, ImportOptions(quantity="transmission"))
+    np.testing.assert_allclose(shares.projections, whole.projections, atol=1e-6)
 
 
 def test_xradia_s_scans_that_stopped_early_and_have_several_references(tmp_path, make_truth, caplog) -> None:

@@ -55,6 +55,13 @@ def test_three_doors_take_a_data_sheet(run, imported, tmp_path, make_truth) -> N
     assert "[timing] detector_model: found 'intensty'" in run(bad)[2]
 
 
+@pytest.mark.parametrize("form", ["naf", "leap", "tigre"])
+def test_no_line_is_empty_where_no_files_were_chosen(run, tmp_path, make_truth, form) -> None:
+    writer, name = w.WRITERS[form]
+    said = run(writer(tmp_path / name, make_truth()))[1].splitlines()
+    assert len(said) == 3 and all(said)
+
+
 def test_import_prints_what_it_took_and_what_it_assumed(run, tmp_path, make_truth) -> None:
     stated = w.write_tiff(tmp_path / "s", make_truth(fly=True), SHEET_TOML)
     order = "columns read in 300 ms, left first; 0.8 fps; exposure 8° in 400 ms"

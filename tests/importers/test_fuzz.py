@@ -22,7 +22,7 @@ from phyradgs_cl.errors import PhyradgsError
 from phyradgs_cl.exporters.writers import write_zarr
 from phyradgs_cl.fields import Gaussians, Grid
 from phyradgs_cl.importers import ImportOptions, import_scan, load_beads, load_volume
-from phyradgs_cl.importers.text import read_angles_rad
+from phyradgs_cl.importers.angles import read_angles_rad
 from phyradgs_cl.io import Volume, load_scanner, write_scan, write_volume
 from phyradgs_cl.settings import read_settings
 from phyradgs_cl.workflow import load_scan

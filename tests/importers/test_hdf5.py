@@ -59,6 +59,22 @@ def moved(path: Path, other: Path, link: object) -> None:
             detector["data"] = link
 
 
+def test_bare_arrays_without_addresses_are_told_how_to_name_them(tmp_path) -> None:
+    """MATLAB's file begins with a text, and its axes are reversed."""
+    with h5py.File(tmp_path / "a.mat", "w", userblock_size=512) as file:
+        file["proj"] = FRAMES[KEY == 0].swapaxes(1, 2)
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["proj"] = FRAMES
+    with open(tmp_path / "a.mat", "r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file".ljust(126) + b"IM")
+    with pytest.raises(InputError, match=r"a file of MATLAB; .* say at projections=/NAME, and at axes=frame,u,v"):
+        import_scan(tmp_path / "a.mat")
+    with pytest.raises(InputError, match="no NXentry group; .* say at projections=/ADDRESS"):
+        import_scan(tmp_path / "b.h5")
+    given = {"at": ("projections=/proj", "axes=frame,u,v"), "flat_value": 5e4, "angles": "0,20", "pixel_size_mm": (1.0, 1.0)}
+    assert import_scan(tmp_path / "a.mat", ImportOptions(**given)).projections.shape == (6, 4, 5)
+
+
 def test_frames_in_linked_files_of_the_folder_are_read(tmp_path) -> None:
     (tmp_path / "raw").mkdir()
     moved(nxtomo(tmp_path / "a.nxs"), tmp_path / "raw/x.h5", h5py.ExternalLink("raw/x.h5", "/raw/frames"))

@@ -7,6 +7,7 @@ import struct
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -114,7 +115,7 @@ MISTAKES: dict[str, dict[str, Damage]] = {  # by format: the field, or what a me
     },
     "data-exchange": {
         "/exchange/theta": on("exchange/theta", value(np.zeros(3))),
-        "gon": on("exchange/theta", attribute("units", "gon")),
+        "grad": on("exchange/theta", attribute("units", "grad")),
         "data_white": on("exchange/data_white", value(np.ones((1, 2, 3)))),
         "no usable value": on("exchange/data_white", value(np.zeros((1, 10, 14)))),
         "what the pixels hold": on("exchange/data_white", removed),
@@ -174,6 +175,36 @@ def test_a_mistake_is_named(tmp_path, make_truth, form) -> None:
         (tmp_path / str(number)).mkdir()
         damage(path := w.write(form, tmp_path / str(number), make_truth))
         refused(path, OPTIONS.get(form), form, said)
+
+
+def in_degrees(table: dict[str, Any]) -> None:
+    table.update({key: np.rad2deg(value).tolist() for key, value in table.items() if "angle" in key or "_line_" in key})
+
+
+ANGLES = {  # what multiplies the angles of a format
+    "r2": meta(lambda m: [in_degrees(one) for one in m["proj_train"]]),
+    "phyradgs": meta(lambda m: [in_degrees(one) for one in m["simulate_train"]], FPS),
+    "naf": pickled(lambda d: in_degrees(d["train"])),
+    "tiff": text(TOML, "values_deg = [", "values_deg = [900"), "leap": text(PARAMS, "phis = 100.0", "phis = 1e5"),
+    "rtk": text(XML, "<GantryAngle>", "<GantryAngle>99"), "nikon": text(XTEK, "AngularStep=25", "AngularStep=2500"),
+    "data-exchange": on("exchange/theta", lambda f, a: f[a].__setitem__(..., 100 * f[a][()])),
+}  # fmt: skip
+
+
+def test_angles_over_many_turns_are_questioned(tmp_path, make_truth, caplog) -> None:
+    for form, change in ANGLES.items():
+        (tmp_path / form).mkdir()
+        path = w.write(form, tmp_path / form, make_truth)
+        import_scan(path, OPTIONS.get(form))
+        assert "are they" not in caplog.text, form
+        change(path)
+        import_scan(path, OPTIONS.get(form))
+        said = "rad: are they degrees? np.deg2rad" if form in ("r2", "phyradgs", "naf") else "°: are they in degrees?"
+        assert caplog.text.count(said) == 1, form
+        caplog.clear()
+    truth = make_truth(fly=False)
+    import_scan(w.write_tigre(tmp_path / "t.pkl", replace(truth, angle_rad=np.rad2deg(truth.angle_rad))))
+    assert caplog.text.count("t.pkl angles: 6 frames over 125 rad: are they degrees?") == 1
 
 
 # --- what no file may do ------------------------------------------------------------------------------------------------

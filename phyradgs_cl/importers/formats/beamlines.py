@@ -15,6 +15,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan
 from phyradgs_cl.acquisition.geometry import Geometry
+from phyradgs_cl.acquisition.plausible import question_unit
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble, hdf5
 from phyradgs_cl.importers.frames import gantry_sign
@@ -63,7 +64,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     options.refuse_unused("nxtomo", OF_HDF5)
     with open_hdf5(path, options.linked_folder) as source:
         places = hdf5.places_of(options, source)
-        entry = find_entry(source, options.entry) if "projections" not in places.stated or options.entry else _NOWHERE
+        entry = _entry(source, options) if "projections" not in places.stated or options.entry else _NOWHERE
         if source.find(extra := f"{entry}/{schema.EXTRA}") is not None:  # a scan of this package, which needs no import
             raise source.error(extra, "a scan file of this package", "a file of another program", "use it as it is")
         detector = f"{entry}/{schema.DETECTOR}"
@@ -84,6 +85,21 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     integrals = stacks.line_integrals(f"{path}:{detector}/data", options, "bottom", quantity, turn)
     parts = integrals, trajectory, geometry, timing, options
     return assemble.assemble_scan(*parts, title=title, source=str(path))
+
+
+def _entry(source: Hdf5Source, options: ImportOptions) -> str:
+    """Returns the address of the scan. Raises InputError without one, which says how to name arrays elsewhere."""
+    with open(source.path, "rb") as file:
+        is_matlab = file.read(6) == b"MATLAB"
+    try:
+        return find_entry(source, options.entry)
+    except InputError as error:
+        at = options.named("at")
+        how = f"say {at} projections=/NAME, and {at} axes=frame,u,v if MATLAB's order is rows, columns, frames"
+        if is_matlab:
+            raise InputError(str(source.path), "a file of MATLAB", "the address of its frames", how) from error
+        remedy = " or ".join(filter(None, (error.remedy, f"say {at} projections=/ADDRESS for arrays elsewhere")))
+        raise InputError(error.subject, error.found, error.expected, remedy) from error
 
 
 def _lengths(entry: str) -> hdf5.Lengths:
@@ -135,6 +151,7 @@ def _motion(
     source, detector, angles = places.source, f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SAMPLE}/rotation_angle"
     sign = gantry_sign(options, h5.read_attribute(source, angles, "rotates") or "sample")
     angle = sign * places.angles_rad(used, options, angles)
+    question_unit(angle, options.called("angles", {"angles": source.name(angles)}), "deg")
     sweeps = source.find(f"{angles}_end") is not None and options.frame_time_s is None and options.angles is None
     start_s = h5.read_per_frame(source, f"{detector}/frame_start_time", used, TIME) if sweeps else None
     stored = assemble.StoredTiming(
@@ -184,6 +201,7 @@ def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
             theta_rad = np.linspace(0, np.pi, int(stacks.used.sum()))
         else:
             theta_rad = places.angles_rad(stacks.used, options, theta)
+            question_unit(theta_rad, options.called("angles", {"angles": source.name(theta)}), "deg")
         geometry = hdf5.beam(source, _LENGTHS, options, stacks.panel)
         exposure_s = hdf5.exposure_s(source, f"{_DETECTOR}/exposure_time", stacks.used, options)
         title = h5.read_title(source, f"{_EXCHANGE}/title", path.stem)

@@ -13,19 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.importers.angles import file_of_angles, measured_angles_rad, read_angles_rad
 from phyradgs_cl.importers.assemble import RotaryStage, cone, scan_on_stage
 from phyradgs_cl.importers.files import SafeFolder, checked_name
 from phyradgs_cl.importers.frames import gantry_sign
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
-from phyradgs_cl.importers.text import (
-    Settings,
-    file_of_angles,
-    measured_angles_rad,
-    read_angles_rad,
-    read_settings,
-    say_missing,
-    white_level,
-)
+from phyradgs_cl.importers.text import Settings, read_settings, say_missing, white_level
 from phyradgs_cl.importers.tiff import read_numbered
 from phyradgs_cl.io.hdf5.datasets import LENGTH
 
@@ -69,7 +62,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     angle_rad = gantry_sign(options, "gantry") * options.angle_rad(len(at), lambda: _angles(scan, measured, count)[at])
     say_missing(scan, {"InitialAngle": "0", "ObjectTilt": "0", "Units": "mm"})
     remedy = f"correct it, or say {options.named('flat_value')}"
-    white = None if options.flat_value else white_level(scan, "WhiteLevel", frames, remedy)
+    is_stated = options.flat_value or options.quantity not in (None, "counts")
+    white = None if is_stated else white_level(scan, "WhiteLevel", frames, remedy)
     turned = frames, ("top", "right"), angle_rad, at, names, said
     return scan_on_stage(stage, options, description, description.stem, *turned, flat_value=white)
 

@@ -13,6 +13,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import PoseTable, Scan, Shutter
 from phyradgs_cl.acquisition.geometry import plain_geometry
+from phyradgs_cl.acquisition.plausible import question_unit
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import tiff
 from phyradgs_cl.importers.assemble import Timing, assemble_scan, turn_of
@@ -86,6 +87,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     panel = (frames.shape[1], frames.shape[2])
     common = meta.table("rolling_shutter_geometry")
     source, detector = (Circle.read(common, views, body) for body in ("source", "detector"))
+    question_unit(detector.angle_rad[:, 0], f"{description} angles", "deg")
     shutter, start_s = _timing(str(description), detector, options)
     if (pitch := options.pixel_size_mm) is None:
         expected, remedy = "a length in mm along v and along u", f"say {options.named('pixel_size_mm')}"

@@ -20,6 +20,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.geometry import ConeGeometry, Geometry, ParallelGeometry, plain_geometry
+from phyradgs_cl.acquisition.plausible import question_unit
 from phyradgs_cl.acquisition.scans_from import is_parallel_tigre, poses_of_tigre
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, PoseTable
 from phyradgs_cl.errors import InputError
@@ -68,6 +69,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         reference = r2_gaussian.turned_volume(data.name("image"), volume, grid, _PER_MM)
     frames = oriented(frames, options, r2_gaussian.ROW_0)
     integrals = line_integrals(str(path), frames, options, convention="attenuation")
+    question_unit(angle_rad, f"{path} angles", "rad")
     trajectory = turning(geometry, angle_rad, timing)
     return assemble_scan(
         integrals, trajectory, geometry, timing, options, title=path.stem, source=str(path), grid=grid,
@@ -202,7 +204,7 @@ def import_scan_tigre(path: Path, options: ImportOptions) -> Scan:
         if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf":
             raise InputError(f"{path}: {name}", described(value), "an array of numbers")
     try:
-        poses, panel, grid = poses_of_tigre(geo, np.asarray(angles))
+        poses, panel, grid = poses_of_tigre(geo, np.asarray(angles), f"{path} ")
     except InputError as error:
         raise InputError(f"{path}: {error.subject}", error.found, error.expected, error.remedy) from error
     checks.shape(f"{path}: projections", frames, (len(poses), *panel))

@@ -13,6 +13,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan, Shutter
 from phyradgs_cl.acquisition.geometry import ConeGeometry, Geometry, ParallelGeometry
+from phyradgs_cl.acquisition.plausible import question_unit
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.importers.assemble import Timing, assemble_scan, make_timing, turning
@@ -96,6 +97,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     opened = R2Folder.opened(path, META, options.unit_mm)
     entries = entries_of(opened.meta, "proj_", options.part)
     angle_rad = np.array([entry.number("angle") for entry in entries])
+    question_unit(angle_rad, f"{opened.meta.subject} angles", "rad")
     timing = make_timing(str(path), len(entries), options)
     return opened.scan(path, entries, turning(opened.geometry, angle_rad, timing), timing, options)
 
@@ -165,6 +167,7 @@ def import_scan_with_times(path: Path, options: ImportOptions) -> Scan:
     opened = R2Folder.opened(path, META_WITH_TIMES, options.unit_mm)
     entries = entries_of(opened.meta, "simulate_", options.part)
     marks = np.array([[entry.number(key) for key in _KEYS] for entry in entries])
+    question_unit(marks[:, 0], f"{opened.meta.subject} angles", "rad")
     timing = timing_of_marks(opened.meta, marks, options)
     sweeps = FrameSweeps(timing.start_s, timing.shutter.exposure_s, marks[:, 0], marks[:, 1])
     return opened.scan(path, entries, CircularOrbit(opened.geometry, sweeps), timing, options)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Scan
 from phyradgs_cl.acquisition.geometry import Geometry, plain_geometry, towards_source
+from phyradgs_cl.acquisition.plausible import question_unit
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers.assemble import along
@@ -122,6 +123,7 @@ def _trajectory(
     def poses(position: np.ndarray) -> np.ndarray:
         return turn.poses(stored(position), panel)
 
+    question_unit(rtk.values[_ANGLE], f"{subject} {_ANGLE}", "deg")
     at_frames = poses(np.arange(rtk.frames, dtype=np.float64))
     geometry = plain_geometry(at_frames, panel, rtk.is_parallel)
     if rtk.is_circular and stack.step_u_mm[1] == stack.step_v_mm[0] == 0:

@@ -112,11 +112,13 @@ def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredT
     return assemble.StoredTiming(exposure_s=stored_s * int(averaged[1] if averaged else 1))
 
 
-def _white(scan: settings.Settings, frames: np.ndarray, options: ImportOptions) -> float:
+def _white(scan: settings.Settings, frames: np.ndarray, options: ImportOptions) -> float | None:
     """Returns the counts of air: the option ``flat_value``, else Reference Intensity, else the largest that Depth (bits)
-    allows. Without the option, raises InputError for frames (F, v, u) that are brighter than Reference Intensity, and
-    for frames without flat-field correction."""
+    allows; None if the options say that frames are no counts. Without options, raises InputError for frames (F, v, u) that
+    are brighter than Reference Intensity, and for frames without flat-field correction."""
     remedy = f"say {options.named('flat_value')}"
+    if options.quantity not in (None, "counts"):
+        return None
     if not options.flat_value and scan.word("Flat Field Correction", default="ON").upper() == "OFF":
         raise scan.error("Flat Field Correction", "OFF", "frames that the scanner has corrected", remedy)
     if options.flat_value or scan.has("Reference Intensity"):

@@ -8,15 +8,17 @@ from typing import Any
 import numpy as np
 
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.acquisition.plausible import question_unit
 from phyradgs_cl.acquisition.readout import frame_time_of, seconds_of
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import hdf5, tiff
+from phyradgs_cl.importers.angles import read_angles_rad
 from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, make_timing, turning, with_options
 from phyradgs_cl.importers.files import SafeFolder, checked_name
 from phyradgs_cl.importers.frames import LineIntegrals, gantry_sign, line_integrals, oriented
 from phyradgs_cl.importers.options import FIELDS, OF_BARE_FRAMES, WORDS, ImportOptions
 from phyradgs_cl.importers.series import Series, flat_places, series_of
-from phyradgs_cl.importers.text import TO_RAD, read_angles_rad
+from phyradgs_cl.io.hdf5.datasets import ANGLE
 from phyradgs_cl.io.scan.reader import united
 from phyradgs_cl.io.scanner import TABLES, Scanner, scanner_from
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
@@ -66,6 +68,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     geometry = with_options(options, scanner.geometry)
     timing = make_timing(str(description), frames, options, _stored_timing(tables, scanner))
     angle_rad = options.angle_rad(frames, lambda: _angles_rad(folder, tables["angles"], used, options))
+    question_unit(angle_rad, options.called("angles", {"angles": tables["angles"].subject}), "deg")
     if stored is None:
         integrals = _line_integrals(files, series, combined, tables["frames"], str(description))
     else:
@@ -229,7 +232,9 @@ def _angles_rad(folder: SafeFolder, angles: Fields, used: np.ndarray, options: I
     if angles.has("unit") and not angles.has("file"):
         raise angles.error("unit", "no file beside it", "the unit of a file of angles", "leave it out")
     if angles.has("file"):
-        unit = angles.word("unit", tuple(TO_RAD)) if angles.has("unit") else None
+        unit = angles.word("unit") if angles.has("unit") else None
+        if unit is not None and ANGLE.factor(unit) is None:
+            raise angles.error("unit", repr(unit[:40]), f"one of {ANGLE.accepted}")
         if hdf5.is_address(text := angles.get("file")):
             places = hdf5.Places({"angles": [str(text)]}, angles.subject, options.linked_folder, folder=folder)
             return places.angles_rad(used, options, unit=unit or "deg")
@@ -278,7 +283,7 @@ pixel_size_u_mm = 0.0 # mm, FILL IN: width of a pixel
 # step_deg = 1.0 # degrees from frame to frame; FILL IN this, last_deg, values_deg or file
 # last_deg = 359.0 # degrees, angle of the last frame
 # values_deg = [0.0, 1.0] # degrees, one for each frame
-# file = "angles.txt" # one angle a line, or an index and an angle
+# file = "angles.txt" # one angle a line, or an index and an angle, or named columns
 # unit = "deg" # or rad: of the file
 # rotates = "gantry" # or sample: what turns, counterclockwise seen from above
 # at = "start" # or middle of the exposure of the frame's first line

@@ -61,7 +61,11 @@ TIME = _quantity("time", "s", 1e12, {
     ("us", "\u00b5s", "microsecond", "microseconds"): 1e-6,
 })  # fmt: skip
 ANGLE = _quantity("angle", "deg", 1e8, {
-    ("deg", "degs", "degree", "degrees", "\u00b0"): math.pi / 180, ("rad", "rads", "radian", "radians"): 1.0
+    ("deg", "degs", "degree", "degrees", "\u00b0"): math.pi / 180, ("rad", "rads", "radian", "radians"): 1.0,
+    ("mdeg", "millidegree", "millidegrees"): math.pi / 180e3, ("mrad", "milliradian", "milliradians"): 1e-3,
+    ("urad", "\u00b5rad", "microradian", "microradians"): 1e-6, ("gon", "gons", "gradian", "gradians"): math.pi / 200,
+    ("arcmin", "arcminute", "arcminutes"): math.pi / 10800, ("arcsec", "arcsecond", "arcseconds"): math.pi / 648000,
+    ("turn", "turns", "rev", "revs", "revolution", "revolutions"): 2 * math.pi,
 })  # fmt: skip
 PHASE = _quantity("phase", "cycle", 1e9, {
     ("cycle", "cycles"): 1.0, ("deg", "degree", "degrees", "\u00b0"): 1 / 360, ("rad", "radian", "radians"): 0.5 / math.pi
