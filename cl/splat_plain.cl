@@ -1,4 +1,4 @@
-/* Converts parameters of Gaussians as users give them (11, count), in mm and with quaternions 1e-12 to 1e12 long, to the rows
+/* Converts parameters of Gaussians as users give them (11, count), in mm, quaternions 1e-12 to 1e12 long, to the rows
    that kernels need (11, stride), with unit quaternions, and gradients back. Twins: tests/operators/test_splat_plain.py. */
 
 #define ROWS 11
