@@ -69,7 +69,7 @@ CASES: dict[str, list[Damage]] = {
     f"{DETECTOR}/count_time": [poked((), -1), replaced([0.8, 0.8, 0.9, 0.8])],
     f"{DETECTOR}/detector_readout_time": [poked((), -1)], f"{DETECTOR}/frame_start_time": [changed(lambda t: t[1:])],
     MASK: [renamed("pixels_mask"), replaced(np.zeros((5, 3), np.uint8)), replaced(np.ones((3, 5), np.uint8))],
-    f"{ANGLE} @units": [attribute("units", "gon")], f"{ANGLE} @rotates": [attribute("rotates", "room")],
+    f"{ANGLE} @units": [attribute("units", "steps")], f"{ANGLE} @rotates": [attribute("rotates", "room")],
     f"{ANGLE}_end": [renamed("rotation_angles_end"), changed(lambda a: a[:2])],
     f"{EXTRA}/readout_axis": [replaced("diagonal")], f"{EXTRA}/readout_direction": [replaced(2)],
     f"{EXTRA}/detector_offset": [replaced([1.0, 2.0, 3.0])],
