@@ -223,7 +223,9 @@ def fdk_volume(
         weight = np.array([np.mean(counted(view)) for view in range(len(filtered))]) if ends else np.empty(0)
         for start, stop in ends:
             slab = grid.part((start, 0, 0), (stop - start, *grid.shape[1:]))
-            volume[start:stop] *= travel.all_over_seen(middle, shape, weight, slab, of_views)
+            volume[start:stop] *= travel.all_over_seen(
+                middle, shape, weight, 0.5 * arc.gap_rad, slab, is_parallel, of_views
+            )
     if circle:
         _, y_mm, x_mm = grid.axes_mm()
         radius_mm = seen_mm + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # up to the edge of the last pixel

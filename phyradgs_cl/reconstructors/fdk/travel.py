@@ -32,6 +32,7 @@ _FEW_VIEWS = 24  # fewer views per turn cause a warning: with 24, densities of b
 _ENOUGH = 0.5  # a voxel that a smaller fraction of a turn's views see has incomplete data: its density fades
 _AROUND = 32  # number of points on the rim of the field of view that tell which slices all views see
 _SAME_ROW = 1e-4  # a voxel that lies so little beyond the outermost row, in slices, lies on it
+_PLACES = 33  # places along a side at which smooth sums over the views are computed
 _ENDLESS = 1e4  # side of a pixel, in pixels, by which every voxel projects into it
 Backproject = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """A function from frames (n, rows, columns) and the numbers (n,) of their views to a volume (z, y, x)."""
@@ -108,26 +109,37 @@ def with_rows(pose: np.ndarray, axis: str, count: int) -> np.ndarray:
 
 
 def all_over_seen(
-    pose: np.ndarray, shape: tuple[int, int], weight: np.ndarray, grid: Grid, backproject: Callable[..., np.ndarray]
-) -> np.ndarray:
+    pose: np.ndarray, shape: tuple[int, int], weight: np.ndarray, share: np.ndarray, grid: Grid, is_parallel: bool,
+    backproject: Callable[..., np.ndarray],
+) -> np.ndarray:  # fmt: skip
     """Returns the factor (nz, ny, nx) for voxels that some views miss: the sum of all views' weights over that of the views
     which see the voxel, at most 2. Rows count less and less up to one row beyond the panel.
 
-    pose (F, 12) in mm of a panel of ``shape``; weight (F,). ``backproject`` takes frames, their numbers, grid and poses."""
-    views, (rows, columns) = np.arange(len(pose)), shape
+    pose (F, 12) in mm of a panel of ``shape``; weight (F,): of redundancy; share (F,): the angle for which ``backproject``
+    lets a view stand. It takes frames, their numbers, grid and poses."""
+    rows, columns = shape
     wide = pose.copy()  # three columns so wide that every voxel projects into them
     wide[:, 3:6] += ((columns - 1) / 2 - _ENDLESS) * pose[:, 6:9]
     wide[:, 6:9] *= _ENDLESS
-    ones = np.broadcast_to(weight[:, None, None], (len(pose), rows, 3))
-    padded = np.pad(ones, ((0, 0), (1, 1), (0, 0))).astype(np.float32)
-    seen = backproject(padded, views, grid, with_rows(wide, "rows", 1))
-    high = wide.copy()
-    high[:, 3:6] += ((rows - 1) / 2 - _ENDLESS) * wide[:, 9:12]
-    high[:, 9:12] *= _ENDLESS
-    one_slice = grid.part((0, 0, 0), (1, *grid.shape[1:]))  # slices differ only where the panel leans, and then little
-    of_all = backproject(np.repeat(ones[:, :1], 3, axis=1).astype(np.float32), views, one_slice, high)
+    ones = np.zeros((len(pose), rows + 2, 3), np.float32)
+    ones[:, 1:-1] = weight[:, None, None]
+    seen = backproject(ones, np.arange(len(pose)), grid, with_rows(wide, "rows", 1))
+    of_all = _distance_weights(pose, weight * share, grid, is_parallel)
     enough = np.maximum(seen, _ENOUGH * of_all)
     return np.divide(of_all, enough, out=np.zeros_like(seen), where=enough > 0)
+
+
+def _distance_weights(pose: np.ndarray, weight: np.ndarray, grid: Grid, is_parallel: bool) -> np.ndarray:
+    """Returns the sums (ny, nx) float32 of ``weight`` (F,) / z² of poses (F, 12) in the grid's middle slice, with z as in
+    ``backproject``. They are smooth, and therefore interpolated between few places."""
+    nz, *sides = grid.shape
+    y, x = (np.linspace(0, side - 1, min(side, _PLACES)) for side in sides)
+    m = voxel_matrices(pose, grid, is_parallel)[:, 8:, None, None]
+    depth = m[:, 0] * x + m[:, 1] * y[:, None] + m[:, 2] * (nz - 1) / 2 + m[:, 3]
+    sums = np.einsum("f,fyx->yx", weight, np.divide(1, depth**2, out=np.zeros_like(depth), where=depth > 0))
+    for places, side in ((y, sides[0]), (x, sides[1])):  # each pass interpolates along the first axis and turns the array
+        sums = np.array([np.interp(np.arange(side), places, line) for line in sums.T])
+    return sums.astype(np.float32)
 
 
 def ends(pose: np.ndarray, rows: int, grid: Grid, radius_mm: float, is_parallel: bool) -> list[tuple[int, int]]:
