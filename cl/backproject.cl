@@ -18,18 +18,17 @@
 
 /* Interpolates linearly at LANES places of a line in memory, with the weight wv of the next element. `fits`: two vectors from
    `least` on contain all places; if so, elements are looked up in them, else gathered. */
+ALWAYS_INLINE vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
 #ifdef V_LOOKUP
 #define COLUMN_SAMPLES(column, least, place, wv, fits)                                                       \
     ((fits) ? lerp_lookup(V_LOAD((column) + (least)), V_LOAD((column) + (least) + LANES), (place) - (least), wv) \
             : lerp_of(GATHER((column), place), GATHER((column) + 1, place), wv))
-ALWAYS_INLINE vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
 ALWAYS_INLINE vf lerp_lookup(const vf lower, const vf upper, const vi place, const vf share)
 {
     return lerp_of(V_LOOKUP(lower, upper, place), V_LOOKUP(lower, upper, place + 1), share);
 }
 #else
 #define COLUMN_SAMPLES(column, least, place, wv, fits) lerp_of(GATHER((column), place), GATHER((column) + 1, place), wv)
-ALWAYS_INLINE vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
 #endif
 
 __kernel void backproject(
@@ -73,6 +72,9 @@ __kernel void backproject(
 }
 
 #ifdef COLUMN_ROWS
+/* With EVEN_ROWS all pixels are 1 but those of the first and last row, which are 0: their value at row v needs no frame. */
+#define EVEN_ROW(v) max(min(min(v, (float)(rows - 1) - (v)), 1.0f), 0.0f)
+
 /* Along z, a column of voxels keeps its detector column and depth, and v is linear. So two detector columns are blended
    once for LANES voxels; or once for all voxels, if LANES voxels project to more rows than two vectors contain. Images are
    transposed: (columns, pitch), v along a row. The host chooses `block` such that its voxels project to at most COLUMN_ROWS
@@ -101,8 +103,14 @@ __kernel void backproject_upright(
         if (!(u >= 0.0f && u <= (float)(width - 1) && depth > 0.0f))
             continue;
         const float step = m[6] * inv, start = (m[4] * x + (m[5] * y + m[6] * first + m[7])) * inv;
+        const float weight = BY_DISTANCE(weights[f], inv);
+#ifdef EVEN_ROWS
+        for (int z = 0; z < count; z += LANES)
+            V_STORE(V_LOAD(sum + z) + weight * EVEN_ROW(start + step * (V_IOTA + (float)z)), sum + z);
+        continue;
+#endif
         const int column = min((int)u, max(width - 2, 0));
-        const float weight = BY_DISTANCE(weights[f], inv), high = weight * (u - column), low = weight - high;
+        const float high = weight * (u - column), low = weight - high;
         __global const float *a = projections + f * image_step + IMAGE_GUARD + (size_t)column * image_pitch;
         __global const float *b = a + (width > 1 ? image_pitch : 0);
 #ifdef V_LOOKUP
@@ -162,8 +170,7 @@ __kernel void backproject_leaning(
     __global const float *projections, __global const float *matrices, __global const float *weights,
     const int views, const int rows, const int width, const int image_pitch, const long image_step,
     const int4 shape, const int4 origin, const int volume_pitch,
-    const int block,
-    __global float *volume)
+    const int block, __global float *volume)
 {
     if (get_global_id(0) >= shape.x)
         return;
@@ -211,6 +218,9 @@ __kernel void backproject_leaning(
                 inside = (u >= 0.0f) & (u <= u_most) & (v >= 0.0f) & (v <= v_most) & (inv > 0.0f);
                 vs = V_PICK(V_PICK(0.0f, v_most, v > v_most), v, (v >= 0.0f) & (v <= v_most));
             }
+#ifdef EVEN_ROWS
+            vf value = EVEN_ROW(vs);
+#else
             const vi row = min(V_INT(vs), last_row);
             const vf wv = vs - V_FLOAT(row);
             int column = own, to = own;
@@ -238,6 +248,7 @@ __kernel void backproject_leaning(
                     value += max(1.0f - fabs(u - (float)i), 0.0f) * high;
                 }
             }
+#endif
             value *= BY_DISTANCE(weights[f], inv);
             V_STORE(V_LOAD(sum + k) + (is_inside ? value : V_PICK(0.0f, value, inside)), sum + k);
         }

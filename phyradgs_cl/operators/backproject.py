@@ -33,20 +33,21 @@ Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.
 
 def backproject(
     rt: Runtime, frames: SameArray, pose: np.ndarray, weight: np.ndarray, grid: Grid, *, is_parallel: bool = False,
-    power: int = 2,
+    power: int = 2, is_even: bool = False,
 ) -> SameArray:
     """Returns Σ_f weight_f / z^power · frame_f(u, v) at every voxel centre. z = (voxel's depth)/(detector's depth), 1 in a
     parallel beam.
 
     frames (F, rows, columns) are interpolated bilinearly, and 0 outside; pose (F, 12) mm; weight (F,). power: 2 for FDK's
-    distance weight, or 1. The volume (nz, ny, nx) float32 is on the device if ``frames`` are, else on the host. Raises
+    distance weight, or 1. is_even: all pixels are 1, but 0 in the first and last row; kernels for upright columns of voxels
+    then read no frames. The volume (nz, ny, nx) float32 is on the device if ``frames`` are, else on the host. Raises
     OutOfMemoryError if not even the smallest part of the volume fits."""
     matrices = voxel_matrices(pose, grid, is_parallel)
     block, leans = (0, False) if rt.pixel_items else _upright_block(matrices, grid)
     views = Views(frames, bool(block), matrices, weight)
     if block:
         name = "backproject_leaning" if leans else "backproject_upright"
-        volume = in_bricks(rt, views, grid, block, lambda *where: _upright(rt, name, power, block, *where))
+        volume = in_bricks(rt, views, grid, block, lambda *where: _upright(rt, name, power, block, is_even, *where))
     else:
         volume = in_bricks(rt, views, grid, 1, lambda *where: _general(rt, power, *where))
     return cast(SameArray, volume)
@@ -166,11 +167,13 @@ def _lines(rt: Runtime, power: int, is_turned: bool, images: Arguments, brick: B
               samples=LINE_SAMPLES * nx * ny * nz * int(images[3]))  # fmt: skip
 
 
-def _upright(rt: Runtime, name: str, power: int, block: int, images: Arguments, brick: Brick, volume: DeviceArray) -> None:
+def _upright(
+    rt: Runtime, name: str, power: int, block: int, is_even: bool, images: Arguments, brick: Brick, volume: DeviceArray
+) -> None:
     """Launches kernel ``name``, for upright columns of voxels. ``images`` holds transposed frames, so their width is the
-    number of detector rows."""
+    number of detector rows. is_even: as in ``backproject``."""
     nz, ny, nx = brick.shape
-    sizes = {"BLOCK_VOXELS": _BLOCK_VOXELS, "COLUMN_ROWS": _COLUMN_ROWS}
+    sizes = {"BLOCK_VOXELS": _BLOCK_VOXELS, "COLUMN_ROWS": _COLUMN_ROWS} | ({"EVEN_ROWS": 1} if is_even else {})
     kernel = rt.kernel("backproject", name, **_defines(power), **sizes)
     image, table, weights, views, columns, rows, *rest = images
     data = (image, table, weights, views, rows, columns, *rest)

@@ -48,6 +48,11 @@ def test_frames(any_rt, make_geometry: Geometries, shape) -> None:
         pose[:, 9:12] += tilt * pose[:, 6:9]
         expected = backprojection(frames, pose, weight, GRID, power=power)
         assert_same(backproject(any_rt, frames, pose, weight, GRID, power=power), expected)
+        if shape[0] > 2:
+            even = np.ones_like(frames)
+            even[:, [0, -1]] = 0
+            expected = backprojection(even, pose, weight, GRID, power=power)
+            assert_same(backproject(any_rt, even, pose, weight, GRID, power=power, is_even=True), expected)
 
 
 LANES = [8, *(pytest.param(n, marks=pytest.mark.slow) for n in (4, 16))]
@@ -63,6 +68,10 @@ def test_panels_rolled_and_tilted_to_either_side(lanes) -> None:
         cells = leaning(tables("static", shape, "rows", frames=2, direction=-1), roll_deg, tilt_deg)
         pose = np.concatenate([table.pose for table in cells])
         assert_same(backproject(rt, frames, pose, weight, grid), backprojection(frames, pose, weight, grid), 5)
+        even = np.ones_like(frames)
+        even[:, [0, -1]] = 0
+        found = backproject(rt, even, pose, weight, grid, is_even=True)
+        assert_same(found, backprojection(even, pose, weight, grid), 5)
 
 
 def test_rows_that_run_downwards_and_tall_detectors(two_rt, make_geometry: Geometries) -> None:

@@ -36,6 +36,7 @@ from phyradgs_cl.reconstructors.fdk.views import (
     Arc,
     RayWeight,
     check_beam,
+    extended,
     filled_gap_rad,
     opposite_weight,
     pose_of_pixels,
@@ -43,7 +44,6 @@ from phyradgs_cl.reconstructors.fdk.views import (
     view_angles,
     view_arc,
     warn_if_incomplete,
-    widened,
 )
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
@@ -188,49 +188,53 @@ def fdk_volume(
         else:
             frames, count = extrapolated(frames, extrapolate)
         # from here on the frames are those of a wider panel
-        pose, circle = widened(pose, axis, (count, count)), False
+        pose, circle = extended(pose, axis, (count, count)), False
         by_pixel, canonical, fan, arc = _seen(pose, frames, axis, is_parallel)
     shape = (frames.shape[1], frames.shape[2])
     warn_if_incomplete(arc, fan, canonical, grid, is_parallel)
     # only a full turn has the opposite rays that complete a displaced detector
     missing = fan.missing_columns if arc.is_full else (0, 0)
-    counted = opposite_weight(canonical, shape, arc, is_parallel)
     seen_mm = fan.half_rad if is_parallel else float(np.linalg.norm(canonical[0, 0, 0, :2]) * np.sin(fan.half_rad))
     travels = travel.travels(by_pixel, shape[0], is_parallel)
     ends = [] if travels or moving is not None else travel.ends(pose, shape[0], grid, seen_mm, is_parallel)
-    filtered = _filtered(frames, ray_weight(canonical, shape, arc, fan, is_parallel), missing, window, 1 if ends else 0)
-    of_frames = pose = widened(pose, axis, missing)
-    if ends:
-        pose = travel.with_rows(pose, axis, 1)
-
-    def of_views(
-        images: np.ndarray, views: np.ndarray, grid: Grid = grid, pose: np.ndarray = pose, power: int = 2
-    ) -> np.ndarray:
-        share, one = 0.5 * arc.gap_rad[views], pose[views]  # 0.5, because a full turn measures every ray twice
-        if moving is not None and power == 2:
-            return moving.of_views(views)(images, one, share, grid, axis, is_parallel=is_parallel)
-        if pose.ndim == 2:
-            return backproject(rt, images, one, share, grid, is_parallel=is_parallel, power=power)
-        return backproject_lines(rt, images, one, share, grid, axis, is_parallel=is_parallel, power=power)
-
+    spare = 1 if ends else 0
+    filtered = _filtered(frames, ray_weight(canonical, shape, arc, fan, is_parallel), missing, window, spare)
+    pose, share = extended(pose, axis, missing), 0.5 * arc.gap_rad  # 0.5, because a full turn measures every ray twice
+    taller = extended(pose, axis, (spare, spare), "rows")
+    of_views = partial(_of_views, rt, taller, share, grid, axis, is_parallel, moving)
     if travels:
+        counted = opposite_weight(canonical, shape, arc, is_parallel)
         volume = travel.seen_volume(
             filtered, pose, axis, grid, fan.is_displaced, is_parallel, counted, of_views, partial(of_views, power=1)
         )
     else:
         volume = of_views(filtered, np.arange(len(filtered)))
-        middle = of_frames if of_frames.ndim == 2 else of_frames[:, of_frames.shape[1] // 2]
-        weight = np.array([np.mean(counted(view)) for view in range(len(filtered))]) if ends else np.empty(0)
+    if ends:  # one row's poses tell which slices a view sees, and how much the view counts
+        middle = pose if pose.ndim == 2 else pose[:, pose.shape[1] // 2]
+        counted = opposite_weight(canonical[:, [canonical.shape[1] // 2]], (1, shape[1]), arc, is_parallel)
+        weight = share * [np.mean(counted(view)) for view in range(len(filtered))]
         for start, stop in ends:
             slab = grid.part((start, 0, 0), (stop - start, *grid.shape[1:]))
-            volume[start:stop] *= travel.all_over_seen(
-                middle, shape, weight, 0.5 * arc.gap_rad, slab, is_parallel, of_views
-            )
+            volume[start:stop] *= travel.all_over_seen(rt, middle, shape, weight, slab, is_parallel)
     if circle:
         _, y_mm, x_mm = grid.axes_mm()
         radius_mm = seen_mm + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # up to the edge of the last pixel
         volume[:, np.hypot(y_mm[:, None], x_mm) > radius_mm] = 0
     return volume
+
+
+def _of_views(
+    rt: Runtime, pose: np.ndarray, share: np.ndarray, grid: Grid, axis: str, is_parallel: bool,
+    moving: MovingBackprojector | None, images: np.ndarray, views: np.ndarray, power: int = 2,
+) -> np.ndarray:  # fmt: skip
+    """Backprojects ``images`` (n, rows, columns) of the numbers ``views`` (n,), weighted by ``share`` (F,). Other arguments:
+    as in ``fdk_volume``. power: of the distance weight. With 1 a moving object counts as at rest."""
+    one, factor = pose[views], share[views]
+    if moving is not None and power == 2:
+        return moving.of_views(views)(images, one, factor, grid, axis, is_parallel=is_parallel)
+    if pose.ndim == 2:
+        return backproject(rt, images, one, factor, grid, is_parallel=is_parallel, power=power)
+    return backproject_lines(rt, images, one, factor, grid, axis, is_parallel=is_parallel, power=power)
 
 
 def _seen(

@@ -25,7 +25,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.operators.rays.subrays import subrays_of
-from phyradgs_cl.reconstructors.fdk.views import widened
+from phyradgs_cl.reconstructors.fdk.views import extended
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Report
 from phyradgs_cl.reconstructors.voxels import fista_tv
 from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions
@@ -106,7 +106,7 @@ def reprojected(
     volume (nz, ny, nx) in 1/mm; pose (F, 12) or (F, lines, 12) in mm, with a pose for every line along ``axis``."""
     rows, columns = frames.shape[1:]
     count = _columns_beyond(pose.reshape(-1, 12), columns, grid, is_parallel)
-    wide = widened(pose, axis, (count, count))
+    wide = extended(pose, axis, (count, count))
     by_line = wide[:, None] if wide.ndim == 2 else wide
     shape = rows, columns + 2 * count
     lines = shape[axis == "columns"]

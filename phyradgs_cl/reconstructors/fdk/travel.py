@@ -13,9 +13,11 @@ from collections.abc import Callable
 import numpy as np
 
 from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import backproject
 from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.reconstructors.fdk import weights
-from phyradgs_cl.reconstructors.fdk.views import pose_of_pixels, view_angles
+from phyradgs_cl.reconstructors.fdk.views import extended, pose_of_pixels, view_angles
+from phyradgs_cl.runtime import Runtime
 
 log = logging.getLogger(__name__)
 
@@ -65,13 +67,13 @@ def still_along_z(canonical: np.ndarray, is_parallel: bool) -> np.ndarray:
 
 def seen_volume(
     frames: np.ndarray, pose: np.ndarray, axis: str, grid: Grid, is_displaced: bool, is_parallel: bool,
-    counted: Callable[[int], np.ndarray | float], backproject: Backproject, backproject_seen: Backproject,
+    counted: Callable[[int], np.ndarray | float], of_views: Backproject, of_views_seen: Backproject,
 ) -> np.ndarray:  # fmt: skip
     """Returns the volume (nz, ny, nx) of filtered frames (F, rows, columns) in which every voxel counts the views that see
     it.
 
     pose (F, 12) or (F, lines, 12) mm. counted: gives a view's redundancy weights (rows, columns). Both backprojections
-    weight each view by the angle for which it stands. ``backproject_seen`` divides by the distance, not by its square."""
+    weight each view by the angle for which it stands. ``of_views_seen`` divides by the distance, not by its square."""
     by_pixel, shape = pose_of_pixels(pose, axis), frames.shape[1:]
     angle_rad, pace = _directions(by_pixel[:, [by_pixel.shape[1] // 2]], shape, is_parallel)
     turn_rad = 2 * np.pi if is_displaced else np.pi  # a centred panel measures every ray in half a turn
@@ -89,42 +91,32 @@ def seen_volume(
         if not views.size:
             continue
         weight = (part[views] * row_weight).astype(np.float32)
-        values = backproject(frames[views] * weight, views)
+        values = of_views(frames[views] * weight, views)
         for i, view in enumerate(views.tolist()):
             weight[i] *= pace[view] * counted(view)
-        seen = backproject_seen(weight, views) * np.float32(2 / width_rad)
+        seen = of_views_seen(weight, views) * np.float32(2 / width_rad)
         volume += values / np.maximum(seen, _LEAST_SHARE) * np.float32(2 * np.pi / turn_rad)
         covered += np.minimum(seen / _LEAST_SHARE, 1)
     _warn_if_unseen(covered / classes, name, "a" if is_displaced else "half a")
     return volume * np.divide(classes, covered, out=np.zeros_like(covered), where=covered > 0)
 
 
-def with_rows(pose: np.ndarray, axis: str, count: int) -> np.ndarray:
-    """Returns the poses (F, 12), or (F, lines, 12) along ``axis``, of a panel with ``count`` more rows at both ends."""
-    if pose.ndim == 3 and axis == "rows":
-        pose = np.pad(pose, ((0, 0), (count, count), (0, 0)), mode="edge")
-    moved = pose.copy()
-    moved[..., 3:6] -= count * pose[..., 9:12]
-    return moved
-
-
 def all_over_seen(
-    pose: np.ndarray, shape: tuple[int, int], weight: np.ndarray, share: np.ndarray, grid: Grid, is_parallel: bool,
-    backproject: Callable[..., np.ndarray],
-) -> np.ndarray:  # fmt: skip
-    """Returns the factor (nz, ny, nx) for voxels that some views miss: the sum of all views' weights over that of the views
-    which see the voxel, at most 2. Rows count less and less up to one row beyond the panel.
+    rt: Runtime, pose: np.ndarray, shape: tuple[int, int], weight: np.ndarray, grid: Grid, is_parallel: bool
+) -> np.ndarray:
+    """Returns the factor (nz, ny, nx) for voxels that some views miss, at most 2: (sum of all views' weights)/(sum of the
+    weights of the views that see the voxel). Up to one row beyond the panel a view counts less and less.
 
-    pose (F, 12) in mm of a panel of ``shape``; weight (F,): of redundancy; share (F,): the angle for which ``backproject``
-    lets a view stand. It takes frames, their numbers, grid and poses."""
+    pose (F, 12) in mm of a panel of ``shape`` (rows, columns); weight (F,): the views' factors in the backprojection."""
     rows, columns = shape
     wide = pose.copy()  # three columns so wide that every voxel projects into them
     wide[:, 3:6] += ((columns - 1) / 2 - _ENDLESS) * pose[:, 6:9]
     wide[:, 6:9] *= _ENDLESS
     ones = np.zeros((len(pose), rows + 2, 3), np.float32)
-    ones[:, 1:-1] = weight[:, None, None]
-    seen = backproject(ones, np.arange(len(pose)), grid, with_rows(wide, "rows", 1))
-    of_all = _distance_weights(pose, weight * share, grid, is_parallel)
+    ones[:, 1:-1] = 1
+    taller = extended(wide, "rows", (1, 1), "rows")
+    seen = backproject(rt, ones, taller, weight, grid, is_parallel=is_parallel, is_even=True)
+    of_all = _distance_weights(pose, weight, grid, is_parallel)
     enough = np.maximum(seen, _ENOUGH * of_all)
     return np.divide(of_all, enough, out=np.zeros_like(seen), where=enough > 0)
 

@@ -256,14 +256,15 @@ def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc, is_parallel:
     return angle_rad + azimuth_rad(pose)
 
 
-def widened(pose: np.ndarray, axis: str, missing: tuple[int, int]) -> np.ndarray:
-    """Returns the poses of frames with ``missing`` (first, last) more columns at their ends."""
-    if missing == (0, 0):
+def extended(pose: np.ndarray, axis: str, more: tuple[int, int], side: str = "columns") -> np.ndarray:
+    """Returns the poses (F, 12), or (F, lines, 12) along ``axis``, of frames with ``more`` (first, last) columns or rows at
+    their ends. side: "columns" or "rows"."""
+    if more == (0, 0):
         return pose
-    if pose.ndim == 3 and axis == "columns":
-        pose = np.pad(pose, ((0, 0), missing, (0, 0)), mode="edge")
+    if pose.ndim == 3 and axis == side:
+        pose = np.pad(pose, ((0, 0), more, (0, 0)), mode="edge")
     moved = pose.copy()
-    moved[..., 3:6] -= missing[0] * pose[..., 6:9]
+    moved[..., 3:6] -= more[0] * (pose[..., 6:9] if side == "columns" else pose[..., 9:12])
     return moved
 
 
