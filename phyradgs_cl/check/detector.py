@@ -44,7 +44,7 @@ class CountReader:
     ) -> tuple[np.ndarray, np.ndarray]:
         if quantity == "counts":
             frames = data[image_key == 0]
-            self.ceiling = float(data[image_key != 2].max())
+            self.ceiling = float(data[(image_key == 0) | (image_key == 1)].max())
             self.at_ceiling = clustered_share(frames == self.ceiling)
         return counts_to_attenuation(data, image_key, quantity)
 

@@ -156,7 +156,9 @@ class Places:
         """Reads angles in rad, sign as stored, of the frames in ``used``, bool (F,), unless the options state them. usual:
         the format's address of angles. unit: the angles' unit if the file states none."""
         quantity = replace(ANGLE, assumed=unit)
-        asked = [options.angles] if options.angles and is_address(options.angles) else self.stated.get("angles", ())
+        asked = [options.angles] if options.angles else self.stated.get("angles", ())
+        if options.angles and not is_address(options.angles):
+            asked = []  # ``angle_rad`` reads the option: a range or a text file
         for text in asked:
             with self.opened("angles", text) as (source, address):
                 return h5.read_per_frame(source, address, used, quantity)

@@ -165,6 +165,9 @@ def test_counts_at_the_ceiling_are_seen_on_reading_or_believed_of_an_import(clea
     counts(data, key, "counts")
     assert counts.ceiling == 65535 and counts.at_ceiling > 0.01
     assert check_saturation(clean, counts).verdict == SUSPICIOUS
+    invalid = np.full_like(data[:1], 65535)
+    counts(np.concatenate([np.minimum(data, 60_000), invalid]), np.r_[key, 3], "counts")
+    assert counts.ceiling == 60_000 and counts.at_ceiling > 0.01
     counts = CountReader()
     noise = np.random.default_rng(0).poisson(data * 0.1)
     counts(noise.astype(np.uint16), key, "counts")

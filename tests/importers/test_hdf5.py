@@ -205,7 +205,8 @@ def test_data_exchange_of_beamlines(tmp_path, added, side_mm, caplog) -> None:
     assert "no angles: 0° to 180°" in caplog.text
     expected = np.log((np.array([50000 - 10000 / 12, 40000 + 10000 / 12]) - 100) / 19900)  # within the first and last
     np.testing.assert_allclose(scan.projections[[0, -1], 0, 0], expected, rtol=1e-3)
-    turned = import_scan(path, ImportOptions(quantity="counts", angles="0,30"))
+    stated = ImportOptions(quantity="counts", angles="0,30", at=("angles=/exchange/nothing",))
+    turned = import_scan(path, stated)  # --angles comes before --at
     last_deg = abs(float(np.rad2deg(turned.trajectory.angle_rad(5, np.array([5.0])))[0]))
     assert last_deg % 360 in (pytest.approx(150), pytest.approx(210))
 
