@@ -9,8 +9,8 @@ from phyradgs_cl.acquisition.readout import FIRST_LINES, Readout
 from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")
-_STEPS = 1000  # least exposure / rounding of float64 times: parts of an exposure are then exact to a thousandth
-_DARK = 1e-9  # a line lit for less than this fraction of the longest lit time counts as missed by the pulsed beam
+_STEPS = 1000  # least (exposure) / (float64 spacing at the scan's latest time), to resolve a thousandth of the exposure
+_DARK = 1e-9  # a line that is lit for at most this fraction of the longest-lit line's time counts as dark
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,10 @@ FINE_COLUMNS = 32  # most blocks of pixels along the panel's longer side, for fi
 SMOOTHING = 0.8  # standard deviation, in blocks, of the Gaussian that smooths frames before pixels are averaged
 _LEAST_VALID = 0.5  # a block with a smaller fraction of valid pixels is masked
 _MOST_VOXELS = 64  # most voxels along the grid's longest side, without the margin
-_MARGIN = 1  # voxels of air added on each side: without them a large object fits best with too small a pixel size
-_OBJECT_SHARE = 0.02  # a column shows the object if its largest line integral is above this fraction of the scan's largest
+_MARGIN = 1  # voxels of air on each side of a grid: without them, too small a pixel size fits a large object best
+_OBJECT_SHARE = 0.02  # a column shows the object if (its largest line integral) / (the scan's largest) is above this
 _LEAST_COLUMNS = 12  # least number of blocks from left to right, if the panel has at least as many columns
-_NARROW = 3  # a block's side is divided by this on a panel lower than two blocks, because one row of blocks tells little
+_NARROW = 3  # divides a block's side if the panel is lower than two blocks, because one row of blocks tells little
 
 
 def coarse(scan: Scan, columns: int) -> Scan:

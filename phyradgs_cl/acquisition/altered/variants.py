@@ -86,8 +86,8 @@ class MappedTrajectory:
 
 
 def altered_trajectory(scan: Scan) -> AlteredTrajectory:
-    """Returns the scan's trajectory as an ``AlteredTrajectory`` whose fields ``dataclasses.replace`` can change. A
-    trajectory of another class becomes its ``base``, as yet unaltered."""
+    """Returns the scan's trajectory as an ``AlteredTrajectory``, whose fields ``dataclasses.replace`` can change. A
+    trajectory of another class becomes the ``base`` of one without changes."""
     trajectory = scan.trajectory
     if isinstance(trajectory, AlteredTrajectory):
         return trajectory
@@ -140,7 +140,8 @@ def stretched(scan: Scan, v: float, u: float) -> Scan:
         pose[..., _ROW_STEP] *= v
         return pose
 
-    half_mm = columns * scan.geometry.pixel_size_mm[1] / 2 + abs(scan.geometry.detector_offset_mm[1])  # far edge
+    # the distance from the central ray to the panel's farther edge
+    half_mm = columns * scan.geometry.pixel_size_mm[1] / 2 + abs(scan.geometry.detector_offset_mm[1])
     share = max(scan.grid.size_mm[1:]) * scan.geometry.magnification / (2 * u * half_mm)
     grows = abs(math.log(share * u)) < abs(math.log(share))
     z, y, x = scan.grid.voxel_size_mm
