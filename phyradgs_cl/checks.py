@@ -43,8 +43,8 @@ def within(subject: str, value: float, lowest: float, highest: float) -> None:
 def option(default: T, help: str = "", usual: bool | str = True, **known: Any) -> T:
     """Returns a dataclass field for an option, with its help text and its limits.
 
-    usual: the default in words, for help texts; True shows ``default``. known: the limits ``range`` (lowest, highest),
-    ``words`` and ``is_positive`` and their messages' ``subject`` (``fields_within``), or settings of a Typer option."""
+    usual: the default in words, for help texts; True shows ``default``. known: limits for ``fields_within``, as ``range``
+    (lowest, highest), allowed ``words`` and ``is_positive``, its ``subject``, and the command option's ``metavar``."""
     return field(default=default, metadata={"help": help, "usual": usual, **known})
 
 
@@ -54,7 +54,7 @@ def ranged(default: T, lowest: float, highest: float, subject: str = "") -> T:
 
 
 def fields_within(named: str | Callable[[str], str], options: object) -> None:
-    """Raises InputError if a field of the dataclass ``options`` breaks the limits given to ``option``. None breaks none.
+    """Raises InputError if a field of the dataclass ``options`` is not None and breaks the limits given to ``option``.
 
     Fields of base classes are checked too, and each number of a tuple. named: the text before a field's name in messages,
     or a function that takes the field's name and returns the message's subject."""
@@ -193,7 +193,7 @@ def short_repr(value: object) -> str:
 
 
 def is_number(value: object) -> bool:
-    """Returns whether ``value`` is a finite number. A bool is not."""
+    """Returns whether ``value`` is a finite number. A bool does not count as a number."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return False
     return isinstance(value, int) or math.isfinite(value)  # isfinite raises for an int too large for a float

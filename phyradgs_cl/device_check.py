@@ -65,7 +65,7 @@ class Verdict:
 
 
 def check_device(device: str | None = None, **launch_shape: bool | int) -> Verdict:
-    """Builds and runs every kernel on a device and compares it with its twin. ``launch_shape``: options of Runtime."""
+    """Builds and runs every kernel on ``device`` (None: the best) and compares it with its twin. Others: as in Runtime."""
     agreeing: set[str] = set()
     failures: list[str] = []
     limits: dict[str, int] = {}
@@ -382,8 +382,7 @@ def _tables(orbit: CircularOrbit = ORBIT) -> tuple[TimeCells, TimeCells, TimeCel
 def _differences(
     function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, h: np.ndarray | float = 1.0
 ) -> np.ndarray:
-    """Returns the derivatives (11, G) of the sum Σ ``h`` · ``function(rows)`` by the parameters ``rows`` of G Gaussians, as
-    central differences."""
+    """Returns derivatives (11, G) of Σ ``h`` · ``function(rows)`` by the Gaussians' ``rows``, by central differences."""
     result = np.zeros_like(rows)
     for index in np.ndindex(*rows.shape):
         ends = []

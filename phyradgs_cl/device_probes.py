@@ -14,7 +14,7 @@ LASTING_S = 0.1, 1.0, 3.0
 # Largest relative error of sums of float pairs. If a compiler simplifies the pairs away, the error is a float's: 6e-8.
 PAIRS = 1e-12
 _ITEMS = 32  # number of work-items in a work-group of the probes
-_TRIED_STEPS = 1 << 14  # multiply-adds of a first short launch; its time gives the number for a launch of wanted duration
+_TRIED_STEPS = 1 << 14  # multiply-adds of a first short launch; its time per step gives the steps of longer launches
 
 
 def pair_error(rt: Runtime) -> float:

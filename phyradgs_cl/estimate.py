@@ -90,8 +90,7 @@ class _Trials:
         self.scan, self.plan, self.rt = scan, plan, rt
 
     def run(self, iterations: int | None) -> float:
-        """Runs the plan with the given number of ``iterations``; None runs it as a whole. Returns the seconds that it
-        took."""
+        """Runs the plan with ``iterations`` iterations; None runs it as a whole. Returns the seconds that the run took."""
         options = self.plan.options
         plan = self.plan if iterations is None else replace(self.plan, options=shortened(options, iterations))
         self.rt.reset_peak()
@@ -120,8 +119,7 @@ class _Trials:
         return float(self.result.facts.get("density_control_seconds", 0.0))
 
     def _rounds_due(self, total: int) -> float:
-        """Returns (rounds of density control in a run of ``total`` iterations) / (rounds in the last trial); 0 if the trial
-        had none."""
+        """Returns (rounds of density control in ``total`` iterations) / (rounds in the last trial); 0 if the latter is 0."""
         rounds = self.result.facts.get("density_control_rounds", 0)
         return sum(self.plan.options.control.is_due(i, total) for i in range(1, total + 1)) / rounds if rounds else 0.0
 

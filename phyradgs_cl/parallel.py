@@ -43,8 +43,8 @@ class Launch:
 
 
 def launched(environment: Mapping[str, str] = os.environ) -> Launch:
-    """Reads from environment variables how mpiexec (MPICH, Open MPI, MVAPICH, Intel MPI) or srun launched this process; one
-    that neither launched has rank 0 of 1."""
+    """Reads from environment variables how mpiexec (MPICH, Open MPI, MVAPICH, Intel MPI) or srun launched this process.
+    Without either, the process has rank 0 of 1."""
     for names in _LAUNCHERS:
         rank, size, local_rank, local_size = (_count(environment.get(name)) for name in names)
         if rank is None or size is None or size < 2:
@@ -181,7 +181,7 @@ def launched_ranks() -> Communicator:
 
 @contextmanager
 def failing_together(ranks: Communicator, report_error: Callable[[BaseException], int]) -> Iterator[None]:
-    """Lets an exception of the body pass if all ranks have one. If only some fail, reports it and ends all ranks,
+    """Lets an exception of the body pass if all ranks have one. If only some have one, reports it and ends all ranks,
     because the others would wait for ever.
 
     ``report_error`` prints the error and returns the exit status."""

@@ -70,7 +70,7 @@ def repr_of_changes(thing: Any) -> str:
 
 
 def value_text(value: Any, digits: int = 6) -> str:
-    """Returns a value for a reader: numbers with ``digits`` significant digits, tables as "name value, name value". Entries
+    """Returns a value as text: numbers with ``digits`` significant digits, tables as "name value, name value". Entries
     of a table that are None are left out, and tables in it get parentheses. Of a list with more than 8 values, the text has
     their number, the first and the last."""
     match value:
@@ -125,7 +125,7 @@ def each_warning_once() -> Any:
 
 
 def without_warnings() -> AbstractContextManager[None]:
-    """Returns a context that drops this package's warnings. For an outer ``each_warning_once`` they were not yet given."""
+    """Returns a context that drops this package's warnings. An outer ``each_warning_once`` does not count them as given."""
     return _filtered(lambda: lambda record: not _is_warning(record))
 
 

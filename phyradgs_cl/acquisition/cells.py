@@ -16,7 +16,7 @@ _SAME_TIME = 1e-6  # two times that differ by less than this fraction of a cell'
 _NOTHING = 1e-9  # if a cell has a smaller fraction of a line's exposure, this is a rounding error and becomes 0
 _INSTANT = 1e-9  # an exposure up to this fraction of the time from a frame's first light to its last counts as a moment
 _OVERHANG = 0.1  # a line leaves out its first or last segment if the exposure covers at most this fraction of the segment
-_TURN_SAMPLES = 32  # intervals between a frame's first and last light: the largest mean speed of them is the highest speed
+_TURN_SAMPLES = 32  # intervals of a frame's exposure whose largest mean speed counts as the gantry's highest speed
 _TURN_FACTOR = 0.32  # measured (relative RMS error of a frame) / (gantry's turn in a segment, in rad)²
 _HARMLESS_PEAK = 4.0  # up to this line integral, averaging intensities needs no more segments than averaging line integrals
 _MOST_SEGMENTS = 1000  # most segments that ``segments_for`` chooses for a frame
@@ -113,7 +113,7 @@ def common_time_cells(
 
 @lru_cache(maxsize=8)  # the lines' windows are the same in all frames of a scan
 def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray, Served]:
-    """Returns the edges (K + 1,) in s of K cells, the fraction (K, lines) of each line's window in each, and the ``Served``.
+    """Returns the edges (K + 1,) in s of K cells, the fraction (K, lines) of each line's window in each, and ``Served``.
 
     windows: the windows (lines, 2) in s after a frame's start, as bytes, because the cache takes no arrays as keys. The
     returned arrays stay in the cache: do not write to them."""

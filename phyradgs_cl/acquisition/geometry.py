@@ -245,7 +245,7 @@ def _travel_mm(poses: np.ndarray, geometry: Geometry) -> tuple[float, float]:
 
 
 def check_distances(geometry: Geometry, grid: Grid) -> None:
-    """Raises InputError for a source more than 1e6 voxels from the axis, at which float32 misplaces rays."""
+    """Raises InputError for a cone beam's source over 1e6 voxels from the axis: farther away, float32 misplaces rays."""
     if isinstance(geometry, ParallelGeometry):
         return
     source_mm, voxel_mm = geometry.source_to_axis_mm, min(grid.voxel_size_mm)

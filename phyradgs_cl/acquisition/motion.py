@@ -25,9 +25,9 @@ RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator that a model may suit: projectors of voxels, of Gaussians, and filtered backprojection."""
 _USUAL_TIMES = 6  # most times of an exposure for ``PerRow``, unless rim or object moves over _COARSE_STEP_VOXELS between two
 _MOST_TIMES = 100  # most times of an exposure for ``PerRow``, however fast the motion
-_FINE_STEP_VOXELS = 0.3  # most voxels that the volume's rim moves from one time of ``PerRow`` to the next, if 6 suffice
-_OBJECT_STEP_VOXELS = 0.7  # as the line above, for an object's fastest part; the limit is larger as other parts move less
-_COARSE_STEP_VOXELS = 3.6  # most voxels that rim or object moves from one time of ``PerRow`` to the next, if 100 suffice
+_FINE_STEP_VOXELS = 0.3  # most voxels that the volume's rim moves between two times of ``PerRow``, if six times suffice
+_OBJECT_STEP_VOXELS = 0.7  # most voxels that an object's fastest part moves between two times, if six times suffice
+_COARSE_STEP_VOXELS = 3.6  # most voxels that rim or object moves between two times of ``PerRow``, if 100 times suffice
 _SUB_INTERVALS = "Sub-intervals N of an exposure; for phyradgs means micro-views."
 _WEIGHT_TOLERANCE = 1e-3  # largest |(sum of a line's weights) − 1| that is accepted from a user-defined model
 
@@ -135,8 +135,7 @@ class Centres(MicroViews):
     name: str = field(default="centres", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """Returns the ``TimeCells`` of one frame: strips × sub-intervals cells with the ``conic_pose`` that all of them
-        share."""
+        """Returns the ``TimeCells`` of one frame: strips × sub-intervals cells with one ``conic_pose`` for all of them."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         return cells.centre_cells(*_place(scan, frame), self.strips, self.sub_intervals)
@@ -224,7 +223,7 @@ class Exact(_Model):
 
     def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
         """Returns the ``TimeCells`` of one frame, one per segment. intensity_peak: the largest line integral if the detector
-        averages intensities, else 0. More segments are needed above 4."""
+        averages intensities, else 0. A peak above 4 needs more segments."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = _place(scan, frame)

@@ -213,8 +213,8 @@ def question_unit(angle_rad: np.ndarray, subject: str, unit: str) -> None:
 
 
 def _check_panel(geometry: Geometry, named: Named) -> None:
-    """Raises InputError for too wide a fan or cone. The message names the distances if the panel is too near and the pixels
-    are not too large; else it names the pixels."""
+    """Raises InputError for a fan or cone above 120°. The message names the distances if the panel is less than 10 mm from
+    the source and pixels are at most 5 mm large; else it names the pixels."""
     widest_deg = max(_cone_deg(geometry))
     if isinstance(geometry, ParallelGeometry) or widest_deg <= _WIDEST_DEG:
         return

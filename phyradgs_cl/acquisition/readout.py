@@ -77,7 +77,7 @@ def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named 
 
 
 def check_readout(readout_ms: float | None, readout_ratio: float | None, fps: float | None, named: Named = str) -> None:
-    """Raises InputError for a ratio outside 0 to 1000 or a time below 0, for both together, and for a time without fps."""
+    """Raises InputError for ``readout_ratio`` outside 0 to 1000, ``readout_ms`` below 0, without ``fps`` or with a ratio."""
     if readout_ratio is not None:
         checks.within(named("readout_ratio"), readout_ratio, 0, 1000)
     if readout_ms is None:

@@ -187,8 +187,7 @@ class Scan:
         return self.shutter.lines(self.geometry.detector_shape)
 
     def on_grid(self, grid: Grid) -> "Scan":
-        """Returns the scan with another grid. True volumes are cut to the new grid if it is a part of the old one, else
-        dropped."""
+        """Returns the scan on ``grid``. True volumes are cut to a ``grid`` that is a part of the scan's, else dropped."""
         if grid == self.grid:
             return self
         part = grid.slices_in(self.grid)

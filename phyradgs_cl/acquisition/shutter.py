@@ -50,7 +50,7 @@ class Shutter:
             raise InputError("pulse_s", found, expected, "correct the pulse, or leave it out")
 
     def check_resolved(self, frame_start_s: np.ndarray, subject: str = "exposure_s") -> None:
-        """Raises InputError for an exposure above 0 that is less than 1000 float64 roundings of the latest time in the scan.
+        """Raises InputError if 0 < exposure < 1000 times the float64 spacing at the scan's latest time.
 
         frame_start_s (F,): when frames open, in s. subject: what the message names."""
         latest_s = float(np.max(np.abs(frame_start_s), initial=0.0)) + self.span_s

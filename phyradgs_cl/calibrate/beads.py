@@ -82,8 +82,7 @@ class BeadOperator:
 
 
 def _mean_of_clipped(p: np.ndarray, sigma: float) -> np.ndarray:
-    """Returns the mean of max(p + noise, 0) for normal noise of standard deviation ``sigma``. It is above p, most of all in
-    air."""
+    """Returns the mean of max(p + noise, 0) for normal noise of standard deviation ``sigma``; it exceeds p, most in air."""
     ratio = p / sigma
     return p * scipy.special.ndtr(ratio) + sigma * np.exp(-(ratio**2) / 2) / math.sqrt(2 * math.pi)
 
@@ -142,9 +141,9 @@ class _PanelLines:
     def _panel_axes(self) -> tuple[tuple[np.ndarray, ...], ...]:
         """Three vectors (N, 3), each with its inner products (N,) with the source and the first pixel, and its length (N,).
 
-        The first vector gives the ratio of two distances from the source along the panel's normal: a point's to the panel's.
-        The other two give the line and the pixel of the point's image. In a parallel beam the ratio counts as 1, and the
-        ray through the point makes the image."""
+        The first vector gives (a point's distance from the source) / (the panel's distance), both along the panel's normal.
+        The other two give the line and the pixel of the point's image. In a parallel beam the quotient counts as 1, and the
+        point's image is where its ray meets the panel."""
         normal = np.cross(self.line_step, self.pixel_step)
         to_panel = self.source if self.is_parallel else self.first - self.source
         vectors = [normal / np.sum(normal * to_panel, -1, keepdims=True)]
@@ -273,8 +272,7 @@ class BeadProblem(CoarseFrames):
         return np.array([pixel_mm / (max(scan.grid.size_mm) / 2)] * 3 + [pixel_mm] * 3 + [1.0])
 
     def _signals(self, operator: BeadOperator, placement: np.ndarray) -> np.ndarray:
-        """Returns the transposed Jacobian, (7, F · pixels): d(compared)/d(placement / ``_units``), by central
-        differences."""
+        """Returns the transposed Jacobian (7, F · pixels), d(compared)/d(placement / ``_units``), by central differences."""
         signals = []
         for number, unit in enumerate(self._units()):
             step = np.eye(DENSITY + 1)[number] * _STEP_PX * unit

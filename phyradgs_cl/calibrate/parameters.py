@@ -74,14 +74,13 @@ def _pitch_mm(scan: Scan) -> float:
 
 
 def _edge_pixels(scan: Scan, factor: float = 1.0) -> float:
-    """Returns ``factor`` times the number of pixels by which a roll of 1 rad moves the panel's edges farthest from its
-    middle."""
+    """Returns ``factor`` × (number of pixels by which a roll of 1 rad moves the panel's edge farthest from the middle)."""
     return factor * max(_half_mm(scan, 0), _half_mm(scan, 1)) / _pitch_mm(scan)
 
 
 def _tilt_pixels(axis: int) -> Callable[[Scan], float]:
     """Returns a function of the scan: by how many pixels a tilt of 1 rad moves the panel's edge at the end of v (``axis`` 0)
-    or u (``axis`` 1). A tilt magnifies one side, so points move in proportion to their squared distance from its axis."""
+    or u (``axis`` 1). A tilt magnifies one side, and moves a point in proportion to (distance from the tilt's axis)²."""
     return lambda scan: _half_mm(scan, axis) ** 2 / _cone(scan).source_to_detector_mm / _pitch_mm(scan)
 
 

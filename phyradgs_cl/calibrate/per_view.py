@@ -1,4 +1,4 @@
-"""Estimates errors of single views (a wobble), or an object that moves slowly (a motion), as splines of time.
+"""Estimates errors of single views (a wobble), or a slow motion of the object as splines of time.
 
 A view's parameters change only its own frame, so their signals (columns of the Jacobian) are images of that frame. CGLS
 solves the normal equations of a Gauss–Newton step for the volume and all parameters together. Parameters then explain only
@@ -248,8 +248,8 @@ def _signal(
 def _share(
     problem: CoarseProblem, operator: RayOperator, basis: np.ndarray, signals: np.ndarray, iterations: int
 ) -> float:
-    """Returns norm(part that no object explains) / norm, 0 to 1, of the change of frames by random coefficients 1 or −1 of
-    the basis (F, n), for the signals (F, rows, columns) of one kind."""
+    """Returns norm(part that no object explains) / norm(whole), 0 to 1, of a random change of the frames: the ``signals``
+    (F, rows, columns) of one kind times the views' values by random coefficients 1 or −1 of the ``basis`` (F, n)."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], basis.shape[1]).astype(np.float32)
     probe = signals * (basis @ signs).astype(np.float32)[:, None, None]
     (rest,) = problem.beyond_object(operator, np.zeros(operator.volume_shape, np.float32), [probe], iterations)

@@ -101,7 +101,7 @@ class PassCounter:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoarseFrames:
-    """``scans`` with fewer frames, full pixels and all line integrals 0, and their measurement in blocks of pixels.
+    """The stated ``scans`` with fewer frames, whose line integrals are 0 to save memory, and their measurement.
 
     measured (F, rows, columns): all scans' frames, in line integrals averaged over blocks of ``block`` × ``block`` pixels.
     valid, of the same shape: True for pixels to use; None: all. ``count_pass`` is called once per iteration, which projects

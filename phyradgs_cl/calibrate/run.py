@@ -1,9 +1,9 @@
 """Calibrates a scan from its own frames.
 
 The start is the axis that fits best and, for a known phantom, the place where its beads are seen. On request the readout's
-direction is tested, and single views or a motion are corrected first. The search (``search``) then estimates what is common
-to all views, from coarse to fine grids. After that, views or the motion are estimated again. Significant corrections enter
-the scan and its provenance. If no views were corrected, corrections that raise the residual are dropped."""
+direction is tested, and single views or a motion are corrected first. ``search.py`` then estimates what is common to all
+views, from coarse to fine grids. After that, views or the motion are estimated again. Significant corrections enter the
+scan and its provenance. If no views were corrected, corrections that raise the residual are dropped."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -274,8 +274,7 @@ class _Calibrator:
         return problem.residual(operator, problem.reconstruct(operator, None, stage.first))
 
     def _plan(self) -> dict[str, Passes]:
-        """Returns the phases in order, each with the largest number of its passes through the frames and their expected
-        cost."""
+        """Returns the phases in order, each with its largest number of passes through the frames and their expected cost."""
         second, last = self.stages[min(1, len(self.stages) - 1)], self.stages[-1]
         parameters, views, most_frames = len(self.request.parameters), (0, 0.0), MOST_FRAMES
         if self.per_view is not None:

@@ -34,21 +34,21 @@ _FEWEST_PIXELS = 32  # fewer valid coarse pixels per frame cannot tell one order
 _CLEAR = 0.5  # a hypothesis must leave less than this fraction of the stated scan's squared residual
 _NEARLY = 1.5  # a rough fit is refined unless (its squared residual) / (least squared residual of rough fits) exceeds this
 _ERRORS = 4.0  # a hypothesis must be better than the stated scan by this many standard errors
-# The object looks the same from every angle if the RMS residual in a random order is at most one of these two products.
-_SAME = 0.03  # times the standard deviation of the line integrals
-_NOISY = 1.6  # times the standard deviation of the noise: round objects had up to 1.3, others 2.3 or more
+# Limits of the RMS residual in a random order. Below either limit, the object looks the same from every angle.
+_SAME = 0.03  # an object looks alike from all angles below this (residual in a random order) / (σ of line integrals)
+_NOISY = 1.6  # an object looks alike from all angles below this (residual in a random order) / (noise): round ones had 1.3
 _MOST_REFINED = 2  # only this many hypotheses, the best ones, get a refined shift of the panel, which takes time
 _SHIFT_PENALTY = 1.5  # factor on a hypothesis's squared residual per coarse pixel of shift: stated offsets are mostly right
-# A frame is odd if |its mean line integral − median of its neighbours' means| exceeds both of these products.
-_DEVIATIONS = 12.0  # times the robust standard deviation of all frames' differences
-_LEAST_CHANGE = 0.75  # times the |median| of the frames' mean line integrals
+# An odd frame exceeds two limits of its change, which is |its mean line integral − median of its neighbours' means|.
+_DEVIATIONS = 12.0  # least (change of an odd frame's mean line integral) / (robust standard deviation of all changes)
+_LEAST_CHANGE = 0.75  # least (change of an odd frame's mean line integral) / |median of all frames' means|
 _REPEATED = 0.15  # a frame repeats the last one if (its change) / (least change between frames nearby) is below this
 _JUMP = 2.5  # an order jumps, as the golden angle does, if (its median step) / (median step of sorted angles) exceeds this
 _UNLIKE = 2.0  # where an order jumps, least (RMS difference of a repeated frame from the next view in angle) / (its median)
 _OUTLIER = 4.0  # least (RMS residual of an outlier) / (median RMS residual of the frames)
 # Frames at both ends of an arc may fit badly if the ratio of their residuals is below this: right frames had 1.4, odd 2.3.
 _ALIKE = 1.7
-# They also need (residual) / (residual in a random order) below this: right frames had 0.2, odd frames mostly 0.3.
+# Frames at both ends may fit badly only if (residual) / (that in a random order) is below this: right ones had 0.2, odd 0.3.
 _AT_BOTH_ENDS = 0.25
 _MOST_OUTLIERS = 0.2  # if this fraction of the frames or more are outliers, they have a common cause, and none is removed
 _EXCHANGED = 0.5  # two frames were exchanged if their exchange leaves less than this fraction of the squared residual
@@ -83,10 +83,9 @@ class _CoarseFit:
 
 
 def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
-    """Finds frames and hypotheses that explain why the frames of a coarse ``scan`` do not fit together.
+    """Finds whether the frames of a coarse ``scan`` fit together, and else frames and hypotheses that explain why not.
 
-    The finding's value is (residual in the stated order) / (residual in a random order), both RMS. as_stated: the full
-    scan."""
+    The finding's value is (RMS residual in the stated order) / (that in a random order). as_stated: the full scan."""
     pixels = float(scan.valid.sum()) / scan.frames
     if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"

@@ -106,8 +106,8 @@ def _jumps(p: np.ndarray, masked: np.ndarray) -> float:
 
 
 def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
-    """Returns the fraction of the pixels p (F, v, u) that have their least value over the frames, in three frames or more.
-    Counts of such pixels were clipped before the division by the flats.
+    """Returns the ``clustered_share`` of line integrals p (F, v, u) at their pixel's least value, for pixels that have this
+    value in three frames or more: their counts were clipped before the division by the flats.
 
     Pixels that never change do not count, because they are dead, nor line integrals of 0, which are noiseless air."""
     least = p.min(0)
@@ -118,8 +118,8 @@ def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
 def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
     """Finds dead pixels that are not masked yet. Returns the finding, and the map of dead pixels, bool (v, u).
 
-    A dead pixel always has the same value, or differs from its neighbours in nearly every frame. Suspicious are more than
-    0.02 % of dead pixels."""
+    A dead pixel always has the same value, or differs from its neighbours in nearly every frame. More than 0.02 % of dead
+    pixels are suspicious."""
     masked = ~scan.valid.any(0)
     if scan.frames < LEAST_FRAMES:
         text = f"fewer than {LEAST_FRAMES} frames"

@@ -18,8 +18,8 @@ _ERRORS = 4.0  # squared residuals of two hypotheses must differ by this many st
 # Least (squared residual of the wrong readout order) / (that of the right order). It may be near 1, because both orders have
 # equally many unknowns.
 _ORDER_RATIO = 1.04
-_OTHER_RATIO = 1.5  # least (squared residual as stated) / (that of another readout axis or time) to call the latter right
-# The same ratio for a gantry at rest. It is higher, because a model without blur always fits better, mostly with few views.
+_OTHER_RATIO = 1.5  # least (squared residual as stated) / (that of another readout axis or time) to call the other right
+# Least (squared residual as stated) / (that of a gantry at rest) to call rest right: models without blur always fit better.
 _REST_RATIO = 2.0
 _AS_GOOD = 1.15  # other readouts are named too if (their squared residual) / (that of the best readout) is at most this
 _READOUT_SHARE = 0.86  # if the stated readout is 0 s, this fraction of the shortest time between frames is tried
@@ -128,8 +128,7 @@ def _fits_worse(stated: np.ndarray, other: np.ndarray | None) -> bool:
 
 
 def _twice_as_long(rt: Runtime, scan: Scan) -> np.ndarray | None:
-    """Returns the frames' mean squared residuals (F,) with twice the exposure; None if a table of poses or angles ends too
-    early."""
+    """Returns the frames' mean squared residuals (F,) with twice the exposure; None if poses or angles end too early."""
     try:
         return _squares_exposed(rt, scan, 2.0)
     except InputError:

@@ -17,7 +17,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import triple
 
 _ORDER = ("channel", "angle", "projection", "vertical", "horizontal_y", "horizontal_x", "horizontal")
-_FLAT = np.array([0.0, 0.0, 1e-3])  # direction of the step to a next row in 2D: out of the plane, and short
+_FLAT = np.array([0.0, 0.0, 1e-3])  # the panel's direction to a next row in 2D: out of the plane, for a short step
 
 
 class ProjectionOperator(LinearOperator):

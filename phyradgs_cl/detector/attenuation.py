@@ -2,7 +2,7 @@
 
 The spectrum behind an aluminium filter follows Kramers' law (Phil. Mag. 46 (1923) 836), or SpekPy's tungsten anode
 (Poludniowski et al., Med. Phys. 48 (2021) 3630). Attenuation is interpolated in the logarithms of NIST's tables (Hubbell and
-Seltzer, NISTIR 5632). Very thin layers attenuate as stated, thick ones less per length, because the beam hardens."""
+Seltzer, NISTIR 5632). Thin layers keep their line integrals; thick ones attenuate less per length: the beam hardens."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -126,8 +126,8 @@ def without_lag(scan: Scan) -> Scan:
 
 
 def pixel_gains(shape: tuple[int, int], spread: float, rng: np.random.Generator) -> Array:
-    """Draws gains (v, u) of pixels with mean 1 and standard deviation ``spread``, at least 0.05. All pixels of a column share
-    a quarter of the variance."""
+    """Draws gains (v, u) of pixels with mean 1 and standard deviation ``spread``, at least 0.05. A quarter of the variance
+    is common to all pixels of a column."""
     own, column = rng.standard_normal(shape), rng.standard_normal((1, shape[1]))
     return np.maximum(1 + spread * (np.sqrt(0.75) * own + 0.5 * column), 0.05)
 

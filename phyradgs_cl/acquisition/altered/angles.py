@@ -33,8 +33,7 @@ def has_opposite_views(scan: Scan) -> bool:
 
 
 def exposure_arc_rad(scan: Scan) -> float:
-    """Returns the angle in rad that the gantry turns in one line's exposure in the scan's middle frame; 0 for a gantry at
-    rest."""
+    """Returns the angle in rad by which the gantry turns in a line's exposure, in the middle frame; 0 if it is at rest."""
     if not scan.is_fly:
         return 0.0
     frame = scan.frames // 2

@@ -155,7 +155,7 @@ def _binned_shutter(scan: Scan, block: int) -> tuple[Shutter, float]:
     shutter, lines = scan.shutter, scan.lines
     line_s = shutter.readout_s / max(lines - 1, 1)
     blocks = lines // block
-    dropped = lines - blocks * block if shutter.direction < 0 else 0  # such a panel reads the dropped lines first
+    dropped = lines - blocks * block if shutter.direction < 0 else 0  # direction −1 reads the dropped last lines first
     # a block of lines opens at the mean of its lines' opening times
     later_s = (dropped + (block - 1) / 2) * line_s
     pulse_s = shutter.pulse_s and (shutter.pulse_s[0] - later_s, shutter.pulse_s[1])

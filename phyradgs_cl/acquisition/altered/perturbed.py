@@ -35,8 +35,7 @@ class GeometryCorrection:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Corrections of single views: rotations (F,) about the axis in rad, and shifts (F, 2) of the panel along v and u in
-    mm."""
+    """Corrections of single views: turns (F,) about the axis in rad, and the panel's shifts (F, 2) along v and u in mm."""
 
     turn_rad: np.ndarray
     shift_mm: np.ndarray
@@ -93,8 +92,7 @@ class PerturbedTrajectory:
 
     @cached_property
     def _turn(self) -> np.ndarray:
-        """The panel's rotation (3, 3) by roll and tilts. Its columns are the new u, v and normal in the stated panel's
-        axes."""
+        """The panel's rotation (3, 3) by roll and tilts: its columns are the new u, v and normal in the stated axes."""
         angles_rad = [self.correction.tilt_u_rad, self.correction.tilt_v_rad, self.correction.roll_rad]
         return np.asarray(Rotation.from_rotvec(angles_rad).as_matrix())
 

@@ -161,8 +161,7 @@ def mirrored(scan: Scan, axis: str) -> Scan:
 def resized(scan: Scan, factor: float, keeps_axis: bool) -> Scan:
     """Returns a cone beam's scan with pixels ``factor`` times as large.
 
-    keeps_axis: True enlarges the panel about the central ray, as if distances had changed. False enlarges it about its
-    middle."""
+    keeps_axis: True enlarges the panel about the central ray, as if distances had changed; False, about its middle."""
     trajectory = altered_trajectory(scan)
     rows, columns = trajectory.panel
 
