@@ -26,7 +26,7 @@ def main() -> None:
     except KeyboardInterrupt:  # Ctrl-C while libraries load; later cli.py itself handles Ctrl-C
         sys.stderr.write("phyradgs: interrupted, nothing new written\n")
         status = 130
-    for number in (signal.SIGINT, signal.SIGTERM):  # a signal while the interpreter ends would print a traceback
+    for number in (signal.SIGINT, signal.SIGTERM):  # ignored: at the interpreter's end one would print a traceback
         signal.signal(number, signal.SIG_IGN)
     sys.exit(status)
 

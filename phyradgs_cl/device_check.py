@@ -208,7 +208,7 @@ def _voxels(rt: Runtime) -> Iterator[Comparison]:
 def _rays(rt: Runtime) -> Iterator[Comparison]:
     volume, frames = _noise(GRID.shape, 5), _noise((1, *SHAPE), 13)
     still, table, _ = _tables()
-    tall = (32, 5)  # enough lines to fill a CPU's widest vectors
+    tall = (32, 5)  # rows and columns: enough rows to fill a CPU's widest vectors
     orbit = CircularOrbit(ConeGeometry(5.0, 7.5, tall, (3.9 / 32, 4.1 / 5)), ConstantSpeed(0.3, 0.5))
     upright = static_cells(orbit, Shutter(0.8, 0.6), 0, 0.2, tall[0])
     common = common_time_cells(orbit, Shutter(0.8, 0.6), 0, np.array([0.2]), tall[0], 3)
@@ -233,7 +233,7 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
     yield rt.download(operator.adjoint(rt.upload(frames))), twins.ray_volume(shares, GRID, finer), VALUE
     intensity = operators.IntensityOperator(rt, GRID, SHAPE, [table])
     mean, averaged = (twins.ray_frame(volume, GRID, table, SHAPE, model) for model in ("log", "intensity"))
-    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # it averages intensities only after ``expected``
+    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # it averages line integrals until ``expected`` runs
     yield rt.download(intensity.expected(on_device))[0], averaged, VALUE
     found = rt.download(intensity.adjoint(rt.upload(frames)))
     yield found, twins.intensity_volume(frames[0], volume, GRID, table), VALUE

@@ -23,7 +23,7 @@ from phyradgs_cl.runtime import Runtime
 
 _SPLAT_TRIALS = (20, 200)  # iterations of the two short runs (trials) of methods with Gaussians
 _TRIALS = (1, 3)  # iterations of the two short runs of other methods, unless their options have ``TRIALS``
-_LEAST_DIFFERENCE_S = 0.3  # if the two trials' times differ by less, noise would count: the second trial is prolonged
+_LEAST_DIFFERENCE_S = 0.3  # if the two trials' times differ by less, the second is prolonged, since times are noisy
 _LONGEST_TRIAL = 200  # a trial of this many iterations is not prolonged, because estimating would take too long
 _FEWEST_BETWEEN = 5  # least number of iterations between rounds of density control in a trial
 
@@ -115,7 +115,7 @@ class _Trials:
 
     @property
     def _control_s(self) -> float:
-        """The seconds that the last run spent in density control, which do not count to the time of its iterations."""
+        """The seconds that the last run spent in density control, which do not count as time of its iterations."""
         return float(self.result.facts.get("density_control_seconds", 0.0))
 
     def _rounds_due(self, total: int) -> float:

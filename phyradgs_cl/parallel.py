@@ -82,7 +82,7 @@ class Communicator:
         """Replaces contiguous ``values`` by their maxima over all ranks, in place."""
 
     def any(self, flag: bool) -> bool:
-        """Returns whether ``flag`` is set on any rank."""
+        """Returns whether ``flag`` is True on any rank."""
         return flag
 
     def bcast(self, value: Any) -> Any:

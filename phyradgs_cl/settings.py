@@ -134,7 +134,7 @@ def _object_motion(path: Path) -> methods.ObjectMotion:
 
 
 def _origin_of(subject: str, origins: Mapping[str, str]) -> str | None:
-    """Returns where the user gave the option that a message's ``subject`` names: a flag or a file's entry; None if nowhere."""
+    """Returns where the user gave the option that a message's ``subject`` names: a flag or a file entry; None if nowhere."""
     words = re.findall(r"option ([\w-]+)", subject) or re.sub(r"\(.*\)", "", subject).split()[-1:]
     first, *rest = [part for word in words for part in word.lstrip("-").split(".")] or [""]
     origin = origins.get(first.replace("-", "_"))

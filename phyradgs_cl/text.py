@@ -12,7 +12,7 @@ from typing import Any
 
 # Control characters may move a terminal's cursor. Lone surrogates, which stand for bytes not in UTF-8, cannot be written.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
-_UNIT = re.compile("(.+?)_(per_mm|mm|s|ms|rad|deg|px|db)")  # a name that ends in a unit
+_UNIT = re.compile("(.+?)_(per_mm|mm|s|ms|rad|deg|px|db)")  # matches a name that ends in a unit, as ``rim_mm``
 _MANY = 8  # of a list with more values, ``value_text`` shows only their number, the first and the last
 
 

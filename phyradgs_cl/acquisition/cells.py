@@ -194,7 +194,7 @@ def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     are projected."""
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
-    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in segments after the frame's first light
+    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # times after first light / length of a segment
     first, last = _segments_of_lines(opens, closes, count)
     index = np.arange(count)[:, None]
     start = np.where(index == first, opens, index)

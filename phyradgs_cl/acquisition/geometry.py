@@ -281,7 +281,7 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_par
     inward = sides * np.sign(sides @ rays.sum(axis=0))[:, None]
     if (corners @ away > rays[0] @ away).all():
         return "behind the panel"
-    planes = np.concatenate([inward, away[None]])  # the four sides of the pyramid of rays, and the plane through the source
+    planes = np.concatenate([inward, away[None]])  # normals of the four sides of the pyramid of rays, and of the panel
     return "beside the rays" if (corners @ planes.T < 0).all(axis=0).any() else ""
 
 

@@ -61,7 +61,8 @@ class Protocol:
         """Returns the protocol with the exposure time that gives ``fps`` frames per second. readout_ms: the readout in ms;
         None keeps its ratio to the exposure.
 
-        Raises InputError for a rate not above 0, an arc of 0, and a readout longer than a frame."""
+        Raises InputError for a rate not above 0, an arc of 0, and a readout longer than a frame. named: translates the names
+        of arguments in messages."""
         checks.positive(named("fps"), fps)
         if self.exposure_deg == 0:
             raise InputError(named("fps"), f"{fps:g} with an exposure arc of 0°", "a gantry that turns", "leave fps out")

@@ -60,7 +60,7 @@ def readout_order(
 
 def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = str) -> float | None:
     """Returns the seconds between frames: 1/``fps``, or ``frame_time_s`` if fps is None. Raises InputError for fps not above
-    0, and if both are given and differ."""
+    0, and if both are given and differ. named: translates the names of arguments in messages."""
     if fps is None:
         return frame_time_s
     checks.positive(named("fps"), fps)
@@ -69,7 +69,7 @@ def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = 
 
 def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named = str) -> float | None:
     """Returns a time in s: ``in_ms``/1000, or ``in_s`` if ``in_ms`` is None. Raises InputError for ``in_ms`` below 0, and if
-    both are given and differ. word: "exposure" or "readout", for the message."""
+    both are given and differ. word: "exposure" or "readout". named: translates the names of arguments in messages."""
     if in_ms is None:
         return in_s
     checks.at_least(named(f"{word}_ms"), in_ms, 0)

@@ -208,8 +208,8 @@ def view_deviations(
     """Returns for each kind the standard deviation (K,) of a view's parameter, in rad or mm, and the fraction (K,) of its
     signals that no object explains.
 
-    signals: (F, K, rows, columns), the Jacobian of the frames per pixel of movement, of all kinds. A view's value is a sum
-    over spline coefficients, whose errors count as independent."""
+    signals (F, K, rows, columns): each frame's derivative by its view's parameter of each kind, per pixel of movement. A
+    view's value is a sum over spline coefficients, whose errors count as independent."""
     operator = parameters.operator(problem, correction)
     norms = _norms(parameters.basis, signals)
     noise = noise_level(problem.measured, problem.valid)

@@ -90,7 +90,7 @@ def _table(scan: Scan) -> list[Finding]:
 
 
 def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:
-    """Compares each frame's angle to the next with the speed within the frame, by medians, since a gantry's speed varies."""
+    """Compares the angle from a frame to the next with the speed within the frame, by medians, since gantry speeds vary."""
     span_s = scan.shutter.exposure_s or scan.shutter.span_s
     by_speed, stepped = np.empty(scan.frames - 1), np.empty(scan.frames - 1)
     for frame in range(scan.frames - 1):

@@ -114,14 +114,14 @@ def give_up_stdout() -> None:
 
 def scores(metrics: Mapping[str, float | None]) -> str:
     """Returns a run's metrics, and its errors on held-out pixels, as text with a comma before each."""
-    from phyradgs_cl.metrics import HELD_OUT  # here, because it loads SciPy, which takes time
+    from phyradgs_cl.metrics import HELD_OUT  # imported here, because it loads SciPy, which takes time
 
     return "".join(f", {words}" for words in [*told(metrics), *told(metrics, HELD_OUT)])
 
 
 def told(metrics: Mapping[str, object], *names: Any) -> list[str]:
     """Returns the metrics that are present as texts such as "PSNR 31.2 dB". names: which metrics; by default ``METRICS``."""
-    from phyradgs_cl.metrics import printed  # here, because it loads SciPy, which takes time
+    from phyradgs_cl.metrics import printed  # imported here, because it loads SciPy, which takes time
 
     return [f"{title} {value}" for title, value in printed(metrics, *names)]
 

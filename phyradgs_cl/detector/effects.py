@@ -44,7 +44,7 @@ def beer_lambert_counts(line_integrals: ArrayLike, dose: float) -> Array:
 
 
 def sample_counts(expected: Array, electronic_noise: float, rng: np.random.Generator) -> Array:
-    """Draws counts Poisson(expected (...)) + N(0, electronic_noise) once, (...) float64. They may be negative."""
+    """Draws one sample of counts Poisson(``expected``) + N(0, ``electronic_noise``), (...) float64; it may be negative."""
     many = expected > NORMAL_FROM
     counts = rng.poisson(np.where(many, 0.0, expected)).astype(np.float64)
     if many.any():

@@ -21,7 +21,7 @@ _FRAMES = 16  # noise is estimated from about this many frames, evenly spread, t
 LEAST_SHARE = 1e-3
 """Saturation is suspected if a larger fraction of the pixels has one extreme value."""
 _TOUCHING = 0.5  # saturation covers areas: pixels at an extreme are clipped if most of them have four neighbours at it
-_SAME = 1e-3  # flats and the largest count that differ by less than this fraction are equally bright: such pixels may be air
+_SAME = 1e-3  # flats within this fraction of the largest count are as bright as it: pixels clipped there may be air
 _MOST_FRAMES = 8  # noise outside saturated pixels is sought in at most this many frames
 _LONGEST_EDGE = 1024  # of larger frames only the middle, this many pixels a side, is searched for noise
 _ROUNDING = 0.5  # largest noise, in counts, that is estimated from rounded counts without noise

@@ -17,7 +17,7 @@ from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_par
 
 _MIRROR_Y = np.array([1.0, -1.0, 1.0] * 4)
 _FIRST, _COLUMN_STEP, _ROW_STEP = slice(3, 6), slice(6, 9), slice(9, 12)
-_STEPS = _ROW_STEP, _COLUMN_STEP  # the step along axis 0 (v), then along axis 1 (u)
+_STEPS = _ROW_STEP, _COLUMN_STEP  # the parts of a pose that are the step along v (axis 0) and along u (axis 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class AlteredTrajectory:
         return pose
 
     def frame_numbers(self, scan: Scan) -> np.ndarray:
-        """Returns the numbers (F,) of the scan's frames in ``base``."""
+        """Returns, for each of the scan's F frames, its number in ``base``, (F,)."""
         return np.arange(scan.frames) if self.frames is None else self.frames
 
     def _mirrored(self, pose: np.ndarray) -> np.ndarray:
