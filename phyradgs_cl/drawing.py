@@ -27,7 +27,7 @@ COLOURS = {
 }
 INK, SOFT, FAINT, ACCENT, EXPOSED, EDGE, SAMPLE, BOX = COLOURS.values()
 _LONGEST_BAR = 0.3  # largest length of the scale bar, as a fraction of a picture's width
-_LOG_RATIO = 20.0  # an axis is logarithmic where the largest value is more than this many times the smallest
+_LOG_RATIO = 20.0  # an axis is logarithmic if its values are above 0 and (largest) / (smallest) exceeds this
 
 
 def new_figure(width_inch: float, height_inch: float) -> "Figure":

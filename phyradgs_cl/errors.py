@@ -24,7 +24,7 @@ class PhyradgsError(Exception):
     exit_code = 2
 
     def __init__(self, subject: str, found: str = "", expected: str = "", remedy: str = "") -> None:
-        super().__init__(subject, found, expected, remedy)  # pickling keeps only what is passed here
+        super().__init__(subject, found, expected, remedy)  # pickling keeps only the arguments that Exception gets
         self.subject, self.found, self.expected, self.remedy = subject, found, expected, remedy
 
     def __str__(self) -> str:

@@ -94,7 +94,7 @@ class Communicator:
         return values
 
     def all_fail(self) -> bool:
-        """Waits, in a rank that fails, for the others to fail too. Returns whether all do so within 5 to 15 s."""
+        """Waits, in a rank that fails, for all others to fail too: 5 s in rank 0, 15 s at most. Returns whether all do."""
         return True
 
     def abort(self, status: int) -> NoReturn:

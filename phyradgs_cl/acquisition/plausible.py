@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 OPAQUE = 50.0  # no panel can measure a larger line integral
-_BRIGHT, _MANY = 5.0, 0.1  # refused: more than the fraction _MANY of the pixels over _BRIGHT times as bright as air
+_BRIGHT, _MANY = 5.0, 0.1  # more than the fraction _MANY of pixels over _BRIGHT times as bright as air is refused
 FEW = 0.01  # up to this fraction of pixels above OPAQUE is ignored, since some pixels of a panel may be broken
 _WIDEST_DEG = 120.0  # a fan or cone angle above this is refused: dental scanners have 30°, nano-CT 60°
 _LARGEST_PITCH_MM = 5.0  # pixels larger than this are not real, so they are named as the cause of too wide a fan
-_LEAST_DISTANCE_MM = 10.0  # a panel nearer to the source than this is not real, so distances are named as the cause
+_LEAST_DISTANCE_MM = 10.0  # a panel nearer to the source is not real, so distances are named as the cause of too wide a fan
 _WRONG_UNIT = 100.0  # a readout over this many frame times is refused: a number in ms, read as s, gives hundreds
 _SHORT_READOUT_S = 0.5e-3  # a shorter readout of at least _MANY_LINES lines causes a warning: real panels take some ms
 _MANY_LINES = 100

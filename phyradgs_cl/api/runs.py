@@ -48,7 +48,7 @@ def runtime_of(device: Device) -> Runtime:
 
 
 _opening = Lock()  # without it, threads that start together open a Runtime each, which refuse arrays of each other
-_runtime_by_name = lru_cache(maxsize=4)(Runtime)  # one Runtime per device, so that kernels are built only once
+_runtime_by_name = lru_cache(maxsize=4)(Runtime)  # keeps the Runtimes of four devices, so that kernels are built once
 
 
 @naming_arguments()

@@ -169,8 +169,8 @@ class _Calibrator:
         pixels of it.
 
         In half a turn of nearly parallel rays, a volume explains most of what an offset changes. The search cannot determine
-        the offset there, so ``check``'s answer stands. The answer also stands if the panel sees few rays twice, because a
-        wrong shift under which even fewer rays are seen twice would fit better."""
+        the offset there, so ``check``'s answer stands. The answer also stands if the panel sees less than half of the rays
+        twice, because a wrong shift under which even fewer rays are seen twice would fit better."""
         if self.phantom is None and has_axis_near_edge(self.ready[0]):
             self.search.held = (OFFSET_U,)
         quick, pitch_mm = coarse(self.ready[0], QUICK_COLUMNS), self.scan.geometry.pixel_size_mm[1]

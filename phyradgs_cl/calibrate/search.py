@@ -38,7 +38,7 @@ _GAUGE_FACTOR = 2.0
 _MOST_GAUGE = 0.2
 DEVIATIONS = 3.0  # a parameter is corrected if |found − stated value| exceeds this many of its standard deviations
 _MOST_PX = 2.0  # most coarse pixels by which a step moves the image's edge: a larger step's effect is not linear
-_SETTLED = 0.1  # the steps on a grid end when every parameter's step is below this many of its standard deviations
+_SETTLED = 0.1  # the steps on a grid end when each parameter has (step) / (standard deviation) below this
 
 
 @dataclass(frozen=True, eq=False)

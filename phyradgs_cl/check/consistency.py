@@ -33,7 +33,7 @@ _FEWEST_FRAMES = 5  # fewer frames cannot tell one order from another
 _FEWEST_PIXELS = 32  # fewer valid coarse pixels per frame cannot tell one order from another
 _CLEAR = 0.5  # a hypothesis must leave less than this fraction of the stated scan's squared residual
 _NEARLY = 1.5  # a rough fit is refined unless (its squared residual) / (least squared residual of rough fits) exceeds this
-_ERRORS = 4.0  # a hypothesis must be better than the stated scan by this many standard errors
+_ERRORS = 4.0  # a hypothesis's squared residual must be below the stated scan's by this many standard errors
 # Limits of the RMS residual in a random order. Below either limit, the object looks the same from every angle.
 _SAME = 0.03  # an object looks alike from all angles below this (residual in a random order) / (σ of line integrals)
 _NOISY = 1.6  # an object looks alike from all angles below this (residual in a random order) / (noise): round ones had 1.3
@@ -150,7 +150,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     turned = best = scan
     least = _CLEAR * fit_squares(rt, scan).sum()
     for sense, rough, limits in zip(senses, roughs, limits_px, strict=True):
-        if rough.squares.mean() > _NEARLY * least_rough:  # this sense fits clearly worse
+        if rough.squares.mean() > _NEARLY * least_rough:  # this sense of rotation fits clearly worse
             continue
         shift = axis.refined_shift(rt, sense, rough, limits)
         if not shift.is_found:
@@ -171,8 +171,8 @@ def _random_order(rt: Runtime, scan: Scan) -> float:
 def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -> Hypothesis | None:
     """Returns the best hypothesis that leaves less than half of the stated scan's squared residual; None without one.
 
-    If the panel sees few rays twice, frames fit any geometry. In this case the first hypothesis about sizes under which the
-    frames are consistent is returned; only without one, and with the axis on the panel, all hypotheses are compared."""
+    If the panel sees less than half of the rays twice, frames fit any geometry. Then the first hypothesis about sizes under
+    which they are consistent is returned. Only without one, and if the panel sees the axis, all hypotheses are compared."""
     is_one_sided = hypotheses.stated_redundancy(as_stated) < hypotheses.LEAST_REDUNDANCY
     about_scan = _refined_hypotheses(rt, scan, as_stated, np.inf if is_one_sided else coarse.rough_mean_square)
     if is_one_sided:

@@ -20,7 +20,7 @@ _OPAQUE = 30.0  # larger values are no line integrals, because no light would pa
 _INVERTED = 0.9  # bright and dark are exchanged if (median of the outer columns) / (largest value) exceeds this
 _BRIGHT = 0.05  # at most this fraction of the pixels may be brighter than the flats by more than the noise
 _FRAMES = 0.1  # the object may touch a side of the panel in up to this fraction of the frames
-_COVERED = 0.1  # a column shows the object if more than this fraction of its pixels does
+_COVERED = 0.1  # a column shows the object if more than this fraction of its pixels shows the object
 # A unit is wrong if (grid's width / width of the panel's view) or (object's width / grid's width) exceeds this.
 _ANOTHER_SIZE = 5.0
 _NOISE_FRAMES, _NEAR = 16, 5  # most frames in which noise is sought; side, in pixels, of the square around a pixel

@@ -46,7 +46,7 @@ def stated_redundancy(scan: Scan) -> float:
 
 
 def has_axis_near_edge(scan: Scan) -> bool:
-    """Returns whether the panel sees the axis, but so near its edge that few rays are measured twice."""
+    """Returns whether the panel sees the axis, but so near its edge that less than half of the rays are measured twice."""
     return 0 <= stated_redundancy(scan) < LEAST_REDUNDANCY
 
 

@@ -36,7 +36,7 @@ from phyradgs_cl.runtime import Runtime
 SIGN, CENTRE, DISTANCES = "sign of rotation", "centre of rotation", "distances"
 OTHER_CAUSE = "pixels, if pixel sizes are right"  # unit of a finding about an offset that wrong pixel sizes explain as well
 UNVERIFIED = "neither pixel sizes nor distances are verified by these frames"
-_ERRORS = 4.0  # two hypotheses must differ by this many standard errors; else the answer is "cannot tell"
+_ERRORS = 4.0  # squared residuals of two hypotheses must differ by this many standard errors; else "cannot tell"
 _SIGN_RATIO = 1.2  # least (squared residual of the wrong sense of rotation) / (that of the right sense)
 _CLEAR_RATIO = 3.0  # shifts are not refined if the squared residuals of both senses' rough fits differ by this factor
 _TOLERATED_PX = 1 / 3  # a shift of the panel by up to this many pixels is always tolerated

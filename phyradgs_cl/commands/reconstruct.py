@@ -43,7 +43,7 @@ _GROUPS = {
     ),
     "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
 }
-GROUPS = {"reconstruct": _GROUPS, "estimate": _GROUPS}  # of these options, a command's help shows those that it has
+GROUPS = {"reconstruct": _GROUPS, "estimate": _GROUPS}  # each command's help shows only options that it has
 _ROWS = "Detector rows of a parallel scan to read and reconstruct; row 0 is the lowest."
 _SLAB = "Rows of a parallel scan at a time: slabs, kept on disk as they are done."
 _WATER = "Attenuation of water in 1/mm, for --initial in Hounsfield units that does not state its scale."

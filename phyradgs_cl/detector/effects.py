@@ -120,7 +120,7 @@ def without_lag(scan: Scan) -> Scan:
     if scan.pixel_mask is None:
         return replace(scan, projections=projections, pixel_mask=bad if bad.any() else None, lag=0.0)
     masked = np.asarray(scan.pixel_mask) != 0
-    if masked.ndim == 3:  # a masked pixel spoils its frame and the next one
+    if masked.ndim == 3:  # a masked pixel spoils the same pixel of the next frame too
         masked = masked | np.concatenate([masked[:1], masked[:-1]])
     return replace(scan, projections=projections, pixel_mask=masked | bad if bad.any() else masked, lag=0.0)
 

@@ -12,10 +12,10 @@ from phyradgs_cl.checks import ceil_div
 
 NORMAL_MAD = 1.4826  # standard deviation / median absolute deviation of a normal variable
 _MEDIAN_OF_NORMAL = 0.6745  # median of |x| / standard deviation of x, for a normal variable x with mean 0
-_FILTER_NORM = 1.5**0.5  # factor by which the filter (-1/2, 1, -1/2) multiplies white noise
+_FILTER_NORM = 1.5**0.5  # factor by which the filter (-1/2, 1, -1/2) multiplies the standard deviation of white noise
 _LARGEST_SAMPLE = 1_000_000  # about the most pixels of which a median is computed: their median is exact enough
-_TENTHS = 10  # number of equally large classes of line integrals in which noise is estimated: it grows with attenuation
-_BEHIND = 5.0  # pixels lie behind the object if they exceed the noise this many times
+_TENTHS = 10  # number of equally large classes of line integrals whose noise is estimated apart: it grows with attenuation
+_BEHIND = 5.0  # pixels lie behind the object if (line integral) / (noise) exceeds this
 _FRAMES = 16  # noise is estimated from about this many frames, evenly spread, to save time
 
 LEAST_SHARE = 1e-3
@@ -26,7 +26,7 @@ _MOST_FRAMES = 8  # noise outside saturated pixels is sought in at most this man
 _LONGEST_EDGE = 1024  # of larger frames only the middle, this many pixels a side, is searched for noise
 _ROUNDING = 0.5  # largest noise, in counts, that is estimated from rounded counts without noise
 _RELATIVE = 2e-5  # an estimate shows noise only if (estimated noise) / (largest count) exceeds this
-# An estimate along both axes shows noise if (it) / (the estimate along rows alone) exceeds this. Structure gives less.
+# Frames show noise if (estimate along both axes) / (estimate along rows alone) exceeds this. Structure gives less.
 _WHITE = 0.5
 _ROOT_OF_NORMAL = 0.8222  # mean of √|x| / √(standard deviation of x), for a normal variable x with mean 0
 _NEAR = 9  # the noise of a pixel is estimated from a square of this side around it

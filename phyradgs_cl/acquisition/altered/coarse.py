@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import scipy  # SciPy's parts load when they are used
+import scipy  # its parts load only when they are used, which saves time
 
 from phyradgs_cl.acquisition.altered.variants import altered_trajectory, with_trajectory
 from phyradgs_cl.acquisition.geometry import ConeGeometry, Geometry
