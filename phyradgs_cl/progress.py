@@ -69,8 +69,8 @@ class Ticker:
         self.show(p.iteration, p.iterations, f"  {p.quantity} {p.loss:.5f}{cloud}")
 
     def show(self, done: int, total: int, more: str = "", share: float | None = None) -> None:
-        """Shows ``done`` of ``total``, then ``more``, unless the last line is newer than 0.2 s (10 s outside of a terminal).
-        share: the fraction of the work that is done, if it differs from done / total."""
+        """Shows ``done`` of ``total``, then ``more``: at the end, and if 0.2 s have passed since the last line (10 s outside
+        of a terminal). share: the fraction of the work that is done, if it differs from done / total."""
         now = time.monotonic()
         if share is None:
             share = done / total if total else 0.0

@@ -102,7 +102,7 @@ def keep_finished_work() -> Iterator[None]:
 
 @contextmanager
 def finish_despite_interrupt() -> Iterator[None]:
-    """Delays signals during short work such as writing. Then raises KeyboardInterrupt if one has come."""
+    """Delays signals during short work such as writing. Then raises KeyboardInterrupt if a signal has come."""
     with stop_on_interrupt() as flag:
         yield
     flag.farewell = COMPLETE

@@ -56,7 +56,7 @@ def nested(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def repr_of_changes(thing: Any) -> str:
-    """Returns the repr of a dataclass, with only the fields that differ from their defaults. Arrays show their shape."""
+    """Returns the repr of a dataclass with only the fields that differ from their defaults. Arrays appear as their shape."""
     texts = []
     for field in fields(thing):
         value = getattr(thing, field.name)

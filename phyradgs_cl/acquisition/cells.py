@@ -28,15 +28,15 @@ their last lines, and the order that sorts the cells by first line."""
 
 
 def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
-    """Returns one cell of all lines, midway between the frame's first and last light: the best time for a single pose."""
+    """Returns one cell for all lines, with the pose midway between first and last light: the best time for a single pose."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.middle_s, lines)
 
 
 def static_start_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int
 ) -> TimeCells:
-    """Returns one cell of all lines, at the frame's first light. A volume reconstructed with it is rotated by half of the
-    arc that the gantry turns between first and last light."""
+    """Returns one cell for all lines, with the pose at the frame's first light. A volume reconstructed from such cells is
+    rotated by half of the arc that the gantry turns between first and last light."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.lit_span_s[0], lines)
 
 

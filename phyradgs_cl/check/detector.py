@@ -141,7 +141,7 @@ def check_gain(rt: Runtime, scan: Scan) -> Finding:
     """Finds drifts and jumps of the detector's gain, from the constants ("levels") that ``fit`` adds to the frames of a
     coarse ``scan``.
 
-    A ramp over the scan, and a step at each of the frames, are fitted to the levels; the best of these fits counts. A change
+    A ramp over the scan, and a step at each inner frame, are fitted to the levels; the best of these fits counts. A change
     above both 1.5 % and five standard deviations is suspicious. Variation as sine and cosine of the angle is no drift."""
     if scan.frames < _FEWEST_FRAMES:
         return Finding(GAIN, CANNOT_TELL, 0.0, _LARGEST_DRIFT, "share", f"fewer than {_FEWEST_FRAMES} frames")

@@ -29,7 +29,7 @@ class Finding:
 
 
 def too_narrow(question: str, unit: str) -> Finding:
-    """Answers ``question`` by "cannot tell", because the panel has too few columns."""
+    """Answers ``question`` by "cannot tell", because the panel has fewer than 8 columns."""
     return Finding(question, CANNOT_TELL, 0.0, 0.0, unit, f"fewer than {FEWEST_COLUMNS} columns")
 
 

@@ -33,7 +33,7 @@ def has_opposite_views(scan: Scan) -> bool:
 
 
 def exposure_arc_rad(scan: Scan) -> float:
-    """Returns the angle in rad by which the gantry turns in a line's exposure, in the middle frame; 0 if it is at rest."""
+    """Returns the angle in rad by which the gantry turns in a line's exposure, in the middle frame; 0 for one at rest."""
     if not scan.is_fly:
         return 0.0
     frame = scan.frames // 2
