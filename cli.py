@@ -1,4 +1,4 @@
-"""The command line with all commands. An error prints one line on stderr, and the kind of error gives the exit status."""
+"""The command line ``phyradgs`` with all commands. An error prints one line on stderr; its kind decides the exit status."""
 
 import importlib
 from collections import UserDict
@@ -15,7 +15,7 @@ from phyradgs_cl.removed import refuse_removed
 
 _CLICK_ERROR: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 HELP = {"help_option_names": ["-h", "--help"]}
-# For each command NAME: the module of commands/ that defines NAME_command, and the command's text in the list of commands.
+# For each command NAME: the module in commands/ that defines the function NAME_command, and NAME's line in the help.
 COMMANDS = {
     "simulate": ("simulate", "Simulate a fly-scan of a phantom or a volume."),
     "import": ("import_scan", "Turn the scan of another program into a scan file."),
@@ -39,7 +39,7 @@ class Interrupted(Exception):
 
 
 class Loaded(UserDict[str, Any]):
-    """Maps names of ``COMMANDS`` to Typer commands. Imports a command's module at look-up, because imports take time."""
+    """Maps a name of ``COMMANDS`` to its Typer command. Imports the command's module only at look-up, which saves time."""
 
     def __getitem__(self, name: str) -> Any:
         module_name, summary = COMMANDS[name]
@@ -101,7 +101,7 @@ def root(
 
 
 def run(arguments: list[str], program: typer.Typer = app) -> int:
-    """Runs one command of ``program`` and returns the exit status. Prints every expected error instead of raising it."""
+    """Runs ``program`` with the words ``arguments`` and returns the exit status. Prints expected errors, raises others."""
     if not takes_part(arguments):
         return 0
     with signals.answer_signals():
@@ -113,10 +113,10 @@ def run(arguments: list[str], program: typer.Typer = app) -> int:
             return complain(str(error), error.exit_code)
         except _CLICK_ERROR as error:
             return complain(usage_text(error, arguments))
-        except OSError as error:  # an error of the system that became no PhyradgsError
+        except OSError as error:  # an error of the operating system that no code turned into a PhyradgsError
             text = f"{error.filename or 'operating system'}: {error.strerror or error}"
             return complain(text, OutputError.exit_code if error.errno in NO_SPACE else 2)
-        except SystemExit:  # Typer raises it if the reader of its help closes the pipe, as `| head` does
+        except SystemExit:  # Typer raises SystemExit if the program that reads its help closes the pipe, as `| head` does
             give_up_stdout()
             return 0
         except (Interrupted, KeyboardInterrupt, typer.Abort):

@@ -7,14 +7,14 @@ __all__ = ["__version__", "resource"]
 
 try:
     __version__ = version("phyradgs-cl")
-except PackageNotFoundError:  # run from a checkout that is not installed
+except PackageNotFoundError:  # the program runs from a checkout that is not installed
     __version__ = "0+unknown"
 
 
 def resource(name: str) -> Path:
-    """Returns the path of ``cl``, ``data`` or ``cli.py``. A wheel has them inside the package, a checkout next to it.
+    """Returns the path of ``name``: ``cl``, ``data`` or ``cli.py``. A wheel has these in the package, a checkout beside it.
 
-    Raises FileNotFoundError where both are missing."""
+    Raises FileNotFoundError if ``name`` is in neither place."""
     package = Path(__file__).resolve().parent
     for folder in (package, package.parent):
         if (folder / name).exists():

@@ -9,7 +9,7 @@ from phyradgs_cl import resource
 
 
 def load_cli() -> ModuleType:
-    """Loads cli.py and returns the module. Raises ImportError or FileNotFoundError where the installation lacks it."""
+    """Loads cli.py and returns the module. Raises ImportError or FileNotFoundError if the installation lacks cli.py."""
     spec = importlib.util.spec_from_file_location("phyradgs_cl_cli", resource("cli.py"))
     if spec is None or spec.loader is None:
         raise ImportError("cli.py cannot be loaded: install phyradgs-cl again")
@@ -20,13 +20,13 @@ def load_cli() -> ModuleType:
 
 
 def main() -> None:
-    """Runs the command line and exits with its status. Ctrl-C prints one line instead of a traceback, with status 130."""
+    """Runs the command line and exits with its status. Ctrl-C prints one line instead of a traceback; the status is 130."""
     try:
         status = load_cli().run(sys.argv[1:])
-    except KeyboardInterrupt:  # Ctrl-C while libraries load; later the command line handles Ctrl-C
+    except KeyboardInterrupt:  # Ctrl-C while libraries load; later cli.py itself handles Ctrl-C
         sys.stderr.write("phyradgs: interrupted, nothing new written\n")
         status = 130
-    for number in (signal.SIGINT, signal.SIGTERM):  # a signal while the interpreter ends would print a traceback
+    for number in (signal.SIGINT, signal.SIGTERM):  # ignored: at the interpreter's end one would print a traceback
         signal.signal(number, signal.SIG_IGN)
     sys.exit(status)
 

@@ -1,4 +1,4 @@
-"""Checks values from users and files. A wrong value raises InputError, whose message begins with ``subject``."""
+"""Checks of values from users and files. They raise InputError, whose message begins with their argument ``subject``."""
 
 import importlib
 import math
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.text import suggest_name
 
-_LONGEST = 80  # number of characters at which a value is cut in a message, so that the message stays readable
+_LONGEST = 80  # most characters of a wrong value in a message; the text of a longer value is cut
 T = TypeVar("T")
 
 
@@ -23,19 +23,19 @@ def ceil_div(count: int, divisor: int) -> int:
 
 
 def positive(subject: str, value: float) -> None:
-    """Raises InputError unless the scalar ``value`` is finite and above zero."""
+    """Raises InputError about ``subject`` unless the scalar ``value`` is finite and above 0."""
     if not (is_number(value) and value > 0):
         raise InputError(subject, short_repr(value), "a finite number above 0")
 
 
 def at_least(subject: str, value: float, minimum: float) -> None:
-    """Raises InputError unless the scalar ``value`` is finite and not below ``minimum``."""
+    """Raises InputError about ``subject`` unless the scalar ``value`` is finite and at least ``minimum``."""
     if not (is_number(value) and value >= minimum):
         raise InputError(subject, short_repr(value), f"a finite number, at least {minimum}")
 
 
 def within(subject: str, value: float, lowest: float, highest: float) -> None:
-    """Raises InputError unless the scalar ``value`` is finite and between two bounds, both included."""
+    """Raises InputError about ``subject`` unless the scalar ``value`` is from ``lowest`` to ``highest``, both included."""
     if not (is_number(value) and lowest <= value <= highest):
         raise InputError(subject, short_repr(value), f"a number from {lowest} to {highest}")
 
@@ -43,21 +43,21 @@ def within(subject: str, value: float, lowest: float, highest: float) -> None:
 def option(default: T, help: str = "", usual: bool | str = True, **known: Any) -> T:
     """Returns a dataclass field for an option, with its help text and its limits.
 
-    usual: what help texts name as the default, in words; True names ``default``. known: limits that ``fields_within``
-    checks: ``range`` (lowest, highest), the allowed ``words``, ``is_positive``; and the ``subject`` of its messages."""
+    usual: the default in words, for help texts; True shows ``default``. known: limits for ``fields_within``, as ``range``
+    (lowest, highest), allowed ``words`` and ``is_positive``, its ``subject``, and the command option's ``metavar``."""
     return field(default=default, metadata={"help": help, "usual": usual, **known})
 
 
 def ranged(default: T, lowest: float, highest: float, subject: str = "") -> T:
-    """Returns a dataclass field for a number from ``lowest`` to ``highest``, as ``fields_within`` checks it."""
+    """Returns a dataclass field for a number that ``fields_within`` checks to be from ``lowest`` to ``highest``."""
     return option(default, range=(lowest, highest), subject=subject)
 
 
 def fields_within(named: str | Callable[[str], str], options: object) -> None:
-    """Raises InputError for a field of a dataclass that breaks the limits given to ``option``. None passes.
+    """Raises InputError if a field of the dataclass ``options`` is not None and breaks the limits given to ``option``.
 
-    Fields of base classes are checked too, and each number of a tuple. ``named``: the text before a field's name in
-    messages, or a function from the name to the subject of the message."""
+    Fields of base classes are checked too, and each number of a tuple. named: the text before a field's name in messages,
+    or a function that takes the field's name and returns the message's subject."""
     own = [one for kind in reversed(type(options).__mro__) for one in getattr(kind, "__dataclass_fields__", {}).values()]
     for name, one in {one.name: one for one in own if one.metadata}.items():
         known, value = one.metadata, getattr(options, name)
@@ -84,13 +84,13 @@ class Checked:
 
 
 def kind(subject: str, value: object, allowed: Any, expected: str, remedy: str = "") -> None:
-    """Raises InputError unless isinstance(``value``, ``allowed``). ``expected`` and ``remedy`` are words of the message."""
+    """Raises InputError, with the words ``expected`` and ``remedy``, unless ``value`` is an instance of ``allowed``."""
     if not isinstance(value, allowed):
         raise InputError(subject, short_repr(value), expected, remedy)
 
 
 def one_of(subject: str, value: object, allowed: Iterable[object]) -> None:
-    """Raises InputError unless ``value`` is among ``allowed``. The message lists them."""
+    """Raises InputError, whose message lists the values ``allowed``, unless ``value`` is one of these."""
     choices = list(allowed)
     if value not in choices:
         remedy = suggest_name(value, (choice for choice in choices if isinstance(choice, str)), "")
@@ -98,7 +98,7 @@ def one_of(subject: str, value: object, allowed: Iterable[object]) -> None:
 
 
 def finite(subject: str, array: ArrayLike) -> None:
-    """Raises InputError if ``array`` (any shape) has NaN or infinite values. The message has the index of the first."""
+    """Raises InputError if ``array`` (any shape) has NaN or infinite values. The message states the first one's index."""
     good = np.isfinite(np.asarray(array))
     if not good.all():
         count = int(good.size - np.count_nonzero(good))
@@ -107,7 +107,7 @@ def finite(subject: str, array: ArrayLike) -> None:
 
 
 def shape(subject: str, array: ArrayLike, expected: Sequence[int | None]) -> None:
-    """Raises InputError unless ``array`` has the shape ``expected``. None in it stands for any length."""
+    """Raises InputError unless ``array`` has the shape ``expected``, in which None stands for any length."""
     found = np.shape(array)
     fits = len(found) == len(expected) and all(e in (None, f) for f, e in zip(found, expected, strict=True))
     if not fits:
@@ -133,14 +133,14 @@ def rising(subject: str, value: ArrayLike) -> NDArray[np.float64]:
 
 
 def real_array(subject: str, value: ArrayLike, kinds: str = "iuf") -> np.ndarray:
-    """Returns ``value`` as an array of its own type. Raises InputError for a masked array, and unless it holds numbers of
-    NumPy's ``kinds``: integers and floats, with "b" also booleans."""
+    """Returns ``value`` as an array of its own type. Raises InputError for masked elements, ragged lists, arrays on a
+    device, and types outside of NumPy's ``kinds``: i and u are integers, f floats, b booleans."""
     unmasked(subject, value)
     try:
         array = np.asarray(value)
     except ValueError as error:  # NumPy's own message is too long for one line
         raise InputError(subject, "lists of unequal length", "an array of numbers") from error
-    except (BufferError, RuntimeError, TypeError) as error:  # arrays on a device, as of CuPy and PyTorch
+    except (BufferError, RuntimeError, TypeError) as error:  # for arrays on a device, such as those of CuPy and PyTorch
         raise not_on_host(subject, value, error) from error
     if array.dtype.kind not in kinds:
         raise InputError(subject, short_repr(value), "numbers")
@@ -148,7 +148,7 @@ def real_array(subject: str, value: ArrayLike, kinds: str = "iuf") -> np.ndarray
 
 
 def unmasked(subject: str, value: object) -> None:
-    """Raises InputError for a NumPy array with masked elements, or a list of such arrays: NumPy would drop the mask."""
+    """Raises InputError for a NumPy array with masked elements, or a list with such an array: NumPy would drop its mask."""
     parts = value if isinstance(value, list | tuple) else [value]
     if any(isinstance(one, np.ma.MaskedArray) and np.ma.is_masked(one) for one in parts):
         remedy = "give array.filled(0), or array.data and its mask apart where there is an argument mask"
@@ -156,25 +156,25 @@ def unmasked(subject: str, value: object) -> None:
 
 
 def not_on_host(subject: str, value: object, error: Exception) -> InputError:
-    """Returns the InputError about an array that NumPy cannot read. error: what the array's library says."""
+    """Returns the InputError about an array that NumPy cannot read. error: the exception from the array's own library."""
     found, expected = f"{type(value).__name__} ({error})", "an array of real numbers on the host"
     return InputError(subject, found, expected, "copy it there: array.get(), or of tensors detach().cpu()")
 
 
 def flag(subject: str, value: object) -> None:
-    """Raises InputError for anything but True and False: other values would count as true."""
+    """Raises InputError for anything but True and False, because Python would take any other value for one of the two."""
     kind(subject, value, bool | np.bool_, "True or False")
 
 
 def whole(subject: str, value: float, lowest: int, highest: int) -> None:
-    """Raises InputError unless the scalar ``value`` is a whole number between two bounds, both included."""
+    """Raises InputError unless the scalar ``value`` is a whole number from ``lowest`` to ``highest``, both included."""
     within(subject, value, lowest, highest)
     if value != int(value):
         raise InputError(subject, short_repr(value), f"a whole number from {lowest} to {highest}")
 
 
 def package(name: str, use: str, install: str) -> ModuleType:
-    """Imports a package. Where it is missing, raises InputError with the command that installs it. ``use``: its purpose."""
+    """Imports and returns the package ``name``. If it is missing, raises InputError with its ``use`` and the pip command."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -193,7 +193,7 @@ def short_repr(value: object) -> str:
 
 
 def is_number(value: object) -> bool:
-    """Returns whether ``value`` is a finite number. A bool is not."""
+    """Returns whether ``value`` is a finite number. A bool does not count as a number."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return False
     return isinstance(value, int) or math.isfinite(value)  # isfinite raises for an int too large for a float

@@ -34,14 +34,14 @@ from phyradgs_cl.optim import DeviceAdam, adam_step
 from phyradgs_cl.runtime import DeviceSpace, HostSpace, Runtime
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
 
-VALUE, GRADIENT = 1e-4, 1e-3  # upper limits of the difference from the float64 twin, relative to the largest value
-_GRIDDED = 5e-3  # upper limit of the difference where a deformation's inverse is interpolated between voxels
+VALUE, GRADIENT = 1e-4, 1e-3  # largest differences of values and gradients from the twin's, relative to the twin's largest
+_GRIDDED = 5e-3  # largest relative difference from the twin where a kernel interpolates a deformation's inverse from a grid
 SHAPE, GRID = (9, 12), Grid((5, 7, 6), (0.3, 0.24, 0.28), (0.1, -0.05, 0.1))
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 9, 4.1 / 12), (0.1, 0.2))
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.5))
 PARALLEL = CircularOrbit(ParallelGeometry(SHAPE, (2.6 / 9, 2.7 / 12), (0.1, 0.2)), ConstantSpeed(0.3, 0.5))
-UNIT = 2.0  # line integral that a pixel of value 1 means to kernels that average intensities exp(−line integral)
-STEP = 1e-6  # central differences take this step to each side
+UNIT = 2.0  # to kernels that average intensities exp(−line integral), a pixel of value p means the line integral UNIT · p
+STEP = 1e-6  # step of central differences to each side
 Comparison = tuple[np.ndarray, np.ndarray, float]
 """The computed and the expected numbers, and the largest difference allowed, relative to the largest expected number."""
 
@@ -50,8 +50,8 @@ Comparison = tuple[np.ndarray, np.ndarray, float]
 class Verdict:
     """The result of a device's check.
 
-    agreeing: the kernels that agree with their twins. failures: a text about each other kernel. group_limits: the largest
-    work-group that the driver allows, in work-items, by kernel; only for kernels that use work-groups."""
+    agreeing: the kernels that agree with their twins. failures: for each check that failed, a text that names the suspected
+    kernels. group_limits: for each kernel that uses work-groups, the largest group in work-items that the driver allows."""
 
     device: str
     agreeing: frozenset[str]
@@ -65,7 +65,7 @@ class Verdict:
 
 
 def check_device(device: str | None = None, **launch_shape: bool | int) -> Verdict:
-    """Builds and runs every kernel on a device and compares it with its twin. ``launch_shape``: options of Runtime."""
+    """Builds and runs every kernel on ``device`` (None: the best) and compares it with its twin. Others: as in Runtime."""
     agreeing: set[str] = set()
     failures: list[str] = []
     limits: dict[str, int] = {}
@@ -79,8 +79,8 @@ def check_device(device: str | None = None, **launch_shape: bool | int) -> Verdi
 
 
 def _problem(check: Callable[[Runtime], Iterator[Comparison]], rt: Runtime, agreeing: set[str]) -> str:
-    """Returns the first problem of ``check`` in words, or "" if there is none. Adds to ``agreeing`` the kernels that had run
-    by the last comparison before it."""
+    """Runs ``check`` up to its first problem, and returns the problem in words, "" without one. Adds to ``agreeing`` the
+    kernels that had run by the last comparison within its limit."""
     try:
         for computed, expected, limit in check(rt):
             off = float(np.abs(np.asarray(computed, np.float64) - expected).max() / (np.abs(expected).max() or 1.0))
@@ -208,7 +208,7 @@ def _voxels(rt: Runtime) -> Iterator[Comparison]:
 def _rays(rt: Runtime) -> Iterator[Comparison]:
     volume, frames = _noise(GRID.shape, 5), _noise((1, *SHAPE), 13)
     still, table, _ = _tables()
-    tall = (32, 5)  # enough lines to fill a CPU's widest vectors
+    tall = (32, 5)  # rows and columns: enough rows to fill a CPU's widest vectors
     orbit = CircularOrbit(ConeGeometry(5.0, 7.5, tall, (3.9 / 32, 4.1 / 5)), ConstantSpeed(0.3, 0.5))
     upright = static_cells(orbit, Shutter(0.8, 0.6), 0, 0.2, tall[0])
     common = common_time_cells(orbit, Shutter(0.8, 0.6), 0, np.array([0.2]), tall[0], 3)
@@ -233,7 +233,7 @@ def _rays(rt: Runtime) -> Iterator[Comparison]:
     yield rt.download(operator.adjoint(rt.upload(frames))), twins.ray_volume(shares, GRID, finer), VALUE
     intensity = operators.IntensityOperator(rt, GRID, SHAPE, [table])
     mean, averaged = (twins.ray_frame(volume, GRID, table, SHAPE, model) for model in ("log", "intensity"))
-    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # before ``expected`` it averages line integrals
+    yield rt.download(intensity.forward(on_device))[0], mean, VALUE  # it averages line integrals until ``expected`` runs
     yield rt.download(intensity.expected(on_device))[0], averaged, VALUE
     found = rt.download(intensity.adjoint(rt.upload(frames)))
     yield found, twins.intensity_volume(frames[0], volume, GRID, table), VALUE
@@ -354,7 +354,7 @@ CHECKS = (
     _numbers, _algebra, _binning, _splats, _splats_of_moving_objects, _layered_splats, _plain_splats, _voxels, _rays, _warps,
     _backprojections, _moving_backprojections, _image_terms, _variation, _optimiser,
 )  # fmt: skip
-"""All checks. A kernel that has agreed is not suspected in later checks, so the kernels that others rely on come first."""
+"""All checks. A kernel that agreed in a check is not suspected in later ones. So kernels that others rely on come first."""
 
 
 def _noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
@@ -362,7 +362,7 @@ def _noise(shape: tuple[int, ...], seed: int) -> np.ndarray:
 
 
 def _cloud(count: int = 3) -> np.ndarray:
-    """Returns parameters of ``count`` random Gaussians, (11, G) float64 with values that float32 holds exactly."""
+    """Returns parameters (11, ``count``) of random Gaussians, in float64. Float32 can hold each of these values exactly."""
     rng = np.random.default_rng(count)
     turn = rng.normal(size=(4, count))
     parts = [
@@ -373,7 +373,7 @@ def _cloud(count: int = 3) -> np.ndarray:
 
 
 def _tables(orbit: CircularOrbit = ORBIT) -> tuple[TimeCells, TimeCells, TimeCells]:
-    """Returns three kinds of time cells: a single pose, micro-views, and lines that integrate while the gantry moves."""
+    """Returns a frame's time cells in three kinds: a single pose, micro-views, and segments in which the gantry moves."""
     rolling = orbit, Shutter(0.8, 0.6, "columns", -1), 0, 0.2, SHAPE[1]
     still = static_cells(orbit, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0])
     return still, micro_view_cells(*rolling, 3, 2), exact_cells(*rolling, 3)
@@ -382,7 +382,7 @@ def _tables(orbit: CircularOrbit = ORBIT) -> tuple[TimeCells, TimeCells, TimeCel
 def _differences(
     function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, h: np.ndarray | float = 1.0
 ) -> np.ndarray:
-    """Returns the derivative (11, G) of Σ ``h`` · ``function``(rows) by each parameter, as central differences."""
+    """Returns derivatives (11, G) of Σ ``h`` · ``function(rows)`` by the Gaussians' ``rows``, by central differences."""
     result = np.zeros_like(rows)
     for index in np.ndindex(*rows.shape):
         ends = []
@@ -395,6 +395,6 @@ def _differences(
 
 
 def _by_class(found: np.ndarray, expected: np.ndarray) -> Iterator[Comparison]:
-    """Yields comparisons of gradients (11, G), each kind of parameter on its own because their magnitudes differ."""
+    """Yields a comparison of gradients (11, G) for each kind of parameter, because the kinds' magnitudes differ."""
     for part in (MEAN, SCALE, QUATERNION, DENSITY):
         yield found[part], expected[part], GRADIENT

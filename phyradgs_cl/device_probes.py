@@ -10,11 +10,11 @@ from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.runtime import Runtime
 
 LASTING_S = 0.1, 1.0, 3.0
-"""Durations of launches that are tried on GPUs, in s. Drivers of GPUs with a screen end launches of 2 to 5 s."""
-# Largest relative error of sums of float pairs. A compiler that simplifies them leaves 6e-8, the error of a single float.
+"""Durations in s of trial launches on GPUs. The driver of a GPU with a screen ends a launch that lasts over 2 to 5 s."""
+# Largest relative error of sums of float pairs. If a compiler simplifies the pairs away, the error is a float's: 6e-8.
 PAIRS = 1e-12
 _ITEMS = 32  # number of work-items in a work-group of the probes
-_TRIED_STEPS = 1 << 14  # number of multiply-adds in a first short launch, whose time gives the length of longer ones
+_TRIED_STEPS = 1 << 14  # multiply-adds of a first short launch; its time per step gives the steps of longer launches
 
 
 def pair_error(rt: Runtime) -> float:
@@ -57,7 +57,7 @@ def longest_launch(make: Callable[[], Runtime], lasting_s: Sequence[float]) -> s
 
 
 def _spin(rt: Runtime, steps: int) -> float:
-    """Returns the seconds that one work-group takes for ``steps`` multiply-adds, each of which needs the one before."""
+    """Returns the seconds that one work-group takes for ``steps`` multiply-adds, each with the previous one's result."""
     out, started = rt.zeros(_ITEMS), time.perf_counter()
     rt.launch(rt.kernel("rates", "multiply_add"), _ITEMS, steps, np.float32(0.5), out, group=_ITEMS)
     rt.finish()
@@ -67,8 +67,8 @@ def _spin(rt: Runtime, steps: int) -> float:
 def probe_lines(device: str | None, limits: dict[str, int], check_s: float, **launch_shape: bool | int) -> Iterator[str]:
     """Yields lines of text about a device: driver, rounding, work-groups, speed and, on GPUs, the longest launch.
 
-    limits: the largest work-group by kernel. check_s: seconds that the comparison with the twins took. launch_shape:
-    options of ``Runtime``. Where a probe raises DeviceError, its message is the last line."""
+    limits: each kernel's largest work-group, in work-items. check_s: seconds that the comparison of kernels took.
+    launch_shape: options of ``Runtime``. If a probe raises DeviceError, the error's message is the last line."""
 
     def make(profile: bool = False) -> Runtime:
         return Runtime(device, profile=profile, **launch_shape)  # type: ignore[arg-type]

@@ -1,5 +1,5 @@
 """Colours, axes, curves and images for the figures of notebooks, reports and the documentation. matplotlib is slow to
-import, so it is imported when something is drawn."""
+import, so functions import it only when they draw."""
 
 import importlib
 import math
@@ -27,7 +27,7 @@ COLOURS = {
 }
 INK, SOFT, FAINT, ACCENT, EXPOSED, EDGE, SAMPLE, BOX = COLOURS.values()
 _LONGEST_BAR = 0.3  # largest length of the scale bar, as a fraction of a picture's width
-_LOG_RATIO = 20.0  # an axis is logarithmic where the largest value is more than this many times the smallest
+_LOG_RATIO = 20.0  # an axis is logarithmic if its values are above 0 and (largest) / (smallest) exceeds this
 
 
 def new_figure(width_inch: float, height_inch: float) -> "Figure":
@@ -82,6 +82,6 @@ def draw_image(
 
 
 def round_length(most: float) -> float:
-    """Rounds a length down to 1, 2 or 5 times a power of ten, for a scale bar."""
+    """Rounds the length ``most``, above 0, down to 1, 2 or 5 times a power of ten, for a scale bar."""
     power = 10.0 ** math.floor(math.log10(most))
     return max(f * power for f in (1, 2, 5) if f * power <= most * (1 + 1e-9))

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 from phyradgs_cl.text import plain_text
 
-# Quoted text matches as a whole and is not changed: it is a command line, in which options keep their dashes.
+# Finds options in messages. Quoted text matches as a whole and is not changed: in a command line options keep their dashes.
 _OPTION = re.compile(r"(?<!\w)'[^']*'|--set |(?<![\w-])--([a-z][a-z-]*)")
 _STATES = ("given ", "not ")  # beginnings of texts that read better without "found", as in "--bins: not a number"
 _OTHER_NAMES = {"with": "others", "readout": "readout_axis", "air-mm": "air", "water-mm": "water", "hu": "hounsfield"}
@@ -24,7 +24,7 @@ class PhyradgsError(Exception):
     exit_code = 2
 
     def __init__(self, subject: str, found: str = "", expected: str = "", remedy: str = "") -> None:
-        super().__init__(subject, found, expected, remedy)  # pickling keeps only what is passed here
+        super().__init__(subject, found, expected, remedy)  # pickling keeps only the arguments that Exception gets
         self.subject, self.found, self.expected, self.remedy = subject, found, expected, remedy
 
     def __str__(self) -> str:
@@ -46,13 +46,13 @@ class NumericalError(PhyradgsError):
 
 
 class OutputError(PhyradgsError):
-    """Raised where a result cannot be written: the disk is full, permission is missing, or another run writes it."""
+    """Raised where a result cannot be written: the disk is full, permission is missing, or another run writes the file."""
 
     exit_code = 4
 
 
 class DeviceError(PhyradgsError):
-    """Raised where there is no OpenCL device, where it fails, or where a kernel does not build on it."""
+    """Raised where there is no OpenCL device, where a device fails, or where a kernel does not build on the device."""
 
     exit_code = 5
 

@@ -1,5 +1,5 @@
-"""Estimates the time and memory of a reconstruction from short runs of two lengths. Their difference gives the time per
-iteration, and the rest is the time of everything else. A method without iterations or checkpoints runs as a whole.
+"""Estimates the time and memory of a reconstruction from short runs of two lengths. The difference of their times gives the
+time per iteration; the rest is the time of everything else. A method without iterations or checkpoints runs as a whole.
 
 Density control adds Gaussians during a run and makes iterations slower. Short runs of a method with Gaussians therefore go
 through the whole schedule of density control, in fewer iterations."""
@@ -23,7 +23,7 @@ from phyradgs_cl.runtime import Runtime
 
 _SPLAT_TRIALS = (20, 200)  # iterations of the two short runs (trials) of methods with Gaussians
 _TRIALS = (1, 3)  # iterations of the two short runs of other methods, unless their options have ``TRIALS``
-_LEAST_DIFFERENCE_S = 0.3  # if the trials' times differ by less, timing noise matters: the second trial is prolonged
+_LEAST_DIFFERENCE_S = 0.3  # if the two trials' times differ by less, the second is prolonged, since times are noisy
 _LONGEST_TRIAL = 200  # a trial of this many iterations is not prolonged, because estimating would take too long
 _FEWEST_BETWEEN = 5  # least number of iterations between rounds of density control in a trial
 
@@ -73,7 +73,7 @@ def estimate(
         seconds, each_s, total = trials.run(None), 0.0, 0
     elif total <= few:
         seconds = trials.run(total)
-        each_s = trials.run(total) / max(total, 1)  # the run before built the kernels, so it took longer
+        each_s = trials.run(total) / max(total, 1)  # from a second run: the first one also built the kernels
     else:
         seconds, each_s = trials.extrapolated(few, more, total)
     around_s = around(trials.result) if around else 0.0
@@ -84,14 +84,13 @@ def estimate(
 
 
 class _Trials:
-    """Makes short runs of one plan. ``result`` and ``device_bytes`` belong to the latest run."""
+    """Makes short runs of one plan. ``result`` and ``device_bytes`` (most memory in OpenCL buffers) are of the last run."""
 
     def __init__(self, scan: Scan, plan: RunPlan, rt: Runtime) -> None:
         self.scan, self.plan, self.rt = scan, plan, rt
 
     def run(self, iterations: int | None) -> float:
-        """Runs the plan with the given number of ``iterations``; None runs it as a whole. Returns the seconds that it
-        took."""
+        """Runs the plan with ``iterations`` iterations; None runs it as a whole. Returns the seconds that the run took."""
         options = self.plan.options
         plan = self.plan if iterations is None else replace(self.plan, options=shortened(options, iterations))
         self.rt.reset_peak()
@@ -102,7 +101,7 @@ class _Trials:
 
     def extrapolated(self, few: int, more: int, total: int) -> tuple[float, float]:
         """Returns the seconds of a run of ``total`` iterations, and those of one iteration. They are extrapolated from runs
-        of ``few`` and ``more`` iterations; the longer run is prolonged if the two differ by less than 0.3 s."""
+        of ``few`` and ``more`` iterations. If their times differ by less than 0.3 s, the longer run is prolonged."""
         first_s = self.run(few) - self._control_s
         again_s = self.run(few) - self._control_s  # the first run also built the kernels, so it took longer
         more = min(more, total)
@@ -116,18 +115,17 @@ class _Trials:
 
     @property
     def _control_s(self) -> float:
-        """The seconds that the last run spent in density control. They are not counted as iterations."""
+        """The seconds that the last run spent in density control, which do not count as time of its iterations."""
         return float(self.result.facts.get("density_control_seconds", 0.0))
 
     def _rounds_due(self, total: int) -> float:
-        """Returns (rounds of density control in a run of ``total`` iterations) / (rounds in the last trial); 0 if the trial
-        had none."""
+        """Returns (rounds of density control in ``total`` iterations) / (rounds in the last trial); 0 if the latter is 0."""
         rounds = self.result.facts.get("density_control_rounds", 0)
         return sum(self.plan.options.control.is_due(i, total) for i in range(1, total + 1)) / rounds if rounds else 0.0
 
 
 def shortened(options: Any, iterations: int) -> Any:
-    """Returns options of the same run in fewer iterations. The schedule of density control is shortened in proportion."""
+    """Returns a run's options with at most ``iterations``. The schedule of density control is shortened in proportion."""
     if not isinstance(options, SplatOptions) or iterations >= options.iterations:
         return replace(options, iterations=min(iterations, options.iterations))
     share, control = iterations / options.iterations, options.control
@@ -138,8 +136,8 @@ def shortened(options: Any, iterations: int) -> Any:
 
 
 def seconds_around(path: Path, scan: Scan, result: Reconstruction) -> float:
-    """Returns the seconds for what ``reconstruct`` does besides the method: it hashes the scan, compares the volume with the
-    scan's ``reference`` if both have one shape, and writes the volume."""
+    """Measures the seconds of what the command ``reconstruct`` does besides the method: it hashes the scan file ``path``,
+    compares the volume with the scan's ``reference`` if both have one shape, and writes the volume."""
     started = time.perf_counter()
     sha256_of(path)
     if scan.reference is not None and result.volume.shape == scan.reference.shape:
@@ -150,8 +148,8 @@ def seconds_around(path: Path, scan: Scan, result: Reconstruction) -> float:
 
 
 def peak_host_bytes() -> int:
-    """Returns the most resident memory of this process so far, in bytes. Linux's getrusage may also count the parent's
-    memory, so it is read from /proc there."""
+    """Returns the most resident memory of this process so far, in bytes. On Linux it comes from /proc, because getrusage may
+    count the parent's memory too."""
     if peak_bytes := in_use_bytes("VmHWM:"):
         return peak_bytes
     largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

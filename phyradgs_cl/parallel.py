@@ -17,7 +17,7 @@ import numpy as np
 
 from phyradgs_cl.errors import InputError
 
-# The variables in which each launcher states rank, number of ranks, rank on this machine, and ranks on this machine.
+# Each launcher's environment variables: rank, number of ranks, rank on this machine, number of ranks on this machine.
 _NAMES = ("RANK", "SIZE", "LOCAL_RANK", "LOCAL_SIZE")
 _LAUNCHERS = (
     *(tuple(f"{mpi}_COMM_WORLD_{name}" for name in _NAMES) for mpi in ("OMPI", "MV2")),
@@ -25,16 +25,16 @@ _LAUNCHERS = (
     ("PMIX_RANK", "SLURM_STEP_NUM_TASKS", "SLURM_LOCALID", "SLURM_STEP_TASKS_PER_NODE"),
 )
 _PATIENCE_S = 5.0  # a failing rank 0 waits this long for the others to fail too, then ends them
-_LATER_S = 0.5  # each further rank waits this much longer than the one before, so that only one reports
-_MOST_VALUES = 1 << 26  # values per MPI call: before MPI 4, a count of 2³¹ overflows
+_LATER_S = 0.5  # each rank up to 20 waits this much longer than the rank before, so that only one rank reports its error
+_MOST_VALUES = 1 << 26  # most values in one MPI call: before MPI 4, a count of 2³¹ overflows
 _BITS = 62  # number of bits of an int64 that a sum may use: all except the sign and one as a reserve
 _NOT_FINITE = 100_000  # stands for the exponent of a row with NaN or infinity: larger than any float's exponent
-_BLOCK_VALUES = 1 << 20  # number of values that are summed at a time, which limits the memory for their integers
+_BLOCK_VALUES = 1 << 20  # ``exact_sum`` sums about this many values at a time, to hold few 64-bit integers in memory
 
 
 @dataclass(frozen=True)
 class Launch:
-    """This process's number ``rank`` among all ``size`` processes, and ``local_rank`` among those on this machine."""
+    """This process's number ``rank`` among all ``size`` ones, and ``local_rank`` among the ``local_size`` on its machine."""
 
     rank: int = 0
     size: int = 1
@@ -43,7 +43,8 @@ class Launch:
 
 
 def launched(environment: Mapping[str, str] = os.environ) -> Launch:
-    """Reads from environment variables how mpiexec (MPICH, Open MPI, MVAPICH, Intel MPI) or srun started this process."""
+    """Reads from environment variables how mpiexec (MPICH, Open MPI, MVAPICH, Intel MPI) or srun launched this process.
+    Without either, the process has rank 0 of 1."""
     for names in _LAUNCHERS:
         rank, size, local_rank, local_size = (_count(environment.get(name)) for name in names)
         if rank is None or size is None or size < 2:
@@ -66,8 +67,8 @@ def _count(text: str | None) -> int | None:
 class Communicator:
     """Communication among the ``size`` processes (ranks) of a run. This base class stands for a single process.
 
-    All ranks must call the methods in the same order, except ``all_fail`` and ``abort``. ``sent_bytes`` counts what this
-    rank has given to sums and gathers."""
+    All ranks must call the methods in the same order, except ``all_fail`` and ``abort``. ``sent_bytes``: bytes of the arrays
+    that this rank has given to sums, maxima and gathers."""
 
     rank, size, local_rank, local_size = 0, 1, 0, 1
     sent_bytes = 0
@@ -81,7 +82,7 @@ class Communicator:
         """Replaces contiguous ``values`` by their maxima over all ranks, in place."""
 
     def any(self, flag: bool) -> bool:
-        """Returns whether ``flag`` is set on any rank."""
+        """Returns whether ``flag`` is True on any rank."""
         return flag
 
     def bcast(self, value: Any) -> Any:
@@ -93,7 +94,7 @@ class Communicator:
         return values
 
     def all_fail(self) -> bool:
-        """Called by a rank that fails. Returns True if all other ranks fail too, within a few seconds."""
+        """Waits, in a rank that fails, for all others to fail too: 5 s in rank 0, 15 s at most. Returns whether all do."""
         return True
 
     def abort(self, status: int) -> NoReturn:
@@ -106,7 +107,7 @@ class Mpi(Communicator):
 
     def __init__(self, comm: Any, launch: Launch) -> None:
         self._comm = comm
-        self._failing = comm.Dup()  # used by failing ranks alone, so that calls of the others do not interfere
+        self._failing = comm.Dup()  # only failing ranks use this copy, so calls of the other ranks do not interfere
         self.rank, self.size = comm.rank, comm.size
         self.local_rank, self.local_size = launch.local_rank, launch.local_size
         self.sent_bytes = 0
@@ -159,7 +160,7 @@ class Mpi(Communicator):
 
 @cache
 def launched_ranks() -> Communicator:
-    """Returns the ranks that this process was launched with, or a single process.
+    """Returns the ``Communicator`` of the ranks that this process was launched with, or of a single process.
 
     Raises InputError where mpi4py is missing, or belongs to another MPI than the launcher."""
     start = launched()
@@ -180,7 +181,7 @@ def launched_ranks() -> Communicator:
 
 @contextmanager
 def failing_together(ranks: Communicator, report_error: Callable[[BaseException], int]) -> Iterator[None]:
-    """Lets an exception of the body pass if all ranks have one. If only some fail, reports it and ends all ranks,
+    """Lets an exception of the body pass if all ranks have one. If only some have one, reports it and ends all ranks,
     because the others would wait for ever.
 
     ``report_error`` prints the error and returns the exit status."""
@@ -210,7 +211,7 @@ def exact_sum(ranks: Communicator, parts: Sequence[np.ndarray], shape: tuple[int
         block = slice(first, min(first + columns, shape[1]))
         integers = np.zeros((shape[0], block.stop - first), np.int64)
         for part in parts:
-            # exact: the factor is a power of two
+            # the product is exact, because the factor is a power of two
             scaled = np.multiply(part[:, block], np.ldexp(1.0, shift)[:, None], dtype=np.float64)
             scaled[not_finite] = 0
             integers += np.rint(scaled, out=scaled).astype(np.int64)
@@ -221,8 +222,8 @@ def exact_sum(ranks: Communicator, parts: Sequence[np.ndarray], shape: tuple[int
 
 
 def _largest_exponents(ranks: Communicator, parts: Sequence[np.ndarray], rows: int) -> np.ndarray:
-    """Returns, for each row, the least e ≥ −300 with |values| < 2^e on all ranks, (rows,) int64; ``_NOT_FINITE`` for a row
-    with NaN or infinity."""
+    """Returns, for each row of the ``parts`` (rows, n) of all ranks, the least e ≥ −300 with |values| < 2^e, (rows,) int64;
+    ``_NOT_FINITE`` for a row with NaN or infinity."""
     exponents = np.full(rows, -300, np.int64)
     for part in parts:
         largest = np.abs(part).max(axis=1, initial=0.0).astype(np.float64)  # NaN for a row with a NaN

@@ -10,7 +10,7 @@ import typer
 from phyradgs_cl.reconstructors import Progress
 from phyradgs_cl.text import clock
 
-_OVER = "\r\x1b[K"  # clears a terminal's line
+_OVER = "\r\x1b[K"  # moves the cursor of a terminal to the start of its line, and clears the line
 _TERMINAL_EVERY_S = 0.2  # least time between two changes of the line on a terminal
 _ELSEWHERE_EVERY_S = 10.0  # least time between two lines in a file or pipe
 
@@ -25,7 +25,7 @@ def _in_notebook() -> bool:
 
 
 class Ticker:
-    """Shows how many ``noun``s are done, the rate and the time left. As a context manager it ends the open line."""
+    """Shows how many ``noun``s, such as frames, are done, the rate and the time left. Leaving its context ends the line."""
 
     def __init__(self, noun: str) -> None:
         self.noun = noun
@@ -55,7 +55,7 @@ class Ticker:
             self.is_open, self.is_counting = True, False
 
     def end(self, text: str) -> None:
-        """Replaces the line on a terminal by a last one that stays. Elsewhere shows nothing."""
+        """Replaces the line on a terminal by ``text``, which stays. Elsewhere shows nothing."""
         self.stage(text)
         self.is_counting = self.is_open
 
@@ -69,8 +69,8 @@ class Ticker:
         self.show(p.iteration, p.iterations, f"  {p.quantity} {p.loss:.5f}{cloud}")
 
     def show(self, done: int, total: int, more: str = "", share: float | None = None) -> None:
-        """Shows ``done`` of ``total``, then ``more``, unless the last line is too recent. share: the fraction of the work
-        that is done, if it differs from done / total."""
+        """Shows ``done`` of ``total``, then ``more``: at the end, and if 0.2 s have passed since the last line (10 s outside
+        of a terminal). share: the fraction of the work that is done, if it differs from done / total."""
         now = time.monotonic()
         if share is None:
             share = done / total if total else 0.0

@@ -40,13 +40,13 @@ REMOVED = {
     "--what drift": "correct the frames by 'phyradgs prepare --steps air'",
     "--what start": "leave it out: another start only turns the object about the axis",
 }
-"""What to do instead, by removed word: an option in Python's spelling, an option with its value, or a command. A word that
-other methods still have starts with ``--method`` and the method that lost it."""
+"""What to do instead of each removed word: an option, an option with its value, or a command. An option that other methods
+still have is listed as ``--method NAME: option WORD``, for the method NAME that lost it."""
 
 
 def removal(word: str, subject: str = "") -> InputError | None:
     """Returns the error that says what replaces ``word``, a former option or value in ``REMOVED``; None for other words.
-    subject: the start of its message, as ``--tune``."""
+    subject: the beginning of the error's message, such as ``--tune``; by default ``word``."""
     return InputError(subject or word, "a word of an earlier version", "", REMOVED[word]) if word in REMOVED else None
 
 

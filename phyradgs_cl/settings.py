@@ -29,8 +29,8 @@ else:
 
 @dataclass(frozen=True)
 class Settings:
-    """Options by name, not yet checked. origins: where each was given, for error messages. device: an index, cpu, gpu or
-    part of a name; None for the best. memory: limit of the device's memory in bytes; None for all that the device has."""
+    """A run's options ``values`` by name, not yet checked. origins: where each was given, for messages. device: an index,
+    cpu, gpu or part of a name; None for the best. memory: limit of device memory in bytes; None for all."""
 
     values: Mapping[str, Any]
     origins: Mapping[str, str]
@@ -93,7 +93,7 @@ class Settings:
 def read_settings(
     config: Path | None, given: Mapping[str, object], assignments: Sequence[str] = ()
 ) -> Settings:
-    """Reads a configuration file. ``assignments`` NAME=VALUE override it, and ``given`` options, unless None, override both.
+    """Returns the settings of a file ``config``. ``assignments`` NAME=VALUE override it, then ``given`` options if not None.
 
     Raises InputError for a wrong file, assignment, device or memory."""
     values: dict[str, Any] = {} if config is None else read_toml(config, f"--config {config}")
@@ -134,7 +134,7 @@ def _object_motion(path: Path) -> methods.ObjectMotion:
 
 
 def _origin_of(subject: str, origins: Mapping[str, str]) -> str | None:
-    """Returns where the user gave the option that ``subject`` names, in a file with its dotted name; None if nowhere."""
+    """Returns where the user gave the option that a message's ``subject`` names: a flag or a file entry; None if nowhere."""
     words = re.findall(r"option ([\w-]+)", subject) or re.sub(r"\(.*\)", "", subject).split()[-1:]
     first, *rest = [part for word in words for part in word.lstrip("-").split(".")] or [""]
     origin = origins.get(first.replace("-", "_"))
@@ -142,7 +142,7 @@ def _origin_of(subject: str, origins: Mapping[str, str]) -> str | None:
 
 
 def assignment(text: str) -> dict[str, Any]:
-    """Parses NAME=VALUE. The value is TOML, or text without quotation marks as in prior=dct. Raises InputError otherwise."""
+    """Parses NAME=VALUE. VALUE: TOML, or text without quotation marks as in prior=dct. Raises InputError for other text."""
     name, sign, value = text.partition("=")
     if not (sign and name.strip()):
         raise InputError("--set", repr(text), "NAME=VALUE", "write for example tv_weight=0.002")

@@ -16,13 +16,13 @@ from phyradgs_cl.errors import DeviceError
 NOTHING = "interrupted, nothing new written"
 COMPLETE = "interrupted, the output is complete"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_SAME_PRESS_S = 1.0  # wrappers such as timeout and uv repeat a signal: within this time both count as one
+_SAME_PRESS_S = 1.0  # signals within this time of the first count as the first: wrappers such as timeout repeat a signal
 
 
 class StopFlag:
-    """The handler of both signals. waits: the first signal is remembered, but raises nothing yet. keeps: ``waits`` stays
-    True after a loop of iterations, until the loop's result is written. farewell: what the command line prints after a
-    signal has ended the command."""
+    """The handler of SIGINT and SIGTERM. waits: the first signal is remembered, but raises nothing yet. keeps: ``waits``
+    stays True after a loop of iterations, until the loop's result is written. farewell: what the command line prints after
+    a signal has ended the command."""
 
     def __init__(self) -> None:
         self.waits = self.keeps = False
@@ -48,9 +48,9 @@ class StopFlag:
 
 @contextmanager
 def answer_signals(*, takes_default: bool = True) -> Iterator[StopFlag]:
-    """Installs a ``StopFlag`` as the handler of both signals and yields it; an outer block's flag is used again.
+    """Installs a ``StopFlag`` as the handler of SIGINT and SIGTERM, and yields it. In such a block, yields the block's flag.
 
-    takes_default: also replace the system's default action, which for SIGTERM ends the process at once."""
+    takes_default: True also replaces the system's default action, which for SIGTERM ends the process at once."""
     is_main = threading.current_thread() is threading.main_thread()
     installed, flag = _installed() if is_main else None, StopFlag()
     if installed is not None or not is_main:
@@ -60,7 +60,7 @@ def answer_signals(*, takes_default: bool = True) -> Iterator[StopFlag]:
     replaced = {n: usual for n in _SIGNALS if (usual := signal.getsignal(n)) not in left_alone}
     for number in replaced:
         signal.signal(number, flag)
-        if hasattr(signal, "siginterrupt"):  # else a signal interrupts reads, and a driver's compiler fails
+        if hasattr(signal, "siginterrupt"):  # without this call a signal interrupts reads, and a driver's compiler fails
             signal.siginterrupt(number, False)
     try:
         yield flag
@@ -73,8 +73,8 @@ def answer_signals(*, takes_default: bool = True) -> Iterator[StopFlag]:
 def stop_on_interrupt(waits: bool = True) -> Iterator[StopFlag]:
     """Yields a flag whose ``is_set`` tells a loop of iterations that a signal came; the first signal does not raise.
 
-    waits: False leaves it to the block around this one whether the first signal raises. A driver's compiler gets the
-    signal too and may die, which makes the device fail. Such a DeviceError becomes KeyboardInterrupt."""
+    waits: False leaves it to the surrounding block whether the first signal raises. A driver's compiler gets the signal too
+    and may end early, so that the device fails. A DeviceError after a signal becomes KeyboardInterrupt."""
     with answer_signals(takes_default=False) as flag:
         before, flag.waits = flag.waits, flag.waits or waits
         try:
@@ -102,7 +102,7 @@ def keep_finished_work() -> Iterator[None]:
 
 @contextmanager
 def finish_despite_interrupt() -> Iterator[None]:
-    """Delays signals during short work such as writing. Then raises KeyboardInterrupt if one has come."""
+    """Delays signals during short work such as writing. Then raises KeyboardInterrupt if a signal has come."""
     with stop_on_interrupt() as flag:
         yield
     flag.farewell = COMPLETE

@@ -12,8 +12,8 @@ from typing import Any
 
 # Control characters may move a terminal's cursor. Lone surrogates, which stand for bytes not in UTF-8, cannot be written.
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
-_UNIT = re.compile("(.+?)_(per_mm|mm|s|ms|rad|deg|px|db)")  # a name that ends in a unit
-_MANY = 8  # longer lists are told by their ends
+_UNIT = re.compile("(.+?)_(per_mm|mm|s|ms|rad|deg|px|db)")  # matches a name that ends in a unit, as ``rim_mm``
+_MANY = 8  # of a list with more values, ``value_text`` shows only their number, the first and the last
 
 
 def plain_text(text: str) -> str:
@@ -33,7 +33,7 @@ def suggest_name(name: object, known_names: Iterable[str], otherwise: str) -> st
 
 
 def flattened(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields (name, value) of every value in nested tables. A name such as ``rates.position`` includes its table's."""
+    """Yields (name, value) of every value in nested tables. A name includes its tables' names, as in ``rates.position``."""
     for name, value in table.items():
         if isinstance(value, Mapping):
             yield from flattened(value, f"{prefix}{name}.")
@@ -42,7 +42,7 @@ def flattened(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Inverts ``flattened``: returns nested tables from dotted names. Where a name is repeated, the last value wins."""
+    """Inverts ``flattened``: returns nested tables from dotted names. Of a value and a table of one name, the later wins."""
     tables: dict[str, Any] = {}
     for name, value in values.items():
         *groups, last = name.split(".")
@@ -56,7 +56,7 @@ def nested(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def repr_of_changes(thing: Any) -> str:
-    """Returns the repr of a dataclass, with only the fields that differ from their defaults. Arrays show their shape."""
+    """Returns the repr of a dataclass with only the fields that differ from their defaults. Arrays appear as their shape."""
     texts = []
     for field in fields(thing):
         value = getattr(thing, field.name)
@@ -70,9 +70,9 @@ def repr_of_changes(thing: Any) -> str:
 
 
 def value_text(value: Any, digits: int = 6) -> str:
-    """Returns a value for a reader: numbers with ``digits`` significant digits, tables as "name value, name value". Entries
-    of a table that are None are left out, and tables in it get parentheses. A list of more than 8 is told by its count and
-    ends."""
+    """Returns a value as text: numbers with ``digits`` significant digits, tables as "name value, name value". Entries
+    of a table that are None are left out, and tables in it get parentheses. Of a list with more than 8 values, the text has
+    their number, the first and the last."""
     match value:
         case float():
             return f"{value:.{digits}g}"
@@ -111,7 +111,7 @@ def _is_warning(record: logging.LogRecord) -> bool:
 
 
 def _is_new(said: set[str], record: logging.LogRecord) -> bool:
-    """Returns False for a warning of this package that is in ``said`` already. Adds a new one to ``said``."""
+    """Returns False for a warning of this package whose message is in ``said``; otherwise adds its message to ``said``."""
     if not _is_warning(record):
         return True
     is_new = record.getMessage() not in said
@@ -120,19 +120,19 @@ def _is_new(said: set[str], record: logging.LogRecord) -> bool:
 
 
 def each_warning_once() -> Any:
-    """Drops this package's warnings that the body, or a decorated function, repeats word for word."""
+    """Returns a context manager or decorator that drops this package's warnings that are repeated word for word in it."""
     return _filtered(lambda: partial(_is_new, set()))
 
 
 def without_warnings() -> AbstractContextManager[None]:
-    """Silences this package's warnings in the body. An outer ``each_warning_once`` does not count them."""
+    """Returns a context that drops this package's warnings. An outer ``each_warning_once`` does not count them as given."""
     return _filtered(lambda: lambda record: not _is_warning(record))
 
 
 @contextmanager
 def _filtered(make_filter: Callable[[], Callable[[logging.LogRecord], bool]]) -> Iterator[None]:
-    """While the body runs, puts a new filter before the other filters of every log handler. The new filter drops the records
-    for which it returns False before an outer ``each_warning_once`` sees them."""
+    """Puts a filter from ``make_filter`` before the other filters of every log handler while the body runs. A record for
+    which the filter returns False is dropped, and an outer ``each_warning_once`` does not see it."""
     handlers = [*logging.getLogger(__package__).handlers, *logging.getLogger().handlers, logging.lastResort]
     filters = [(handler, make_filter()) for handler in handlers if handler is not None]
     for handler, one in filters:

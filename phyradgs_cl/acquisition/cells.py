@@ -13,10 +13,10 @@ from phyradgs_cl.acquisition.time_cells import TimeCells
 from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames, is_parallel
 
 _SAME_TIME = 1e-6  # two times that differ by less than this fraction of a cell's duration count as equal
-_NOTHING = 1e-9  # a cell's fraction of a line's exposure below this is a rounding error, and becomes 0
-_INSTANT = 1e-9  # a line's exposure shorter than this fraction of the frame's lit span counts as a single moment
-_OVERHANG = 0.1  # a line leaves out its first or last segment of time if its exposure covers at most this fraction of it
-_TURN_SAMPLES = 32  # the gantry's highest speed is taken from the mean speeds in this many intervals of a frame's lit span
+_NOTHING = 1e-9  # if a cell has a smaller fraction of a line's exposure, this is a rounding error and becomes 0
+_INSTANT = 1e-9  # an exposure up to this fraction of the time from a frame's first light to its last counts as a moment
+_OVERHANG = 0.1  # a line leaves out its first or last segment if the exposure covers at most this fraction of the segment
+_TURN_SAMPLES = 32  # intervals of a frame's exposure whose largest mean speed counts as the gantry's highest speed
 _TURN_FACTOR = 0.32  # measured (relative RMS error of a frame) / (gantry's turn in a segment, in rad)²
 _HARMLESS_PEAK = 4.0  # up to this line integral, averaging intensities needs no more segments than averaging line integrals
 _MOST_SEGMENTS = 1000  # most segments that ``segments_for`` chooses for a frame
@@ -28,15 +28,15 @@ their last lines, and the order that sorts the cells by first line."""
 
 
 def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
-    """Returns one cell of all lines, midway between the frame's first and last light: the best time for a single pose."""
+    """Returns one cell for all lines, with the pose midway between first and last light: the best time for a single pose."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.middle_s, lines)
 
 
 def static_start_cells(
     trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int
 ) -> TimeCells:
-    """Returns one cell of all lines, at the frame's first light. A volume reconstructed with it is rotated by half of the
-    arc that the gantry turns between first and last light."""
+    """Returns one cell for all lines, with the pose at the frame's first light. A volume reconstructed from such cells is
+    rotated by half of the arc that the gantry turns between first and last light."""
     return _single_cell(trajectory, shutter, frame, start_s + shutter.lit_span_s[0], lines)
 
 
@@ -105,7 +105,7 @@ def common_time_cells(
     if length_s <= 0 or last_s - first_s > lines * step_s:
         return per_line_cells(trajectory, shutter, frame, start_s, lines, samples if length_s > 0 else 1)
     edges_s, share, (used, line_start, line_stop, order) = _common_shares(windows_s.tobytes(), samples)
-    latest_s = float(np.max(frame_start_s)) + last_s - step_s / 2  # the trajectory's table may end at the scan's last light
+    latest_s = float(np.max(frame_start_s)) + last_s - step_s / 2  # the trajectory may have no poses after the last light
     middle_s = np.minimum(_middles_s(frame_start_s, frame, edges_s), latest_s)[used]
     table = cell_table(trajectory, shutter, frame, middle_s, line_start, line_stop, np.ones(used.size), lines)
     return replace(table, line_share=share[used][order])
@@ -113,7 +113,7 @@ def common_time_cells(
 
 @lru_cache(maxsize=8)  # the lines' windows are the same in all frames of a scan
 def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray, Served]:
-    """Returns the edges (K + 1,) in s of cells, the fraction (K, lines) of each line's window in each cell, and ``Served``.
+    """Returns the edges (K + 1,) in s of K cells, the fraction (K, lines) of each line's window in each, and ``Served``.
 
     windows: the windows (lines, 2) in s after a frame's start, as bytes, because the cache takes no arrays as keys. The
     returned arrays stay in the cache: do not write to them."""
@@ -126,8 +126,8 @@ def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _served_lines(served: np.ndarray) -> Served:
-    """Returns the indices of the cells that serve any line, their first lines, the lines after their last lines, and the
-    order by first line. served: whether each of K cells serves each line, bool (K, lines)."""
+    """Returns the indices of the cells that serve any line, these cells' first lines, the lines after their last lines, and
+    the order that sorts them by first line. served: whether each of K cells serves each line, bool (K, lines)."""
     used = np.flatnonzero(served.any(axis=1))
     line_start = served[used].argmax(axis=1)
     line_stop = served.shape[1] - served[used, ::-1].argmax(axis=1)
@@ -175,7 +175,7 @@ def exact_cells(
         return static_cells(trajectory, shutter, frame, start_s, lines)
     edges_s = np.linspace(first_s, last_s, segments + 1)
     times = _line_times(shutter.line_windows_s(lines), edges_s)
-    # Leaves out cells that no line sees: projecting them would be wasted work.
+    # Cells that serve no line are left out: their projections would have no effect.
     used, line_start, line_stop, order = _served_lines(times[:, 2] > 0)
     middle_s = start_s + (edges_s[:-1] + edges_s[1:])[used] / 2
     ends_s = start_s + np.stack([edges_s[:-1], edges_s[1:]], -1)[used][order]
@@ -194,7 +194,7 @@ def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     are projected."""
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
-    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # in segments after the frame's first light
+    opens, closes = ((windows_s - edges_s[0]) / length_s).T  # times after first light / length of a segment
     first, last = _segments_of_lines(opens, closes, count)
     index = np.arange(count)[:, None]
     start = np.where(index == first, opens, index)
@@ -254,7 +254,8 @@ def cell_table(
     trajectory: Trajectory, shutter: Shutter, frame: int, time_s: np.ndarray, line_start: np.ndarray,
     line_stop: np.ndarray, weight: np.ndarray, lines: int
 ) -> TimeCells:
-    """Returns the cells at times (C,) in s, sorted by their first lines, with the trajectory's poses at these times."""
+    """Returns still cells at times (C,) in s with the trajectory's poses at these times, sorted by ``line_start``. Other
+    arrays (C,): as in ``TimeCells``."""
     order = np.argsort(line_start, kind="stable")
     return TimeCells(
         pose=trajectory.pose(frame, time_s[order]), time_s=time_s[order],

@@ -245,7 +245,7 @@ def _travel_mm(poses: np.ndarray, geometry: Geometry) -> tuple[float, float]:
 
 
 def check_distances(geometry: Geometry, grid: Grid) -> None:
-    """Raises InputError for a source more than 1e6 voxels from the axis, at which float32 misplaces rays."""
+    """Raises InputError for a cone beam's source over 1e6 voxels from the axis: farther away, float32 misplaces rays."""
     if isinstance(geometry, ParallelGeometry):
         return
     source_mm, voxel_mm = geometry.source_to_axis_mm, min(grid.voxel_size_mm)
@@ -281,7 +281,7 @@ def hidden(grid: Grid, pose: np.ndarray, detector_shape: tuple[int, int], is_par
     inward = sides * np.sign(sides @ rays.sum(axis=0))[:, None]
     if (corners @ away > rays[0] @ away).all():
         return "behind the panel"
-    planes = np.concatenate([inward, away[None]])  # the four sides of the pyramid of rays, and the plane through the source
+    planes = np.concatenate([inward, away[None]])  # normals of the four sides of the pyramid of rays, and of the panel
     return "beside the rays" if (corners @ planes.T < 0).all(axis=0).any() else ""
 
 

@@ -23,17 +23,17 @@ from phyradgs_cl.fields import Deformation
 
 RAYS, SPLATS, LINE_POSES = "rays", "splats", "one pose per line"
 """The kinds of operator that a model may suit: projectors of voxels, of Gaussians, and filtered backprojection."""
-_USUAL_TIMES = 6  # most times at which ``PerRow`` samples an exposure, if they are at most _COARSE_STEP_VOXELS apart
-_MOST_TIMES = 100  # most times at which ``PerRow`` samples an exposure, however fast the motion
-_FINE_STEP_VOXELS = 0.3  # most voxels that the volume's rim travels from one time of ``PerRow`` to the next
-_OBJECT_STEP_VOXELS = 0.7  # most voxels that an object's fastest part travels between two times; other parts travel less
-_COARSE_STEP_VOXELS = 3.6  # most voxels that rim or object travels between two times, of which it may need more than six
+_USUAL_TIMES = 6  # most times of an exposure for ``PerRow``, unless rim or object moves over _COARSE_STEP_VOXELS between two
+_MOST_TIMES = 100  # most times of an exposure for ``PerRow``, however fast the motion
+_FINE_STEP_VOXELS = 0.3  # most voxels that the volume's rim moves between two times of ``PerRow``, if six times suffice
+_OBJECT_STEP_VOXELS = 0.7  # most voxels that an object's fastest part moves between two times, if six times suffice
+_COARSE_STEP_VOXELS = 3.6  # most voxels that rim or object moves between two times of ``PerRow``, if 100 times suffice
 _SUB_INTERVALS = "Sub-intervals N of an exposure; for phyradgs means micro-views."
-_WEIGHT_TOLERANCE = 1e-3  # largest difference from 1 of the sum of a line's weights in a user-defined model
+_WEIGHT_TOLERANCE = 1e-3  # largest |(sum of a line's weights) − 1| that is accepted from a user-defined model
 
 
 class Motion(Protocol):
-    """The interface of a motion model. A result's provenance lists the model's ``name``, if any, and dataclass fields."""
+    """The interface of a motion model. A result's provenance lists the model's ``name``, if it has one, and its fields."""
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """Returns the time cells of one frame. The weights of every line sum to 1."""
 
@@ -53,7 +53,7 @@ def rim_travel_voxels(scan: Scan) -> float:
 
 
 def _travel_mm(scan: Scan, frame: int, points_mm: np.ndarray) -> float:
-    """Returns the largest travel in mm of points (P, 3), relative to the panel, during the first line's exposure."""
+    """Returns the largest travel in mm of points (P, 3), relative to the panel, while a frame's first line is exposed."""
     start_s = float(scan.frame_start_s[frame])
     pose = scan.trajectory.pose(frame, np.array([start_s, start_s + scan.shutter.exposure_s]))
     panel, column, row = pose[:, 3:6], pose[:, 6:9], pose[:, 9:12]
@@ -73,7 +73,7 @@ class _Model(checks.Checked):
     operators: ClassVar[tuple[str, ...]]  # which methods take the model: some of RAYS, SPLATS, LINE_POSES
     poses: ClassVar[str] = ""  # a frame's poses in words, for the help of --motion; "" hides the model from the command line
     counts: ClassVar[str] = ""  # format string of the model's fields, whose text is appended to its name in reports
-    is_implied: ClassVar[bool] = True  # whether giving one of its numbers, such as --strips, chooses the model
+    is_implied: ClassVar[bool] = True  # whether an option for one of the model's numbers, as --strips, chooses the model
 
 
 @dataclass(frozen=True)
@@ -135,8 +135,7 @@ class Centres(MicroViews):
     name: str = field(default="centres", init=False, repr=False)
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
-        """Returns the ``TimeCells`` of one frame: strips × sub-intervals cells with the ``conic_pose`` that all of them
-        share."""
+        """Returns the ``TimeCells`` of one frame: strips × sub-intervals cells with one ``conic_pose`` for all of them."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         return cells.centre_cells(*_place(scan, frame), self.strips, self.sub_intervals)
@@ -224,7 +223,7 @@ class Exact(_Model):
 
     def cells(self, scan: Scan, frame: int, intensity_peak: float = 0.0) -> TimeCells:
         """Returns the ``TimeCells`` of one frame, one per segment. intensity_peak: the largest line integral if the detector
-        averages intensities, else 0. More segments are needed above 4."""
+        averages intensities, else 0. A peak above 4 needs more segments."""
         if not scan.is_fly:
             return Static().cells(scan, frame)
         where = _place(scan, frame)
@@ -238,7 +237,7 @@ MOTIONS = tuple(dict.fromkeys(model.name for model in MODELS))
 
 
 def motions_for(*operators: str) -> tuple[Motion, ...]:
-    """Returns the models, with their default numbers, that suit any of the given operators: RAYS, SPLATS, LINE_POSES."""
+    """Returns the models, with their default numbers, that suit any of ``operators``: some of RAYS, SPLATS, LINE_POSES."""
     return tuple(model() for model in MODELS if set(operators) & set(model.operators))
 
 
@@ -284,8 +283,8 @@ def motion_from_facts(facts: Mapping[str, object]) -> Motion | None:
 
 
 def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
-    """Raises InputError for a value that is not a motion model, and for one of ``MODELS`` whose class is not among those of
-    ``taken``. A model of the user's own is accepted."""
+    """Raises InputError for anything but a motion model, and for an instance of one of ``MODELS`` if no model in ``taken``
+    has its class. A user-defined model is accepted."""
     if isinstance(motion, type) and hasattr(motion, "cells"):
         raise InputError("--motion", f"the class {motion.__name__}", "a model", f"write {motion.__name__}()")
     if not callable(getattr(motion, "cells", None)):
@@ -295,7 +294,7 @@ def check_motion(motion: Motion, taken: tuple[Motion, ...]) -> None:
 
 
 class MotionOptions(checks.Checked):
-    """Base of a method's options: checks that ``motion`` has the class of one of ``MOTIONS``, or a user-defined class."""
+    """Base of a method's options: checks that ``motion`` has the class of one in ``MOTIONS``, or a user-defined class."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]]
     motion: Motion

@@ -16,19 +16,19 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 OPAQUE = 50.0  # no panel can measure a larger line integral
-_BRIGHT, _MANY = 5.0, 0.1  # more than this fraction of the pixels cannot be so many times as bright as air
-FEW = 0.01  # fraction of pixels above OPAQUE that is ignored, since some pixels of a panel may be broken
+_BRIGHT, _MANY = 5.0, 0.1  # more than the fraction _MANY of pixels over _BRIGHT times as bright as air is refused
+FEW = 0.01  # up to this fraction of pixels above OPAQUE is ignored, since some pixels of a panel may be broken
 _WIDEST_DEG = 120.0  # a fan or cone angle above this is refused: dental scanners have 30°, nano-CT 60°
 _LARGEST_PITCH_MM = 5.0  # pixels larger than this are not real, so they are named as the cause of too wide a fan
-_LEAST_DISTANCE_MM = 10.0  # a panel nearer to the source than this is not real, so distances are named as the cause
-_WRONG_UNIT = 100.0  # a readout longer than this many frame times is refused: one stated in ms as if in s lasts hundreds
+_LEAST_DISTANCE_MM = 10.0  # a panel nearer to the source is not real, so distances are named as the cause of too wide a fan
+_WRONG_UNIT = 100.0  # a readout over this many frame times is refused: a number in ms, read as s, gives hundreds
 _SHORT_READOUT_S = 0.5e-3  # a shorter readout of at least _MANY_LINES lines causes a warning: real panels take some ms
 _MANY_LINES = 100
 _SLOW_FPS = 2.0  # a lower frame rate causes a warning if the gantry turns by more than _LARGE_STEP_DEG between frames
 _LARGE_STEP_DEG = 10.0
-_LEAST_LIT = 0.25  # a low frame rate causes a warning only if exposure + readout is below this fraction of a frame's time
-_TIMES = 17  # number of angles sampled in an exposure: no gantry makes half a turn from one to the next
-_SLACK = 1e-3  # relative tolerance, because stated times and angles are rounded
+_LEAST_LIT = 0.25  # a low frame rate causes a warning only if (exposure + readout) / (frame time) is below this
+_TIMES = 17  # number of times at which angles of an exposure are computed: no gantry makes half a turn between two of them
+_SLACK = 1e-3  # relative tolerance of times and angles, because users and files round them
 _MOST_RAD = 20 * np.pi  # angles that span more than these ten turns are most likely in another unit
 _MANY_FRAMES = 10  # fewer frames may lie within a few degrees on purpose, so they cause no warning about radians
 _ASIDE = 0.1  # a panel off centre by more than this fraction of its width was displaced for a wider field of view
@@ -163,8 +163,8 @@ def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> 
 
 
 def check_brightness(projections: np.ndarray, valid: np.ndarray, subject: str) -> None:
-    """Raises InputError for line integrals (F, v, u) of which more than a tenth say a pixel 5 times as bright as air.
-    valid: True where they count, in an array that broadcasts."""
+    """Raises InputError about ``subject`` if over a tenth of the line integrals (F, v, u) are below −ln 5, as in pixels over
+    5 times as bright as air. valid: True where a line integral counts, in an array that broadcasts."""
     pairs = [(frame, ok) for frame, ok in zip(projections, np.broadcast_to(valid, projections.shape), strict=True)]
     bright = sum(np.count_nonzero((frame < -math.log(_BRIGHT)) & ok) for frame, ok in pairs)
     share = bright / max(1, sum(np.count_nonzero(ok) for _, ok in pairs))
@@ -176,8 +176,8 @@ def check_brightness(projections: np.ndarray, valid: np.ndarray, subject: str) -
 
 
 def _check_opaque(scan: "Scan", subject: str) -> None:
-    """Raises InputError if most line integrals are larger than a panel can measure: such values are counts, which are large
-    in air. Warns if more than 1 % of the pixels have such values."""
+    """Raises InputError if over half of the line integrals are above 50, more than a panel can measure: such values are
+    counts, which are large in air. Warns if over 1 % of them are."""
     pairs = zip(scan.projections, scan.valid, strict=True)
     counts = [(np.count_nonzero(frame[valid] > OPAQUE), np.count_nonzero(valid)) for frame, valid in pairs]
     opaque, valid_pixels = np.sum(counts, axis=0).tolist()
@@ -213,8 +213,8 @@ def question_unit(angle_rad: np.ndarray, subject: str, unit: str) -> None:
 
 
 def _check_panel(geometry: Geometry, named: Named) -> None:
-    """Raises InputError for too wide a fan or cone. The message names the distances if the panel is too near and the pixels
-    are not too large; else it names the pixels."""
+    """Raises InputError for a fan or cone above 120°. The message names the distances if the panel is less than 10 mm from
+    the source and pixels are at most 5 mm large; else it names the pixels."""
     widest_deg = max(_cone_deg(geometry))
     if isinstance(geometry, ParallelGeometry) or widest_deg <= _WIDEST_DEG:
         return

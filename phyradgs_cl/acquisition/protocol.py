@@ -24,7 +24,7 @@ class Protocol:
     ``exposure_deg`` (paper, section 3.1).
 
     A negative ``turns`` means clockwise, seen from above. start_deg: the gantry's angle as the first frame begins.
-    exposure_s: the exposure T_exp of a line. readout_ratio: the readout time over T_exp. is_fly: False if the gantry stops
+    exposure_s: the exposure T_exp of a line. readout_ratio: (readout time) / T_exp. is_fly: False if the gantry stops
     for every frame. pulse: (start, length) of the time in which the beam is on, after a frame's start, in units of T_exp;
     None means always. Raises InputError for values out of range."""
 
@@ -61,7 +61,8 @@ class Protocol:
         """Returns the protocol with the exposure time that gives ``fps`` frames per second. readout_ms: the readout in ms;
         None keeps its ratio to the exposure.
 
-        Raises InputError for a rate not above 0, an arc of 0, and a readout longer than a frame."""
+        Raises InputError for a rate not above 0, an arc of 0, and a readout longer than a frame. named: translates the names
+        of arguments in messages."""
         checks.positive(named("fps"), fps)
         if self.exposure_deg == 0:
             raise InputError(named("fps"), f"{fps:g} with an exposure arc of 0°", "a gantry that turns", "leave fps out")

@@ -60,7 +60,7 @@ def readout_order(
 
 def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = str) -> float | None:
     """Returns the seconds between frames: 1/``fps``, or ``frame_time_s`` if fps is None. Raises InputError for fps not above
-    0, and if both are given and differ."""
+    0, and if both are given and differ. named: translates the names of arguments in messages."""
     if fps is None:
         return frame_time_s
     checks.positive(named("fps"), fps)
@@ -69,7 +69,7 @@ def frame_time_of(fps: float | None, frame_time_s: float | None, named: Named = 
 
 def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named = str) -> float | None:
     """Returns a time in s: ``in_ms``/1000, or ``in_s`` if ``in_ms`` is None. Raises InputError for ``in_ms`` below 0, and if
-    both are given and differ. word: "exposure" or "readout", for the message."""
+    both are given and differ. word: "exposure" or "readout". named: translates the names of arguments in messages."""
     if in_ms is None:
         return in_s
     checks.at_least(named(f"{word}_ms"), in_ms, 0)
@@ -77,7 +77,7 @@ def seconds_of(word: str, in_ms: float | None, in_s: float | None, named: Named 
 
 
 def check_readout(readout_ms: float | None, readout_ratio: float | None, fps: float | None, named: Named = str) -> None:
-    """Raises InputError for a ratio outside 0 to 1000 or a time below 0, for both together, and for a time without fps."""
+    """Raises InputError for ``readout_ratio`` outside 0 to 1000, ``readout_ms`` below 0, without ``fps`` or with a ratio."""
     if readout_ratio is not None:
         checks.within(named("readout_ratio"), readout_ratio, 0, 1000)
     if readout_ms is None:

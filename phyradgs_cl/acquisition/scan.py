@@ -36,7 +36,7 @@ LARGEST_LAG = 0.9  # largest ``Scan.lag``: panels have less, and a frame with a 
 
 @dataclass(frozen=True)
 class Saturation:
-    """Saturation of the raw counts. level: the largest count. share: the fraction of pixels clipped at this count."""
+    """Saturation of a scan's raw counts. level: the largest count. share: the fraction of pixels clipped at this count."""
 
     level: float
     share: float
@@ -82,7 +82,7 @@ class Scan:
     gating: Gating | None = None
     metal: Metal | None = None
     _checked: np.ndarray | None = field(default=None, kw_only=True)
-    """Projections already known to be finite. ``dataclasses.replace`` passes them on, so the same array is checked once."""
+    """The array of projections that was last found finite. ``replace`` passes it on, so that no array is checked twice."""
 
     def __post_init__(self) -> None:
         self._check_kinds()
@@ -187,8 +187,7 @@ class Scan:
         return self.shutter.lines(self.geometry.detector_shape)
 
     def on_grid(self, grid: Grid) -> "Scan":
-        """Returns the scan with another grid. True volumes are cut to the new grid if it is a part of the old one, else
-        dropped."""
+        """Returns the scan on ``grid``. True volumes are cut to a ``grid`` that is a part of the scan's, else dropped."""
         if grid == self.grid:
             return self
         part = grid.slices_in(self.grid)

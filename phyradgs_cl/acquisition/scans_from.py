@@ -3,8 +3,7 @@
 ASTRA's ``cone_vec`` (F, 12) is source, centre of the panel, step to the next column, step to the next row, x y z each.
 ``parallel3d_vec`` begins with the direction of the rays. TIGRE's cone beam has our conventions: the source is at
 (DSO cos α, DSO sin α, 0), columns rise in the direction of the turn, row 0 is the lowest. TIGRE's pairs are (v, u), its
-triples (z, y, x). ``COR`` shifts source and panel in the direction of the columns. In both packages the rotation axis is
-z."""
+triples (z, y, x). ``COR`` shifts source and panel in the direction of columns. In both packages z is the rotation axis."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -30,7 +29,8 @@ from phyradgs_cl.text import suggest_name
 if TYPE_CHECKING:
     from phyradgs_cl.acquisition.scan import Scan
 
-_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")  # fields of ``Scan``
+# The fields of ``Scan`` that the makers of scans take as further keywords.
+_OTHERS = ("detector_model", "pixel_mask", "reference", "title", "lag", "provenance")
 
 
 def from_poses(
@@ -89,7 +89,8 @@ def from_tigre(cls: "type[Scan]", /, geo: Any, angles: "ArrayLike", frames: "Arr
 
     geo: anything with TIGRE's attributes in mm: DSD, DSO (not needed for geo.mode "parallel"), nDetector, dDetector (v, u),
     nVoxel, dVoxel (z, y, x). Optional are offDetector (v, u), offOrigin (z, y, x) and COR, each for all frames or per frame.
-    angles (F,) in radians. frames (F, v, u): line integrals as TIGRE's ``Ax`` gives them. others: fields of ``Scan``.
+    angles in radians: (F,), or Euler angles (F, 3) with zeros after the first. frames (F, v, u): line integrals as TIGRE's
+    ``Ax`` gives them. others: fields of ``Scan``.
 
     Raises InputError for a turned panel, and for attributes that are missing or do not fit."""
     check_others(others)
@@ -132,8 +133,8 @@ def check_not_counts(frames: np.ndarray, remedy: str, mask: ArrayLike | None = N
 
 
 def _uncounted(frames: ArrayLike, mask: np.ndarray | None) -> np.ndarray:
-    """Returns frames as ``line_integrals`` does. Raises InputError also for frames that look like raw counts, because the
-    caller does not state their quantity."""
+    """Returns frames as ``line_integrals`` does. Raises InputError also for frames that look like raw counts, since the user
+    does not state their quantity."""
     values = checks.real_array("frames", frames)
     check_not_counts(values, "give −ln(counts / flats)", mask)
     return line_integrals(values, mask)

@@ -9,8 +9,8 @@ from phyradgs_cl.acquisition.readout import FIRST_LINES, Readout
 from phyradgs_cl.errors import InputError
 
 AXES = ("rows", "columns")
-_STEPS = 1000  # least exposure / rounding of float64 times: parts of an exposure are then exact to a thousandth
-_DARK = 1e-9  # a line lit for less than this fraction of the longest lit time counts as missed by the pulsed beam
+_STEPS = 1000  # least (exposure) / (float64 spacing at the scan's latest time), to resolve a thousandth of the exposure
+_DARK = 1e-9  # a line that is lit for at most this fraction of the longest-lit line's time counts as dark
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Shutter:
             raise InputError("pulse_s", found, expected, "correct the pulse, or leave it out")
 
     def check_resolved(self, frame_start_s: np.ndarray, subject: str = "exposure_s") -> None:
-        """Raises InputError for an exposure above 0 that is less than 1000 float64 roundings of the latest time in the scan.
+        """Raises InputError if 0 < exposure < 1000 times the float64 spacing at the scan's latest time.
 
         frame_start_s (F,): when frames open, in s. subject: what the message names."""
         latest_s = float(np.max(np.abs(frame_start_s), initial=0.0)) + self.span_s

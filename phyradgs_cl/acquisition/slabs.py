@@ -11,12 +11,12 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 
 HALO_ROWS = 4
-"""Number of rows read beyond each side of a slab. A slice between two rows needs both, and priors compare near slices."""
+"""Number of detector rows read beyond each side of a slab. A slice between two rows needs both; priors need near slices."""
 
 
 def check_has_slabs(scan: Scan, subject: str, found: str) -> None:
-    """Raises InputError for anything but a parallel beam on a circular orbit: slices then need rows of the whole panel.
-    subject: the option that asked for a slab. found: the option's value."""
+    """Raises InputError for anything but a parallel beam on a circular orbit: a slice of other scans needs rows of the whole
+    panel. subject: the option that asked for a slab. found: the option's value."""
     if not has_slabs(scan):
         expected = "all rows: only in a parallel beam about z does a slice need few of them"
         raise InputError(subject, found, expected, "take --roi-mm, with --margin-mm")
@@ -59,8 +59,8 @@ def slab(scan: Scan, first: int, stop: int) -> Scan:
 
 
 def slices_of(scan: Scan, first: int, stop: int) -> slice:
-    """Returns the range of the grid's slices whose centres lie at the height of detector rows [first, stop); it may be
-    empty. Slices beyond the panel belong to its first or last row, so that slabs of all rows together have every slice."""
+    """Returns the range, maybe empty, of the grid's slices whose centres lie at the height of detector rows [first, stop).
+    Slices beyond the panel belong to its first or last row, so that slabs of all rows together have every slice."""
     rows, pitch_mm = scan.geometry.detector_shape[0], scan.geometry.pixel_size_mm[0]
     row = (scan.grid.axes_mm()[0] - scan.geometry.detector_offset_mm[0]) / pitch_mm + (rows - 1) / 2
     number = np.clip(np.floor(row + 0.5), 0, rows - 1)

@@ -38,8 +38,7 @@ class Trajectory(Protocol):
 
 
 def is_parallel(trajectory: Trajectory) -> bool:
-    """Returns whether the beam is parallel. A trajectory states it by its attribute ``is_parallel``; without it the beam is
-    a cone."""
+    """Returns whether the beam is parallel: the trajectory's attribute ``is_parallel``, or False if it has none."""
     return bool(getattr(trajectory, "is_parallel", False))
 
 

@@ -18,8 +18,8 @@ from phyradgs_cl.fields import Gaussians
 from phyradgs_cl.fields.gaussians import ROWS
 from phyradgs_cl.importers import load_beads
 
-# A central difference moves the image's edge by this many pixels to each side. The frames' change by a smaller step is lost
-# in errors of voxels. Their change by a larger step is not linear.
+# A central difference moves the image's edge by this many pixels to each side. With a smaller step, errors of voxels hide
+# the change of the frames. With a larger step, the change is not linear.
 _STEP_PX = 0.25
 
 
@@ -63,7 +63,7 @@ def move_views(scan: Scan, views: np.ndarray, *, without_gauges: bool = False) -
     views: (F, 3), for each view the gantry's turn about the axis in rad, counterclockwise seen from above, and the panel's
     shifts along v and u in mm. They hold for all times of a view. without_gauges: leaves out the part of ``views`` that a
     turned or shifted object explains as well (docs/calibrate.md). If frames overlap in time, ``save_scan`` refuses the
-    result, because a file has one pose at a time. It stores exposures that touch shorter by two billionths.
+    result, because a file has one pose at a time. If exposures touch, it stores them two billionths shorter.
 
     Raises InputError for anything but a Scan, and for ``views`` of another shape or with numbers that are not finite."""
     check_scan(scan)

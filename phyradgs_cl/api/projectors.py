@@ -72,8 +72,8 @@ def _intensities(rt: Runtime, engine: IntensityOperator) -> Operator:
 
 
 def _in_new_memory(rt: Runtime, function: Callable[..., Any], values: Values, shape: tuple[int, ...]) -> Values:
-    """Returns ``function(values)``. A result on the device is in a new array of ``shape``, because the next call overwrites
-    the array of the operator."""
+    """Returns ``function(values)``. A result on the device is in a new array of ``shape``, because the next call would
+    overwrite the operator's own array."""
     return function(values, rt.empty(shape)) if isinstance(values, DeviceArray) else function(values)
 
 

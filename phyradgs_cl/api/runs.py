@@ -47,8 +47,8 @@ def runtime_of(device: Device) -> Runtime:
         return _runtime_by_name(None if device is None else str(device))
 
 
-_opening = Lock()  # threads that start together would open a Runtime each, whose arrays the others' operators refuse
-_runtime_by_name = lru_cache(maxsize=4)(Runtime)  # one Runtime per device, so that kernels are built only once
+_opening = Lock()  # without it, threads that start together open a Runtime each, which refuse arrays of each other
+_runtime_by_name = lru_cache(maxsize=4)(Runtime)  # keeps the Runtimes of four devices, so that kernels are built once
 
 
 @naming_arguments()
@@ -286,8 +286,8 @@ def check_scan(scan: object, subject: str = "scan") -> None:
 
 @contextmanager
 def _reporting(report: ProgressReport | bool) -> Iterator[tuple[ProgressReport, Callable[[str], None]]]:
-    """Yields two functions: one to call with each ``Progress``, and one that ends the progress line with a text. If nothing
-    is shown, or ``report`` is the user's function, the second does nothing."""
+    """Yields two functions: one to call with each ``Progress``, and one that ends the progress line with a text. The latter
+    does nothing if no line is shown: if ``report`` is False or a user's function, or stderr is a file or a pipe."""
     if not isinstance(report, bool):
         yield report, lambda text: None
     elif not (report and has_reader()):

@@ -24,7 +24,7 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.removed import refuse_removed
 
 log = logging.getLogger(__name__)
-# For messages: the name of a value in the checks of a Scan, and the argument of ``fly_scan`` that states this value.
+# For messages: the name of a value in the checks of a Scan, and the argument of ``fly_scan`` in which the user states it.
 _ARGUMENTS = {
     "angles": "angles_deg", "exposure_s": "exposure_deg", "frame_time_s": "exposure_s", "readout_s": "readout_ratio",
     "readout_axis": "readout",
@@ -93,7 +93,7 @@ def fly_scan(
 
 
 def _arcs_deg(angles_deg: np.ndarray, exposure_deg: float) -> np.ndarray:
-    """Returns how far the gantry turns in each frame's exposure (F,), in degrees, with the sign of its turn.
+    """Returns how far the gantry turns in each frame's exposure (F,), in degrees, negative for a clockwise turn.
 
     Unwrapped angles (F,) that rise and fall belong to a gantry that swings back and forth. In each frame it turns towards
     the next frame's angle, but at a reversal it may still turn the other way. Otherwise, and with any step of 90° or more,

@@ -24,29 +24,29 @@ from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
 DENSITY = 6  # a placement (7,) is a turn (rotation vector, rad), a shift (mm) and, at this index, a factor of the density
-_MARGIN = 1.2  # a bead's shadow is taken to be wider by this factor, because an oblique panel widens it
-# Fewest and most times of an exposure. Within these limits the grid's edge moves by at most a pixel from time to time.
+_MARGIN = 1.2  # the region searched for a bead's shadow is wider by this factor: an oblique panel widens shadows
+# Fewest and most times of an exposure. Within these limits the grid's edge moves by at most a pixel between two times.
 _FEWEST_TIMES, _MOST_TIMES = 6, 24
 _FEWEST_RAYS = 2  # fewest rays along each side of a pixel, and along a bead's radius: sharp edges need several
 _MOST_RAYS = 6  # rays along each side of a pixel, at most: the time grows with their square
-# Standard deviation, in pixels, of the blur of compared frames: without blur, differences of sharp edges would show single
-# rays, half a pixel apart.
+# Standard deviation, in pixels, of the blur of compared frames. Rays are up to half a pixel apart: without blur, differences
+# of sharp edges would show single rays.
 _BLUR_PX = 0.8
 _LEAST_ZEROS = 0.2  # if at least this fraction of the pixels is 0, the noise of air was clipped at 0
-_ZEROS_PX = 5  # the noise of clipped air is computed from moving means over squares of this many pixels a side
-_BACKGROUND = 4  # cosines along each side of a frame: together they describe holder, scatter and drift of the tube
+_ZEROS_PX = 5  # side, in pixels, of the squares whose means show the noise of clipped air
+_BACKGROUND = 4  # number of cosines along each side of a frame, which describe holder, scatter and drift of the tube
 _STEP_PX = 0.25  # a central difference moves the frame's edge by this many pixels to each side
-_MOST_PX = 1.5  # most pixels by which one step of the placement moves a frame: a larger step's effect is not linear
-_SETTLED_PX = 0.01  # the search ends when a step moves the frame by fewer pixels
-_LINEAR_PX = 0.3  # derivatives are computed again after a step that moves the frame by more pixels
+_MOST_PX = 1.5  # most pixels by which a step of the placement moves a frame's edge: beyond them the effect is not linear
+_SETTLED_PX = 0.01  # the search for the placement ends when a step moves the frame's edge by fewer pixels
+_LINEAR_PX = 0.3  # derivatives are computed again after a step that moves the frame's edge by more pixels
 
 
 @dataclass(frozen=True, eq=False)
 class BeadOperator:
-    """Computes the frames (F, rows, columns) of a phantom at the poses of ``tables``, the time cells of each frame.
+    """Computes the frames (F, rows, columns) of a phantom. tables: the time cells of each frame, one table per frame.
 
-    shape: the panel's (rows, columns). model: what the detector averages, "log" or "intensity". samples: rays along each
-    side of a pixel. clipped_noise: standard deviation of the noise, if line integrals below 0 were set to 0; else 0."""
+    shape: the panel's (rows, columns). model: what the detector averages, "log" (line integrals) or "intensity". samples:
+    rays along each side of a pixel. clipped_noise: standard deviation of noise that was clipped at 0; 0 without clipping."""
 
     phantom: EllipsoidPhantom
     tables: Sequence[TimeCells]
@@ -82,14 +82,13 @@ class BeadOperator:
 
 
 def _mean_of_clipped(p: np.ndarray, sigma: float) -> np.ndarray:
-    """Returns the mean of max(p + noise, 0) for normal noise of standard deviation ``sigma``. Clipping raises the mean, and
-    most in air."""
+    """Returns the mean of max(p + noise, 0) for normal noise of standard deviation ``sigma``; it exceeds p, most in air."""
     ratio = p / sigma
     return p * scipy.special.ndtr(ratio) + sigma * np.exp(-(ratio**2) / 2) / math.sqrt(2 * math.pi)
 
 
 def _poses_by_line(tables: Sequence[TimeCells]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns poses (F · lines · S, 4, 3) and weights (F, lines, S) of every line of every frame, at S times each."""
+    """Returns poses (F · lines · S, 4, 3) and weights (F, lines, S) of every line of every frame, at the line's S times."""
     poses, weights = [], []
     for table in tables:
         counts = table.line_stop - table.line_start
@@ -105,9 +104,9 @@ def _poses_by_line(tables: Sequence[TimeCells]) -> tuple[np.ndarray, np.ndarray]
 class _PanelLines:
     """N lines of a panel, each at one time, in the phantom's frame of reference.
 
-    - source, first (N, 3): the source, and the middle of the panel's first pixel, in mm.
-    - line_step, pixel_step (N, 3): the steps to the next line, and to the next of its ``pixels``. line (N,): line numbers.
-    - is_parallel: ``source`` is the rays' direction."""
+    - source, first (N, 3): the source, and the centre of the panel's pixel (0, 0), in mm.
+    - line_step, pixel_step (N, 3): steps in mm to the next line, and to a line's next pixel. line (N,): the lines' numbers.
+    - pixels: the number of pixels of a line. is_parallel: ``source`` is the rays' direction."""
 
     source: np.ndarray
     first: np.ndarray
@@ -118,7 +117,7 @@ class _PanelLines:
     is_parallel: bool
 
     def integrals(self, phantom: EllipsoidPhantom, samples: int) -> Iterator[np.ndarray]:
-        """Yields the line integrals (N, pixels), float32, at each of samples² points of a pixel's area in turn."""
+        """Yields samples² arrays of line integrals (N, pixels), float32, each for rays to another point within a pixel."""
         shadows = [(body, *self._shadow(np.array(body.ends_mm), body.reach_mm)) for body in phantom.ellipsoids]
         offsets = (np.arange(samples) + 0.5) / samples - 0.5
         for across, along in itertools.product(offsets, offsets):
@@ -130,7 +129,7 @@ class _PanelLines:
                 first = first if self.is_parallel else first - source
                 ray = first[:, None] + (pixel[..., None] + along) * self.pixel_step[lines][:, None]
                 starts, rays = np.repeat(source, width, axis=0), ray.reshape(-1, 3)
-                if self.is_parallel:  # there is no source: a ray starts and ends outside of the body
+                if self.is_parallel:  # a parallel ray has no source: it starts and ends far outside of the body
                     reach = 2 * (np.abs(rays).max(initial=0.0) + np.abs(body.ends_mm).max() + body.reach_mm)
                     starts, rays = rays - reach * starts, 2 * reach * starts
                 fraction = body.chord_fraction(starts, rays)
@@ -142,9 +141,9 @@ class _PanelLines:
     def _panel_axes(self) -> tuple[tuple[np.ndarray, ...], ...]:
         """Three vectors (N, 3), each with its inner products (N,) with the source and the first pixel, and its length (N,).
 
-        The first vector gives the ratio of two distances from the source along the panel's normal: a point's to the panel's.
-        The other two give the line and the pixel of the point's image. In a parallel beam the ratio counts as 1, and the
-        ray through the point makes the image."""
+        The first vector gives (a point's distance from the source) / (the panel's distance), both along the panel's normal.
+        The other two give the line and the pixel of the point's image. In a parallel beam the quotient counts as 1, and the
+        point's image is where its ray meets the panel."""
         normal = np.cross(self.line_step, self.pixel_step)
         to_panel = self.source if self.is_parallel else self.first - self.source
         vectors = [normal / np.sum(normal * to_panel, -1, keepdims=True)]
@@ -157,8 +156,8 @@ class _PanelLines:
         return tuple((v, *both, np.linalg.norm(v, axis=-1)) for v, both in zip(vectors, products, strict=True))
 
     def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:
-        """Returns the lines (n,) that may see a body, the first pixel (n,) of its shadow on each, and the widest shadow's
-        width in pixels. The body lies within ``reach_mm`` of the line between its two ``ends_mm`` (2, 3)."""
+        """Returns the indices (n,) of lines that may see a body, the first pixel (n,) of its shadow on each, and the widest
+        shadow's width in pixels. The body lies within ``reach_mm`` of the segment between its ``ends_mm`` (2, 3)."""
         (depth, depth_of_source, *_), *axes = self._panel_axes
         lowest, highest = [], []
         for end_mm in ends_mm:
@@ -183,7 +182,7 @@ class _PanelLines:
 class BeadProblem(CoarseFrames):
     """The counterpart of ``CoarseProblem`` for a known phantom, whose placement (7,) replaces the volume.
 
-    start: a first placement. clipped_noise: as in ``BeadOperator``."""
+    start: the first placement of the search. clipped_noise: as in ``BeadOperator``."""
 
     phantom: EllipsoidPhantom
     start: np.ndarray
@@ -221,12 +220,12 @@ class BeadProblem(CoarseFrames):
         return self._without_background(self.measured - operator.forward(placement))
 
     def noise(self, residual: np.ndarray) -> float:
-        """Returns the standard deviation of the residual's valid pixels: noise, and errors of the model."""
+        """Returns the standard deviation of the valid pixels of ``residual``: of noise and errors of the model together."""
         return float(np.std(residual if self.valid is None else residual[self.valid]))
 
     def explained(self, operator: BeadOperator, placement: np.ndarray) -> float:
-        """Returns the fraction of the compared values' sum of squares that the phantom explains; 0 unless the placement's
-        density factor is above 0."""
+        """Returns 1 − Σ (``compared`` residual)² / Σ (``compared`` measurement)², the fraction that the phantom explains; 0
+        unless the placement's density factor is above 0."""
         residual = self.compared(self.residual(operator, placement))
         whole = self.compared(self.masked(self.measured))
         return float(1 - residual @ residual / max(float(whole @ whole), 1e-30)) if placement[DENSITY] > 0 else 0.0
@@ -252,29 +251,28 @@ class BeadProblem(CoarseFrames):
     def beyond_object(
         self, operator: BeadOperator, placement: np.ndarray, images: Sequence[np.ndarray], iterations: int
     ) -> list[np.ndarray]:
-        """Returns the part of each image (F, rows, columns) that no change of the placement explains: the part outside the
-        Jacobian's range at ``placement``. ``iterations`` has no effect."""
+        """Returns the ``compared`` part of each image (F, rows, columns) that no change of the placement explains: the part
+        outside of the Jacobian's range at ``placement``. ``iterations`` has no effect."""
         basis, _ = np.linalg.qr(self._signals(operator, placement).T)
         compared = np.array([self.compared(image) for image in images])
         beyond = compared - compared @ basis @ basis.T
         return list(beyond.reshape(len(images), *self.measured.shape))
 
     def compared(self, frames: np.ndarray) -> np.ndarray:
-        """Returns the values (F · pixels,) float64 by which frames are compared: without background, blurred to hide single
-        rays."""
+        """Returns the values (F · pixels,) float64 by which frames are compared: the frames without background, and blurred
+        to hide single rays."""
         blurred = gaussian_filter(self._without_background(frames), (0, _BLUR_PX, _BLUR_PX), output=np.float64)
         return blurred.ravel()
 
     def _units(self) -> np.ndarray:
-        """Returns steps (7,) of a placement. Each turn and shift moves the image's edge by about one coarse pixel. The last
-        step adds 1 to the density factor."""
+        """Returns the unit (7,) of each number of a placement: turns (rad) and shifts (mm) that move the image's edge by one
+        coarse pixel or so, and 1 for the density factor."""
         scan = self.scans[0]
         pixel_mm = self.block * min(scan.geometry.pixel_size_mm) / scan.geometry.magnification
         return np.array([pixel_mm / (max(scan.grid.size_mm) / 2)] * 3 + [pixel_mm] * 3 + [1.0])
 
     def _signals(self, operator: BeadOperator, placement: np.ndarray) -> np.ndarray:
-        """Returns the transposed Jacobian, (7, F · pixels): d(compared)/d(placement / ``_units``), by central
-        differences."""
+        """Returns the transposed Jacobian (7, F · pixels), d(compared)/d(placement / ``_units``), by central differences."""
         signals = []
         for number, unit in enumerate(self._units()):
             step = np.eye(DENSITY + 1)[number] * _STEP_PX * unit
@@ -283,7 +281,7 @@ class BeadProblem(CoarseFrames):
         return np.array(signals)
 
     def _without_background(self, frames: np.ndarray) -> np.ndarray:
-        """Subtracts from frames (F, rows, columns) their fit by a few slow cosines along each side."""
+        """Subtracts from frames (F, rows, columns) their fit by a few slow cosines along each side; 0 at invalid pixels."""
         rows, columns = (_cosines(count) for count in frames.shape[1:])
         if self.valid is None:
             inner = np.einsum("vi,fvu,uj->fij", rows, frames, columns)
@@ -297,8 +295,8 @@ class BeadProblem(CoarseFrames):
 
 
 def _clipped_noise(scans: Sequence[Scan]) -> float:
-    """Returns the standard deviation of noise in air whose values below 0 were set to 0, from means over small squares. It
-    is 0 if less than a fifth of the pixels are 0, or if any are below 0, because then nothing was clipped."""
+    """Returns the standard deviation of the noise of air if its values below 0 were set to 0, from means over small squares.
+    Returns 0 if nothing was clipped: if less than a fifth of the pixels are 0, or any is below 0."""
     values = np.concatenate([np.asarray(scan.projections, np.float32) for scan in scans])
     valid = np.concatenate([scan.valid for scan in scans])
     if np.mean(values[valid] == 0) < _LEAST_ZEROS or values[valid].min() < 0:
@@ -308,9 +306,9 @@ def _clipped_noise(scans: Sequence[Scan]) -> float:
 
 
 def _with_spread_of(scan: Scan, times: int) -> Scan:
-    """Returns the scan with longer exposures about the same middle, so that the ``times`` moments of a line have the
-    standard deviation of its whole exposure. Without this, few moments would look like a shorter exposure. Pulsed scans
-    stay unchanged."""
+    """Returns the scan with longer exposures about the same middle: the ``times`` moments at which a line is computed then
+    have the standard deviation of its stated exposure. Otherwise few moments would look like a shorter exposure. A pulsed
+    scan stays unchanged."""
     if scan.shutter.pulse_s is not None:
         return scan
     exposure_s = scan.shutter.exposure_s / math.sqrt(1 - times**-2)

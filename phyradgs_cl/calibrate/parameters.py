@@ -14,9 +14,9 @@ from phyradgs_cl.removed import removal
 from phyradgs_cl.text import suggest_name
 
 _STEP_PX = 0.25  # a central difference moves the image's edge by this many pixels to each side
-_TIMING_STEP = 0.1  # a time is changed by at most this fraction of itself in a central difference
-_LARGEST_CUT = 0.7  # the search shortens a time by at most this fraction, so that it stays above 0
-_MOST_TILT_RAD = math.radians(2.0)  # an angle is changed by at most this in a central difference
+_TIMING_STEP = 0.1  # a central difference changes exposure or readout by at most this fraction of the stated time
+_LARGEST_CUT = 0.7  # the search shortens exposure or readout by at most this fraction, so that the time stays above 0
+_MOST_TILT_RAD = math.radians(2.0)  # a central difference changes an angle by at most this
 # ``Parameter.mismatch`` of parameters whose effect changes sign after half a turn. Errors of voxels keep their sign, so they
 # disturb such parameters less.
 _SMALL_MISMATCH = 1.3
@@ -29,7 +29,7 @@ _DEGREES = math.degrees(1.0)
 class Parameter:
     """A parameter that can be calibrated. field: the field of ``GeometryCorrection`` that it changes.
 
-    - stated: the scan's own value, in the field's unit. scale: displayed units per unit of the field.
+    - stated: the value that a scan states, in the field's unit. scale: (displayed value) / (value in the field's unit).
     - object_instead: another object that explains the frames as well, if they do not determine the parameter.
     - pixels: how many pixels a unit of the field moves the image at its edge.
     - mismatch: (measured errors) / (errors by noise alone), see docs/calibrate.md. Voxels cause the difference, because
@@ -60,7 +60,7 @@ class Parameter:
         return self.unit != "deg" or deviation < _LEAST_KNOWN_RAD
 
     def lowest(self, scan: Scan) -> float:
-        """Returns the lowest correction that the search may try: times stay above 0, other fields have no limit (−∞)."""
+        """Returns the lowest correction that the search may try: −0.7 times a stated time above 0, otherwise −∞."""
         stated = self.stated(scan) if self.is_timing else 0.0
         return -_LARGEST_CUT * stated if stated > 0 else -math.inf
 
@@ -74,26 +74,24 @@ def _pitch_mm(scan: Scan) -> float:
 
 
 def _edge_pixels(scan: Scan, factor: float = 1.0) -> float:
-    """Returns ``factor`` times the number of pixels by which a roll of 1 rad moves the panel's edges farthest from its
-    middle."""
+    """Returns ``factor`` × (number of pixels by which a roll of 1 rad moves the panel's edge farthest from the middle)."""
     return factor * max(_half_mm(scan, 0), _half_mm(scan, 1)) / _pitch_mm(scan)
 
 
 def _tilt_pixels(axis: int) -> Callable[[Scan], float]:
-    """Returns a function of the scan: by how many pixels a radian of tilt moves the panel's edge. A tilt magnifies one side,
-    so points move in proportion to the square of their distance from the tilt's axis. axis: 0 for edges along v, 1 along
-    u."""
+    """Returns a function of the scan: by how many pixels a tilt of 1 rad moves the panel's edge at the end of v (``axis`` 0)
+    or u (``axis`` 1). A tilt magnifies one side, and moves a point in proportion to (distance from the tilt's axis)²."""
     return lambda scan: _half_mm(scan, axis) ** 2 / _cone(scan).source_to_detector_mm / _pitch_mm(scan)
 
 
 def _cone(scan: Scan) -> ConeGeometry:
-    """Returns the geometry, which must be a cone beam's: ``requested`` refuses tilts and distances of other beams."""
+    """Returns the scan's geometry, a cone beam's: ``requested`` refuses tilts and distances of parallel beams."""
     assert isinstance(scan.geometry, ConeGeometry)
     return scan.geometry
 
 
 def _timing_pixels(scan: Scan) -> float:
-    """Returns by how many pixels the image of the grid's edge moves in a second as the gantry turns."""
+    """Returns by how many pixels per second the image of the grid's edge moves as the gantry turns; at least 1e-12."""
     speed_rad_per_s = exposure_arc_rad(scan) / scan.shutter.exposure_s
     edge_mm = max(scan.grid.size_mm[1:]) / 2 * scan.geometry.magnification
     return max(speed_rad_per_s * edge_mm / _pitch_mm(scan), 1e-12)
@@ -158,8 +156,8 @@ NAMES = list(dict.fromkeys([*PARAMETER_GROUPS, *PARAMETERS, WOBBLE, MOTION, DIRE
 
 @dataclass(frozen=True)
 class Request:
-    """What to estimate. parameters: common to all views. per_view: "wobble", "motion" or "". asks_direction: whether to test
-    which line is read first."""
+    """What to estimate. parameters: those that all views share. per_view: "wobble", "motion" or "". asks_direction: whether
+    to test which line is read first."""
 
     parameters: list[Parameter]
     per_view: str
@@ -214,14 +212,14 @@ def _turns(scan: Scan) -> bool:
 
 
 def correction_of(values: Mapping[str, float]) -> GeometryCorrection:
-    """Returns the correction that has the parameters' ``values`` (by name, in the fields' units), and else zeros."""
+    """Returns the correction with the ``values`` of parameters, by name and in its fields' units; other fields are 0."""
     fields = {**PARAMETERS, **{gauge.name: gauge for gauge in GAUGES}}
     return GeometryCorrection(**{fields[name].field: float(value) for name, value in values.items()})
 
 
 def in_words(weights: Mapping[str, float]) -> str:
-    """Returns a combination of parameters (weights by name) in words, with the other object that looks the same. The
-    parameter of largest weight comes first. Those with up to 0.3 of its weight are left out."""
+    """Returns a combination of parameters in words, with the other object that looks the same. The parameter of the largest
+    weight comes first. Parameters of at most 0.3 times this weight are left out. weights: by name."""
     order = sorted(weights, key=lambda name: -abs(weights[name]))
     largest = abs(weights[order[0]])
     main, *others = [name for name in order if abs(weights[name]) > 0.3 * largest]

@@ -1,4 +1,4 @@
-"""Estimates errors of single views (a wobble), or an object that moves slowly (a motion), as splines of time.
+"""Estimates errors of single views (a wobble), or a slow motion of the object as splines of time.
 
 A view's parameters change only its own frame, so their signals (columns of the Jacobian) are images of that frame. CGLS
 solves the normal equations of a Gauss–Newton step for the volume and all parameters together. Parameters then explain only
@@ -27,17 +27,17 @@ TURN, SHIFT_V, SHIFT_U = 0, 1, 2
 _STEP_PX = 0.25  # a central difference moves a frame by this many coarse pixels to each side
 _LEAST_NORM = 0.1  # a signal is divided by its norm, or by this fraction of the largest norm of its kind if that is larger
 _DEG = float(np.rad2deg(1.0))
-# This fraction of a value's change since the next coarser grid counts as its discretisation error. With voxels half as
-# large, 1 suits errors ∝ voxel size, and 1/3 suits errors ∝ its square.
+# (Discretisation error of a value) / (its change since the next coarser grid). With voxels half as large, 1 suits errors
+# ∝ voxel size, and 1/3 suits errors ∝ (voxel size)².
 DISCRETISATION = 0.5
-_STEPS = 3  # Gauss–Newton steps on each grid; the next grid continues from there
-_ITERATIONS = 20  # iterations of CGLS for each step and each standard deviation
+_STEPS = 3  # number of Gauss–Newton steps on each grid
+_ITERATIONS = 20  # number of CGLS iterations for each step, and for each standard deviation
 _DEVIATIONS = 3.0  # a kind of parameter is corrected only if its RMS over the views exceeds this many standard deviations
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of parameter: its name and unit in the table. scale: the number of these units in a rad or a mm."""
+    """A kind of parameter: its name and unit in the table of estimates. scale: table units per rad or per mm."""
 
     name: str
     unit: str
@@ -46,10 +46,10 @@ class Kind:
 
 @dataclass(frozen=True, eq=False)
 class PerViewParameters(ABC):
-    """Parameters of views: ``values`` (n, K) of K kinds. View f has (``basis`` @ ``values``)[f], (K,), with basis (F, n).
+    """Parameters of F views: K kinds with n coefficients ``values`` (n, K). View f has (``basis`` @ ``values``)[f], (K,).
 
-    - units (K,): the value of each kind that moves a frame's edge by a pixel.
-    - circle (n, 2): values that vary as cosine and sine of the gantry's angle, as far as the basis allows.
+    - basis (F, n). units (K,): the value of each kind, in rad or mm, that moves a frame's edge by a pixel.
+    - circle (n, 2): coefficients of the cosine and sine of the gantry's angle, as far as the basis allows.
     - MISMATCH: (measured errors) / (errors by noise alone), see docs/calibrate.md. Errors of voxels cause the difference.
     - RESTARTED: kinds that start from 0 on each grid."""
 
@@ -64,11 +64,11 @@ class PerViewParameters(ABC):
 
     @abstractmethod
     def views_of(self, values: np.ndarray) -> Views | Sway:
-        """Returns the change of a scan's views, or of its object's pose, that values (n, K) stand for."""
+        """Returns the change of a scan's views, or of its object's pose, that the coefficients ``values`` (n, K) mean."""
 
     @abstractmethod
     def without_gauges(self, values: np.ndarray) -> np.ndarray:
-        """Returns values (n, K) without the part that another object would explain exactly."""
+        """Returns coefficients (n, K) without the part that another object would explain exactly."""
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
         """Returns the indices of the kinds to estimate in stage ``number`` of ``count``. A subclass may leave some out."""
@@ -89,7 +89,7 @@ class WobbleParameters(PerViewParameters):
 
     @classmethod
     def of(cls, scan: Scan, count: int = 0) -> "WobbleParameters":
-        """Returns a wobble of 0, as ``count`` splines of time, or as separate parameters of each view if ``count`` is 0."""
+        """Returns a wobble of 0 in ``count`` splines of time, or with separate parameters of each view if ``count`` is 0."""
         if count:
             basis = splines(scan_course(scan) + 0.5, count)
             circle = _fitted_circle(scan, basis)
@@ -159,7 +159,7 @@ def _turn_unit_rad(scan: Scan) -> float:
 
 
 def units_of_views(scan: Scan) -> np.ndarray:
-    """Returns (3,) the turn in rad and the shifts along v and u in mm that each move a frame's edge by a pixel."""
+    """Returns (3,): the turn in rad, and the shifts along v and u in mm, that each move a frame's edge by a pixel."""
     return np.array([_turn_unit_rad(scan), *scan.geometry.pixel_size_mm])
 
 
@@ -177,15 +177,15 @@ def view_step(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters, volume: np.ndarray,
     kinds: Sequence[int], iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a Gauss–Newton step (n, K) of the parameters, at the object ``volume``; it is 0 for kinds outside of
-    ``kinds``. Also returns the signals (F, kinds, rows, columns), the Jacobian of the frames per pixel of movement."""
+    """Returns a Gauss–Newton step (n, K) of the parameters at the object ``volume``, 0 for kinds not in ``kinds``. Also
+    returns signals (F, kinds, rows, columns): each frame's derivative by its view's parameters, per pixel of movement."""
     operator = parameters.operator(problem, correction)
     residual = problem.residual(operator, volume)
     signals = np.stack([_signal(problem, correction, parameters, volume, kind) for kind in kinds], 1)
     norms = _norms(parameters.basis, signals)
     scale = _strength(operator) / np.maximum(norms, _LEAST_NORM * norms.max(0))
     if not np.array_equal(parameters.basis, np.eye(len(signals))):
-        # Several splines act on a view, but the view's derivative can have only one scale. So all splines share one scale.
+        # Several splines act on a view, but its signal can have only one scale: all splines share the mean scale.
         scale = np.broadcast_to(scale.mean(0), scale.shape)
     per_view = parameters.basis @ scale / parameters.basis.sum(1, keepdims=True)
     scaled = (signals * per_view[:, :, None, None]).astype(np.float32)
@@ -205,11 +205,11 @@ def view_deviations(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters,
     signals: np.ndarray, iterations: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns for each kind the standard deviation (K,) of a view's parameter, in the parameters' units, and the fraction
-    (K,) of its signals that no object explains.
+    """Returns for each kind the standard deviation (K,) of a view's parameter, in rad or mm, and the fraction (K,) of its
+    signals that no object explains.
 
-    signals: (F, K, rows, columns), the Jacobian of the frames per pixel of movement, of all kinds. A view's value is a sum
-    over spline coefficients, whose errors count as independent."""
+    signals (F, K, rows, columns): each frame's derivative by its view's parameter of each kind, per pixel of movement. A
+    view's value is a sum over spline coefficients, whose errors count as independent."""
     operator = parameters.operator(problem, correction)
     norms = _norms(parameters.basis, signals)
     noise = noise_level(problem.measured, problem.valid)
@@ -221,14 +221,14 @@ def view_deviations(
 
 
 def _norms(basis: np.ndarray, signals: np.ndarray) -> np.ndarray:
-    """Returns the norms (n, K) of the Jacobian's columns d(frames)/d(coefficient). basis: (F, n). signals: (F, K, rows,
-    columns), per pixel of movement of each view."""
+    """Returns the norms (n, K) of the columns d(frames)/d(coefficient) of the Jacobian. basis: (F, n). signals (F, K, rows,
+    columns): each frame's derivative per pixel of movement."""
     return np.sqrt(basis.T**2 @ np.sum(np.square(signals, dtype=np.float64), (2, 3)))
 
 
 def _strength(operator: RayOperator) -> float:
-    """Estimates the largest singular value of the projector, in mm. If parameters are scaled to it, CGLS finds them as fast
-    as the volume."""
+    """Estimates the largest singular value of the projector, in mm. CGLS finds parameters as fast as the volume if their
+    signals are scaled to this norm."""
     lengths = operator.forward(np.ones(operator.volume_shape, np.float32))
     return float(np.linalg.norm(operator.adjoint(lengths)) / np.linalg.norm(lengths))
 
@@ -237,7 +237,7 @@ def _signal(
     problem: CoarseProblem, correction: GeometryCorrection, parameters: PerViewParameters, volume: np.ndarray,
     kind: int,
 ) -> np.ndarray:
-    """Returns the Jacobian d(frames)/d(``kind``), (F, rows, columns), per pixel of movement of each view."""
+    """Returns each frame's derivative (F, rows, columns) by its view's parameter of ``kind``, per pixel of movement."""
     step_px = _STEP_PX * problem.block
     step = np.zeros(len(parameters.units))
     step[kind] = step_px * parameters.units[kind]
@@ -248,8 +248,8 @@ def _signal(
 def _share(
     problem: CoarseProblem, operator: RayOperator, basis: np.ndarray, signals: np.ndarray, iterations: int
 ) -> float:
-    """Returns the fraction, 0 to 1, of signals (F, rows, columns) that no object explains, if each coefficient of the basis
-    is 1 or −1 by chance."""
+    """Returns norm(part that no object explains) / norm(whole), 0 to 1, of a random change of the frames: the ``signals``
+    (F, rows, columns) of one kind times the views' values by random coefficients 1 or −1 of the ``basis`` (F, n)."""
     signs = np.random.default_rng(0).choice([-1.0, 1.0], basis.shape[1]).astype(np.float32)
     probe = signals * (basis @ signs).astype(np.float32)[:, None, None]
     (rest,) = problem.beyond_object(operator, np.zeros(operator.volume_shape, np.float32), [probe], iterations)
@@ -258,8 +258,8 @@ def _share(
 
 @dataclass(frozen=True, eq=False)
 class ViewsEstimate:
-    """The result of ``estimate_views``. views: the corrections, 0 for kinds that are not significant; None if no kind is
-    significant. table: an estimate per kind, whose value is the root mean square over the views."""
+    """The result of ``estimate_views``. views: the corrections, 0 for kinds that are not significant; None if no kind is.
+    table: an estimate per kind; its value is the kind's root mean square over the views."""
 
     views: Views | Sway | None
     table: list[ParameterEstimate]
@@ -279,8 +279,8 @@ def estimate_views(
 ) -> ViewsEstimate:
     """Estimates ``parameters`` of a scan after ``correction``, by three Gauss–Newton steps on each grid, coarse to fine.
 
-    A deviation combines noise and discretisation error. The latter is half the change since the coarser grid, or 0 for a
-    kind that the coarser grid did not estimate."""
+    A standard deviation combines noise and discretisation error. The latter is half the value's change since the coarser
+    grid, or 0 for a kind that the coarser grid did not estimate."""
     for number, stage in enumerate(stages):
         problem = CoarseProblem.of(rt, [scan], stage, scan.frames)
         problem = replace(problem, count_pass=passes.counter(pass_cost([scan], stage.columns, scan.frames)))

@@ -14,15 +14,15 @@ FEWEST_BEADS = 4  # three beads determine a placement, a fourth confirms it
 WRONG_PHANTOM = "is it the right phantom, all of it in view, in mm? Does the gantry turn as stated ('phyradgs check')?"
 _LEAST_SHARE = 0.75  # at least this fraction of the beads must lie in bright spots of the volume
 _SMOOTH = 0.5  # standard deviation of the smoothing, in radii of a bead: a bead of many voxels then has one maximum
-_PEAKS_PER_BEAD = 2.0  # this many bright spots per bead are compared with the beads, because some spots are no beads
-_TOLERANCE_VOXELS = 1.5  # a bead lies at most this far from its bright spot, in voxels
-_TRIANGLES = 40  # this many random triangles of beads are looked for among the spots: one that fits gives a placement
+_PEAKS_PER_BEAD = 2.0  # about (number of bright spots compared with beads) / (number of beads): some spots are no beads
+_TOLERANCE_VOXELS = 1.5  # largest distance of a bead from its bright spot, in voxels
+_TRIANGLES = 40  # number of random triangles of beads that are compared with triangles of spots, to find placements
 _APART = 0.05  # placements whose turns differ by at most this, in rad, count as one
-_MOST = 6  # a nearly symmetric phantom fits equally well in several placements: at most this many are tried
+_MOST = 6  # most placements that are returned: a nearly symmetric phantom fits equally well in several
 
 
 def bead_centres_mm(phantom: EllipsoidPhantom) -> np.ndarray:
-    """Returns the centres (n, 3) of a phantom's beads. Raises InputError for fewer than four, and for beads on a line."""
+    """Returns the centres (n, 3) in mm of a phantom's beads. Raises InputError for fewer than four, or beads on a line."""
     centres_mm = np.array([body.centre_mm for body in phantom.ellipsoids if isinstance(body, Ellipsoid)]).reshape(-1, 3)
     spread_mm = np.linalg.svd(centres_mm - centres_mm.mean(0), compute_uv=False) if len(centres_mm) else np.zeros(3)
     if len(centres_mm) < FEWEST_BEADS or spread_mm[1] < 0.01 * spread_mm[0]:
@@ -46,7 +46,7 @@ def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> lis
     matches: list[tuple[int, float, np.ndarray]] = []  # −(number of beads found), mean distance in mm, placement
     for three, corners in _matching_triangles(beads_mm, spots_mm, within_mm):
         place = _rigid(beads_mm[list(three)], spots_mm[corners])
-        for _ in range(2):  # first from three beads, then from all beads that are near
+        for _ in range(2):  # fits the placement again, to all beads that it takes near a spot
             apart_mm = np.linalg.norm(_moved(place, beads_mm)[:, None] - spots_mm, axis=-1)
             near = apart_mm.min(1) < within_mm
             if near.sum() < 3:
@@ -88,8 +88,8 @@ def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
 def _matching_triangles(
     beads_mm: np.ndarray, spots_mm: np.ndarray, within_mm: float
 ) -> Iterator[tuple[tuple[int, int, int], list[int]]]:
-    """Yields indices of three beads and of three spots whose triangles have the same sides within ``within_mm``. The beads
-    (n, 3) are chosen at random; triangles with a short side are left out. spots_mm: (m, 3)."""
+    """Yields indices of three beads and three spots whose triangles have the same sides within ``within_mm``. Three of the
+    beads (n, 3) are chosen at random; triangles with a side below 3 · ``within_mm`` are left out. spots_mm: (m, 3)."""
     rng = np.random.default_rng(0)
     apart = np.linalg.norm(spots_mm[:, None] - spots_mm, axis=-1)
     for _ in range(_TRIANGLES):

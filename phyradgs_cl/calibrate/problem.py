@@ -24,22 +24,22 @@ from phyradgs_cl.reconstructors.voxels.priors import axis_weights
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-_MOST_TIMES = 8  # most times per exposure: each costs a projection
-_VOXELS_PER_TIME = 2.0  # the volume's rim moves by at most this many voxels between two times, if _MOST_TIMES suffice
+_MOST_TIMES = 8  # most times per exposure, since each time costs a projection
+_VOXELS_PER_TIME = 2.0  # most voxels that the volume's rim moves between two times, if _MOST_TIMES times suffice
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
 Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
-_LEAST_SHARE = 0.1  # progress counts a phase's remaining passes at no less than this fraction of their full cost
+_LEAST_SHARE = 0.1  # least (expected cost of a phase's remaining passes) / (their full cost) in the progress
 Passes = tuple[int, float]
-"""The largest number of passes through the frames that may still come, and their expected total cost."""
+"""For a phase: the largest number of passes through the frames, and their expected total cost (``pass_cost``)."""
 
 
 @dataclass(frozen=True)
 class Stage:
     """One grid of a calibration: at most ``columns`` blocks of pixels along the panel's longer side.
 
-    first, again: iterations for the first volume and for each later one. steps: most Gauss–Newton steps. project: iterations
-    of CGLS, in each step, that remove what a volume explains."""
+    first, again: iterations for the first volume, and for each later one. steps: most Gauss–Newton steps. project: in each
+    step, the iterations of CGLS that remove from signals what a volume explains."""
 
     columns: int
     first: int
@@ -52,22 +52,22 @@ class Stage:
         return ceil_div(max(scan.geometry.detector_shape), self.columns)
 
     def passes(self, parameters: int, asks: bool) -> int:
-        """Returns the largest number of passes through the frames, for a number of ``parameters``. asks: the stage also
+        """Returns the largest number of passes through the frames, for ``parameters`` unknowns. asks: whether the stage also
         tests which parameters the frames determine."""
         return self.first - self.again + self.steps * (self.again + self.project * (parameters + (3 if asks else 1)))
 
 
 def pass_cost(scans: Sequence[Scan], columns: int, most_frames: int) -> float:
-    """Returns the cost of a pass through the scans, rays × voxels along a ray, with at most ``columns`` blocks of pixels
-    along the panel's longer side and ``most_frames`` frames of each scan."""
+    """Returns the cost of a pass through all scans: (number of rays) × (voxels along a ray), with at most ``columns`` blocks
+    of pixels along the panel's longer side, and at most ``most_frames`` frames of each scan."""
     shape = scans[0].geometry.detector_shape
     rows, across = (ceil_div(n, ceil_div(max(shape), columns)) for n in shape)
     return float(sum(min(scan.frames, most_frames) for scan in scans) * rows * across * max(rows, across))
 
 
 class PassCounter:
-    """Counts passes through the frames and reports them. plan: number and cost of the passes of each phase, in order. Phases
-    that turn out to be unnecessary leave the plan, so the reported total falls."""
+    """Counts passes through the frames and reports them. plan: number and cost of each phase's passes, in order. A skipped
+    phase leaves the plan, so the reported total falls."""
 
     def __init__(self, report: Report, plan: Mapping[str, Passes]) -> None:
         self.plan = dict(plan)
@@ -101,11 +101,11 @@ class PassCounter:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoarseFrames:
-    """The scans as stated, with fewer frames and zeros for pixels, and their measurement averaged over blocks of pixels.
+    """The stated ``scans`` with fewer frames, whose line integrals are 0 to save memory, and their measurement.
 
     measured (F, rows, columns): all scans' frames, in line integrals averaged over blocks of ``block`` × ``block`` pixels.
-    valid, of the same shape: pixels to use; None: all. ``count_pass`` is called once per iteration, which projects and
-    backprojects all frames."""
+    valid, of the same shape: True for pixels to use; None: all. ``count_pass`` is called once per iteration, which projects
+    and backprojects all frames."""
 
     scans: Sequence[Scan]
     block: int
@@ -124,13 +124,13 @@ def measured_blocks(small: Sequence[Scan]) -> tuple[np.ndarray, np.ndarray | Non
 
 
 def without_pixels(scan: Scan) -> Scan:
-    """Returns the scan with frames of zeros, which take no memory."""
+    """Returns the scan with line integrals of 0 in place of its frames, in an array that takes no memory."""
     return replace(scan, projections=np.broadcast_to(np.float32(0), scan.projections.shape))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CoarseProblem(CoarseFrames):
-    """Frames of an unknown object, and the grid of its volume."""
+    """Coarse frames of an unknown object, and the grid of its volume."""
 
     rt: Runtime
     grid: Grid
@@ -168,8 +168,8 @@ class CoarseProblem(CoarseFrames):
         return RayOperator(self.rt, self.grid, small.geometry.detector_shape, tables, fewest_lines=FEWEST_LINES)
 
     def line_integrals(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
-        """Returns the measurement as mean line integrals. A detector that averages intensity measures less at edges; the
-        difference, computed for ``volume``, is added."""
+        """Returns the measurement as mean line integrals (F, rows, columns). A detector that averages intensity measures
+        less at edges; this difference, computed for ``volume``, is added."""
         if self.scans[0].detector_model != "intensity":
             return self.measured
         return self.measured + self.masked(operator.forward(volume) - self._expected(operator, volume))
@@ -193,7 +193,7 @@ class CoarseProblem(CoarseFrames):
         return method.volume
 
     def compared(self, frames: np.ndarray) -> np.ndarray:
-        """Returns the values (F · pixels,) by which frames are compared: 0 at invalid pixels."""
+        """Returns the values (F · pixels,) by which frames are compared: the frames themselves, 0 at invalid pixels."""
         return self.masked(frames).ravel()
 
     def residual(self, operator: RayOperator, volume: np.ndarray) -> np.ndarray:
@@ -201,8 +201,8 @@ class CoarseProblem(CoarseFrames):
         return self.measured - self.masked(self._expected(operator, volume))
 
     def noise(self, residual: np.ndarray) -> float:
-        """Returns the standard deviation of a pixel's noise, from the measurement. ``residual`` would give too little,
-        because the volume has fitted some of the noise."""
+        """Returns the standard deviation of a pixel's noise, from the measurement. ``residual`` is not used: the volume has
+        fitted some of its noise."""
         return noise_level(self.measured, self.valid)
 
     def beyond_object(
@@ -223,8 +223,8 @@ class CoarseProblem(CoarseFrames):
 
 def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:
     """Returns the standard deviations (v, u), in pixels, of the smoothing before binning. Rows that are read one after the
-    other are not smoothed together: they see the object at different angles, so smoothing would look like a shorter
-    readout. Columns that are read one after the other shear the image, which smoothing does not change."""
+    other are not smoothed together: they see the object at different angles, and smoothed they would look like a shorter
+    readout. A readout by columns shears the image, and smoothing does not change the shear."""
     if block == 1:
         return 0.0
     is_rolling = scan.shutter.readout_s > 0 and scan.shutter.axis == "rows"

@@ -24,8 +24,8 @@ _ROW_INCH, _CURVES_INCH, _WIDTH_INCH = 1.8, 2.4, 7.0
 class ParameterEstimate:
     """One parameter in ``unit``: its stated value, and the value found with its standard deviation.
 
-    The value found and its deviation are None if the frames do not determine the parameter. share: the fraction, 0 to 1, of
-    the frames' change with the parameter that no object and no other parameter explains."""
+    ``found`` and ``deviation`` are None if the frames do not determine the parameter. share: of the frames' change with the
+    parameter, the fraction, 0 to 1, that no object and no other parameter explains."""
 
     name: str
     unit: str

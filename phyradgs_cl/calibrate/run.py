@@ -1,9 +1,9 @@
 """Calibrates a scan from its own frames.
 
 The start is the axis that fits best and, for a known phantom, the place where its beads are seen. On request the readout's
-direction is tested, and single views or a motion are corrected first. The search (``search``) then estimates what is common
-to all views, from coarse to fine grids. After that, views or the motion are estimated again. Significant corrections enter
-the scan and its provenance. If no views were corrected, corrections that raise the residual are dropped."""
+direction is tested, and single views or a motion are corrected first. ``search.py`` then estimates what is common to all
+views, from coarse to fine grids. After that, views or the motion are estimated again. Significant corrections enter the
+scan and its provenance. If no views were corrected, corrections that raise the residual are dropped."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -63,12 +63,12 @@ _FEWEST_COLUMNS = 12  # with fewer columns a scan does not determine its geometr
 _FEWEST_SPLINES = 4  # cubic splines need at least four coefficients
 # In its best place, the right phantom explains at least this fraction of the frames' sum of squares, before corrections.
 _LEAST_EXPLAINED = 0.3
-_ORDER_ERRORS = 4.0  # least difference of the readout directions' squared residuals in standard errors, as in ``check``
-_ORDER_RATIO = 1.04  # least ratio of the readout directions' squared residuals, as in ``check``
-# An encoder table is continued by this many times a frame's exposure and readout: first steps of the search may ask for
-# times far beyond the table.
+_ORDER_ERRORS = 4.0  # least difference, in standard errors, of the squared residuals of both readout directions
+_ORDER_RATIO = 1.04  # least (larger squared residual) / (smaller squared residual) of both readout directions
+# An encoder table is continued at each end by this many times (exposure + readout), because early steps of the search may
+# ask for times far beyond the table.
 _BEYOND = 1e6
-# Progress expects stages to cost this fraction of their largest cost, because few parameters are determined in few steps.
+# In progress, (expected cost of a stage) / (its largest cost): mostly few parameters are determined, in few steps.
 _EXPECTED_SHARE = 0.25
 
 
@@ -83,7 +83,7 @@ def calibrate(
     - others: more scans of the same object in the same place, with the same errors.
     - phantom: the object, in any place, if its shape is known.
     - splines: a wobble's number of splines of time; 0: each view has parameters of its own.
-    - note: takes a line with the estimates so far after each grid.
+    - note: a function that is called after each grid with a line about the estimates so far.
 
     Raises InputError for what ``requested`` refuses, options that exclude each other, a scan too small, ``others`` that do
     not fit ``scan``, and a phantom that the frames do not show."""
@@ -99,7 +99,7 @@ def calibrate(
 
 @dataclass(eq=False)
 class _Calibrator:
-    """One calibration: its inputs, its grids, and the progress of its phases. ``ready``: the scans with lag removed and
+    """One calibration: its inputs, its grids, and the progress of its phases. ``ready``: all scans, with lag removed and
     encoder tables continued."""
 
     rt: Runtime
@@ -113,9 +113,9 @@ class _Calibrator:
 
     def __post_init__(self) -> None:
         self.placement = np.zeros(0)
-        self.stated = self.ready  # ``ready`` may later get the other readout direction
+        self.stated = self.ready  # the scans as stated: ``ready`` may later get the other readout direction
         stages = {one.block(self.scan): one for one in reversed(STAGES if self.phantom is None else BEAD_STAGES)}
-        # on a small panel several stages bin pixels to blocks of the same size: the first of them is kept
+        # on a small panel several stages have blocks of the same size: the first stage of each size is kept
         self.stages = list(stages.values())[::-1]
         self.per_view: PerViewParameters | None = None
         if self.request.per_view == WOBBLE:
@@ -165,12 +165,12 @@ class _Calibrator:
         return replace(calibration, scan=_with_provenance(corrected, self.scan, calibration))
 
     def _start_from_axis(self) -> None:
-        """Starts from the offset that ``check`` finds, because Gauss–Newton steps reach the right one from a few pixels away
-        only.
+        """Starts from the offset that ``check`` finds, because Gauss–Newton steps find the right offset only within a few
+        pixels of it.
 
         In half a turn of nearly parallel rays, a volume explains most of what an offset changes. The search cannot determine
-        the offset there, so ``check``'s answer stands. Its answer also stands if the panel sees few rays twice: a shift
-        under which even fewer rays are seen twice fits better, even if it is wrong."""
+        the offset there, so ``check``'s answer stands. The answer also stands if the panel sees less than half of the rays
+        twice, because a wrong shift under which even fewer rays are seen twice would fit better."""
         if self.phantom is None and has_axis_near_edge(self.ready[0]):
             self.search.held = (OFFSET_U,)
         quick, pitch_mm = coarse(self.ready[0], QUICK_COLUMNS), self.scan.geometry.pixel_size_mm[1]
@@ -200,8 +200,8 @@ class _Calibrator:
             self.passes.plan |= self._plan_of_stages(len(self.search.determined), number + 1)
 
     def _with_steady_views(self, scan: Scan) -> Scan:
-        """Returns the scan with its single views corrected. If the panel's offset along u is to be estimated, the mean shift
-        of the views along u counts to the offset."""
+        """Returns the scan with its single views corrected. If the search has an offset along u, the views' mean shift along
+        u is added to this offset instead."""
         views = self._estimate_views(correction_of(self.search.at)).views
         if isinstance(views, Views) and OFFSET_U in self.search.at:
             common_mm = float(views.shift_mm[:, 1].mean())
@@ -210,7 +210,7 @@ class _Calibrator:
         return scan if views is None else perturb(scan, GeometryCorrection(), views)
 
     def _estimate_views(self, correction: GeometryCorrection) -> ViewsEstimate:
-        """Returns the estimate of single views after ``correction``, computed once for each correction."""
+        """Returns the estimate of single views of the scan after ``correction``; computed only once per correction."""
         assert self.per_view is not None
         if correction not in self.views_estimates:
             self.views_estimates[correction] = estimate_views(
@@ -246,11 +246,11 @@ class _Calibrator:
         return placement
 
     def _test_direction(self) -> list[ParameterEstimate]:
-        """Compares the residuals for lines read from either end. Reverses the direction if the other end fits better.
-        Returns the table's entry for the direction.
+        """Compares the residuals for both directions of the readout. Takes the other direction if it fits better. Returns an
+        estimate of the direction for the table.
 
-        Only squared residuals that differ by four standard errors and by 4 % decide. The direction is 1 or −1. Its deviation
-        is 2 (the difference between 1 and −1) divided by the number of standard errors."""
+        Only squared residuals that differ by four standard errors and by 4 % decide. The direction is 1 or −1. Its standard
+        deviation is 2 / (number of standard errors), where 2 is the difference between 1 and −1."""
         self.passes.begin("order", "which line is read first")
         stage = self.stages[min(1, len(self.stages) - 1)]
         reverse = [reversed_readout(scan) for scan in self.ready]
@@ -274,8 +274,7 @@ class _Calibrator:
         return problem.residual(operator, problem.reconstruct(operator, None, stage.first))
 
     def _plan(self) -> dict[str, Passes]:
-        """Returns the phases in order, each with the largest number of its passes through the frames and their expected
-        cost."""
+        """Returns the phases in order, each with its largest number of passes through the frames and their expected cost."""
         second, last = self.stages[min(1, len(self.stages) - 1)], self.stages[-1]
         parameters, views, most_frames = len(self.request.parameters), (0, 0.0), MOST_FRAMES
         if self.per_view is not None:

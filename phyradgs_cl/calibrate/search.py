@@ -1,9 +1,9 @@
 """Searches for the parameters that all views share, with Gauss–Newton steps from coarse to fine grids.
 
 On each grid a volume is reconstructed, and each parameter's signal is computed: the change of the frames per unit of the
-parameter. The part of a signal that a change of the volume explains is removed (``reduced``). The parameters step until the
-steps are small, or the stage allows no more. On the first grid each step also decides which parameters the frames determine.
-In a ``BeadProblem`` a known object of beads replaces the volume.
+parameter. The part of a signal that a change of the volume explains is removed (``reduced``). Steps end when they are small,
+or when their number reaches the limit of the grid. On the first grid each step also decides which parameters the frames
+determine. In a ``BeadProblem`` a known object of beads replaces the volume.
 
 The steps are variable projection (Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973) 413) in Kaufman's form. With A the
 operator at the parameters θ, x the volume and P the projector onto A's range, the Jacobian is J = (I − P) ∂A/∂θ x. The
@@ -25,30 +25,30 @@ from phyradgs_cl.calibrate.per_view import DISCRETISATION
 from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, ParameterEstimate
 
-# Frames determine a parameter if object and other parameters leave at least this fraction of its signal unexplained.
+# Frames determine a parameter if its share, the fraction of its signal that no object explains, is at least this.
 LEAST_SHARE = 0.2
-# For a known object (beads) a smaller share is enough: there are no voxels that explain signals by accident.
+# For a known object (beads) a smaller share is enough, because there are no voxels that explain signals by accident.
 LEAST_SHARE_OF_BEADS = 0.02
 _TINY = 1e-9  # added to the diagonal of a matrix before its inverse, because signals may be linearly dependent
-# A determined parameter has at least this many times the share of a turn or a lift (``GAUGES``). No frame shows these two,
-# so their share is due to errors of voxels alone.
+# A parameter is determined only if its share is at least this many times that of a turn or a lift (``GAUGES``). No frame
+# shows these two, so their share is due to errors of voxels alone.
 _GAUGE_FACTOR = 2.0
 # The share of a turn or a lift counts as at most this. It grows in a wrong geometry, where without this limit no parameter
 # would count as determined.
 _MOST_GAUGE = 0.2
-DEVIATIONS = 3.0  # a parameter is corrected if it differs from its stated value by more than this many standard deviations
-_MOST_PX = 2.0  # a step moves the image's edge by at most this many coarse pixels: a larger step's effect is not linear
-_SETTLED = 0.1  # the steps on a grid end when every parameter's step is below this many of its standard deviations
+DEVIATIONS = 3.0  # a parameter is corrected if |found − stated value| exceeds this many of its standard deviations
+_MOST_PX = 2.0  # most coarse pixels by which a step moves the image's edge: a larger step's effect is not linear
+_SETTLED = 0.1  # the steps on a grid end when each parameter has (step) / (standard deviation) below this
 
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
     """The linear problem of the K parameters ``names`` on one grid. N = F · pixels, ordered by frame.
 
-    - jacobian (K, N): the part of each signal that no volume explains, per unit of the parameter's field.
-    - residual (N,): the part of the residual that no volume explains.
+    - jacobian (K, N): the part of each signal d(frames)/d(parameter) that no volume explains.
+    - residual (N,): the part of measured minus expected frames that no volume explains.
     - sizes (K,): norms of the whole signals. whole_gram (K, K): inner products of the whole signals divided by their norms.
-    - noise: standard deviation of a pixel. mismatch (K,): factors on the deviations, for errors other than noise."""
+    - noise: standard deviation of a pixel. mismatch (K,): factors on standard deviations, for errors other than noise."""
 
     names: tuple[str, ...]
     mismatch: np.ndarray
@@ -69,8 +69,8 @@ class Reduced:
         )
 
     def relative_to_stated(self, at: Mapping[str, float]) -> "Reduced":
-        """Returns the problem with unknowns that count from the stated values instead of the values ``at`` (by name) at
-        which it was linearised."""
+        """Returns the problem for unknowns that count from the stated values. So far they count from the values at which it
+        was linearised: stated values + ``at`` (by name)."""
         back = np.array([at.get(name, 0.0) for name in self.names]) @ self.jacobian
         return replace(self, residual=self.residual + back)
 
@@ -97,11 +97,11 @@ class Reduced:
         return np.sqrt(np.minimum(np.minimum(certainty, np.diag(self.gram)), 1.0))
 
     def step(self) -> np.ndarray:
-        """Returns the Gauss–Newton step (K,) of the parameters, in the units of their fields."""
+        """Returns the Gauss–Newton step (K,) of the parameters, in the units of their ``GeometryCorrection`` fields."""
         return np.linalg.solve(self.gram, self.unit @ self.residual) / self.sizes
 
     def deviations(self) -> np.ndarray:
-        """Returns the standard deviations (K,) of the step, in the fields' units, by a sandwich estimator.
+        """Returns the standard deviations (K,) of ``step()``, in the same units, by a sandwich estimator.
 
         Its samples are the frames, so noise may be correlated within a frame. Deviations are at least those of white noise.
         A factor makes up for the noise that the fit has removed from the residual."""
@@ -123,7 +123,7 @@ def reduced(
     """Returns the linear problem of ``parameters`` at their values ``at`` (by name) and at the object ``volume``: a volume,
     or a placement of beads.
 
-    operator: the projector at these values. iterations: those of CGLS that remove what a volume explains."""
+    operator: the projector at these values. iterations: of CGLS, which removes what a volume explains."""
     signals = [_signal(problem, one, at, volume) for one in parameters]
     images = [*signals, problem.residual(operator, volume)]
     *jacobian, residual = problem.beyond_object(operator, volume, images, iterations)
@@ -141,18 +141,18 @@ def reduced(
 def _signal(
     problem: CoarseProblem | BeadProblem, one: Parameter, at: Mapping[str, float], volume: np.ndarray
 ) -> np.ndarray:
-    """Returns the signal (F, rows, columns): d(expected frames)/d(parameter), per unit of its field, 0 at invalid pixels."""
+    """Returns the signal (F, rows, columns) of a parameter: d(expected frames)/d(its field's value); 0 at invalid pixels."""
     step = one.step(problem.scans[0]) * (1 if one.is_timing else problem.block)
     ends = []
     for sign in (1, -1):
         correction = correction_of({**at, one.name: at.get(one.name, 0.0) + sign * step})
         operator: Any = problem.operator(correction)
-        ends.append(operator.forward(volume) - problem.measured)  # small numbers, whose difference is exact in float32
+        ends.append(operator.forward(volume) - problem.measured)  # small numbers: float32 rounds their difference little
     return problem.masked((ends[0] - ends[1]) / np.float32(2 * step))
 
 
 def least_shares(problem: Reduced) -> dict[str, float]:
-    """Returns, by name, the share from which on a parameter counts as determined. ``problem`` includes the ``GAUGES``.
+    """Returns each parameter's least share, by name, to count as determined. ``problem`` includes the ``GAUGES``.
 
     No frame distinguishes a turn of all views from a turned object. Voxels do not follow such an object exactly, though:
     they leave some of the turn's signal unexplained, and as much of any other signal. So a parameter's share must be at
@@ -176,8 +176,8 @@ Problem = CoarseProblem | BeadProblem
 
 @dataclass(frozen=True)
 class Fallback:
-    """An estimate that the search did not make. value: estimate minus stated value, in the field's unit. deviation: its
-    standard deviation. is_significant: whether the value is applied."""
+    """A parameter's estimate from outside of the search. value: estimate minus stated value, in the parameter's unit.
+    deviation: its standard deviation. is_significant: whether the value is applied."""
 
     value: float
     deviation: float
@@ -192,10 +192,10 @@ class Fallback:
 class Search:
     """The state of a search.
 
-    - at: the current values minus the stated ones, by name, in the fields' units. former: those at the end of the previous
-      grid; the difference shows the error of the voxels.
+    - at: current minus stated values, by name, in units of ``GeometryCorrection``. former: ``at`` when the previous grid
+      ended; ``at`` − ``former`` shows the error of the voxels.
     - determined: the parameters that the frames determine; None before the first step.
-    - fallback: estimates from elsewhere, for parameters that are not determined. fixed: the fallbacks in use.
+    - fallback: estimates from outside of the search, for parameters that are not determined. fixed: the fallbacks in use.
     - held: parameters that are not fitted, because wrong values would fit better.
     - shares: each parameter's share, by name. alike: combinations, in words, that no frame distinguishes.
     - reduced: the last linear problem."""
@@ -212,7 +212,7 @@ class Search:
     reduced: Reduced | None = None
 
     def descend(self, problem: Problem, stage: Stage) -> None:
-        """Moves the parameters on one grid until the steps are small, or the stage allows no more."""
+        """Moves the parameters on the grid of ``stage`` until the steps are small, at most ``stage.steps`` times."""
         volume: np.ndarray | None = None
         asks = self.determined is None
         self.former = {} if asks or isinstance(problem, BeadProblem) else dict(self.at)
@@ -247,8 +247,8 @@ class Search:
             self.at[name] = estimate.correction
 
     def _step(self, problem: Problem) -> bool:
-        """Moves the determined parameters by the Gauss–Newton step, each at most as far as its signal is linear. Returns
-        whether all steps were small."""
+        """Moves the determined parameters by the Gauss–Newton step, each by at most two coarse pixels of the image's edge.
+        Returns whether all steps were below a tenth of their standard deviations."""
         assert self.reduced is not None and self.determined is not None
         current = np.array([self.at.get(name, 0.0) for name in self.determined])
         change = self.reduced.step() - current
@@ -260,15 +260,15 @@ class Search:
         return bool(np.all(np.abs(change) < _SETTLED * self.reduced.deviations()))
 
     def keep_held(self) -> None:
-        """Drops all estimates except those of held parameters, which the search did not make (``fallback``)."""
+        """Drops all estimates except the fallbacks of held parameters."""
         self.determined = ()
         self.fixed = {name: estimate for name, estimate in self.fixed.items() if name in self.held}
 
     def estimates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the values (K,) of the determined parameters and their standard deviations (K,), in the fields' units.
+        """Returns the determined parameters' values minus stated values (K,), and their standard deviations (K,).
 
         A deviation combines noise and discretisation error, taken as half the change since the coarser grid. It is larger
-        for a parameter whose effect resembles that of undetermined ones, because these keep stated values that may be
+        for a parameter whose effect resembles an undetermined one's, because the latter keeps a stated value that may be
         wrong."""
         if self.reduced is None or not self.determined:
             return np.zeros(0), np.zeros(0)
@@ -278,11 +278,11 @@ class Search:
         return values, resemblance * np.hypot(noise, DISCRETISATION * change)
 
     def corrections(self) -> dict[str, float]:
-        """Returns, by name, the values of the parameters that differ from their stated values by more than three deviations,
-        and of significant fallbacks in use.
+        """Returns the corrections by name: found minus stated values of the parameters for which they exceed three standard
+        deviations, and significant fallbacks in use.
 
-        All other parameters go back to their stated values. This changes the remaining values, so the test repeats until
-        all that remain differ."""
+        All other parameters go back to their stated values. This changes the remaining values, so the test is repeated
+        until all that remain exceed the limit."""
         values, deviations = self.estimates()
         deviation = dict(zip(self.determined or (), deviations, strict=True))
         names = self.determined or ()
@@ -296,8 +296,8 @@ class Search:
         return significant | dict(zip(names, map(float, values), strict=True))
 
     def table(self, scan: Scan, corrections: Mapping[str, float]) -> list[ParameterEstimate]:
-        """Returns an estimate per parameter in displayed units. corrections: values by name, in the fields' units, which
-        replace the values found."""
+        """Returns an estimate per parameter in displayed units. corrections: the result of the method ``corrections``, whose
+        values replace those found."""
         values, deviations = self.estimates()
         estimates = {name: (estimate.value, estimate.deviation) for name, estimate in self.fixed.items()}
         estimates |= dict(zip(self.determined or (), zip(values.tolist(), deviations.tolist(), strict=True), strict=True))

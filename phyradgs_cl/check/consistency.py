@@ -1,9 +1,9 @@
 """Checks whether the frames fit together under the stated order, angles and geometry.
 
-A coarse reconstruction of consistent frames leaves a far smaller residual than one of the same frames in a random order.
-Otherwise, or if another hypothesis leaves less than half the squared residual, something stated is wrong. The steps: remove
-odd frames; choose the sense of rotation and the panel's shift (``orbit.py`` reports them); remove outliers; compare with
-random orders; try hypotheses."""
+A coarse reconstruction of consistent frames leaves a far smaller residual than one of the same frames in a random order. If
+it does not, or if another hypothesis leaves less than half the squared residual, something stated is wrong. The steps:
+remove odd frames; choose the sense of rotation and the panel's shift (``orbit.py`` reports them); remove outliers; compare
+with random orders; try hypotheses."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -25,39 +25,39 @@ from phyradgs_cl.reconstructors.fits.residuals import Fit, fit, fit_squares, t_s
 from phyradgs_cl.runtime import Runtime
 
 CONSISTENCY = "consistency"
-# Consistent frames leave less than this fraction of their residual in a random order: correct scans have 0.02 to 0.23.
+# Frames are consistent if (RMS residual) / (that in a random order) is at most this: correct scans have 0.02 to 0.23.
 _LARGEST = 0.35
-_DOUBTFUL = 0.1  # missing and repeated frames are tried if the residual exceeds this fraction of that in a random order
-_RANDOM_ORDERS = 2  # the squared residual in a random order is the mean over this many random orders
+_DOUBTFUL = 0.1  # missing and repeated frames are tried if (residual) / (residual in a random order) exceeds this
+_RANDOM_ORDERS = 2  # number of random orders over which their squared residual is averaged
 _FEWEST_FRAMES = 5  # fewer frames cannot tell one order from another
 _FEWEST_PIXELS = 32  # fewer valid coarse pixels per frame cannot tell one order from another
 _CLEAR = 0.5  # a hypothesis must leave less than this fraction of the stated scan's squared residual
-_NEARLY = 1.5  # a rough fit is refined unless its squared residual exceeds this many times the least one
-_ERRORS = 4.0  # a hypothesis must be better than the stated scan by this many standard errors
-# The object looks the same from every angle if a random order leaves an RMS residual below _SAME or _NOISY times a scale.
-_SAME = 0.03  # times the standard deviation of the line integrals
-_NOISY = 1.6  # times the standard deviation of the noise: round objects had up to 1.3, others 2.3 or more
+_NEARLY = 1.5  # a rough fit is refined unless (its squared residual) / (least squared residual of rough fits) exceeds this
+_ERRORS = 4.0  # a hypothesis's squared residual must be below the stated scan's by this many standard errors
+# Limits of the RMS residual in a random order. Below either limit, the object looks the same from every angle.
+_SAME = 0.03  # an object looks alike from all angles below this (residual in a random order) / (σ of line integrals)
+_NOISY = 1.6  # an object looks alike from all angles below this (residual in a random order) / (noise): round ones had 1.3
 _MOST_REFINED = 2  # only this many hypotheses, the best ones, get a refined shift of the panel, which takes time
 _SHIFT_PENALTY = 1.5  # factor on a hypothesis's squared residual per coarse pixel of shift: stated offsets are mostly right
-# A frame is odd if its mean line integral differs from the median of its neighbours' means by more than both limits:
-_DEVIATIONS = 12.0  # times the robust standard deviation of all frames' differences
-_LEAST_CHANGE = 0.75  # times the median of the frames' mean line integrals
-_REPEATED = 0.15  # a frame repeats the last one if its change is below this fraction of the least change of frames nearby
-_JUMP = 2.5  # an order jumps, as the golden angle does, if its median step exceeds that of sorted angles by this factor
-_UNLIKE = 2.0  # least RMS difference of a repeated frame from the next view in angle, as a multiple of all frames' median
-_OUTLIER = 4.0  # least RMS residual of an outlier, as a multiple of the frames' median RMS residual
-# Both ends of an arc may fit badly if their residuals differ by less than this factor: right frames had 1.4, odd ones 2.3.
+# An odd frame exceeds two limits of its change, which is |its mean line integral − median of its neighbours' means|.
+_DEVIATIONS = 12.0  # least (change of an odd frame's mean line integral) / (robust standard deviation of all changes)
+_LEAST_CHANGE = 0.75  # least (change of an odd frame's mean line integral) / |median of all frames' means|
+_REPEATED = 0.15  # a frame repeats the last one if (its change) / (least change between frames nearby) is below this
+_JUMP = 2.5  # an order jumps, as the golden angle does, if (its median step) / (median step of sorted angles) exceeds this
+_UNLIKE = 2.0  # where an order jumps, least (RMS difference of a repeated frame from the next view in angle) / (its median)
+_OUTLIER = 4.0  # least (RMS residual of an outlier) / (median RMS residual of the frames)
+# Frames at both ends of an arc may fit badly if the ratio of their residuals is below this: right frames had 1.4, odd 2.3.
 _ALIKE = 1.7
-# Both ends must also leave less than this fraction of the residual in a random order: right ones had 0.2, odd mostly 0.3.
+# Frames at both ends may fit badly only if (residual) / (that in a random order) is below this: right ones had 0.2, odd 0.3.
 _AT_BOTH_ENDS = 0.25
 _MOST_OUTLIERS = 0.2  # if this fraction of the frames or more are outliers, they have a common cause, and none is removed
-_EXCHANGED = 0.5  # two frames were exchanged if the opposite order leaves less than this fraction of the squared residual
+_EXCHANGED = 0.5  # two frames were exchanged if their exchange leaves less than this fraction of the squared residual
 
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
     """The ``finding`` about whether frames fit together. frames (n,): indices of the frames that fit. is_sound: whether
-    further questions make sense. sees_angles: whether the object looks different from different angles."""
+    further questions can be answered. sees_angles: whether the object looks different from different angles."""
 
     finding: Finding
     frames: np.ndarray
@@ -68,8 +68,8 @@ class Consistency:
 @dataclass(frozen=True, eq=False)
 class _CoarseFit:
     """The coarse scan with its best sense of rotation (``turned``), and with the best panel shift too (``best``). fitted:
-    the fit of ``best``. random_total: mean squared residuals of its frames in a random order, summed over the frames.
-    rough_mean_square: mean squared residual of the best rough fit."""
+    the fit of ``best``. random_total: the mean squared residuals of the frames of ``best`` in a random order, summed over
+    the frames. rough_mean_square: mean squared residual of the best rough fit."""
 
     turned: Scan
     best: Scan
@@ -83,10 +83,9 @@ class _CoarseFit:
 
 
 def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
-    """Finds frames and hypotheses that explain why the frames of a coarse ``scan`` do not fit together.
+    """Finds whether the frames of a coarse ``scan`` fit together, and else frames and hypotheses that explain why not.
 
-    The finding's value is (residual in the stated order) / (residual in a random order), both RMS. as_stated: the full
-    scan."""
+    The finding's value is (RMS residual in the stated order) / (that in a random order). as_stated: the full scan."""
     pixels = float(scan.valid.sum()) / scan.frames
     if scan.frames < _FEWEST_FRAMES or pixels < _FEWEST_PIXELS or scan.projections.shape[2] < FEWEST_COLUMNS:
         text = f"fewer than {_FEWEST_FRAMES} frames, {FEWEST_COLUMNS} columns or {_FEWEST_PIXELS} coarse pixels per frame"
@@ -151,7 +150,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
     turned = best = scan
     least = _CLEAR * fit_squares(rt, scan).sum()
     for sense, rough, limits in zip(senses, roughs, limits_px, strict=True):
-        if rough.squares.mean() > _NEARLY * least_rough:  # this sense fits clearly worse
+        if rough.squares.mean() > _NEARLY * least_rough:  # this sense of rotation fits clearly worse
             continue
         shift = axis.refined_shift(rt, sense, rough, limits)
         if not shift.is_found:
@@ -163,7 +162,7 @@ def _best_sense(rt: Runtime, scan: Scan) -> tuple[Scan, Scan, float]:
 
 
 def _random_order(rt: Runtime, scan: Scan) -> float:
-    """Returns the sum, over the frames, of their mean squared residuals in a random order, averaged over two orders."""
+    """Returns the sum of all frames' mean squared residuals if the frames are in a random order; a mean over two orders."""
     rng = np.random.default_rng(0)
     orders = [rng.permutation(scan.frames) for _ in range(_RANDOM_ORDERS)]
     return float(np.mean([fit_squares(rt, replace(scan, projections=scan.projections[order])).sum() for order in orders]))
@@ -172,8 +171,8 @@ def _random_order(rt: Runtime, scan: Scan) -> float:
 def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -> Hypothesis | None:
     """Returns the best hypothesis that leaves less than half of the stated scan's squared residual; None without one.
 
-    If the panel sees few rays twice, frames fit any geometry. Then the first hypothesis of other sizes under which frames
-    are consistent is returned."""
+    If the panel sees less than half of the rays twice, frames fit any geometry. Then the first hypothesis about sizes under
+    which they are consistent is returned. Only without one, and if the panel sees the axis, all hypotheses are compared."""
     is_one_sided = hypotheses.stated_redundancy(as_stated) < hypotheses.LEAST_REDUNDANCY
     about_scan = _refined_hypotheses(rt, scan, as_stated, np.inf if is_one_sided else coarse.rough_mean_square)
     if is_one_sided:
@@ -189,9 +188,9 @@ def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -
 def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:
     """Returns up to two hypotheses about the whole scan, the best ones, with the panel shifted to fit best.
 
-    most: rough fits with more than 1.5 times this mean squared residual are left out. The factor is not 1 because an offset
-    between two coarse pixels hides other differences. Large shifts count against a hypothesis. Of several hypotheses with
-    the same factor of sizes, the best counts."""
+    most: hypotheses whose rough fit leaves over 1.5 times this mean squared residual are left out. The factor is not 1
+    because an offset between two coarse pixels hides other differences. Large shifts count against a hypothesis. Of several
+    hypotheses with the same factor of sizes, only the best counts."""
     tried: list[tuple[Hypothesis, Scan, axis.AxisShift]] = []
     for hypothesis in hypotheses.of_scan(scan, as_stated):
         other = hypothesis.scan()
@@ -218,8 +217,8 @@ def _is_consistent(rt: Runtime, scan: Scan) -> bool:
 
 
 def _best_below(rt: Runtime, candidates: Iterable[Hypothesis], stated: Fit, most: float) -> Hypothesis | None:
-    """Returns the hypothesis with the least squared residual among those below ``most`` and better than the fit ``stated``
-    by four standard errors; None without one."""
+    """Returns the candidate with the least squared residual, among those with less than ``most`` that are better than the
+    fit ``stated`` by four standard errors; None if there is none."""
     best, least = None, most
     for hypothesis in candidates:
         squares = fit_squares(rt, hypothesis.scan())
@@ -252,8 +251,9 @@ def odd_frames(p: np.ndarray, mask: np.ndarray | None) -> list[int]:
 
 def repeated_frames(scan: Scan) -> list[int]:
     """Returns the indices of frames that repeat their predecessor although the gantry has turned: they differ from it by
-    less than 0.15 of the least change between frames nearby. In an order that jumps, such as the golden angle, distant views
-    of a round object may look the same. In such an order a repeated frame must also differ from the next view in angle."""
+    less than 0.15 times the least change between frames nearby. In an order that jumps, such as the golden angle, distant
+    views of a round object may look the same. In such an order a repeated frame must also differ from the next view in
+    angle."""
     p = scan.projections
     if len(p) < _FEWEST_FRAMES:
         return []
@@ -278,7 +278,7 @@ def _rms(image: np.ndarray) -> float:
 
 
 def _neighbours(values: np.ndarray) -> np.ndarray:
-    """Returns (4, F): the two values before and the two after each of ``values`` (F,), mirrored at the ends."""
+    """Returns (4, F): for each of ``values`` (F,), the two values before and the two after it. The ends are mirrored."""
     wide = np.r_[values[2:0:-1], values, values[-2:-4:-1]]
     return np.stack([wide[:-4], wide[1:-3], wide[3:-1], wide[4:]])
 
@@ -289,8 +289,8 @@ def without_outliers(
     """Removes frames whose RMS residual is 4 times the median or more, the worst first, with a new fit after each.
 
     stated: the fit of all frames. random_square: the mean squared residual of frames in a random order. Returns the indices
-    (n,) of the frames that stay, their fit, and notes. If a fifth of the frames would go, the cause is common to all, and
-    none is removed. Two outliers may be two exchanged frames, which a note says."""
+    (n,) of the frames that stay, their fit, and notes. If a fifth of the frames are outliers, they have a common cause, and
+    none is removed. If two outliers fit in exchanged order, the note says so."""
     remaining, current = np.arange(scan.frames), stated
     outliers: list[int] = []
     while len(outliers) < _MOST_OUTLIERS * scan.frames:
@@ -319,8 +319,8 @@ def _ends_alike(residual: np.ndarray, random: float) -> np.ndarray:
     """Returns which first and last frames, bool (F,), fit about equally badly, as correct frames of an open arc do.
 
     Frames at an end have neighbours on one side only, so a few iterations fit them less well, and a slow drift shows in
-    them. If they were removed, the frames next to them would be outliers. residual (F,): RMS of each frame. random: RMS
-    residual in a random order."""
+    them. If they were removed, the frames next to them would be outliers. residual (F,): each frame's RMS residual. random:
+    RMS residual in a random order."""
     is_apart = residual >= _OUTLIER * np.median(residual)
     at_an_end = np.logical_and.accumulate(is_apart) | np.logical_and.accumulate(is_apart[::-1])[::-1]
     return at_an_end & (residual < _ALIKE * residual[::-1]) & (residual < _AT_BOTH_ENDS * random)

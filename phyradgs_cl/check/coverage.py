@@ -14,18 +14,18 @@ from phyradgs_cl.detector import noise_level
 from phyradgs_cl.detector.noise_level import noise_rms
 
 _LARGEST_SHARE = 0.1  # at the panel's sides, values above this fraction of the largest line integral are not air
-_DISPLACED = 0.1  # a panel that is off centre by this fraction of its width was displaced on purpose
+_DISPLACED = 0.1  # a panel whose centre is off the central ray by this fraction of its width was displaced on purpose
 _NOISES = 4.0  # values above this many standard deviations of the noise belong to the object
 _OPAQUE = 30.0  # larger values are no line integrals, because no light would pass
-_INVERTED = 0.9  # bright and dark are exchanged if the edges' median exceeds this fraction of the largest value
+_INVERTED = 0.9  # bright and dark are exchanged if (median of the outer columns) / (largest value) exceeds this
 _BRIGHT = 0.05  # at most this fraction of the pixels may be brighter than the flats by more than the noise
 _FRAMES = 0.1  # the object may touch a side of the panel in up to this fraction of the frames
-_COVERED = 0.1  # a column shows the object if more than this fraction of its rows does
+_COVERED = 0.1  # a column shows the object if more than this fraction of its pixels shows the object
 # A unit is wrong if (grid's width / width of the panel's view) or (object's width / grid's width) exceeds this.
 _ANOTHER_SIZE = 5.0
-_NOISE_FRAMES, _NEAR = 16, 5  # most frames in which noise is sought, and side in pixels of a square around a pixel
-# Limits of noise / mean line integral behind the object: above the first one noise dominates, above the second one there is
-# no object.
+_NOISE_FRAMES, _NEAR = 16, 5  # most frames in which noise is sought; side, in pixels, of the square around a pixel
+# Limits of (noise) / (mean line integral) behind the object: above _MOST_NOISE noise dominates, above _NO_OBJECT_FROM there
+# is no object.
 _MOST_NOISE, _NO_OBJECT_FROM = 0.4, 4.0
 NOISE = "noise"
 NO_OBJECT, OPAQUE, TOO_BRIGHT = "no object", "opaque", "too bright"  # findings with these units end the check
@@ -54,10 +54,10 @@ def check_coverage(scan: Scan) -> Finding:
 
 
 def find_noise(scan: Scan) -> Finding | None:
-    """Returns a finding if noise dominates: if the noise of a pixel behind the object, by ``noise_rms``, exceeds 40 % of the
-    mean line integral there; else None. Pixels lie behind the object where the mean over their neighbours is above a tenth
-    of its largest value. Scans of 1000 photons had at most 0.29, of 30 at least 0.85. Above 4 returns None too, because
-    ``check_coverage`` finds no object then."""
+    """Returns a finding if noise dominates: if (noise of a pixel, by ``noise_rms``) / (mean line integral) behind the object
+    exceeds 0.4; else None. Pixels lie behind the object where the mean over their neighbours is above a tenth of its largest
+    value. Scans of 1000 photons per pixel had at most 0.29, of 30 at least 0.85. Above 4 the result is None too, because
+    ``check_coverage`` finds no object."""
     some = slice(None, None, ceil_div(scan.frames, _NOISE_FRAMES))
     p, valid = np.asarray(scan.projections[some]), scan.valid[some]
     mean = scipy.ndimage.uniform_filter(np.where(valid, p, 0), (1, _NEAR, _NEAR))
@@ -71,8 +71,8 @@ def find_noise(scan: Scan) -> Finding | None:
 
 
 def _check_values(p: np.ndarray, valid: np.ndarray, largest: float, noise: float, threshold: float) -> Finding | None:
-    """Returns a finding where the values cannot be line integrals of an object; None where they can. largest: the largest
-    line integral. noise: values that noise alone does not exceed. threshold: least value of a pixel that sees the object."""
+    """Returns a finding if the values p (F, v, u) cannot be line integrals of an object; else None. largest: their 99.9th
+    percentile. noise: a value that noise alone does not exceed. threshold: least value of a pixel that sees the object."""
     if largest <= noise:
         text = f"no object: line integrals reach {largest:.3g}, noise {noise:.3g}"
         advice = "was the object in the beam? Are the values line integrals, larger behind more material?"
@@ -122,7 +122,8 @@ def _check_sides(scan: Scan, p: np.ndarray, valid: np.ndarray, largest: float, t
 
 
 def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) -> float:
-    """Returns the object's median width in mm at the axis. A column counts if a tenth of its rows is above ``threshold``."""
+    """Returns the object's width in mm at the axis, the median over frames. It has the columns in which over a tenth of the
+    pixels are above ``threshold``."""
     geometry = scan.geometry
     columns = float(np.median((((p > threshold) & valid).mean(1) > _COVERED).sum(1)))
     if isinstance(geometry, ParallelGeometry):
@@ -132,8 +133,8 @@ def _width_mm(scan: Scan, p: np.ndarray, valid: np.ndarray, threshold: float) ->
 
 
 def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
-    """Returns the level of the line integrals p (F, v, u) in some ``columns``: in each frame the largest of their means over
-    an eighth of the rows, and of these the 90th percentile over the frames."""
+    """Returns the level of line integrals p (F, v, u) in ``columns``: the 90th percentile, over the frames, of the largest
+    mean over an eighth of the rows."""
     edge = p[:, :, columns]
     weight = valid[:, :, columns].astype(float)
     rows = max(1, edge.shape[1] // 8)
@@ -145,7 +146,7 @@ def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
 
 
 def _short_side(scan: Scan) -> str:
-    """Returns the side, "left" or "right", on which a displaced panel ends nearer to the axis; "" for a centred one."""
+    """Returns the side, "left" or "right", on which a displaced panel ends nearer to the axis; "" for a centred panel."""
     geometry = scan.geometry
     offset_mm = geometry.detector_offset_mm[1]
     width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1]

@@ -19,10 +19,10 @@ GAIN = "gain drift"
 OVERFLOW = "overflow"  # a finding with this unit ends the check
 _SATURATION, _DEAD = "saturation", "dead pixels"
 _MOST_SATURATED = 1e-3  # a larger fraction of saturated pixels is suspicious
-_REPEATS = 3  # a pixel repeats its least value in at least this many frames if it was clipped there
+_REPEATS = 3  # a pixel counts as clipped at its least value if it has this value in at least this many frames
 _ZERO = 1e-6  # smaller line integrals count as 0
-_JUMP = 0.75  # overflowed counts jump between neighbouring pixels by this fraction of the brightest transmission
-_MOST_JUMPS = 5e-4  # a larger fraction of jumping pixels is suspicious
+_JUMP = 0.75  # a pixel jumps if (change of transmission to the next pixel) / (brightest transmission) exceeds this
+_MOST_JUMPS = 5e-4  # a larger fraction of pixels that jump (``_JUMP``) is suspicious: counts have overflowed
 _MOST_DEAD = 2e-4  # a larger fraction of dead pixels is suspicious
 _LARGEST_DRIFT = 0.015  # a larger relative change of the gain over the scan is suspicious
 _DRIFT_DEVIATIONS = 5.0  # a change of the gain counts only beyond this many of its standard deviations
@@ -33,8 +33,8 @@ _FEWEST_FRAMES = 8  # fewer frames cannot tell a drift from noise
 class CountReader:
     """Converts counts to line integrals for ``read_scan``, as ``counts_to_attenuation`` does, and remembers saturation.
 
-    ceiling: the largest count of projections and flats; None for files without counts. at_ceiling: the fraction of the
-    projections' pixels that lie in areas at that count."""
+    ceiling: the largest count of projections, flats and invalid frames; None for files without counts. at_ceiling: the
+    fraction of the projections' pixels in areas at that count."""
 
     ceiling: float | None = None
     at_ceiling: float = 0.0
@@ -50,8 +50,8 @@ class CountReader:
 
 
 def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
-    """Finds areas of pixels at one extreme value, suspicious above 0.1 % of the pixels. counts: the reader of the scan's
-    file, if it is known.
+    """Finds areas of pixels at one extreme value, suspicious above 0.1 % of the pixels. counts: the ``CountReader`` with
+    which the scan's file was read; None if it was read otherwise.
 
     Only pixels whose neighbours have the same value count: saturation covers areas, noise clipped at 0 hits single pixels.
     Areas of exactly 0 may be air, so they get the answer "cannot tell"."""
@@ -95,8 +95,8 @@ def _clipped(saturation: Saturation, remedy: str) -> Finding:
 
 
 def _jumps(p: np.ndarray, masked: np.ndarray) -> float:
-    """Returns the fraction of pixels whose transmission differs from the next one's in the row by 3/4 of the brightest: the
-    median over the frames of line integrals p (F, v, u). Single dead pixels are filtered out first."""
+    """Returns the fraction of pixels whose transmission differs from that of the next pixel in the row by over 3/4 of the
+    brightest transmission: the median over frames of line integrals p (F, v, u). Dead pixels are filtered out first."""
     if p.shape[2] < 2:
         return 0.0
     transmission = np.where(masked, 1.0, np.exp(-np.clip(p, -20, 20))).astype(np.float32)
@@ -106,10 +106,10 @@ def _jumps(p: np.ndarray, masked: np.ndarray) -> float:
 
 
 def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
-    """Returns the fraction of pixels (F, v, u) that repeat their own least value: their counts were clipped before the
-    division by the flats.
+    """Returns the ``clustered_share`` of line integrals p (F, v, u) at their pixel's least value, for pixels that have this
+    value in three frames or more: their counts were clipped before the division by the flats.
 
-    Two kinds do not count: pixels that never change, which are dead, and line integrals of 0, which are noiseless air."""
+    Pixels that never change do not count, because they are dead, nor line integrals of 0, which are noiseless air."""
     least = p.min(0)
     at = (p == least) & ~masked & (np.abs(least) > _ZERO) & (p.max(0) > least)
     return clustered_share(at & (at.sum(0) >= _REPEATS))
@@ -118,7 +118,7 @@ def _at_own_least(p: np.ndarray, masked: np.ndarray) -> float:
 def check_dead_pixels(scan: Scan) -> tuple[Finding, np.ndarray]:
     """Finds dead pixels that are not masked yet. Returns the finding, and the map of dead pixels, bool (v, u).
 
-    A dead pixel always has the same value, or differs from its neighbours in nearly every frame. More than 0.02 % of the
+    A dead pixel always has the same value, or differs from its neighbours in nearly every frame. More than 0.02 % of dead
     pixels are suspicious."""
     masked = ~scan.valid.any(0)
     if scan.frames < LEAST_FRAMES:
@@ -141,8 +141,8 @@ def check_gain(rt: Runtime, scan: Scan) -> Finding:
     """Finds drifts and jumps of the detector's gain, from the constants ("levels") that ``fit`` adds to the frames of a
     coarse ``scan``.
 
-    A ramp over the scan, or a step at one of the frames, is fitted to the levels; the best of all fits counts. A change is
-    suspicious above 1.5 % and five standard deviations. Variation with sine and cosine of the angle is no drift."""
+    A ramp over the scan, and a step at each inner frame, are fitted to the levels; the best of these fits counts. A change
+    above both 1.5 % and five standard deviations is suspicious. Variation as sine and cosine of the angle is no drift."""
     if scan.frames < _FEWEST_FRAMES:
         return Finding(GAIN, CANNOT_TELL, 0.0, _LARGEST_DRIFT, "share", f"fewer than {_FEWEST_FRAMES} frames")
     level = fit(rt, scan).level
@@ -162,7 +162,7 @@ def check_gain(rt: Runtime, scan: Scan) -> Finding:
 
 
 def _fit_change(turning: np.ndarray, shape: np.ndarray, level: np.ndarray) -> tuple[float, float, float]:
-    """Fits ``level`` (F,) by least squares with a column ``shape`` (F,) and the columns ``turning`` (F, n).
+    """Fits ``level`` (F,) by least squares as a linear combination of ``shape`` (F,) and the columns of ``turning`` (F, n).
 
     Returns the coefficient of ``shape``, its standard deviation, and the squared residual."""
     design = np.column_stack([turning, shape])

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 OK, SUSPICIOUS, CANNOT_TELL = "ok", "suspicious", "cannot tell"
 PIXEL_SIZES = "x_pixel_size and y_pixel_size (--pixel-size-mm of import)"
 MIRROR_U, MIRROR_V = "--column-0 (left or right)", "--row-0 (top or bottom)"  # options of import that mirror frames
-FEWEST_COLUMNS = 8  # panels with fewer columns cannot be judged: four columns gave false alarms, five did not
+FEWEST_COLUMNS = 8  # panels with fewer columns are not judged: four columns gave wrong findings, five did not
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Finding:
 
 
 def too_narrow(question: str, unit: str) -> Finding:
-    """Answers ``question`` by "cannot tell", because the panel has too few columns."""
+    """Answers ``question`` by "cannot tell", because the panel has fewer than 8 columns."""
     return Finding(question, CANNOT_TELL, 0.0, 0.0, unit, f"fewer than {FEWEST_COLUMNS} columns")
 
 

@@ -16,13 +16,13 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fits import axis
 
 SIZE_FACTORS = (10.0, 0.1, 1e3, 1e-3)
-LEAST_REDUNDANCY = 0.5  # frames fit any pixel size if a smaller fraction of columns has rays that are measured twice
+LEAST_REDUNDANCY = 0.5  # if a full turn measures the rays of fewer than this fraction of the columns twice, any size fits
 _UNITS = {10.0: " (in cm, read as mm?)", 1e3: " (in m, read as mm?)", 1e-3: " (in µm, read as mm?)"}
 _FANS = (0.02, 3.0)  # range of (panel's width / panel's distance from the source) in real scanners
-_GRID_FACTOR = 3.0  # a grid this many times wider or narrower than the panel's view is replaced: it is as wrong as the sizes
+_GRID_FACTOR = 3.0  # a grid this many times wider or narrower than the panel's view has wrong sizes too, and is replaced
 _SAME_PLACE = 1.0  # shifts of the panel that differ by less, in coarse pixels, look the same
 _ARC_PERCENTS = (-5, -4, -3, -2, -1, 1, 2, 3, 4, 5)  # changes of the angle between views, in percent, that are tried
-_GAPS = 15  # a missing or repeated frame is looked for at this many frames, evenly spread
+_GAPS = 15  # number of places, evenly spread over the frames, at which a missing or repeated frame is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ def stated_redundancy(scan: Scan) -> float:
 
 
 def has_axis_near_edge(scan: Scan) -> bool:
-    """Returns whether the panel sees the axis, but so near its edge that few rays are measured twice."""
+    """Returns whether the panel sees the axis, but so near its edge that less than half of the rays are measured twice."""
     return 0 <= stated_redundancy(scan) < LEAST_REDUNDANCY
 
 
@@ -75,8 +75,8 @@ def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
 
 
 def _other_units(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses of pixel sizes or distances in other units. The fan angle shows only the ratio of pixel size to
-    distance. The panel's offset may decide whether pixel sizes or distances are wrong."""
+    """Yields hypotheses of pixel sizes or distances in other units. Frames show only (pixel size) / (panel's distance). The
+    panel's offset may decide which of the two is wrong. ``scan`` is coarse, ``stated`` the full scan."""
     geometry = stated.geometry
     if isinstance(geometry, ParallelGeometry):
         return  # in a parallel beam, other sizes only scale the object
@@ -105,8 +105,8 @@ def _times(name: str, factor: float) -> str:
 
 
 def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Scan:
-    """Returns ``scan``, whose pixels are binned, with pixels ``factor`` times as large as those of ``stated``, the scan of
-    the file, and a fitting grid. keeps_axis: the rotation axis still projects to the same detector column."""
+    """Returns the coarse ``scan`` with pixels ``factor`` times as large as ``stated``, the full scan, says, and a fitting
+    grid. keeps_axis: True keeps the detector column to which the rotation axis projects; False keeps the offset in mm."""
     v_mm, u_mm = stated.geometry.pixel_size_mm
     off_v_mm, off_u_mm = (offset * (factor if keeps_axis else 1) for offset in stated.geometry.detector_offset_mm)
     pixel_size_mm = (factor * v_mm, factor * u_mm)
@@ -118,8 +118,8 @@ def _with_sizes(scan: Scan, stated: Scan, factor: float, keeps_axis: bool) -> Sc
 
 
 def _matching_grid(stated: Scan, panel_grid: Grid) -> Grid:
-    """Returns ``panel_grid`` if the stated grid was derived from the panel, or if the longest sides of the two differ by a
-    factor of 3 or more; else the stated grid."""
+    """Returns ``panel_grid`` if the stated grid was derived from the panel, or if the longest sides of the two grids differ
+    by a factor of 3 or more; else the stated grid."""
     ratio = max(stated.grid.size_mm) / max(panel_grid.size_mm)
     is_derived = stated.grid == default_grid(stated.geometry)
     return panel_grid if is_derived or not 1 / _GRID_FACTOR < ratio < _GRID_FACTOR else stated.grid
@@ -137,8 +137,8 @@ def _other_images(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
 
 
 def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hypothesis]:
-    """Yields hypotheses about single frames of a coarse scan: other angle steps, exchanged pixel sizes (of ``shifted_scan``)
-    and, with ``tries_orders``, missing or repeated frames."""
+    """Yields hypotheses about a coarse scan: other steps of its angles, exchanged pixel sizes (of ``shifted_scan``, its copy
+    with the best shift of the panel) and, with ``tries_orders``, a missing or repeated frame."""
     yield from _other_steps(scan)
     yield from _exchanged_sizes(shifted_scan)
     if tries_orders:
@@ -146,7 +146,7 @@ def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hy
 
 
 def _azimuths(scan: Scan) -> np.ndarray:
-    """Returns each frame's angle (F,) in rad from the first frame's. Whole turns between frames are kept only if the
+    """Returns each frame's angle (F,) in rad minus the first frame's. Whole turns between frames are kept only if the
     trajectory states angles."""
     trajectory = variants.altered_trajectory(scan)
     angle_rad = getattr(trajectory.base, "angle_rad", None)
@@ -195,8 +195,8 @@ def nearly_sized(scan: Scan, factor: float) -> Scan:
 
 
 def _missing_frames(scan: Scan) -> Iterator[Hypothesis]:
-    """Yields hypotheses that a frame is missing, or there twice, at up to 15 places. They move the angles of later frames
-    one step forwards or backwards."""
+    """Yields, for up to 15 places, the hypotheses that a frame is missing there, or there twice. Their corrections turn all
+    later frames one step of the angles forwards or backwards."""
     sense = -1.0 if variants.altered_trajectory(scan).is_reversed else 1.0
     step = float(np.median(wrapped(np.diff(_azimuths(scan))))) * sense
     for at in np.unique(np.linspace(1, scan.frames - 1, _GAPS).round().astype(int)):

@@ -34,27 +34,27 @@ from phyradgs_cl.reconstructors.fits.twice import shift_by_rays_seen_twice
 from phyradgs_cl.runtime import Runtime
 
 SIGN, CENTRE, DISTANCES = "sign of rotation", "centre of rotation", "distances"
-OTHER_CAUSE = "pixels, if pixel sizes are right"  # unit of an offset that wrong pixel sizes explain as well
+OTHER_CAUSE = "pixels, if pixel sizes are right"  # unit of a finding about an offset that wrong pixel sizes explain as well
 UNVERIFIED = "neither pixel sizes nor distances are verified by these frames"
-_ERRORS = 4.0  # two hypotheses must differ by this many standard errors; else the answer is "cannot tell"
-_SIGN_RATIO = 1.2  # the wrong sense of rotation leaves at least this many times the squared residual of the right one
+_ERRORS = 4.0  # squared residuals of two hypotheses must differ by this many standard errors; else "cannot tell"
+_SIGN_RATIO = 1.2  # least (squared residual of the wrong sense of rotation) / (that of the right sense)
 _CLEAR_RATIO = 3.0  # shifts are not refined if the squared residuals of both senses' rough fits differ by this factor
-_TOLERATED_PX = 1 / 3  # a shift of the panel by this many pixels is always tolerated
-_DEVIATIONS = 4.0  # a shift by this many of its standard deviations is always tolerated
+_TOLERATED_PX = 1 / 3  # a shift of the panel by up to this many pixels is always tolerated
+_DEVIATIONS = 4.0  # a shift by up to this many of its standard deviations is always tolerated
 _BIAS_FULL_TURN = 0.003  # measured error of the axis in scans of a full turn, in coarse pixels
 _BIAS_HALF_TURN = 0.04  # measured error of the axis in coarse pixels, if some rays are measured only once
-_WHOLE_PIXELS = 2  # if full pixels were compared, the answer "ok" needs a threshold of at most this many pixels
-_LEAST_REDUNDANCY = 0.1  # least fraction of rays measured twice to divide by: it is below 0 if the axis misses the panel
+_WHOLE_PIXELS = 2  # if shifts were found from full pixels, "ok" needs a threshold of at most this many pixels
+_LEAST_REDUNDANCY = 0.1  # the fraction of rays measured twice, by which an error is divided, is raised to at least this
 _NO_SIGN = "parallel rays show an object that turns one way and its mirror image that turns the other way alike"
 _SIGN_ADVICE = "look for a feature whose side is known: a mirror image would fit as well"
 _OTHER_SIZES = (0.8, 1.25)  # factors on the fan's width: distances are "ok" if both other fans fit worse than the stated fan
-_SIZE_RATIO = 1.05  # another fan fits worse if its squared residual is at least this many times that of the stated fan
+_SIZE_RATIO = 1.05  # another fan fits worse if (its squared residual) / (the stated fan's) is at least this
 
 
 @dataclass(frozen=True, eq=False)
 class Orbit:
-    """The findings about sense of rotation (``sign``) and axis (``centre``). shift: how far the panel is shifted along u.
-    is_reversed: whether the gantry turns the other way."""
+    """The findings about the sense of rotation (``sign``) and the axis (``centre``). shift: how far the panel is from its
+    stated place along u. is_reversed: whether the gantry turns the other way than stated."""
 
     sign: Finding
     centre: Finding
@@ -84,7 +84,7 @@ def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> 
     reverse, limits_px = reversed_rotation(quick), shifts_for_sense_px(quick)
     stated, other = (axis.rough_shift(rt, sense, limits_px) for sense in (quick, reverse))
     ratio = residual_ratio(stated.squares, other.squares)
-    is_rough = max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_RATIO  # so clear an answer needs no refined shifts
+    is_rough = max(ratio, 1 / max(ratio, 1e-30)) >= _CLEAR_RATIO  # a difference so large needs no refined shifts
     if not is_rough:
         stated = axis.refined_shift(rt, quick, stated, limits_px)
         other = axis.refined_shift(rt, reverse, other, limits_px)
@@ -104,8 +104,8 @@ def find_orbit(rt: Runtime, quick: Scan, as_stated: Scan, sees_angles: bool) -> 
 def check_rotation(stated: axis.AxisShift, other: axis.AxisShift) -> Finding:
     """Compares the residuals with the angles as stated and reversed, each with its own best shift of the panel.
 
-    A reversal must fit better by four standard errors and 20 % of the squared residual: in a narrow fan a mirror image fits
-    as well. Frames mirrored in u fit reversed angles and the opposite offset; ``with_cause`` decides between the two."""
+    To decide, squared residuals must differ by four standard errors and by a factor of 1.2: in a narrow fan a mirror image
+    fits as well. Frames mirrored in u fit reversed angles with the opposite offset; ``with_cause`` tells the two apart."""
     errors, ratio = t_statistic(stated.squares, other.squares), residual_ratio(stated.squares, other.squares)
     text = f"turned the other way, the squared residual is {ratio:.3g} times as large ({errors:+.1f} standard errors)"
     values = (errors, -_ERRORS, "standard errors", text)
@@ -119,8 +119,9 @@ def check_rotation(stated: axis.AxisShift, other: axis.AxisShift) -> Finding:
 def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px: float) -> Finding:
     """Returns the finding about a wrong sense of rotation with its cause: angles are reversed, or frames mirrored in u.
 
-    stated_px: the panel's offset along u. stated_px + shift_px: the offset that fits best under reversed angles. If this is
-    nearer to −stated_px, frames are mirrored. Offsets below ``tolerance_px`` cannot tell; then the advice names both."""
+    stated_px: the panel's offset along u. stated_px + shift_px: the offset that fits best under reversed angles. If it is
+    nearer to −stated_px than to stated_px, frames are mirrored. If |stated_px| < ``tolerance_px``, the advice names both
+    causes."""
     if abs(stated_px) < tolerance_px:
         text = f"{finding.text}; frames mirrored in u would look the same"
         advice = f"change the sign of the angles ('gantry' for 'sample'), or import with the other {MIRROR_U}"
@@ -136,10 +137,10 @@ def with_cause(finding: Finding, shift_px: float, stated_px: float, tolerance_px
 def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisShift, Finding]:
     """Returns the panel's shift along u and the finding about it. ``shift`` was found with blocks of ``block`` pixels.
 
-    Coarse pixels cause an error that the bootstrap over frames does not include: it is added to the standard deviation. This
-    error is larger where ``scan`` measures fewer rays twice. Opposite views of parallel rays give a shift too, from pixels
-    of full size; the shift with the smaller deviation counts. If the panel sees the axis but measures fewer than half of the
-    rays twice, ``shift_by_rays_seen_twice`` decides: in a fit, any shift with fewer such rays would leave less residual."""
+    The standard deviation also gets the error by coarse pixels, which the bootstrap over frames does not include. This error
+    is larger where ``scan`` measures fewer rays twice. Opposite views of parallel rays give a shift too, from pixels of full
+    size; the shift with the smaller deviation counts. If the panel sees the axis but measures fewer than half of the rays
+    twice, ``shift_by_rays_seen_twice`` decides: in a fit, any shift with fewer such rays would leave less residual."""
     pitch_mm = scan.geometry.pixel_size_mm[1]
     if has_axis_near_edge(scan):
         shift = shift_by_rays_seen_twice(scan)
@@ -155,9 +156,9 @@ def centre_of(shift: axis.AxisShift, block: int, scan: Scan) -> tuple[axis.AxisS
 
 
 def check_centre(shift: axis.AxisShift, block: int, pitch_mm: float, stated_px: float) -> Finding:
-    """Finds whether the panel is shifted by more than a third of a pixel and four standard deviations.
+    """Finds whether the panel is shifted along u by more than 1/3 pixel and more than four standard deviations.
 
-    If the stated offset is wrong by the factor of a unit, it may be right in mm, and pixel sizes wrong by that factor."""
+    If (offset found) / (stated offset) is a factor between units, the offset may be right in mm and pixel sizes wrong."""
     threshold = max(_TOLERATED_PX, _DEVIATIONS * shift.deviation)
     if not (shift.is_found and math.isfinite(shift.deviation)):
         return Finding(CENTRE, CANNOT_TELL, 0.0, _TOLERATED_PX, "pixels", "no shift fits best")
@@ -184,8 +185,8 @@ def check_centre(shift: axis.AxisShift, block: int, pitch_mm: float, stated_px: 
 def check_distances(rt: Runtime, scan: Scan) -> Finding:
     """Fits a coarse scan with its fan 0.8 and 1.25 times as wide, each with its own best shift of the panel.
 
-    Sizes and distances show in the fan alone. The answer is "ok" where both fit worse, otherwise "cannot tell". Sizes that
-    leave less than half of the squared residual make the frames inconsistent, which another question finds."""
+    Sizes and distances show only in the fan. The answer is "ok" if both other fans fit worse, otherwise "cannot tell". A fan
+    that leaves less than half of the stated fan's squared residual is found by ``check_consistency``."""
     stated = fit_squares(rt, scan)
     others = {factor: fit_squares(rt, axis.with_best_shift(rt, nearly_sized(scan, factor))) for factor in _OTHER_SIZES}
     ratios = {factor: residual_ratio(stated, other) for factor, other in others.items()}

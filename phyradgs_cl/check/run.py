@@ -1,5 +1,5 @@
-"""Asks all questions, in an order in which each may rely on earlier answers. Errors found are corrected for later
-questions."""
+"""Asks all questions about a scan, in an order in which each may rely on earlier answers. Errors that are found, such as a
+shifted panel, are corrected for later questions."""
 
 import math
 from collections.abc import Callable
@@ -24,18 +24,18 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.scan.reader import united
 from phyradgs_cl.runtime import Runtime
 
-_SPARE_COLUMNS = 2.0  # the grid has room for an error of the stated detector offset by this many coarse columns
+_SPARE_COLUMNS = 2.0  # room in the grid for an error of the stated detector offset, in coarse columns
 Report = Callable[[int, int, str], None]
-"""A callback for progress. It takes how many questions are answered, how many there are, and the next one."""
+"""A callback for progress. It takes the number of answered questions, the number of all questions, and the next question."""
 
 
 @dataclass(frozen=True, eq=False)
 class CheckResult:
     """The findings of a check, in order.
 
-    offset_mm: the shift of the panel along u that explains the frames best; ``offset_spread_mm``: its standard deviation.
-    Both are NaN if no shift fits best, or if something else has to be corrected first. In the latter case ``is_consistent``
-    is False."""
+    offset_mm: the shift of the panel along u, from its stated place, that explains the frames best. offset_spread_mm: the
+    shift's standard deviation. Both are NaN if no shift fits best. Both are NaN too, and ``is_consistent`` is False, if
+    something else has to be corrected first."""
 
     findings: list[Finding]
     offset_mm: float = math.nan
@@ -78,8 +78,8 @@ def check(
     scan: Scan, rt: Runtime, counts: detector.CountReader | None = None,
     report: Report = lambda done, total, question: None,
 ) -> CheckResult:
-    """Returns the findings about a scan. counts: the reader of the scan's file, if it is known. report: is called with how
-    many questions are answered, how many there are, and the next one.
+    """Returns the findings about a scan. counts: the ``CountReader`` with which the scan's file was read, or None.
+    report: called with the number of answered questions, the number of all questions, and the next question.
 
     Raises InputError where every pixel is masked, and for NaN or infinity at other pixels."""
     scan = without_lag(_finite(scan))
@@ -127,7 +127,7 @@ def check(
     if not scan.is_parallel:
         ask(orbit.DISTANCES, orbit.check_distances, quick)
     gain = detector.check_gain(rt, quick)
-    if gain.verdict == SUSPICIOUS and covered.unit == coverage.CUT_OFF:  # an object that is cut off changes the levels too
+    if gain.verdict == SUSPICIOUS and covered.unit == coverage.CUT_OFF:  # an object beyond the panel changes levels too
         gain = replace(gain, verdict=CANNOT_TELL, text=f"{gain.text}, or the object does beyond the panel")
     answers.add(gain)
     if shutter.READOUT in questions:
@@ -135,14 +135,14 @@ def check(
         ask(shutter.READOUT, shutter.check_readout, around_object(turn.corrected(fine)))
     if shutter.EXPOSURE in questions:
         ask(shutter.EXPOSURE, shutter.check_exposure, quick)
-    if turn.is_reversed or turn.centre.unit == orbit.OTHER_CAUSE:  # the offset is right only after another correction
+    if turn.is_reversed or turn.centre.unit == orbit.OTHER_CAUSE:  # the offset holds only after another correction
         return CheckResult(answers.findings, is_consistent=False)
     pitch_mm = scan.geometry.pixel_size_mm[1]
     return CheckResult(answers.findings, turn.shift.pixels * pitch_mm, turn.shift.deviation * pitch_mm)
 
 
 def quick_scan(scan: Scan) -> Scan:
-    """Returns the coarse scan for all questions that need a reconstruction, except that about the readout.
+    """Returns the coarse scan for all questions that need a reconstruction, except the question about the readout.
 
     If the axis is near the panel's edge, the grid is cut to the object: with many voxels of air, the few frames of a coarse
     scan would fit under wrong angles too."""

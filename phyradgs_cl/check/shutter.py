@@ -14,27 +14,27 @@ from phyradgs_cl.reconstructors.fits.residuals import fit_squares, residual_rati
 from phyradgs_cl.runtime import Runtime
 
 READOUT, EXPOSURE = "sign of readout", "exposure"
-_ERRORS = 4.0  # two hypotheses must differ by this many standard errors
-# The wrong readout order leaves at least this many times the squared residual of the right one. The factor may be small,
-# because both orders have equally many unknowns.
+_ERRORS = 4.0  # squared residuals of two hypotheses must differ by this many standard errors
+# Least (squared residual of the wrong readout order) / (that of the right order). It may be near 1, because both orders have
+# equally many unknowns.
 _ORDER_RATIO = 1.04
-_OTHER_RATIO = 1.5  # the same factor for another readout axis or time in place of the stated one
-# The same factor for a gantry at rest: a model without blur always fits better, above all with few views.
+_OTHER_RATIO = 1.5  # least (squared residual as stated) / (that of another readout axis or time) to call the other right
+# Least (squared residual as stated) / (that of a gantry at rest) to call rest right: models without blur always fit better.
 _REST_RATIO = 2.0
-_AS_GOOD = 1.15  # readouts that leave up to this many times the best one's squared residual are named too
-_READOUT_SHARE = 0.86  # if no readout time is stated, this fraction of the time between frames is tried
+_AS_GOOD = 1.15  # other readouts are named too if (their squared residual) / (that of the best readout) is at most this
+_READOUT_SHARE = 0.86  # if the stated readout is 0 s, this fraction of the shortest time between frames is tried
 _OTHER_WAY, _AT_REST = "the other way", "all at once, the gantry at rest"
 _NEEDED_RATIO = {_OTHER_WAY: _ORDER_RATIO, _AT_REST: _REST_RATIO}
 # An exposure is suspicious if half of it leaves at most this fraction of the squared residual: correct scans have ≥ 0.8.
 _HALF_RATIO = 0.6
-_WORSE_RATIO = 1.05  # another exposure fits worse if its squared residual is at least this many times the stated exposure's
+_WORSE_RATIO = 1.05  # another exposure fits worse if (its squared residual) / (the stated exposure's) is at least this
 
 
 def check_readout(rt: Runtime, scan: Scan) -> Finding:
     """Fits a coarse fly-scan with its lines read as stated, and with other orders, axes and times of the readout.
 
-    Squared residuals must differ by four standard errors and by a ratio. A wrong order of rows only twists the object about
-    the axis, which shows in a cone beam alone. A wrong order of columns bends the object."""
+    To decide, squared residuals must differ by four standard errors and by a factor of 1.04 to 2. A wrong order of rows only
+    twists the object about the axis, which shows in a cone beam alone. A wrong order of columns bends the object."""
     stated = fit_squares(rt, scan)
     others: dict[str, np.ndarray] = {}
     for name, variant in _other_readouts(scan).items():
@@ -61,8 +61,8 @@ def check_readout(rt: Runtime, scan: Scan) -> Finding:
 
 
 def _compared(hypothesis: str, stated: np.ndarray, other: np.ndarray) -> tuple[str, float, float]:
-    """Returns a sentence about another readout, the number of standard errors by which the stated readout fits better, and
-    (squared residual of the other readout) / (squared residual of the stated one)."""
+    """Returns a sentence about the readout ``hypothesis``, the number of standard errors by which the stated readout fits
+    better, and the ratio Σ ``other`` / Σ ``stated`` of the two readouts' squared residuals."""
     ratio, errors = residual_ratio(stated, other), t_statistic(stated, other)
     return f"{hypothesis}, the squared residual is {ratio:.4g} times as large ({errors:+.1f} standard errors)", errors, ratio
 
@@ -102,8 +102,8 @@ def check_exposure(rt: Runtime, scan: Scan) -> Finding:
     """Fits a coarse scan with half and with twice the stated exposure.
 
     Only detail as fine as the arc of an exposure tells blur by motion from a blurred object. A sharper model always fits a
-    little better. So half the exposure is suspicious only if its squared residual is 40 % smaller. For "ok" both half and
-    twice must fit worse."""
+    little better, so the stated exposure is suspicious only if half of it leaves at most 60 % of the squared residual. It is
+    "ok" if both half and twice the exposure fit worse."""
     if not scan.is_fly:
         text = "the gantry is stated to stand still: had it turned, a blurred object would fit as well"
         return Finding(EXPOSURE, CANNOT_TELL, 1.0, _HALF_RATIO, "share", text)
@@ -128,8 +128,7 @@ def _fits_worse(stated: np.ndarray, other: np.ndarray | None) -> bool:
 
 
 def _twice_as_long(rt: Runtime, scan: Scan) -> np.ndarray | None:
-    """Returns the frames' mean squared residuals (F,) with twice the exposure; None if a table of poses or angles ends too
-    early."""
+    """Returns the frames' mean squared residuals (F,) with twice the exposure; None if poses or angles end too early."""
     try:
         return _squares_exposed(rt, scan, 2.0)
     except InputError:
@@ -137,6 +136,5 @@ def _twice_as_long(rt: Runtime, scan: Scan) -> np.ndarray | None:
 
 
 def _squares_exposed(rt: Runtime, scan: Scan, factor: float) -> np.ndarray:
-    """Returns the frames' mean squared residuals (F,) with lines that open as stated and stay open ``factor`` times as
-    long."""
+    """Returns the frames' mean squared residuals (F,) if lines open as stated, and stay open ``factor`` times as long."""
     return fit_squares(rt, replace(scan, shutter=replace(scan.shutter, exposure_s=factor * scan.shutter.exposure_s)))

@@ -25,11 +25,11 @@ from phyradgs_cl.check.finding import OK, SUSPICIOUS, Finding
 _TIMING, _ANGLES = "timing", "angles"
 _ROUNDING = 1e-3  # relative tolerance: files round times and angles
 _SPEED_TOLERANCE = 0.02  # largest relative difference of the speeds between and within frames: gantries vary less
-_LONGEST_TABLE = 100.0  # a table that lasts this many times as long as the scan belongs to more than one scan
-_FEW_RAD = math.radians(5)  # the times of a long table may be in another unit if the frames see a smaller arc of it
-_MILLISECONDS = (900.0, 3000.0)  # if a table lasts this many times as long as the scan, it is in ms and the frames are in s
+_LONGEST_TABLE = 100.0  # largest (a table's duration) / (the scan's duration) if the frames see an arc below _FEW_RAD
+_FEW_RAD = math.radians(5)  # frames that see at least this arc of a table show that table and frames have one unit of time
+_MILLISECONDS = (900.0, 3000.0)  # with (table's duration) / (scan's duration) in this range, the table is likely in ms
 _WIDE = 3.0  # a gap between views is wide above this multiple of the median gap
-_SAME_VIEW = 0.05  # views nearer to each other than this fraction of the mean step are repeats whose angles jitter
+_SAME_VIEW = 0.05  # views nearer to each other than this fraction of the mean step are repeats with uneven angles
 _SAME_RAD = 1e-6  # views nearer to each other than this have the same angle
 _TOLERATED_DEG = 1.0  # views may cover this much less than half a turn plus the fan, which nearly parallel rays do not need
 
@@ -38,9 +38,9 @@ def check_timing(scan: Scan) -> Finding:
     """Compares exposure, readout and table times with the frame times, and the angles with the speed.
 
     A line cannot open while it is open, a frame cannot be read while the one before is read, and a gantry has one angle at a
-    time. The finding's value is the first of four numbers that exceeds its limit, else the one nearest to its limit. They
-    are exposure / shortest frame period, readout / shortest frame period, 1 + the relative difference between the angle
-    steps and the speed within the frames, and (a table's duration) / (the scan's duration)."""
+    time. Four numbers have limits: exposure / shortest frame period, readout / shortest frame period, 1 + the relative
+    difference between the angle steps and the speed within the frames, and (a table's duration) / (the scan's duration). The
+    finding's value is the first number that exceeds its limit, or else the one nearest to its limit."""
     starts_s = np.asarray(scan.frame_start_s, np.float64)
     if scan.frames < 2:
         return Finding(_TIMING, OK, 0.0, 1.0, "share", "one frame: nothing to compare")
@@ -55,7 +55,7 @@ def check_timing(scan: Scan) -> Finding:
         _share("exposure", "a line would open again while it is open", scan.shutter.exposure_s / period_s),
         _share("readout", "a frame would be read while the last one is", scan.shutter.readout_s / period_s),
     ]
-    # other trajectories compute the angle steps and the speed from one function of time, so the two always agree
+    # in other trajectories the angle steps and the speed come from one function of time, so the two always agree
     if isinstance(scan.trajectory, CircularOrbit) and isinstance(scan.trajectory.kinematics, FrameSweeps):
         findings.append(_speed(scan, starts_s))
     findings += _table(scan)
@@ -72,8 +72,8 @@ def _share(name: str, consequence: str, share: float) -> Finding:
 
 
 def _table(scan: Scan) -> list[Finding]:
-    """Returns a finding if a table of angles or poses lasts over 100 times as long as the scan, which sees less than 5° of
-    it. The units of the two times are then likely to differ. Returns [] otherwise."""
+    """Returns a finding if a table of angles or poses lasts over 100 times as long as the scan, and the frames see less than
+    5° of it: the times of table and frames are then likely to be in different units. Returns [] otherwise."""
     table = scan.trajectory.kinematics if isinstance(scan.trajectory, CircularOrbit) else scan.trajectory
     if not isinstance(table, EncoderTable | PoseTable):
         return []
@@ -90,7 +90,7 @@ def _table(scan: Scan) -> list[Finding]:
 
 
 def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:
-    """Compares the angle to the next frame with the speed within the frame, by medians, since a gantry's speed varies."""
+    """Compares the angle from a frame to the next with the speed within the frame, by medians, since gantry speeds vary."""
     span_s = scan.shutter.exposure_s or scan.shutter.span_s
     by_speed, stepped = np.empty(scan.frames - 1), np.empty(scan.frames - 1)
     for frame in range(scan.frames - 1):
@@ -115,9 +115,9 @@ def _speed(scan: Scan, starts_s: np.ndarray) -> Finding:
 def check_angles(scan: Scan) -> Finding:
     """Compares the largest gap between neighbouring views with three times the median gap.
 
-    Views that cover at least half a turn and the fan may leave one gap. Less coverage is suspicious whatever the gaps.
+    Views of a cone beam that cover at least half a turn plus the fan may leave one wide gap. Less coverage is suspicious.
     Parallel rays at right angles to the axis see the same after half a turn, so their angles are taken modulo 180°. Parallel
-    rays that are tilted to the axis need a full turn."""
+    rays at another angle to the axis need a full turn."""
     turn_deg, needed_deg, of_needed = _needed_turn(scan)
     steps_deg = _steps_deg(scan, turn_deg)
     if steps_deg.size < 3:
@@ -149,7 +149,7 @@ def is_full_turn(scan: Scan) -> bool:
 
 
 def _needed_turn(scan: Scan) -> tuple[float, float, str]:
-    """Returns after how many degrees views repeat, how many degrees of views a volume needs, and the need in words."""
+    """Returns the degrees after which views repeat, the degrees of views that a volume needs, and the latter in words."""
     geometry = scan.geometry
     if isinstance(geometry, ParallelGeometry):
         if has_opposite_views(scan):
@@ -160,7 +160,7 @@ def _needed_turn(scan: Scan) -> tuple[float, float, str]:
 
 
 def _steps_deg(scan: Scan, turn_deg: float = 360.0) -> np.ndarray:
-    """Returns the gaps (n,) in degrees between neighbouring view angles, around a turn of ``turn_deg``."""
+    """Returns the gaps (n,) in degrees between neighbouring views' angles modulo ``turn_deg``, without gaps of repeats."""
     angles_deg = np.rad2deg(azimuth_rad(middle_poses(scan))) % turn_deg
     angles_deg = np.sort(angles_deg % turn_deg)  # the second % is needed because -1e-16 % 360 is 360
     steps_deg = np.diff(angles_deg, append=angles_deg[0] + turn_deg)
@@ -168,7 +168,7 @@ def _steps_deg(scan: Scan, turn_deg: float = 360.0) -> np.ndarray:
 
 
 def _half_fan_deg(scan: Scan, geometry: ConeGeometry) -> float:
-    """Returns half of the fan angle in degrees under which the source sees the grid's box, at most half of the panel's."""
+    """Returns half of the fan angle in degrees under which the source sees the grid, or the panel if its fan is narrower."""
     half_width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2
     panel_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
     radius_mm = max(scan.grid.size_mm[1:]) / 2

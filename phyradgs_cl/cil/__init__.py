@@ -17,7 +17,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import triple
 
 _ORDER = ("channel", "angle", "projection", "vertical", "horizontal_y", "horizontal_x", "horizontal")
-_FLAT = np.array([0.0, 0.0, 1e-3])  # in 2D the panel has one row; the step to a next row is out of the plane, and small
+_FLAT = np.array([0.0, 0.0, 1e-3])  # the panel's direction to a next row in 2D: out of the plane, for a short step
 
 
 class ProjectionOperator(LinearOperator):
@@ -143,7 +143,7 @@ def _angles_rad(frames: AcquisitionGeometry) -> np.ndarray:
 
 
 def _at_zero(frames: AcquisitionGeometry) -> np.ndarray:
-    """Returns ASTRA's vectors (4, 3) at angle 0: source or rays' direction, panel's middle, steps to next column and row."""
+    """Returns ASTRA's vectors (4, 3) at angle 0: source or ray direction, panel's middle, steps to next column and row."""
     system = frames.copy().config.system
     system.align_reference_frame("cil")
     origin = system.ray.direction if frames.geom_type == "parallel" else system.source.position
@@ -151,15 +151,15 @@ def _at_zero(frames: AcquisitionGeometry) -> np.ndarray:
 
 
 def _panel(frames: AcquisitionGeometry, detector: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns a panel's middle, and the steps to the data's next column and row, x y z. The data start with the pixel in the
-    corner that CIL calls the panel's origin."""
+    """Returns a panel's middle, and the steps to the next column and row of the data, x y z each. The data's first pixel is
+    in the panel's corner that CIL calls its origin."""
     panel, along_y = frames.config.panel, getattr(detector, "direction_y", _FLAT)
     step_x, step_y = panel.pixel_size[0] * detector.direction_x, panel.pixel_size[1] * along_y
     return detector.position, -step_x if "right" in panel.origin else step_x, -step_y if "top" in panel.origin else step_y
 
 
 def _turned(at_zero: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
-    """Returns ASTRA's vectors (F, 12) for an object at angles (F,) about z: ``at_zero`` turned by minus the angles."""
+    """Returns ASTRA's vectors (F, 12) for an object at angles (F,) about z: ``at_zero`` (4, 3) turned by minus the angle."""
     (x, y, z), cos, sin = at_zero.T, np.cos(angles_rad)[:, None], np.sin(angles_rad)[:, None]
     return np.stack([cos * x + sin * y, cos * y - sin * x, z + 0 * cos], -1).reshape(-1, 12)
 
@@ -167,8 +167,8 @@ def _turned(at_zero: np.ndarray, angles_rad: np.ndarray) -> np.ndarray:
 def _mapped(
     function: Callable[[np.ndarray], np.ndarray], x: DataContainer, of: Any, to: Any, out: DataContainer | None
 ) -> DataContainer:
-    """Applies ``function`` to each channel of data with geometry ``of``. Returns data with geometry ``to``, in ``out`` if
-    given."""
+    """Applies ``function`` to each channel of the data ``x``, whose geometry is ``of``. Returns the results as data with the
+    geometry ``to``, in ``out`` if given."""
     channels = np.transpose(x.as_array(), np.argsort(_places(of))).reshape(of.channels, *_shape(of))
     mapped, places = np.stack([function(np.ascontiguousarray(one)) for one in channels]), _places(to)
     out = to.allocate(None) if out is None else out
@@ -177,14 +177,14 @@ def _mapped(
 
 
 def _places(geometry: Any) -> list[int]:
-    """Returns the place of each of the geometry's dimensions, which are in CIL's order, in this package's order: channels,
-    frames or slices, rows, columns."""
+    """Returns, for each dimension of the geometry in CIL's order, its index in this package's order: channels, frames or
+    slices, rows, columns."""
     present = [name for name in _ORDER if name in geometry.dimension_labels]
     return [present.index(name) for name in geometry.dimension_labels]
 
 
 def _shape(geometry: Any) -> tuple[int, int, int]:
-    """Returns (slices, rows, columns) of an image, or (frames, rows, columns). Dimensions that CIL leaves out become 1."""
+    """Returns an image's (slices, rows, columns), or (frames, rows, columns); 1 for a dimension that CIL leaves out."""
     if isinstance(geometry, ImageGeometry):
         return geometry.voxel_num_z or 1, geometry.voxel_num_y, geometry.voxel_num_x
     return geometry.num_projections, int(geometry.config.panel.num_pixels[1]), int(geometry.config.panel.num_pixels[0])

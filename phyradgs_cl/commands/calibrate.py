@@ -78,7 +78,7 @@ def calibrate_command(
 
 
 def _check_storable(scan: Loaded, names: list[str]) -> None:
-    """Raises InputError for a wobble of frames that overlap in time, since a scan file has one pose at a time."""
+    """Raises InputError if ``names`` has the wobble and frames overlap in time: a scan file has only one pose at a time."""
     if WOBBLE not in names:
         return
     if scan.is_fly and overlaps(scan):

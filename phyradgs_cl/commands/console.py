@@ -46,7 +46,7 @@ def file_argument(name: str, help: str) -> Any:
 
 
 def pair_option(form: str, example: str, metavar: str, largest: float = math.inf) -> Callable[[str, str, Any], Any]:
-    """Returns a function (flag, help, default) that makes an option of two numbers, which ``pair_of`` parses."""
+    """Returns a function (flag, help, default) that makes an option of two numbers. Other arguments: as in ``pair_of``."""
     return lambda flag, help, default: option(
         help, default, flag, parser=pair_of(flag, form, example, largest), metavar=metavar
     )
@@ -71,7 +71,7 @@ def pair_of(
 
 
 def file_parser(subject: str) -> Callable[[str], Path]:
-    """Returns a parser of paths. It raises InputError for an empty name, which Path would take as the current folder."""
+    """Returns a parser of paths. It raises InputError about ``subject`` for an empty name, which Path takes as "."."""
 
     def file(text: str) -> Path:
         if not text.strip():
@@ -105,7 +105,7 @@ def remark(text: str) -> None:
 
 
 def give_up_stdout() -> None:
-    """Discards unwritten output. Otherwise Python would try to write it at its end, and fail with a traceback."""
+    """Discards output not yet written. Otherwise Python, as it ends, would try to write it, and print a traceback."""
     with suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
@@ -114,21 +114,21 @@ def give_up_stdout() -> None:
 
 def scores(metrics: Mapping[str, float | None]) -> str:
     """Returns a run's metrics, and its errors on held-out pixels, as text with a comma before each."""
-    from phyradgs_cl.metrics import HELD_OUT  # here, because it loads SciPy, which takes time
+    from phyradgs_cl.metrics import HELD_OUT  # imported here, because it loads SciPy, which takes time
 
     return "".join(f", {words}" for words in [*told(metrics), *told(metrics, HELD_OUT)])
 
 
 def told(metrics: Mapping[str, object], *names: Any) -> list[str]:
-    """Returns the metrics that are present as texts such as "PSNR 31.2 dB". names: as in ``printed``."""
-    from phyradgs_cl.metrics import printed  # here, because it loads SciPy, which takes time
+    """Returns the metrics that are present as texts such as "PSNR 31.2 dB". names: which metrics; by default ``METRICS``."""
+    from phyradgs_cl.metrics import printed  # imported here, because it loads SciPy, which takes time
 
     return [f"{title} {value}" for title, value in printed(metrics, *names)]
 
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:
-    """Returns Typer's message about wrong arguments, with the value that it could not read; for an option of an earlier
-    version, the message that says what replaces the option."""
+    """Returns Typer's message ``error`` about wrong ``arguments``, with the value that Typer could not read. For an option
+    of an earlier version, returns what to write in place of the option."""
     flag, param = str(getattr(error, "option_name", "")), getattr(error, "param", None)
     value = _value_of(param, arguments)
     words = [(flag, ""), (flag.lstrip("-").replace("-", "_"), flag)]
@@ -183,12 +183,12 @@ def takes_part(arguments: Sequence[str]) -> bool:
     only, and this function turns off their output."""
     if launched().rank == 0:
         return True
-    sys.stdout = sys.stderr = None  # None as in programs without a console: libraries check for it
+    sys.stdout = sys.stderr = None  # libraries check for None, which programs without a console have here
     return arguments[:1] == ["reconstruct"]  # all other commands run on rank 0 only
 
 
 def last_words(error: BaseException) -> int:
-    """Prints the error with which a rank ends all ranks, and returns the exit status."""
+    """Prints the error because of which this rank ends all ranks, and returns the exit status."""
     rank = launched().rank
     if isinstance(error, KeyboardInterrupt):
         text, status = signals.farewell(), signals.exit_status()

@@ -87,7 +87,7 @@ import_command.__doc__ = f"Import a scan: {', '.join(dict.fromkeys(whose for _, 
 
 
 def _applied_in_words(scan: Scan) -> list[str]:
-    """Says how many flats and darks were applied, as ["10 flats and 5 darks applied"]; [] if none."""
+    """Returns how many flats and darks were applied, as in ["10 flats and 5 darks applied"]; [] if none were."""
     counts = [scan.provenance.get(key, 0) for key in APPLIED]
     if not any(counts):
         return []
@@ -96,7 +96,7 @@ def _applied_in_words(scan: Scan) -> list[str]:
 
 
 def _refuse_overwriting(source: Path, output: Path) -> None:
-    """Raises InputError for an output that is the input, or an existing file in its folder that is no scan file."""
+    """Raises InputError if ``output`` is the input ``source``, or a file in the input's folder that is no scan file."""
     target, origin = output.resolve(), source.resolve()
     folder = origin if origin.is_dir() else origin.parent
     refuse_overwriting("--output", output, source)

@@ -34,7 +34,7 @@ ObjectMotion = Annotated[Path | None, file_option(_OBJECT_MOTION, "--object-moti
 
 _CHECKPOINT = "Seconds from checkpoint to checkpoint of a run, which continues from its last; 0: on Ctrl-C only."
 CheckpointEvery = Annotated[float, option(_CHECKPOINT, metavar="SECONDS")]
-CHECKPOINT_EVERY_S = 600.0  # a killed run loses about this time at most; writing a checkpoint takes a small part of it
+CHECKPOINT_EVERY_S = 600.0  # a killed run loses at most about this time, of which writing a checkpoint takes a small part
 
 
 lengths = pair_option("V,U in mm", "0,12.5", "V,U", LARGEST_MM)
@@ -108,7 +108,7 @@ RUN_OPTIONS: dict[str, Any] = {
 
 
 def with_run_options(*without: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Returns a decorator that replaces the parameter ``settings`` by a reconstruction's options, except ``without``."""
+    """Returns a decorator that replaces a command's parameter ``settings`` by ``RUN_OPTIONS`` other than ``without``."""
     kinds = {name: kind for name, kind in RUN_OPTIONS.items() if name not in without}
     options = {name: (kind, False if get_args(kind)[0] is bool else None) for name, kind in kinds.items()}
     return with_options("settings", options, settings_of)

@@ -43,7 +43,7 @@ _GROUPS = {
     ),
     "Run": ("device", "memory", "config", "preview", "live", "resume", "checkpoint_every", "profile"),
 }
-GROUPS = {"reconstruct": _GROUPS, "estimate": _GROUPS}  # each command shows only the options that it has
+GROUPS = {"reconstruct": _GROUPS, "estimate": _GROUPS}  # each command's help shows only options that it has
 _ROWS = "Detector rows of a parallel scan to read and reconstruct; row 0 is the lowest."
 _SLAB = "Rows of a parallel scan at a time: slabs, kept on disk as they are done."
 _WATER = "Attenuation of water in 1/mm, for --initial in Hounsfield units that does not state its scale."
@@ -135,8 +135,8 @@ def reconstruct_command(
 
 
 def _finish(page: "report.LivePage", result: Reconstruction, scan: Path, output: Path, rt: Runtime) -> None:
-    """Turns the live page of a complete run into its report. The page of an interrupted run says how to continue. The page
-    of a run in slabs names the command that makes a report, since the run's frames may exceed the memory."""
+    """Turns the live page of a complete run into the run's report. The page of an interrupted run says how to continue. The
+    page of a run in slabs names the command that makes a report, because all its frames may not fit in memory."""
     if result.state is not None:
         page.end(f"Interrupted at {result.interrupted_at}: repeat the command with --resume to continue.")
     elif "slabs" in result.facts:
@@ -152,7 +152,7 @@ def estimate_command(scan: Scan, settings: Settings, object_motion: ObjectMotion
     plan = settings.plan(object_motion=object_motion)
     loaded = load_scan(scan, plan.preprocessing.flats)
     rt = settings.runtime()
-    before_s = time.process_time()  # a run will need this time too, to start and to read the scan
+    before_s = time.process_time()  # the time to start and to read the scan, which a run will need too
     values = estimate(loaded, plan, rt, lambda result: before_s + seconds_around(scan, loaded, result))
     say(f"{plan.method_name} on {rt.device.name}, from a trial of {duration(values.trial_seconds)}")
     say("\n".join(filter(None, (values.text(), blur_line(loaded)))))

@@ -13,7 +13,7 @@ EXAMPLES = {
     "report": "Example: phyradgs report volume.h5 -o report.html",
     "view": "Example: phyradgs view volume.h5",
 }
-MOST_VIEWS = 24  # more frames would make the page very large
+MOST_VIEWS = 24  # most frames on a page: more would make its file very large
 _SCAN_DEFAULT = "the one that the volume file names, if unchanged"
 _VIEWS = "Frames to compute from the volume and compare with the measurement."
 

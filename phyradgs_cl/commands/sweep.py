@@ -34,7 +34,7 @@ def sweep_command(
 
         def tell(done: int, line: dict[str, Any]) -> None:
             ticker.end_line()
-            ticker.first = None  # so that the next run's rate counts from its own start
+            ticker.first = None  # so that the ticker measures the next run's rate from that run's start
             outcome = f"failed: {line['error']}" if "error" in line else f"{line['seconds']:.1f} s{scores(line['metrics'])}"
             say(f"{done}/{len(runs)} {line['run']} ({line['label']}): {outcome}")
 

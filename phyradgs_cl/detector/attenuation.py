@@ -2,7 +2,7 @@
 
 The spectrum behind an aluminium filter follows Kramers' law (Phil. Mag. 46 (1923) 836), or SpekPy's tungsten anode
 (Poludniowski et al., Med. Phys. 48 (2021) 3630). Attenuation is interpolated in the logarithms of NIST's tables (Hubbell and
-Seltzer, NISTIR 5632). Very thin layers attenuate as stated, thick ones less per length, because the beam hardens."""
+Seltzer, NISTIR 5632). Thin layers keep their line integrals; thick ones attenuate less per length: the beam hardens."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -15,10 +15,10 @@ from phyradgs_cl.errors import InputError
 
 PROJECTION, FLAT, DARK, INVALID = 0, 1, 2, 3  # the codes of NXtomo's image_key
 QUANTITIES = ("attenuation", "transmission", "counts")
-# Least transmission before the logarithm: 16-bit panels resolve no less. Pixels at or below it are masked.
+# The logarithm is taken of this transmission at least: 16-bit panels resolve no less. Pixels at or below it are masked.
 TRANSMISSION_FLOOR = 1e-6
 _LARGEST = float(np.finfo(np.float32).max)  # by default every finite float32 is a usable line integral
-_BLOCK_PIXELS = 1 << 18  # most pixels converted at a time: a float64 copy of a whole scan needs much memory
+_BLOCK_PIXELS = 1 << 18  # about as many pixels are converted at a time: a float64 copy of a whole scan needs much memory
 Array = NDArray[np.floating]
 _ENERGY_KEV = np.array([15.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0, 100.0, 150.0])
 # Mass attenuation coefficients at these energies, in cm²/g, of water, cortical bone (ICRU-44) and aluminium.
@@ -53,9 +53,9 @@ def frames_to_attenuation(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Converts projections (P, v, u) to line integrals as ``counts_to_attenuation`` does. flats, darks: (n, v, u), or None.
 
-    Attenuation above ``largest`` is marked as unusable too. place (P,): where each projection lies between the flats, which
-    are then interpolated: 0.5 is halfway from the first to the second; None: the flats' mean is used. numbers (P,): indices
-    of the projections in ``frames``; None: all."""
+    With the quantity "attenuation", |values| above ``largest`` are marked as unusable too. place (P,): each projection's
+    place among the flats, which are interpolated there: 0.5 is halfway from the first flat to the second; None takes the
+    flats' mean. numbers (P,): indices of the projections in ``frames``; None: all."""
     panel, projections = frames.shape[1:], range(len(frames)) if numbers is None else numbers
     result = np.empty((len(projections), *panel), dtype=np.float32)
     unusable = np.empty(result.shape, dtype=bool)
@@ -91,10 +91,10 @@ def mean_dark(darks: NDArray[np.generic] | None, panel: tuple[int, ...]) -> NDAr
 
 
 def minus_log(signal: NDArray[np.float64], gain: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Returns −ln(signal / gain) for arrays of one shape, and where the result must not be used.
+    """Returns −ln(signal / gain) for arrays of one shape, and a mask that is True where the result must not be used.
 
-    The result is 0 where signal or gain is not finite, and where the gain is 0 or less. A pixel without signal becomes
-    −ln ``TRANSMISSION_FLOOR``."""
+    The result is 0 where signal or gain is not finite, and where the gain is 0 or less. Transmissions below
+    ``TRANSMISSION_FLOOR`` count as this floor."""
     live = np.isfinite(signal) & np.isfinite(gain) & (gain > 0)
     transmission = np.divide(signal, gain, out=np.zeros_like(signal), where=live)
     p = -np.log(np.maximum(transmission, TRANSMISSION_FLOOR))
@@ -105,16 +105,16 @@ def minus_log(signal: NDArray[np.float64], gain: NDArray[np.float64]) -> tuple[N
 def average(p: ArrayLike, weight: ArrayLike, model: str) -> NDArray[np.float64]:
     """Averages line integrals p (S, ...) over S moments of an exposure. Returns (...) float64.
 
-    Model "log" takes their weighted mean (PhyRadGS, Eq. 1). Model "intensity" adds photons as a detector does: −ln Σ w
-    exp(−p), without overflow at any p. weight (S,): fractions of the exposure, not negative, with sum 1."""
+    The model "log" takes their weighted mean (PhyRadGS, Eq. 1). The model "intensity" adds photons as a detector does:
+    −ln Σ w exp(−p), without overflow at any p. weight (S,): the moments' fractions w of the exposure, at least 0, sum 1."""
     values, weights = np.asarray(p, dtype=np.float64), np.asarray(weight, dtype=np.float64)
     return np.tensordot(weights, values, axes=1) if model == "log" else intensity_average(values, weights)[0]
 
 
 def intensity_average(p: Iterable[np.ndarray], weights: Iterable[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Returns −ln Σ w exp(−p) over S moments, and each moment's weight in its derivative, w exp(−p) / Σ w exp(−p).
+    """Returns −ln Σ w exp(−p) over S moments, and its derivative by each moment's p: w exp(−p) / Σ w exp(−p).
 
-    p: S arrays of line integrals; the result has their precision and cannot overflow. weights: S numbers or arrays that
+    p: S arrays of line integrals; the results have their precision and cannot overflow. weights: S numbers or arrays w that
     broadcast, with sum 1. Where all weights are 0, both results are 0."""
     pairs = list(zip(p, weights, strict=True))
     least = np.minimum.reduce([np.where(w > 0, q, np.inf) for q, w in pairs])  # line integral of the brightest moment
@@ -127,9 +127,9 @@ def intensity_average(p: Iterable[np.ndarray], weights: Iterable[np.ndarray]) ->
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """A beam's spectrum. energy_kev (E,). weight (E,): fraction of the signal recorded at each energy, with sum 1.
+    """A beam's spectrum at energies energy_kev (E,). weight (E,): each energy's fraction of the recorded signal, sum 1.
 
-    soft, bone (E,): attenuation of soft tissue and of bone at each energy, divided by its mean over the spectrum."""
+    soft, bone (E,): attenuation coefficients of soft tissue and bone, divided by their means weighted by ``weight``."""
 
     energy_kev: Array
     weight: Array
@@ -137,17 +137,18 @@ class Spectrum:
     bone: Array
 
     def hardened(self, soft: Array, bone: Array | float = 0.0) -> Array:
-        """Returns the line integrals (any shape) that this beam measures. soft, bone: line integrals without hardening."""
+        """Returns the line integrals (any shape) that this beam measures. soft, bone: both materials' parts of the line
+        integrals without hardening."""
         soft, energies = np.asarray(soft, np.float64), zip(self.weight, self.soft, self.bone, strict=True)
-        # One energy at a time: ``intensity_average`` would hold all of them in memory.
+        # The sum runs over one energy at a time: ``intensity_average`` would hold arrays of all energies in memory.
         return -np.log(sum(w * np.exp(-(s * soft + b * np.asarray(bone))) for w, s, b in energies))
 
 
 def tube_spectrum(kvp: float, filter_mm: float = FILTER_MM, anode_deg: float = 0.0) -> Spectrum:
     """Returns the spectrum of a tube at ``kvp`` kV behind ``filter_mm`` of aluminium, for a panel that integrates energy.
 
-    The spectrum is SpekPy's for a tungsten anode of ``anode_deg``; at 0 it follows Kramers' law. Raises InputError for an
-    anode without the package spekpy."""
+    The spectrum is SpekPy's for a tungsten anode at the angle ``anode_deg``; for 0 it follows Kramers' law. Raises
+    InputError for an ``anode_deg`` other than 0 if the package spekpy is missing."""
     energy_kev, photons = _tungsten(kvp, anode_deg) if anode_deg else _kramers(kvp)
     light = photons * energy_kev * np.exp(-_at(energy_kev, _ALUMINIUM) * _ALUMINIUM_G_PER_CM3 * filter_mm / 10)
     weight = light / light.sum()

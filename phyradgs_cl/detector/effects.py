@@ -22,11 +22,11 @@ from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 Array = NDArray[np.floating]
 # From this mean on, a rounded normal stands for Poisson (skewness off by < 4e-5): NumPy's own sampler fails near 9.2e18.
 NORMAL_FROM = 1e9
-COUNT_FLOOR = 0.5  # smaller counts are raised to this before the logarithm, which 0 lacks; no detector records so little
+COUNT_FLOOR = 0.5  # smaller counts, which no detector tells from 0, are raised to this, because 0 has no logarithm
 _LARGEST_EXPONENT = 700.0  # largest exponent: float64 overflows at very negative line integrals, which ringing may cause
 _SPARK_HEIGHT = (0.3, 2.0)  # least and most light that a spark adds, relative to the light without object
-_SCATTER_REACH = 6.0  # the scatter kernel falls to 1/e over the panel's longer side divided by this
-_SCATTER_POWERS = (0.8, 1.5)  # scattered light is the product of these powers of the primary light and the line integral
+_SCATTER_REACH = 6.0  # (panel's longer side) / (length over which the scatter kernel falls to 1/e)
+_SCATTER_POWERS = (0.8, 1.5)  # powers a, b of scattered light ∝ P^a p^b, with primary light P and line integral p
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
 
 
@@ -44,7 +44,7 @@ def beer_lambert_counts(line_integrals: ArrayLike, dose: float) -> Array:
 
 
 def sample_counts(expected: Array, electronic_noise: float, rng: np.random.Generator) -> Array:
-    """Draws counts Poisson(expected (...)) + N(0, electronic_noise) once, (...) float64. They may be negative."""
+    """Draws one sample of counts Poisson(``expected``) + N(0, ``electronic_noise``), (...) float64; it may be negative."""
     many = expected > NORMAL_FROM
     counts = rng.poisson(np.where(many, 0.0, expected)).astype(np.float64)
     if many.any():
@@ -76,8 +76,8 @@ def beer_lambert_noise(
     light: ArrayLike = 1.0, lag: float = 0.0
 ) -> NDArray[np.float32]:
     """Returns −ln(counts/dose), (F, v, u) float32; ``COUNT_FLOOR`` is the least count. Negative values stay: with 0 in their
-    place the mean of air would rise. Arguments as in ``tigre_noise``. Lag λ mixes successive frames, before electronic noise
-    is added."""
+    place the mean of air would rise. A ``lag`` λ mixes successive frames, before electronic noise is added. Other arguments:
+    as in ``tigre_noise``."""
     expected = beer_lambert_counts(line_integrals, dose)
     share = np.asarray(light, dtype=np.float64)
     counts = add_lag(sample_counts(expected * share, 0.0, rng), lag)
@@ -91,7 +91,8 @@ def _log_ratio(counts: Array, dose: float | Array) -> Array:
 
 
 def add_lag(signal: ArrayLike, lag: float) -> NDArray[np.float64]:
-    """Returns signals (F, ...), one per frame in order of time, as a panel with lag λ records them, float64."""
+    """Returns signals (F, ...), one per frame in order of time, as a panel with lag λ records them, float64:
+    y_f = (1 − λ) x_f + λ y_(f−1), with y = 0 before the first frame."""
     return np.asarray(scipy.signal.lfilter([1 - lag], [1, -lag], np.asarray(signal, np.float64), axis=0))
 
 
@@ -104,7 +105,7 @@ def without_lag(scan: Scan) -> Scan:
     """Returns the scan as a panel without lag would have recorded it. A scan whose lag is 0 is returned itself.
 
     Masked are transmissions at or below ``TRANSMISSION_FLOOR``, and values computed from a masked pixel of the same or the
-    previous frame. Photon noise returns to its level without lag. Noise added after the panel grows by √(1 + λ²)/(1 − λ)."""
+    previous frame. Photon noise returns to its level without lag. Electronic noise grows by the factor √(1 + λ²)/(1 − λ)."""
     if scan.lag == 0:
         return scan
     projections = np.empty(scan.projections.shape, np.float32)
@@ -119,21 +120,21 @@ def without_lag(scan: Scan) -> Scan:
     if scan.pixel_mask is None:
         return replace(scan, projections=projections, pixel_mask=bad if bad.any() else None, lag=0.0)
     masked = np.asarray(scan.pixel_mask) != 0
-    if masked.ndim == 3:  # a masked pixel spoils its frame and the next one
+    if masked.ndim == 3:  # a masked pixel spoils the same pixel of the next frame too
         masked = masked | np.concatenate([masked[:1], masked[:-1]])
     return replace(scan, projections=projections, pixel_mask=masked | bad if bad.any() else masked, lag=0.0)
 
 
 def pixel_gains(shape: tuple[int, int], spread: float, rng: np.random.Generator) -> Array:
-    """Draws gains (v, u) about 1, at least 0.05, with the standard deviation ``spread``. Whole columns share a quarter of
-    the variance."""
+    """Draws gains (v, u) of pixels with mean 1 and standard deviation ``spread``, at least 0.05. A quarter of the variance
+    is common to all pixels of a column."""
     own, column = rng.standard_normal(shape), rng.standard_normal((1, shape[1]))
     return np.maximum(1 + spread * (np.sqrt(0.75) * own + 0.5 * column), 0.05)
 
 
 def add_sparks(line_integrals: Array, share: float, rng: np.random.Generator) -> tuple[Array, NDArray[np.bool_]]:
-    """Adds light to pixels of line integrals (F, v, u), each with the probability ``share``. Also returns which pixels were
-    hit, bool (F, v, u)."""
+    """Returns line integrals (F, v, u) after light was added to pixels, each with the probability ``share``. Also returns
+    which pixels were hit, bool (F, v, u)."""
     hit = rng.random(line_integrals.shape) < share
     height = rng.uniform(*_SPARK_HEIGHT, int(hit.sum()))
     sparked = np.array(line_integrals)
@@ -165,7 +166,7 @@ def add_scatter(line_integrals: Array, to_primary: float) -> Array:
 
 
 def _spread(light: Array, length: float) -> Array:
-    """Convolves a frame (v, u) with exp(−r/length), length in pixels. No light comes from beyond the panel."""
+    """Convolves a frame (v, u) with exp(−r/length), where r and length are in pixels; beyond the panel the light is 0."""
     v, u = (np.arange(1 - n, n) for n in light.shape)
     kernel = np.exp(-np.hypot(v[:, None], u[None, :]) / length)
     return np.maximum(scipy.signal.fftconvolve(light, kernel / kernel.sum(), mode="same"), 0)

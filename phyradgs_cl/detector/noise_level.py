@@ -12,21 +12,21 @@ from phyradgs_cl.checks import ceil_div
 
 NORMAL_MAD = 1.4826  # standard deviation / median absolute deviation of a normal variable
 _MEDIAN_OF_NORMAL = 0.6745  # median of |x| / standard deviation of x, for a normal variable x with mean 0
-_FILTER_NORM = 1.5**0.5  # factor by which the filter (-1/2, 1, -1/2) multiplies white noise
-_LARGEST_SAMPLE = 1_000_000  # the median of about this many pixels is exact enough
-_TENTHS = 10  # noise grows with attenuation: it is estimated in this many equally large classes of line integrals
-_BEHIND = 5.0  # pixels lie behind the object if they exceed the noise this many times
+_FILTER_NORM = 1.5**0.5  # factor by which the filter (-1/2, 1, -1/2) multiplies the standard deviation of white noise
+_LARGEST_SAMPLE = 1_000_000  # about the most pixels of which a median is computed: their median is exact enough
+_TENTHS = 10  # number of equally large classes of line integrals whose noise is estimated apart: it grows with attenuation
+_BEHIND = 5.0  # pixels lie behind the object if (line integral) / (noise) exceeds this
 _FRAMES = 16  # noise is estimated from about this many frames, evenly spread, to save time
 
 LEAST_SHARE = 1e-3
 """Saturation is suspected if a larger fraction of the pixels has one extreme value."""
 _TOUCHING = 0.5  # saturation covers areas: pixels at an extreme are clipped if most of them have four neighbours at it
-_SAME = 1e-3  # flats and the largest count that differ by less than this fraction are equally bright: such pixels may be air
+_SAME = 1e-3  # flats within this fraction of the largest count are as bright as it: pixels clipped there may be air
 _MOST_FRAMES = 8  # noise outside saturated pixels is sought in at most this many frames
 _LONGEST_EDGE = 1024  # of larger frames only the middle, this many pixels a side, is searched for noise
-_ROUNDING = 0.5  # rounding of counts alone causes an estimated noise of up to this, in counts
-_RELATIVE = 2e-5  # an estimated noise up to this fraction of the largest count is too small to show that there is noise
-# An estimate along both axes shows noise if it is at least this fraction of the estimate along rows. Structure gives less.
+_ROUNDING = 0.5  # largest noise, in counts, that is estimated from rounded counts without noise
+_RELATIVE = 2e-5  # an estimate shows noise only if (estimated noise) / (largest count) exceeds this
+# Frames show noise if (estimate along both axes) / (estimate along rows alone) exceeds this. Structure gives less.
 _WHITE = 0.5
 _ROOT_OF_NORMAL = 0.8222  # mean of √|x| / √(standard deviation of x), for a normal variable x with mean 0
 _NEAR = 9  # the noise of a pixel is estimated from a square of this side around it
@@ -42,7 +42,7 @@ def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | 
 
     It comes from the median of |second differences| along rows, where line integrals (F, v, u) are above 0. An object is
     smooth compared with white noise, and a median ignores edges (Donoho and Johnstone, Biometrika 81 (1994) 425). Detail as
-    fine as a pixel raises the estimate; noise correlated along rows lowers it. valid (F, v, u): None for all."""
+    fine as a pixel raises the estimate; noise correlated along rows lowers it. valid (F, v, u): pixels to use; None: all."""
     if line_integrals.shape[-1] < 3:
         return 0.0
     left, middle, right = _along_rows(line_integrals)
@@ -86,9 +86,9 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
 def noise_map(residual: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Returns the standard deviation of each pixel's noise (v, u), from the 9 × 9 pixels of a residual (v, u) around it.
 
-    It comes from the mean root of |second differences along rows and then along columns|. The differences vanish for smooth
-    structure, which is no noise though the volume does not explain it. Roots give edges little weight. An axis shorter than
-    three pixels is left out. Without ``valid`` (v, u) pixels nearby the noise is 0."""
+    It comes from the mean of √|second differences along rows and then along columns|. The differences vanish for smooth
+    structure, which is no noise even if the volume does not explain it. The roots give edges little weight. An axis shorter
+    than three pixels is left out. Without ``valid`` (v, u) pixels nearby the noise is 0."""
     differences, usable, axes = residual.astype(np.float64), valid, [axis for axis in (0, 1) if residual.shape[axis] >= 3]
     for axis in axes:
         differences = scipy.ndimage.correlate1d(differences, (-0.5, 1, -0.5), axis, mode="mirror")
@@ -136,8 +136,8 @@ def transmission_weights(
 def find_saturation(frames: NDArray[np.generic], flat: NDArray[np.floating]) -> Saturation:
     """Returns the largest count of projections (P, v, u), and the fraction of their pixels that are clipped at it.
 
-    Only whole areas count as clipped. An area as bright as the mean ``flat`` (v, u) may be air without noise. So it counts
-    only where the rest of the frames is noisy."""
+    Only whole areas count as clipped. An area as bright as the mean ``flat`` (v, u) may be air without noise: it counts only
+    if the other pixels of the frames are noisy."""
     level = float(np.fmax.reduce([np.fmax.reduce(frame, axis=None) for frame in frames]))
     share = clustered_share(frame == level for frame in frames)
     if share <= LEAST_SHARE or not (_flat_differs(frames, flat, level) or _shows_noise(frames, level)):
@@ -170,7 +170,7 @@ def _flat_differs(frames: NDArray[np.generic], flat: NDArray[np.floating], level
 
 def _shows_noise(frames: NDArray[np.generic], level: float) -> bool:
     """Returns whether unclipped pixels are noisy, by their second differences along both axes. The noise that these give
-    must exceed what rounding causes, and half of the noise by differences along rows alone: structure gives less."""
+    must exceed the error of rounding, and half of the noise by differences along rows alone: structure gives less."""
     along_rows, along_both = [], []
     top, left = (max(0, n - _LONGEST_EDGE) // 2 for n in frames.shape[1:])
     middle = np.s_[top : top + _LONGEST_EDGE, left : left + _LONGEST_EDGE]

@@ -4,8 +4,8 @@ import numpy as np
 
 from phyradgs_cl.acquisition.scan import Scan
 
-_ACROSS = 1e-3  # a ray is perpendicular to the axis if the cosine of their angle is below this
-_ARC_STEPS = 32  # steps in which an exposure's arc is measured: a gantry must turn by less than half a turn in each
+_ACROSS = 1e-3  # a ray counts as perpendicular to the axis if the cosine of the angle between them is below this
+_ARC_STEPS = 32  # number of steps whose angles make an exposure's arc: in each, the gantry must make less than half a turn
 
 
 def azimuth_rad(pose: np.ndarray) -> np.ndarray:
@@ -28,17 +28,16 @@ def middle_poses(scan: Scan) -> np.ndarray:
 
 
 def has_opposite_views(scan: Scan) -> bool:
-    """Returns whether views half a turn apart are mirror images: if rays are parallel and at right angles to the axis."""
+    """Returns whether rays are parallel and perpendicular to the axis, so that views half a turn apart are mirror images."""
     return scan.is_parallel and bool((np.abs(middle_poses(scan)[:, 2]) < _ACROSS).all())
 
 
 def exposure_arc_rad(scan: Scan) -> float:
-    """Returns the angle in rad that the gantry turns in one line's exposure in the scan's middle frame; 0 for a gantry at
-    rest."""
+    """Returns the angle in rad by which the gantry turns in a line's exposure, in the middle frame; 0 for one at rest."""
     if not scan.is_fly:
         return 0.0
     frame = scan.frames // 2
-    # A sum over small steps, because the azimuths at both ends alone do not tell an arc of 270° from one of 90°.
+    # The arc is a sum over small steps, because the azimuths at its ends alone do not tell 270° from 90°.
     times_s = float(scan.frame_start_s[frame]) + scan.shutter.exposure_s * np.linspace(0, 1, _ARC_STEPS + 1)
     return abs(float(wrapped(np.diff(azimuth_rad(scan.trajectory.pose(frame, times_s)))).sum()))
 

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import scipy  # SciPy's parts load when they are used
+import scipy  # its parts load only when they are used, which saves time
 
 from phyradgs_cl.acquisition.altered.variants import altered_trajectory, with_trajectory
 from phyradgs_cl.acquisition.geometry import ConeGeometry, Geometry
@@ -18,10 +18,10 @@ FINE_COLUMNS = 32  # most blocks of pixels along the panel's longer side, for fi
 SMOOTHING = 0.8  # standard deviation, in blocks, of the Gaussian that smooths frames before pixels are averaged
 _LEAST_VALID = 0.5  # a block with a smaller fraction of valid pixels is masked
 _MOST_VOXELS = 64  # most voxels along the grid's longest side, without the margin
-_MARGIN = 1  # voxels of air added on each side: without them a large object fits best with too small a pixel size
-_OBJECT_SHARE = 0.02  # a column shows the object if its largest line integral is above this fraction of the scan's largest
+_MARGIN = 1  # voxels of air on each side of a grid: without them, too small a pixel size fits a large object best
+_OBJECT_SHARE = 0.02  # a column shows the object if (its largest line integral) / (the scan's largest) is above this
 _LEAST_COLUMNS = 12  # least number of blocks from left to right, if the panel has at least as many columns
-_NARROW = 3  # a block's side is divided by this on a panel lower than two blocks, because one row of blocks tells little
+_NARROW = 3  # divides a block's side if the panel is lower than two blocks, because one row of blocks tells little
 
 
 def coarse(scan: Scan, columns: int) -> Scan:
@@ -155,7 +155,7 @@ def _binned_shutter(scan: Scan, block: int) -> tuple[Shutter, float]:
     shutter, lines = scan.shutter, scan.lines
     line_s = shutter.readout_s / max(lines - 1, 1)
     blocks = lines // block
-    dropped = lines - blocks * block if shutter.direction < 0 else 0  # such a panel reads the dropped lines first
+    dropped = lines - blocks * block if shutter.direction < 0 else 0  # direction −1 reads the dropped last lines first
     # a block of lines opens at the mean of its lines' opening times
     later_s = (dropped + (block - 1) / 2) * line_s
     pulse_s = shutter.pulse_s and (shutter.pulse_s[0] - later_s, shutter.pulse_s[1])

@@ -35,8 +35,7 @@ class GeometryCorrection:
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """Corrections of single views: rotations (F,) about the axis in rad, and shifts (F, 2) of the panel along v and u in
-    mm."""
+    """Corrections of single views: turns (F,) about the axis in rad, and the panel's shifts (F, 2) along v and u in mm."""
 
     turn_rad: np.ndarray
     shift_mm: np.ndarray
@@ -69,10 +68,9 @@ class Sway:
 
 
 def splines(fraction: np.ndarray, count: int) -> np.ndarray:
-    """Returns the values (..., count) of ``count`` cubic B-splines at fractions (...) of their interval. The values sum to
-    1.
+    """Returns the values (..., count) of ``count`` cubic B-splines at fractions (...) of their interval. Values sum to 1.
 
-    count: at least 4. Fractions below 0 or above 1 are cut to this range."""
+    count: at least 4. Fractions below 0 count as 0, and above 1 as 1."""
     knots = np.concatenate([np.zeros(3), np.linspace(0, 1, count - 2), np.ones(3)])
     basis: np.ndarray = BSpline.design_matrix(np.clip(np.ravel(fraction), 0, 1), knots, 3).toarray()
     return basis.reshape(*np.shape(fraction), count)
@@ -94,8 +92,7 @@ class PerturbedTrajectory:
 
     @cached_property
     def _turn(self) -> np.ndarray:
-        """The panel's rotation (3, 3) by roll and tilts. Its columns are the new u, v and normal in the stated panel's
-        axes."""
+        """The panel's rotation (3, 3) by roll and tilts: its columns are the new u, v and normal in the stated axes."""
         angles_rad = [self.correction.tilt_u_rad, self.correction.tilt_v_rad, self.correction.roll_rad]
         return np.asarray(Rotation.from_rotvec(angles_rad).as_matrix())
 
@@ -113,8 +110,8 @@ class PerturbedTrajectory:
         return np.concatenate(vectors, -1)
 
     def _with_moved_panel(self, pose: np.ndarray, shift_v_mm: float, shift_u_mm: float) -> list[np.ndarray]:
-        """Returns source (or direction), first pixel, column step and row step, each (..., 3), after ``correction`` and a
-        view's shifts of the panel."""
+        """Returns source (or direction), first pixel, column step and row step, each (..., 3), of poses (..., 12) after
+        ``correction`` and a view's shifts of the panel along v and u."""
         correction = self.correction
         source, first, column, row = np.moveaxis(pose.reshape(*pose.shape[:-1], 4, 3), -2, 0)
         pitch_u_mm, pitch_v_mm = (np.linalg.norm(step, axis=-1, keepdims=True) for step in (column, row))

@@ -31,9 +31,9 @@ def sum_frames(
     scan: F projections (F, rows, columns), line integrals. Each projection stands for an interval about its mid-time, as
     long as the time from frame to frame, in which the gantry turns evenly. count: the number of projections in an exposure.
     readout_ratio, readout, readout_direction: how the new panel is read, as in ``fly_scan``. A line whose exposure begins
-    within a projection's interval takes a fraction of that projection. Frames that would need projections which the scan
-    lacks are left out. Photons, detector and object are the given scan's, so the result tests a motion model on real data.
-    For this test the object must move by less than a pixel from projection to projection.
+    within a projection's interval takes a fraction of that projection. The result has only frames whose projections the scan
+    has. Photons, detector and object are the given scan's, so the result tests a motion model on real data. For this test
+    the object's image must move by less than a pixel from projection to projection.
 
     Raises InputError for too few projections for one frame, a rolling shutter or lag in ``scan``, and uneven intervals."""
     if not isinstance(scan, Scan):
@@ -77,9 +77,9 @@ def _interval_s(scan: Scan) -> tuple[float, float]:
 
 
 def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, int]:
-    """Returns a continuous trajectory through the projections' poses, each in the middle of its interval. Also returns how
-    many projections at either end have intervals that the trajectory does not wholly cover. first_s: when the first interval
-    begins. step_s: the length of an interval."""
+    """Returns a continuous trajectory through the projections' poses, each in the middle of its interval. Also returns the
+    number of projections at each end of the scan whose intervals the trajectory does not wholly cover. first_s: when the
+    first interval begins. step_s: the length of an interval."""
     middle_s = first_s + (np.arange(scan.frames) + 0.5) * step_s
     own_s = scan.middle_times_s
     if isinstance(scan.trajectory, CircularOrbit):
@@ -98,8 +98,8 @@ def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, i
 
 
 def _shares(delay: np.ndarray, count: int) -> np.ndarray:
-    """Returns the fraction of each projection's interval in which each line is exposed, (projections, lines). delay
-    (lines,): the number of intervals from the frame's start to a line's opening. count: the exposure in intervals."""
+    """Returns the fraction (projections, lines) of each projection's interval in which each line is exposed. delay (lines,):
+    (time from the frame's start to a line's opening) / (interval). count: (exposure) / (interval)."""
     number = np.arange(int(np.ceil(delay.max() - 1e-9)) + count)[:, None]
     overlap = np.minimum(number + 1, delay + count) - np.maximum(number, delay)
     return np.where(overlap > 1e-9, overlap, 0.0)

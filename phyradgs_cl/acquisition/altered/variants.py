@@ -17,7 +17,7 @@ from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_par
 
 _MIRROR_Y = np.array([1.0, -1.0, 1.0] * 4)
 _FIRST, _COLUMN_STEP, _ROW_STEP = slice(3, 6), slice(6, 9), slice(9, 12)
-_STEPS = _ROW_STEP, _COLUMN_STEP  # the step along axis 0 (v), then along axis 1 (u)
+_STEPS = _ROW_STEP, _COLUMN_STEP  # the parts of a pose that are the step along v (axis 0) and along u (axis 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class AlteredTrajectory:
         return pose
 
     def frame_numbers(self, scan: Scan) -> np.ndarray:
-        """Returns the numbers (F,) of the scan's frames in ``base``."""
+        """Returns, for each of the scan's F frames, its number in ``base``, (F,)."""
         return np.arange(scan.frames) if self.frames is None else self.frames
 
     def _mirrored(self, pose: np.ndarray) -> np.ndarray:
@@ -86,8 +86,8 @@ class MappedTrajectory:
 
 
 def altered_trajectory(scan: Scan) -> AlteredTrajectory:
-    """Returns the scan's trajectory as an ``AlteredTrajectory`` whose fields ``dataclasses.replace`` can change. A
-    trajectory of another class becomes its ``base``, as yet unaltered."""
+    """Returns the scan's trajectory as an ``AlteredTrajectory``, whose fields ``dataclasses.replace`` can change. A
+    trajectory of another class becomes the ``base`` of one without changes."""
     trajectory = scan.trajectory
     if isinstance(trajectory, AlteredTrajectory):
         return trajectory
@@ -140,7 +140,8 @@ def stretched(scan: Scan, v: float, u: float) -> Scan:
         pose[..., _ROW_STEP] *= v
         return pose
 
-    half_mm = columns * scan.geometry.pixel_size_mm[1] / 2 + abs(scan.geometry.detector_offset_mm[1])  # far edge
+    # the distance from the central ray to the panel's farther edge
+    half_mm = columns * scan.geometry.pixel_size_mm[1] / 2 + abs(scan.geometry.detector_offset_mm[1])
     share = max(scan.grid.size_mm[1:]) * scan.geometry.magnification / (2 * u * half_mm)
     grows = abs(math.log(share * u)) < abs(math.log(share))
     z, y, x = scan.grid.voxel_size_mm
@@ -160,8 +161,7 @@ def mirrored(scan: Scan, axis: str) -> Scan:
 def resized(scan: Scan, factor: float, keeps_axis: bool) -> Scan:
     """Returns a cone beam's scan with pixels ``factor`` times as large.
 
-    keeps_axis: True enlarges the panel about the central ray, as if distances had changed. False enlarges it about its
-    middle."""
+    keeps_axis: True enlarges the panel about the central ray, as if distances had changed; False, about its middle."""
     trajectory = altered_trajectory(scan)
     rows, columns = trajectory.panel
 
