@@ -15,8 +15,8 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import Grid
 
-_LEVELS = 16  # ``smallest_determinant`` rounds weights to this many levels, so that it tests few different states
-_MOST_STEPS = 200  # most iterations that invert a displacement field: enough if each makes the error 0.93 times as large
+_LEVELS = 16  # ``smallest_determinant`` rounds weights to this many steps, so that few different states are left to test
+_MOST_STEPS = 200  # most iterations that invert a displacement field: enough if each multiplies the error by at most 0.93
 _FLAT = 1e-4  # ``smallest_determinant`` leaves out points where the displacement's slope, in mm per mm, is below this
 _CLOSE = 1e-6  # the inversion stops when no displacement changes by more than this fraction of the control spacing
 
@@ -224,15 +224,16 @@ def control_points(
 ) -> tuple[tuple[float, float, float], tuple[int, int, int]]:
     """Returns origin x, y, z in mm and counts (nz, ny, nx) of control points that cover a grid and ``margin_mm`` around it.
 
-    The control points extend one spacing or more beyond, since a spline at a point needs the nearest four per axis."""
+    The control points extend one spacing or more beyond the margin: a spline at a point needs the nearest four per axis."""
     counts = [int(np.ceil((side_mm + 2 * margin_mm) / spacing_mm)) + 3 for side_mm in grid.size_mm]
     first_mm = [middle - (n - 1) / 2 * spacing_mm for middle, n in zip(grid.offset_mm, counts, strict=True)]
     return (first_mm[2], first_mm[1], first_mm[0]), (counts[0], counts[1], counts[2])
 
 
 def fitted_control_mm(fields_mm: np.ndarray, grid: Grid, spacing_mm: float) -> tuple[np.ndarray, tuple[float, float, float]]:
-    """Fits splines to fields (R, nz, ny, nx, 3) on ``grid``. Returns control vectors (R, cz, cy, cx, 3) and their origin in
-    mm. The basis is a product over the axes, so the least squares are solved along one axis after the other."""
+    """Fits splines to fields (R, nz, ny, nx, 3) on ``grid``. Returns control vectors (R, cz, cy, cx, 3), and x, y, z in mm
+    of the first one. The basis is a product over the axes, so the least squares are solved along one axis after the
+    other."""
     origin_mm, counts = control_points(grid, spacing_mm)
     empty = Deformation(np.zeros((1, *counts, 3)), origin_mm, spacing_mm, np.zeros(1), np.zeros((1, 1)))
     inverses = [np.linalg.pinv(matrix, rcond=1e-3) for matrix in empty.bases(grid)]

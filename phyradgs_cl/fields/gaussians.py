@@ -1,6 +1,6 @@
 """Radiative Gaussians: their parameters with units, and the unconstrained ("raw") numbers that the optimiser changes.
 
-The field of one Gaussian is ρ exp(−½ (x−μ)ᵀ Σ⁻¹ (x−μ)) with Σ = R diag(s²) Rᵀ (paper, section 2)."""
+The field of a Gaussian of density ρ, mean μ and scale s is ρ exp(−½ (x−μ)ᵀ Σ⁻¹ (x−μ)), Σ = R diag(s²) Rᵀ, R its rotation."""
 
 from dataclasses import dataclass
 
@@ -51,7 +51,7 @@ class Gaussians:
         """Returns the parameters (11, G) float64, in the order that kernels read: mean, scale, unit quaternion, density."""
         q = self.quaternion
         if self.count:
-            q = np.ldexp(q, -np.frexp(np.abs(q).max(axis=1, keepdims=True))[1])  # exact; then no square is 0 or infinite
+            q = np.ldexp(q, -np.frexp(np.abs(q).max(axis=1, keepdims=True))[1])  # exact; so no square is 0 or infinite
             q = q / np.linalg.norm(q, axis=1, keepdims=True)
         return np.concatenate([self.mean.T, self.scale.T, q.T, self.density[None]]).astype(np.float64)
 
@@ -67,7 +67,7 @@ class Gaussians:
         for a covariance that is not positive definite."""
         count = len(np.atleast_1d(checks.real_array("Gaussians' mean", mean)))
         variance, axes = np.linalg.eigh(checks.numbers("covariance", covariance, (count, 3, 3)))
-        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # flips an axis of each reflection: then it is a rotation
+        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # flips an axis of a reflection, so that it is a rotation
         x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(axes).as_quat().T
         return cls(mean, np.sqrt(variance), np.stack([w, x, y, z], -1), density)
 

@@ -17,8 +17,8 @@ _ROI = "Box of the volume about the axis, mm, or its sides about the scan's midd
 _MARGIN = "Width around the box, mm, that is reconstructed and discarded: for objects larger than box or panel."
 _SCAN = "the scan's"
 _LARGEST_MM = 1e9  # largest length in mm that an option takes; the smallest is 1e-9 mm
-_ROUNDING = 1e-6  # a box that exceeds whole voxels by at most this fraction of a voxel gets no further voxel: it is rounding
-# The same for a box that a user typed, which rarely fits the scan's voxels exactly: voxel sides are rarely round numbers.
+_ROUNDING = 1e-6  # a box may exceed whole voxels by this fraction of a voxel, as rounding, without getting a further voxel
+# The same fraction for a box that a user typed: it rarely ends at voxels' faces, since voxel sides are rarely round numbers.
 _TYPED = 0.01
 
 

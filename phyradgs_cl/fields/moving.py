@@ -14,8 +14,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.deformation import Deformation
 from phyradgs_cl.fields.volume import Grid, triple
 
-_SLAB_VOXELS = 1 << 18  # about how many voxels a thread deforms at a time: coordinates take six times the voxels' memory
-_BORDER = 8  # width in voxels of the zeros put around a volume: over it the spline's coefficients fall to 3e-5
+_SLAB_VOXELS = 1 << 18  # about how many voxels a thread deforms at a time: their coordinates take six times their memory
+_BORDER = 8  # width in voxels of the zeros around a volume: across it the spline's coefficients fall by a factor of 3e-5
 
 
 @dataclass(frozen=True, eq=False)

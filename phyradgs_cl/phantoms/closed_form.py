@@ -88,8 +88,8 @@ def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
 class MovingBody:
     """A body that moves forth and back along a line at constant speed.
 
-    body: the body when it is at the middle of the line. swing_mm: the vector (x, y, z) from the middle to one end. At time 0
-    the body is at the other end; after half a period it reaches this end. period_s: the time forth and back. Raises
+    body: the body when it is at the middle of the line. swing_mm: the vector (x, y, z) from the middle to the end that the
+    body reaches after half a period. At time 0 the body is at the other end. period_s: the time forth and back. Raises
     InputError for a period that is not positive."""
 
     body: Body

@@ -13,7 +13,7 @@ from phyradgs_cl.phantoms.implicit import Capsule, Field, Lattice, Point
 
 Bone = tuple[Capsule, ...]
 
-# Attenuation of each tissue, relative: dense bone is near 1.
+# Relative attenuation of each tissue: dense bone is near 1.
 _CORTICAL, _TRABECULAR, _MARROW = 0.92, 0.56, 0.36
 _MUSCLE, _FAT, _SKIN = 0.24, 0.18, 0.27
 _SHELL = 0.022  # thickness of cortical bone

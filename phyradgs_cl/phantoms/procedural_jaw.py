@@ -23,7 +23,7 @@ _BONE_BLEND, _FLESH_BLEND = 0.025, 0.04  # widths over which bodies that touch m
 # The arc of the mandible: x = A sin(phi), y = Y0 - B cos(phi), phi from -_PHI_END to +_PHI_END.
 _ARC_A, _ARC_B, _ARC_Y0 = 0.60, 0.86, 0.22
 _PHI_END = 0.46 * np.pi
-_BODY_Z, _BODY_HEIGHT, _BODY_WIDTH = -0.26, 0.19, 0.105  # z of the ellipse's centre, and its semi-axes along z and across
+_BODY_Z, _BODY_HEIGHT, _BODY_WIDTH = -0.26, 0.19, 0.105  # section of the arc: z of its centre, semi-axes along z and across
 _GUM_Z = -0.08  # upper rim of the bone, where the crowns begin
 # Teeth of one side, from the middle: width along the arc, width across, crown height, number of roots.
 _TEETH = (
