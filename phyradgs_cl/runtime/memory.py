@@ -191,8 +191,8 @@ def reported_bytes(device: DeviceInfo) -> int | None:
 
 
 def memory_limit(wish: str | int | None) -> int | None:
-    """Returns the limit in bytes that ``wish`` sets, else the environment variable PHYRADGS_MEMORY; None if neither is set.
-    Raises InputError for a value that is no size."""
+    """Returns the limit in bytes from ``wish``, else from the environment variable PHYRADGS_MEMORY, or None if neither is
+    set. Raises InputError for a value that is no size."""
     if wish is not None:
         return bytes_of(wish, "memory")
     text = os.environ.get(MEMORY_VARIABLE)

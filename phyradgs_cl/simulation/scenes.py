@@ -17,8 +17,8 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.sources import AnalyticSource, DeformedSource, FrameSource, VolumeSource, on_panel
 
 _DENSE = 0.5  # in a beam of many energies, voxels above this fraction of the largest attenuation may be bone
-# Bone begins at a bin of the histogram with fewer voxels than this fraction of the fullest bin's, so that no material is cut
-# in two.
+# Bone begins at a bin of the histogram of attenuation with fewer voxels than this times the fullest bin's, so that bone's
+# limit cuts no material in two.
 _RARE = 0.2
 log = logging.getLogger(__name__)
 Moves = Callable[[Grid], Deformation]
@@ -47,7 +47,7 @@ class Scene:
     fastest_mm_per_s: float = 0.0
 
     def warn_of_inverse_crime(self) -> None:
-        """Warns if the projected voxels are not finer than the grid along any axis: reconstructions then look too good."""
+        """Warns if the projected voxels are finer than the grid's along no axis: reconstructions then look too good."""
         shape = self.source_shape
         if shape is None or any(n > m for n, m in zip(shape, self.grid.shape, strict=True)):
             return
@@ -156,8 +156,8 @@ def _voxel_scene(
 
 
 def bone_from(volume: np.ndarray) -> float:
-    """Returns the attenuation in 1/mm from which voxels (nz, ny, nx) count as bone: half the largest value. If that would
-    cut a material in two, it is the upper end of this material's attenuations, or infinite if they have no upper end."""
+    """Returns the attenuation in 1/mm from which voxels (nz, ny, nx) count as bone: half the largest value. If this would
+    cut a material in two, returns the upper end of the material's attenuations, or infinity if they have no upper end."""
     largest = float(volume.max())
     counts, edges = np.histogram(volume, 64, (0.1 * largest, max(largest, 1e-20)))
     is_rare = (edges[1:] > _DENSE * largest) & (counts < _RARE * counts.max())
