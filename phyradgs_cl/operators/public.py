@@ -108,7 +108,7 @@ class Operator:
     def to_device(self, values: Any) -> Any:
         """Copies an x or a y, or a stack of them, to a pyopencl Array (float32) on ``queue``, for a loop on the device.
 
-        Raises InputError unless it is an array of real numbers whose last axes have the shape of x or of y."""
+        Raises InputError unless ``values`` is an array of real numbers whose last axes have the shape of x or of y."""
         array = on_host("values", values)
         sides = self.domain_shape, self.range_shape
         if not any(_ends_with(array.shape, side) for side in sides):
@@ -197,7 +197,7 @@ class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy ha
         ScipyOperator.__init__(self, np.float32, (_size(range_), _size(domain)))
         self._pair = forward, adjoint
 
-    shape = (0, 0)  # SciPy's attribute, in place of the property: each instance sets it
+    shape = (0, 0)  # this attribute of SciPy replaces the property; each instance sets its own
     __matmul__ = ScipyOperator.__matmul__
 
     @property
@@ -210,7 +210,7 @@ class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy ha
         return self
 
     def dot(self, x: Any) -> Any:
-        """Returns SciPy's product, also of ``@``. Raises InputError for masked arrays, whose mask SciPy would drop."""
+        """Returns the product A x, as ``@`` does. Raises InputError for masked arrays, whose mask SciPy would drop."""
         checks.unmasked(self._domain[0], x)
         return ScipyOperator.dot(self, x)
 

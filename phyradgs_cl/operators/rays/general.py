@@ -23,7 +23,7 @@ def launch_forward(
     frames: DeviceArray, *, add: bool = False,
 ) -> None:
     """Projects a padded volume, or a part of one (brick), to the padded frames numbered ``frame_list``. add: adds to these
-    frames, as all bricks after the first must; else overwrites them."""
+    frames, as needed for all bricks after the first; else overwrites them."""
     blocks = ceil_div(layout.width, rt.lanes)
     kernel = rt.kernel("rays", "rays_forward", **_defines(layout, cells))
     items = blocks, layout.lines, frame_list.size
@@ -46,7 +46,7 @@ def launch_adjoint(
     group = rt.group(1, math.prod(owned))
     each = _SAMPLES_PER_VOXEL * nz * ny * nx * cells.most_per_line
     for first, stop in _parts(rt, frame_list.size, each):
-        adds = add or first > 0  # later launches continue the sums, as if it were one launch
+        adds = add or first > 0  # later launches add to the sums of earlier ones, as one launch would
         rt.launch(
             kernel, (columns * group, rows, slices), frames, cells.cells, cells.cell_lines, cells.matrices,
             cells.matrix_stride, cells.frame_cells, frame_list, cells.weights, cells.weight_at, first, stop,

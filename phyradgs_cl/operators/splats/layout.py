@@ -46,7 +46,7 @@ def pad_columns(rows: np.ndarray) -> np.ndarray:
 
 
 def split_coefficients(rt: Runtime, matrix: np.ndarray) -> DeviceArray:
-    """Uploads coefficients as float64, or as pairs of floats (high, low) if the device lacks float64."""
+    """Uploads a matrix's coefficients as float64, or as pairs of float32 (high, low) if the device lacks float64."""
     matrix = np.ascontiguousarray(matrix, np.float64)
     if rt.fp64:
         return rt.upload(matrix)

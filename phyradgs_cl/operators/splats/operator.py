@@ -27,7 +27,7 @@ from phyradgs_cl.operators.splats.voxelise import Voxeliser
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of
 
-QUATERNION_LENGTHS = 1e-12, 1e12  # kernels square them in float32, from 1e-38 to 3e38
+QUATERNION_LENGTHS = 1e-12, 1e12  # limits of a quaternion's length: kernels square it in float32, which spans 1e-38 to 3e38
 _FRAMES, _VOLUME, _ROWS, _DENSITY = "frames", "volume", "rows", "density"
 
 
@@ -40,8 +40,8 @@ class SplatPoint:
 
 
 class PlainRows:
-    """Converts parameter rows (11, G), in mm and 1/mm with quaternions of ``QUATERNION_LENGTHS``, to the kernels' rows:
-    lengths in units of ``length_mm``, and unit quaternions.
+    """Converts parameter rows (11, G), in mm and 1/mm with quaternions of lengths in ``QUATERNION_LENGTHS``, to the kernels'
+    rows: lengths in units of ``length_mm``, and unit quaternions.
 
     line_integrals: densities become 1/``length_mm``, so that line integrals have no unit. Else they stay in 1/mm."""
 
@@ -298,7 +298,7 @@ def _check_rows(rows: np.ndarray) -> None:
         raise InputError(_ROWS, f"a scale of {rows[SCALE].min():g}", "scales above 0", "of logarithms: np.exp(scale)")
     lengths = np.linalg.norm(rows[QUATERNION].astype(np.float64), axis=0)
     shortest, longest = QUATERNION_LENGTHS
-    if (wrong := (lengths < 0.99 * shortest) | (lengths > 1.01 * longest)).any():  # float32 has rounded them
+    if (wrong := (lengths < 0.99 * shortest) | (lengths > 1.01 * longest)).any():  # margins for the rounding of float32
         found = f"a quaternion of length {lengths[wrong][0]:g}"
         raise InputError(_ROWS, found, f"lengths from {shortest:g} to {longest:g}", "divide it by its length")
 

@@ -1,6 +1,6 @@
 """Projector of Gaussians to a frame, merged over all its time cells, and its adjoint.
 
-This is the paper's *multi-pose batch rendering* (section 2.3): each kernel handles all M×N micro-views of a frame in one
+This is *multi-pose batch rendering* (PhyRadGS paper, section 2.3): each kernel handles all M×N micro-views of a frame in one
 launch. ``splat_prepare`` projects every Gaussian from every pose. ``splat_forward`` adds up micro-views and joins strips
 (Eq. 3) directly in the merged frame; no micro-view is stored. ``splat_backward`` and ``splat_chain`` are the adjoint.
 

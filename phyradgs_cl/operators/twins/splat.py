@@ -101,8 +101,8 @@ def splat_frame(
     rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], cutoff_sigma: float = 0.0,
     affine: bool = False,
 ) -> np.ndarray:
-    """Returns the frame (rows, columns) by the paper's Eq. 3: adds up, over the cells, the cell's lines of a complete
-    projection from its pose, times its weight."""
+    """Returns the frame (rows, columns) by Eq. 3 of the PhyRadGS paper: sums, over the cells, the cell's lines of a complete
+    projection from the cell's pose, times the cell's weight."""
     frame = np.zeros(detector_shape)
     for cell in range(table.count):
         lines = slice(int(table.line_start[cell]), int(table.line_stop[cell]))

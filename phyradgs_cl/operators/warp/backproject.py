@@ -97,8 +97,8 @@ class MovingBackprojector:
         return push
 
     def _wide_pull_mm(self, state: int) -> tuple[np.ndarray, Grid, tuple[int, int, int]]:
-        """Returns the field w (…, 3) in mm on a wider grid, which the grid's matter does not leave; this wider grid; and its
-        padding (z, y, x) before the grid in voxels."""
+        """Returns the field w (…, 3) in mm on a wider grid, which matter of the grid does not leave; the wider grid; and the
+        number of voxels (z, y, x) that it has before the grid's first."""
         grid, weights = self.states.grid, self.states.weights[state]
         reach_mm = np.abs(np.tensordot(weights, self.states.fields_mm, 1)).max((0, 1, 2))[::-1]
         margin = np.ceil(1.5 * reach_mm / grid.voxel_size_mm).astype(int) + 1

@@ -10,8 +10,8 @@ import numpy as np
 from phyradgs_cl.fields import Deformation, Grid
 
 MOST_STATES = 12  # most states that represent a motion, by default
-_SPACING = 0.6  # largest RMS distance, in voxels, of moving voxels from where the nearest state has them, with blends
-_SPACING_OF_NEAREST = 0.3  # like _SPACING, if each time takes the nearest state, without a blend
+_SPACING = 0.6  # largest RMS distance, in voxels, of moving voxels from their places in the nearest state, with blends
+_SPACING_OF_NEAREST = 0.3  # the same distance if each time takes the nearest state, without a blend
 _MOVES = 0.1  # a voxel counts as moving if its squared displacement is at least this fraction of the largest one
 
 
