@@ -10,7 +10,7 @@ import scipy
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 
-ROWS = 11  # mean 3, scale 3, quaternion 4, density 1
+ROWS = 11  # numbers of a Gaussian: mean 3, scale 3, quaternion 4, density 1
 MEAN, SCALE, QUATERNION, DENSITY = slice(0, 3), slice(3, 6), slice(6, 10), 10
 _DENSITY_FLOOR = 1e-12  # least density of a Gaussian, so that its raw number is finite
 
@@ -51,7 +51,7 @@ class Gaussians:
         """Returns the parameters (11, G) float64, in the order that kernels read: mean, scale, unit quaternion, density."""
         q = self.quaternion
         if self.count:
-            q = np.ldexp(q, -np.frexp(np.abs(q).max(axis=1, keepdims=True))[1])  # exact; so no square is 0 or infinite
+            q = np.ldexp(q, -np.frexp(np.abs(q).max(axis=1, keepdims=True))[1])  # exact scaling: no square is 0 or infinite
             q = q / np.linalg.norm(q, axis=1, keepdims=True)
         return np.concatenate([self.mean.T, self.scale.T, q.T, self.density[None]]).astype(np.float64)
 
@@ -93,8 +93,8 @@ class Activation:
         return rows
 
     def invert(self, rows: np.ndarray) -> np.ndarray:
-        """Returns raw rows for parameter rows (11, G). Scales at or outside their bounds count as a little inside, and
-        densities as at least 1e-12: the inverse is infinite at the bounds."""
+        """Returns raw rows for parameter rows (11, G). The inverse is infinite at the bounds. So scales are first moved 1e-4
+        of their range inside their bounds, and densities are raised to at least 1e-12."""
         raw = np.array(rows, dtype=np.float64)
         span = self.scale_max - self.scale_min
         raw[SCALE] = scipy.special.logit(np.clip((rows[SCALE] - self.scale_min) / span, 1e-4, 1 - 1e-4))

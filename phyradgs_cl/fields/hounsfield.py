@@ -23,7 +23,7 @@ Window = tuple[float, float, int]
 _FEWEST = 100  # least number of voxels of air and of water: their mean then has a tenth of one voxel's noise
 # Limits of water's attenuation in 1/mm: 0.0097 at 500 keV, 0.53 at 10 keV. A scale beyond them is warned of.
 _WATER_PER_MM = (0.009, 0.6)
-_AIR_BELOW = 0.25  # a lowest peak above this fraction of water's attenuation is not air; it may be fat
+_AIR_BELOW = 0.25  # the lowest peak is not air, but perhaps fat, if it lies above this fraction of water's attenuation
 _ONE_MATERIAL = 0.4  # a box whose standard deviation exceeds this times (water − air) is warned of: perhaps two materials
 _BINS = 512  # number of bins of the histogram
 _SMOOTH_BINS = 2.0  # standard deviation of the Gaussian that smooths the histogram, in bins
@@ -175,7 +175,7 @@ def _largest(windows: list[Window]) -> Window:
 
 
 def _windows(values: np.ndarray, lowest: float, highest: float) -> list[Window]:
-    """Returns the peaks of the histogram that hold enough voxels, from low to high attenuation."""
+    """Returns the peaks of the histogram from ``lowest`` to ``highest`` that hold 100 voxels or more, from low to high."""
     if not lowest < highest:
         return []
     counts, edges = np.histogram(values, _BINS, (lowest, highest))

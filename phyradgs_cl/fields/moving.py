@@ -105,7 +105,7 @@ def deformed(volume: np.ndarray, grid: Grid, deformation: Deformation, weights: 
 
 
 class SplineVolume:
-    """A volume (nz, ny, nx) float32 in 1/mm, interpolated by cubic splines. It is 0 outside.
+    """A volume (nz, ny, nx) float32 in 1/mm on ``grid``, interpolated by cubic splines, and 0 outside the grid.
 
     Splines undershoot near edges, so no value is returned below the least voxel, or below 0 if that is less."""
 

@@ -139,7 +139,7 @@ class Operator:
         raise self._not_linear()
 
     def frames(self, chosen: Sequence[int]) -> Any:
-        """Returns the operator to some of the frames, given by their numbers from 0, in this order. It shares all memory.
+        """Returns the operator to some of the frames, given by their numbers from 0, in this order. Both share all memory.
 
         Raises InputError for numbers of missing frames, for no number, and for an operator without frames."""
         if self._frames is None:
@@ -223,7 +223,7 @@ class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy ha
     def _transpose(self) -> "LinearOperator":
         return self.T
 
-    _adjoint = _transpose  # the same for operators on real numbers
+    _adjoint = _transpose  # an operator on real numbers has its transpose as its adjoint
 
 
 def _is_index(number: object, count: int) -> bool:

@@ -1,6 +1,6 @@
 """Phantoms made of ellipsoids and cylinders whose attenuations add up, with exact line integrals.
 
-An affine map takes an ellipsoid to the unit ball, and a ray to a ray. The length of the ray inside follows from its distance
+An affine map takes an ellipsoid to the unit ball, and a ray to a ray. The ray's length in the ball follows from its distance
 to the centre (Kak and Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, section 3.1)."""
 
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ Triple = tuple[float, float, float]
 Matrix = tuple[Triple, Triple, Triple]
 
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_PARALLEL = 1e-30  # replaces a divisor of 0, which a ray along a cylinder's axis, or at right angles to the axis, gives
+_PARALLEL = 1e-30  # replaces divisors of 0: those of a ray along a cylinder's axis, or at right angles to the axis
 RAYS_PER_CHUNK = 1 << 15  # most rays projected at a time: their intermediate arrays, 2-3 MB, stay in a core's cache
 
 
@@ -66,8 +66,7 @@ class Ellipsoid:
 
     @property
     def ends_mm(self) -> tuple[Triple, Triple]:
-        """The centre, twice: a cylinder has two different ends. No point of the body is further than ``reach_mm`` from the
-        line between the ends."""
+        """Both ends of the body's axis, here the centre. No point of the body is further than ``reach_mm`` from the axis."""
         return self.centre_mm, self.centre_mm
 
     @property

@@ -35,7 +35,7 @@ _TEETH = (
     (0.150, 0.145, 0.12, 2),
     (0.150, 0.145, 0.11, 2),
 )
-_FIRST_GAP = 0.006  # from the middle of the arc to the first tooth on either side, along the arc
+_FIRST_GAP = 0.006  # distance along the arc from its middle to the first tooth on either side
 
 
 @dataclass(frozen=True)

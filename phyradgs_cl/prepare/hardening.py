@@ -41,7 +41,7 @@ _AS_WELL = 0.1
 # Bone is corrected even if this leaves up to 2 % more unexplained than water alone does, provided that it leaves less than
 # no correction: who states a voltage expects hardening.
 _NEARLY = 1.02
-_NEWTON = 3  # steps of Newton's method, enough for an error of 1e-12
+_NEWTON = 3  # steps of Newton's method that find the soft tissue: enough for an error of 1e-12
 _UNIFORM = 0.08  # the object has several materials if path lengths leave a larger relative RMS of line integrals unexplained
 _SHADOW = 0.1  # pixels whose path is longer than this fraction of the longest lie behind the object
 _WATER_TO = 8.0  # the polynomial of a voltage is fitted up to this line integral: 40 cm of water at 0.2/cm
@@ -79,7 +79,7 @@ class HardeningOptions(checks.Checked):
 
 
 def straighten(frames: np.ndarray, polynomial: Polynomial) -> np.ndarray:
-    """Returns p + a p² + b p³ + c p⁴ for line integrals p (any shape), float32. Values below 0 are air and stay."""
+    """Returns p + a p² + b p³ + c p⁴ (float32) for line integrals p of any shape. p below 0 is air and stays as it is."""
     p = np.asarray(frames, np.float64)
     up = np.maximum(p, 0)
     square, cube, fourth = polynomial
@@ -138,8 +138,7 @@ def _straighten_two(
     frames: np.ndarray, spectrum: Spectrum, model: Model, blur: float, water: Polynomial, bone_in: BoneIn
 ) -> tuple[np.ndarray, float]:
     """Returns line integrals (F, v, u) corrected for soft tissue and bone, and bone's fraction of the volume's attenuation.
-    Without bone they are corrected for water. blur: standard deviation in pixels of the blur that fits frames to
-    ``model``."""
+    Without bone they are corrected for water. blur: standard deviation in pixels of the blur of frames for ``model``."""
     clean, share = straighten(frames, water), 0.0
     for _ in range(_PASSES):
         volume = model.regularised(step.smooth(clean, blur))

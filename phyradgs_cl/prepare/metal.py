@@ -55,8 +55,7 @@ def mask_metal(scan: Scan, options: MetalOptions, make_model: MakeModel) -> tupl
 
 def _completed(masked: Scan, shadow: np.ndarray, is_metal: np.ndarray, make_model: MakeModel) -> np.ndarray:
     """Returns the frames (F, v, u) with the shadow filled by the projection of a volume, reconstructed from the other
-    pixels. The projection's difference from the frames at the shadow's rim is interpolated across the shadow: no edge is
-    left.
+    pixels. The projection's difference from the frames at the shadow's rim is interpolated across the shadow: no edge shows.
 
     Only masked rays meet the voxels in and next to metal. These voxels would stay near 0, so they get the density around."""
     model, _ = step.coarse_model(masked, make_model, _VOXELS)

@@ -32,7 +32,7 @@ _SURE = 12.0  # a pattern is certain if its variance exceeds the noise's by this
 _THRESHOLD = 3.5  # cosine coefficients above this many standard deviations of the pattern belong to the object
 _SHIFTS = 8  # positions of the blocks along each side, over which the result is averaged so that no block edges show
 _DEVIATIONS = 8.0  # a gain is wrong if it is off by more than this many robust standard deviations in both sets of views
-_LEAST = 2e-3  # a gain that is off by less, 0.2 %, is left alone
+_LEAST = 2e-3  # a gain that is off by less than this, 0.2 %, is left alone
 _NEIGHBOURS = 7  # deviations are measured from the median of this many columns
 _NEAR = 21  # the usual deviation near a pixel is the median over this many columns
 _AXIS = 3  # near the axis an object's edges stay in one column, like rings: this many columns on each side are left alone
@@ -205,11 +205,11 @@ def _antisymmetric(mean: np.ndarray, axis_column: float | None) -> np.ndarray:
 
 
 def _rough(image: np.ndarray) -> np.ndarray:
-    return (2 * image[:, 1:-1] - image[:, :-2] - image[:, 2:]) / np.sqrt(6)  # white noise keeps its variance
+    return (2 * image[:, 1:-1] - image[:, :-2] - image[:, 2:]) / np.sqrt(6)  # the factor keeps the variance of white noise
 
 
 def _covariance(one: np.ndarray, other: np.ndarray) -> float:
-    """Returns the robust covariance of two images, which few edge pixels hardly change (Gnanadesikan, Kettenring, Biometrics
+    """Returns the images' robust covariance, which few edge pixels hardly change (Gnanadesikan, Kettenring, Biometrics
     1972)."""
     return (robust_deviation(one + other) ** 2 - robust_deviation(one - other) ** 2) / 4
 

@@ -94,8 +94,7 @@ def object_in(volume: np.ndarray) -> np.ndarray:
 
 
 def densest(volume: np.ndarray) -> float:
-    """Returns the 99.9th percentile of the middle of a volume (z, y, x), as a cone beam sees only part of the volume's
-    ends."""
+    """Returns the 99.9th percentile in the middle of a volume (z, y, x), since a cone beam sees its ends only in part."""
     z, y, x = (np.abs(np.arange(n) - (n - 1) / 2) / max(n / 2, 1) for n in volume.shape)
     middle = (z[:, None, None] <= 0.6) & (y[None, :, None] ** 2 + x[None, None, :] ** 2 <= 0.9)
     return float(np.percentile(volume[middle], 99.9))

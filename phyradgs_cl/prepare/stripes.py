@@ -33,8 +33,7 @@ _SMALLEST = 1e-6  # a column's spread in line integrals that divides counts as a
 @dataclass(frozen=True)
 class StripeOptions(checks.Checked):
     """Options of the step ``stripes``. width: columns over which the median is taken; stripes are narrower than half of it.
-    ratio: a stripe deviates at least this many times as much as the columns at both sides; 0 replaces every column, as Vo,
-    Atwood and Drakopoulos do."""
+    ratio: a stripe deviates at least this many times as much as the columns at both sides; 0 replaces all columns."""
 
     PREFIX = "stripes."
 

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 Sides = tuple[int, ...]
 
 LANE_CHOICES = (1, 4, 8, 16)  # numbers of floats that a kernel's vectors may have
-# The compiler's option that fuses multiply and add, and a source's line before its header of pairs of float32.
+# The compiler's option that fuses multiply and add; the line by which a source begins its header for pairs of float32.
 _FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'
 _TILE_ITEMS = 256  # largest work-group that shares a tile of pixels, in work-items
 _FEWEST_ITEMS = 32  # a kernel whose launch asks for groups of this many work-items or more must allow at least this many
@@ -258,7 +258,7 @@ class Runtime:
                     event = cl.enqueue_nd_range_kernel(self.queue, built, part, local, first)
                     self._record(kernel.function_name, event, nbytes if first is None or not any(first) else 0)
                     if first is not None:
-                        self.queue.flush()  # without a flush the driver may hand several parts to the GPU at once
+                        self.queue.flush()  # without a flush the driver may give the GPU several parts of a launch at once
         except cl.Error as error:
             raise self.ledger.error(f"a launch of {kernel.function_name}", error, self.queue) from error
 
@@ -276,8 +276,7 @@ class Runtime:
 
     def group(self, on_cpu: int = 1, on_gpu: int = 64, *kernels: Kernel) -> int:
         """Returns a work-group's size in work-items: ``on_cpu``, or ``on_gpu`` halved until all ``kernels`` can run. Name
-        here every kernel whose local memory depends on the size: ``launch`` may halve its groups, but not its local
-        memory."""
+        here all kernels whose local memory depends on the size: ``launch`` may halve their groups, but not their memory."""
         while self.pixel_items and any(on_gpu > self.most_items(kernel) for kernel in kernels):
             on_gpu //= 2
         return on_gpu if self.pixel_items else on_cpu

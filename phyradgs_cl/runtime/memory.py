@@ -115,7 +115,7 @@ class MemoryLedger:
         self.held_bytes = 0
         self.peak_bytes = 0
         self.reserved_bytes = 0
-        self._counting = threading.RLock()  # several threads count; the release of an array may count amid a count
+        self._counting = threading.RLock()  # for threads; re-entrant: the release of an array may count amid a count
 
     def count(self, nbytes: int) -> None:
         with self._counting:
@@ -246,8 +246,8 @@ def attempts(what: str) -> Iterator[Attempt]:
 
 
 def is_cl_array(value: object) -> bool:
-    """Returns whether a value is a pyopencl.array.Array. Does not import pyopencl.array: until it is imported, there is no
-    such value."""
+    """Returns whether a value is a pyopencl.array.Array. Does not import that module: before its import no such value
+    exists."""
     module = sys.modules.get("pyopencl.array")
     return module is not None and isinstance(value, module.Array)
 

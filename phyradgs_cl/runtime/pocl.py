@@ -121,7 +121,7 @@ def warn_of_cache() -> None:
 def _caches() -> Path:
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    except RuntimeError:  # the user has no home
+    except RuntimeError:  # the user has no home folder
         return Path("/nonexistent")
 
 
@@ -172,8 +172,7 @@ def use_library_target(device_address: int) -> str | None:
     """Writes the name of the library's processor into PoCL 3.0's record of a CPU device, and returns this name.
 
     In the record, a pointer to LLVM's target triple is followed by a pointer to the processor's name. Changes nothing and
-    returns None if no such pair is found, or not on x86-64 Linux. PoCL 3.1 and later name the library's processor
-    themselves."""
+    returns None without such a pair, or not on x86-64 Linux. PoCL 3.1 and later name the library's processor themselves."""
     target = library_target()
     if target is None or platform.system() != "Linux":
         return None

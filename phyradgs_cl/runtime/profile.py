@@ -62,8 +62,8 @@ class Rates:
 
 
 def profile_text(uses: dict[str, KernelUse], wall_s: float) -> str:
-    """Returns a table of the kernels' ``uses``. Its last line compares the sum of their seconds with ``wall_s``, the run's
-    time in s."""
+    """Returns a table of the kernels' ``uses``. Its last line compares the sum of their seconds with the run's,
+    ``wall_s``."""
     busy_s = sum(use.seconds for use in uses.values())
     rows = [("kernel", "launches", "seconds", "share", "ms each", "GB/s")]
     for name, use in uses.items():
@@ -80,8 +80,7 @@ def measure_rates(
     queue: "cl.CommandQueue", multiply_add: "cl.Kernel", lanes: int, units: int, group: int
 ) -> Rates:
     """Measures the rates of copies and of the kernel ``multiply_add``, each as the best of 5 runs, on a ``queue`` with
-    profiling. lanes: floats in the kernel's vectors. units: the device's compute units. group: work-items in a
-    work-group."""
+    profiling. lanes: floats in the kernel's vectors. units: the device's compute units. group: size of a work-group."""
     context = queue.context
     source, target = (cl.Buffer(context, cl.mem_flags.READ_WRITE, _COPY_BYTES) for _ in range(2))
     cl.enqueue_fill_buffer(queue, source, np.zeros(1, np.float32), 0, _COPY_BYTES)

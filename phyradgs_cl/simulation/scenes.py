@@ -64,8 +64,7 @@ def phantom_scene(
 
     Phantoms in closed form are integrated exactly unless they deform. Other phantoms are projected from voxels at twice
     ``size``, and the reference is their block mean. Pixels average ``pixel_samples``² rays over their area; 0 chooses the
-    number by the size of the grid's voxels. axis: the panel's readout axis. moves: returns the deformation; None: no
-    motion."""
+    number by the size of the grid's voxels. axis: the panel's readout axis. moves: returns the deformation, if any."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
     if isinstance(phantom, MovingPhantom):

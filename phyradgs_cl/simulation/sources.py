@@ -24,7 +24,7 @@ from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
 # common scanner with as many voxels as pixels along a side.
 WIDEST_RAY = 1.5
 _MOST_SAMPLES = 32  # most rays along each side of a pixel: the time grows with their square
-NEAREST = 0.1  # moving matter is projected at most this far from its exact position, in voxels to be reconstructed
+NEAREST = 0.1  # moving matter is projected at most this far from its exact position, in voxels of the grid to reconstruct
 
 
 class FrameSource:

@@ -96,8 +96,7 @@ class RayLayout:
         return (strides.start, *steps, strides.slice)
 
     def column_floats(self, axis: str) -> int:
-        """Returns the number of floats of a padded frame that is stored column by column. axis: that along which it is
-        read."""
+        """Returns the number of floats of a padded frame that is stored by columns. axis: as for ``pixel_strides``."""
         return (self.turned if axis == "rows" else self).frames_strides.slice
 
     def inside(self, flat: np.ndarray) -> np.ndarray:

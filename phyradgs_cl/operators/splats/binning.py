@@ -9,7 +9,7 @@ _CHUNK = 512  # number of splats whose tiles one work-item of a CPU counts
 _GROUP = 64  # number of splats whose tiles one work-group of a GPU counts
 _LARGEST_GROUP = 256  # most splats per work-group of a GPU, taken if _GROUP would give more than _MANY_COUNTS counts
 _MANY_COUNTS = 1 << 22  # above this many counts, tiles × work-groups, counting takes much memory and time
-_SCANNED = 64  # number of counts that a work-group adds at a time when it sums counts to positions
+_SCANNED = 64  # number of counts that a work-group adds at a time in the running sums that give list positions
 _SLACK = 1.5  # new lists get memory for this many times the entries needed, because the number of Gaussians grows
 _NEAR = 1.25  # lists with memory for less than this many times the entries needed are replaced before they overflow
 # A launch whose lists overflow tests every splat at every pixel. Above this many tests, a second on a fast GPU, the host
@@ -23,9 +23,8 @@ class TileLists:
 
     tile: a tile's size in pixels or voxels along x, y, z. tiles: the number of tiles along x, y, z. A list keeps the order
     of the splats, so that sums over it repeat bit for bit. The number of list entries is known only on the device. The host
-    waits for this number if the number of splats is new, if ``waits`` is set, or if a GPU would take long without lists.
-    Else it reads the number later. Until then, kernels test all splats in a tile whose list did not fit
-    (cl/common/tile.h)."""
+    waits for it if the number of splats is new, if ``waits`` is set, or if a GPU would take long without lists. Else the
+    host reads it later. Until then, kernels test all splats in a tile whose list did not fit (cl/common/tile.h)."""
 
     def __init__(self, rt: Runtime, tile: tuple[int, int, int], tiles: tuple[int, int, int]) -> None:
         self.rt = rt

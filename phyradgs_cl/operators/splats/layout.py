@@ -56,8 +56,8 @@ def split_coefficients(rt: Runtime, matrix: np.ndarray) -> DeviceArray:
 
 @dataclass(eq=False)
 class DeviceCells:
-    """The C time cells of one frame on the device. A frame that is read column by column is projected transposed, with the
-    steps of its poses exchanged, so lines are always rows of the image.
+    """The C time cells of one frame on the device. A frame that is read column by column is projected transposed, with its
+    poses' steps along u and v exchanged, so lines are always rows of the image.
 
     - matrices: one pose per cell. If ``moving``, three: the middle and both ends.
     - line_times (C, 3, time_pitch): ``TimeCells.line_times`` with padded lines if ``moving``, else one element.

@@ -235,7 +235,7 @@ class SplatProjection(GaussianOperator):
             turn, along, across = by_pose(rows[:, : cloud.count], by_rows)
             shifts = [across / (self._projector.lines / 2), along / (self._projector.width / 2)]
             found[number] = turn, *(shifts[::-1] if self._images.turned else shifts)
-            if not (self._affine or cells.is_parallel):  # in these two projections, a shift does not change rays' lengths
+            if not (self._affine or cells.is_parallel):  # here a panel's shift does not change the rays' lengths
                 found[number, 1:] += by_length(self._poses[self._chosen[number]], weighed[number])
         return found
 
@@ -318,7 +318,7 @@ def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, floa
 
 def by_length(pose: np.ndarray, weighed: np.ndarray) -> np.ndarray:
     """Returns the part (2,) of dL/d(panel shift along v, along u), for shifts in pixels, that comes from changed distances
-    between source and pixels. Line integrals are proportional to them. pose (12,) mm; weighed (rows, columns): frame ×
+    between source and pixels, to which line integrals are proportional. pose (12,) mm; weighed (rows, columns): frame ×
     dL/d(frame)."""
     source, first, column, row = pose.reshape(4, 3)
     v, u = (np.arange(n, dtype=np.float64) for n in weighed.shape)

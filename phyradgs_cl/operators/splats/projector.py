@@ -160,8 +160,8 @@ class SplatProjector:
         """Writes dL/d(parameters) into ``gradients`` (13, stride), with rows as in cl/common/gradient.h, from dL/d(frame)
         with padded rows.
 
-        Call ``prepare`` or ``forward`` with the same Gaussians and cells before each call, because their results are
-        overwritten."""
+        Before each call, call ``prepare`` or ``forward`` with the same Gaussians and cells: ``backward`` overwrites their
+        results."""
         rt = self.rt
         items, group = items_by_gaussian(rt, gaussians.count)
         by_images = by_image if self._layers is None else self._layers.split(cells, by_image)

@@ -163,7 +163,7 @@ def moving_frame(
         clouds = [rows] * 3
         if cloud_at is not None and table.end_times_s is not None:
             clouds = [cloud_at(time_s) for time_s in (table.time_s[cell], *table.end_times_s[cell])]
-        means = np.stack([cloud[:3] for cloud in clouds[1:]]).transpose(2, 0, 1)  # at both ends, (G, 2, 3)
+        means = np.stack([cloud[:3] for cloud in clouds[1:]]).transpose(2, 0, 1)  # means at both ends of the cell, (G, 2, 3)
         for row, precision, end_means in zip(clouds[0].T, precision_matrices(clouds[0]), means, strict=True):
             frame += _segment_image(
                 row, precision, pose, ends, end_means, times, shape, cutoff_sigma, affine, table.is_parallel, moved

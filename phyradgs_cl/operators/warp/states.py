@@ -82,8 +82,7 @@ class MotionStates:
         """Returns the fractions of the states (T, K) at times (T,) in s. They sum to 1, with at most two above 0.
 
         A blend takes the two states with the smallest error in voxels. The error is a sum: the distance of the object at
-        that time from the line between both states, and the blur of adding two volumes that are displaced against each
-        other."""
+        that time from the line between both states, and the blur of adding two volumes displaced against each other."""
         wanted = self.deformation.weights_at(times_s)
         if not self.blends:
             distances = np.stack([_length(wanted - weights, self.metric) for weights in self.weights], -1)
