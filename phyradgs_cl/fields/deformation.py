@@ -138,8 +138,7 @@ class Deformation:
         return np.stack([np.einsum("na,nb,nc,nabci->ni", *three, vectors) for three in factors], -1)
 
     def on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
-        """Returns displacements w (nz, ny, nx, 3) float32 in mm, x y z, at voxel centres of ``grid`` for ``weights``
-        (R,)."""
+        """Returns displacements w (nz, ny, nx, 3) float32 in mm, x y z, at voxel centres of ``grid``. weights: (R,)."""
         along_z, along_y, along_x = self.bases(grid)
         rows = np.einsum("zk,kyxi->zyxi", along_z, self._state(weights), optimize=True)
         planes = np.einsum("yk,zkxi->zyxi", along_y, rows, optimize=True).astype(np.float32)

@@ -134,8 +134,7 @@ def voxel_sides_mm(option: str, value: Any) -> tuple[float, float, float]:
 
 
 def _numbers(option: str, value: Any, counts: tuple[int, ...], example: str) -> tuple[float, ...]:
-    """Returns a number or a sequence as floats. counts: the allowed lengths. Raises InputError about ``option``
-    otherwise."""
+    """Returns a number or a sequence as floats. counts: the allowed lengths. Raises InputError about ``option`` else."""
     value = value.ravel().tolist() if isinstance(value, np.ndarray) else value  # an array may be (3, 2), as Grid.box_mm is
     parts = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
     parts = [part.item() if isinstance(part, np.generic) else part for part in parts]

@@ -129,7 +129,7 @@ class SplineVolume:
         return np.concatenate(slabs)
 
     def _slab(self, deformation: Deformation, weights: np.ndarray, first: int, part: Grid) -> np.ndarray:
-        """Returns the deformed slices of ``part``, a part of the grid that begins at slice ``first``."""
+        """Returns the deformed slices of ``part``, which is a part of the grid and begins at the grid's slice ``first``."""
         shift = deformation.on_grid_mm(part, weights) / np.array(self.grid.voxel_size_mm[::-1], np.float32)
         nz, ny, nx = part.shape
         voxels = np.ogrid[first : first + nz, :ny, :nx]

@@ -51,7 +51,7 @@ class Grid:
 
     @classmethod
     def cube(cls, count: int, side_mm: float) -> "Grid":
-        """Returns a cube of ``count``³ voxels and side ``side_mm`` about the origin. Raises InputError for values not above
+        """Returns a cube of ``count``³ voxels and side ``side_mm`` about the origin. Raises InputError if one is not above
         0."""
         checks.whole("count", count, 1, MOST_VOXELS)
         checks.positive("side_mm", side_mm)

@@ -33,8 +33,8 @@ def moved_to(rt: Runtime, values: Values, on_device: bool) -> Any:
 
 
 def computed(rt: Runtime, on_device: bool, function: Callable[[Any], Values], values: Values) -> Any:
-    """Applies a function that needs its argument on the device (``on_device``) or the host. Returns the result on the side
-    where ``values`` are."""
+    """Applies a function that needs its argument on the device if ``on_device``, else on the host. Returns the function's
+    result on the device if ``values`` are there, else on the host."""
     return moved_to(rt, function(moved_to(rt, values, on_device)), isinstance(values, DeviceArray))
 
 
@@ -167,7 +167,7 @@ class Operator:
         return self._at(self._to_array(self._domain, x))
 
     def _to_array(self, side: tuple[str, Shape], values: Any) -> Values:
-        """Returns an x or a y as float32 in C order, on the side where it is. Copies only other types or layouts."""
+        """Returns an x or a y as float32 in C order, left on the host or device. Copies only other types or layouts."""
         array = adopted(side[0], values, self.queue) if is_cl_array(values) else on_host(side[0], values)
         checks.shape(side[0], array, side[1])  # type: ignore[arg-type]
         return array

@@ -23,7 +23,7 @@ RAYS_PER_CHUNK = 1 << 15  # most rays projected at a time: their intermediate ar
 
 
 def rotation_about_z(angle_rad: float) -> Matrix:
-    """Returns the matrix that rotates counter-clockwise about z, seen from +z: an ellipsoid's ``rotation``."""
+    """Returns the matrix that rotates counter-clockwise about z, seen from +z, for an ellipsoid's ``rotation``."""
     c, s = float(np.cos(angle_rad)), float(np.sin(angle_rad))
     return ((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0))
 

@@ -136,7 +136,7 @@ def _intersect(part: Box, box: Box) -> Box:
 def texture(
     lattice: Lattice, wavelengths: tuple[float, float], waves: int, rng: np.random.Generator
 ) -> Field:
-    """Draws isotropic noise (n, n, n) float32 of variance 1: a sum of ``waves`` random cosines, averaged over each voxel.
+    """Draws isotropic noise (n, n, n) float32: ``waves`` random cosines whose sum has variance 1, averaged over each voxel.
 
     The cosines' wavelengths lie between the two ``wavelengths``. The draws from ``rng`` do not depend on the resolution."""
     direction = rng.standard_normal((waves, 3))

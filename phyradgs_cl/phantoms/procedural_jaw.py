@@ -139,7 +139,7 @@ def _bone_distance(lattice: Lattice) -> Field:
 
 
 def _soft_tissue(lattice: Lattice, bone: Field, teeth: list[Tooth], rng: np.random.Generator) -> Field:
-    """Returns the attenuation of gums, cheeks and the floor of the mouth under a layer of fat. Air is 0."""
+    """Returns the attenuation of flesh around the bone, of the mouth's floor, tongue and throat, under fat. Air is 0."""
     x, y, z = lattice.points(lattice.everything)
     union = np.zeros_like(bone)
     implicit.add_to_union(union, lattice.everything, bone - np.float32(0.075), _FLESH_BLEND)
@@ -160,7 +160,7 @@ def _soft_tissue(lattice: Lattice, bone: Field, teeth: list[Tooth], rng: np.rand
 
 
 def _fill_bone(volume: Field, lattice: Lattice, distance: Field, rng: np.random.Generator) -> None:
-    """Puts the bone into `volume`: a cortical shell, trabeculae inside, and in them the canal of the nerve."""
+    """Puts the bone into `volume`: a cortical shell, trabeculae inside, and in the trabeculae the canal of the nerve."""
     _, _, z = lattice.points(lattice.everything)
     outer = lattice.coverage(distance)
     inner = lattice.coverage(distance + np.float32(_SHELL))

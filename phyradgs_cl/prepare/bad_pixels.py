@@ -68,8 +68,8 @@ def find_sparks(
 
     A spark's line integral lies below the median of 5 × 5 pixels by ``least``, and by ``threshold`` standard deviations.
     These are estimated from the median distance to that median in 9 × 9 pixels. A spark is sharp in every direction and has
-    at most ``pixels`` touching pixels. A feature that the frames before and after both show nearby, at least half as high,
-    is a gap of the moving object and no spark."""
+    at most ``pixels`` touching pixels. A feature that the frames before and after (at an end the one neighbour) show nearby,
+    at least half as high, is a gap of the moving object and no spark."""
     sparks = np.stack([_sparks_of(frame, threshold, least, pixels) for frame in frames])
     for f in np.flatnonzero(sparks.any(axis=(1, 2))) if len(frames) > 2 else ():
         height = _height(frames[f])

@@ -30,7 +30,7 @@ Polynomial = tuple[float, float, float]
 BoneIn = Callable[[np.ndarray], np.ndarray]
 """Maps a volume (z, y, x) to the attenuation of the bone in each voxel."""
 _LARGEST = 1e3  # limit of stated coefficients and attenuations: larger ones must be mistakes
-_PASSES = 2  # rounds in which bone is taken from a volume and frames are corrected for it: the second round has better bone
+_PASSES = 2  # rounds that take bone from a volume and correct frames for it: the second round has better bone
 _BONE_VOXELS = 128  # most voxels along the longest side of the volume in which bone is found: hardening by bone is smooth
 # Candidates (a, b), fractions of the densest voxel: soft tissue ends at a, pure bone begins at b (above 1: no pure bone).
 _BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in (0.4, 0.7, 1.0) if soft < bone]

@@ -140,7 +140,7 @@ def find_air(frames: np.ndarray, *, below: float = 0.05) -> np.ndarray:
     """Returns the pixels of line integrals (F, v, u) that no object covers, bool (F, v, u).
 
     They exceed the air's median by less than the fraction ``below`` of the largest line integral (99.9th percentile), are
-    connected with the first or last column through such pixels, and lie at least two pixels away from all others."""
+    connected with the first or last column through such pixels, and lie more than two pixels away from all others."""
     limit = below * float(np.percentile(frames, 99.9))
     air = np.empty(frames.shape, bool)
     for f, frame in enumerate(frames):

@@ -209,8 +209,7 @@ def _rough(image: np.ndarray) -> np.ndarray:
 
 
 def _covariance(one: np.ndarray, other: np.ndarray) -> float:
-    """Returns the images' robust covariance, which few edge pixels hardly change (Gnanadesikan, Kettenring, Biometrics
-    1972)."""
+    """Returns a robust covariance: few edge pixels hardly change it (Gnanadesikan and Kettenring, Biometrics 1972)."""
     return (robust_deviation(one + other) ** 2 - robust_deviation(one - other) ** 2) / 4
 
 

@@ -246,8 +246,7 @@ def attempts(what: str) -> Iterator[Attempt]:
 
 
 def is_cl_array(value: object) -> bool:
-    """Returns whether a value is a pyopencl.array.Array. Does not import that module: before its import no such value
-    exists."""
+    """Returns whether a value is a pyopencl.array.Array, without importing that module: before its import, no value is."""
     module = sys.modules.get("pyopencl.array")
     return module is not None and isinstance(value, module.Array)
 

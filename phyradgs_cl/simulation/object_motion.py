@@ -62,7 +62,7 @@ class ObjectMotion(checks.Checked):
     def deformation(self, box: Grid, first_s: float, last_s: float) -> Deformation:
         """Returns the deformation of an object in ``box``, from a scan's first light to its last, first_s to last_s in s.
 
-        Raises InputError for an amplitude larger than half of the box's shortest side."""
+        Raises InputError for an amplitude above half of the box's shortest side, and for more than 100 000 cycles."""
         half_mm = min(box.size_mm) / 2
         amplitude_mm = self.amplitude * half_mm if self.amplitude_mm is None else self.amplitude_mm
         if amplitude_mm > half_mm:

@@ -92,8 +92,8 @@ def _least_horizontal(d00: np.ndarray, eu: np.ndarray, width: int) -> np.ndarray
 
 
 def _lies_between(grid: Grid, source: np.ndarray, d00: np.ndarray, eu: np.ndarray, ev: np.ndarray) -> bool:
-    """Returns whether the grid, with a voxel around it, lies between source and panel in every pose. The poses are given by
-    vectors (C, 3) in voxels."""
+    """Returns whether the grid, with a voxel around it, lies between source and panel in every pose. The poses' source, d00,
+    eu and ev are vectors (C, 3) in voxels, as in ``ray_constants``."""
     nz, ny, nx = grid.shape
     corners = np.array([(x, y, z) for x in (-1, nx) for y in (-1, ny) for z in (-1, nz)])
     normal = np.cross(eu, ev)

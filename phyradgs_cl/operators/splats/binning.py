@@ -15,7 +15,7 @@ _NEAR = 1.25  # lists with memory for less than this many times the entries need
 # A launch whose lists overflow tests every splat at every pixel. Above this many tests, a second on a fast GPU, the host
 # waits for the lists' size instead.
 _MOST_CHECKS = 2**38
-_MOST_ENTRIES = 2**31 - 1  # most entries of all lists together: kernels use 32-bit indices
+_MOST_ENTRIES = 2**31 - 1  # all lists together must have fewer entries than this: kernels use 32-bit indices
 
 
 class TileLists:
@@ -51,7 +51,7 @@ class TileLists:
         """Fills ``tile_offsets`` (tiles + 1,) and ``splat_ids`` for ``count`` splats. extents (6, stride): a splat's first
         and last pixel or voxel along x, y, z. cells: the number of time cells from which each splat was projected.
 
-        Raises MemoryShortage for 2^31 list entries or more, since a smaller part of a volume may have fewer."""
+        Raises MemoryShortage for 2^31 − 1 list entries or more, since a smaller part of a volume may have fewer."""
         rt = self.rt
         chunk = chunk_of(rt, self.total, count)
         chunks = max(ceil_div(count, chunk), 1)

@@ -317,8 +317,8 @@ def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, floa
 
 
 def by_length(pose: np.ndarray, weighed: np.ndarray) -> np.ndarray:
-    """Returns the part (2,) of dL/d(panel shift along v, along u), for shifts in pixels, that comes from changed distances
-    between source and pixels, to which line integrals are proportional. pose (12,) mm; weighed (rows, columns): frame ×
+    """Returns the part (2,) of dL/d(panel shift along v, along u), in pixels, that comes from changed distances between
+    source and pixels, to which line integrals are proportional. pose (12,) mm; weighed (rows, columns): frame ×
     dL/d(frame)."""
     source, first, column, row = pose.reshape(4, 3)
     v, u = (np.arange(n, dtype=np.float64) for n in weighed.shape)

@@ -160,7 +160,7 @@ class SplatProjector:
         """Writes dL/d(parameters) into ``gradients`` (13, stride), with rows as in cl/common/gradient.h, from dL/d(frame)
         with padded rows.
 
-        Before each call, call ``prepare`` or ``forward`` with the same Gaussians and cells: ``backward`` overwrites their
+        Before each call, call ``prepare`` or ``forward`` with the same Gaussians and cells, as ``backward`` overwrites the
         results."""
         rt = self.rt
         items, group = items_by_gaussian(rt, gaussians.count)

@@ -115,8 +115,7 @@ def splat_frame(
 def voxel_field(
     rows: np.ndarray, z: np.ndarray, y: np.ndarray, x: np.ndarray, cutoff_sigma: float = 0.0
 ) -> np.ndarray:
-    """Evaluates parameter rows (11, G) at the coordinates z, y, x of voxel centres, in the rows' unit of length. Returns
-    (nz, ny, nx)."""
+    """Evaluates parameter rows (11, G) at voxel centres z, y, x, in the rows' unit of length. Returns (nz, ny, nx)."""
     points = np.stack(np.meshgrid(x, y, z, indexing="ij"), -1).transpose(2, 1, 0, 3)
     volume = np.zeros(points.shape[:3])
     for row, precision in zip(rows.T, precision_matrices(rows), strict=True):

@@ -59,8 +59,7 @@ class MovingBackprojector:
         self, pair: tuple[int, int], frames: np.ndarray, pose: np.ndarray, weights: np.ndarray, grid: Grid, axis: str,
         is_parallel: bool,
     ) -> np.ndarray:  # fmt: skip
-        """Backprojects frames that lie between two states, the same for all. weights (F, 2): FDK's weight; the second
-        state's share."""
+        """Backprojects frames between the states ``pair``. weights (F, 2): FDK's weight, and the second state's fraction."""
         rt, fields = self.rt, [self._push(state) for state in pair]
         size, by_lines = np.array([*grid.shape[::-1], 0], np.int32), pose.ndim == 3
         turned = by_lines and axis == "columns"

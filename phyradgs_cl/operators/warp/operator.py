@@ -72,8 +72,7 @@ class WarpedOperator:
         self.project(lambda k: volume if self.warp.is_still(k) else self.warp.forward(k, source), frames)
 
     def project(self, volume_of: Callable[[int], DeviceArray], frames: DeviceArray) -> None:
-        """Projects all states to frames (F, rows, columns): Σ_k P_k v_k. volume_of(k): the volume v_k (nz, ny, nx) of state
-        k."""
+        """Projects all states to frames (F, rows, columns): Σ_k P_k v_k. volume_of(k): state k's volume v_k (nz, ny, nx)."""
         self.rt.fill(frames, 0)
         for part in self._parts:
             part.operator.forward(volume_of(part.state), out=self.warp.stack.of(len(part.frames), self.detector_shape))

@@ -51,8 +51,7 @@ class VolumeWarp:
         return self.states.is_still(state)
 
     def source(self, volume: DeviceArray) -> DeviceArray:
-        """Returns the spline coefficients F E v, valid until the next call, of a volume v (nz, ny, nx): E pads, F
-        filters."""
+        """Returns the spline coefficients F E v of a volume v (nz, ny, nx): E pads, F filters. Valid until the next call."""
         if self._source is None:
             self._source = self.rt.empty(self._floats)
         self.rt.fill(self._source, 0)
@@ -73,8 +72,7 @@ class VolumeWarp:
             self.rt.launch(across, (width // lanes, planes), values, start, *sides, group=group)
 
     def forward(self, state: int, source: DeviceArray) -> DeviceArray:
-        """Returns the warped volume W_k v (nz, ny, nx) of a state from its coefficients ``source``, valid until the next
-        call."""
+        """Returns a state's warped volume W_k v (nz, ny, nx) from coefficients ``source``. Valid until the next call."""
         nz, ny, nx = self.shape
         result, blocks = self.moved(), ceil_div(nx, self.rt.lanes)
         self.rt.launch(
@@ -212,8 +210,7 @@ class StateStack:
         return self._total
 
     def adjoint(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Writes a volume v of state k to volume k = ``state`` of ``total``. It adds nothing, as it is called once per
-        state."""
+        """Writes a volume v of state k to volume k = ``state`` of ``total``. Called once per state, it need not add."""
         self.rt.copy(moved, total, nbytes=4 * self._voxels, target_offset=4 * self._voxels * state)
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:
