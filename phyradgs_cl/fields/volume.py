@@ -51,8 +51,8 @@ class Grid:
 
     @classmethod
     def cube(cls, count: int, side_mm: float) -> "Grid":
-        """Returns a cube of ``count``³ voxels and side ``side_mm`` about the origin. Raises InputError if one is not above
-        0."""
+        """Returns a cube of ``count``³ voxels and side ``side_mm`` about the origin. Raises InputError unless both are
+        positive."""
         checks.whole("count", count, 1, MOST_VOXELS)
         checks.positive("side_mm", side_mm)
         return cls((count,) * 3, (side_mm / count,) * 3)

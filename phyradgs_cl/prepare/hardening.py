@@ -138,7 +138,8 @@ def _straighten_two(
     frames: np.ndarray, spectrum: Spectrum, model: Model, blur: float, water: Polynomial, bone_in: BoneIn
 ) -> tuple[np.ndarray, float]:
     """Returns line integrals (F, v, u) corrected for soft tissue and bone, and bone's fraction of the volume's attenuation.
-    Without bone they are corrected for water. blur: standard deviation in pixels of the blur of frames for ``model``."""
+    Without bone they are corrected by the polynomial ``water``. blur: standard deviation in pixels of the blur of frames for
+    ``model``. bone_in: returns the bone of a volume, as ``BoneIn``."""
     clean, share = straighten(frames, water), 0.0
     for _ in range(_PASSES):
         volume = model.regularised(step.smooth(clean, blur))

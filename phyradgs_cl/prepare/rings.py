@@ -138,8 +138,9 @@ def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: f
 
 
 def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarray:
-    """Denoises an image (v, u): thresholds the coefficients of overlapping cosine blocks, then guides a Wiener filter by the
-    result. variances (2,): the variance of each pixel's own noise, and of the noise that a whole column shares."""
+    """Denoises an image (v, u): thresholds the coefficients of overlapping cosine blocks of side ``window``, then guides a
+    Wiener filter by the result. variances (2,): that of each pixel's own noise, and that of the noise that a whole column
+    shares."""
     sigma = np.full((window, window), variances[0])
     # an error that a column shares is constant along it, so only the first row of coefficients has it
     sigma[0] += window * variances[1]
@@ -216,7 +217,7 @@ def _covariance(one: np.ndarray, other: np.ndarray) -> float:
 @dataclass(frozen=True)
 class SingleGains:
     """Wrong gains of whole columns and single pixels. offset: the error (v, u) float32 that they add to line integrals, 0
-    elsewhere. columns, pixels: how many columns and single pixels have one."""
+    elsewhere. columns, pixels: how many columns and single pixels have a wrong gain."""
 
     offset: np.ndarray
     columns: int = 0
@@ -238,7 +239,8 @@ def find_single_gains(
     means: np.ndarray, mirrored: np.ndarray, usable: np.ndarray, full_turn: bool
 ) -> SingleGains:
     """Finds single wrong gains in the means (2, v, u) of two sets of views. mirrored: the columns' mirror images, from
-    ``mirror_columns``; columns without a mirror image are left alone. usable: bool (v, u), False for masked pixels."""
+    ``mirror_columns``; columns without a mirror image are left alone. usable: bool (v, u), False for masked pixels.
+    full_turn: finds wrong pixels too, not only columns; on an arc an edge of the object looks like a wrong pixel."""
     offset = np.zeros(usable.shape, np.float32)
     if len(mirrored) < _NEAR:
         return SingleGains(offset)
@@ -264,7 +266,7 @@ def _deviation(means: np.ndarray) -> np.ndarray:
 
 def _outliers(deviation: np.ndarray, unlike: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """Returns the errors (v, u) of outliers, 0 elsewhere. deviation: ``_deviation`` (set, v, u) of the means. unlike:
-    ``_deviation`` of the means minus their mirror images, which cancels the object."""
+    ``_deviation`` of the means minus their mirror images, which cancels the object. usable: pixels that may be outliers."""
     around = (1, 3, 3)
     mirrored = deviation[..., ::-1]
     low, high = scipy.ndimage.minimum_filter(mirrored, around), scipy.ndimage.maximum_filter(mirrored, around)

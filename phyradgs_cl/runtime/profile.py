@@ -62,8 +62,7 @@ class Rates:
 
 
 def profile_text(uses: dict[str, KernelUse], wall_s: float) -> str:
-    """Returns a table of the kernels' ``uses``. Its last line compares the sum of their seconds with the run's
-    ``wall_s``."""
+    """Returns a table of the kernels' ``uses``. Its last line compares their total seconds with ``wall_s``, the run's."""
     busy_s = sum(use.seconds for use in uses.values())
     rows = [("kernel", "launches", "seconds", "share", "ms each", "GB/s")]
     for name, use in uses.items():

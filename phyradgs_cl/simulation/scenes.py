@@ -108,7 +108,8 @@ def volume_scene(
     """Returns the scene of a volume, called ``name``, at its own resolution, with ``pixel_samples``² rays per pixel.
 
     A volume with a grid keeps it, and its values are in 1/mm. A bare array is fitted into the scanner's box; its values are
-    attenuation per half of the longest side."""
+    attenuation per half of the longest side. size: voxels along the reference's longest side; None: the volume's. box, axis,
+    moves: as for ``phantom_scene``."""
     volume, fine = loaded.values, loaded.grid
     if fine is None:
         voxel_mm = min(side / n for side, n in zip(box.size_mm, volume.shape, strict=True))
@@ -124,7 +125,8 @@ def _voxel_scene(
     rt: Runtime, volume: np.ndarray, fine: Grid, grid: Grid, title: str, deformation: Deformation | None,
     geometry: Geometry, axis: str, pixel_samples: int,
 ) -> Scene:
-    """Returns the scene of a volume (nz, ny, nx) on the grid ``fine``. The reference is its block means on ``grid``."""
+    """Returns the scene of a volume (nz, ny, nx) on the grid ``fine``. The reference is its block means on ``grid``. axis,
+    pixel_samples: as for ``phantom_scene``."""
 
     def source_of(values: np.ndarray) -> FrameSource:
         return on_panel(geometry, grid, pixel_samples, lambda panel: on_one_panel(values, panel))

@@ -111,7 +111,8 @@ def launch_upright(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, columns: DeviceArray,
     target: tuple[DeviceArray, np.ndarray],
 ) -> None:
-    """Projects a volume, transposed to ``columns`` (y, x, z), to slots. target: an array and its ``Slots.strides``."""
+    """Projects a volume, transposed to ``columns`` (y, x, z), to slots. target: an array and its ``Slots.strides``. how: as
+    ``upright_of`` returns it."""
     shape, origin, _, pitch_mm, *_ = layout.constants()
     array, strides = target
     rt.launch(
@@ -126,7 +127,8 @@ def launch_upright_adjoint(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, values: DeviceArray,
     target: tuple[DeviceArray, Strides], *, add: bool = False,
 ) -> None:
-    """Backprojects slots, written by ``split_slots``, to ``target``: a volume and its strides. add: adds to the volume."""
+    """Backprojects ``values``, the slots that ``split_slots`` has written, to ``target``, a volume and its strides. add: adds
+    to the volume, else overwrites it. how: as ``upright_of`` returns it."""
     shape, origin, *_ = layout.constants()
     (x, y, z), items = _owned(layout.brick.shape, rt.device.compute_units)
     rt.launch(

@@ -39,8 +39,7 @@ class MotionStates:
         nearest to their mean. Each further one is the object when it differs most from all states so far, until at every
         time a state is near enough.
 
-        least_voxels: a change of a weight by 1 counts as at least this displacement, so that fields of zeros get states
-        too."""
+        least_voxels: a change of a weight by 1 counts as at least this displacement, so fields of zeros get states too."""
         units, fields_mm = np.eye(deformation.rank), unit_fields_mm(deformation, grid)
         voxel_mm = min(grid.voxel_size_mm)
         seen = np.unique(deformation.weights_at(times_s), axis=0)
