@@ -127,7 +127,7 @@ def launch_upright_adjoint(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, values: DeviceArray,
     target: tuple[DeviceArray, Strides], *, add: bool = False,
 ) -> None:
-    """Backprojects ``values``, the slots that ``split_slots`` has written, to ``target``, a volume and its strides. add: adds
+    """Backprojects ``values``, the slots that ``split_slots`` wrote, to ``target``, a volume and its strides. add: adds
     to the volume, else overwrites it. how: as ``upright_of`` returns it."""
     shape, origin, *_ = layout.constants()
     (x, y, z), items = _owned(layout.brick.shape, rt.device.compute_units)
