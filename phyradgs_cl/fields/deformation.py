@@ -17,7 +17,7 @@ from phyradgs_cl.fields.volume import Grid
 
 _LEVELS = 16  # ``smallest_determinant`` rounds weights to this many steps, so that few different states are left to test
 _MOST_STEPS = 200  # most iterations that invert a displacement field: enough if each multiplies the error by at most 0.93
-_FLAT = 1e-4  # ``smallest_determinant`` takes 1 at points where every slope of the displacement, in mm per mm, is below this
+_FLAT = 1e-4  # a point where every slope of the displacement, in mm per mm, is below this counts as having determinant 1
 _CLOSE = 1e-6  # the inversion stops when no displacement changes by more than this fraction of the control spacing
 
 

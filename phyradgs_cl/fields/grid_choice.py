@@ -90,7 +90,7 @@ class GridChoice:
         return Grid(self._whole(shape), triple(np.broadcast_to(voxel_mm, 3)), triple(box_mm.mean(1)))
 
     def with_margin(self, grid: Grid) -> Grid:
-        """Returns ``grid`` enlarged by ``margin_mm`` on all sides, in whole voxels. Raises InputError for too many."""
+        """Returns ``grid`` with ``margin_mm`` on all sides, in whole voxels. Raises InputError for too many voxels."""
         if self.margin_mm is None:
             return grid
         around = np.ceil(np.divide(self.margin_mm, grid.voxel_size_mm) - _TYPED)
@@ -134,7 +134,7 @@ def voxel_sides_mm(option: str, value: Any) -> tuple[float, float, float]:
 
 
 def _numbers(option: str, value: Any, counts: tuple[int, ...], example: str) -> tuple[float, ...]:
-    """Returns a number or a sequence as floats. counts: the allowed lengths. Raises InputError about ``option`` else."""
+    """Returns a number or a sequence as floats. counts: allowed lengths. Raises InputError about ``option`` otherwise."""
     value = value.ravel().tolist() if isinstance(value, np.ndarray) else value  # an array may be (3, 2), as Grid.box_mm is
     parts = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
     parts = [part.item() if isinstance(part, np.generic) else part for part in parts]

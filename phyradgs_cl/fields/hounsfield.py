@@ -21,17 +21,17 @@ Box = tuple[float, ...]
 Window = tuple[float, float, int]
 """A peak of the histogram: its two attenuations in 1/mm at half its prominence, and the number of voxels between them."""
 _FEWEST = 100  # least number of voxels of air and of water: their mean then has a tenth of one voxel's noise
-# Limits of water's attenuation in 1/mm: 0.0097 at 500 keV, 0.53 at 10 keV. A scale beyond them is warned of.
+# A warning is logged for water outside these limits, in 1/mm: water has 0.0097 at 500 keV and 0.53 at 10 keV.
 _WATER_PER_MM = (0.009, 0.6)
 _AIR_BELOW = 0.25  # the lowest peak is not air, but perhaps fat, if it lies above this fraction of water's attenuation
-_ONE_MATERIAL = 0.4  # a box whose standard deviation exceeds this times (water − air) is warned of: perhaps two materials
+_ONE_MATERIAL = 0.4  # a warning is logged for a box whose standard deviation exceeds this times (water − air): two materials
 _BINS = 512  # number of bins of the histogram
 _SMOOTH_BINS = 2.0  # standard deviation of the Gaussian that smooths the histogram, in bins
 _PROMINENT = 0.1  # a peak must rise above its surroundings by this fraction of its smoothed count
 # A peak must also rise by this times the square root of its smoothed count. That is eight times the smoothed count's noise.
 _CERTAIN = 3.0
 _ZOOM = 2.5  # the last histogram ends at this times the upper end of water's peak, so that peaks span many bins
-_SHORTENED = 5  # how often the histogram's range is cut to a quarter at most: metal may be 1000 times denser than water
+_SHORTENED = 5  # most times that the histogram's range is cut to a quarter: metal may be 1000 times denser than water
 _NUMBER = r"-?\d+\.?\d*(?:e[-+]\d+)?"
 _NOTE = re.compile(rf"values in HU(?:, water ({_NUMBER}), air ({_NUMBER}) 1/mm)?")
 

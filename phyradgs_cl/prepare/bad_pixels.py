@@ -28,7 +28,7 @@ _MOST_TIMES = 0.7  # a dead pixel is above, or below, all its neighbours in more
 _MOST_FRAMES = 40  # dead pixels are sought in at most this many frames, evenly spread, to save time
 _STILL_SIDES = 0.5  # if more than this fraction of the two outermost columns never changes, they are air without noise
 _NEAR_AXIS = 1.5  # a small part of the object this close to the axis, in columns, stays on one pixel in all views
-_SHARED = 0.1  # a dead pixel differs alone: its neighbours' difference is below this fraction of its own
+_SHARED = 0.1  # a dead pixel differs alone: its neighbours differ by less than this fraction of its difference
 _LINE = 0.9  # a row or column with more than this fraction of dead pixels is dead as a whole
 
 
@@ -149,8 +149,8 @@ def find_dead(
 
 
 def _lines(frames: np.ndarray, deviations: float) -> np.ndarray:
-    """Returns whole rows and columns, bool (v, u), that lie above or below both neighbours in most pixels, in the median
-    over frames. Pixels of air count too: an object may be long and thin, but not as long as the panel."""
+    """Returns whole rows and columns, bool (v, u), that lie above or below both neighbours in over 90 % of their pixels, in
+    the median over frames. Pixels of air count too: an object may be long and thin, but not as long as the panel."""
     dead = np.zeros(frames.shape[1:], bool)
     floor = 1e-3 * max(float(np.percentile(frames, 99.9)), 1e-9)
     for axis in (0, 1):

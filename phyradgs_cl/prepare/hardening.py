@@ -79,7 +79,7 @@ class HardeningOptions(checks.Checked):
 
 
 def straighten(frames: np.ndarray, polynomial: Polynomial) -> np.ndarray:
-    """Returns p + a p² + b p³ + c p⁴ (float32) for line integrals p of any shape. p below 0 is air and stays as it is."""
+    """Returns p + a p² + b p³ + c p⁴, float32, for line integrals p and ``polynomial`` (a, b, c). Negative p stay: air."""
     p = np.asarray(frames, np.float64)
     up = np.maximum(p, 0)
     square, cube, fourth = polynomial

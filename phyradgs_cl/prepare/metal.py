@@ -13,7 +13,7 @@ from phyradgs_cl.fields import Metal
 from phyradgs_cl.prepare import step
 from phyradgs_cl.prepare.step import Facts, MakeModel
 
-_DENSER = 6.0  # metal attenuates 6 times as much as the main material or more: bone up to 5 times water's, titanium from 7
+_DENSER = 6.0  # metal has at least 6 times the main material's attenuation; bone has up to 5 times water's, titanium 7
 _FEWEST = 4  # fewer touching voxels than this are noise, not metal
 _BLIND = 2  # voxels up to this many voxels from metal are filled from outside: all rays through them are masked
 _VOXELS = 128  # the volume that fills the shadow has at most this many voxels along its longest side, to save time

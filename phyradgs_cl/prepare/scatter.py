@@ -104,9 +104,9 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
 
 
 def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
-    """Returns the kernel with the strength that leaves the least rest ``unexplained``, or ``kernel`` itself unless that rest
-    is below 0.65 times its own. frames: line integrals (F, v, u), first blurred by ``blur`` pixels to fit a coarse model.
-    The corrected frames are shifted so that the median of each frame's ``air``, bool (F, v, u), is 0."""
+    """Returns the kernel with the strength that leaves the least ``unexplained`` rest, or ``kernel`` itself unless that rest
+    is below 0.65 times the rest of ``kernel``. frames: line integrals (F, v, u), first blurred by ``blur`` pixels to fit a
+    coarse model. The corrected frames are shifted so that the median of each frame's ``air``, bool (F, v, u), is 0."""
     if not kernel:
         return kernel
     coarse = step.smooth(frames, blur)

@@ -12,7 +12,7 @@ from phyradgs_cl.fields import GridChoice
 
 Facts = dict[str, Any]
 """What a step did, as numbers and words by name, for the scan's provenance."""
-_COARSE_VOXELS = 48  # most voxels along the longest side of a coarse model: enough for smooth errors, hardening and scatter
+_COARSE_VOXELS = 48  # most voxels along the longest side of a coarse model: few suffice, as hardening and scatter are smooth
 _INSIDE = 0.1  # voxels above this fraction of the densest voxel belong to the object
 # Standard deviation of a blur, as a fraction of the panel's longer side: the blur keeps the smooth errors of hardening and
 # scatter, and removes the finer errors of the grid.
@@ -105,8 +105,8 @@ def unexplained(frames: np.ndarray, volume: np.ndarray, inside: np.ndarray, mode
     divided by the line integrals' RMS.
 
     Only voxels ``inside`` the object, bool (z, y, x), are projected. The grid and the number of views cause a difference
-    too. It is measured by reconstructing and projecting the projection itself, and subtracted. What remains comes from
-    hardening, scatter and the like."""
+    too. This part is measured by reconstructing and projecting the projection itself, and subtracted. What remains comes
+    from hardening, scatter and the like."""
 
     def reprojected(values: np.ndarray) -> np.ndarray:
         return model.frames(np.where(inside, np.maximum(values, 0), 0).astype(np.float32))

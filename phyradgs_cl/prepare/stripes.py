@@ -27,7 +27,7 @@ _NEAR = 5  # each side of a column is represented by the median of this many col
 _FLUCTUATING = 3.0  # a column fluctuates if it changes this many times as much between views as the columns at both sides
 _UNRESPONSIVE = 10.0  # a column does not respond if it varies this many times less than the columns at both sides
 _MIRRORED = 2.0  # an edge shows in the mirror image too: a stripe deviates this many times as much as its image
-_SMALLEST = 1e-6  # a column's spread in line integrals that divides counts as at least this: a stuck pixel's is 0
+_SMALLEST = 1e-6  # least spread of a column, in line integrals, as a divisor: the spread of a stuck pixel is 0
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ class Strides:
 
     @classmethod
     def plain(cls, shape: Sequence[int], first: Sequence[int] = (0, 0, 0)) -> "Strides":
-        """Returns the strides of a C-contiguous array of ``shape`` (nz, ny, nx), for a part from element ``first`` (z, y, x)
-        on."""
+        """Returns the strides of an array of ``shape`` (nz, ny, nx) in C order, for its part from element ``first`` (z, y,
+        x) on."""
         _, ny, nx = shape
         return cls((first[0] * ny + first[1]) * nx + first[2], ny * nx, nx)
 

@@ -31,7 +31,7 @@ _MEMORY_CODES = (-4, -5, -6, -61)
 
 
 class MemoryShortage(OutOfMemoryError):
-    """Raised where device memory runs short, by the limit or in the driver. Work on smaller parts of a volume may fit."""
+    """Raised where device memory runs short: beyond the limit, or in the driver. Smaller parts of a volume may fit."""
 
 
 @dataclass(eq=False)
@@ -246,7 +246,7 @@ def attempts(what: str) -> Iterator[Attempt]:
 
 
 def is_cl_array(value: object) -> bool:
-    """Returns whether a value is a pyopencl.array.Array, without importing that module: before its import, no value is."""
+    """Returns whether a value is a pyopencl.array.Array. Its module is not imported: without it no such value exists."""
     module = sys.modules.get("pyopencl.array")
     return module is not None and isinstance(value, module.Array)
 

@@ -47,7 +47,7 @@ class Scene:
     fastest_mm_per_s: float = 0.0
 
     def warn_of_inverse_crime(self) -> None:
-        """Warns if the projected voxels are finer than the grid's along no axis: reconstructions then look too good."""
+        """Warns if along no axis the projected voxels are finer than the grid's: reconstructions then look too good."""
         shape = self.source_shape
         if shape is None or any(n > m for n, m in zip(shape, self.grid.shape, strict=True)):
             return
