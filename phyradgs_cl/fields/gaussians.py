@@ -19,8 +19,8 @@ _DENSITY_FLOOR = 1e-12  # least density of a Gaussian, so that its raw number is
 class Gaussians:
     """A cloud of G Gaussians.
 
-    mean (G, 3), x y z, and scale (G, 3): in the same unit of length, which is mm outside the reconstruction. quaternion
-    (G, 4): w x y z, of any length above 0. density (G,): attenuation per unit of length. Raises InputError for other shapes,
+    mean (G, 3), x y z, and scale (G, 3): in the same unit of length, mm except within reconstruction methods. quaternion (G,
+    4): w x y z, of any length above 0. density (G,): attenuation per unit of length. Raises InputError for other shapes,
     infinite values or NaN, scales that are not above 0, and quaternions of length 0."""
 
     mean: np.ndarray

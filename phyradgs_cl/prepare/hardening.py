@@ -79,7 +79,8 @@ class HardeningOptions(checks.Checked):
 
 
 def straighten(frames: np.ndarray, polynomial: Polynomial) -> np.ndarray:
-    """Returns p + a p² + b p³ + c p⁴, float32, for line integrals p and ``polynomial`` (a, b, c). Negative p stay: air."""
+    """Returns p + a p² + b p³ + c p⁴, float32, for line integrals p of any shape. polynomial: (a, b, c). Negative p are air
+    and stay as they are."""
     p = np.asarray(frames, np.float64)
     up = np.maximum(p, 0)
     square, cube, fourth = polynomial

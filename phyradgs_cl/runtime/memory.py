@@ -140,7 +140,7 @@ class MemoryLedger:
         return Room(int(self.planned * free_bytes), min(largest_bytes, self.limit_bytes))
 
     def check(self, nbytes: int, largest_bytes: int) -> None:
-        """Raises MemoryShortage for a buffer of ``nbytes`` above ``largest_bytes``, or above what is left of the limit."""
+        """Raises MemoryShortage for a buffer of ``nbytes`` above ``largest_bytes``, or above the rest of the limit."""
         subject, found = f"memory of {self.device.name}", f"{mebibytes(nbytes)} in one buffer"
         remedy = "use a smaller problem"
         if nbytes > largest_bytes:

@@ -43,7 +43,8 @@ class PlainRows:
     """Converts parameter rows (11, G), in mm and 1/mm with quaternions of lengths in ``QUATERNION_LENGTHS``, to the kernels'
     rows: lengths in units of ``length_mm``, and unit quaternions.
 
-    line_integrals: densities become 1/``length_mm``, so that line integrals have no unit. Else they stay in 1/mm."""
+    line_integrals: densities are converted to 1/``length_mm``, so that line integrals have no unit; else they stay in
+    1/mm."""
 
     def __init__(self, rt: Runtime, length_mm: float, *, line_integrals: bool) -> None:
         self.rt = rt
