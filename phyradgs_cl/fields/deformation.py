@@ -15,9 +15,9 @@ from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.volume import Grid
 
-_LEVELS = 16  # ``smallest_determinant`` rounds weights to this many levels, so that it tests few different states
-_MOST_STEPS = 200  # most iterations that invert a displacement field: enough if each makes the error 0.93 times as large
-_FLAT = 1e-4  # ``smallest_determinant`` leaves out points where the displacement's slope, in mm per mm, is below this
+_LEVELS = 16  # ``smallest_determinant`` rounds weights to this many steps, so that few different states are left to test
+_MOST_STEPS = 200  # most iterations that invert a displacement field: enough if each multiplies the error by at most 0.93
+_FLAT = 1e-4  # a point where every slope of the displacement, in mm per mm, is below this counts as having determinant 1
 _CLOSE = 1e-6  # the inversion stops when no displacement changes by more than this fraction of the control spacing
 
 
@@ -129,7 +129,7 @@ class Deformation:
         """Returns the derivative ∂w_i/∂y_j (n, 3, 3) at points (n, 3), x y z, for fields weighted by ``weights`` (R,)."""
         control_mm = np.pad(self._state(weights), [(1, 1)] * 3 + [(0, 0)])
         place = self._in_spacings(points_mm)[..., None]
-        taps = np.floor(place).astype(np.int64) + np.arange(-1, 3)  # (n, 3, 4): the control points that act on each point
+        taps = np.floor(place).astype(np.int64) + np.arange(-1, 3)  # (n, 3, 4): the 4 control points per axis near a point
         values, slopes = cubic(place - taps), cubic_slope(place - taps) / np.reshape(self.spacing_mm, (3, 1))
         last = np.reshape(control_mm.shape[2::-1], (3, 1)) - 1
         x, y, z = np.moveaxis(np.clip(taps + 1, 0, last), 1, 0)
@@ -138,8 +138,7 @@ class Deformation:
         return np.stack([np.einsum("na,nb,nc,nabci->ni", *three, vectors) for three in factors], -1)
 
     def on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
-        """Returns displacements w (nz, ny, nx, 3) float32 in mm, x y z, at the voxel centres of ``grid`` for ``weights``
-        (R,)."""
+        """Returns displacements w (nz, ny, nx, 3) float32 in mm, x y z, at voxel centres of ``grid``. weights: (R,)."""
         along_z, along_y, along_x = self.bases(grid)
         rows = np.einsum("zk,kyxi->zyxi", along_z, self._state(weights), optimize=True)
         planes = np.einsum("yk,zkxi->zyxi", along_y, rows, optimize=True).astype(np.float32)
@@ -171,7 +170,7 @@ class Deformation:
         Without a grid, points half a control spacing apart are tested. To save time, weights are rounded to a 16th of each
         field's largest weight, and a point whose slopes stay below 1e-4 counts as having the determinant 1."""
         grid = grid or self._half_spacing_grid()
-        slopes = np.stack([self._slopes(grid, control_mm) for control_mm in self.control_mm])  # (R, 3, 3, n)
+        slopes = np.stack([self._slopes(grid, control_mm) for control_mm in self.control_mm])  # (R, 3, 3, n): ∂(U_r)_i/∂y_j
         largest = np.abs(self.weights).max(axis=0)
         step = np.maximum(largest / _LEVELS, np.finfo(float).tiny)
         states = np.unique(np.round(self.weights / step), axis=0) * step
@@ -214,7 +213,7 @@ class Deformation:
     def _half_spacing_grid(self) -> Grid:
         spacing_mm = np.broadcast_to(self.spacing_mm, 3)[::-1]
         counts = np.array(self.control_mm.shape[1:4])
-        shape = 2 * (counts + 3) + 1  # the field falls to 0 within two more spacings on either side
+        shape = 2 * (counts + 3) + 1  # beyond the outermost control points the field falls to 0 within two more spacings
         centre_mm = np.array(self.origin_mm)[::-1] + spacing_mm * (counts - 1) / 2
         return Grid(tuple(shape.tolist()), tuple((spacing_mm / 2).tolist()), tuple(centre_mm.tolist()))
 
@@ -224,15 +223,15 @@ def control_points(
 ) -> tuple[tuple[float, float, float], tuple[int, int, int]]:
     """Returns origin x, y, z in mm and counts (nz, ny, nx) of control points that cover a grid and ``margin_mm`` around it.
 
-    The control points extend one spacing or more beyond, since a spline at a point needs the nearest four per axis."""
+    The control points extend one spacing or more beyond the margin: a spline at a point needs the nearest four per axis."""
     counts = [int(np.ceil((side_mm + 2 * margin_mm) / spacing_mm)) + 3 for side_mm in grid.size_mm]
     first_mm = [middle - (n - 1) / 2 * spacing_mm for middle, n in zip(grid.offset_mm, counts, strict=True)]
     return (first_mm[2], first_mm[1], first_mm[0]), (counts[0], counts[1], counts[2])
 
 
 def fitted_control_mm(fields_mm: np.ndarray, grid: Grid, spacing_mm: float) -> tuple[np.ndarray, tuple[float, float, float]]:
-    """Fits splines to fields (R, nz, ny, nx, 3) on ``grid``. Returns control vectors (R, cz, cy, cx, 3) and their origin in
-    mm. The basis is a product over the axes, so the least squares are solved along one axis after the other."""
+    """Fits splines to fields (R, nz, ny, nx, 3) on ``grid``. Returns control vectors (R, cz, cy, cx, 3), and x, y, z in mm
+    of the first one. The basis is a product over the axes: the least squares are solved along one axis after the other."""
     origin_mm, counts = control_points(grid, spacing_mm)
     empty = Deformation(np.zeros((1, *counts, 3)), origin_mm, spacing_mm, np.zeros(1), np.zeros((1, 1)))
     inverses = [np.linalg.pinv(matrix, rcond=1e-3) for matrix in empty.bases(grid)]

@@ -1,6 +1,6 @@
 """Radiative Gaussians: their parameters with units, and the unconstrained ("raw") numbers that the optimiser changes.
 
-The field of one Gaussian is ρ exp(−½ (x−μ)ᵀ Σ⁻¹ (x−μ)) with Σ = R diag(s²) Rᵀ (paper, section 2)."""
+The field of a Gaussian of density ρ, mean μ and scale s is ρ exp(−½ (x−μ)ᵀ Σ⁻¹ (x−μ)), Σ = R diag(s²) Rᵀ, R its rotation."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ import scipy
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 
-ROWS = 11  # mean 3, scale 3, quaternion 4, density 1
+ROWS = 11  # numbers of a Gaussian: mean 3, scale 3, quaternion 4, density 1
 MEAN, SCALE, QUATERNION, DENSITY = slice(0, 3), slice(3, 6), slice(6, 10), 10
 _DENSITY_FLOOR = 1e-12  # least density of a Gaussian, so that its raw number is finite
 
@@ -19,8 +19,8 @@ _DENSITY_FLOOR = 1e-12  # least density of a Gaussian, so that its raw number is
 class Gaussians:
     """A cloud of G Gaussians.
 
-    mean (G, 3), x y z, and scale (G, 3): in the same unit of length, which is mm outside the reconstruction. quaternion
-    (G, 4): w x y z, of any length above 0. density (G,): attenuation per unit of length. Raises InputError for other shapes,
+    mean (G, 3), x y z, and scale (G, 3): in the same unit of length, mm except within reconstruction methods. quaternion (G,
+    4): w x y z, of any length above 0. density (G,): attenuation per unit of length. Raises InputError for other shapes,
     infinite values or NaN, scales that are not above 0, and quaternions of length 0."""
 
     mean: np.ndarray
@@ -51,7 +51,7 @@ class Gaussians:
         """Returns the parameters (11, G) float64, in the order that kernels read: mean, scale, unit quaternion, density."""
         q = self.quaternion
         if self.count:
-            q = np.ldexp(q, -np.frexp(np.abs(q).max(axis=1, keepdims=True))[1])  # exact; then no square is 0 or infinite
+            q = np.ldexp(q, -np.frexp(np.abs(q).max(axis=1, keepdims=True))[1])  # exact scaling: no square is 0 or infinite
             q = q / np.linalg.norm(q, axis=1, keepdims=True)
         return np.concatenate([self.mean.T, self.scale.T, q.T, self.density[None]]).astype(np.float64)
 
@@ -67,7 +67,7 @@ class Gaussians:
         for a covariance that is not positive definite."""
         count = len(np.atleast_1d(checks.real_array("Gaussians' mean", mean)))
         variance, axes = np.linalg.eigh(checks.numbers("covariance", covariance, (count, 3, 3)))
-        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # flips an axis of each reflection: then it is a rotation
+        axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]  # flips an axis of a reflection, so that it is a rotation
         x, y, z, w = scipy.spatial.transform.Rotation.from_matrix(axes).as_quat().T
         return cls(mean, np.sqrt(variance), np.stack([w, x, y, z], -1), density)
 
@@ -93,8 +93,8 @@ class Activation:
         return rows
 
     def invert(self, rows: np.ndarray) -> np.ndarray:
-        """Returns raw rows for parameter rows (11, G). Scales at or outside their bounds count as a little inside, and
-        densities as at least 1e-12: the inverse is infinite at the bounds."""
+        """Returns raw rows for parameter rows (11, G). The inverse is infinite at the bounds. So scales are first moved 1e-4
+        of their range inside their bounds, and densities are raised to at least 1e-12."""
         raw = np.array(rows, dtype=np.float64)
         span = self.scale_max - self.scale_min
         raw[SCALE] = scipy.special.logit(np.clip((rows[SCALE] - self.scale_min) / span, 1e-4, 1 - 1e-4))

@@ -17,8 +17,8 @@ _ROI = "Box of the volume about the axis, mm, or its sides about the scan's midd
 _MARGIN = "Width around the box, mm, that is reconstructed and discarded: for objects larger than box or panel."
 _SCAN = "the scan's"
 _LARGEST_MM = 1e9  # largest length in mm that an option takes; the smallest is 1e-9 mm
-_ROUNDING = 1e-6  # a box that exceeds whole voxels by at most this fraction of a voxel gets no further voxel: it is rounding
-# The same for a box that a user typed, which rarely fits the scan's voxels exactly: voxel sides are rarely round numbers.
+_ROUNDING = 1e-6  # a box may exceed whole voxels by this fraction of a voxel, as rounding, without getting a further voxel
+# The same fraction for a box that a user typed: it rarely ends at voxels' faces, since voxel sides are rarely round numbers.
 _TYPED = 0.01
 
 
@@ -90,7 +90,7 @@ class GridChoice:
         return Grid(self._whole(shape), triple(np.broadcast_to(voxel_mm, 3)), triple(box_mm.mean(1)))
 
     def with_margin(self, grid: Grid) -> Grid:
-        """Returns ``grid`` enlarged by ``margin_mm``, in whole voxels. Raises InputError for too many voxels."""
+        """Returns ``grid`` with ``margin_mm`` on all sides, in whole voxels. Raises InputError for too many voxels."""
         if self.margin_mm is None:
             return grid
         around = np.ceil(np.divide(self.margin_mm, grid.voxel_size_mm) - _TYPED)
@@ -134,7 +134,7 @@ def voxel_sides_mm(option: str, value: Any) -> tuple[float, float, float]:
 
 
 def _numbers(option: str, value: Any, counts: tuple[int, ...], example: str) -> tuple[float, ...]:
-    """Returns a number, or a sequence of numbers, as floats. counts: the lengths allowed. Raises InputError otherwise."""
+    """Returns a number or a sequence as floats. counts: allowed lengths. Raises InputError about ``option`` otherwise."""
     value = value.ravel().tolist() if isinstance(value, np.ndarray) else value  # an array may be (3, 2), as Grid.box_mm is
     parts = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
     parts = [part.item() if isinstance(part, np.generic) else part for part in parts]

@@ -19,20 +19,19 @@ HOUNSFIELD = "hounsfield"
 Box = tuple[float, ...]
 """A box in world coordinates: Z0, Z1, Y0, Y1, X0, X1 in mm."""
 Window = tuple[float, float, int]
-"""A peak of the histogram: the attenuations in 1/mm at half its prominence, below and above it, and the number of voxels in
-between."""
-_FEWEST = 100  # least number of voxels of air and of water: the noise of their mean is then a tenth of a voxel's
-# Water's attenuation in 1/mm is 0.0097 at 500 keV and 0.53 at 10 keV. Outside these limits a warning is logged.
+"""A peak of the histogram: its two attenuations in 1/mm at half its prominence, and the number of voxels between them."""
+_FEWEST = 100  # least number of voxels of air and of water: their mean then has a tenth of one voxel's noise
+# A warning is logged for water outside these limits, in 1/mm: water has 0.0097 at 500 keV and 0.53 at 10 keV.
 _WATER_PER_MM = (0.009, 0.6)
-_AIR_BELOW = 0.25  # a lowest peak above this fraction of water's attenuation is not air; it may be fat
-_ONE_MATERIAL = 0.4  # a box whose standard deviation exceeds this times (water − air) may hold two materials
+_AIR_BELOW = 0.25  # the lowest peak is not air, but perhaps fat, if it lies above this fraction of water's attenuation
+_ONE_MATERIAL = 0.4  # a warning is logged for a box whose standard deviation exceeds this times (water − air): two materials
 _BINS = 512  # number of bins of the histogram
 _SMOOTH_BINS = 2.0  # standard deviation of the Gaussian that smooths the histogram, in bins
 _PROMINENT = 0.1  # a peak must rise above its surroundings by this fraction of its smoothed count
 # A peak must also rise by this times the square root of its smoothed count. That is eight times the smoothed count's noise.
 _CERTAIN = 3.0
 _ZOOM = 2.5  # the last histogram ends at this times the upper end of water's peak, so that peaks span many bins
-_SHORTENED = 5  # how often the histogram's range may be cut to a quarter: metal may be 1000 times denser than water
+_SHORTENED = 5  # most times that the histogram's range is cut to a quarter: metal may be 1000 times denser than water
 _NUMBER = r"-?\d+\.?\d*(?:e[-+]\d+)?"
 _NOTE = re.compile(rf"values in HU(?:, water ({_NUMBER}), air ({_NUMBER}) 1/mm)?")
 
@@ -176,7 +175,7 @@ def _largest(windows: list[Window]) -> Window:
 
 
 def _windows(values: np.ndarray, lowest: float, highest: float) -> list[Window]:
-    """Returns the peaks of the histogram that hold enough voxels, from low to high attenuation."""
+    """Returns the peaks of the histogram from ``lowest`` to ``highest`` that hold 100 voxels or more, from low to high."""
     if not lowest < highest:
         return []
     counts, edges = np.histogram(values, _BINS, (lowest, highest))

@@ -14,8 +14,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields.deformation import Deformation
 from phyradgs_cl.fields.volume import Grid, triple
 
-_SLAB_VOXELS = 1 << 18  # about how many voxels a thread deforms at a time: coordinates take six times the voxels' memory
-_BORDER = 8  # width in voxels of the zeros put around a volume: over it the spline's coefficients fall to 3e-5
+_SLAB_VOXELS = 1 << 18  # about how many voxels a thread deforms at a time: their coordinates take six times their memory
+_BORDER = 8  # width in voxels of the zeros around a volume: across it the spline's coefficients fall by a factor of 3e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +105,7 @@ def deformed(volume: np.ndarray, grid: Grid, deformation: Deformation, weights: 
 
 
 class SplineVolume:
-    """A volume (nz, ny, nx) float32 in 1/mm, interpolated by cubic splines. It is 0 outside.
+    """A volume (nz, ny, nx) float32 in 1/mm on ``grid``, interpolated by cubic splines, and 0 outside the grid.
 
     Splines undershoot near edges, so no value is returned below the least voxel, or below 0 if that is less."""
 
@@ -129,7 +129,7 @@ class SplineVolume:
         return np.concatenate(slabs)
 
     def _slab(self, deformation: Deformation, weights: np.ndarray, first: int, part: Grid) -> np.ndarray:
-        """Returns the deformed slices of ``part``, a part of the grid that begins at slice ``first``."""
+        """Returns the deformed slices of ``part``, which is a part of the grid and begins at the grid's slice ``first``."""
         shift = deformation.on_grid_mm(part, weights) / np.array(self.grid.voxel_size_mm[::-1], np.float32)
         nz, ny, nx = part.shape
         voxels = np.ogrid[first : first + nz, :ny, :nx]

@@ -1,4 +1,4 @@
-"""``Grid``, a regular voxel grid in world coordinates, and the metal in an object."""
+"""``Grid``, a regular voxel grid in world coordinates, and ``Metal``, the metal in an object."""
 
 import math
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 MOST_VOXELS = 2**38
 """The most voxels of a grid: a terabyte of float32. Larger numbers come from damaged files."""
-_SAME_PLACE = 1e-3  # voxels of two grids this close, in voxels, are at the same place: float32 rounds stored grids
+_SAME_PLACE = 1e-3  # voxels of two grids closer than this, in voxels, are at the same place: float32 rounds stored grids
 T = TypeVar("T")
 
 
@@ -29,8 +29,8 @@ def triple(values: Iterable[T]) -> tuple[T, T, T]:
 class Grid:
     """A box of voxels centred at ``offset_mm``. All triples are (z, y, x), like the arrays.
 
-    shape: numbers of voxels. voxel_size_mm: sides of a voxel. Raises InputError for numbers that are not whole or below 1,
-    more than ``MOST_VOXELS`` voxels, lengths that are not finite, and sides that are not above 0."""
+    shape: numbers of voxels. voxel_size_mm: sides of a voxel. Raises InputError for a number of voxels that is below 1 or
+    not whole, more than ``MOST_VOXELS`` voxels, lengths that are not finite, and sides that are not above 0."""
 
     shape: tuple[int, int, int]
     voxel_size_mm: tuple[float, float, float]
@@ -70,7 +70,7 @@ class Grid:
 
     @property
     def half_longest_mm(self) -> float:
-        """Half the longest side in mm: the unit of length in which splatting and neural methods compute."""
+        """Half the longest side of the box in mm: the unit of length of splatting and neural methods."""
         return max(self.size_mm) / 2
 
     @property
@@ -101,7 +101,7 @@ class Grid:
         return self.shape == other.shape and same_voxels and np.allclose(self.offset_mm, other.offset_mm, atol=near_mm)
 
     def part(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> "Grid":
-        """Returns the grid of the voxels [start, start + shape) (z, y, x), which may lie beyond this grid."""
+        """Returns the grid of this grid's voxels [start, start + shape) (z, y, x). They may lie beyond this grid."""
         sides = zip(self.first_centre_mm, start, shape, self.voxel_size_mm, strict=True)
         return Grid(shape, self.voxel_size_mm, triple(first + (s + (n - 1) / 2) * d for first, s, n, d in sides))
 

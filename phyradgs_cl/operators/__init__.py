@@ -1,5 +1,5 @@
 """Operators between objects and frames: projectors of voxels (rays) and of Gaussians (splats), voxelisation of Gaussians,
-and FDK's backprojection. An operator has a domain, a range and a transpose. Algorithms are elsewhere."""
+and FDK's backprojection. An operator has a domain, a range and a transpose."""
 
 from phyradgs_cl.operators.backproject import backproject, backproject_lines
 from phyradgs_cl.operators.rays.intensity import IntensityOperator

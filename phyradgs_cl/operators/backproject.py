@@ -26,7 +26,7 @@ _COLUMN_ROWS = 512  # in the upright kernels, a work-item's voxels project to at
 _UPRIGHT = 1e-7
 # Largest lean of the image of a column of voxels, in detector columns per row. Beyond it the general kernel is faster.
 _MOST_LEAN = 0.25
-LINE_SAMPLES = 4  # time of a voxel with one pose per line, divided by its time with one pose per view
+LINE_SAMPLES = 4  # (time of a voxel with one pose per line) / (its time with one pose per view)
 _WIDEST = 16  # number of voxels along z in the widest vector, which may reach beyond the volume
 Arguments = tuple[DeviceArray, DeviceArray, DeviceArray, np.int32, np.int32, np.int32, np.int32, np.int64]
 
@@ -120,7 +120,7 @@ _Launch = Callable[[Arguments, Brick, DeviceArray], None]
 
 
 def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch) -> Array:
-    """Returns the views' volume (nz, ny, nx). ``launch`` adds some views to a part of it (brick). The whole volume is one
+    """Returns the views' volume (nz, ny, nx). ``launch`` adds some views to a brick, a part of the volume. The volume is one
     brick if it fits; else the bricks' sides along z are multiples of ``step``. Raises OutOfMemoryError if no brick fits."""
     is_resident = isinstance(views.frames, DeviceArray)
     volume: Array = rt.empty(grid.shape) if is_resident else np.empty(grid.shape, np.float32)
@@ -181,7 +181,7 @@ def _upright(
 
 
 def _defines(power: int) -> dict[str, int]:
-    """Returns the kernels' macros for the exponent ``power``. For FDK's 2, their default, it is left out."""
+    """Returns the kernels' macros for the exponent ``power`` of the distance weight; FDK's 2 is the kernels' default."""
     return {"IMAGE_GUARD": GUARD} if power == 2 else {"IMAGE_GUARD": GUARD, "DISTANCE_POWER": power}
 
 

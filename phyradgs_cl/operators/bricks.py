@@ -36,7 +36,7 @@ def cut(
 
     The sides of bricks are multiples of ``steps`` (z, y) in voxels, except at the volume's end. needs: returns the bytes of
     each buffer that a brick of shape (z, y, x) takes. A brick of the smallest size may take all of the free memory. Raises
-    OutOfMemoryError if it does not fit."""
+    OutOfMemoryError if not even such a brick fits."""
     nz, ny, nx = shape
     smallest = (min(steps[0], nz), min(steps[1], ny), nx)
     if not room.holds(*needs(smallest)):

@@ -33,8 +33,8 @@ def moved_to(rt: Runtime, values: Values, on_device: bool) -> Any:
 
 
 def computed(rt: Runtime, on_device: bool, function: Callable[[Any], Values], values: Values) -> Any:
-    """Applies a function that needs its argument on the device (``on_device``) or the host. Returns the result on the side
-    where ``values`` are."""
+    """Applies a function that needs its argument on the device if ``on_device``, else on the host. Returns the function's
+    result on the device if ``values`` are there, else on the host."""
     return moved_to(rt, function(moved_to(rt, values, on_device)), isinstance(values, DeviceArray))
 
 
@@ -108,7 +108,7 @@ class Operator:
     def to_device(self, values: Any) -> Any:
         """Copies an x or a y, or a stack of them, to a pyopencl Array (float32) on ``queue``, for a loop on the device.
 
-        Raises InputError unless it is an array of real numbers whose last axes have the shape of x or of y."""
+        Raises InputError unless ``values`` is an array of real numbers whose last axes have the shape of x or of y."""
         array = on_host("values", values)
         sides = self.domain_shape, self.range_shape
         if not any(_ends_with(array.shape, side) for side in sides):
@@ -139,7 +139,7 @@ class Operator:
         raise self._not_linear()
 
     def frames(self, chosen: Sequence[int]) -> Any:
-        """Returns the operator to some of the frames, given by their numbers from 0, in this order. It shares all memory.
+        """Returns the operator to some of the frames, given by their numbers from 0, in this order. Both share all memory.
 
         Raises InputError for numbers of missing frames, for no number, and for an operator without frames."""
         if self._frames is None:
@@ -167,7 +167,7 @@ class Operator:
         return self._at(self._to_array(self._domain, x))
 
     def _to_array(self, side: tuple[str, Shape], values: Any) -> Values:
-        """Returns an x or a y as float32 in C order, on the side where it is. Copies only other types or layouts."""
+        """Returns an x or a y as float32 in C order, left on the host or device. Copies only other types or layouts."""
         array = adopted(side[0], values, self.queue) if is_cl_array(values) else on_host(side[0], values)
         checks.shape(side[0], array, side[1])  # type: ignore[arg-type]
         return array
@@ -197,7 +197,7 @@ class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy ha
         ScipyOperator.__init__(self, np.float32, (_size(range_), _size(domain)))
         self._pair = forward, adjoint
 
-    shape = (0, 0)  # SciPy's attribute, in place of the property: each instance sets it
+    shape = (0, 0)  # this attribute of SciPy replaces the property; each instance sets its own
     __matmul__ = ScipyOperator.__matmul__
 
     @property
@@ -210,7 +210,7 @@ class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy ha
         return self
 
     def dot(self, x: Any) -> Any:
-        """Returns SciPy's product, also of ``@``. Raises InputError for masked arrays, whose mask SciPy would drop."""
+        """Returns the product A x, as ``@`` does. Raises InputError for masked arrays, whose mask SciPy would drop."""
         checks.unmasked(self._domain[0], x)
         return ScipyOperator.dot(self, x)
 
@@ -223,7 +223,7 @@ class LinearOperator(Operator, ScipyOperator):  # type: ignore[misc]  # SciPy ha
     def _transpose(self) -> "LinearOperator":
         return self.T
 
-    _adjoint = _transpose  # the same for operators on real numbers
+    _adjoint = _transpose  # an operator on real numbers has its transpose as its adjoint
 
 
 def _is_index(number: object, count: int) -> bool:

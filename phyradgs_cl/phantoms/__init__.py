@@ -54,7 +54,7 @@ class VoxelPhantom:
 
 
 Phantom = EllipsoidPhantom | MovingPhantom | VoxelPhantom
-# (half_size_mm, resolution, seed) -> phantom. Phantoms without voxels ignore the last two.
+# (half_size_mm, resolution, seed) -> phantom. Phantoms without voxels ignore ``resolution`` and ``seed``.
 Factory = Callable[[float, int, int], Phantom]
 
 

@@ -29,7 +29,7 @@ _GREY_LEVELS = {
     "toft": (1.0, -0.8, -0.2, -0.2, 0.2, 0.2, 0.1, 0.1, 0.2, -0.2),
     "kak-slaney": (2.0, -0.98, -0.02, -0.02, 0.02, 0.02, 0.01, 0.01, 0.02, -0.02),
 }
-_OUTER, _INNER, _SWING = 60 / 64, 8 / 64, 8 / 64  # RTK's lengths in mm, divided by 64 mm, half the side of its box
+_OUTER, _INNER, _SWING = 60 / 64, 8 / 64, 8 / 64  # RTK's radii and swing in mm, divided by 64 mm, half its box's side
 _STEPS = 8  # number of frames in which RTK's sphere goes forth and back
 
 
@@ -58,7 +58,7 @@ def shepp_logan(
 _BEADS_PER_LAYER = 8
 _LAYER_HEIGHT = 0.27
 _CIRCLE_RADIUS = 0.52
-_BEAD_RADII = (0.12, 0.06, 0.09, 0.045)  # taken in turn by the beads of a circle
+_BEAD_RADII = (0.12, 0.06, 0.09, 0.045)  # radii that the beads of a circle take in turn
 _BEAD_DENSITY = 0.85
 _HOLDER_DENSITY = 0.15
 _HOLDER_AXES = (0.85, 0.85, 0.7)  # the holder contains every bead and stays in the field of view
@@ -88,8 +88,8 @@ def sphere_phantom(half_size_mm: float) -> EllipsoidPhantom:
 class MovingBody:
     """A body that moves forth and back along a line at constant speed.
 
-    body: the body when it is at the middle of the line. swing_mm: the vector (x, y, z) from the middle to one end. At time 0
-    the body is at the other end; after half a period it reaches this end. period_s: the time forth and back. Raises
+    body: the body when it is at the middle of the line. swing_mm: the vector (x, y, z) from the middle to the end that the
+    body reaches after half a period. At time 0 the body is at the other end. period_s: the time forth and back. Raises
     InputError for a period that is not positive."""
 
     body: Body

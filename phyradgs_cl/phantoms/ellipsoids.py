@@ -1,6 +1,6 @@
 """Phantoms made of ellipsoids and cylinders whose attenuations add up, with exact line integrals.
 
-An affine map takes an ellipsoid to the unit ball, and a ray to a ray. The length of the ray inside follows from its distance
+An affine map takes an ellipsoid to the unit ball, and a ray to a ray. The ray's length in the ball follows from its distance
 to the centre (Kak and Slaney, Principles of Computerized Tomographic Imaging, IEEE Press 1988, section 3.1)."""
 
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ Triple = tuple[float, float, float]
 Matrix = tuple[Triple, Triple, Triple]
 
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_PARALLEL = 1e-30  # replaces a divisor of 0, which a ray along a cylinder's axis, or at right angles to the axis, gives
+_PARALLEL = 1e-30  # replaces divisors of 0: those of a ray along a cylinder's axis, or at right angles to the axis
 RAYS_PER_CHUNK = 1 << 15  # most rays projected at a time: their intermediate arrays, 2-3 MB, stay in a core's cache
 
 
 def rotation_about_z(angle_rad: float) -> Matrix:
-    """Returns the matrix that rotates counter-clockwise about z, seen from +z: an ellipsoid's ``rotation``."""
+    """Returns the matrix that rotates counter-clockwise about z, seen from +z, for an ellipsoid's ``rotation``."""
     c, s = float(np.cos(angle_rad)), float(np.sin(angle_rad))
     return ((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0))
 
@@ -66,8 +66,7 @@ class Ellipsoid:
 
     @property
     def ends_mm(self) -> tuple[Triple, Triple]:
-        """The ends of a line segment in the body, here both the centre. No point of the body is further than ``reach_mm``
-        from the segment."""
+        """Both ends of the body's axis, here the centre. No point of the body is further than ``reach_mm`` from the axis."""
         return self.centre_mm, self.centre_mm
 
     @property
@@ -75,20 +74,20 @@ class Ellipsoid:
         return max(self.semi_axes_mm)
 
     def chord_fraction(self, start: Array, step: Array) -> Array:
-        """Returns the fraction (n,) of each segment start + t·step (n, 3), 0 <= t <= 1, that lies inside."""
+        """Returns the fraction (n,) of each segment start + t·step (n, 3), 0 <= t <= 1, that lies inside the ellipsoid."""
         to_ball = self.to_unit_ball.T
         o = (start - np.asarray(self.centre_mm)) @ to_ball
         d = step @ to_ball
         dd = np.einsum("ij,ij->i", d, d)
         dd[dd == 0] = 1.0  # avoids a division by 0; a segment without length has line integral 0
         nearest = -np.einsum("ij,ij->i", o, d) / dd
-        # Computed from the ray's point nearest to the centre: the quadratic formula would lose digits for far sources.
+        # Computed from the ray's point nearest to the centre, as the quadratic formula would lose digits for far sources.
         foot = o + nearest[:, None] * d
         half = np.sqrt(np.maximum(1.0 - np.einsum("ij,ij->i", foot, foot), 0.0) / dd)
         return np.clip(nearest + half, 0.0, 1.0) - np.clip(nearest - half, 0.0, 1.0)
 
     def contains(self, x: Array, y: Array, z: Array) -> NDArray[np.bool_]:
-        """Returns whether points, given by coordinates in mm that broadcast, lie inside, bool (...)."""
+        """Returns whether points, given by coordinates in mm that broadcast, lie inside the ellipsoid, bool (...)."""
         cx, cy, cz = self.centre_mm
         # Products are formed before the coordinates are broadcast to each other: this costs far less time than afterwards.
         rows = [m[0] * (x - cx) + m[1] * (y - cy) + m[2] * (z - cz) for m in self.to_unit_ball]
@@ -137,7 +136,7 @@ class Cylinder:
         return self.length_mm / 2 * along + self.radius_mm * np.sqrt(np.maximum(1 - along**2, 0))
 
     def chord_fraction(self, start: Array, step: Array) -> Array:
-        """Returns the fraction (n,) of each segment start + t·step (n, 3), 0 <= t <= 1, that lies inside."""
+        """Returns the fraction (n,) of each segment start + t·step (n, 3), 0 <= t <= 1, that lies inside the cylinder."""
         o = start - np.asarray(self.ends_mm[0])
         height, rise = o @ self.axis, step @ self.axis
         o, d = o - height[:, None] * self.axis, step - rise[:, None] * self.axis
@@ -151,7 +150,7 @@ class Cylinder:
         return np.maximum(np.clip(last, 0.0, 1.0) - np.clip(first, 0.0, 1.0), 0.0)
 
     def contains(self, x: Array, y: Array, z: Array) -> NDArray[np.bool_]:
-        """Returns whether points, given by coordinates in mm that broadcast, lie inside, bool (...)."""
+        """Returns whether points, given by coordinates in mm that broadcast, lie inside the cylinder, bool (...)."""
         points = [c - c0 for c, c0 in zip((x, y, z), self.ends_mm[0], strict=True)]
         height = sum(a * p for a, p in zip(self.axis, points, strict=True))
         across = sum((p - a * height) ** 2 for a, p in zip(self.axis, points, strict=True))

@@ -101,8 +101,8 @@ def capsule_box(lattice: Lattice, capsules: Sequence[Capsule], margin: float) ->
 
 
 def add_to_union(union: Field, box: Box, distance: Field, blend: float) -> None:
-    """Adds a body to a smooth union of bodies, in place. The union is stored as the sum of exp(-distance / blend). blend:
-    the width over which bodies merge."""
+    """Adds a body to a smooth union of bodies in place. The union is stored as the sum of exp(-distance / blend). distance:
+    that of the voxels ``box`` to the body. blend: the width over which bodies merge."""
     union[box] += np.exp(np.clip(-distance / np.float32(blend), -60.0, 60.0))
 
 
@@ -136,12 +136,12 @@ def _intersect(part: Box, box: Box) -> Box:
 def texture(
     lattice: Lattice, wavelengths: tuple[float, float], waves: int, rng: np.random.Generator
 ) -> Field:
-    """Draws isotropic noise (n, n, n) float32 of variance 1: a sum of ``waves`` random cosines, averaged over each voxel.
+    """Draws isotropic noise (n, n, n) float32: ``waves`` random cosines whose sum has variance 1, averaged over each voxel.
 
     The cosines' wavelengths lie between the two ``wavelengths``. The draws from ``rng`` do not depend on the resolution."""
     direction = rng.standard_normal((waves, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    k = 2 * np.pi * direction / rng.uniform(*wavelengths, waves)[:, None]  # rad per unit length
+    k = 2 * np.pi * direction / rng.uniform(*wavelengths, waves)[:, None]  # wave vectors, in rad per unit length
     phase = rng.uniform(0, 2 * np.pi, waves)
     mean = np.prod(np.sinc(k * lattice.step / (2 * np.pi)), axis=1)  # how much averaging over a voxel damps each cosine
     amplitude = np.sqrt(2.0 / waves) * mean

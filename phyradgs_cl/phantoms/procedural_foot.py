@@ -13,7 +13,7 @@ from phyradgs_cl.phantoms.implicit import Capsule, Field, Lattice, Point
 
 Bone = tuple[Capsule, ...]
 
-# Attenuation of each tissue, relative: dense bone is near 1.
+# Relative attenuation of each tissue: dense bone is near 1.
 _CORTICAL, _TRABECULAR, _MARROW = 0.92, 0.56, 0.36
 _MUSCLE, _FAT, _SKIN = 0.24, 0.18, 0.27
 _SHELL = 0.022  # thickness of cortical bone
@@ -101,7 +101,8 @@ def _toe(head: Point, thickness: float, joints: tuple[float, ...], rng: np.rando
 
 
 def _soft_tissue(lattice: Lattice, cover: list[Capsule], ripple: Field, rng: np.random.Generator) -> Field:
-    """Returns the attenuation of muscle, fat and skin in the union of the capsules `cover` and `_FLESH`. Air is 0."""
+    """Returns the attenuation (n, n, n) of muscle, fat and skin in the union of the capsules `cover` and `_FLESH`; air is 0.
+    ripple: distances (n, n, n) by which the skin lies below the union's surface, above it where they are negative."""
     distance = implicit.capsule_union(lattice, [*cover, *_FLESH], _SKIN_BLEND, lattice.everything) + ripple
     muscle = np.float32(_MUSCLE) + np.float32(0.02) * implicit.texture(lattice, (0.12, 0.4), 48, rng)
     whole = lattice.coverage(distance)
@@ -111,7 +112,8 @@ def _soft_tissue(lattice: Lattice, cover: list[Capsule], ripple: Field, rng: np.
 
 
 def _add_bone(volume: Field, lattice: Lattice, bone: Bone, ripple: Field, grain: Field) -> None:
-    """Puts a bone into `volume`: a cortical shell, trabeculae inside, and fatty marrow in the middle."""
+    """Puts a bone into `volume`: a cortical shell, trabeculae inside, and fatty marrow in the middle. ripple: as in
+    ``_soft_tissue``. grain: noise (n, n, n) in the attenuation of trabeculae and marrow."""
     box = implicit.capsule_box(lattice, bone, 0.05)
     distance = implicit.capsule_union(lattice, bone, _JOINT_BLEND, box) + ripple[box]
     outer = lattice.coverage(distance)

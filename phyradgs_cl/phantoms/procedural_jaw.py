@@ -23,7 +23,7 @@ _BONE_BLEND, _FLESH_BLEND = 0.025, 0.04  # widths over which bodies that touch m
 # The arc of the mandible: x = A sin(phi), y = Y0 - B cos(phi), phi from -_PHI_END to +_PHI_END.
 _ARC_A, _ARC_B, _ARC_Y0 = 0.60, 0.86, 0.22
 _PHI_END = 0.46 * np.pi
-_BODY_Z, _BODY_HEIGHT, _BODY_WIDTH = -0.26, 0.19, 0.105  # z of the ellipse's centre, and its semi-axes along z and across
+_BODY_Z, _BODY_HEIGHT, _BODY_WIDTH = -0.26, 0.19, 0.105  # section of the arc: z of its centre, semi-axes along z and across
 _GUM_Z = -0.08  # upper rim of the bone, where the crowns begin
 # Teeth of one side, from the middle: width along the arc, width across, crown height, number of roots.
 _TEETH = (
@@ -35,7 +35,7 @@ _TEETH = (
     (0.150, 0.145, 0.12, 2),
     (0.150, 0.145, 0.11, 2),
 )
-_FIRST_GAP = 0.006  # from the middle of the arc to the first tooth on either side, along the arc
+_FIRST_GAP = 0.006  # distance along the arc from its middle to the first tooth on either side
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def _bone_distance(lattice: Lattice) -> Field:
 
 
 def _soft_tissue(lattice: Lattice, bone: Field, teeth: list[Tooth], rng: np.random.Generator) -> Field:
-    """Returns the attenuation of gums, cheeks and the floor of the mouth under a layer of fat. Air is 0."""
+    """Returns the attenuation of flesh around the bone, of the mouth's floor, tongue and throat, under fat. Air is 0."""
     x, y, z = lattice.points(lattice.everything)
     union = np.zeros_like(bone)
     implicit.add_to_union(union, lattice.everything, bone - np.float32(0.075), _FLESH_BLEND)
@@ -160,7 +160,7 @@ def _soft_tissue(lattice: Lattice, bone: Field, teeth: list[Tooth], rng: np.rand
 
 
 def _fill_bone(volume: Field, lattice: Lattice, distance: Field, rng: np.random.Generator) -> None:
-    """Puts the bone into `volume`: a cortical shell, trabeculae inside, and in them the canal of the nerve."""
+    """Puts the bone into `volume`: a cortical shell, trabeculae inside, and in the trabeculae the canal of the nerve."""
     _, _, z = lattice.points(lattice.everything)
     outer = lattice.coverage(distance)
     inner = lattice.coverage(distance + np.float32(_SHELL))

@@ -19,7 +19,7 @@ _AROUND = np.ones((3, 3), bool)
 _NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
 _SHARPNESS = 0.3  # a spark is brighter than the pixels on both sides, in every direction, by this fraction of its height
 _NEAR, _FAR = 2, 3  # a spark's surroundings are 2 pixels away, or 3 where another spark is near
-_MOVED = 5  # the next frame may show a gap of the object moved by 2 pixels, so a square of this side is searched
+_MOVED = 5  # the next frame may show a gap of the object moved by up to 2 pixels, so a square of this side is searched
 _SHOWN_AGAIN = 0.5  # a gap of the object is at least this fraction as high in the frames before and after; a spark is not
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 LEAST_FRAMES = 5  # in fewer frames a sound pixel may look dead by chance
@@ -28,7 +28,7 @@ _MOST_TIMES = 0.7  # a dead pixel is above, or below, all its neighbours in more
 _MOST_FRAMES = 40  # dead pixels are sought in at most this many frames, evenly spread, to save time
 _STILL_SIDES = 0.5  # if more than this fraction of the two outermost columns never changes, they are air without noise
 _NEAR_AXIS = 1.5  # a small part of the object this close to the axis, in columns, stays on one pixel in all views
-_SHARED = 0.1  # a dead pixel differs alone: its neighbours show less than this fraction of the difference
+_SHARED = 0.1  # a dead pixel differs alone: its neighbours differ by less than this fraction of its difference
 _LINE = 0.9  # a row or column with more than this fraction of dead pixels is dead as a whole
 
 
@@ -66,10 +66,10 @@ def find_sparks(
 ) -> np.ndarray:
     """Returns the pixels, bool (F, v, u), of line integrals (F, v, u) that are brighter than an object can make them.
 
-    They lie below the median of 5 × 5 pixels by ``least``, and by ``threshold`` standard deviations, estimated from the
-    median distance to that median in 9 × 9 pixels. They are sharp in every direction and form groups of at most ``pixels``.
-    A feature that the frames before and after show nearby, at least half as high, is a gap of the moving object and no
-    spark."""
+    A spark's line integral lies below the median of 5 × 5 pixels by ``least``, and by ``threshold`` standard deviations.
+    These are estimated from the median distance to that median in 9 × 9 pixels. A spark is sharp in every direction and has
+    at most ``pixels`` touching pixels. A feature that the frames before and after (at an end the one neighbour) show nearby,
+    at least half as high, is a gap of the moving object and no spark."""
     sparks = np.stack([_sparks_of(frame, threshold, least, pixels) for frame in frames])
     for f in np.flatnonzero(sparks.any(axis=(1, 2))) if len(frames) > 2 else ():
         height = _height(frames[f])
@@ -98,9 +98,9 @@ def _height(frame: np.ndarray) -> np.ndarray:
 
 
 def _opposite(frame: np.ndarray) -> Iterable[np.ndarray]:
-    """Yields, for each of four directions, the lower value (v, u) of the two opposite pixels 2 pixels away. Where the lower
-    value 3 pixels away is higher, it counts instead, because a nearer pixel may be a spark too. The frame is mirrored at the
-    panel's edge."""
+    """Yields, for each of four directions, the lower value (v, u) of the two opposite pixels 2 pixels away. If the lower
+    value of those 3 pixels away is higher, yields that, because a nearer pixel may be a spark too. The frame is mirrored at
+    the panel's edge."""
     wide = np.pad(frame, _FAR, mode="symmetric")
     rows, columns = frame.shape
 
@@ -149,8 +149,8 @@ def find_dead(
 
 
 def _lines(frames: np.ndarray, deviations: float) -> np.ndarray:
-    """Returns whole rows and columns, bool (v, u), that lie above or below both neighbours nearly everywhere, in the median
-    over frames. Pixels of air count too: an object may be long and thin, but not as long as the panel."""
+    """Returns whole rows and columns, bool (v, u), that lie above or below both neighbours in over 90 % of their pixels, in
+    the median over frames. Pixels of air count too: an object may be long and thin, but not as long as the panel."""
     dead = np.zeros(frames.shape[1:], bool)
     floor = 1e-3 * max(float(np.percentile(frames, 99.9)), 1e-9)
     for axis in (0, 1):
@@ -192,7 +192,7 @@ def _exceeding(frames: np.ndarray, deviations: float) -> np.ndarray:
 
 def _shared(frames: np.ndarray) -> np.ndarray:
     """Returns the pixels, bool (v, u), whose four neighbours differ from the median of 5 × 5 in the same direction, as in a
-    blurred image of an object. The median over the four counts, since one of them may be dead too."""
+    blurred image of an object. The median of the neighbours' four differences counts, since one may be dead too."""
     difference = np.median([f - scipy.ndimage.median_filter(f, size=5) for f in frames], axis=0)
     wide = np.pad(difference, 1, mode="edge")
     sides = np.median([wide[:-2, 1:-1], wide[2:, 1:-1], wide[1:-1, :-2], wide[1:-1, 2:]], axis=0)

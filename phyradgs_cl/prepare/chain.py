@@ -37,8 +37,8 @@ DEFAULT_STEPS = "sparks,dead,rings"
 STEPS_HELP = f"Corrections of the frames, of {', '.join(STEPS)} (docs: prepare.md)."
 PREPARED_KEY = "prepared"
 """The key under which a scan's provenance lists the steps that were applied to it."""
-# Steps to run only once, because a second run would subtract from what the first one left. Where the provenance has a
-# "result" of such a step, it corrected nothing and may run again.
+# Steps to run only once, because a second run would subtract from what the first one left. A step whose entry in the
+# provenance has a "result" corrected nothing, and may run again.
 _ONCE = ("scatter", "hardening", "phase")
 
 
@@ -99,7 +99,7 @@ def prepare(scan: Scan, options: PrepareOptions, make_model: MakeModel) -> Scan:
 def one_by_one(
     scan: Scan, options: PrepareOptions, make_model: MakeModel
 ) -> Iterator[tuple[str, Scan, Facts]]:
-    """Applies the chosen steps as ``prepare`` does. Yields the name, the scan after the step, and the step's numbers."""
+    """Applies the chosen steps as ``prepare`` does. Yields for each step its name, the scan after it, and its numbers."""
     if options.flats not in ("mean", scan.provenance.get("flats")):
         expected = "counts and their flats, read from a file: load_scan(path, flats=...)"
         raise InputError("option flats", "a scan of line integrals", expected, "leave it out")

@@ -29,10 +29,10 @@ log = logging.getLogger(__name__)
 Polynomial = tuple[float, float, float]
 BoneIn = Callable[[np.ndarray], np.ndarray]
 """Maps a volume (z, y, x) to the attenuation of the bone in each voxel."""
-_LARGEST = 1e3  # larger coefficients and attenuations must be mistakes
-_PASSES = 2  # rounds in which bone is taken from a volume and frames are corrected for it: the second round has better bone
-_BONE_VOXELS = 128  # voxels along the longest side of the volume in which bone is found: its hardening is smooth
-# Candidates: soft tissue ends, and pure bone begins, at these fractions of the densest voxel (above 1: no voxel is pure).
+_LARGEST = 1e3  # limit of stated coefficients and attenuations: larger ones must be mistakes
+_PASSES = 2  # rounds that take bone from a volume and correct frames for it: the second round has better bone
+_BONE_VOXELS = 128  # most voxels along the longest side of the volume in which bone is found: hardening by bone is smooth
+# Candidates (a, b), fractions of the densest voxel: soft tissue ends at a, pure bone begins at b (above 1: no pure bone).
 _BETWEEN = [(soft, bone) for soft in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6) for bone in (0.4, 0.7, 1.0) if soft < bone]
 _BETWEEN += [(0.7, 1.0), (0.7, 1.5), (0.8, 1.5)]
 # Candidates count as equally good if they improve on water alone by at least 90 % as much as the best one does. Of these
@@ -41,7 +41,7 @@ _AS_WELL = 0.1
 # Bone is corrected even if this leaves up to 2 % more unexplained than water alone does, provided that it leaves less than
 # no correction: who states a voltage expects hardening.
 _NEARLY = 1.02
-_NEWTON = 3  # steps of Newton's method, enough for an error of 1e-12
+_NEWTON = 3  # steps of Newton's method that find the soft tissue: enough for an error of 1e-12
 _UNIFORM = 0.08  # the object has several materials if path lengths leave a larger relative RMS of line integrals unexplained
 _SHADOW = 0.1  # pixels whose path is longer than this fraction of the longest lie behind the object
 _WATER_TO = 8.0  # the polynomial of a voltage is fitted up to this line integral: 40 cm of water at 0.2/cm
@@ -79,7 +79,8 @@ class HardeningOptions(checks.Checked):
 
 
 def straighten(frames: np.ndarray, polynomial: Polynomial) -> np.ndarray:
-    """Returns p + a p² + b p³ + c p⁴ for line integrals p (any shape), float32. Values below 0 are air and stay."""
+    """Returns p + a p² + b p³ + c p⁴, float32, for line integrals p of any shape. polynomial: (a, b, c). Negative p are air
+    and stay as they are."""
     p = np.asarray(frames, np.float64)
     up = np.maximum(p, 0)
     square, cube, fourth = polynomial
@@ -138,7 +139,8 @@ def _straighten_two(
     frames: np.ndarray, spectrum: Spectrum, model: Model, blur: float, water: Polynomial, bone_in: BoneIn
 ) -> tuple[np.ndarray, float]:
     """Returns line integrals (F, v, u) corrected for soft tissue and bone, and bone's fraction of the volume's attenuation.
-    Without bone they are corrected for water. blur: standard deviation in pixels of the frames' blur for a coarse model."""
+    Without bone they are corrected by the polynomial ``water``. blur: standard deviation in pixels of the blur of frames for
+    ``model``. bone_in: returns the bone of a volume, as ``BoneIn``."""
     clean, share = straighten(frames, water), 0.0
     for _ in range(_PASSES):
         volume = model.regularised(step.smooth(clean, blur))
@@ -155,9 +157,9 @@ def find_bone(
 ) -> tuple[tuple[float, float] | None, dict[str, float]]:
     """Finds the candidate (``_BETWEEN``) whose corrected line integrals (F, v, u) agree best with their own reprojection.
 
-    Returns two fractions of the densest voxel: all is soft up to the first, all is bone from the second on (both infinite:
-    water alone is best; None: no correction). Also returns each alternative's unexplained rest. Raises InputError without an
-    object."""
+    Returns two fractions of the densest voxel: voxels up to the first are soft tissue, voxels from the second on are bone.
+    Both are infinite if water alone is best; None means no correction. Also returns the rest that each alternative leaves
+    unexplained. Raises InputError without an object."""
 
     def rest_of(clean: np.ndarray) -> float:
         return step.unexplained(clean, model.volume(clean), inside, model)

@@ -24,7 +24,7 @@ from phyradgs_cl.io import ToAttenuation, read_scan
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 WAYS = ("mean", "time", "pca")
-_MOST_COMPONENTS, _CLEAR = 4, 4.0  # most components used; those with less than 4 times the median variance are noise
+_MOST_COMPONENTS, _CLEAR = 4, 4.0  # most components used; a component with less than 4 times the median variance is noise
 _REWEIGHTINGS = 12  # rounds of least squares, each with new weights
 _LEAST_PIXELS = 20  # with fewer pixels of air in a frame, their median is too noisy
 _AROUND = np.ones((3, 3), bool)
@@ -37,8 +37,8 @@ def flat_correction(way: str) -> ToAttenuation:
     """Returns the function that converts counts to line integrals for ``read_scan``. way: how the function uses the flats
     (``WAYS``).
 
-    The function takes data (F, v, u), image_key (F,) and the quantity, and returns line integrals (P, v, u) and bad pixels.
-    It raises InputError for too few flats and, with "time" or "pca", for other quantities than counts."""
+    The function takes data (F, v, u), image_key (F,) and the data's quantity. It returns line integrals (P, v, u) and bad
+    pixels. It raises InputError for too few flats and, with "time" or "pca", for other quantities than "counts"."""
     checks.one_of("flats", way, WAYS)
     return counts_to_attenuation if way == "mean" else partial(_with_changing_flats, way)
 
@@ -70,7 +70,7 @@ def _with_changing_flats(
 
 
 def _in_time(signal: np.ndarray, flats: np.ndarray, numbers: np.ndarray) -> Iterator[np.ndarray]:
-    """Yields each projection's flat (v, u): means of flats taken one after another, interpolated by frame number."""
+    """Yields each projection's flat (v, u): the means of flats taken one after another, interpolated by frame number."""
     groups = np.split(np.arange(len(flats)), np.flatnonzero(np.diff(flats) > 1) + 1)
     time = np.array([flats[group].mean() for group in groups])
     means = np.stack([signal[group].mean(axis=0) for group in groups])
@@ -140,7 +140,7 @@ def find_air(frames: np.ndarray, *, below: float = 0.05) -> np.ndarray:
     """Returns the pixels of line integrals (F, v, u) that no object covers, bool (F, v, u).
 
     They exceed the air's median by less than the fraction ``below`` of the largest line integral (99.9th percentile), are
-    connected with the first or last column through such pixels, and lie at least two pixels away from all others."""
+    connected with the first or last column through such pixels, and lie more than two pixels away from all others."""
     limit = below * float(np.percentile(frames, 99.9))
     air = np.empty(frames.shape, bool)
     for f, frame in enumerate(frames):

@@ -1,5 +1,5 @@
-"""Metal: masks rays through it for iterative methods, fills its shadow for FDK, and returns its voxels for the finished
-volume (Kalender, Hebel and Ebersberger, Radiology 164 (1987) 576)."""
+"""Masks rays through metal for iterative methods, fills the metal's shadow for FDK, and returns the metal's voxels for the
+finished volume (Kalender, Hebel and Ebersberger, Radiology 164 (1987) 576)."""
 
 from dataclasses import dataclass, replace
 
@@ -13,11 +13,11 @@ from phyradgs_cl.fields import Metal
 from phyradgs_cl.prepare import step
 from phyradgs_cl.prepare.step import Facts, MakeModel
 
-_DENSER = 6.0  # metal attenuates 6 times as much as the main material: bone has up to 5 times water's, titanium 7 or more
+_DENSER = 6.0  # metal has at least 6 times the main material's attenuation; bone has up to 5 times water's, titanium 7
 _FEWEST = 4  # fewer touching voxels than this are noise, not metal
-_BLIND = 2  # voxels this near to metal, in voxels, are filled from outside: all rays through them are masked
+_BLIND = 2  # voxels up to this many voxels from metal are filled from outside: all rays through them are masked
 _VOXELS = 128  # the volume that fills the shadow has at most this many voxels along its longest side, to save time
-_MOST, _OBJECT = 0.5, 0.02  # the shadow may cover at most half of the pixels above 0.02 of the frames' largest value
+_MOST, _OBJECT = 0.5, 0.02  # the shadow may cover at most half of the pixels that exceed 0.02 of the frames' largest value
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class MetalOptions(checks.Checked):
 
 
 def mask_metal(scan: Scan, options: MetalOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
-    """Returns the scan with the shadow of metal masked and filled, and with the metal's voxels. A scan without metal is
-    returned itself. Raises InputError where the shadow covers most of the object."""
+    """Returns the scan with the shadow of metal masked and filled, and with the metal's voxels. Returns a scan without metal
+    unchanged. Raises InputError where the shadow covers most of the object."""
     model = make_model(scan)
     frames = step.unmasked_frames(scan)
     volume = model.volume(frames)
@@ -54,8 +54,8 @@ def mask_metal(scan: Scan, options: MetalOptions, make_model: MakeModel) -> tupl
 
 
 def _completed(masked: Scan, shadow: np.ndarray, is_metal: np.ndarray, make_model: MakeModel) -> np.ndarray:
-    """Returns the frames (F, v, u) with the shadow filled by the projection of a volume that the other pixels give. The
-    projection's difference from the frames at the shadow's rim is interpolated across the shadow, so that no edge is left.
+    """Returns the frames (F, v, u) with the shadow filled by the projection of a volume, reconstructed from the other
+    pixels. The projection's difference from the frames at the shadow's rim is interpolated across the shadow: no edge shows.
 
     Only masked rays meet the voxels in and next to metal. These voxels would stay near 0, so they get the density around."""
     model, _ = step.coarse_model(masked, make_model, _VOXELS)

@@ -26,17 +26,17 @@ from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
 _LEAST_FRAMES = 8  # fewer views do not average the object enough to show rings: such scans stay unchanged
 _LEAST_PAIRS = 0.25  # columns are compared with their mirror images if at least this fraction of them has one on the panel
-_LEAST_SHARE = 0.25  # a pattern with less than this fraction of the variance of the mean's noise is not worth a correction
-_NEGLIGIBLE = 1e-4  # nobody sees a pattern with a smaller standard deviation in line integrals: gains off by 0.01 %
-_SURE = 12.0  # a pattern is certain if its variance exceeds this / √pixels times the noise's variance: 12 standard errors
-_THRESHOLD = 3.5  # coefficients above this many standard deviations of the pattern belong to the object
+_LEAST_SHARE = 0.25  # a pattern whose variance is below this fraction of the variance of the mean's noise is not corrected
+_NEGLIGIBLE = 1e-4  # a pattern with a smaller standard deviation in line integrals is invisible: gains off by 0.01 %
+_SURE = 12.0  # a pattern is certain if its variance exceeds (this / √pixels) times the noise's: 12 standard errors
+_THRESHOLD = 3.5  # cosine coefficients above this many standard deviations of the pattern belong to the object
 _SHIFTS = 8  # positions of the blocks along each side, over which the result is averaged so that no block edges show
 _DEVIATIONS = 8.0  # a gain is wrong if it is off by more than this many robust standard deviations in both sets of views
-_LEAST = 2e-3  # a gain that is off by less, 0.2 %, is left alone
+_LEAST = 2e-3  # a gain that is off by less than this, 0.2 %, is left alone
 _NEIGHBOURS = 7  # deviations are measured from the median of this many columns
 _NEAR = 21  # the usual deviation near a pixel is the median over this many columns
 _AXIS = 3  # near the axis an object's edges stay in one column, like rings: this many columns on each side are left alone
-_UNEQUAL = 0.25  # the two sets of views may differ about a wrong gain by this fraction, plus 2 standard deviations
+_UNEQUAL = 0.25  # a wrong gain's value in the two sets of views may differ by this fraction of it plus 2 standard deviations
 _OBJECT = 0.5  # a pixel whose mirror image deviates by more than this fraction of its own deviation is left alone
 _EQUALLY_FAR = 1.15  # in a full turn, (largest distance / smallest distance) of the sources from their mean is below this
 
@@ -81,7 +81,7 @@ def _strength(means: np.ndarray, axis_column: float) -> Strength:
 
 
 def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
-    """Returns the scan without rings and single wrong gains, unchanged where nothing is certain; and the step's numbers."""
+    """Returns the scan without rings and single wrong gains, or unchanged if no error is certain; and the step's numbers."""
     frames = unmasked_frames(scan)
     if options.window > frames.shape[2]:
         expected = f"no more than the panel's {frames.shape[2]} columns"
@@ -123,8 +123,8 @@ def _means(frames: np.ndarray, full_turn: bool) -> np.ndarray:
 
 
 def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: float | None) -> np.ndarray:
-    """Returns the pattern (v, u) float32, given its strength. If all columns have a mirror image, the symmetric and the
-    antisymmetric part of the mean over views hold half of the pattern's variance each, and are denoised separately."""
+    """Returns the pattern (v, u) float32, or 0 if it is not certain. If all columns have a mirror image, the symmetric and
+    the antisymmetric part of the mean over views hold half of the pattern's variance each, and are denoised separately."""
     mean = frames.mean(axis=0, dtype=np.float64)
     if not strength.is_certain:
         return np.zeros(mean.shape, np.float32)
@@ -138,8 +138,9 @@ def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: f
 
 
 def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarray:
-    """Denoises an image (v, u): thresholds the coefficients of overlapping cosine blocks, then guides a Wiener filter by the
-    result. variances (2,): the variance of each pixel's own noise, and of the noise that a whole column shares."""
+    """Denoises an image (v, u): thresholds the coefficients of overlapping cosine blocks of side ``window``, then guides a
+    Wiener filter by the result. variances (2,): that of each pixel's own noise, and that of the noise that a whole column
+    shares."""
     sigma = np.full((window, window), variances[0])
     # an error that a column shares is constant along it, so only the first row of coefficients has it
     sigma[0] += window * variances[1]
@@ -151,9 +152,9 @@ def _denoised(image: np.ndarray, variances: np.ndarray, window: int) -> np.ndarr
 def _blockwise(
     image: np.ndarray, guide: np.ndarray, share_of: Callable[[np.ndarray], np.ndarray], window: int
 ) -> np.ndarray:
-    """Multiplies the cosine coefficients of overlapping blocks by ``share_of`` the coefficients of ``guide``, and averages
-    blocks where they overlap. Each block keeps its mean value. A block of fewer remaining coefficients has less noise and
-    weighs more."""
+    """Multiplies the cosine coefficients of overlapping blocks of ``image`` by ``share_of``(coefficients of ``guide``), and
+    averages blocks where they overlap. Each block keeps its mean value. A block with fewer coefficients left has less noise
+    and weighs more."""
     width = [(window, window + (-n) % window) for n in image.shape]
     padded, guiding = (np.pad(part, width, mode="symmetric") for part in (image, guide))
     total, weight = np.zeros_like(padded), np.zeros_like(padded)
@@ -205,18 +206,18 @@ def _antisymmetric(mean: np.ndarray, axis_column: float | None) -> np.ndarray:
 
 
 def _rough(image: np.ndarray) -> np.ndarray:
-    return (2 * image[:, 1:-1] - image[:, :-2] - image[:, 2:]) / np.sqrt(6)  # white noise keeps its variance
+    return (2 * image[:, 1:-1] - image[:, :-2] - image[:, 2:]) / np.sqrt(6)  # the factor keeps the variance of white noise
 
 
 def _covariance(one: np.ndarray, other: np.ndarray) -> float:
-    """Returns a robust covariance, which few edge pixels hardly change (Gnanadesikan and Kettenring, Biometrics 1972)."""
+    """Returns a robust covariance: few edge pixels hardly change it (Gnanadesikan and Kettenring, Biometrics 1972)."""
     return (robust_deviation(one + other) ** 2 - robust_deviation(one - other) ** 2) / 4
 
 
 @dataclass(frozen=True)
 class SingleGains:
     """Wrong gains of whole columns and single pixels. offset: the error (v, u) float32 that they add to line integrals, 0
-    elsewhere. columns, pixels: how many columns and single pixels have one."""
+    elsewhere. columns, pixels: how many columns and single pixels have a wrong gain."""
 
     offset: np.ndarray
     columns: int = 0
@@ -238,7 +239,8 @@ def find_single_gains(
     means: np.ndarray, mirrored: np.ndarray, usable: np.ndarray, full_turn: bool
 ) -> SingleGains:
     """Finds single wrong gains in the means (2, v, u) of two sets of views. mirrored: the columns' mirror images, from
-    ``mirror_columns``; columns without a mirror image are left alone. usable: bool (v, u), False for masked pixels."""
+    ``mirror_columns``; columns without a mirror image are left alone. usable: bool (v, u), False for masked pixels.
+    full_turn: finds wrong pixels too, not only columns; on an arc an edge of the object looks like a wrong pixel."""
     offset = np.zeros(usable.shape, np.float32)
     if len(mirrored) < _NEAR:
         return SingleGains(offset)
@@ -264,7 +266,7 @@ def _deviation(means: np.ndarray) -> np.ndarray:
 
 def _outliers(deviation: np.ndarray, unlike: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """Returns the errors (v, u) of outliers, 0 elsewhere. deviation: ``_deviation`` (set, v, u) of the means. unlike:
-    ``_deviation`` of the means minus their mirror images, which cancels the object."""
+    ``_deviation`` of the means minus their mirror images, which cancels the object. usable: pixels that may be outliers."""
     around = (1, 3, 3)
     mirrored = deviation[..., ::-1]
     low, high = scipy.ndimage.minimum_filter(mirrored, around), scipy.ndimage.maximum_filter(mirrored, around)

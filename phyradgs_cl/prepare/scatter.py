@@ -37,10 +37,10 @@ _MOST_STEPS = 8  # at most this many steps make the kernel stronger, up to 6 tim
 _TRIALS = 6  # most strengths tried in the final search, between the neighbours of the best one
 # A stronger kernel is taken if it leaves less than this fraction of the rest that the fitted kernel leaves unexplained.
 _BETTER = 0.65
-_AS_WELL = 1.05  # no stronger kernel is tried once one leaves over this many times the least rest found so far
-_LEAST_RATIO = 0.01  # less scatter than this, over primary light behind the object, is not told from none
+_AS_WELL = 1.05  # no stronger kernel is tried after one that leaves over this many times the least unexplained rest so far
+_LEAST_RATIO = 0.01  # a ratio (scatter)/(primary light) behind the object below this is not told from 0
 _LARGEST_HEIGHT = 1000.0  # no kernel for a stated to_primary is stronger than this
-_BISECTIONS = 26  # halvings of an interval of 1000, which give the strength for a stated to_primary to within 2e-5
+_BISECTIONS = 26  # halvings of the interval from 0 to 1000 that give the strength for a stated to_primary to within 2e-5
 _SAME_RATIO = 0.25  # a kernel gives a stated to_primary if its ratio differs by at most this fraction
 
 
@@ -70,7 +70,7 @@ def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel)
     if options.to_primary == 0 and ratio < _LEAST_RATIO:
         return scan, {"result": "no scatter found in the light beside the object: the projections stay as they are"}
     if options.to_primary > 0 and abs(ratio - options.to_primary) > _SAME_RATIO * options.to_primary:
-        # a thin object scatters little in this model: with its strength the ratio jumps to nearly all light
+        # a thin object scatters little in this model: as the kernel grows stronger, the ratio jumps past to_primary
         expected = f"a ratio that the kernel gives, here {ratio:.2g}"
         raise InputError("scatter.to_primary", f"{options.to_primary:g}", expected, "leave thin objects without this step")
     terms = {"reach": [reach for reach, _ in kernel], "power": [power for _, power in kernel]}
@@ -84,9 +84,9 @@ def remove_scatter(frames: np.ndarray, kernel: Kernel) -> np.ndarray:
 
 
 def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kernel:
-    """Fits the kernel, by non-negative least squares, to the transmission above 1 in ``air``, bool (F, v, u), of line
-    integrals (F, v, u). A ``reach`` other than 0 fixes its width. The light may vary between frames; on average it is that
-    of the flats."""
+    """Fits the kernel by non-negative least squares: the scatter explains by how much the transmission exceeds 1 in ``air``,
+    bool (F, v, u), of line integrals (F, v, u). A ``reach`` other than 0 fixes the kernel's width. The light may vary
+    between frames; its mean is that of the flats."""
     numbers = _some(len(frames))
     recorded, where = np.exp(-frames[numbers].astype(np.float64)), air[numbers]
     terms = list(itertools.product((reach,) if reach > 0 else _REACHES, _POWERS))
@@ -104,9 +104,9 @@ def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kern
 
 
 def raised(kernel: Kernel, frames: np.ndarray, air: np.ndarray, model: Model, blur: float = 0.0) -> Kernel:
-    """Returns the kernel with the strength that leaves the least ``unexplained``. Returns it unchanged unless that is below
-    0.65 times what the fitted kernel leaves. frames: line integrals (F, v, u), which are first blurred by ``blur`` pixels to
-    fit a coarse model. The corrected frames are shifted so that the median of each frame's ``air``, bool (F, v, u), is 0."""
+    """Returns the kernel with the strength that leaves the least ``unexplained`` rest, or ``kernel`` itself unless that rest
+    is below 0.65 times the rest of ``kernel``. frames: line integrals (F, v, u), first blurred by ``blur`` pixels to fit a
+    coarse model. The corrected frames are shifted so that the median of each frame's ``air``, bool (F, v, u), is 0."""
     if not kernel:
         return kernel
     coarse = step.smooth(frames, blur)

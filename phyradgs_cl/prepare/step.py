@@ -12,16 +12,16 @@ from phyradgs_cl.fields import GridChoice
 
 Facts = dict[str, Any]
 """What a step did, as numbers and words by name, for the scan's provenance."""
-_COARSE_VOXELS = 48  # hardening and scatter are smooth, so few voxels along the longest side show them
-_INSIDE = 0.1  # the object is denser than this fraction of the densest voxel
-# Blur, as a fraction of the panel's longer side: it keeps the smooth errors of hardening and scatter, and removes the finer
-# ones of the grid.
+_COARSE_VOXELS = 48  # most voxels along the longest side of a coarse model: few suffice, as hardening and scatter are smooth
+_INSIDE = 0.1  # voxels above this fraction of the densest voxel belong to the object
+# Standard deviation of a blur, as a fraction of the panel's longer side: the blur keeps the smooth errors of hardening and
+# scatter, and removes the finer errors of the grid.
 _SMOOTH = 1 / 24
 
 
 @dataclass(frozen=True)
 class Model:
-    """Reconstructs a scan and projects the volume again, on its grid: for steps that need to know the object.
+    """Reconstructs a scan and projects the volume again, on the scan's grid: for steps that need to know the object.
 
     volume: reconstructs frames (F, v, u) to a volume (z, y, x) in 1/mm. frames: projects a volume. regularised: reconstructs
     more slowly, with a weak total-variation prior. shadow: returns the pixels, bool (F, v, u), whose rays meet given voxels,
@@ -45,7 +45,7 @@ def unmasked_frames(scan: Scan) -> np.ndarray:
 
 def fill_masked(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Returns frames (F, v, u) with masked pixels interpolated linearly along their row. A row without valid pixels is
-    interpolated between its neighbours; a frame without any becomes 0."""
+    interpolated between the nearest rows that have some; a frame without valid pixels becomes 0."""
     filled = frames.copy()
     empty: np.ndarray = np.asarray(mask.all(axis=-1))
     for f, v in zip(*np.nonzero(mask.any(axis=-1) & ~empty), strict=True):
@@ -94,19 +94,19 @@ def object_in(volume: np.ndarray) -> np.ndarray:
 
 
 def densest(volume: np.ndarray) -> float:
-    """Returns the 99.9th percentile in the middle of a volume (z, y, x), because a cone beam sees only part of its ends."""
+    """Returns the 99.9th percentile in the middle of a volume (z, y, x), since a cone beam sees its ends only in part."""
     z, y, x = (np.abs(np.arange(n) - (n - 1) / 2) / max(n / 2, 1) for n in volume.shape)
     middle = (z[:, None, None] <= 0.6) & (y[None, :, None] ** 2 + x[None, None, :] ** 2 <= 0.9)
     return float(np.percentile(volume[middle], 99.9))
 
 
 def unexplained(frames: np.ndarray, volume: np.ndarray, inside: np.ndarray, model: Model) -> float:
-    """Returns the relative RMS by which line integrals (F, v, u) differ from the projection of their ``volume``, after
-    blurring.
+    """Returns the RMS of the blurred difference between line integrals (F, v, u) and the projection of their ``volume``,
+    divided by the line integrals' RMS.
 
     Only voxels ``inside`` the object, bool (z, y, x), are projected. The grid and the number of views cause a difference
-    too, which is measured by reconstructing and projecting the projection itself, and subtracted. What remains is hardening,
-    scatter and the like."""
+    too. This part is measured by reconstructing and projecting the projection itself, and subtracted. What remains comes
+    from hardening, scatter and the like."""
 
     def reprojected(values: np.ndarray) -> np.ndarray:
         return model.frames(np.where(inside, np.maximum(values, 0), 0).astype(np.float32))

@@ -21,20 +21,19 @@ from phyradgs_cl.prepare.bad_pixels import axis_column
 from phyradgs_cl.prepare.rings import mirror_columns
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
 
-_LEAST_VIEWS = 60  # the method assumes that neighbouring columns record the same values, which takes this many views
-_LEAST = 2e-3  # a stripe whose line integrals deviate by less is left alone: this is a gain that is off by 0.2 %
+_LEAST_VIEWS = 60  # fewest views: the method assumes that neighbouring columns record the same values, which takes this many
+_LEAST = 2e-3  # a stripe whose line integrals deviate by less is left alone: its gain is off by less than 0.2 %
 _NEAR = 5  # each side of a column is represented by the median of this many columns
 _FLUCTUATING = 3.0  # a column fluctuates if it changes this many times as much between views as the columns at both sides
 _UNRESPONSIVE = 10.0  # a column does not respond if it varies this many times less than the columns at both sides
 _MIRRORED = 2.0  # an edge shows in the mirror image too: a stripe deviates this many times as much as its image
-_SMALLEST = 1e-6  # least spread in line integrals, to divide by: that of a stuck pixel is 0
+_SMALLEST = 1e-6  # least spread of a column, in line integrals, as a divisor: the spread of a stuck pixel is 0
 
 
 @dataclass(frozen=True)
 class StripeOptions(checks.Checked):
     """Options of the step ``stripes``. width: columns over which the median is taken; stripes are narrower than half of it.
-    ratio: a stripe deviates this many times as much as the columns at both sides; 0 replaces every column, as the paper
-    does."""
+    ratio: a stripe deviates at least this many times as much as the columns at both sides; 0 replaces all columns."""
 
     PREFIX = "stripes."
 
@@ -80,8 +79,8 @@ def _spread(sinogram: np.ndarray) -> np.ndarray:
 
 
 def _stand_out(values: np.ndarray, ratio: float, mirrored: np.ndarray) -> np.ndarray:
-    """Returns the columns, bool (u,), whose ``values`` exceed ``ratio`` times those at both sides, and twice those of their
-    mirror image if ``mirrored`` has one. A ratio of 0 chooses all columns."""
+    """Returns the columns, bool (u,), whose ``values`` exceed ``_LEAST``, ``ratio`` times those at both sides, and twice
+    those of their mirror image, if ``mirrored`` has one. A ratio of 0 chooses all columns."""
     if ratio == 0:
         return np.ones(len(values), bool)
     columns, usual = np.arange(len(values)), scipy.ndimage.median_filter(values, _NEAR)

@@ -1,7 +1,7 @@
-"""Sums, products and norms of arrays behind one interface (``Space``), for host and device: NumPy or cl/algebra.cl.
+"""Sums, products and norms of arrays behind one interface (``Space``): NumPy on the host, cl/algebra.cl on a device.
 
-An iterative method is written once, in terms of a ``Space``. Every function returns a new array, which stays on the device,
-or a number on the host. The same arrays on the same device always give the same bits."""
+An iterative method is written once, in terms of a ``Space``. A ``Space`` returns arrays, which stay on the device, or
+numbers on the host. The same arrays on the same device always give the same bits."""
 
 import weakref
 from collections import defaultdict
@@ -53,7 +53,7 @@ class Space(Protocol, Generic[A]):
         """Returns x y element by element. y may lack the first axes of x: it is then repeated along these axes."""
 
     def reciprocal(self, x: A, share: float) -> A:
-        """Returns 1/max(x, ``share`` · largest x) where x > 0, else 0, so that small x give no huge result."""
+        """Returns 1/max(x, ``share`` · m) where x > 0, else 0. m: the largest x. The bound limits the results of small x."""
 
     def inner(self, x: A, y: A) -> float:
         """Returns Σ x y, with the accuracy of float64."""
@@ -68,7 +68,7 @@ class Space(Protocol, Generic[A]):
         """Returns Σ ‖x‖² over ``arrays``, which may be a generator. A device sends back only the sum over all arrays."""
 
     def largest(self, x: A, *, absolute: bool = False) -> float:
-        """Returns the largest x, or the largest |x| if ``absolute``."""
+        """Returns the largest element of x, or of |x| if ``absolute``."""
 
 
 class HostSpace:
@@ -134,12 +134,12 @@ class DeviceSpace:
     def __init__(self, rt: Runtime) -> None:
         self.rt = rt
         self._unused: dict[int, list[DeviceArray]] = defaultdict(list)
-        # Memory for the work-groups' sums, the total of an array, and a total to which several arrays are added.
+        # Memory for the work-groups' partial sums, for the sum of one array, and for a sum over several arrays.
         self._parts, self._whole, self._total = (rt.empty(count, np.float64) for count in (_GPU_GROUPS, 1, 1))
 
     def empty(self, shape: Shape) -> DeviceArray:
-        """Returns uninitialised memory, of a released array if one of this size is left. Queued work may still read that
-        array: the queue is in order, so what is written to the new array comes later."""
+        """Returns uninitialised memory, that of a released array of this size if there is one. Queued work may still read
+        that array: the queue is in order, so writes to the new array come later."""
         unused = self._unused[int(np.prod(shape, dtype=np.int64))]
         memory = unused.pop() if unused else self.rt.empty(shape)
         array = DeviceArray(memory.buffer, tuple(shape), memory.dtype)
@@ -191,7 +191,7 @@ class DeviceSpace:
     def descend(self, x: DeviceArray, y: DeviceArray, step: float) -> DeviceArray:
         """Returns x − ``step`` y/‖y‖, or x if y is all 0. The host need not wait, since ‖y‖ stays on the device."""
         self._sum("dot_parts", self._whole, y, y)
-        # Two floats, the rounded step and the rest, keep the step's precision on devices without float64.
+        # Two float32, the rounded step and its rounding error, keep the step's precision on devices without float64.
         high = np.float32(step)
         return self._each("descend", x, y, np.array([high, step - float(high)], np.float32), self._whole)
 
@@ -217,8 +217,8 @@ class DeviceSpace:
         return float(self.rt.download(self._parts).view(np.float32)[:groups].max())
 
     def _each(self, name: str, x: DeviceArray, *others: Any, period: int = 0) -> DeviceArray:
-        """Returns the result of an element-wise kernel for x and the other arguments. period: the size of a second operand
-        that is smaller than x and repeats along x; 0 if all operands have the size of x."""
+        """Returns the result of the element-wise kernel ``name`` for x and ``others``. period: the size of an operand that
+        is smaller than x and repeats along x; 0 if all operands have the size of x."""
         result, count = self.empty(x.shape), period or x.size
         items = ceil_div(count, self.rt.lanes), x.size // max(count, 1)
         kernel = self.rt.kernel("algebra", name)

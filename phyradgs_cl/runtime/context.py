@@ -24,10 +24,10 @@ log = logging.getLogger(__name__)
 Sides = tuple[int, ...]
 
 LANE_CHOICES = (1, 4, 8, 16)  # numbers of floats that a kernel's vectors may have
-# The compiler's option that fuses multiply and add, and the line of a source that includes arithmetic on pairs of float32.
+# The compiler's option that fuses multiply and add; the line by which a source begins its header for pairs of float32.
 _FUSING, _PAIRS = "-cl-mad-enable", '#line 1 "common/precise.h"'
 _TILE_ITEMS = 256  # largest work-group that shares a tile of pixels, in work-items
-_FEWEST_ITEMS = 32  # least work-group, in work-items, that a kernel must allow if its launch asks for one as large or larger
+_FEWEST_ITEMS = 32  # a kernel whose launch asks for groups of this many work-items or more must allow at least this many
 
 
 class Runtime:
@@ -46,7 +46,7 @@ class Runtime:
     Raises DeviceError for a device that does not exist or cannot be opened, and for ``lanes`` other than 1, 4, 8 or 16, or
     other than 1 with ``pixel_items``. Raises InputError for a ``memory`` that is no size."""
 
-    # Most samples of rays in one GPU launch: a display driver kills launches of seconds, and these take 0.1 s on a slow GPU.
+    # Most samples of rays in one GPU launch, 0.1 s on a slow GPU: display drivers kill launches that take seconds.
     most_samples = 2**29
 
     def __init__(
@@ -180,7 +180,7 @@ class Runtime:
 
     @naming_failures("a copy to it")
     def write(self, array: DeviceArray, values: np.ndarray) -> None:
-        """Copies NumPy values (same size) into an existing array, and waits until they may be overwritten."""
+        """Copies NumPy values (same size) into an existing array, and returns once the values may be overwritten."""
         values = np.ascontiguousarray(values, dtype=array.dtype)
         if values.size:
             cl.enqueue_copy(self.queue, array.buffer, values, is_blocking=True)
@@ -258,7 +258,7 @@ class Runtime:
                     event = cl.enqueue_nd_range_kernel(self.queue, built, part, local, first)
                     self._record(kernel.function_name, event, nbytes if first is None or not any(first) else 0)
                     if first is not None:
-                        self.queue.flush()  # without it the driver may give the GPU several launches at once
+                        self.queue.flush()  # without a flush the driver may give the GPU several parts of a launch at once
         except cl.Error as error:
             raise self.ledger.error(f"a launch of {kernel.function_name}", error, self.queue) from error
 
@@ -275,9 +275,8 @@ class Runtime:
         return tuple(sides)
 
     def group(self, on_cpu: int = 1, on_gpu: int = 64, *kernels: Kernel) -> int:
-        """Returns a work-group's size in work-items, ``on_cpu`` or ``on_gpu``. A GPU's size is halved until ``kernels`` can
-        run. Name here every kernel whose local memory depends on the size: ``launch`` could halve its groups afterwards,
-        but not its memory."""
+        """Returns a work-group's size in work-items: ``on_cpu``, or ``on_gpu`` halved until all ``kernels`` can run. Name
+        here all kernels whose local memory depends on the size: ``launch`` may halve their groups, but not their memory."""
         while self.pixel_items and any(on_gpu > self.most_items(kernel) for kernel in kernels):
             on_gpu //= 2
         return on_gpu if self.pixel_items else on_cpu
@@ -293,8 +292,8 @@ class Runtime:
         return int(self.compile(kernel).get_work_group_info(getattr(cl.kernel_work_group_info, name), self.device.handle))
 
     def _fitting(self, kernel: Kernel, group: tuple[int, ...]) -> tuple[int, ...]:
-        """Halves the sides of a work-group until the kernel can run. Raises DeviceError for a group of several work-items if
-        the kernel allows neither the whole group nor 32 of them."""
+        """Returns a work-group's sides, halved until the kernel can run. Raises DeviceError for a group of several
+        work-items if the kernel allows neither the whole group nor 32 work-items."""
         if math.prod(group) == 1:
             return group
         most, sides = self.most_items(kernel), list(group)

@@ -41,12 +41,12 @@ class DeviceInfo:
     has_fp64: bool
     by_default: bool
     handle: "cl.Device"
-    target: str | None = None  # the processor for which PoCL builds kernels; None: unknown, or a device not of PoCL
+    target: str | None = None  # the processor for which PoCL builds kernels; None: unknown, or not a CPU of PoCL
 
     @property
     def rank(self) -> tuple[int, int, int, int, int]:
         """The key by which devices are compared: the best device has the largest. Entries: 1 if it may be chosen by default;
-        2 for a GPU, 1 for a CPU; 1 if it has memory of its own; floats in its vectors; its compute units."""
+        2 for a GPU, 1 for a CPU, 0 for others; 1 if it has memory of its own; floats in its vectors; its compute units."""
         kind = {"gpu": 2, "cpu": 1}.get(self.kind, 0)
         unified = bool(self.handle.host_unified_memory)
         return (int(self.by_default), kind, int(not unified), self.vector_width, self.compute_units)

@@ -13,7 +13,7 @@ from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.runtime.context import Runtime
 from phyradgs_cl.runtime.memory import Array, DeviceArray, SameArray
 
-GUARD = 16  # number of floats before the first row, and least number of zeros after each row
+GUARD = 16  # number of zeros before the first row, and least number of zeros after each row
 
 _TILE = 16  # a CPU's work-item transposes a tile of this many rows and columns, which stays in the cache
 
@@ -28,8 +28,8 @@ class Strides:
 
     @classmethod
     def plain(cls, shape: Sequence[int], first: Sequence[int] = (0, 0, 0)) -> "Strides":
-        """Returns the strides of a part of a C-contiguous array of ``shape`` (nz, ny, nx). first: the part's first element,
-        (z, y, x)."""
+        """Returns the strides of an array of ``shape`` (nz, ny, nx) in C order, for its part from element ``first`` (z, y,
+        x) on."""
         _, ny, nx = shape
         return cls((first[0] * ny + first[1]) * nx + first[2], ny * nx, nx)
 
@@ -64,7 +64,7 @@ def beside(rt: Runtime, volume: Array, out: DeviceArray | None) -> tuple[DeviceA
 
 
 def brought_to(rt: Runtime, like: SameArray, result: DeviceArray) -> SameArray:
-    """Returns ``result`` as a NumPy array if ``like`` is one, else on the device as it is."""
+    """Returns the device array ``result``, downloaded to NumPy if ``like`` is a NumPy array."""
     return cast(SameArray, result if isinstance(like, DeviceArray) else rt.download(result))
 
 
@@ -87,7 +87,7 @@ def pad_rows(values: np.ndarray) -> np.ndarray:
 
 
 def unpad_rows(flat: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Inverts ``pad_rows`` for an image or volume of the given shape."""
+    """Returns the image or volume of the given shape that ``pad_rows`` has turned into ``flat``."""
     width, rows = shape[-1], int(np.prod(shape[:-1], dtype=np.int64))
     body = flat[GUARD : GUARD + rows * pitch_of(width)].reshape(rows, -1)
     return np.ascontiguousarray(body[:, :width]).reshape(shape)

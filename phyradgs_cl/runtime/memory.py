@@ -26,12 +26,12 @@ _UNITS = {"": 1, "B": 1}
 for _power, _letter in enumerate("KMGT", start=1):
     _UNITS |= {_letter: 1024**_power, f"{_letter}IB": 1024**_power, f"{_letter}B": 1000**_power}
 log = logging.getLogger(__name__)
-# OpenCL's codes: allocation failure, out of resources, out of host memory, invalid buffer size.
+# OpenCL's error codes for a shortage: allocation failure, out of resources, out of host memory, invalid buffer size.
 _MEMORY_CODES = (-4, -5, -6, -61)
 
 
 class MemoryShortage(OutOfMemoryError):
-    """Raised for a buffer that is too large for the device or for the limit. Work on smaller parts of a volume may fit."""
+    """Raised where device memory runs short: beyond the limit, or in the driver. Smaller parts of a volume may fit."""
 
 
 @dataclass(eq=False)
@@ -103,7 +103,7 @@ class Room:
 
 
 class MemoryLedger:
-    """Counts the device memory in use, in bytes, and refuses buffers beyond a limit."""
+    """Counts the device memory in use, in bytes, and refuses a buffer that would raise it above ``limit_bytes``."""
 
     def __init__(self, device: DeviceInfo, limit_bytes: int | None) -> None:
         self.device = device
@@ -115,7 +115,7 @@ class MemoryLedger:
         self.held_bytes = 0
         self.peak_bytes = 0
         self.reserved_bytes = 0
-        self._counting = threading.RLock()  # arrays of any Python thread; collecting one may interrupt a count
+        self._counting = threading.RLock()  # for threads; re-entrant: the release of an array may count amid a count
 
     def count(self, nbytes: int) -> None:
         with self._counting:
@@ -140,7 +140,7 @@ class MemoryLedger:
         return Room(int(self.planned * free_bytes), min(largest_bytes, self.limit_bytes))
 
     def check(self, nbytes: int, largest_bytes: int) -> None:
-        """Raises MemoryShortage for a buffer of ``nbytes`` that is larger than ``largest_bytes`` or would pass the limit."""
+        """Raises MemoryShortage for a buffer of ``nbytes`` above ``largest_bytes``, or above the rest of the limit."""
         subject, found = f"memory of {self.device.name}", f"{mebibytes(nbytes)} in one buffer"
         remedy = "use a smaller problem"
         if nbytes > largest_bytes:
@@ -153,11 +153,11 @@ class MemoryLedger:
             raise MemoryShortage(subject, found, expected, remedy)
 
     def error(self, work: str, error: "cl.Error", queue: "cl.CommandQueue | None" = None) -> DeviceError:
-        """Returns an OpenCL error as a DeviceError, or as a MemoryShortage if memory ran out. work: what failed.
+        """Returns an OpenCL error as a DeviceError, or as a MemoryShortage if memory ran out. work: the failed call.
 
         Some drivers report a shortage only at a launch or a wait. They also say "out of resources" after a kernel that
         crashed or ran too long. In that case ``queue`` no longer works, which tells the two causes apart."""
-        code = getattr(error, "code", 0)  # some errors of pyopencl have no code, as those of builds
+        code = getattr(error, "code", 0)  # some errors of pyopencl, such as those of a build, have no code
         is_dead = queue is not None and not answers(queue)
         if not is_dead and (isinstance(error, cl.MemoryError) or code in _MEMORY_CODES):
             remedy = f"set a limit with --memory or {MEMORY_VARIABLE}, or use a smaller problem"
@@ -191,8 +191,8 @@ def reported_bytes(device: DeviceInfo) -> int | None:
 
 
 def memory_limit(wish: str | int | None) -> int | None:
-    """Returns the limit in bytes that ``wish`` or the environment variable PHYRADGS_MEMORY sets; None if neither does.
-    Raises InputError for text that is no size."""
+    """Returns the limit in bytes from ``wish``, else from the environment variable PHYRADGS_MEMORY, or None if neither is
+    set. Raises InputError for a value that is no size."""
     if wish is not None:
         return bytes_of(wish, "memory")
     text = os.environ.get(MEMORY_VARIABLE)
@@ -232,7 +232,7 @@ class Attempt:
     def __exit__(self, kind: object, error: object, at: object) -> bool:
         self.has_failed = isinstance(error, MemoryShortage) and self.share == 1
         if self.has_failed:
-            # As text, because a log record that held the error would keep its buffers alive.
+            # The error is logged as text: a record with the error itself would keep the failed attempt's buffers alive.
             log.warning("%s: %s; trying again with smaller bricks", self.what, str(error))
         return self.has_failed
 
@@ -246,8 +246,7 @@ def attempts(what: str) -> Iterator[Attempt]:
 
 
 def is_cl_array(value: object) -> bool:
-    """Returns whether a value is a pyopencl.array.Array. Does not import pyopencl.array: until it is imported, there is no
-    such value."""
+    """Returns whether a value is a pyopencl.array.Array. Its module is not imported: without it no such value exists."""
     module = sys.modules.get("pyopencl.array")
     return module is not None and isinstance(value, module.Array)
 
@@ -269,7 +268,7 @@ def adopted(name: str, array: Any, queue: "cl.CommandQueue") -> DeviceArray:
 
 
 def lent(array: DeviceArray, queue: "cl.CommandQueue") -> Any:
-    """Returns a DeviceArray as pyopencl's Array on the same memory, which counts as used while the Array exists."""
+    """Returns a DeviceArray as pyopencl's Array on the same memory, which counts as in use while the Array exists."""
     import pyopencl.array
 
     shared = pyopencl.array.Array(queue, array.shape, array.dtype, data=array.buffer)

@@ -1,15 +1,16 @@
 """Makes PoCL (OpenCL on CPUs) fast and safe: sets its cache and threads, and the processor for which it builds kernels.
 
-PoCL links each kernel with a library of built-in functions (fma, min, vload16, ...). Its wheel has one such library for each
-family of x86 processors. LLVM inlines a function only if the kernel's processor has all instruction sets of the processor
-for which the library was built. PoCL 3.0 builds kernels for the processor that LLVM 14 takes the host for. It may be wrong:
+PoCL links each kernel with a library of built-in functions (fma, min, vload16, ...). PoCL's wheel has one such library for
+each family of x86 processors. LLVM inlines a built-in only if the kernel's processor has all instruction sets of the
+processor for which the library was built. PoCL 3.0 builds kernels for the processor that LLVM 14 takes the host for, which
+may be wrong:
 
-- Ice Lake lacks the instruction CLWB in LLVM's list, so no built-in is inlined, and kernels are 3 times slower.
+- LLVM's Ice Lake lacks the instruction CLWB of the library's processor. No built-in is inlined: kernels are 3 times slower.
 - An unknown processor becomes "generic", for which no kernel builds (pocl/pocl issue 1049).
 - Zen 4 is taken for a Zen 3 without AVX-512, and LLVM aborts ("Cannot select: i64 = fma").
 
-PoCL has no setting for the processor's name. Its record of the device in memory points to the name, so this pointer is
-changed to the name of the library's processor."""
+PoCL has no setting for the processor's name. In memory, PoCL's record of a device has a pointer to this name.
+``use_library_target`` changes the pointer to the name of the library's processor."""
 
 import contextlib
 import ctypes
@@ -30,11 +31,11 @@ from phyradgs_cl.parallel import Launch, launched
 
 log = logging.getLogger(__name__)
 
-_RECORD_BYTES = 2048  # number of bytes of PoCL's record of a device that are searched for the processor's name
-_LONGEST_TEXT = 64  # most bytes of a text that are read at an address in PoCL's record of a device
+_RECORD_BYTES = 2048  # this many bytes of PoCL's record of a device are searched for the processor's name
+_LONGEST_TEXT = 64  # most bytes read of a text to which PoCL's record of a device points
 _TRIPLE = re.compile(rb"x86_64-[a-z0-9_]+-linux-gnu\Z")
 _PROCESSOR = re.compile(rb"[a-z0-9][a-z0-9.-]*\Z")
-_USER_SPACE = 1 << 47  # addresses of a process on x86-64 are below this
+_USER_SPACE = 1 << 47  # every address of a process on x86-64 is below this
 CACHE_VARIABLE = "POCL_CACHE_DIR"
 AVX512_TARGET = "skylake-avx512"
 _AVX = {"avx", "cx16", "popcnt"}
@@ -47,9 +48,9 @@ _LIBRARIES = (
     ({"sse4_1", "cx16"}, "penryn"),
     ({"ssse3", "cx16"}, "core2"),
 )
-"""PoCL's libraries, as (flags, processor): PoCL takes the first one whose flags are all in /proc/cpuinfo. ``processor`` is
-LLVM's name of the processor for which the library was compiled."""
-_OLDEST_TARGET = "athlon64"  # the processor of the library that PoCL takes if none of ``_LIBRARIES`` fits
+"""PoCL's libraries of built-in functions: (flags, processor). PoCL takes the first library whose flags are all in
+/proc/cpuinfo. ``processor`` is LLVM's name of the processor for which the library was compiled."""
+_OLDEST_TARGET = "athlon64"  # the processor of the library that PoCL takes if no entry of ``_LIBRARIES`` fits
 THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
 _MOST_THREADS = 1024  # largest POCL_MAX_PTHREAD_COUNT that is accepted
 _NO_CACHE_VARIABLE = "PYOPENCL_NO_CACHE"
@@ -58,13 +59,13 @@ _kept_alive: list[ctypes.Array[ctypes.c_char]] = []
 
 
 def prepare_environment() -> None:
-    """Sets PoCL's kernel cache on Linux, to the user's choice or to a folder of this program. Call it before pyopencl loads.
+    """Sets PoCL's kernel cache on Linux: the folder POCL_CACHE_DIR, or one of this program. Call it before pyopencl loads.
 
-    PoCL names its own cache after LLVM's target, so two unknown processors would share binaries. If the cache cannot be
-    written, PoCL finds no device. If it is on a mount with noexec, PoCL ends the process. In both cases a temporary folder
-    is used instead. pyopencl's cache is switched off where it cannot be written. Limits the threads where several ranks
-    share a machine. Raises InputError for a number of threads that PoCL would crash on or ignore, and for a cache on a mount
-    with noexec if no temporary folder works."""
+    PoCL's default cache is named after LLVM's target, so two unknown processors would share binaries. If the cache cannot be
+    written, PoCL finds no device. If the cache is on a mount with noexec, PoCL ends the process. In both cases a temporary
+    folder is used instead. pyopencl's own cache is switched off where it cannot be written. Where several ranks share a
+    machine, each rank's threads are limited. Raises InputError for a number of threads that PoCL would crash on or ignore,
+    and for a cache on a mount with noexec if no temporary folder works."""
     global _unusable
     if platform.system() != "Linux":
         return
@@ -120,7 +121,7 @@ def warn_of_cache() -> None:
 def _caches() -> Path:
     try:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    except RuntimeError:  # the user has no home
+    except RuntimeError:  # the user has no home folder
         return Path("/nonexistent")
 
 
@@ -160,7 +161,7 @@ def _temporary_cache() -> Path:
 
 
 def library_target() -> str | None:
-    """Returns LLVM's name of the processor for which PoCL's library for this machine was compiled. None: not x86-64."""
+    """Returns LLVM's name of the processor of PoCL's library for this machine, or None if the machine is not x86-64."""
     if platform.machine() not in ("x86_64", "AMD64"):
         return None
     flags = _cpu_flags()
@@ -170,8 +171,8 @@ def library_target() -> str | None:
 def use_library_target(device_address: int) -> str | None:
     """Writes the name of the library's processor into PoCL 3.0's record of a CPU device, and returns this name.
 
-    The record has a pointer to LLVM's target triple and, next to it, one to the processor's name. If the two are not found,
-    nothing is changed and None is returned. PoCL 3.1 and later name the library's processor themselves."""
+    In the record, a pointer to LLVM's target triple is followed by a pointer to the processor's name. Changes nothing and
+    returns None without such a pair, or not on x86-64 Linux. PoCL 3.1 and later name the library's processor themselves."""
     target = library_target()
     if target is None or platform.system() != "Linux":
         return None
@@ -217,7 +218,7 @@ def _cpu_flags() -> set[str]:
 
 
 def cpu_facts(described: Path = Path("/proc/cpuinfo")) -> dict[str, str]:
-    """Returns the entries of /proc/cpuinfo for the first processor ("model name", "flags", …); {} without that file."""
+    """Returns the entries of ``described`` for the first processor ("model name", "flags", …); {} if it is not readable."""
     facts: dict[str, str] = {}
     with contextlib.suppress(OSError):
         for line in described.read_text().split("\n\n", 1)[0].splitlines():

@@ -8,7 +8,7 @@ import numpy as np
 
 from phyradgs_cl.runtime.opencl import cl
 
-_FOLD_AT = 20_000  # number of events that are kept before their times are added up: adding up waits for the device
+_FOLD_AT = 20_000  # number of events kept before their times are added up: this sum waits for the device
 _COPY_BYTES = 1 << 26  # size of the copy that measures the memory's rate: larger than most caches
 _STEPS = 20_000  # multiply-adds in each chain that measures the arithmetic rate; a quarter of them if ``lanes`` is 1
 _REPEATS = 5  # number of runs of each measurement; the fastest counts
@@ -16,7 +16,7 @@ _REPEATS = 5  # number of runs of each measurement; the fastest counts
 
 @dataclass
 class KernelUse:
-    """What one kernel used in a run: launches, seconds, and bytes of its buffers."""
+    """What one kernel used in a run: its launches, seconds, and the bytes of its launches' buffers."""
 
     launches: int = 0
     seconds: float = 0.0
@@ -62,8 +62,7 @@ class Rates:
 
 
 def profile_text(uses: dict[str, KernelUse], wall_s: float) -> str:
-    """Returns a table of the kernels' ``uses``. Its last line compares the sum of their seconds with ``wall_s``, the run's
-    time in s."""
+    """Returns a table of the kernels' ``uses``. Its last line compares their total seconds with ``wall_s``, the run's."""
     busy_s = sum(use.seconds for use in uses.values())
     rows = [("kernel", "launches", "seconds", "share", "ms each", "GB/s")]
     for name, use in uses.items():
@@ -79,8 +78,8 @@ def profile_text(uses: dict[str, KernelUse], wall_s: float) -> str:
 def measure_rates(
     queue: "cl.CommandQueue", multiply_add: "cl.Kernel", lanes: int, units: int, group: int
 ) -> Rates:
-    """Measures the rates of copies and multiply-adds, each as the best of 5 runs, on a ``queue`` with profiling. lanes:
-    floats in the kernel's vectors. units: the device's compute units. group: work-items in a work-group."""
+    """Measures the rates of copies and of the kernel ``multiply_add``, each as the best of 5 runs, on a ``queue`` with
+    profiling. lanes: floats in the kernel's vectors. units: the device's compute units. group: size of a work-group."""
     context = queue.context
     source, target = (cl.Buffer(context, cl.mem_flags.READ_WRITE, _COPY_BYTES) for _ in range(2))
     cl.enqueue_fill_buffer(queue, source, np.zeros(1, np.float32), 0, _COPY_BYTES)

@@ -13,12 +13,12 @@ from phyradgs_cl.fields import Deformation, Grid, control_points
 from phyradgs_cl.io.tables import Fields, read_toml
 
 _NODES = 40  # weights stored per cycle; linear interpolation between them is then off by 0.3 % at most
-_SETTLING_NODES = 200  # number of times at which drying's weights are stored: enough for its smooth curve
+_SETTLING_NODES = 200  # number of times at which the weights of "drying" are stored: enough for their smooth curve
 _SPACINGS = 8.0  # breathing and drying are smooth, so this many spacings of control points along the longest side are enough
-_SLIDING_SPACINGS = 16.0  # sliding has a sharp edge, which becomes about three control points wide
+_SLIDING_SPACINGS = 16.0  # the edge of "sliding" is sharp: the spline makes it about three control points wide
 _ASIDE = 1 / 3  # breathing moves the object along y, too, by this fraction of its motion along z
 _PERIODS = (0.5, 1.5)  # least and largest duration of a random breath, in mean periods
-_FADE = 3.0  # beyond the box, motion falls to 0 over this many amplitudes: with a slope of a third, the field cannot fold
+_FADE = 3.0  # beyond the box, motion falls to 0 over this many amplitudes, a slope of a third, so that the field cannot fold
 _MOST_CYCLES = 100_000  # most cycles of breathing or sliding in a scan: more would mean a wrong unit of time
 _COMMON = ("kind", "amplitude_mm", "amplitude", "states")
 _KEYS = {
@@ -62,7 +62,7 @@ class ObjectMotion(checks.Checked):
     def deformation(self, box: Grid, first_s: float, last_s: float) -> Deformation:
         """Returns the deformation of an object in ``box``, from a scan's first light to its last, first_s to last_s in s.
 
-        Raises InputError for an amplitude larger than half of the box's shortest side."""
+        Raises InputError for an amplitude above half of the box's shortest side, and for more than 100 000 cycles."""
         half_mm = min(box.size_mm) / 2
         amplitude_mm = self.amplitude * half_mm if self.amplitude_mm is None else self.amplitude_mm
         if amplitude_mm > half_mm:
@@ -94,9 +94,9 @@ class ObjectMotion(checks.Checked):
         return np.asarray(first + parts * (last - first))
 
     def _sliding_mm(self, places: list[Array], height: Array) -> list[Array]:
-        """Returns the control vectors of a cylinder about the z axis that moves along z, for unit amplitude. Its edge is
-        about three control points wide. places: z, y, x of control points from the box's middle, in units of half its
-        shortest side."""
+        """Returns the control vectors of a cylinder about the z axis that moves along z, for unit amplitude. The cylinder's
+        edge becomes about three control points wide. places: z, y, x of control points from the box's middle, in units of
+        half the box's shortest side."""
         _, y, x = places
         return [_vectors(z=(np.hypot(x, y) < self.radius).astype(float))]
 
@@ -153,15 +153,15 @@ def _breath(phase: Array) -> Array:
 
 
 def _breathing_mm(places: list[Array], height: Array) -> list[Array]:
-    """Returns two sets of control vectors of unit amplitude, along z and along y. They grow with ``height``, which is 0 at
-    the box's base and 1 at its top."""
+    """Returns two sets of control vectors: along z with unit amplitude, and along −y with a third of it. Both grow with
+    ``height``, which is 0 at the box's base and 1 at its top."""
     share = height**2 * (3 - 2 * height)
     return [_vectors(z=share), _vectors(y=-_ASIDE * share)]
 
 
 def _drying_mm(places: list[Array], height: Array) -> list[Array]:
-    """Returns two sets of control vectors of unit amplitude: downwards, growing with height, and towards the z axis.
-    places and height: as in ``_sliding_mm`` and ``_breathing_mm``."""
+    """Returns two sets of control vectors of unit amplitude: one lowers the object, in proportion to height; one shrinks it
+    towards the z axis. places, height: as in ``_sliding_mm`` and ``_breathing_mm``."""
     _, y, x = places
     return [_vectors(z=height), _vectors(x=x / 2, y=y / 2)]
 

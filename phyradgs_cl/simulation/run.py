@@ -43,7 +43,7 @@ _LARGEST_PEAK = 1e4  # limit of --peak, a line integral
 _LARGEST_NOISE = 1e9  # limit of --electronic-noise, in counts
 _SMALLEST_DOSE, _LARGEST_DOSE = 1e-3, 1e12  # limits of --dose, in photons per pixel
 _LARGEST_DETECTOR = 32_000  # limit of --detector, in pixels along a side of the panel
-_SLACK = 1.001  # a warning is logged if (exposure's arc)/(turn from frame to frame) exceeds this: 1, and room for rounding
+_SLACK = 1.001  # a warning is logged if (arc of an exposure)/(turn between frames) exceeds this: 1, and 0.001 for rounding
 _TIMING = ("views", "exposure_deg", "readout_ratio", "start_deg", "pulse", "turns")  # options that change the protocol
 _DATA_SHEET = ("first", "fps", "readout_ms")  # options in a data sheet's terms: first line read, frames/s, readout time
 
@@ -271,23 +271,23 @@ def _gating(scan: Scan, scene: Scene) -> Gating:
 
 
 def default_time_samples(protocol: Protocol, grid: Grid, fastest_mm_per_s: float = 0.0) -> int:
-    """Returns at how many times, 8 to 128, an exposure is sampled. From one time to the next, the volume's edge and the
-    fastest part of a moving object go at most half a voxel, unless this would take more than 128 times."""
+    """Returns at how many times, 8 to 128, an exposure is sampled. Between two of these times, the volume's edge and the
+    fastest part of a moving object move by at most half a voxel, unless this would take more than 128 times."""
     path_mm = np.deg2rad(protocol.exposure_deg) * max(grid.size_mm[1:]) / 2
     path_mm = max(path_mm, fastest_mm_per_s * protocol.exposure_s)
     return int(np.clip(np.ceil(2 * path_mm / min(grid.voxel_size_mm)), 8, 128))
 
 
 def _recorded(frames: np.ndarray, options: SimulationOptions, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Adds to frames (F, v, u), in physical order, the effects that the options ask for. light: how long each pixel receives
-    light, as a fraction of the longest time; it broadcasts with a frame."""
+    """Adds the effects that ``options`` ask for to frames (F, v, u), in physical order. light: the fraction of the longest
+    lit time for which each pixel receives light; it broadcasts with a frame."""
     if options.scatter > 0:
         frames = effects.add_scatter(frames, options.scatter).astype(np.float32)
     if options.drift > 0:
         frames = frames - np.log(effects.drifting_light(len(frames), options.drift, rng)).astype(np.float32)[:, None, None]
     if options.noise == "beer":
         frames = effects.beer_lambert_noise(frames, options.dose, options.electronic_noise, rng, light, options.lag)
-    elif options.lag > 0:  # TIGRE's counts are no intensities: lag comes before their noise
+    elif options.lag > 0:  # TIGRE's noisy counts are no intensities, so the lag is added before the noise
         frames = effects.lagged(frames, options.lag).astype(np.float32)
     if options.noise == "tigre":
         frames = effects.tigre_noise(frames, options.dose, options.electronic_noise, rng, light)

@@ -17,8 +17,8 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation.sources import AnalyticSource, DeformedSource, FrameSource, VolumeSource, on_panel
 
 _DENSE = 0.5  # in a beam of many energies, voxels above this fraction of the largest attenuation may be bone
-# Bone begins at a bin of the histogram with fewer voxels than this fraction of the fullest bin's, so that no material is cut
-# in two.
+# Bone begins at a bin of the histogram of attenuation with fewer voxels than this times the fullest bin's, so that bone's
+# limit cuts no material in two.
 _RARE = 0.2
 log = logging.getLogger(__name__)
 Moves = Callable[[Grid], Deformation]
@@ -47,7 +47,7 @@ class Scene:
     fastest_mm_per_s: float = 0.0
 
     def warn_of_inverse_crime(self) -> None:
-        """Warns if the projected voxels are not finer than the grid along any axis: reconstructions then look too good."""
+        """Warns if along no axis the projected voxels are finer than the grid's: reconstructions then look too good."""
         shape = self.source_shape
         if shape is None or any(n > m for n, m in zip(shape, self.grid.shape, strict=True)):
             return
@@ -64,8 +64,7 @@ def phantom_scene(
 
     Phantoms in closed form are integrated exactly unless they deform. Other phantoms are projected from voxels at twice
     ``size``, and the reference is their block mean. Pixels average ``pixel_samples``² rays over their area; 0 chooses the
-    number by the size of the grid's voxels. axis: the panel's readout axis. moves: returns the deformation; None: no
-    motion."""
+    number by the size of the grid's voxels. axis: the panel's readout axis. moves: returns the deformation, if any."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
     if isinstance(phantom, MovingPhantom):
@@ -109,7 +108,8 @@ def volume_scene(
     """Returns the scene of a volume, called ``name``, at its own resolution, with ``pixel_samples``² rays per pixel.
 
     A volume with a grid keeps it, and its values are in 1/mm. A bare array is fitted into the scanner's box; its values are
-    attenuation per half of the longest side."""
+    attenuation per half of the longest side. size: voxels along the reference's longest side; None: the volume's. box, axis,
+    moves: as for ``phantom_scene``."""
     volume, fine = loaded.values, loaded.grid
     if fine is None:
         voxel_mm = min(side / n for side, n in zip(box.size_mm, volume.shape, strict=True))
@@ -125,7 +125,8 @@ def _voxel_scene(
     rt: Runtime, volume: np.ndarray, fine: Grid, grid: Grid, title: str, deformation: Deformation | None,
     geometry: Geometry, axis: str, pixel_samples: int,
 ) -> Scene:
-    """Returns the scene of a volume (nz, ny, nx) on the grid ``fine``. The reference is its block means on ``grid``."""
+    """Returns the scene of a volume (nz, ny, nx) on the grid ``fine``. The reference is its block means on ``grid``. axis,
+    pixel_samples: as for ``phantom_scene``."""
 
     def source_of(values: np.ndarray) -> FrameSource:
         return on_panel(geometry, grid, pixel_samples, lambda panel: on_one_panel(values, panel))
@@ -156,8 +157,8 @@ def _voxel_scene(
 
 
 def bone_from(volume: np.ndarray) -> float:
-    """Returns the attenuation in 1/mm from which voxels (nz, ny, nx) count as bone: half the largest value. If that would
-    cut a material in two, it is the upper end of this material's attenuations, or infinite if they have no upper end."""
+    """Returns the attenuation in 1/mm from which voxels (nz, ny, nx) count as bone: half the largest value. If this would
+    cut a material in two, returns the upper end of the material's attenuations, or infinity if they have no upper end."""
     largest = float(volume.max())
     counts, edges = np.histogram(volume, 64, (0.1 * largest, max(largest, 1e-20)))
     is_rare = (edges[1:] > _DENSE * largest) & (counts < _RARE * counts.max())

@@ -20,16 +20,16 @@ from phyradgs_cl.operators.warp.volume import VolumeWarp
 from phyradgs_cl.phantoms import EllipsoidPhantom, MovingPhantom
 from phyradgs_cl.runtime import DeviceArray, MemoryShortage, Runtime
 
-# One ray is enough for a pixel whose image at the axis is at most this many voxels wide. In a common scanner with as many
-# voxels as pixels along a side, a pixel is 1.43 voxels wide.
+# One ray is enough for a pixel whose image at the axis is at most this many voxels wide. A pixel is 1.43 voxels wide in a
+# common scanner with as many voxels as pixels along a side.
 WIDEST_RAY = 1.5
 _MOST_SAMPLES = 32  # most rays along each side of a pixel: the time grows with their square
-NEAREST = 0.1  # moving matter is projected at most this far from its exact position, in voxels to be reconstructed
+NEAREST = 0.1  # moving matter is projected at most this far from its exact position, in voxels of the grid to reconstruct
 
 
 class FrameSource:
     """Projects an object, its attenuation multiplied by ``factor``, to the frame of each table of time cells. model: what
-    the detector averages, "log" (line integrals) or "intensity". A subclass writes ``frame`` or ``frames``."""
+    the detector averages, "log" (line integrals) or "intensity". A subclass overrides ``frame`` or ``frames``."""
 
     pixel_samples = 1  # rays along each side of a pixel
 
@@ -63,7 +63,7 @@ class VolumeSource(FrameSource):
         return (self._rt.download(frames) if isinstance(frames, DeviceArray) else frames)[0]
 
     def _where_it_fits(self, volume: np.ndarray) -> np.ndarray | DeviceArray:
-        """Returns the volume on the device if there is room for it and for the operator's padded copy; else on the host."""
+        """Returns the volume on the device if it and the operator's padded copy of it fit there, else on the host."""
         if not self._rt.room().holds(volume.nbytes, 4 * self._memory.layout.volume_floats):
             return volume
         try:
@@ -142,8 +142,8 @@ def on_panel(geometry: Geometry, grid: Grid, pixel_samples: int, make: Callable[
 class DeformedSource(FrameSource):
     """Projects a deforming volume (nz, ny, nx) in 1/mm on ``grid``.
 
-    A state of the object is a set of the fields' weights φ_r, for which the volume is deformed once. Weights are rounded so
-    that many time cells, also of other frames, share a state. Rounding displaces no point by more than ``NEAREST`` times
+    A state of the object is a set of the fields' weights φ_r, for which the volume is deformed once. Weights are rounded, so
+    that many time cells, also of other frames, share a state. The rounding moves no point by more than ``NEAREST`` ·
     ``voxel_mm``. Weights of a frame at a single time are not rounded. make: returns the source of a volume at rest."""
 
     def __init__(
@@ -171,8 +171,8 @@ class DeformedSource(FrameSource):
         return (each.frame() for each in sums)
 
     def _volumes(self, weights: np.ndarray) -> Callable[[int], np.ndarray]:
-        """Returns a function from a state's index to its volume (nz, ny, nx), for ``weights`` (K, R). It uses the device if
-        all buffers fit there."""
+        """Returns a function from a state's index to its volume (nz, ny, nx), for ``weights`` (K, R). The device deforms the
+        volumes if all buffers fit into half of its free memory, else the host."""
         volume, rank = self._volume, self._deformation.rank
         if not self._rt.room().scaled(0.5).holds(3 * rank * volume.nbytes, *[2 * volume.nbytes] * 2):
             spline = SplineVolume(volume, self._grid)
@@ -196,12 +196,12 @@ class _Average:
         self._sum: np.ndarray | None = None  # so far: Σ w p in the log model, ln Σ w exp(−p) in the intensity model
 
     def add(self, frame: np.ndarray, share: np.ndarray) -> None:
-        """Adds line integrals (rows, columns) of some cells. share (lines,): these cells' part of each line's weight."""
+        """Adds line integrals (rows, columns) of some time cells. share (lines,): their part of each line's weight."""
         weight = self._readout.spread(share)
         if self._is_log:
             self._sum = weight * frame + (0.0 if self._sum is None else self._sum)
             return
-        with np.errstate(divide="ignore"):  # lines that these cells do not serve have the weight 0, and its logarithm is −∞
+        with np.errstate(divide="ignore"):  # lines without light from these cells have the weight 0, and its logarithm is −∞
             log_part = np.log(weight) - frame
         self._sum = log_part if self._sum is None else np.logaddexp(self._sum, log_part)
 
@@ -213,7 +213,7 @@ class _Average:
 
 
 def part_of(cells: TimeCells, members: np.ndarray) -> tuple[TimeCells, np.ndarray]:
-    """Returns a table of the cells ``members``, bool (C,), and the fraction (lines,) of each line's weight that they have.
+    """Returns a table of the cells ``members``, bool (C,), and the fraction (lines,) of each line's weight in these cells.
 
     Weights are rescaled: in the new table a line's weights sum to 1, or are all 0. Each cell must have a single pose."""
     part = some_cells(cells, np.flatnonzero(members))

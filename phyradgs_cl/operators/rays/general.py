@@ -13,7 +13,7 @@ from phyradgs_cl.runtime.layout import GUARD
 # On a CPU, each work-item of the adjoint sums for its own box of voxels (x, y, z), which it keeps in local memory.
 _BRICK = (32, 32, 8)
 _SMALL_BRICK = (24, 24, 8)  # takes 27 kB, for devices with only the 32 kB of local memory that OpenCL guarantees
-_BLOCK = 4  # on a GPU, each work-group sums for a cube of this side (less along z if groups are small), in voxels
+_BLOCK = 4  # on a GPU, the adjoint's work-groups compute cubes of this side in voxels, less along z if groups are small
 _SAMPLES_PER_VOXEL = 4  # estimated number of ray samples from one pose that touch a voxel
 _LONG_FROM = 2**31  # a volume with this many floats needs indices of 64 bits
 
@@ -23,7 +23,7 @@ def launch_forward(
     frames: DeviceArray, *, add: bool = False,
 ) -> None:
     """Projects a padded volume, or a part of one (brick), to the padded frames numbered ``frame_list``. add: adds to these
-    frames, as all bricks after the first must; else overwrites them."""
+    frames, as needed for all bricks after the first; else overwrites them."""
     blocks = ceil_div(layout.width, rt.lanes)
     kernel = rt.kernel("rays", "rays_forward", **_defines(layout, cells))
     items = blocks, layout.lines, frame_list.size
@@ -46,7 +46,7 @@ def launch_adjoint(
     group = rt.group(1, math.prod(owned))
     each = _SAMPLES_PER_VOXEL * nz * ny * nx * cells.most_per_line
     for first, stop in _parts(rt, frame_list.size, each):
-        adds = add or first > 0  # later launches continue the sums, as if it were one launch
+        adds = add or first > 0  # later launches add to the sums of earlier ones, as one launch would
         rt.launch(
             kernel, (columns * group, rows, slices), frames, cells.cells, cells.cell_lines, cells.matrices,
             cells.matrix_stride, cells.frame_cells, frame_list, cells.weights, cells.weight_at, first, stop,
@@ -55,7 +55,7 @@ def launch_adjoint(
 
 
 def _owners(rt: Runtime, layout: RayLayout, cells: RayCells) -> tuple[tuple[int, int, int], Kernel]:
-    """Returns the box of voxels (x, y, z) for which one work-item or work-group sums, and the adjoint's kernel."""
+    """Returns the box of voxels (x, y, z) that each work-item or work-group of the adjoint computes, and the kernel."""
     owned, defines = (_BLOCK,) * 3 if rt.pixel_items else brick_of(rt), _defines(layout, cells)
     if not rt.pixel_items:
         defines |= dict(zip(("BRICK_X", "BRICK_Y", "BRICK_Z"), owned, strict=True))
@@ -68,22 +68,22 @@ def _owners(rt: Runtime, layout: RayLayout, cells: RayCells) -> tuple[tuple[int,
 
 
 def _parts(rt: Runtime, frames: int, samples_per_frame: int) -> Iterator[tuple[int, int]]:
-    """Divides the frames among launches, so that none takes too long on a GPU. Yields [first, stop) of each."""
+    """Divides the frames among launches, so that no launch takes too long on a GPU. Yields [first, stop) of each launch."""
     step = max(rt.most_samples // samples_per_frame, 1) if rt.pixel_items else frames
     for first in range(0, frames, step):
         yield first, min(first + step, frames)
 
 
 def brick_of(rt: Runtime) -> tuple[int, int, int]:
-    """Returns the box of voxels (x, y, z) for which a CPU's work-item sums. The larger of two boxes is 14 % faster, and is
-    taken if local memory can hold it."""
+    """Returns the box of voxels (x, y, z) that a CPU's work-item of the adjoint computes. The larger of two boxes is 14 %
+    faster, and is taken if local memory can hold it."""
     tile_bytes = 4 * math.prod(n + 2 for n in _BRICK)
     return _BRICK if rt.device.handle.local_mem_size >= tile_bytes else _SMALL_BRICK
 
 
 def owner_steps(rt: Runtime) -> tuple[int, int]:
-    """Returns the sides (z, y) of the box of voxels for which one work-item or work-group sums. A volume cut into multiples
-    of these sides gets the same bits as the whole volume."""
+    """Returns the sides (z, y) of the box of voxels that one work-item or work-group of the adjoint computes. A volume cut
+    into multiples of these sides gets the same bits as the whole volume."""
     x, y, z = brick_of(rt)
     return (_BLOCK, _BLOCK) if rt.pixel_items else (z, y)
 

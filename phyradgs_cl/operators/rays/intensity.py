@@ -55,8 +55,8 @@ class IntensityOperator:
 
     @property
     def holds(self) -> tuple[int, int]:
-        """The numbers of volumes and of arrays of all frames on the device besides ``memory``, such as each layer's line
-        integrals and weights."""
+        """How many volumes and how many arrays of the frames' shape, such as each layer's line integrals and weights, the
+        device holds besides ``memory``."""
         return 2, 2 * len(self._operators) + 3
 
     def expected(self, volume: SameArray, out: DeviceArray | None = None) -> SameArray:

@@ -90,13 +90,13 @@ class RayLayout:
     def pixel_strides(self, axis: str, *, turned: bool = False) -> tuple[int, int, int, int]:
         """Returns the offset of padded frames, and the strides to the next detector column, row and frame, in floats.
 
-        axis: along which the panel is read. turned: the frames are stored transposed, (F, width, lines)."""
+        axis: the axis along which the panel is read. turned: the frames are stored transposed, (F, width, lines)."""
         strides = self.turned.frames_strides if turned else self.frames_strides
         steps = (1, strides.row) if (axis == "rows") != turned else (strides.row, 1)
         return (strides.start, *steps, strides.slice)
 
     def column_floats(self, axis: str) -> int:
-        """Returns the number of floats of a padded frame that is stored column by column. axis: along which it is read."""
+        """Returns the number of floats of a padded frame that is stored by columns. axis: as for ``pixel_strides``."""
         return (self.turned if axis == "rows" else self).frames_strides.slice
 
     def inside(self, flat: np.ndarray) -> np.ndarray:

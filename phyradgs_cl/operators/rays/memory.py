@@ -121,7 +121,7 @@ class RayMemory:
             self._volume = self.rt.zeros(self.layout.of(largest).volume_floats)
             self._bordered = largest.shape
         layout = self.layout.of(brick)
-        if brick.shape != self._bordered:  # another shape has its border where the last brick had voxels
+        if brick.shape != self._bordered:  # a brick of another shape has its border where the last one had voxels
             self._bordered = None
         return layout, DeviceArray(self._volume.buffer, (layout.volume_floats,), self._volume.dtype)
 
@@ -213,8 +213,7 @@ class RayMemory:
         return on_device
 
     def read_frames(self, on_device: DeviceArray, result: Array, part: slice, axis: str) -> None:
-        """Copies padded frames to the frames ``part`` of ``result`` (F, rows, columns), as means of each pixel's
-        sub-rays."""
+        """Copies padded frames to the frames ``part`` of ``result`` (F, rows, columns). Sub-rays of a pixel are averaged."""
         shape, subrays = self.layout.frames_shape(part.stop - part.start), self.layout.subrays
         if subrays != SINGLE and isinstance(result, DeviceArray):
             launch_means(self.rt, on_device, self.layout.pixel_strides(axis), subrays, result, part)

@@ -209,7 +209,7 @@ class RayOperator:
         self._slots: dict[tuple[int, int], Slots] = {}
 
     def _listed(self, part: slice) -> DeviceArray:
-        """Returns, on the device, the scan's numbers of this operator's frames ``part``. They are uploaded only once."""
+        """Uploads, once, the numbers that this operator's frames ``part`` have in the whole scan, and returns them."""
         key = part.start, part.stop
         if key not in self._lists:
             self._lists[key] = self.rt.upload(self._chosen[part], np.int32)

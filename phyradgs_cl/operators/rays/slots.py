@@ -16,7 +16,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, pitch_of
 
 _SLOT_INTS, _SHARE_INTS = 8, 4  # integers per slot (cl/common/ray_column.h) and per share (cl/rays_slots.cl)
-_SAME_POSE = 10  # decimals to which two poses must agree to be one, after division by the largest number in all poses
+_SAME_POSE = 10  # poses are the same if they agree to this many decimals, after division by the largest number in all poses
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ def _largest(table: np.ndarray) -> tuple[int, int]:
 @dataclass(frozen=True, eq=False)
 class Slots:
     """The slots (buffers, one per pose) of some frames on the device, as the arrays that cl/rays_slots.cl describes.
-    columns, rows: the size in pixels of every slot, as large as the largest needs."""
+    columns, rows: the size of every slot in pixels, that of the largest slot."""
 
     slots: DeviceArray
     frame_shares: DeviceArray

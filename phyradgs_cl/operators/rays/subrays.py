@@ -21,7 +21,7 @@ as pixels has 1.43. The volume of least norm that fits the rays loses 4 % of its
 and half at 2, where rays may miss voxels."""
 # Largest distance between rays, in voxels, if a method begins with the object's density: voxels without a ray keep it.
 _FARTHEST_OF_DENSE = 2.0
-_ROUNDING = 1e-3  # a distance may exceed its limit by this fraction, so that rounding does not add rays
+_ROUNDING = 1e-3  # a distance between rays may exceed its limit by this fraction, so that rounding does not add rays
 _MOST = 8  # most sub-rays of a pixel along an axis: enough where single rays are 10 voxels apart
 
 

@@ -92,8 +92,8 @@ def _least_horizontal(d00: np.ndarray, eu: np.ndarray, width: int) -> np.ndarray
 
 
 def _lies_between(grid: Grid, source: np.ndarray, d00: np.ndarray, eu: np.ndarray, ev: np.ndarray) -> bool:
-    """Returns whether the grid, with a voxel around it, lies between source and panel in every pose. The poses are given by
-    vectors (C, 3) in voxels."""
+    """Returns whether the grid, with a voxel around it, lies between source and panel in every pose. The poses' source, d00,
+    eu and ev are vectors (C, 3) in voxels, as in ``ray_constants``."""
     nz, ny, nx = grid.shape
     corners = np.array([(x, y, z) for x in (-1, nx) for y in (-1, ny) for z in (-1, nz)])
     normal = np.cross(eu, ev)
@@ -111,7 +111,8 @@ def launch_upright(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, columns: DeviceArray,
     target: tuple[DeviceArray, np.ndarray],
 ) -> None:
-    """Projects a volume, transposed to ``columns`` (y, x, z), to slots. target: an array and its ``Slots.strides``."""
+    """Projects a volume, transposed to ``columns`` (y, x, z), to slots. target: an array and its ``Slots.strides``. how: as
+    ``upright_of`` returns it."""
     shape, origin, _, pitch_mm, *_ = layout.constants()
     array, strides = target
     rt.launch(
@@ -126,7 +127,8 @@ def launch_upright_adjoint(
     rt: Runtime, layout: RayLayout, how: Upright, poses: UprightPoses, slots: Slots, values: DeviceArray,
     target: tuple[DeviceArray, Strides], *, add: bool = False,
 ) -> None:
-    """Backprojects slots, written by ``split_slots``, to ``target``: a volume and its strides. add: adds to the volume."""
+    """Backprojects ``values``, the slots that ``split_slots`` wrote, to ``target``, a volume and its strides. add: adds
+    to the volume, else overwrites it. how: as ``upright_of`` returns it."""
     shape, origin, *_ = layout.constants()
     (x, y, z), items = _owned(layout.brick.shape, rt.device.compute_units)
     rt.launch(

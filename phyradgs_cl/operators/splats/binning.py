@@ -9,13 +9,13 @@ _CHUNK = 512  # number of splats whose tiles one work-item of a CPU counts
 _GROUP = 64  # number of splats whose tiles one work-group of a GPU counts
 _LARGEST_GROUP = 256  # most splats per work-group of a GPU, taken if _GROUP would give more than _MANY_COUNTS counts
 _MANY_COUNTS = 1 << 22  # above this many counts, tiles × work-groups, counting takes much memory and time
-_SCANNED = 64  # number of counts that a work-group adds at a time when it sums counts to positions
-_SLACK = 1.5  # new lists get memory for this many times the entries needed, because clouds grow
+_SCANNED = 64  # number of counts that a work-group adds at a time in the running sums that give list positions
+_SLACK = 1.5  # new lists get memory for this many times the entries needed, because the number of Gaussians grows
 _NEAR = 1.25  # lists with memory for less than this many times the entries needed are replaced before they overflow
 # A launch whose lists overflow tests every splat at every pixel. Above this many tests, a second on a fast GPU, the host
 # waits for the lists' size instead.
 _MOST_CHECKS = 2**38
-_MOST_ENTRIES = 2**31 - 1  # most entries of all lists together: kernels use 32-bit indices
+_MOST_ENTRIES = 2**31 - 1  # all lists together must have fewer entries than this: kernels use 32-bit indices
 
 
 class TileLists:
@@ -23,8 +23,8 @@ class TileLists:
 
     tile: a tile's size in pixels or voxels along x, y, z. tiles: the number of tiles along x, y, z. A list keeps the order
     of the splats, so that sums over it repeat bit for bit. The number of list entries is known only on the device. The host
-    waits for it if the number of splats is new, ``waits`` is set, or a GPU would take long without lists. Otherwise it reads
-    the number later. Until then, kernels test all splats in a tile whose list did not fit (cl/common/tile.h)."""
+    waits for it if the number of splats is new, if ``waits`` is set, or if a GPU would take long without lists. Else the
+    host reads it later. Until then, kernels test all splats in a tile whose list did not fit (cl/common/tile.h)."""
 
     def __init__(self, rt: Runtime, tile: tuple[int, int, int], tiles: tuple[int, int, int]) -> None:
         self.rt = rt
@@ -51,7 +51,7 @@ class TileLists:
         """Fills ``tile_offsets`` (tiles + 1,) and ``splat_ids`` for ``count`` splats. extents (6, stride): a splat's first
         and last pixel or voxel along x, y, z. cells: the number of time cells from which each splat was projected.
 
-        Raises MemoryShortage for 2^31 list entries or more, since a smaller part of a volume may have fewer."""
+        Raises MemoryShortage for 2^31 − 1 list entries or more, since a smaller part of a volume may have fewer."""
         rt = self.rt
         chunk = chunk_of(rt, self.total, count)
         chunks = max(ceil_div(count, chunk), 1)

@@ -46,7 +46,7 @@ def pad_columns(rows: np.ndarray) -> np.ndarray:
 
 
 def split_coefficients(rt: Runtime, matrix: np.ndarray) -> DeviceArray:
-    """Uploads coefficients as float64, or as pairs of floats (high, low) if the device lacks float64."""
+    """Uploads a matrix's coefficients as float64, or as pairs of float32 (high, low) if the device lacks float64."""
     matrix = np.ascontiguousarray(matrix, np.float64)
     if rt.fp64:
         return rt.upload(matrix)
@@ -56,8 +56,8 @@ def split_coefficients(rt: Runtime, matrix: np.ndarray) -> DeviceArray:
 
 @dataclass(eq=False)
 class DeviceCells:
-    """The C time cells of one frame on the device. A frame that is read column by column is projected transposed, with the
-    steps of its poses exchanged, so lines are always rows of the image.
+    """The C time cells of one frame on the device. A frame that is read column by column is projected transposed, with its
+    poses' steps along u and v exchanged, so lines are always rows of the image.
 
     - matrices: one pose per cell. If ``moving``, three: the middle and both ends.
     - line_times (C, 3, time_pitch): ``TimeCells.line_times`` with padded lines if ``moving``, else one element.

@@ -27,7 +27,7 @@ from phyradgs_cl.operators.splats.voxelise import Voxeliser
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, padded_zeros, pitch_of
 
-QUATERNION_LENGTHS = 1e-12, 1e12  # kernels square them in float32, from 1e-38 to 3e38
+QUATERNION_LENGTHS = 1e-12, 1e12  # limits of a quaternion's length: kernels square it in float32, which spans 1e-38 to 3e38
 _FRAMES, _VOLUME, _ROWS, _DENSITY = "frames", "volume", "rows", "density"
 
 
@@ -40,10 +40,11 @@ class SplatPoint:
 
 
 class PlainRows:
-    """Converts parameter rows (11, G), in mm and 1/mm with quaternions of ``QUATERNION_LENGTHS``, to the kernels' rows:
-    lengths in units of ``length_mm``, and unit quaternions.
+    """Converts parameter rows (11, G), in mm and 1/mm with quaternions of lengths in ``QUATERNION_LENGTHS``, to the kernels'
+    rows: lengths in units of ``length_mm``, and unit quaternions.
 
-    line_integrals: densities become 1/``length_mm``, so that line integrals have no unit. Else they stay in 1/mm."""
+    line_integrals: densities are converted to 1/``length_mm``, so that line integrals have no unit; else they stay in
+    1/mm."""
 
     def __init__(self, rt: Runtime, length_mm: float, *, line_integrals: bool) -> None:
         self.rt = rt
@@ -235,7 +236,7 @@ class SplatProjection(GaussianOperator):
             turn, along, across = by_pose(rows[:, : cloud.count], by_rows)
             shifts = [across / (self._projector.lines / 2), along / (self._projector.width / 2)]
             found[number] = turn, *(shifts[::-1] if self._images.turned else shifts)
-            if not (self._affine or cells.is_parallel):  # in these two projections, a shift does not change rays' lengths
+            if not (self._affine or cells.is_parallel):  # here a panel's shift does not change the rays' lengths
                 found[number, 1:] += by_length(self._poses[self._chosen[number]], weighed[number])
         return found
 
@@ -298,7 +299,7 @@ def _check_rows(rows: np.ndarray) -> None:
         raise InputError(_ROWS, f"a scale of {rows[SCALE].min():g}", "scales above 0", "of logarithms: np.exp(scale)")
     lengths = np.linalg.norm(rows[QUATERNION].astype(np.float64), axis=0)
     shortest, longest = QUATERNION_LENGTHS
-    if (wrong := (lengths < 0.99 * shortest) | (lengths > 1.01 * longest)).any():  # float32 has rounded them
+    if (wrong := (lengths < 0.99 * shortest) | (lengths > 1.01 * longest)).any():  # margins for the rounding of float32
         found = f"a quaternion of length {lengths[wrong][0]:g}"
         raise InputError(_ROWS, found, f"lengths from {shortest:g} to {longest:g}", "divide it by its length")
 
@@ -317,8 +318,8 @@ def by_pose(rows: np.ndarray, gradients: np.ndarray) -> tuple[float, float, floa
 
 
 def by_length(pose: np.ndarray, weighed: np.ndarray) -> np.ndarray:
-    """Returns the part (2,) of dL/d(panel shift along v, along u), for shifts in pixels, that comes from changed distances
-    between source and pixels. Line integrals are proportional to them. pose (12,) mm; weighed (rows, columns): frame ×
+    """Returns the part (2,) of dL/d(panel shift along v, along u), in pixels, that comes from changed distances between
+    source and pixels, to which line integrals are proportional. pose (12,) mm; weighed (rows, columns): frame ×
     dL/d(frame)."""
     source, first, column, row = pose.reshape(4, 3)
     v, u = (np.arange(n, dtype=np.float64) for n in weighed.shape)

@@ -1,6 +1,6 @@
 """Projector of Gaussians to a frame, merged over all its time cells, and its adjoint.
 
-This is the paper's *multi-pose batch rendering* (section 2.3): each kernel handles all M×N micro-views of a frame in one
+This is *multi-pose batch rendering* (PhyRadGS paper, section 2.3): each kernel handles all M×N micro-views of a frame in one
 launch. ``splat_prepare`` projects every Gaussian from every pose. ``splat_forward`` adds up micro-views and joins strips
 (Eq. 3) directly in the merged frame; no micro-view is stored. ``splat_backward`` and ``splat_chain`` are the adjoint.
 
@@ -160,8 +160,8 @@ class SplatProjector:
         """Writes dL/d(parameters) into ``gradients`` (13, stride), with rows as in cl/common/gradient.h, from dL/d(frame)
         with padded rows.
 
-        Call ``prepare`` or ``forward`` with the same Gaussians and cells before each call, because their results are
-        overwritten."""
+        Before each call, call ``prepare`` or ``forward`` with the same Gaussians and cells, as ``backward`` overwrites the
+        results."""
         rt = self.rt
         items, group = items_by_gaussian(rt, gaussians.count)
         by_images = by_image if self._layers is None else self._layers.split(cells, by_image)

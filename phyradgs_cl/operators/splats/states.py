@@ -17,7 +17,7 @@ STATE_ROWS = 12  # numbers of a Gaussian in a state: its centre x, y, z, and the
 _PROBED_SIDE = 9  # number of points along each axis of the grid at which the inverse of a field is checked
 _PROBED_STATES = 16  # number of evenly spread times at which a field's inverse is checked, besides those of most motion
 _WRONG = 0.01  # largest accepted error of a field's inverse, in voxels
-_BEND = 0.25  # largest deviation of a point's path in a segment from a straight line, in voxels: its RMS is 0.3 times this
+_BEND = 0.25  # largest deviation in voxels of a point's path in a segment from a straight line; its RMS is 0.3 times this
 _MOST_SEGMENTS = 32  # most segments of a frame, even if paths then deviate by more than _BEND
 
 

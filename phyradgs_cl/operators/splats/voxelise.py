@@ -147,7 +147,7 @@ def _in_bricks(
     made: Voxeliser | None = None
     for brick in cut(grid.shape, (1, 1), needs, room, share):
         if made is None or made.shape != brick.shape:
-            made = None  # frees its memory before the next one is made
+            made = None  # frees the last Voxeliser's memory before the next one is made
             made = Voxeliser(rt, brick.shape, cutoff_sigma=cutoff_sigma)
             made.lists.waits = True  # lists differ between bricks, and the host waits for each brick anyway
         part = made.forward(gaussians, grid, brick.start)

@@ -265,8 +265,7 @@ def deformed_frame(
     rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], deformation: Deformation, affine: bool = False
 ) -> np.ndarray:
     """Returns the frame (nv, nu) of an object that moves, summed over all time cells. rows (11, G): its Gaussians in the
-    reference state. A cell projects them as they are at its time; a moving cell takes their centres at both of its ends
-    too."""
+    reference state. A cell projects them at its time; a moving cell also takes their centres at both of its ends."""
 
     def cloud_at(time_s: float) -> np.ndarray:
         return moved_rows(rows, deformation, deformation.weights_at(time_s)[0])

@@ -101,8 +101,8 @@ def splat_frame(
     rows: np.ndarray, table: TimeCells, detector_shape: tuple[int, int], cutoff_sigma: float = 0.0,
     affine: bool = False,
 ) -> np.ndarray:
-    """Returns the frame (rows, columns) by the paper's Eq. 3: adds up, over the cells, the cell's lines of a complete
-    projection from its pose, times its weight."""
+    """Returns the frame (rows, columns) by Eq. 3 of the PhyRadGS paper: sums, over the cells, the cell's lines of a complete
+    projection from the cell's pose, times the cell's weight."""
     frame = np.zeros(detector_shape)
     for cell in range(table.count):
         lines = slice(int(table.line_start[cell]), int(table.line_stop[cell]))
@@ -115,8 +115,7 @@ def splat_frame(
 def voxel_field(
     rows: np.ndarray, z: np.ndarray, y: np.ndarray, x: np.ndarray, cutoff_sigma: float = 0.0
 ) -> np.ndarray:
-    """Evaluates parameter rows (11, G) at the coordinates z, y, x of voxel centres, in the rows' unit of length. Returns
-    (nz, ny, nx)."""
+    """Evaluates parameter rows (11, G) at voxel centres z, y, x, in the rows' unit of length. Returns (nz, ny, nx)."""
     points = np.stack(np.meshgrid(x, y, z, indexing="ij"), -1).transpose(2, 1, 0, 3)
     volume = np.zeros(points.shape[:3])
     for row, precision in zip(rows.T, precision_matrices(rows), strict=True):
@@ -163,7 +162,7 @@ def moving_frame(
         clouds = [rows] * 3
         if cloud_at is not None and table.end_times_s is not None:
             clouds = [cloud_at(time_s) for time_s in (table.time_s[cell], *table.end_times_s[cell])]
-        means = np.stack([cloud[:3] for cloud in clouds[1:]]).transpose(2, 0, 1)  # at both ends, (G, 2, 3)
+        means = np.stack([cloud[:3] for cloud in clouds[1:]]).transpose(2, 0, 1)  # means at both ends of the cell, (G, 2, 3)
         for row, precision, end_means in zip(clouds[0].T, precision_matrices(clouds[0]), means, strict=True):
             frame += _segment_image(
                 row, precision, pose, ends, end_means, times, shape, cutoff_sigma, affine, table.is_parallel, moved

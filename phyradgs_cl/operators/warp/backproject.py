@@ -59,8 +59,7 @@ class MovingBackprojector:
         self, pair: tuple[int, int], frames: np.ndarray, pose: np.ndarray, weights: np.ndarray, grid: Grid, axis: str,
         is_parallel: bool,
     ) -> np.ndarray:  # fmt: skip
-        """Backprojects frames that lie between the same two states. weights (F, 2): FDK's weight, and the second state's
-        fraction."""
+        """Backprojects frames between the states ``pair``. weights (F, 2): FDK's weight, and the second state's fraction."""
         rt, fields = self.rt, [self._push(state) for state in pair]
         size, by_lines = np.array([*grid.shape[::-1], 0], np.int32), pose.ndim == 3
         turned = by_lines and axis == "columns"
@@ -97,8 +96,8 @@ class MovingBackprojector:
         return push
 
     def _wide_pull_mm(self, state: int) -> tuple[np.ndarray, Grid, tuple[int, int, int]]:
-        """Returns the field w (…, 3) in mm on a wider grid, which the grid's matter does not leave; this wider grid; and its
-        padding (z, y, x) before the grid in voxels."""
+        """Returns the field w (…, 3) in mm on a wider grid, which matter of the grid does not leave; the wider grid; and the
+        number of voxels (z, y, x) that it has before the grid's first."""
         grid, weights = self.states.grid, self.states.weights[state]
         reach_mm = np.abs(np.tensordot(weights, self.states.fields_mm, 1)).max((0, 1, 2))[::-1]
         margin = np.ceil(1.5 * reach_mm / grid.voxel_size_mm).astype(int) + 1

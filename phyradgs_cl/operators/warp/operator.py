@@ -37,7 +37,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 _FRAMES_PER_STATE = 12
 _REACH = 2  # a cubic spline's coefficient acts up to this far, in voxels, as in cl/warp.cl
 _BORDER = 4  # width in voxels around the volume in which coefficients are kept, as in cl/warp.cl
-_SETTLES = 8  # width in voxels of the zero padding around ``_BORDER``, over which coefficients decay to 3e-5
+_SETTLES = 8  # width in voxels of the zero padding around ``_BORDER``, over which coefficients decay by a factor of 3e-5
 
 
 class WarpedOperator:
@@ -72,8 +72,7 @@ class WarpedOperator:
         self.project(lambda k: volume if self.warp.is_still(k) else self.warp.forward(k, source), frames)
 
     def project(self, volume_of: Callable[[int], DeviceArray], frames: DeviceArray) -> None:
-        """Projects all states to frames (F, rows, columns): Σ_k P_k v_k. volume_of: returns the volume v_k (nz, ny, nx) of
-        state k."""
+        """Projects all states to frames (F, rows, columns): Σ_k P_k v_k. volume_of(k): state k's volume v_k (nz, ny, nx)."""
         self.rt.fill(frames, 0)
         for part in self._parts:
             part.operator.forward(volume_of(part.state), out=self.warp.stack.of(len(part.frames), self.detector_shape))

@@ -10,8 +10,8 @@ import numpy as np
 from phyradgs_cl.fields import Deformation, Grid
 
 MOST_STATES = 12  # most states that represent a motion, by default
-_SPACING = 0.6  # largest RMS distance, in voxels, of moving voxels from where the nearest state has them, with blends
-_SPACING_OF_NEAREST = 0.3  # like _SPACING, if each time takes the nearest state, without a blend
+_SPACING = 0.6  # largest RMS distance, in voxels, of moving voxels from their places in the nearest state, with blends
+_SPACING_OF_NEAREST = 0.3  # the same distance if each time takes the nearest state, without a blend
 _MOVES = 0.1  # a voxel counts as moving if its squared displacement is at least this fraction of the largest one
 
 
@@ -39,8 +39,7 @@ class MotionStates:
         nearest to their mean. Each further one is the object when it differs most from all states so far, until at every
         time a state is near enough.
 
-        least_voxels: a change of a weight by 1 counts as at least this displacement, so that fields of zeros get several
-        states too."""
+        least_voxels: a change of a weight by 1 counts as at least this displacement, so fields of zeros get states too."""
         units, fields_mm = np.eye(deformation.rank), unit_fields_mm(deformation, grid)
         voxel_mm = min(grid.voxel_size_mm)
         seen = np.unique(deformation.weights_at(times_s), axis=0)
@@ -82,8 +81,7 @@ class MotionStates:
         """Returns the fractions of the states (T, K) at times (T,) in s. They sum to 1, with at most two above 0.
 
         A blend takes the two states with the smallest error in voxels. The error is a sum: the distance of the object at
-        that time from the line between both states, and the blur of adding two volumes that are displaced against each
-        other."""
+        that time from the line between both states, and the blur of adding two volumes displaced against each other."""
         wanted = self.deformation.weights_at(times_s)
         if not self.blends:
             distances = np.stack([_length(wanted - weights, self.metric) for weights in self.weights], -1)

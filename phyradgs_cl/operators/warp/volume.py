@@ -13,7 +13,7 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
 # Width in voxels around the volume in which spline coefficients are kept, as in cl/warp.cl. Farther out they would be below
 # 3e-3 of the voxels' values.
 _BORDER = 4
-_MOST_OWNED = 8  # most slices that a CPU's work-item sums: with fewer, more voxels would be computed by two work-items
+_MOST_OWNED = 8  # most slices that a CPU's work-item sums; voxels near the border of two work-items are computed by both
 _ITEMS_PER_UNIT = 4  # wanted work-items per compute unit, so that none waits long for the last
 _HEADROOM = 64  # largest sum of weights that a voxel may receive: 4³, where a field contracts by 4 along each axis
 _TOGETHER = 8, 8, 4  # box of voxels (x, y, z) that a GPU's work-group adds up in local memory
@@ -51,8 +51,7 @@ class VolumeWarp:
         return self.states.is_still(state)
 
     def source(self, volume: DeviceArray) -> DeviceArray:
-        """Returns the spline coefficients F E v of a volume v (nz, ny, nx), padded (E) and filtered (F). Valid until the
-        next call."""
+        """Returns the spline coefficients F E v of a volume v (nz, ny, nx): E pads, F filters. Valid until the next call."""
         if self._source is None:
             self._source = self.rt.empty(self._floats)
         self.rt.fill(self._source, 0)
@@ -73,8 +72,7 @@ class VolumeWarp:
             self.rt.launch(across, (width // lanes, planes), values, start, *sides, group=group)
 
     def forward(self, state: int, source: DeviceArray) -> DeviceArray:
-        """Returns the volume warped to a state, W_k v (nz, ny, nx), from its coefficients ``source``. Valid until the next
-        call."""
+        """Returns a state's warped volume W_k v (nz, ny, nx) from coefficients ``source``. Valid until the next call."""
         nz, ny, nx = self.shape
         result, blocks = self.moved(), ceil_div(nx, self.rt.lanes)
         self.rt.launch(
@@ -178,7 +176,7 @@ class TimeStates:
 class StateStack:
     """Takes states from a stack x (K, nz, ny, nx): W_k x = x_k. Stands in for ``VolumeWarp``, for an object that changes."""
 
-    volumes = 2  # most stacks x held on the device
+    volumes = 2  # most stacks x that the device holds
 
     def __init__(self, rt: Runtime, volume_shape: tuple[int, int, int], states: TimeStates) -> None:
         self.rt, self.states, self.shape = rt, states, (states.count, *volume_shape)
@@ -212,8 +210,7 @@ class StateStack:
         return self._total
 
     def adjoint(self, state: int, moved: DeviceArray, total: DeviceArray) -> None:
-        """Writes a volume v of state k to volume k = ``state`` of ``total``. It need not add, because it is called once per
-        state."""
+        """Writes a volume v of state k to volume k = ``state`` of ``total``. Called once per state, it need not add."""
         self.rt.copy(moved, total, nbytes=4 * self._voxels, target_offset=4 * self._voxels * state)
 
     def read(self, total: DeviceArray, result: DeviceArray) -> None:
