@@ -23,7 +23,7 @@ OWN = "h5"
 """This package's volume files. Their values stay in 1/mm; a scale of Hounsfield units is stored next to them."""
 ScaleOf = Callable[[Volume], Hounsfield | None]
 _SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": (), "zarr": (".ome.zarr", ".zarr")}
-# Formats of other programs that are not written: HDF5 under such a name would be read as something else.
+# Suffixes of formats that are not written: an HDF5 file with such a name would be read as something else.
 _NOT_WRITTEN = (".mhd", ".dcm", ".png", ".jpg", ".raw", ".vol", ".bin", ".img", ".mat", ".vtk", ".vti", ".csv", ".json")
 _PLAIN = "values in 1/mm"  # a note for files of other programs, which have no field for this unit
 
@@ -102,9 +102,9 @@ def _in_unit(volume: Volume, scale: Hounsfield | None, unit: str = _PLAIN) -> tu
 
 
 def state_times_s(moves: Deformation | States, count: int, during_s: tuple[float, float] | None = None) -> list[float]:
-    """Returns times (count,) in s: middles of equal parts of ``during_s``, by default the motion's whole time. If a file
-    stores ``count`` states and no ``during_s`` is given, it returns their times. Raises InputError for a count outside 1
-    to 1000, and for a ``during_s`` that does not end after its begin, or lies entirely outside the motion's time."""
+    """Returns times (count,) in s: middles of equal parts of ``during_s``, by default the motion's whole time. If ``moves``
+    are ``count`` stored states and no ``during_s`` is given, returns their times. Raises InputError for a count outside 1 to
+    1000, and for a ``during_s`` that does not end after its begin, or lies entirely outside the motion's time."""
     checks.whole("--states", count, 1, 1000)
     if isinstance(moves, States) and during_s is None and count == len(moves.times_s):
         return moves.times_s.tolist()

@@ -26,7 +26,7 @@ Chart = tuple[str, Markup]
 
 
 def chart(draw: "Callable[[Axes], None]", title: str, description: str, size: tuple[float, float] = SIZE) -> Markup:
-    """Returns, as an SVG element in the page's colours, what ``draw`` draws. title, description: for screen readers."""
+    """Returns an SVG element of what ``draw`` draws, in the page's colours. title, description: for screen readers."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -110,7 +110,7 @@ def views_chart(key: str, values: object) -> Chart | None:
 
 
 def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:
-    """Returns a chart of histograms of line integrals, before and after: ``counts`` (2, n) between ``edges`` (n + 1,)."""
+    """Returns a chart of line integrals before and after a step: pixels ``counts`` (2, n) between ``edges`` (n + 1,)."""
 
     def draw(axes: "Axes") -> None:
         before, after = np.maximum(counts, 0.9)  # a logarithmic axis has no 0

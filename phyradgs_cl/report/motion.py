@@ -92,7 +92,7 @@ def object_in_motion(
 
 
 def fitting(deformation: Deformation, grid: Grid) -> Deformation:
-    """Returns the deformation in at most ``MOST_VALUES`` numbers: a larger one keeps its values at fewer control points."""
+    """Returns the deformation in at most ``MOST_VALUES`` numbers: a larger one is sampled at fewer control points."""
     spacing_mm = float(np.max(deformation.spacing_mm))
     reduced = deformation
     while reduced.control_mm.size > MOST_VALUES and spacing_mm < 2 * max(grid.size_mm):
@@ -112,7 +112,7 @@ def fitting(deformation: Deformation, grid: Grid) -> Deformation:
 
 
 def _data(deformation: Deformation, grid: Grid, span_s: tuple[float, float]) -> dict[str, object]:
-    """Returns the deformation for the script, axes x, y, z. Control points are 16-bit fractions of their largest value."""
+    """Returns the deformation for the script, axes x, y, z. Control points are 16-bit fractions of a field's largest one."""
     control_mm = deformation.control_mm
     largest_mm = np.abs(control_mm).max(axis=(1, 2, 3, 4))
     units_mm = np.where(largest_mm > 0, largest_mm, 1.0) / _LARGEST

@@ -32,15 +32,15 @@ from phyradgs_cl.workflow.volumes import compared_states
 
 log = logging.getLogger(__name__)
 # A converged run with a large last residual (a fraction of the line integrals' norm) gives a warning.
-_SETTLED = 5  # fewer recorded residuals say nothing about convergence: without a first volume, the first one is 1
+_SETTLED = 5  # fewer recorded residuals show no convergence; the first is 1 unless the run begins with a given volume
 _UNLIKELY = 0.15  # smaller residuals give no warning: correct scans had at most 0.13, besides noise
-_AT_REST = 1.05  # converged: the residual after 3/4 of the iterations is at most this many times the last one
-_BEYOND_NOISE = 1.5  # no warning up to this many times the noise; correct scans, even of 100 photons, had at most 1.1
+_AT_REST = 1.05  # converged: residual after 3/4 of the iterations / last residual is at most this
+_BEYOND_NOISE = 1.5  # no warning if residual / noise is at most this; correct scans, even of 100 photons, had at most 1.1
 _ALL_ROWS = Slabs()
 
 
 class _Checkpoints:
-    """Writes checkpoints; call it with each progress report. It writes at most every ``every_s`` seconds, never for 0. A
+    """Writes a run's checkpoints, at most every ``every_s`` seconds, never for 0; call it with each progress report. A
     killed run leaves its last complete checkpoint. A failure to write gives a warning, once, and no error."""
 
     def __init__(self, path: Path, every_s: float) -> None:
@@ -109,7 +109,7 @@ def run_reconstruction(
 
 
 def _slabs_of(plan: methods.RunPlan, slabs: Slabs, scan: Path, ranks: Communicator | None) -> list[tuple[int, int]]:
-    """Returns the slabs of a run; [] reconstructs the whole scan at once. Raises InputError for what needs all rows."""
+    """Returns the slabs of a run; [] reconstructs the whole scan at once. Raises InputError for runs that need all rows."""
     if slabs == _ALL_ROWS and surely_fits(scan):
         return []
     with expecting(scan, "scan"):

@@ -57,7 +57,7 @@ def _read_geometry(rtk: Any, reader_name: str, description: str, names: list[str
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a folder of one of the makers, or the description in it, with projections."""
+    """Returns whether ``path`` is a folder with a maker's description and projections, or this description in the folder."""
     return _located(path) is not None
 
 
@@ -77,7 +77,7 @@ def _located(path: Path) -> tuple[_Maker, Path, list[Path]] | None:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a maker's folder. ``path`` may also be the description in it."""
+    """Imports a folder with one maker's description and projections. ``path`` may also be the description in it."""
     if (located := _located(path)) is None:
         expected = ", ".join(f"*{maker.description} with *{maker.suffixes[0]}" for maker in _MAKERS)
         raise InputError(str(path), "no description with projections", expected)
