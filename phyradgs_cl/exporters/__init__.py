@@ -95,7 +95,7 @@ def _checked(
 
 
 def _in_unit(volume: Volume, scale: Hounsfield | None, unit: str = _PLAIN) -> tuple[Volume, str]:
-    """Returns the volume with float32 values, and a note of their unit: Hounsfield units if there is a ``scale``, else
+    """Returns the volume with float32 values, and a note of their unit: Hounsfield units by ``scale``, if given, else
     ``unit``."""
     values = np.ascontiguousarray(volume.values, np.float32)
     return replace(volume, values=values if scale is None else scale.of(values)), unit if scale is None else scale.note
@@ -122,7 +122,7 @@ def export_states(
     output: str | Path | None = None, mu_water_per_mm: float | None = None, labels: DicomLabels | None = None,
     scale_of: ScaleOf | None = None,
 ) -> list[Path]:  # fmt: skip
-    """Writes the object of a volume file at evenly spaced times in s, and returns the paths. deformation: how the object
+    """Writes the object of a volume file at the times ``times_s`` in s, and returns the paths. deformation: how the object
     moves; None if the file has the object at several times. NIfTI has all times in one file of four dimensions. Other
     formats have a file or folder per time: NAME_01.SUFFIX and so on. See ``export_volume`` for other arguments and errors.
     Raises InputError also for a format of Gaussians, and for a deformation that moves nothing in the volume's grid."""

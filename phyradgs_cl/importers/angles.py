@@ -19,9 +19,9 @@ _NO_ANGLE = re.compile(r"speed|veloc|rate|temp|err|std|sigma", re.I)
 _WHOLE = r"(?![^(\[]*[)\]])"
 _SPLITS = [re.compile(rf"(?:{separator}){_WHOLE}") for separator in (r"[\t;,:]\s*|\s{2,}", r"[\t;,:\s]+")]
 _BRACKETS, _BEFORE_BRACKET = re.compile(r"[(\[]([^)\]]*)[)\]]"), re.compile(r"(?<! ) (?=[(\[])")
-_GLUED = re.compile(r"(angle|theta|phi|rotation|rot)(?=[a-zµμ]{3})", re.I)  # a unit glued to its word, as in thetadeg
+_GLUED = re.compile(r"(angle|theta|phi|rotation|rot)(?=[a-zµμ]{3})", re.I)  # a unit joined to a word, as in thetadeg
 _HUMP = re.compile(r"(?<=[a-z])(?=[A-Z])")
-_SCALED = re.compile(  # a unit with a multiple, prefix or rate (deg/s), whose factor is another one
+_SCALED = re.compile(  # a unit with a multiple, prefix or rate, as 0.1 deg or deg/s: not a known unit
     r"(milli|micro)(?-i:(?![a-z]))|centi|(\d[.,]\d+|\de-?\d+|\^\S+)\s*(deg|°|rad)|(deg\w*|°|rad\w*|turns?)\s*(/|per\b)\s*\w*",
     re.I,
 )
@@ -35,9 +35,9 @@ def read_angles_rad(path: Path, count: int, unit: str | None = None, column: int
     """Reads angles (count,) in rad from a text file: one per line, all on one line, or in a column of a table, where an
     index may give their order. Lines above the numbers, with or without a #, may name the columns and the unit.
 
-    unit: the angles' unit, one of ``ANGLE``; None takes the one that the file names, else degrees. column: where a scanner's
-    files have the angles, from 0 on, unless names say otherwise. Raises InputError for another count, several columns
-    without names, names that contradict the numbers, unknown units, and lines without numbers."""
+    unit: the angles' unit, one of ``ANGLE``; None takes the one that the file names, else degrees. column: the column, from
+    0 on, in which a scanner's files have the angles, unless names say otherwise. Raises InputError for another count,
+    several columns without names, names that contradict the numbers, unknown units, and lines without numbers."""
     stored = read_text(path).splitlines()
     lines = [(i, text) for i, line in enumerate(stored, 1) if (text := line.partition("#")[0].strip())]
     is_header = [not re.search(r"\d", line) or (_cells(line, True) or _cells(line, False)) is None for _, line in lines]
@@ -102,7 +102,8 @@ def _factor(path: Path, texts: list[str]) -> float:
 
 
 def _units(text: str) -> tuple[dict[str, float], list[str]]:
-    """Returns the units of angles in a text, with their factors to rad, and its words that may be other units."""
+    """Returns the units of angles that a text names, each with its factor to rad, and the words of the text that may be
+    units of another quantity or unknown ones."""
     if scaled := _SCALED.search(text):
         return {}, [scaled[0]]
     known, others = dict[str, float](), list[str]()
@@ -171,7 +172,7 @@ def _column(
     if len(named) == 1:
         column = named[0]
         counts = [_is_index(values.tolist()) for values in columns]
-        if words != _split(header) and counts[column] and not all(counts):  # words may be a title, "Angle table"
+        if words != _split(header) and counts[column] and not all(counts):  # header may be a title: Angle table
             found, remedy = f"{header[:60]!r}, and numbers that count", "separate the names by tabs or commas"
             raise InputError(f"{path} column {words[column]}", found, "angles", remedy)
     if column >= width:
@@ -195,7 +196,7 @@ def file_of_angles(folder: SafeFolder, name: str, *ends: str) -> Path | None:
 
 def measured_angles_rad(path: Path, steps_rad: np.ndarray) -> np.ndarray:
     """Reads measured angles (F,) in rad, shifted so that the first is steps_rad[0]. steps_rad (F,): the planned, equal
-    steps. Files differ in sign and order: those nearest to the steps are taken. Warns of the largest difference."""
+    steps. Files differ in sign and order: the ones nearest to ``steps_rad`` are taken. Warns of the largest difference."""
     listed_rad = np.unwrap(read_angles_rad(path, len(steps_rad), column=1))
     ways = [steps_rad[0] + way - way[0] for way in (listed_rad, listed_rad[::-1], -listed_rad, -listed_rad[::-1])]
     best = min(ways, key=lambda way: float(np.abs(way - steps_rad).max()))

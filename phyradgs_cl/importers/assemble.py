@@ -1,7 +1,6 @@
 """The last steps of every importer: computes the shutter, the frames' opening times and the trajectory, and makes the scan.
 
-``RotaryStage`` describes a sample that turns between a source and a panel at rest, about an axis that may miss the central
-ray."""
+``RotaryStage`` describes a sample that turns between a source and a panel at rest. Its axis may miss the central ray."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -146,8 +145,7 @@ class Turned:
         return array[..., ::-1] if self.columns else array
 
     def poses(self, pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-        """Converts poses (..., 12), see ``PoseTable``, of stored images to the poses of the reversed images. panel: (rows,
-        columns)."""
+        """Converts stored images' poses (..., 12), see ``PoseTable``, to the reversed images'. panel: (rows, columns)."""
         pose = np.array(pose, np.float64)
         sides = (self.rows, panel[0], slice(9, 12)), (self.columns, panel[1], slice(6, 9))
         for count, step in ((count, step) for is_flipped, count, step in sides if is_flipped):
@@ -157,8 +155,7 @@ class Turned:
 
 
 def turn_of(pose: np.ndarray) -> Turned:
-    """Finds the flips that put row 0 at the bottom and column 0 on the left. pose (12,): of a stored image (see
-    PoseTable)."""
+    """Finds the flips that put row 0 at the bottom and column 0 on the left. pose (12,): see ``PoseTable``."""
     source, step_u, step_v = pose[:3], pose[6:9], pose[9:12]
     right = np.array([-source[1], source[0], 0.0])
     return Turned(rows=bool(step_v[2] < 0), columns=bool(step_u @ right < 0))
@@ -212,7 +209,7 @@ def assemble_scan(
 
 
 def _check_turn(trajectory: CircularOrbit | PoseTable, middle_s: np.ndarray, subject: str) -> None:
-    """Raises InputError if more than half of the views, at times ``middle_s`` (F,), have one angle or pose: a wrong one."""
+    """Raises InputError if more than half of the views, at times ``middle_s`` (F,) in s, have the same angle or pose."""
     if isinstance(trajectory, PoseTable):
         views = trajectory.pose(0, middle_s)
         views = views / np.abs(views).max(axis=0, initial=1e-9)
@@ -246,9 +243,9 @@ def cone(
     options: ImportOptions, to_axis_mm: Length, to_detector_mm: Length, panel: tuple[int, int], pitch_mm: Pitch,
     offset_mm: tuple[float, float], names: Mapping[str, str] | None = None,
 ) -> ConeGeometry:
-    """Returns a cone beam. Options replace the file's values, which are the other arguments. A length or pitch may be a
-    function that reads it. The function is called only if no option replaces its value. names: what the file calls its
-    values, for messages. Raises InputError unless the distance to the detector exceeds that to the axis."""
+    """Returns the geometry of a cone beam. Options replace the file's values, which are the other arguments. A length or
+    pitch may be a function that reads it. The function is called only if no option replaces its value. names: what the file
+    calls its values, for messages. Raises InputError unless the distance to the detector exceeds that to the axis."""
     axis_mm, detector_mm = map(partial(_taken, options), _DISTANCES, (to_axis_mm, to_detector_mm))
     if detector_mm <= axis_mm:
         axis, detector = (options.called(name, names) for name in _DISTANCES)
@@ -293,8 +290,8 @@ class RotaryStage:
     def turned(
         self, angle_rad: np.ndarray, timing: Timing, subject: str
     ) -> tuple[CircularOrbit | PoseTable, Geometry]:
-        """Returns the trajectory of gantry angles (F,) in rad, and the nearest circular geometry. The trajectory is a
-        circular orbit if the axis crosses the central ray at a right angle and the panel has no shifts, else a table."""
+        """Returns trajectory and nearest circular geometry for gantry angles (F,) in rad. The trajectory is a circular orbit
+        if the axis crosses the central ray at a right angle and the panel has no shifts, else a pose table."""
         question_unit(angle_rad, f"{subject} angles", "deg")
         if self.axis_u_mm == self.roll_rad == self.tilt_rad == 0 and self.shift_mm is None:
             return turning(self.geometry, angle_rad, timing), self.geometry

@@ -59,7 +59,7 @@ def read_npy(path: Path, ndim: int) -> np.ndarray:
         if file.read(6) != b"\x93NUMPY":
             raise InputError(subject, "another kind of file", "a NumPy array")
     with naming_damage(path, "a damaged .npy file", "a NumPy array"):
-        values = np.load(path, mmap_mode="r", allow_pickle=False)  # fails if the header announces more than the file
+        values = np.load(path, mmap_mode="r", allow_pickle=False)  # fails if the header announces more than the file holds
         dtype, shape = values.dtype, values.shape
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         raise InputError(subject, f"type {dtype}", "plain real numbers")
@@ -103,8 +103,8 @@ class SafeFolder:
         return [path for path in _files(self.root) if _is_one_of(path, suffixes)]
 
     def only(self, what: str, *suffixes: str) -> Path:
-        """Returns the only file with one of the suffixes. Raises InputError for none or several; its message calls the file
-        ``what``."""
+        """Returns the only file with one of the suffixes. Raises InputError, which calls it ``what``, for none or
+        several."""
         paths = self.matching(*suffixes)
         if len(paths) != 1:
             names = ", ".join(path.name for path in paths[:5]) or "none"
@@ -125,7 +125,7 @@ def _is_one_of(path: Path, suffixes: tuple[str, ...]) -> bool:
 
 
 def checked_name(name: object, subject: str) -> str:
-    """Returns ``name`` with forward slashes. Raises InputError about ``subject`` for "", absolute paths, and ".." in it."""
+    """Returns ``name`` with forward slashes. Raises InputError about ``subject`` for empty or absolute names, and ".."."""
     text = name.replace("\\", "/") if isinstance(name, str) else ""
     leads_out = PureWindowsPath(text).drive or text.startswith("/") or ".." in PurePosixPath(text).parts
     if not text.strip() or "\0" in text or leads_out:
@@ -135,5 +135,5 @@ def checked_name(name: object, subject: str) -> str:
 
 def in_natural_order(paths: Sequence[Path]) -> list[Path]:
     """Returns the paths sorted by name, numbers by value: 2.tif before 10.tif."""
-    parts = {path: re.split(r"(\d+)", path.name) for path in paths}  # lists of text at even indices, digits at odd ones
+    parts = {path: re.split(r"(\d+)", path.name) for path in paths}  # of each name: text at even indices, digits at odd ones
     return sorted(paths, key=lambda path: [int(part) if i % 2 else part for i, part in enumerate(parts[path])])

@@ -27,9 +27,9 @@ _TOGETHER = 0.1  # largest relative difference of medians among flats of one tim
 _APART = 0.3  # largest relative difference of medians among flats of several times, between which the tube may drift
 _DARK = 0.02  # largest difference of medians among darks, as a fraction of the flats' median
 
-# A flat or dark is also left out if its pixels' mean difference from the others exceeds the sum of _PATTERN and _TIMES.
-_PATTERN = 0.02  # part of a frame's allowed mean difference of pixels: a fraction of the flats' median
-_TIMES = 5.0  # part of a frame's allowed mean difference of pixels: a multiple of all frames' median difference
+# A flat or dark is also left out if its pixels' mean difference from the others exceeds the sum of the next two limits.
+_PATTERN = 0.02  # first part of a frame's allowed mean difference of pixels: this × the flats' median
+_TIMES = 5.0  # second part of a frame's allowed mean difference of pixels: this × its median over all frames
 _BLOCK_BYTES = 1 << 26  # bytes of the rows whose median is computed at once: a float64 copy of all frames would be large
 Mask = np.ndarray | None
 TAKEN = "taken"
@@ -63,8 +63,7 @@ def light_of(
 ) -> Light:
     """Returns the flats and dark for ``count`` projections, from flats and darks (n, v, u). Of three or more, those that do
     not fit the others are left out, with a warning. at (n,): flats' places, see ``places``; None: not stated. names: what
-    messages call each of the "flats" and "darks". Raises InputError if the option ``flats`` is "time" and all flats are of
-    one time."""
+    messages call the single "flats" and "darks". Raises InputError for the option flats "time" with flats of one time."""
     at, assumed = _times(subject, len(flats), count, options, at)
     light = max(float(np.median(_levels(flats)[1])), 1e-30)
     times = [np.flatnonzero(at == time) for time in np.unique(at)]
@@ -106,7 +105,7 @@ def _times(
 
 
 def _levels(stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns k evenly spaced pixels of n frames, (n, k) float64, and each frame's median (n,). NaN and ±infinity are 0."""
+    """Returns k evenly spaced pixels of n frames, (n, k) float64, and each frame's median (n,). NaN and infinity give 0."""
     pixels = stack.reshape(len(stack), -1)
     some = np.nan_to_num(pixels[:, :: -(-pixels.shape[1] // _PIXELS)].astype(np.float64), posinf=0.0, neginf=0.0)
     return some, np.median(some, axis=1)
@@ -223,7 +222,7 @@ def _warn_of_transmission(subject: str, frames: np.ndarray, options: ImportOptio
 
 def _refuse_no_counts(subject: str, frames: np.ndarray, flat: np.ndarray, options: ImportOptions) -> None:
     """Raises InputError for line integrals: the flat is 1 everywhere, and frames are near 0 at their left and right borders.
-    Raises it for transmissions too: floats of at most 2 in 99 % of the pixels, while air has a thousand counts."""
+    Raises it for transmissions: floats of at most 2 in 99 % of the pixels, while air has 1000 counts or more."""
     air, may_be = float(np.median(flat)), frames.dtype.kind == "f"
     if may_be and air >= _MANY_COUNTS and sum(map(np.count_nonzero, (f > _DIVIDED for f in frames))) <= FEW * frames.size:
         found = f"fractions, at most {_DIVIDED:g}, and air at {air:g} counts"

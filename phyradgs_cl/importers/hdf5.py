@@ -55,7 +55,8 @@ class Places:
 
     @contextmanager
     def opened(self, name: str, text: str) -> Iterator[tuple[Hdf5Source, str]]:
-        """Yields the open file and the address in it. text: FILE:/ADDRESS or /ADDRESS. Raises InputError for other texts."""
+        """Yields the open file and the address in it. text: FILE:/ADDRESS or /ADDRESS of the array ``name``. Raises
+        InputError for other texts."""
         file, _, address = text.rpartition(":/")
         subject = f"{self.subject} {name}"
         if self.source is not None and not file and text.startswith("/"):
@@ -95,7 +96,7 @@ class Places:
             remedy = "of a stack of sinograms say v,frame,u"
             raise InputError(f"{self.subject} axes", " ".join(order), "frame, v and u in the order of the data", remedy)
         dataset = source.dataset(address)
-        long = [count for count in dataset.shape if count != 1]  # without further axes of length 1
+        long = [count for count in dataset.shape if count != 1]  # a file may have further axes of length 1
         shape = dataset.shape if dataset.ndim <= len(_AXES) or len(long) > len(_AXES) else tuple(long)
         if len(shape) == len(_AXES) - 1 and panel is not None:
             shape = tuple(np.insert(shape, order.index("frame"), 1).tolist())
@@ -153,8 +154,9 @@ class Places:
         return np.full(frames, schema.PROJECTION)
 
     def angles_rad(self, used: np.ndarray, options: ImportOptions, usual: str = "", unit: str = "deg") -> np.ndarray:
-        """Returns angles in rad, sign as stored, of the frames in ``used``, bool (F,). Reads them at the address in the
-        option ``angles``, else where stated, else from the option, else at ``usual``. unit: of a file that states none."""
+        """Returns angles in rad, sign as stored, of the frames marked in ``used``, bool (F,). They are at the address in the
+        option ``angles``, else at the stated address; else the option itself gives them, else they are at the format's
+        address ``usual``. unit: the angles' unit if the file states none."""
         quantity = replace(ANGLE, assumed=unit)
         asked = [options.angles] if options.angles and is_address(options.angles) else self.stated.get("angles", ())
         for text in asked:

@@ -46,8 +46,8 @@ _MOST_FILES = 1000
 
 
 def refuse_unread(path: Path, expected: str) -> None:
-    """Raises InputError, which says how to convert, for a file of a known format that this package does not read, and for a
-    folder with such files. expected: what the error says was expected."""
+    """Raises InputError, which says how to convert the data, for a file of a known format that this package does not read,
+    and for a folder with such files. expected: what the error says was expected."""
     entries = [path] if path.is_file() else sorted(path.iterdir())[:_MOST_FILES] if path.is_dir() else []
     files = [file for file in entries if file.is_file()]
     suffixes = Counter("dcm" if _is_dicom(file) else file.suffix.lower()[1:] for file in files)

@@ -94,8 +94,8 @@ class ImportOptions:
         return [name for name in among if getattr(self, name) != _DEFAULTS[name]]
 
     def taken(self, name: str, stored: Callable[[], T]) -> T:
-        """Returns the option ``name`` if given, else what ``stored`` reads from the file. If reading raises InputError, its
-        remedy then names the option."""
+        """Returns the option ``name`` if given, else what ``stored`` reads from the file. If reading raises InputError, the
+        error's remedy names the option."""
         value: T | None = getattr(self, name)
         if value is not None:
             return value

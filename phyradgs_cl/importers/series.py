@@ -21,13 +21,13 @@ _DATE = r"(?<!\d)((?:19|20)\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])
 _TIME = re.compile(_DATE + r"[-_ T.]*([01]\d|2[0-3])[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d)(?!\d)")
 _DEGREES, _ANGLE = re.compile(r"[ _]?(deg|°|grad)", re.I), re.compile(r"(deg|angle|ang|theta|phi|rot)[ _=]*$", re.I)
 # A step from one number to the next is regular if it is near the usual step, the most frequent one.
-_STEADY = 0.25  # largest difference from the usual step, as a fraction of it
+_STEADY = 0.25  # largest difference of a regular step from the usual one, as a fraction of the usual step
 _GAP = 1.5  # a step between angles or times ≥ this × the usual step shows a missing frame
-_USUAL = 0.5  # a series is regular if at least this fraction of its steps is
+_USUAL = 0.5  # a series of numbers is regular if at least this fraction of its steps is regular
 _STEADY_ANGLES = 0.75  # angles or times with a smaller fraction of regular steps are uneven: no step shows a missing frame
 _SMALL = 0.25  # a group of files with the same words holds no frames if it is smaller than this fraction of the largest
 _BEFORE, _AFTER = (re.compile(rf"(?<![a-z])({words})(?![a-z])", re.I) for words in ("before|pre|start", "after|post|end"))
-_STAMP = 10**7  # numbers from here on are times in milliseconds, not indices
+_STAMP = 10**7  # numbers of this size and above are times in milliseconds, not indices
 _MOST_NAMES = 8  # a message lists at most this many file names
 
 
@@ -159,7 +159,8 @@ def _of_one_series(paths: list[Path], subject: str) -> list[Path]:
 
 
 def _do_alternate(groups: list[list[Path]]) -> bool:
-    """Returns whether groups take turns, as a_1, b_2, a_3: in the order of a number, neighbours often differ in group."""
+    """Returns whether groups of files take turns, as a_1, b_2, a_3 do: if the files are sorted by a number in their names,
+    the group changes at least as often as the smallest group has files."""
     if len({len(_words(group[0].stem)) for group in groups}) > 1:
         return False
     owner = [i for i, group in enumerate(groups) for _ in group]

@@ -41,8 +41,8 @@ def number_at_start(text: str, comma_is_decimal: bool = False) -> tuple[float, s
 
 
 def commas_are_decimal(texts: list[str]) -> bool:
-    """Returns whether numbers in the texts have decimal commas: one has a comma that cannot mark thousands, and none a
-    decimal point."""
+    """Returns whether commas in the texts' numbers are decimal: some comma cannot mark thousands, and no number has a
+    point."""
     commas = any(_ONE_COMMA.fullmatch(text) and not _EITHER.fullmatch(text) for text in texts)
     return commas and not any(re.fullmatch(r"[-+]?\d*\.\d+", text) for text in texts)
 

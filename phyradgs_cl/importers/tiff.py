@@ -63,8 +63,8 @@ def read_numbered(
     numbers (F,) from 0 on, and a text about which were taken. shape: the expected (F, v, u), None where any size fits.
     subject: what states the shape, or each of its sizes, for messages. first: the number of the first frame, needed if that
     frame is missing. pattern: the form of numbers. Files beyond the stated count are left out, with a warning. Raises
-    InputError for such files if the numbers do not begin with ``first``, since any may be the surplus one, for fewer files
-    than stated, unless the options say to take those found, and for images of another size."""
+    InputError for such files if the numbers do not begin with ``first`` (any file may then be the surplus one); for fewer
+    files than stated, unless the options say to take those found; and for images of another size."""
     subjects = [subject] * 3 if isinstance(subject, str) else subject
     name = re.compile(re.escape(prefix) + pattern, re.I)
     paths = [path for path in folder.matching(*SUFFIXES) if name.fullmatch(path.stem)]

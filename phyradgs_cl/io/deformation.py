@@ -88,8 +88,7 @@ def read_deformation_group(source: Hdf5Source, address: str) -> Deformation:
 
 
 def write_truth(extra: h5py.Group, scan: Scan) -> None:
-    """Writes a scan's true volume, its true volumes at several times and its deformation, as far as it has them, into the
-    group ``reference``."""
+    """Writes into the group ``reference`` the true volume, true states at several times and deformation that a scan has."""
     moving = scan.moving_truth
     if scan.reference is None and moving is None:
         return

@@ -1,5 +1,5 @@
-"""Writes outputs completely or not at all: first under another name, which is then renamed. A lock file keeps two runs
-from writing one output. Checkpoints of interrupted runs are plain arrays in a NumPy archive, never a pickle."""
+"""Writes outputs completely or not at all: each is written under another name first, and then renamed. A lock file keeps two
+runs from writing one output. Checkpoints of interrupted runs are plain arrays in a NumPy archive, never a pickle."""
 
 import errno
 import glob

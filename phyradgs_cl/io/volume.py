@@ -55,7 +55,7 @@ class Volume:
         return deformed(self.values, self.required_grid, field, field.weights_at(time_s)[0])
 
     def moved_by(self, deformation: Deformation, subject: str) -> "Volume":
-        """Returns the volume with another deformation. Raises InputError about ``subject`` if the volume has states."""
+        """Returns the volume with another deformation. Raises InputError, which names ``subject``, if it holds states."""
         if self.states is not None:
             found, expected = f"{subject}, which holds its states", "a volume whose object does not change"
             raise InputError("--object-motion", found, expected, "leave it out")
@@ -209,7 +209,7 @@ def _read_provenance(source: Hdf5Source) -> dict[str, object]:
 
 
 def interruption(provenance: Mapping[str, object]) -> dict[str, object]:
-    """Returns where a run was interrupted: ``interrupted_at`` and ``iterations_asked``. If it consists of several runs, for
+    """Returns where a run was interrupted: ``interrupted_at`` and ``iterations_asked``. If the run consists of several, for
     error bars, adds ``interrupted_in_run``. Returns an empty dict for a complete run."""
     at, options, doubt = (provenance.get(name) for name in ("interrupted_at", "options", "doubt"))
     if type(at) is not int:  # not isinstance, which accepts True
@@ -331,8 +331,7 @@ def shares_of_maximum(values: np.ndarray) -> np.ndarray:
 
 
 def finite_float32(subject: str, values: np.ndarray) -> np.ndarray:
-    """Returns ``values`` as contiguous float32. Raises InputError about ``subject`` for NaN, infinity and too
-    large values."""
+    """Returns ``values`` as contiguous float32. Raises InputError about ``subject`` for values that are not finite then."""
     with np.errstate(over="ignore"):  # values beyond float32 become infinite
         volume = np.ascontiguousarray(values, np.float32)
     bad = int(volume.size - np.count_nonzero(np.isfinite(volume)))

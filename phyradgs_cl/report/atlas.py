@@ -79,8 +79,8 @@ def _controls(threshold: int, cloud: Gaussians | None) -> list[Markup]:
 
 
 def _centres(cloud: Gaussians, grid: Grid) -> dict[str, str]:
-    """Returns evenly chosen centres inside the grid's box and their densities, in base64: x, y, z as 16-bit fractions of the
-    box's sides, densities in 8 bits."""
+    """Returns, in base64, evenly chosen Gaussians' centres inside the grid's box and their densities: x, y, z as 16-bit
+    fractions of the box's sides, densities in 8 bits."""
     some = np.unique(np.linspace(0, cloud.count - 1, min(cloud.count, MOST_CENTRES)).round().astype(int))
     low_mm, size_mm = (np.array(three[::-1]) for three in (np.array(grid.box_mm)[:, 0], grid.size_mm))
     share = (cloud.mean[some] - low_mm) / size_mm
@@ -118,5 +118,5 @@ def _between(steps: NDArray[np.uint8]) -> int:
     with np.errstate(all="ignore"):
         variance = below * above * (sums / below - (sums[-1] - sums) / above) ** 2
     variance = np.nan_to_num(variance)
-    best = np.flatnonzero(variance >= variance.max() * (1 - 1e-9))  # the levels between the two classes are all equally good
+    best = np.flatnonzero(variance >= variance.max() * (1 - 1e-9))  # several levels may be equally good: their mean is taken
     return int(np.clip(round(best.mean()) + 1, 1, 255))

@@ -1,5 +1,5 @@
-"""Makes pictures for the report: values as grey or coloured PNG, and as many slices of a volume as the page's budget of
-pixels allows."""
+"""Makes pictures for the report: values as grey or coloured PNG, and a volume's slices within the page's budget of
+pixels."""
 
 import base64
 import io
@@ -73,7 +73,7 @@ def diverging() -> NDArray[np.uint8]:
 
 
 def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
-    """Returns the values of black and white: 0 and a high percentile of the volume, or its extremes if that is 0 or less."""
+    """Returns the values of black and white: 0 and the volume's 99.9th percentile, or its extremes if that is 0 or less."""
     high = float(np.percentile(volume, _PERCENTILE))
     if high > 0:
         return 0.0, high

@@ -35,10 +35,10 @@ _LATE_S, _LATE_TIMES = 30.0, 6
 _LOG_RATIO = 20.0  # the curve's axis is logarithmic if the largest value is more than this many times the smallest
 _CHART = 560, 240  # width and height of the chart in pixels
 _MARGIN = 64, 12, 12, 34  # margins of the chart in pixels: left, top, right, bottom
-EVERY_S = 5.0  # time between two versions of the page
+EVERY_S = 5.0  # time in s between two versions of the page
 SHARE = 0.01  # fraction of the run's time that making pictures may take
 FRAMES = 2  # frames that are computed from the volume and compared with the measured ones
-FRAMES_FROM_S = 60.0  # shorter runs compute no frames, since their report comes soon
+FRAMES_FROM_S = 60.0  # runs shorter than this compute no frames, since their report comes soon
 
 
 @dataclass(frozen=True, eq=False)

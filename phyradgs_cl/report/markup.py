@@ -37,7 +37,7 @@ def joined(*children: object) -> Markup:
 
 
 def raw_text(name: str, content: str, /, **attributes: object) -> Markup:
-    """Returns a ``style`` or ``script`` element of own text, not escaped. Raises ValueError for text that would end it."""
+    """Returns a ``style`` or ``script`` element of trusted text, unescaped. Raises ValueError for text that would end it."""
     if "</" + name in content.lower():
         raise ValueError(f"{name}: the content would end its element")
     return element(name, Markup(content), **attributes)

@@ -40,8 +40,8 @@ from phyradgs_cl.workflow.reconstruct import resume_or_restart
 log = logging.getLogger(__name__)
 RESULTS, TABLE = "results.jsonl", "results.md"
 _RETRIES = 3  # times that Dask repeats a run after an error
-_CONNECT_S = 10.0  # time limit for connecting to Dask's scheduler
-_BUSY_S = 20.0  # wait in s before a run is tried again whose output another process is writing
+_CONNECT_S = 10.0  # time limit in s for connecting to Dask's scheduler
+_BUSY_S = 20.0  # pause in s before a new try of a run whose output another process is writing
 # Dask listens on this machine only, so that nobody else can send work to it
 _LOCAL = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
 Line = dict[str, Any]
@@ -218,8 +218,8 @@ def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: st
 
 
 def _failed(run: SweepRun, error: Exception) -> Line:
-    """Returns the line of results of a failed run. An OutputError that is no BusyError is raised instead, because all runs
-    would meet it."""
+    """Returns the line of results of a failed run. Raises an OutputError that is no BusyError, because all runs would meet
+    it."""
     if isinstance(error, OutputError) and not isinstance(error, BusyError):
         raise error
     text = str(error) if isinstance(error, PhyradgsError) else f"{type(error).__name__}: {error}"

@@ -116,8 +116,8 @@ def _lengths(entry: str) -> hdf5.Lengths:
 
 
 def _turned(source: Hdf5Source, detector: str) -> assemble.Turned:
-    """Reads which image axes are flipped: y_flipped and half turns of the detector about its x axis flip rows, x_flipped and
-    half turns about its y axis columns. Two flips of an axis cancel."""
+    """Reads which image axes are flipped. y_flipped and half turns of the detector about its x axis flip rows; x_flipped and
+    half turns about its y axis flip columns. Two flips of one axis cancel."""
     flips = [False, False]
     for index, address in enumerate((f"{detector}/y_flipped", f"{detector}/x_flipped")):
         if source.find(address) is not None:

@@ -133,7 +133,8 @@ def _frames_and_views(
 
 
 def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> ImportOptions:
-    """Returns the options. If counts lack a flat value, it is the brightest pixel, as in PhyRadGS's code, with a warning."""
+    """Returns the options, completed by a flat value if the frames are counts without one: the brightest pixel, as in
+    PhyRadGS's published code, with a warning. Raises InputError for frames without a count above 0."""
     if options.flat_value is not None or options.quantity not in (None, "counts"):
         return options
     brightest = float(frames.max())
@@ -160,7 +161,7 @@ def _view_poses(
     panel: tuple[int, int], pitch: tuple[float, float],
 ) -> np.ndarray:
     """Returns a view's poses (T, 12), see ``PoseTable``. detector: the panel's angles (T,) in rad and centres (T, 3) in mm.
-    The panel is rotated about +z by its angle minus the angle at which its matrix holds. centre: (x, y) of its circle."""
+    The panel is rotated about +z by its angle minus the angle at which its matrix holds. centre (2,): its circle's."""
     rotation, stands_at = _matrix(view)
     angle_rad, centre_mm = detector
     turned_rad = angle_rad - np.arctan2(stands_at[1] - centre[1], stands_at[0] - centre[0])

@@ -29,7 +29,7 @@ ROW_0 = "top"
 OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 OPTIONS_WITH_TIMES = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
 _KEYS = ("first_line_start", "first_line_end", "last_line_end")
-_SAME = 1e-3  # the frames' ratios (readout time / exposure time) differ by at most this × max(1, largest ratio)
+_SAME = 1e-3  # the ratio readout time / exposure time may differ between frames by this × max(1, largest ratio)
 
 
 @dataclass(frozen=True, eq=False)

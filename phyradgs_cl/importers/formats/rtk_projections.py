@@ -24,8 +24,7 @@ _COPIES = 12  # bytes of memory for every byte of the files: some makers pack im
 @dataclass(frozen=True)
 class _Maker:
     """A maker's files. description, suffixes: how names of the description and of projections end. reader: RTK's class that
-    reads the geometry. below: pattern of projections in folders below the description's. options: import options that
-    apply."""
+    reads the geometry. below: pattern of projections in folders below the description's. options: usable import options."""
 
     description: str
     suffixes: tuple[str, ...]

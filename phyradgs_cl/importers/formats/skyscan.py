@@ -3,7 +3,7 @@
 The maker publishes no description of the log. Distances and pixels are read as in TIGRE. A pixel of the camera is Image
 Pixel Size times the magnification; X/Y Ratio is its width over its height. The central ray falls on the row Optical Axis,
 counted from the bottom. Row 0 is on top, column 0 on the right seen from the source. The log writes CC for a sample that
-turns counterclockwise seen from above. It does not state the column of the axis."""
+turns counterclockwise seen from above. The log does not state the column of the axis."""
 
 import logging
 import re

@@ -105,8 +105,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _taken(scan: Streams, count: int) -> int:
-    """Returns how many of ``count`` planned images were taken: all if the file does not state it, or states 0. Warns if the
-    scan stopped early."""
+    """Returns how many of ``count`` planned images were taken: all if the file states no number or 0. Warns if fewer."""
     taken = int(scan.first_of(f"{_INFO}/ImagesTaken", 0)) if scan.has(f"{_INFO}/ImagesTaken") else count
     if 0 < taken < count:
         _log.warning("%s: the scan stopped early: %d of %d images were taken", scan.subject, taken, count)

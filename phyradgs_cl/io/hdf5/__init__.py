@@ -48,7 +48,7 @@ def open_hdf5(path: str | Path, linked_folder: Path | None = None) -> "Iterator[
         unknown = f"a file that HDF5 cannot open ({error})", ""
         found, remedy = next((known for words, known in _REASONS.items() if words in str(error)), unknown)
         raise InputError(subject, found, "a readable HDF5 file", remedy) from error
-    folders = filter(None, (path.parent, path.resolve().parent, linked_folder))  # of a link: its own and its target's
+    folders = filter(None, (path.parent, path.resolve().parent, linked_folder))  # path may be a link into another folder
     places = tuple(Path(place) for one in folders for place in (os.path.abspath(one), one.resolve()))
     with file:
         try:

@@ -35,7 +35,7 @@ class ScanHeader:
     """A checked scan without its arrays: ``scan.projections`` are zeros that take no memory.
 
     entry: address of the NXtomo group. image_key (F,): types of all stored frames. quantity, data_type: of the frames.
-    mask_shape: None without a mask. states: number of times with a true volume. has_grid: the file states it."""
+    mask_shape: None without a mask. states: how many times have a true volume. has_grid: the file states a grid."""
 
     scan: Scan
     entry: str
@@ -190,8 +190,8 @@ def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int
 
 
 def _is_parallel(source: Hdf5Source, entry: str) -> bool:
-    """Returns whether the file says that the beam is parallel. A file of another program is also taken as parallel, with a
-    warning, if it has no source distance."""
+    """Returns whether the file says that the beam is parallel. The beam of another program's file is taken as parallel, with
+    a warning, if the file has no source distance."""
     beam, distance = f"{entry}/{schema.BEAM}", f"{entry}/{schema.SOURCE}/distance"
     has_distance = source.optional(distance) is not None
     if source.optional(beam) is not None:

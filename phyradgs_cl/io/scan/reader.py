@@ -149,8 +149,8 @@ def _read_mask(source: Hdf5Source, header: ScanHeader, rows: slice | None) -> np
 def _read_frames(
     source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None, rows: slice | None
 ) -> np.ndarray:
-    """Reads all stored frames (F, v, u), or their ``rows``. Raises InputError for NaN and infinity in valid frames, unless
-    they are masked."""
+    """Reads all stored frames (F, v, u), or their ``rows``. Raises InputError for unmasked NaN or infinity in valid
+    frames."""
     address = f"{header.entry}/{schema.DATA}"
     data = read_values(source, address, source.dataset(address), rows=rows)
     if data.dtype.kind == "f":
