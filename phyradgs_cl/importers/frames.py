@@ -105,7 +105,7 @@ def _times(
 
 
 def _levels(stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns k evenly spaced pixels of n frames, (n, k) float64, and each frame's median (n,). NaN and infinity give 0."""
+    """Returns k evenly spaced pixels of n frames, (n, k) float64, and each frame's median (n,). NaN and infinity are 0."""
     pixels = stack.reshape(len(stack), -1)
     some = np.nan_to_num(pixels[:, :: -(-pixels.shape[1] // _PIXELS)].astype(np.float64), posinf=0.0, neginf=0.0)
     return some, np.median(some, axis=1)
@@ -117,8 +117,8 @@ def _fitting(
 ) -> np.ndarray:
     """Returns which of k flats or darks, bool (k,), are like most of them in median and pattern. group (k,): their indices
     in ``stack`` (n, v, u). tolerance: largest difference of medians, as a fraction of ``light``, the flats' median counts.
-    kind ("flats" or "darks"), subject, names: words of messages. Keeps all of fewer than 3, and all if half are unlike.
-    Warns of each frame that it leaves out."""
+    kind ("flats" or "darks"), subject, names: words of messages. Keeps all if k < 3 or at least half are unlike. Warns of
+    each frame that it leaves out."""
     some, level = _levels(stack[group])
     usual = float(np.median(level))
     is_odd = np.abs(level - usual) > tolerance * light

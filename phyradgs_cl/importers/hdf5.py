@@ -28,7 +28,7 @@ STACKS = ("projections", "flats", "darks", "mask")
 NAMES = (*STACKS, "image_key", "angles", "axes")
 _AXES = ("frame", "v", "u")
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_LIKE = 0.1  # relative difference up to which pixel size on the panel = pixel size at the sample × magnification
+_LIKE = 0.1  # a larger relative difference between pixels on the panel and pixels at the sample × magnification is a warning
 _LEAST_MM = 1e-4  # no pixel is smaller than this: a smaller number without a unit must be in m
 _TIMES = replace(LENGTH, name="magnification", assumed="", factors=MappingProxyType({"": 1.0, "x": 1.0}))
 

@@ -155,7 +155,7 @@ def read_image_volume(path: Path, state: int | None = None) -> Volume:
 
 def _resize_by_sform(subject: str, image: Any) -> None:
     """Gives a NIfTI image the voxel sizes of its sform, if only the sform states its place: SimpleITK always takes the sizes
-    of pixdim, which belong to the qform. Raises InputError where both are stated and differ."""
+    of pixdim, which belong to the qform. Raises InputError where sform and qform are both stated and differ."""
     codes = {form: float(image.GetMetaData(key)) for form in "sq" if image.HasMetaDataKey(key := f"{form}form_code")}
     if codes.get("s", 0) <= 0:
         return

@@ -45,9 +45,9 @@ def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Vol
 
 
 def in_per_mm(subject: str, volume: Volume, mu_water_per_mm: float | None = None) -> Volume:
-    """Returns a volume in 1/mm, with the scale of the Hounsfield units that it was in, if any. A file's note may say that
+    """Returns a volume in 1/mm, with the scale of the Hounsfield units that it had, if any. A file's note may say that
     values are in Hounsfield units, and state the scale; else ``mu_water_per_mm`` states it. Without a note, this argument
-    converts volumes with values beyond ±10 1/mm. Raises InputError about ``subject`` for noted Hounsfield units without a
+    converts volumes with values beyond ±10 1/mm. Raises InputError about ``subject`` for noted Hounsfield units without
     scale."""
     stated = None if mu_water_per_mm is None else Hounsfield(mu_water_per_mm)
     is_hu, scale = of_note(str(volume.provenance.get(VALUES, "")))

@@ -171,7 +171,7 @@ def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None,
     """Yields lines of runs as they finish; writes Dask's report to ``page``. Raises InputError if no scheduler answers."""
     os.environ.setdefault("DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION", "1.0")  # else a worker's death fails queued runs
     dask = checks.package("distributed", "the package that --workers needs", "phyradgs-cl[cluster]")
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # the InputError below reports the same
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # Dask's own log would repeat the InputError below
     count, where = int(workers) if workers.isdigit() else None, {"address": workers, "timeout": _CONNECT_S}
     if count is not None:
         checks.within("--workers", count, 1, 1024)

@@ -161,7 +161,7 @@ def _view_poses(
     panel: tuple[int, int], pitch: tuple[float, float],
 ) -> np.ndarray:
     """Returns a view's poses (T, 12), see ``PoseTable``. detector: the panel's angles (T,) in rad and centres (T, 3) in mm.
-    The panel is rotated about +z by its angle minus the angle at which its matrix holds. centre (2,): its circle's."""
+    The panel is rotated about +z by its angle minus the angle at which its matrix holds. centre (2,): of its circle."""
     rotation, stands_at = _matrix(view)
     angle_rad, centre_mm = detector
     turned_rad = angle_rad - np.arctan2(stands_at[1] - centre[1], stands_at[0] - centre[0])

@@ -58,8 +58,8 @@ class Streams(Fields):
         return values[:count]
 
     def steady(self, name: str) -> float:
-        """Returns a length in mm without its sign, which must be the same in all images. Images in which it is 0 do not
-        count. Raises InputError if it differs between the others, or is 0 in all images."""
+        """Returns the size in mm of a length that all images share. Images in which the length is 0 do not count. Raises
+        InputError if it differs between the others, or is 0 in all images."""
         lengths = np.abs(self.numbers(name))
         lengths = lengths[lengths > 0]
         if not len(lengths) or np.ptp(lengths) > _STEADY * lengths[0]:

@@ -158,7 +158,7 @@ def read_integers(source: Hdf5Source, address: str, shape: Sequence[int | None])
 def read_word(
     source: Hdf5Source, address: str, allowed: Collection[str] | None = None, default: str | None = None
 ) -> str:
-    """Reads a string, one of ``allowed`` if given. Raises InputError for others, and for a missing one without default."""
+    """Reads a string, one of ``allowed`` if given. Raises InputError for another value, and for none without ``default``."""
     if default is not None and source.optional(address) is None:
         return default
     dataset, word = source.dataset(address), None
