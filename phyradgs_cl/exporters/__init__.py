@@ -23,7 +23,7 @@ OWN = "h5"
 """This package's volume files. Their values stay in 1/mm; a scale of Hounsfield units is stored next to them."""
 ScaleOf = Callable[[Volume], Hounsfield | None]
 _SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": (), "zarr": (".ome.zarr", ".zarr")}
-# Formats of other programs that are not written: HDF5 under such a name would be read as something else.
+# Suffixes of formats that are not written: an HDF5 file with such a name would be read as something else.
 _NOT_WRITTEN = (".mhd", ".dcm", ".png", ".jpg", ".raw", ".vol", ".bin", ".img", ".mat", ".vtk", ".vti", ".csv", ".json")
 _PLAIN = "values in 1/mm"  # a note for files of other programs, which have no field for this unit
 
@@ -95,16 +95,16 @@ def _checked(
 
 
 def _in_unit(volume: Volume, scale: Hounsfield | None, unit: str = _PLAIN) -> tuple[Volume, str]:
-    """Returns the volume with float32 values, and a note of their unit: Hounsfield units if there is a ``scale``, else
+    """Returns the volume with float32 values, and a note of their unit: Hounsfield units by ``scale``, if given, else
     ``unit``."""
     values = np.ascontiguousarray(volume.values, np.float32)
     return replace(volume, values=values if scale is None else scale.of(values)), unit if scale is None else scale.note
 
 
 def state_times_s(moves: Deformation | States, count: int, during_s: tuple[float, float] | None = None) -> list[float]:
-    """Returns times (count,) in s: middles of equal parts of ``during_s``, by default the motion's whole time. If a file
-    stores ``count`` states and no ``during_s`` is given, it returns their times. Raises InputError for a count outside 1
-    to 1000, and for a ``during_s`` that does not end after its begin, or lies entirely outside the motion's time."""
+    """Returns times (count,) in s: middles of equal parts of ``during_s``, by default the motion's whole time. If ``moves``
+    are ``count`` stored states and no ``during_s`` is given, returns their times. Raises InputError for a count outside 1 to
+    1000, and for a ``during_s`` that does not end after its begin, or lies entirely outside the motion's time."""
     checks.whole("--states", count, 1, 1000)
     if isinstance(moves, States) and during_s is None and count == len(moves.times_s):
         return moves.times_s.tolist()
@@ -122,7 +122,7 @@ def export_states(
     output: str | Path | None = None, mu_water_per_mm: float | None = None, labels: DicomLabels | None = None,
     scale_of: ScaleOf | None = None,
 ) -> list[Path]:  # fmt: skip
-    """Writes the object of a volume file at evenly spaced times in s, and returns the paths. deformation: how the object
+    """Writes the object of a volume file at the times ``times_s`` in s, and returns the paths. deformation: how the object
     moves; None if the file has the object at several times. NIfTI has all times in one file of four dimensions. Other
     formats have a file or folder per time: NAME_01.SUFFIX and so on. See ``export_volume`` for other arguments and errors.
     Raises InputError also for a format of Gaussians, and for a deformation that moves nothing in the volume's grid."""

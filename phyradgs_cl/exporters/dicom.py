@@ -90,7 +90,7 @@ def write_dicom(path: Path, volume: Volume, note: str, labels: DicomLabels) -> N
 
 
 def _rescale_slope(values: np.ndarray, unit: str) -> str:
-    """Returns the value of one step of the stored integers as text: 1 HU, or the smallest for which 16 bits suffice."""
+    """Returns, as text, the value of one step of the stored integers: 1 HU, or the smallest that 16 bits allow."""
     peak = float(np.abs(values).max())
     if unit == "HU" and peak <= _LARGEST:
         return "1"

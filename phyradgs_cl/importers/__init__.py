@@ -1,6 +1,6 @@
 """Reads scans and volumes of other programs, checks them and converts them to this package's conventions.
 
-Call ``import_scan`` for a scan and ``load_volume`` for a volume. Each format of scans has a module in formats/."""
+Call ``import_scan`` for a scan and ``load_volume`` for a volume. A module in formats/ reads one or two formats of scans."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Reads tables of angles, whose columns and unit the lines above the numbers may name, and files of measured angles."""
+"""Reads the angles of frames from text files: tables whose heading may name columns and unit, and scanners' own files."""
 
 import logging
 import re
@@ -15,34 +15,34 @@ _log = logging.getLogger(__name__)
 _COLUMNS = re.compile(r",\s+|[;:\s]+")
 _ANGLE = re.compile(r"angle|theta|phi|rot|winkel|deg(?!_?c\b)", re.I)
 _NO_ANGLE = re.compile(r"speed|veloc|rate|temp|err|std|sigma", re.I)
-# Names of columns are split at tabs, punctuation and several blanks, or at every blank. Brackets stay whole.
+# _WHOLE forbids splits inside brackets. _SPLITS split columns' names at tabs, punctuation and several blanks, or any blank.
 _WHOLE = r"(?![^(\[]*[)\]])"
 _SPLITS = [re.compile(rf"(?:{separator}){_WHOLE}") for separator in (r"[\t;,:]\s*|\s{2,}", r"[\t;,:\s]+")]
 _BRACKETS, _BEFORE_BRACKET = re.compile(r"[(\[]([^)\]]*)[)\]]"), re.compile(r"(?<! ) (?=[(\[])")
-_GLUED = re.compile(r"(angle|theta|phi|rotation|rot)(?=[a-zµμ]{3})", re.I)  # as in thetadeg and angleRad
+_GLUED = re.compile(r"(angle|theta|phi|rotation|rot)(?=[a-zµμ]{3})", re.I)  # a unit joined to a word, as in thetadeg
 _HUMP = re.compile(r"(?<=[a-z])(?=[A-Z])")
-_SCALED = re.compile(  # a multiple, a prefix or a rate, so that the unit itself would be wrong
+_SCALED = re.compile(  # a unit with a multiple, prefix or rate, as 0.1 deg or deg/s: not a known unit
     r"(milli|micro)(?-i:(?![a-z]))|centi|(\d[.,]\d+|\de-?\d+|\^\S+)\s*(deg|°|rad)|(deg\w*|°|rad\w*|turns?)\s*(/|per\b)\s*\w*",
     re.I,
 )
 _OTHERS = re.compile(
     r"counts?|ticks|pulses|steps|s|sec|seconds?|ms|mm|um|px|pixels?|percent|time|dose|current|grad", re.I
 )
-_FEW_WORDS = 3  # a longer text is a sentence, in which words such as time say nothing about the unit
+_FEW_WORDS = 3  # a text of more words is a sentence, in which a word such as "time" is no unit
 
 
 def read_angles_rad(path: Path, count: int, unit: str | None = None, column: int | None = None) -> np.ndarray:
-    """Reads angles (count,) in rad from a text file: one per line, all on one line, or in a column next to an index that
-    gives their order. Lines above the numbers, behind a # or not, may name the columns and the angles' unit.
+    """Reads angles (count,) in rad from a text file: one per line, all on one line, or in a column of a table, where an
+    index may give their order. Lines above the numbers, with or without a #, may name the columns and the unit.
 
-    unit: a unit of ``ANGLE``; None takes the one that is named, else degrees. column: where a scanner's files have the
-    angles, from 0 on, unless names say otherwise. Raises InputError for another count, several columns without names, names
-    that contradict the numbers, units that are not known, and lines that are no numbers."""
+    unit: the angles' unit, one of ``ANGLE``; None takes the one that the file names, else degrees. column: the column, from
+    0 on, in which a scanner's files have the angles, unless names say otherwise. Raises InputError for another count,
+    several columns without names, names that contradict the numbers, unknown units, and lines without numbers."""
     stored = read_text(path).splitlines()
     lines = [(i, text) for i, line in enumerate(stored, 1) if (text := line.partition("#")[0].strip())]
     is_header = [not re.search(r"\d", line) or (_cells(line, True) or _cells(line, False)) is None for _, line in lines]
     head = is_header.index(False) if False in is_header else len(lines)
-    if column is not None:  # a scanner's file: lines above the table may look like its lines
+    if column is not None:  # a scanner's heading may hold lines of numbers: the table has at most ``count`` lines
         head = max(head, len(lines) - count)
     rows = lines[head:]
     if not rows:
@@ -55,7 +55,7 @@ def read_angles_rad(path: Path, count: int, unit: str | None = None, column: int
             raise InputError(f"{path} line {i}", repr(line[:40]), "a finite number, or an index and a number")
         table.append(cells)
     above = [line.strip() for line in stored[rows[0][0] - 2 :: -1]] if rows[0][0] > 1 else []
-    # a remark with digits, such as a date, names nothing; a unit in brackets may have some
+    # a line behind a # that has digits outside brackets, such as a date, names neither columns nor a unit
     named = [text for text in above if text[:1] != "#" or not re.search(r"\d", _BRACKETS.sub("", text))]
     named = [text.strip("# ") for text in named if re.search(r"[^\W\d_]|°", text)]
     words, header = _names(named, len(table[0]))
@@ -69,8 +69,8 @@ def read_angles_rad(path: Path, count: int, unit: str | None = None, column: int
 
 
 def _names(lines: list[str], width: int) -> tuple[list[str], str]:
-    """Returns the names of ``width`` > 1 columns and the line that has them. lines: the texts above the numbers, the
-    nearest first; one that names a single column as an angle comes before others. Without such a line: [] and ""."""
+    """Returns the names of ``width`` columns and the line that has them; [] and "" without such a line. lines: the texts
+    above the numbers, nearest first. Of lines with ``width`` > 1 names, the first with one name of an angle is preferred."""
     fitting = [
         (words, line) for line in lines for words in [_split(line, len(_split(line)) != width)]
         if len(words) == width > 1
@@ -79,8 +79,8 @@ def _names(lines: list[str], width: int) -> tuple[list[str], str]:
 
 
 def _split(line: str, at_blanks: bool = False) -> list[str]:
-    """Returns the names of columns in a line, with their units: between tabs, punctuation and several blanks, or between
-    single blanks too."""
+    """Returns the names of columns in a line, each with its unit. Names end at tabs, punctuation and several blanks; with
+    ``at_blanks`` also at single blanks."""
     return [word for word in _SPLITS[at_blanks].split(_BEFORE_BRACKET.sub("", line)) if word]
 
 
@@ -89,8 +89,8 @@ def _angles_among(words: list[str]) -> list[int]:
 
 
 def _factor(path: Path, texts: list[str]) -> float:
-    """Returns the factor to rad of the unit in the texts, of which the first names the angles; that of degrees without one.
-    Raises InputError for several units, and where the first text names another one."""
+    """Returns the factor to rad of the unit in the first text that names one; that of degrees without one. texts: the
+    heading of the angles comes first. Raises InputError for two units in a text, or an unknown one in the heading."""
     for i, text in enumerate(texts):
         known, others = _units(text)
         if len(set(known.values())) > 1 or (others and (i == 0 or known)):
@@ -102,14 +102,15 @@ def _factor(path: Path, texts: list[str]) -> float:
 
 
 def _units(text: str) -> tuple[dict[str, float], list[str]]:
-    """Returns the units of angles in a text with their factors to rad, and words that may be units but are not known."""
+    """Returns the units of angles that a text names, each with its factor to rad, and the words of the text that may be
+    units of another quantity or unknown ones."""
     if scaled := _SCALED.search(text):
         return {}, [scaled[0]]
     known, others = dict[str, float](), list[str]()
     for part, is_bracket in ((_BRACKETS.sub(" ", text), False), *((inside, True) for inside in _BRACKETS.findall(text))):
         words = [word for word in re.split(r"[\s_,;:=/\"-]+", _GLUED.sub(r"\1 ", part)) if word]
         words = [one for word in words for one in ([word] if ANGLE.factor(word) else _HUMP.split(word))]
-        if re.search("winkel", text, re.I):  # German: gradians are Gon
+        if re.search("winkel", text, re.I):  # in German, Grad means degrees, not gradians
             words = ["deg" if word.lower() == "grad" else word for word in words]
         units = {word: factor for word in words if (factor := ANGLE.factor(word)) is not None}
         known |= units
@@ -121,7 +122,7 @@ def _units(text: str) -> tuple[dict[str, float], list[str]]:
 
 
 def _cells(line: str, is_comma: bool) -> list[float] | None:
-    """Returns the numbers on a line of a table; None if it has anything else. is_comma: commas are decimal."""
+    """Returns the numbers on a line of a table; None if the line has anything else. is_comma: commas are decimal."""
     parts = [part for part in (_COLUMNS if is_comma else re.compile(r"[,;:\s]+")).split(line) if part]
     try:
         return [float(part.replace(",", ".")) for part in parts]
@@ -130,7 +131,7 @@ def _cells(line: str, is_comma: bool) -> list[float] | None:
 
 
 def _is_decimal_comma(path: Path, lines: list[str]) -> bool:
-    """Returns whether commas in a table are decimal, else they separate columns. Raises InputError if both are possible."""
+    """Returns whether commas in the lines of a table are decimal, not separators. Raises InputError if they may be both."""
     parts = [part for line in lines for part in _COLUMNS.split(line) if "," in part]
     if not all(part.count(",") == 1 and "." not in part for part in parts):
         return False
@@ -147,7 +148,7 @@ def _is_decimal_comma(path: Path, lines: list[str]) -> bool:
 
 
 def _is_index(values: list[float]) -> bool:
-    """Returns whether the values count from 0 or 1 without a gap, in any order."""
+    """Returns whether the values, sorted, are 0, 1, 2, … or 1, 2, 3, …, and at least two."""
     first = min(values)
     return len(values) > 1 and first in (0, 1) and sorted(values) == [first + i for i in range(len(values))]
 
@@ -155,9 +156,9 @@ def _is_index(values: list[float]) -> bool:
 def _column(
     path: Path, words: list[str], header: str, table: list[list[float]], count: int, usual: int | None
 ) -> tuple[np.ndarray, int]:
-    """Returns a table's angles in the stored unit, and their column: its only column or row, the column named as an angle,
-    the ``usual`` one, or the one next to an index, which gives the angles' order. words: the columns' names,
-    which ``header`` has. Raises InputError if several columns may be meant."""
+    """Returns the angles of a table in the file's unit, and their column: the only column or row, else the one named as an
+    angle, else ``usual``, else the one beside an index. An index gives the order. words: the columns' names, found in the
+    line ``header``. count: the number of frames. Raises InputError if several columns may hold the angles."""
     widths, named = {len(row) for row in table}, _angles_among(words)
     is_row = len(named) != 1 and ((len(table) == 1 and usual is None) or len(table) < count == sum(map(len, table)))
     is_row &= widths != {2} or not _is_index([row[0] for row in table])
@@ -171,7 +172,7 @@ def _column(
     if len(named) == 1:
         column = named[0]
         counts = [_is_index(values.tolist()) for values in columns]
-        if words != _split(header) and counts[column] and not all(counts):  # or the names are a text, as "Angle table"
+        if words != _split(header) and counts[column] and not all(counts):  # header may be a title: Angle table
             found, remedy = f"{header[:60]!r}, and numbers that count", "separate the names by tabs or commas"
             raise InputError(f"{path} column {words[column]}", found, "angles", remedy)
     if column >= width:
@@ -183,8 +184,8 @@ def _column(
 
 
 def file_of_angles(folder: SafeFolder, name: str, *ends: str) -> Path | None:
-    """Returns, for the first of the ``ends`` that a file's name has, the file called ``name`` + end, else the only file with
-    that end. Returns None if no end leads to one file."""
+    """Returns a folder's file of angles. Takes each of the ``ends`` in turn: the file called ``name`` + end, else the only
+    file with this end. Returns None if no end leads to one file."""
     for end in ends:
         files = folder.glob(f"*{end}")
         own = [file for file in files if file.name.lower() == f"{name}{end}".lower()]
@@ -194,8 +195,8 @@ def file_of_angles(folder: SafeFolder, name: str, *ends: str) -> Path | None:
 
 
 def measured_angles_rad(path: Path, steps_rad: np.ndarray) -> np.ndarray:
-    """Reads measured angles (F,) in rad, relative to the first of the equal steps ``steps_rad`` (F,). Files differ in sign
-    and order, so the sign and order nearest to the steps are taken. Warns with the largest difference."""
+    """Reads measured angles (F,) in rad, shifted so that the first is steps_rad[0]. steps_rad (F,): the planned, equal
+    steps. Files differ in sign and order: the ones nearest to ``steps_rad`` are taken. Warns of the largest difference."""
     listed_rad = np.unwrap(read_angles_rad(path, len(steps_rad), column=1))
     ways = [steps_rad[0] + way - way[0] for way in (listed_rad, listed_rad[::-1], -listed_rad, -listed_rad[::-1])]
     best = min(ways, key=lambda way: float(np.abs(way - steps_rad).max()))

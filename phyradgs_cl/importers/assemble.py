@@ -1,7 +1,6 @@
-"""The last steps of every importer: computes shutter, opening times and trajectory, and makes the scan.
+"""The last steps of every importer: computes the shutter, the frames' opening times and the trajectory, and makes the scan.
 
-``RotaryStage`` describes a sample that turns between a source and a panel at rest, about an axis that may miss the central
-ray."""
+``RotaryStage`` describes a sample that turns between a source and a panel at rest. Its axis may miss the central ray."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -28,15 +27,15 @@ _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_di
 Length = float | Callable[[], float]
 Pitch = tuple[float, float] | Callable[[], tuple[float, float]]
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_VIEW_DIGITS = 5  # views are equal if cosine and sine of their angles, or their scaled poses, agree to this many decimals
-_SLACK = 1e-6  # pose tables are extended by this fraction of a frame's duration, so that rounded times stay in the table
+_VIEW_DIGITS = 5  # two views are equal if their angles' cosine and sine, or their scaled poses, agree to so many decimals
+_SLACK = 1e-6  # pose tables extend by this fraction of a frame's duration beyond the frames, for times that are rounded
 
 
 @dataclass(frozen=True, eq=False)
 class Timing:
-    """When frames were taken. start_s (F,): times in s at which each frame's first line opens. is_fly: the gantry never
-    stops. angle_at: a stored angle belongs to the "start" or "middle" of the first line's exposure. assumed: names, as in
-    ``acquisition/plausible.py``, of values that neither file nor user stated."""
+    """Shutter and times of a scan's frames. start_s (F,): time in s at which each frame's first line opens. is_fly: whether
+    the gantry never stops. angle_at: a stored angle holds at the "start" or in the "middle" of its first line's exposure.
+    assumed: names, as in ``acquisition/plausible.py``, of values that neither file nor user stated."""
 
     shutter: Shutter
     start_s: np.ndarray
@@ -52,8 +51,8 @@ class Timing:
 
 @dataclass(frozen=True, eq=False)
 class StoredTiming:
-    """The timing that a file states; None for missing values. start_s (F,): opening times in s of a fly-scan's frames.
-    written: names of values that the user wrote into a description; a scanner's header has none."""
+    """The timing that a file states; None for missing values. start_s (F,): opening times in s of a fly-scan's frames. axis,
+    direction: of the readout. written: names of values that a user wrote into the description; () for a scanner's header."""
 
     exposure_s: float | None = None
     readout_s: float | None = None
@@ -69,8 +68,8 @@ class StoredTiming:
 def make_timing(
     subject: str, frames: int | np.ndarray, options: ImportOptions, stored: StoredTiming | None = None
 ) -> Timing:
-    """Returns the timing of frames, given by their count or their numbers (F,). Options replace stored values. With start
-    times, or a time from frame to frame, the scan is a fly-scan. Without them, every frame was taken at rest.
+    """Returns the timing of ``frames``: a count, or the frames' numbers (F,). Options replace stored values. With start
+    times or a frame time (from start to start) the scan is a fly-scan. Without both, every frame was taken at rest.
 
     Raises InputError for a fly-scan without an exposure, with fewer than two frames, or with start times that do not rise.
     Raises it also for options about the exposure or readout of frames at rest, and for a pulse outside the exposure."""
@@ -108,8 +107,8 @@ def make_timing(
 
 
 def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> CircularOrbit:
-    """Returns a circular orbit through gantry angles (F,) in rad. Central differences of the angles over time give the
-    gantry's speed within a frame; differences are one-sided at both ends. Frames taken at rest keep their angle."""
+    """Returns a circular orbit through gantry angles (F,) in rad. The gantry's speed during a frame is the central
+    difference of the angles over time, one-sided in the first and the last frame. Frames taken at rest keep one angle."""
     angle_rad = np.asarray(angle_rad, np.float64)
     exposure_s = timing.shutter.exposure_s
     if not timing.is_fly:
@@ -121,8 +120,8 @@ def turning(geometry: Geometry, angle_rad: np.ndarray, timing: Timing) -> Circul
 
 
 def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: StoredTiming) -> None:
-    """Raises InputError for options and written values that only a fly-scan has. Warns of an exposure, which hints at a
-    fly-scan."""
+    """Raises InputError for options, and values written into a description, that only a fly-scan has. Warns of an exposure,
+    which hints at a fly-scan without a frame time."""
     turns = [name for name in options.given(_OF_A_TURN) if name != "exposure_s" or stored.exposure_s is None]
     frame_time = " or ".join(dict.fromkeys(map(options.named, ("frame_time_s", "fps"))))
     for name in (*map(options.called, turns), *stored.written):
@@ -146,8 +145,7 @@ class Turned:
         return array[..., ::-1] if self.columns else array
 
     def poses(self, pose: np.ndarray, panel: tuple[int, int]) -> np.ndarray:
-        """Converts poses (..., 12), as in ``PoseTable``, of stored images to the poses of the reversed images. panel: (rows,
-        columns)."""
+        """Converts stored images' poses (..., 12), see ``PoseTable``, to the reversed images'. panel: (rows, columns)."""
         pose = np.array(pose, np.float64)
         sides = (self.rows, panel[0], slice(9, 12)), (self.columns, panel[1], slice(6, 9))
         for count, step in ((count, step) for is_flipped, count, step in sides if is_flipped):
@@ -157,7 +155,7 @@ class Turned:
 
 
 def turn_of(pose: np.ndarray) -> Turned:
-    """Finds the flips that put row 0 at the bottom and column 0 on the left, from an image's pose (see ``PoseTable``)."""
+    """Finds the flips that put row 0 at the bottom and column 0 on the left. pose (12,): see ``PoseTable``."""
     source, step_u, step_v = pose[:3], pose[6:9], pose[9:12]
     right = np.array([-source[1], source[0], 0.0])
     return Turned(rows=bool(step_v[2] < 0), columns=bool(step_u @ right < 0))
@@ -166,8 +164,8 @@ def turn_of(pose: np.ndarray) -> Turned:
 def table_over_time(
     pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, subject: str, is_parallel: bool = False
 ) -> PoseTable:
-    """Returns a pose table from the first line's opening to the last line's closing of every frame. pose_at: returns poses
-    (T, 12) at frame positions (T,), where 2.5 is halfway from frame 2 to 3. A gantry at rest keeps one pose per frame."""
+    """Returns a pose table from the first frame's opening to the last line's closing of the last frame. pose_at: returns
+    poses (T, 12) at frame positions (T,), where 2.5 is halfway from frame 2 to 3. At rest, every frame has one pose."""
     if not timing.is_fly:
         at_s = np.asarray(timing.start_s) + timing.shutter.middle_s
         poses = pose_at(np.arange(len(at_s), dtype=np.float64))
@@ -186,9 +184,9 @@ def assemble_scan(
     options: ImportOptions, *, title: str, source: str, grid: Grid | None = None,
     reference: np.ndarray | None = None, lag: float = 0.0, names: Mapping[str, str] | None = None, said: str = "",
 ) -> Scan:
-    """Returns a scan of line integrals whose row 0 is the lowest. grid: None takes ``grid_of_scan``. names: what the file
-    calls its values, for messages. said: a text that says which frames were read. Raises InputError for implausible
-    values, and if more than half of the views have the same pose."""
+    """Returns a scan of line integrals whose row 0 is the lowest. grid: None takes ``grid_of_scan``. reference, lag: see
+    ``Scan``. names: what the file calls its values, for messages. said: a text that says which frames were read. Raises
+    InputError for implausible values, and if more than half of the views have the same pose."""
     assumed = [*timing.assumed, *([] if options.detector_model else ["average"])] if timing.is_fly else []
     scan = Scan(
         projections=integrals.values, geometry=geometry, trajectory=trajectory, shutter=timing.shutter,
@@ -204,14 +202,14 @@ def assemble_scan(
     )
     subjects = {"grid": f"{source} grid", "angles": f"{source} angles", **(names or {})}
     _check_turn(trajectory, scan.frame_start_s + timing.shutter.middle_s, options.called("angles", subjects))
-    is_timed = "exposure" not in assumed  # an assumed exposure is 1 s, from which no real frame rate follows
+    is_timed = "exposure" not in assumed  # an assumed exposure of 1 s gives no frame rate that can be checked
     check_plausible(scan, lambda name: options.called(name, subjects), is_timed)
     scan.warn_of_near_panel()
     return scan
 
 
 def _check_turn(trajectory: CircularOrbit | PoseTable, middle_s: np.ndarray, subject: str) -> None:
-    """Raises InputError if more than half of the views, at ``middle_s`` (F,), have one angle, which must then be wrong."""
+    """Raises InputError if more than half of the views, at times ``middle_s`` (F,) in s, have the same angle or pose."""
     if isinstance(trajectory, PoseTable):
         views = trajectory.pose(0, middle_s)
         views = views / np.abs(views).max(axis=0, initial=1e-9)
@@ -233,7 +231,7 @@ def with_options(options: ImportOptions, geometry: Geometry) -> Geometry:
 def parallel(
     options: ImportOptions, panel: tuple[int, int], pitch_mm: Pitch, offset_mm: tuple[float, float]
 ) -> ParallelGeometry:
-    """Returns the geometry of a parallel beam. Options replace the file's values, which are the other arguments. Raises
+    """Returns the geometry of a parallel beam. Options replace the file's pitch and offset, both (v, u) in mm. Raises
     InputError if an option gives a distance of the source."""
     for name in options.given(_DISTANCES):
         expected, remedy = "no distance: this file has a parallel beam", "leave it out"
@@ -245,9 +243,9 @@ def cone(
     options: ImportOptions, to_axis_mm: Length, to_detector_mm: Length, panel: tuple[int, int], pitch_mm: Pitch,
     offset_mm: tuple[float, float], names: Mapping[str, str] | None = None,
 ) -> ConeGeometry:
-    """Returns a cone beam. Options replace the file's values, which are the other arguments. A length or pitch may be a
-    function that reads it. The function is called only if no option replaces the value, which the file may then lack.
-    names: what the file calls its values, for messages. Raises InputError unless the panel stands behind the axis."""
+    """Returns the geometry of a cone beam. Options replace the file's values, which are the other arguments. A length or
+    pitch may be a function that reads it. The function is called only if no option replaces its value. names: what the file
+    calls its values, for messages. Raises InputError unless the distance to the detector exceeds that to the axis."""
     axis_mm, detector_mm = map(partial(_taken, options), _DISTANCES, (to_axis_mm, to_detector_mm))
     if detector_mm <= axis_mm:
         axis, detector = (options.called(name, names) for name in _DISTANCES)
@@ -266,7 +264,7 @@ def _taken(options: ImportOptions, name: str, stored: Any) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class RotaryStage:
-    """A source and a panel of ``geometry`` at rest, and an axis of rotation that may be off the central ray.
+    """A source and a panel of ``geometry`` at rest, and a sample that turns about an axis, which may be off the central ray.
 
     axis_u_mm: how far the axis lies to the right of the central ray, seen from the source. roll_rad, tilt_rad: how far the
     axis' top leans to the right, and towards the panel. shift_mm (F, 2): the panel's shifts (v, u) per frame."""
@@ -280,7 +278,7 @@ class RotaryStage:
     def poses(self, angle_rad: np.ndarray, shift_mm: np.ndarray | float = 0.0) -> np.ndarray:
         """Returns poses (T, 12), see ``PoseTable``, in the sample's frame at gantry angles (T,) in rad. shift_mm (T, 2): the
         panel's shifts (v, u)."""
-        upright = self.geometry.pose(0.0).reshape(4, 3)  # in axes x to the source, y to the right, z up
+        upright = self.geometry.pose(0.0).reshape(4, 3)  # axes: x towards the source, y to the right, z up
         is_parallel = isinstance(self.geometry, ParallelGeometry)
         parts = np.repeat(upright[None], len(angle_rad), axis=0)
         parts[:, int(is_parallel) : 2, 1] -= self.axis_u_mm  # moves source and panel, so that the axis is at y = 0
@@ -292,8 +290,8 @@ class RotaryStage:
     def turned(
         self, angle_rad: np.ndarray, timing: Timing, subject: str
     ) -> tuple[CircularOrbit | PoseTable, Geometry]:
-        """Returns the trajectory of gantry angles (F,) in rad, and the nearest circular geometry. The trajectory is a
-        circular orbit where the axis crosses the central ray at a right angle, else a pose table."""
+        """Returns trajectory and nearest circular geometry for gantry angles (F,) in rad. The trajectory is a circular orbit
+        if the axis crosses the central ray at a right angle and the panel has no shifts, else a pose table."""
         question_unit(angle_rad, f"{subject} angles", "deg")
         if self.axis_u_mm == self.roll_rad == self.tilt_rad == 0 and self.shift_mm is None:
             return turning(self.geometry, angle_rad, timing), self.geometry
@@ -314,11 +312,11 @@ def scan_on_stage(
     angle_rad: np.ndarray, places: np.ndarray, names: dict[str, str], said: str, *, stored: StoredTiming | None = None,
     flats: np.ndarray | None = None, darks: np.ndarray | None = None, flat_value: float | None = None,
 ) -> Scan:
-    """Returns the scan of a sample on a stage. frames (F, v, u) are counts; the file ``path`` describes them. Options
+    """Returns the scan of a sample on a stage. frames (F, v, u) are counts, which the file ``path`` describes. Options
     replace values of the file.
 
-    - sides: where row 0 and column 0 are, such as ("top", "left"). angle_rad (F,): gantry angles. places (F,): the
-      frames' numbers from 0 on. names, said: see ``assemble_scan``. stored: the file's timing.
+    - sides: where row 0 and column 0 are, such as ("top", "left"). angle_rad (F,): gantry angles. places (F,): the frames'
+      numbers from 0 on. names, said: see ``assemble_scan``. stored: the file's timing.
     - flats, darks (n, v, u): None where the scanner has applied them. flat_value: counts of air that the file states."""
     timing = make_timing(str(path), places, options, stored)
     trajectory, geometry = stage.turned(angle_rad, timing, str(path))

@@ -1,4 +1,4 @@
-"""Reads other programs' files safely: names stay in the folder, and headers cannot claim more data than the file has."""
+"""Reads other programs' files safely: names cannot lead out of a folder, nor headers claim more data than a file has."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -13,7 +13,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.io.files import HOST_SHARE, decoded, host_bytes, read_regular, regular_file
 from phyradgs_cl.io.tables import read_facts
 
-_MOST_TEXT_BYTES = 64 << 20  # larger files are images, not a text that describes a scan
+_MOST_TEXT_BYTES = 64 << 20  # no text that describes a scan is larger: such a file holds images
 
 
 def check_room(subject: str, needed_bytes: int) -> None:
@@ -59,7 +59,7 @@ def read_npy(path: Path, ndim: int) -> np.ndarray:
         if file.read(6) != b"\x93NUMPY":
             raise InputError(subject, "another kind of file", "a NumPy array")
     with naming_damage(path, "a damaged .npy file", "a NumPy array"):
-        values = np.load(path, mmap_mode="r", allow_pickle=False)  # mapping fails where the header announces too much
+        values = np.load(path, mmap_mode="r", allow_pickle=False)  # fails if the header announces more than the file holds
         dtype, shape = values.dtype, values.shape
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         raise InputError(subject, f"type {dtype}", "plain real numbers")
@@ -81,8 +81,8 @@ class SafeFolder:
             raise InputError(str(self.root), found, "a folder", "check the path")
 
     def file(self, name: object, subject: str) -> Path:
-        """Returns the path of the file ``name`` in the folder or below. subject: where the name stands, for messages.
-        Raises InputError for a name that leads outside, and for anything but a regular file."""
+        """Returns the path of the file ``name`` in the folder or below. subject: where the name stands, for messages. Raises
+        InputError for a name that leads out of the folder, and for anything but a regular file."""
         path = self.root / checked_name(name, subject)
         regular_file(path, subject)
         return path
@@ -103,8 +103,8 @@ class SafeFolder:
         return [path for path in _files(self.root) if _is_one_of(path, suffixes)]
 
     def only(self, what: str, *suffixes: str) -> Path:
-        """Returns the only file with one of the suffixes. Raises InputError for none or several; its message calls the file
-        ``what``."""
+        """Returns the only file with one of the suffixes. Raises InputError, which calls it ``what``, for none or
+        several."""
         paths = self.matching(*suffixes)
         if len(paths) != 1:
             names = ", ".join(path.name for path in paths[:5]) or "none"
@@ -125,7 +125,7 @@ def _is_one_of(path: Path, suffixes: tuple[str, ...]) -> bool:
 
 
 def checked_name(name: object, subject: str) -> str:
-    """Returns ``name`` with forward slashes. Raises InputError about ``subject`` for an absolute path, and for ".."."""
+    """Returns ``name`` with forward slashes. Raises InputError about ``subject`` for empty or absolute names, and ".."."""
     text = name.replace("\\", "/") if isinstance(name, str) else ""
     leads_out = PureWindowsPath(text).drive or text.startswith("/") or ".." in PurePosixPath(text).parts
     if not text.strip() or "\0" in text or leads_out:
@@ -135,5 +135,5 @@ def checked_name(name: object, subject: str) -> str:
 
 def in_natural_order(paths: Sequence[Path]) -> list[Path]:
     """Returns the paths sorted by name, numbers by value: 2.tif before 10.tif."""
-    parts = {path: re.split(r"(\d+)", path.name) for path in paths}  # text at even places, numbers at odd ones
+    parts = {path: re.split(r"(\d+)", path.name) for path in paths}  # of each name: text at even indices, digits at odd ones
     return sorted(paths, key=lambda path: [int(part) if i % 2 else part for i, part in enumerate(parts[path])])

@@ -20,29 +20,29 @@ from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io.scan.reader import LARGEST_LINE_INTEGRAL
 
 _log = logging.getLogger(__name__)
-_PIXELS = 1 << 16  # most pixels of a frame that are compared with other frames; all would take long and show little more
+_PIXELS = 1 << 16  # largest number of a frame's pixels that are compared with other frames': more would show little
 
-# A flat or dark is left out if its median differs from the others' by more than this fraction of the flats' median.
-_TOGETHER = 0.1  # largest difference among flats of one time, in which the tube hardly drifts
-_APART = 0.3  # largest difference among flats of several times, between which the tube may drift
-_DARK = 0.02  # largest difference among darks
+# A flat or dark is left out if |its median − the median of all| exceeds this fraction of the flats' median.
+_TOGETHER = 0.1  # largest relative difference of medians among flats of one time, in which the tube hardly drifts
+_APART = 0.3  # largest relative difference of medians among flats of several times, between which the tube may drift
+_DARK = 0.02  # largest difference of medians among darks, as a fraction of the flats' median
 
-# A flat or dark is left out too if its pixels differ from the others', in the mean, by more than the sum of these two.
-_PATTERN = 0.02  # allowed mean difference of pixels, as a fraction of the flats' median
-_TIMES = 5.0  # allowed mean difference of pixels, as a multiple of its median over the frames
-_BLOCK_BYTES = 1 << 26  # memory of a block of rows whose median is taken: a float64 copy of all frames would be large
+# A flat or dark is also left out if its pixels' mean difference from the others exceeds the sum of the next two limits.
+_PATTERN = 0.02  # first part of a frame's allowed mean difference of pixels: this × the flats' median
+_TIMES = 5.0  # second part of a frame's allowed mean difference of pixels: this × its median over all frames
+_BLOCK_BYTES = 1 << 26  # bytes of the rows whose median is computed at once: a float64 copy of all frames would be large
 Mask = np.ndarray | None
 TAKEN = "taken"
 """The provenance's key of a text that says which frames and flats were used."""
-_AIR = 0.2  # a median line integral up to this size at the frames' borders is air, as is a transmission so near to 1
-_DIVIDED, _MANY_COUNTS = 2.0, 1000.0  # frames up to this value, with air of so many counts or more, are divided already
-_SAME = 1e-3  # flats up to this fraction above the saturation level are clipped too
+_AIR = 0.2  # frames show air at their borders if |median line integral| or |median transmission − 1| is below this
+_DIVIDED, _MANY_COUNTS = 2.0, 1000.0  # frames of values up to 2, with air at 1000 counts or more, are already divided by air
+_SAME = 1e-3  # flats at most this fraction above the saturation level count as clipped
 
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Flats (G, v, u) at G times, and the dark (1, v, u) or None. place (P,): the time of each projection, counted in
-    flats: 0.5 is halfway from the first to the second. used: how many flats and darks were used. said: this as a text."""
+    """Flats (G, v, u) at G times, and the dark (1, v, u) or None. place (P,): each projection's place among the flats, where
+    0.5 is halfway from flat 0 to flat 1. used: how many flats and darks were used. said: a text about flats and darks."""
 
     flats: np.ndarray
     dark: np.ndarray | None
@@ -52,7 +52,7 @@ class Light:
 
 
 def places(is_flat: np.ndarray, is_projection: np.ndarray) -> np.ndarray:
-    """Returns when n flats were taken (n,), counted in projections: −0.5 is before the first, 9.5 between 9 and 10.
+    """Returns the place (n,) of each flat among the projections: −0.5 is before the first, 9.5 between projections 9 and 10.
     is_flat, is_projection: bool (F,), for frames in the order in which they were taken."""
     return np.cumsum(is_projection)[is_flat] - 0.5
 
@@ -62,9 +62,8 @@ def light_of(
     at: np.ndarray | None = None, names: Mapping[str, Sequence[str]] | None = None,
 ) -> Light:
     """Returns the flats and dark for ``count`` projections, from flats and darks (n, v, u). Of three or more, those that do
-    not fit the others are left out, with a warning. at (n,): when flats were taken, as in ``places``; None: not stated.
-    names: what messages call the "flats" and "darks". Raises InputError for the option flats "time" if all flats are of one
-    time."""
+    not fit the others are left out, with a warning. at (n,): flats' places, see ``places``; None: not stated. names: what
+    messages call the single "flats" and "darks". Raises InputError for the option flats "time" with flats of one time."""
     at, assumed = _times(subject, len(flats), count, options, at)
     light = max(float(np.median(_levels(flats)[1])), 1e-30)
     times = [np.flatnonzero(at == time) for time in np.unique(at)]
@@ -94,8 +93,8 @@ def median(stack: np.ndarray) -> np.ndarray:
 def _times(
     subject: str, flats: int, count: int, options: ImportOptions, at: np.ndarray | None
 ) -> tuple[np.ndarray, str]:
-    """Returns when flats were taken (n,), as in ``places``, and a text about assumptions. Flats of equal times will be
-    combined by their median."""
+    """Returns the places (n,) of n flats, see ``places``, and a text about assumed places. Flats of equal places will be
+    combined by their median. count: the number of projections."""
     if options.flats != "time":
         return np.zeros(flats) if at is None or options.flats else at, ""
     if flats < 2 or (at is not None and np.ptp(at) == 0):
@@ -106,7 +105,7 @@ def _times(
 
 
 def _levels(stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns k evenly chosen pixels (n, k) float64 of n frames, and the frames' medians (n,). NaN and infinity become 0."""
+    """Returns k evenly spaced pixels of n frames, (n, k) float64, and each frame's median (n,). NaN and infinity are 0."""
     pixels = stack.reshape(len(stack), -1)
     some = np.nan_to_num(pixels[:, :: -(-pixels.shape[1] // _PIXELS)].astype(np.float64), posinf=0.0, neginf=0.0)
     return some, np.median(some, axis=1)
@@ -118,8 +117,8 @@ def _fitting(
 ) -> np.ndarray:
     """Returns which of k flats or darks, bool (k,), are like most of them in median and pattern. group (k,): their indices
     in ``stack`` (n, v, u). tolerance: largest difference of medians, as a fraction of ``light``, the flats' median counts.
-    kind ("flats" or "darks"), subject, names: words of messages. Keeps all if there is no majority. Warns of each frame that
-    it leaves out."""
+    kind ("flats" or "darks"), subject, names: words of messages. Keeps all if k < 3 or at least half are unlike. Warns of
+    each frame that it leaves out."""
     some, level = _levels(stack[group])
     usual = float(np.median(level))
     is_odd = np.abs(level - usual) > tolerance * light
@@ -211,8 +210,8 @@ def line_integrals(
 
 
 def _warn_of_transmission(subject: str, frames: np.ndarray, options: ImportOptions) -> None:
-    """Warns of frames (P, v, u) that look like transmissions: near 1 at the left and right borders, and at least one pixel
-    darker between them."""
+    """Warns of frames (P, v, u) that look like transmissions: near 1 at the left and right borders, hardly a pixel above,
+    and at least one pixel clearly below."""
     with np.errstate(over="ignore"):
         border = float(np.median(frames[..., [0, -1]]))
     brighter = sum(np.count_nonzero(frame > 1 + _AIR) for frame in frames)
@@ -222,8 +221,8 @@ def _warn_of_transmission(subject: str, frames: np.ndarray, options: ImportOptio
 
 
 def _refuse_no_counts(subject: str, frames: np.ndarray, flat: np.ndarray, options: ImportOptions) -> None:
-    """Raises InputError for line integrals: flats are 1 everywhere and frames near 0 at their left and right borders. Raises
-    it for transmissions too: fractions of at most 2 in 99 % of the pixels, while the flats have a thousand counts."""
+    """Raises InputError for line integrals: the flat is 1 everywhere, and frames are near 0 at their left and right borders.
+    Raises it for transmissions: floats of at most 2 in 99 % of the pixels, while air has 1000 counts or more."""
     air, may_be = float(np.median(flat)), frames.dtype.kind == "f"
     if may_be and air >= _MANY_COUNTS and sum(map(np.count_nonzero, (f > _DIVIDED for f in frames))) <= FEW * frames.size:
         found = f"fractions, at most {_DIVIDED:g}, and air at {air:g} counts"
@@ -262,7 +261,7 @@ def compact(mask: np.ndarray) -> Mask:
 
 def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: str = "left") -> np.ndarray:
     """Flips frames or masks (..., v, u) so that row 0 is the lowest and column 0 on the left, seen from the source. row_0,
-    column_0: where the format has them, such as "top"; the options' values come first."""
+    column_0: the sides on which the format stores them, such as "top"; the options' values come first."""
     if (options.row_0 or row_0) == "top":
         array = array[..., ::-1, :]
     if (options.column_0 or column_0) == "right":

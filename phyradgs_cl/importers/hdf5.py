@@ -28,7 +28,7 @@ STACKS = ("projections", "flats", "darks", "mask")
 NAMES = (*STACKS, "image_key", "angles", "axes")
 _AXES = ("frame", "v", "u")
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_LIKE = 0.1  # relative difference up to which the pixel size on the panel agrees with that at the sample, magnified
+_LIKE = 0.1  # a larger relative difference between pixels on the panel and pixels at the sample × magnification is a warning
 _LEAST_MM = 1e-4  # no pixel is smaller than this: a smaller number without a unit must be in m
 _TIMES = replace(LENGTH, name="magnification", assumed="", factors=MappingProxyType({"": 1.0, "x": 1.0}))
 
@@ -43,8 +43,8 @@ class Places:
     """The addresses in HDF5 of a scan's arrays.
 
     - stated: for each array (one of ``NAMES``), a list of FILE:/ADDRESS, or of /ADDRESS in ``source``. A FILE that does not
-      exist is sought beside ``source``. The entry "axes" is the order of the frames' axes instead. subject: what states the
-      addresses, for messages.
+      exist is sought beside ``source``. Instead of addresses, "axes" has the order of the frames' axes. subject: what states
+      the addresses, for messages.
     - linked_folder: see ``open_hdf5``. folder: the only folder from which files are read; None allows any."""
 
     stated: Mapping[str, Sequence[str]]
@@ -55,7 +55,8 @@ class Places:
 
     @contextmanager
     def opened(self, name: str, text: str) -> Iterator[tuple[Hdf5Source, str]]:
-        """Yields the open file and the address in it. text: FILE:/ADDRESS or /ADDRESS. Raises InputError for others."""
+        """Yields the open file and the address in it. text: FILE:/ADDRESS or /ADDRESS of the array ``name``. Raises
+        InputError for other texts."""
         file, _, address = text.rpartition(":/")
         subject = f"{self.subject} {name}"
         if self.source is not None and not file and text.startswith("/"):
@@ -71,7 +72,7 @@ class Places:
             yield other, f"/{address}"
 
     def _at(self, name: str, usual: Sequence[str]) -> Sequence[str]:
-        """Returns the addresses stated for an array, else the format's (``usual``), as far as the file has them."""
+        """Returns the stated addresses of the array ``name``, else those of ``usual``, the format's, that the file has."""
         there = [address for address in usual if self.source is not None and self.source.find(address) is not None]
         return self.stated.get(name, there)
 
@@ -125,7 +126,7 @@ class Places:
         for name, addresses in (("flats", flats), ("darks", darks), ("mask", mask)):
             if parts := self.stack(name, addresses, panel):
                 stacks[name] = parts[0]
-                at = {"pre": -0.5, "post": int(used.sum()) - 0.5}  # when flats were taken, by the end of their address
+                at = {"pre": -0.5, "post": int(used.sum()) - 0.5}  # flats' times, by the end of their address
                 ends = [text.rpartition("_")[2] for text in parts[1]]
                 if name == "flats":
                     flats_at = np.repeat([at.get(end, np.nan) for end in ends], list(parts[1].values()))
@@ -153,8 +154,9 @@ class Places:
         return np.full(frames, schema.PROJECTION)
 
     def angles_rad(self, used: np.ndarray, options: ImportOptions, usual: str = "", unit: str = "deg") -> np.ndarray:
-        """Reads angles in rad, sign as stored, of the frames in ``used``, bool (F,), unless the options state them. usual:
-        the format's address of angles. unit: the angles' unit if the file states none."""
+        """Returns angles in rad, sign as stored, of the frames marked in ``used``, bool (F,). They are at the address in the
+        option ``angles``, else at the stated address; else the option itself gives them, else they are at the format's
+        address ``usual``. unit: the angles' unit if the file states none."""
         quantity = replace(ANGLE, assumed=unit)
         asked = [options.angles] if options.angles else self.stated.get("angles", ())
         if options.angles and not is_address(options.angles):
@@ -231,8 +233,7 @@ def beam(
 ) -> Geometry:
     """Returns the geometry from the options' numbers, else the file's. If the options give no distance and the file has none
     of the source, the beam is parallel, with a warning. axis_columns: columns from the axis to the panel's middle, positive
-    to the right.
-    Raises InputError for wrong lengths."""
+    to the right. Raises InputError for wrong lengths."""
     quantity = LENGTH
     for address in (address for pair in (*lengths.at_sample, *lengths.on_panel) for address in pair):
         if source.find(address) is not None and not h5.read_attribute(source, address, "units"):

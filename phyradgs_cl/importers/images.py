@@ -99,9 +99,9 @@ def read_image(path: Path, state: int | None = None) -> Any:
 
 
 def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
-    """Returns how many bytes of voxels a file holds when unpacked. SimpleITK raises no error for missing voxels of NIfTI and
-    damaged ones of packed MetaImages, but invents values. Returns None for NRRD, which SimpleITK checks. Raises InputError
-    for data outside the folder or in several files."""
+    """Returns how many bytes of voxels a file holds when unpacked, or None for NRRD, which SimpleITK checks. In NIfTI
+    without some voxels and damaged packed MetaImages, SimpleITK invents values and raises no error. Raises InputError for
+    data outside the folder or in several files."""
     with gzip.open(path) if path.suffix.lower() == ".gz" else open(path, "rb") as file:
         head = file.read(_HEAD_BYTES)
         if reader.HasMetaDataKey("bitpix"):  # NIfTI: SimpleITK turns scaled integers into floats of another size
@@ -124,7 +124,7 @@ def _held_bytes(path: Path, reader: Any, voxel_bytes: int) -> int | None:
 def read_image_volume(path: Path, state: int | None = None) -> Volume:
     """Reads a volume (z, y, x) float32 whose axes point as the world's do (LPS). A NRRD file without voxel sizes has no
     grid, and its integers are divided by the maximum of their type. state: see ``read_image``. Raises InputError as
-    there, and for oblique axes, unknown units and impossible sizes."""
+    ``read_image`` does, and for oblique axes, unknown units and impossible sizes."""
     subject, image = str(path), read_image(path, state)
     note = image.GetMetaData(_NOTE) if image.HasMetaDataKey(_NOTE) else ""
     sitk = checks.package("SimpleITK", "the package that reads this file", "phyradgs-cl[formats]")
@@ -154,8 +154,8 @@ def read_image_volume(path: Path, state: int | None = None) -> Volume:
 
 
 def _resize_by_sform(subject: str, image: Any) -> None:
-    """Gives a NIfTI image the voxel sizes of its sform, if that alone states its place: SimpleITK always takes those of
-    pixdim, which belong to the qform. Raises InputError where both are stated and differ."""
+    """Gives a NIfTI image the voxel sizes of its sform, if only the sform states its place: SimpleITK always takes the sizes
+    of pixdim, which belong to the qform. Raises InputError where sform and qform are both stated and differ."""
     codes = {form: float(image.GetMetaData(key)) for form in "sq" if image.HasMetaDataKey(key := f"{form}form_code")}
     if codes.get("s", 0) <= 0:
         return

@@ -41,13 +41,13 @@ _KINDS = {
     ("fit", "fits"): ("FITS", "convert them to TIFF: astropy.io.fits and tifffile.imwrite"),
     ("xrm", "txm"): ("single images or a volume of Xradia", "import the scan's .txrm, or export TIFFs"),
 }  # fmt: skip
-# An error about a folder's format reads the suffixes of at most this many entries: more would take long.
+# To name the format of a folder in an error, at most this many of its entries are looked at: more would take long.
 _MOST_FILES = 1000
 
 
 def refuse_unread(path: Path, expected: str) -> None:
-    """Raises InputError, which says how to convert, for a file of a known format that this package does not read, and for a
-    folder with such files. expected: what the error says was expected."""
+    """Raises InputError, which says how to convert the data, for a file of a known format that this package does not read,
+    and for a folder with such files. expected: what the error says was expected."""
     entries = [path] if path.is_file() else sorted(path.iterdir())[:_MOST_FILES] if path.is_dir() else []
     files = [file for file in entries if file.is_file()]
     suffixes = Counter("dcm" if _is_dicom(file) else file.suffix.lower()[1:] for file in files)
@@ -175,7 +175,7 @@ def _reader(path: str | Path) -> tuple[str, Callable[[Path], Volume]] | None:
 
 
 def _read_npy(path: Path) -> Volume:
-    """Reads an array (nz, ny, nx), and its grid from a .json file of the same name, if there is one."""
+    """Reads an array (nz, ny, nx), and its grid from a .json file of the same name, if this file exists."""
     values, beside = read_npy(path, 3), path.with_suffix(".json")
     facts = read_json(beside) if beside.is_file() else {}
     if "voxel_size_mm" not in facts:

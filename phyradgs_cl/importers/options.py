@@ -81,7 +81,7 @@ class ImportOptions:
     def __post_init__(self) -> None:
         checks.fields_within(self.named, self)
         axis, direction = readout_order(self.first, self.readout_axis, self.readout_direction, self.named)
-        stated = {  # fields that every format reads, and their values
+        stated = {  # these fields are what importers read, computed from the options given
             "readout_axis": axis, "readout_direction": direction,
             "frame_time_s": frame_time_of(self.fps, self.frame_time_s, self.named),
             "exposure_s": seconds_of("exposure", self.exposure_ms, self.exposure_s, self.named),
@@ -94,8 +94,8 @@ class ImportOptions:
         return [name for name in among if getattr(self, name) != _DEFAULTS[name]]
 
     def taken(self, name: str, stored: Callable[[], T]) -> T:
-        """Returns the option ``name`` if given, else what ``stored`` reads from the file. If reading raises InputError,
-        the error's remedy names the option."""
+        """Returns the option ``name`` if given, else what ``stored`` reads from the file. If reading raises InputError, the
+        error's remedy names the option."""
         value: T | None = getattr(self, name)
         if value is not None:
             return value
@@ -141,7 +141,7 @@ WORDS = {item.name: item.metadata["words"] for item in fields(ImportOptions) if 
 FIELDS = tuple(_DEFAULTS)
 """The names of all import options."""
 
-# Groups of options, for formats whose files lack these values.
+# Groups of options that formats accept because their files may lack these values.
 TIMING = (
     *("exposure_s", "readout_s", "frame_time_s", "angle_at", "readout_axis", "readout_direction"),
     *("first", "fps", "exposure_ms", "readout_ms"),

@@ -21,19 +21,19 @@ _DATE = r"(?<!\d)((?:19|20)\d\d)[-_.]?(0[1-9]|1[0-2])[-_.]?(0[1-9]|[12]\d|3[01])
 _TIME = re.compile(_DATE + r"[-_ T.]*([01]\d|2[0-3])[-_.:h]?([0-5]\d)[-_.:m]?([0-5]\d)(?!\d)")
 _DEGREES, _ANGLE = re.compile(r"[ _]?(deg|°|grad)", re.I), re.compile(r"(deg|angle|ang|theta|phi|rot)[ _=]*$", re.I)
 # A step from one number to the next is regular if it is near the usual step, the most frequent one.
-_STEADY = 0.25  # largest difference from the usual step, as a fraction of it
-_GAP = 1.5  # a step between angles or times of this many usual steps shows a missing frame
-_USUAL = 0.5  # a series is regular if at least this fraction of its steps is
-_STEADY_ANGLES = 0.75  # angles or times with fewer regular steps are uneven: no gap shows a missing frame
+_STEADY = 0.25  # largest difference of a regular step from the usual one, as a fraction of the usual step
+_GAP = 1.5  # a step between angles or times ≥ this × the usual step shows a missing frame
+_USUAL = 0.5  # a series of numbers is regular if at least this fraction of its steps is regular
+_STEADY_ANGLES = 0.75  # angles or times with a smaller fraction of regular steps are uneven: no step shows a missing frame
 _SMALL = 0.25  # a group of files with the same words holds no frames if it is smaller than this fraction of the largest
 _BEFORE, _AFTER = (re.compile(rf"(?<![a-z])({words})(?![a-z])", re.I) for words in ("before|pre|start", "after|post|end"))
-_STAMP = 10**7  # numbers from here on are times in milliseconds, not indices
+_STAMP = 10**7  # numbers of this size and above are times in milliseconds, not indices
 _MOST_NAMES = 8  # a message lists at most this many file names
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Files in the scan's order. numbers (F,): the numbers in their names, or None. said: a text about files and order."""
+    """A scan's files in order. numbers (F,): the numbers in their names, or None. said: a text about files and order."""
 
     paths: list[Path]
     numbers: np.ndarray | None
@@ -75,7 +75,7 @@ class _Column:
 
     @property
     def rank(self) -> tuple[bool, bool, bool]:
-        """Sort key of numbers that may give the order: regular first, indices before angles, whole ones before decimals."""
+        """Sort key of columns that may give the order: regular ones first, indices before angles, integers before others."""
         return self.regular < _USUAL, self.is_angle, self.values.dtype.kind == "f"
 
 
@@ -159,7 +159,8 @@ def _of_one_series(paths: list[Path], subject: str) -> list[Path]:
 
 
 def _do_alternate(groups: list[list[Path]]) -> bool:
-    """Returns whether the groups take turns, as a_1, b_2, a_3 do: in the order of a number, neighbours often differ."""
+    """Returns whether groups of files take turns, as a_1, b_2, a_3 do: if the files are sorted by a number in their names,
+    the group changes at least as often as the smallest group has files."""
     if len({len(_words(group[0].stem)) for group in groups}) > 1:
         return False
     owner = [i for i, group in enumerate(groups) for _ in group]
@@ -194,7 +195,7 @@ def _column(place: int, numbers: tuple[re.Match[str], ...]) -> Iterator[_Column]
     befores, afters = ([one.string[: one.start()] for one in numbers], [one.string[one.end() :] for one in numbers])
     is_angle = all(map(_DEGREES.match, afters)) or all(map(_ANGLE.search, befores))
     signs, decimals = [one[1] for one in numbers], [one[3] or "" for one in numbers]
-    # a hyphen in all names separates words and is no minus, except before angles that follow a space
+    # a hyphen that all names have separates words; it is a minus only before angles and behind no letter or digit
     is_signed = not all(signs) or (is_angle and not any(before[-1:].isalnum() for before in befores))
     sign = np.array([-1 if is_signed and one == "-" else 1 for one in signs])
     whole = np.array([int(one[2]) for one in numbers])

@@ -19,7 +19,7 @@ _ENGLISH, _GERMAN = (re.compile(rf"[-+]?\d{{1,3}}({k}\d{{3}})+{d}") for k, d in 
 _ONE_COMMA, _EITHER = re.compile(r"[-+]?\d*,\d+"), re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
 _BRIGHTER = 1.2  # a pixel is too bright above this many times the stated counts of air: noise does not reach so far
 _FEW = 0.01  # this fraction of the pixels may be too bright, because they are broken
-_HEAD_BYTES = 1 << 14  # words of a format are searched in this many bytes at a file's start
+_HEAD_BYTES = 1 << 14  # bytes at a file's start in which the words that mark a format are sought
 
 
 def number_at_start(text: str, comma_is_decimal: bool = False) -> tuple[float, str] | None:
@@ -41,8 +41,8 @@ def number_at_start(text: str, comma_is_decimal: bool = False) -> tuple[float, s
 
 
 def commas_are_decimal(texts: list[str]) -> bool:
-    """Returns whether numbers in the texts have decimal commas: one has a comma that cannot mark thousands, and none a
-    decimal point."""
+    """Returns whether commas in the texts' numbers are decimal: some comma cannot mark thousands, and no number has a
+    point."""
     commas = any(_ONE_COMMA.fullmatch(text) and not _EITHER.fullmatch(text) for text in texts)
     return commas and not any(re.fullmatch(r"[-+]?\d*\.\d+", text) for text in texts)
 

@@ -63,8 +63,8 @@ def read_numbered(
     numbers (F,) from 0 on, and a text about which were taken. shape: the expected (F, v, u), None where any size fits.
     subject: what states the shape, or each of its sizes, for messages. first: the number of the first frame, needed if that
     frame is missing. pattern: the form of numbers. Files beyond the stated count are left out, with a warning. Raises
-    InputError if they do not begin with ``first``, so that any file may be the surplus one, for fewer than stated, unless
-    the options say to take those found, and for images of another size."""
+    InputError for such files if the numbers do not begin with ``first`` (any file may then be the surplus one); for fewer
+    files than stated, unless the options say to take those found; and for images of another size."""
     subjects = [subject] * 3 if isinstance(subject, str) else subject
     name = re.compile(re.escape(prefix) + pattern, re.I)
     paths = [path for path in folder.matching(*SUFFIXES) if name.fullmatch(path.stem)]
@@ -120,7 +120,7 @@ def _header(path: Path) -> tuple[int, tuple[tuple[int, int], np.dtype]]:
         raise InputError(str(path), "no page", "at least one image")
     if any(kind != kinds[0] for kind in kinds):
         raise InputError(str(path), "pages of several sizes or types", "one for all frames")
-    if stated_images > images:  # ImageJ's files of more than 4 GB list fewer images than they have
+    if stated_images > images:  # ImageJ's files above 4 GB hold more images than their directory lists
         found, expected = f"{stated_images} images and {images} of them in its directory", "a directory of all images"
         raise InputError(str(path), found, expected, "save it as BigTIFF, or as one file per image")
     return images, kinds[0]

@@ -14,8 +14,8 @@ from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.volume import Volume
 from phyradgs_cl.text import plain_text
 
-_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # a value outside these limits is in HU: no noise is lower, no metal higher
-_USUAL_PER_MM = 10.0  # where the user states water's attenuation, a value of larger size means HU, not 1/mm
+_LOWEST_PER_MM, _HIGHEST_PER_MM = -10.0, 1000.0  # values outside these limits are in HU: no noise is lower, no metal higher
+_USUAL_PER_MM = 10.0  # if the user states water's attenuation, a value of larger size means HU, not 1/mm
 VALUES = "values"
 """The provenance's key for the note that another program's file has about its values."""
 FROM_HU = "1/mm, from HU"
@@ -45,9 +45,10 @@ def check_attenuation(subject: str, volume: Volume, *, warn: bool = True) -> Vol
 
 
 def in_per_mm(subject: str, volume: Volume, mu_water_per_mm: float | None = None) -> Volume:
-    """Returns a volume in 1/mm; if it was in Hounsfield units, with their scale. A file's note may say that values are in
-    Hounsfield units, and state the scale; else ``mu_water_per_mm`` states it. Without a note, ``mu_water_per_mm`` converts
-    volumes with values beyond 10 1/mm. Raises InputError about ``subject`` for noted Hounsfield units without a scale."""
+    """Returns a volume in 1/mm, with the scale of the Hounsfield units that it had, if any. A file's note may say that
+    values are in Hounsfield units, and state the scale; else ``mu_water_per_mm`` states it. Without a note, this argument
+    converts volumes with values beyond ±10 1/mm. Raises InputError about ``subject`` for noted Hounsfield units without
+    scale."""
     stated = None if mu_water_per_mm is None else Hounsfield(mu_water_per_mm)
     is_hu, scale = of_note(str(volume.provenance.get(VALUES, "")))
     if scale is None and (is_hu or float(np.abs(volume.values).max()) > _USUAL_PER_MM):

@@ -88,8 +88,7 @@ def read_deformation_group(source: Hdf5Source, address: str) -> Deformation:
 
 
 def write_truth(extra: h5py.Group, scan: Scan) -> None:
-    """Writes a scan's true volume, its true volumes at several times and its deformation, as far as it has them, into the
-    group ``reference``."""
+    """Writes into the group ``reference`` the true volume, true states at several times and deformation that a scan has."""
     moving = scan.moving_truth
     if scan.reference is None and moving is None:
         return
@@ -104,7 +103,7 @@ def write_truth(extra: h5py.Group, scan: Scan) -> None:
 
 
 def check_truth(source: Hdf5Source, entry: str, grid: Grid) -> tuple[bool, int]:
-    """Returns whether a scan file has a true volume, and at how many times it has the true state of the object. Raises
+    """Returns whether the scan at ``entry`` has a true volume, and for how many times it has the object's true state. Raises
     InputError for shapes that do not fit the grid."""
     if source.optional_group(f"{entry}/{schema.REFERENCE}") is None:
         return False, 0

@@ -101,7 +101,7 @@ def host_bytes() -> float:
 
 def free_bytes() -> float:
     """Returns the memory in bytes that this process may still take: what Linux calls available, elsewhere all memory. A
-    limit of the process' address space lowers it."""
+    limit of the process' address space lowers the result."""
     free = host_bytes()
     with suppress(OSError, ValueError, IndexError):
         free = 1024.0 * int(Path("/proc/meminfo").read_text().partition("MemAvailable:")[2].split()[0])

@@ -1,5 +1,5 @@
-"""Writes outputs completely or not at all: first under another name, which is then renamed. A lock file keeps two runs
-from writing one output. Checkpoints of interrupted runs are plain arrays in a NumPy archive, never a pickle."""
+"""Writes outputs completely or not at all: each is written under another name first, and then renamed. A lock file keeps two
+runs from writing one output. Checkpoints of interrupted runs are plain arrays in a NumPy archive, never a pickle."""
 
 import errno
 import glob
@@ -22,7 +22,7 @@ from phyradgs_cl.errors import InputError, OutputError
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC))
 """Error numbers of a full disk, a file that is too large, and a user's exhausted quota."""
-# A temporary name has at most this many characters of the target's, so that it stays below 255 bytes at 4 bytes a character.
+# A temporary name takes at most so many characters of the target's name: at 4 bytes each, it stays below 255 bytes.
 _LONGEST = 50
 _LONGEST_BYTES = 255  # longest file name that common file systems allow
 _SPARE_BYTES = 1 << 16  # room on the disk that is reserved for headers, besides the arrays
@@ -170,7 +170,7 @@ def _is_dead(process: int) -> bool:
     try:
         os.kill(process, 0)
     except OSError as error:
-        return isinstance(error, ProcessLookupError)  # any other error: the process lives, as another user's
+        return isinstance(error, ProcessLookupError)  # another error: the process lives, but is another user's
     return False
 
 

@@ -34,9 +34,9 @@ MOST_LINES = 65_536  # a panel has at most this many rows or columns
 class Scanner:
     """A scanner: geometry, imaged volume, and how its panel is read by default.
 
-    readout_ratio: readout / exposure time, T_ro/T_exp; None takes the protocol's. pulse: start and length of the beam in
-    a frame, in exposures; None for a steady beam. lag: the fraction λ of a frame that stems from earlier frames. fps,
-    readout_ms: frame rate and readout from a data sheet, or None."""
+    readout_ratio: readout / exposure time, T_ro/T_exp; None takes the protocol's. pulse: start and length of the beam's
+    pulse in a frame, as fractions of the exposure; None for a steady beam. lag: the fraction λ of a frame that stems from
+    earlier frames. fps, readout_ms: frame rate and readout from a data sheet, or None."""
 
     name: str
     geometry: Geometry

@@ -20,7 +20,7 @@ else:
     import tomli as tomllib
 
 LARGEST = 1e12  # no angle, time or count is larger, and sums of such numbers stay finite
-LARGEST_LENGTH = 1e9  # no length is larger in mm, and none smaller than its inverse except 0
+LARGEST_LENGTH = 1e9  # no length is larger in mm, and none but 0 is below 1 / this number
 _MOST_TOML_BYTES = 16 << 20  # a larger file is no description, and would take long to parse
 _COUNTS = {2: "two", 3: "three"}
 _log = logging.getLogger(__name__)
@@ -121,7 +121,7 @@ class Fields:
         return value
 
     def length(self, key: str) -> float:
-        """Returns a number from 1e-9 to 1e9, in the file's unit: no scanner has lengths outside this range."""
+        """Returns a number from 1e-9 to 1e9, in the file's unit of length: no scanner has lengths outside this range."""
         value = self.number(key, highest=LARGEST_LENGTH)
         if value < 1 / LARGEST_LENGTH:
             raise self.error(key, f"{value:g}", "a number above 0")

@@ -27,7 +27,7 @@ _VOLUME, _DOUBT, _BARE = f"{_DATA}/volume", f"{_DATA}/doubt", "/volume"
 _AXES = ("z", "y", "x")
 _GAUSSIANS, _STATE, _STATES = "/entry/gaussians", "/entry/state", "/entry/time_series"
 _CLOUD = {"mean": (3,), "scale": (3,), "quaternion": (4,), "density": ()}
-_AXIS_TOLERANCE = 1e-3  # stored voxel centres may be off even steps by this fraction of a step, as float32 rounds them
+_AXIS_TOLERANCE = 1e-3  # stored voxel centres may differ from even steps by this fraction of a step, as float32 rounds them
 log = logging.getLogger(__name__)
 
 
@@ -55,7 +55,7 @@ class Volume:
         return deformed(self.values, self.required_grid, field, field.weights_at(time_s)[0])
 
     def moved_by(self, deformation: Deformation, subject: str) -> "Volume":
-        """Returns the volume with another deformation. Raises InputError, which names ``subject``, if it has states."""
+        """Returns the volume with another deformation. Raises InputError, which names ``subject``, for one with states."""
         if self.states is not None:
             found, expected = f"{subject}, which holds its states", "a volume whose object does not change"
             raise InputError("--object-motion", found, expected, "leave it out")
@@ -146,7 +146,7 @@ def read_volume(path: str | Path) -> Volume:
 
 def read_state(path: str | Path) -> dict[str, np.ndarray] | None:
     """Reads the arrays, by name, from which an interrupted run resumes. Returns None if there are none and, with a warning,
-    if they are damaged. Their shapes are left to the caller to check."""
+    if they are damaged. The caller must check the arrays' shapes."""
     with open_hdf5(path) as source:
         try:
             group = source.optional_group(_STATE)
@@ -209,7 +209,7 @@ def _read_provenance(source: Hdf5Source) -> dict[str, object]:
 
 
 def interruption(provenance: Mapping[str, object]) -> dict[str, object]:
-    """Returns where a run was interrupted: ``interrupted_at`` and ``iterations_asked``. If it consists of several runs, for
+    """Returns where a run was interrupted: ``interrupted_at`` and ``iterations_asked``. If the run consists of several, for
     error bars, adds ``interrupted_in_run``. Returns an empty dict for a complete run."""
     at, options, doubt = (provenance.get(name) for name in ("interrupted_at", "options", "doubt"))
     if type(at) is not int:  # not isinstance, which accepts True
@@ -331,8 +331,7 @@ def shares_of_maximum(values: np.ndarray) -> np.ndarray:
 
 
 def finite_float32(subject: str, values: np.ndarray) -> np.ndarray:
-    """Returns ``values`` as contiguous float32. Raises InputError about ``subject`` for NaN, infinity and too
-    large values."""
+    """Returns ``values`` as contiguous float32. Raises InputError about ``subject`` for values not finite in float32."""
     with np.errstate(over="ignore"):  # values beyond float32 become infinite
         volume = np.ascontiguousarray(values, np.float32)
     bad = int(volume.size - np.count_nonzero(np.isfinite(volume)))

@@ -24,7 +24,7 @@ _HELP = (
 
 def space(volume: NDArray[np.floating], grid: Grid, window: Window, gaussians: Gaussians | None) -> Markup | None:
     """Returns a 3D picture of a volume (nz, ny, nx) with its controls and the script's data; None for a volume one voxel
-    thick. window: grey values, as in the slices. gaussians: in mm, or None."""
+    thick. window: the slices' grey values. gaussians: in mm, or None."""
     if not has_depth(volume):
         return None
     cloud = None if gaussians is None or not gaussians.count else gaussians
@@ -79,8 +79,8 @@ def _controls(threshold: int, cloud: Gaussians | None) -> list[Markup]:
 
 
 def _centres(cloud: Gaussians, grid: Grid) -> dict[str, str]:
-    """Returns evenly chosen centres inside the grid's box and their densities, in base64: x, y, z as 16-bit fractions of the
-    box's sides, densities in 8 bits."""
+    """Returns, in base64, evenly chosen Gaussians' centres inside the grid's box and their densities: x, y, z as 16-bit
+    fractions of the box's sides, densities in 8 bits."""
     some = np.unique(np.linspace(0, cloud.count - 1, min(cloud.count, MOST_CENTRES)).round().astype(int))
     low_mm, size_mm = (np.array(three[::-1]) for three in (np.array(grid.box_mm)[:, 0], grid.size_mm))
     share = (cloud.mean[some] - low_mm) / size_mm
@@ -94,7 +94,7 @@ def _centres(cloud: Gaussians, grid: Grid) -> dict[str, str]:
 def _atlas_within(steps: NDArray[np.uint8], most_text: int) -> tuple[str, int]:
     """Returns the slices of grey levels (nz, ny, nx) as one PNG in base64, and how many are side by side in it.
 
-    Noise compresses badly, so lowest bits are dropped until the text has at most ``most_text`` characters."""
+    Noise compresses badly, so the levels' lowest bits are dropped until the text has at most ``most_text`` characters."""
     nz, ny, nx = steps.shape
     columns = max(1, min(nz, round(math.sqrt(nz * ny / nx))))
     rows = math.ceil(nz / columns)
@@ -118,5 +118,5 @@ def _between(steps: NDArray[np.uint8]) -> int:
     with np.errstate(all="ignore"):
         variance = below * above * (sums / below - (sums[-1] - sums) / above) ** 2
     variance = np.nan_to_num(variance)
-    best = np.flatnonzero(variance >= variance.max() * (1 - 1e-9))  # all levels between the two classes are equally good
+    best = np.flatnonzero(variance >= variance.max() * (1 - 1e-9))  # several levels may be equally good: their mean is taken
     return int(np.clip(round(best.mean()) + 1, 1, 255))

@@ -1,4 +1,4 @@
-"""Draws charts by matplotlib as SVG for the report's page. Here are the charts of curves."""
+"""Draws charts by matplotlib as SVG for the report's page: the common frame of all charts, and the charts of curves."""
 
 import hashlib
 import io
@@ -26,7 +26,8 @@ Chart = tuple[str, Markup]
 
 
 def chart(draw: "Callable[[Axes], None]", title: str, description: str, size: tuple[float, float] = SIZE) -> Markup:
-    """Returns, as an SVG element in the page's colours, what ``draw`` draws. title, description: for screen readers."""
+    """Returns an SVG element, in the page's colours, of what ``draw`` draws on axes of matplotlib. size: width and height in
+    points. title, description: for screen readers."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -44,7 +45,7 @@ def chart(draw: "Callable[[Axes], None]", title: str, description: str, size: tu
 
 
 def _label_powers(axes: "Axes") -> None:
-    """Labels logarithmic axes with powers of ten and, if they span less than four decades, with 2 and 5 times these."""
+    """Labels logarithmic axes at powers of ten and, if they span less than four decades, at 2 and 5 times each power."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     for axis, scale, (low, high) in (
@@ -110,7 +111,7 @@ def views_chart(key: str, values: object) -> Chart | None:
 
 
 def histogram(edges: NDArray[np.float64], counts: NDArray[np.int64]) -> Markup:
-    """Returns a chart of histograms of line integrals, before and after: ``counts`` (2, n) between ``edges`` (n + 1,)."""
+    """Returns a chart of histograms of line integrals before and after a step: ``counts`` (2, n), ``edges`` (n + 1,)."""
 
     def draw(axes: "Axes") -> None:
         before, after = np.maximum(counts, 0.9)  # a logarithmic axis has no 0

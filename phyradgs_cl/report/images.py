@@ -1,5 +1,5 @@
-"""Makes pictures for the report: values as grey or coloured PNG, and as many slices of a volume as the page's budget of
-pixels allows."""
+"""Makes pictures for the report: values as grey or coloured PNG, and a volume's slices within the page's budget of
+pixels."""
 
 import base64
 import io
@@ -13,11 +13,11 @@ from phyradgs_cl.fields import Grid
 
 LONGEST_EDGE = 192  # larger slices are averaged over blocks to at most this many pixels along each side
 BUDGET_PIXELS = 16_000_000  # pixels of all slices together: pure noise, the worst case, makes a page of some 20 MB
-# Plane, index and letter of the axis across it, and the world axes to the right and up in the picture.
+# For each plane: name, index and letter of the axis across it, and the world axes to the right and up in the picture.
 PLANES = (("axial", 0, "z", "x", "y"), ("coronal", 1, "y", "x", "z"), ("sagittal", 2, "x", "y", "z"))
 _ROOM = 0.25  # users may move black and white outwards by this fraction of their initial distance
 _BLUE, _WHITE, _RED = (33, 86, 158), (247, 247, 245), (178, 34, 40)
-_PERCENTILE = 99.9  # this percentile is white, since a few very bright voxels would make all others dark
+_PERCENTILE = 99.9  # this percentile of the values is white, since a few very bright voxels would make all others dark
 Volume = NDArray[np.floating]
 
 
@@ -73,7 +73,7 @@ def diverging() -> NDArray[np.uint8]:
 
 
 def grey_range(volume: NDArray[np.floating]) -> tuple[float, float]:
-    """Returns the values of black and white: 0 and a high percentile of the volume, or its extremes if none is above 0."""
+    """Returns the values of black and white: 0 and the volume's 99.9th percentile, or its extremes if that is 0 or less."""
     high = float(np.percentile(volume, _PERCENTILE))
     if high > 0:
         return 0.0, high
@@ -94,7 +94,7 @@ class Window:
 
     @classmethod
     def of(cls, low: float, high: float, *volumes: Volume) -> "Window":
-        """Returns a window whose levels go beyond black and white, if values do, by up to a quarter of their distance."""
+        """Returns a window whose levels go beyond ``low`` and ``high``, if values do, by up to a quarter of high − low."""
         room = _ROOM * (high - low)
         lowest, highest = (float(f([f(v) for v in volumes])) for f in (np.min, np.max))
         least, most = min(low, max(lowest, low - room)), max(high, min(highest, high + room))

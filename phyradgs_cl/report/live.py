@@ -29,21 +29,21 @@ from phyradgs_cl.text import clock
 
 log = logging.getLogger(__name__)
 _MOST_POINTS = 400  # beyond this many points, every second one of the convergence curve is dropped
-_SAMPLES = 64  # voxels along each side from which grey values are computed, to save time
+_SAMPLES = 64  # grey values are computed from at most this many voxels along each side, to save time
 # a page that is older than both this time and this many of its intervals says that the run may have been killed
 _LATE_S, _LATE_TIMES = 30.0, 6
 _LOG_RATIO = 20.0  # the curve's axis is logarithmic if the largest value is more than this many times the smallest
 _CHART = 560, 240  # width and height of the chart in pixels
 _MARGIN = 64, 12, 12, 34  # margins of the chart in pixels: left, top, right, bottom
-EVERY_S = 5.0  # time between two versions of the page
+EVERY_S = 5.0  # time in s between two versions of the page
 SHARE = 0.01  # fraction of the run's time that making pictures may take
 FRAMES = 2  # frames that are computed from the volume and compared with the measured ones
-FRAMES_FROM_S = 60.0  # shorter runs compute no frames, since their report comes soon
+FRAMES_FROM_S = 60.0  # runs shorter than this compute no frames, since their report comes soon
 
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """Middle slices in 1/mm of the volume after an iteration, and some frames. high: the value of white in 1/mm."""
+    """Middle slices in 1/mm of the volume after an iteration, and measured and computed frames. high: white in 1/mm."""
 
     iteration: int
     slices: tuple[NDArray[np.floating], ...]
@@ -216,7 +216,7 @@ class LivePage:
         self.status = Status(title, settings, every_s, time.time())
         self.spent_s = 0.0  # the run has waited this long for pictures
         self._pictured_s = -every_s
-        self._waits = False  # whether an existing file is still kept, until the first progress
+        self._waits = False  # whether a file at ``path`` is kept until the first progress report
         self._started_s = time.monotonic()
         self._is_over = threading.Event()
         self._writer = threading.Thread(target=self._keep_writing, name="live page", daemon=True)
@@ -263,7 +263,7 @@ class LivePage:
             self._write()
 
     def become(self, write_report: Callable[[Path], object]) -> None:
-        """Replaces the page by the report that ``write_report`` writes. If that fails, the page says how to make it."""
+        """Replaces the page by the report that ``write_report`` writes. If that fails, the page names the command for it."""
         self.stage("Writing the report")
         try:
             write_report(self.path)
@@ -273,7 +273,7 @@ class LivePage:
             self.end("The run is complete. 'phyradgs report' makes its report.", is_complete=True)
 
     def _snapshot(self, progress: Progress, used_s: float) -> Snapshot:
-        """Returns the present slices and frames; no frames if the device cannot compute them."""
+        """Returns the present slices and frames; no frames if the run is short or the device cannot compute them."""
         assert progress.volume is not None
         frames: list[FramePair] = []
         expected_s = used_s * progress.iterations / max(progress.iteration, 1)

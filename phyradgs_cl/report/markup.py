@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from phyradgs_cl.text import plain_text
 
 UNITS = {"_per_mm": "1/mm", "_mm": "mm", "_deg": "°", "_db": "dB", "_s": "s"}
-_RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # by unit: a number below a millionth of this is shown as 0
+_RESOLUTION = {"mm": 1e-4, "°": 1e-4, "s": 1e-6}  # for each unit: numbers up to a millionth of this are shown as 0
 _WORDS = {"psnr": "PSNR", "rms": "RMS", "ssim": "SSIM", "sha256": "SHA-256", "tv": "TV", "l1": "L1", "fdk": "FDK"}
 _LONGEST = 400  # longer values are cut after this many characters
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -37,7 +37,7 @@ def joined(*children: object) -> Markup:
 
 
 def raw_text(name: str, content: str, /, **attributes: object) -> Markup:
-    """Returns a ``style`` or ``script`` element of own text, not escaped. Raises ValueError for text that would end it."""
+    """Returns a ``style`` or ``script`` element of trusted text, unescaped. Raises ValueError for text that would end it."""
     if "</" + name in content.lower():
         raise ValueError(f"{name}: the content would end its element")
     return element(name, Markup(content), **attributes)
@@ -100,7 +100,7 @@ def grouped(value: int) -> str:
 
 
 def tiles(facts: Iterable[tuple[str, str]]) -> Markup:
-    """Returns a list of (name, value), each value in large letters above its name."""
+    """Returns an HTML list of ``facts`` (name, value), each value in large letters above its name."""
     return element("ul", *(element("li", element("b", v), element("span", name)) for name, v in facts), class_="tiles")
 
 

@@ -26,7 +26,7 @@ _FRAME_HELP = (
     "Lines that wait are thin and grey, exposed ones gold, with the rays of the first and the last. A line that has been "
     "read is blue, and stays where the panel was in the middle of its exposure. Drag, or press arrow keys here, to turn."
 )
-MOST_VALUES = 150_000  # numbers in the page's control points, of 2 bytes each: about 0.4 MB of base64
+MOST_VALUES = 150_000  # most numbers in the page's control points, of 2 bytes each: about 0.4 MB of base64
 _MOST_TIMES = 2000  # limit of the times at which the page has the deformation's weights
 _STEPS = 200  # steps of the slider for the object's time
 _MOST_LENGTH = 10  # users may lengthen arrows by up to this factor
@@ -92,7 +92,7 @@ def object_in_motion(
 
 
 def fitting(deformation: Deformation, grid: Grid) -> Deformation:
-    """Returns the deformation in at most ``MOST_VALUES`` numbers: a larger one keeps its values at fewer control points."""
+    """Returns the deformation in at most ``MOST_VALUES`` numbers: a larger one is sampled at fewer control points."""
     spacing_mm = float(np.max(deformation.spacing_mm))
     reduced = deformation
     while reduced.control_mm.size > MOST_VALUES and spacing_mm < 2 * max(grid.size_mm):
@@ -112,7 +112,7 @@ def fitting(deformation: Deformation, grid: Grid) -> Deformation:
 
 
 def _data(deformation: Deformation, grid: Grid, span_s: tuple[float, float]) -> dict[str, object]:
-    """Returns the deformation for the script, axes x, y, z. Control points are 16-bit fractions of their largest value."""
+    """Returns the deformation for the script, axes x, y, z. Control points are 16-bit multiples of each field's unit."""
     control_mm = deformation.control_mm
     largest_mm = np.abs(control_mm).max(axis=(1, 2, 3, 4))
     units_mm = np.where(largest_mm > 0, largest_mm, 1.0) / _LARGEST

@@ -1,4 +1,4 @@
-"""Shows a volume without a report: its middle slices as a PNG, which a run can also renew as it goes, or the whole volume
+"""Shows a volume without a report: its middle slices as a PNG, which a run can also renew until it ends, or the whole volume
 in napari."""
 
 import logging
@@ -40,7 +40,7 @@ def write_preview(volume: NDArray[np.floating], grid: Grid, path: str | Path) ->
 class Preview:
     """Writes a picture of the volume during a run; call it with each progress report.
 
-    It writes to ``io.partial_path`` of ``path``, at most every ``every_s`` seconds. A failure gives one warning."""
+    During the run the file is ``io.partial_path(path)``, made at most every ``every_s`` s. A failure gives one warning."""
 
     def __init__(self, path: Path, every_s: float = 5.0) -> None:
         self.path, self.partial, self.every_s = path, partial_path(path), every_s

@@ -109,8 +109,8 @@ def load_run(path: Path, scan_path: Path | None = None) -> Run:
 
 
 def _with_scan(run: Run, path: Path, is_given: bool, notes: list[str]) -> Run:
-    """Returns the run with a scan file, compared with its true volume. Appends remarks to ``notes``. is_given: the user
-    named the file; then it raises InputError for a file that is no scan."""
+    """Returns the run with a scan file, compared with its true volume. Appends remarks to ``notes``. is_given: whether the
+    user named the file. Raises InputError for a given file that is no scan."""
     kind = file_kind(path) if is_given else "scan"
     if kind != "scan":
         raise InputError(f"--scan {path}", f"a {kind}", "a scan")

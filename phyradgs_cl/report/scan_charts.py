@@ -21,7 +21,7 @@ _MOST_FRAMES = 180  # about this many source positions are marked, even if there
 _ARC_SAMPLES = 24  # number of poses along the first frame's arc
 _FIRST_FRAMES = 4  # number of frames in the chart of successive frames
 _MOST_DOTS = 600  # limit of the dots that mark the times and lines of a motion model's poses
-_LINES_WITH_DOTS = 12  # detector lines that have such dots; dots of more lines would merge
+_LINES_WITH_DOTS = 12  # at most so many detector lines have dots for their poses; more would merge
 _BESIDE = 0.75  # a parallel beam's source and panel are drawn this many diagonals of the volume from its middle
 _ROOM = 0.06  # margin around the data, as a fraction of their range
 Points = NDArray[np.float64]
@@ -135,7 +135,7 @@ def panel_corners(pose: Points, detector_shape: tuple[int, int]) -> Points:
 
 def _first_arc(scan: Scan) -> Points:
     """Returns drawable poses (T, 12) at even times, from the first to the last light of a fly-scan's first frame. For a
-    gantry at rest all are its one pose."""
+    gantry at rest all poses are the same."""
     first_s, last_s = scan.shutter.lit_span_s if scan.is_fly else (scan.shutter.middle_s,) * 2
     times_s = scan.frame_start_s[0] + np.linspace(first_s, last_s, _ARC_SAMPLES)
     return with_sources(scan, scan.trajectory.pose(0, times_s))

@@ -211,7 +211,7 @@ def calibration_section(scan: Scan) -> Markup | None:
 
 
 def _calibration(calibration: Mapping[str, object], scan: Scan) -> list[Markup]:
-    """Returns a table of parameters, the combinations that frames cannot tell apart, and charts of views' corrections."""
+    """Returns a table of parameters, combinations of parameters that frames cannot tell apart, and charts over the views."""
     parameters = _tables(calibration.get("parameters"))
     if not parameters:
         return []

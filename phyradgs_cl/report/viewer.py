@@ -99,7 +99,7 @@ def place(plane: Plane, k: int) -> str:
 
 
 def choice(name: str, prefix: str, words: Mapping[str, str]) -> Markup:
-    """Returns buttons that choose one of the values in ``words``, at first the first."""
+    """Returns buttons that choose one of the values in ``words``; the first is chosen initially."""
     labels = list[Markup]()
     for value, text in words.items():
         button = element("input", type="radio", name=name, id=f"{prefix}-{value}", value=value, checked=not labels)

@@ -24,7 +24,7 @@ _KINDS = {
     "plain-volume": "a bare volume (dataset /volume)",
     "deformation": "how an object moves (/entry/deformation)",
 }
-_OF_MOTION = ("fields", "control_points", "displacements_below_mm", "smallest_determinant")  # facts shown of a deformation
+_OF_MOTION = ("fields", "control_points", "displacements_below_mm", "smallest_determinant")  # shown of a deformation
 
 
 def load_scan(path: str | Path, flats: str = "mean", rows: tuple[int, int] | None = None) -> Scan:
@@ -36,8 +36,8 @@ def load_scan(path: str | Path, flats: str = "mean", rows: tuple[int, int] | Non
 
 @contextmanager
 def expecting(path: str | Path, *kinds: str) -> Iterator[None]:
-    """Improves the message of an InputError about the file ``path``: it then says what the file holds, if none of
-    ``kinds``. For another program's scan it names the command that imports it."""
+    """Improves the message of an InputError about the file ``path``: the message says what the file holds, if that is none
+    of ``kinds``. For another program's scan it names the command that imports it."""
     try:
         yield
     except InputError as error:

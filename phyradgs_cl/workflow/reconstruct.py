@@ -32,22 +32,22 @@ from phyradgs_cl.workflow.volumes import compared_states
 
 log = logging.getLogger(__name__)
 # A converged run with a large last residual (a fraction of the line integrals' norm) gives a warning.
-_SETTLED = 5  # fewer recorded residuals say nothing about convergence: without a first volume, the first one is 1
+_SETTLED = 5  # fewer recorded residuals show no convergence; the first is 1 unless the run begins with a given volume
 _UNLIKELY = 0.15  # smaller residuals give no warning: correct scans had at most 0.13, besides noise
-_AT_REST = 1.05  # converged: the residual after 3/4 of the iterations is at most this many times the last one
-_BEYOND_NOISE = 1.5  # no warning up to this many times the noise; correct scans, even of 100 photons, had at most 1.1
+_AT_REST = 1.05  # converged: (residual after 3/4 of the iterations) / (last residual) is at most this
+_BEYOND_NOISE = 1.5  # no warning if residual / noise is at most this; correct scans, even of 100 photons, had at most 1.1
 _ALL_ROWS = Slabs()
 
 
 class _Checkpoints:
-    """Writes checkpoints; call it with each progress report. It writes at most every ``every_s`` seconds, never for 0. A
+    """Writes a run's checkpoints, at most every ``every_s`` seconds, never for 0; call it with each progress report. A
     killed run leaves its last complete checkpoint. A failure to write gives a warning, once, and no error."""
 
     def __init__(self, path: Path, every_s: float) -> None:
         self.path, self.every_s = path, every_s
         self.last_s = time.monotonic()
         self.has_failed = False
-        self.iteration: int | None = None  # of this run's last checkpoint
+        self.iteration: int | None = None  # iteration of this run's last checkpoint
 
     def __call__(self, progress: methods.Progress) -> None:
         is_due = self.every_s > 0 and time.monotonic() - self.last_s >= self.every_s
@@ -109,7 +109,7 @@ def run_reconstruction(
 
 
 def _slabs_of(plan: methods.RunPlan, slabs: Slabs, scan: Path, ranks: Communicator | None) -> list[tuple[int, int]]:
-    """Returns the slabs of a run; [] reconstructs the whole scan at once. Raises InputError for what needs all rows."""
+    """Returns the slabs of a run; [] reconstructs the whole scan at once. Raises InputError for runs that need all rows."""
     if slabs == _ALL_ROWS and surely_fits(scan):
         return []
     with expecting(scan, "scan"):
@@ -269,7 +269,7 @@ def resume_or_restart(
     plan: methods.RunPlan, scan: Path, output: Path, make_runtime: Callable[[], Runtime],
     report: methods.ProgressReport = methods.ignore_progress, checkpoint_every_s: float = 600.0,
 ) -> tuple[methods.Reconstruction, dict[str, float]]:
-    """Continues ``run_reconstruction`` from its checkpoint; starts again if that is missing, damaged or of another run."""
+    """Continues ``run_reconstruction`` from its checkpoint; starts again if there is none that this run can use."""
     run = partial(run_reconstruction, plan, scan, output, make_runtime, report, checkpoint_every_s=checkpoint_every_s)
     checkpoint = checkpoint_path(output)
     if checkpoint.is_file() and methods.method_of(plan.method).is_resumable:

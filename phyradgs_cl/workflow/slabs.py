@@ -37,8 +37,8 @@ _COPIES = 4  # arrays of the frames' size that a method holds at a time
 @dataclass(frozen=True)
 class Slabs:
     """Which detector rows to reconstruct, and how many at a time. rows: [first, stop); None takes all. rows_at_a_time: 0
-    takes stated ``rows`` at once; without stated ``rows`` it takes as many as half of this machine's memory holds in four
-    copies."""
+    takes stated ``rows`` at once; without stated ``rows`` it takes as many rows as fit into half of this machine's memory
+    with four copies of their frames."""
 
     rows: tuple[int, int] | None = None
     rows_at_a_time: int = 0
@@ -112,7 +112,7 @@ def reconstruct_slabs(
 def _slab(
     plan: methods.RunPlan, path: Path, whole: Scan, rows: tuple[int, int], rt: Runtime, report: methods.ProgressReport
 ) -> methods.Reconstruction:
-    """Reconstructs the slices that detector rows [first, stop) see, from ``HALO_ROWS`` more rows on each side."""
+    """Reconstructs the slices that detector rows [first, stop) see, from these rows and ``HALO_ROWS`` more on each side."""
     count, (first, stop) = whole.geometry.detector_shape[0], rows
     near = max(first - HALO_ROWS, 0), min(stop + HALO_ROWS, count)
     scan = load_scan(path, plan.preprocessing.flats, near).on_grid(part_of(whole.grid, slices_of(whole, *rows)))

@@ -40,8 +40,8 @@ from phyradgs_cl.workflow.reconstruct import resume_or_restart
 log = logging.getLogger(__name__)
 RESULTS, TABLE = "results.jsonl", "results.md"
 _RETRIES = 3  # times that Dask repeats a run after an error
-_CONNECT_S = 10.0  # time limit for connecting to Dask's scheduler
-_BUSY_S = 20.0  # wait before a new try, while another process still writes the run's output
+_CONNECT_S = 10.0  # time limit in s for connecting to Dask's scheduler
+_BUSY_S = 20.0  # pause in s before a new try of a run whose output another process is writing
 # Dask listens on this machine only, so that nobody else can send work to it
 _LOCAL = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "silence_logs": logging.CRITICAL}
 Line = dict[str, Any]
@@ -51,7 +51,7 @@ runtime_of_process = functools.cache(Runtime)  # one Runtime per process and dev
 
 @dataclass(frozen=True)
 class SweepRun:
-    """One reconstruction of a sweep. facts: the first entries of the run's line of results, of which "run" is its name."""
+    """One reconstruction of a sweep. facts: the first entries of the run's line of results; "run" is the run's name."""
 
     scan: Path
     plan: RunPlan
@@ -118,7 +118,7 @@ def _settings(document: Mapping[str, Any], path: Path) -> Iterator[dict[str, Any
 
 
 def _plan(values: Mapping[str, Any], seed: int, where: str) -> RunPlan:
-    """Returns the plan of a run. Errors of ``plan_run`` get ``where`` and the values in front of their message."""
+    """Returns the plan of a run. In errors of ``plan_run``, ``where`` and the ``values`` come before the message."""
     options = nested(values)
     method, preset = options.pop("method", DEFAULT_METHOD), options.pop("preset", None)
     try:
@@ -171,7 +171,7 @@ def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None,
     """Yields lines of runs as they finish; writes Dask's report to ``page``. Raises InputError if no scheduler answers."""
     os.environ.setdefault("DASK_DISTRIBUTED__SCHEDULER__WORKER_SATURATION", "1.0")  # else a worker's death fails queued runs
     dask = checks.package("distributed", "the package that --workers needs", "phyradgs-cl[cluster]")
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # the InputError below reports the same
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # Dask's own log would repeat the InputError below
     count, where = int(workers) if workers.isdigit() else None, {"address": workers, "timeout": _CONNECT_S}
     if count is not None:
         checks.within("--workers", count, 1, 1024)
@@ -182,7 +182,7 @@ def _made_by_workers(runs: Sequence[SweepRun], workers: str, device: str | None,
             if count is not None:
                 client.register_worker_callbacks(functools.partial(_begin, device))
                 client.cluster.adapt(minimum=count, maximum=count)  # else Dask does not replace a worker that dies early
-                device = None  # None, since _begin has chosen each worker's device
+                device = None  # _begin chooses each worker's device
             run_of = {client.submit(make_run, run, device=device, retries=_RETRIES, pure=False): run for run in runs}
             for future in dask.as_completed(list(run_of)):
                 run = run_of.pop(future)
@@ -218,8 +218,8 @@ def make_run(run: SweepRun, report: ProgressReport = ignore_progress, device: st
 
 
 def _failed(run: SweepRun, error: Exception) -> Line:
-    """Returns the line of results of a failed run. An OutputError that is no BusyError is raised instead, because all runs
-    would meet it."""
+    """Returns the line of results of a failed run. Raises an OutputError that is no BusyError, because all runs would meet
+    it."""
     if isinstance(error, OutputError) and not isinstance(error, BusyError):
         raise error
     text = str(error) if isinstance(error, PhyradgsError) else f"{type(error).__name__}: {error}"

@@ -83,7 +83,7 @@ def run_evaluation(
     with finish_despite_interrupt(), written_beside(picture) as temporary:
         try:
             slices_png(temporary, volume, reference, title)
-        except OutputError as error:  # it names the temporary file; from its cause ``written_beside`` names the picture
+        except OutputError as error:  # raises its cause, so that the message names the picture, not the temporary file
             raise error.__cause__ or error from None
     known: dict[str, object] = {key: provenance[key] for key in ("method", "seconds", "gaussians") if key in provenance}
     files = {"volume": str(volume_path), "reference": str(reference_path), "picture": str(picture)}
@@ -115,7 +115,7 @@ def compared_states(result: Volume, truth: MovingTruth, truth_grid: Grid) -> dic
 
 def _with_our_axes(volume: Volume) -> Volume:
     """Reorders a volume of RTK, whose axes x, y, z are this package's y, z, x."""
-    order, grid = [1, 2, 0], volume.grid  # where our axes (z, y, x) are in RTK's (z, y, x)
+    order, grid = [1, 2, 0], volume.grid  # the index in RTK's (z, y, x) of each of our axes (z, y, x)
     if grid is not None:
         shape, size_mm, offset_mm = (np.array(zyx)[order] for zyx in (grid.shape, grid.voxel_size_mm, grid.offset_mm))
         grid = Grid(triple(shape.tolist()), triple(size_mm.tolist()), triple(offset_mm.tolist()))

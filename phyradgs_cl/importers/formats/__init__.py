@@ -1,1 +1,1 @@
-"""Importers of scans, a module for each format of another program."""
+"""Importers of scans. Each module reads one or two formats of other programs."""

@@ -27,7 +27,7 @@ from phyradgs_cl.io.hdf5.datasets import ANGLE, LENGTH, TIME
 from phyradgs_cl.io.scan.header import find_entry, read_duration
 
 _log = logging.getLogger(__name__)
-_NOWHERE = "/no entry"  # an address that no file has, for bare arrays: all metadata then come from options
+_NOWHERE = "/no entry"  # an address that no file has, for arrays without an entry: options then give all metadata
 _EXCHANGE = "/exchange"
 _INSTRUMENT = "/measurement/instrument"
 _DETECTOR, _OPTICS = f"{_INSTRUMENT}/detector", f"{_INSTRUMENT}/detection_system/objective"
@@ -46,7 +46,7 @@ _MOVES = ("x_translation", "y_translation", "z_translation")
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is an HDF5 file but no Data Exchange. Raises InputError for this package's volumes."""
+    """Returns whether ``path`` is an HDF5 file without a group /exchange. Raises InputError for a volume of this package."""
     if not path.is_file() or not h5py.is_hdf5(path):
         return False
     with open_hdf5(path) as source:
@@ -88,7 +88,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _entry(source: Hdf5Source, options: ImportOptions) -> str:
-    """Returns the address of the scan. Raises InputError without one, which says how to name arrays elsewhere."""
+    """Returns the address of the NXtomo entry. Raises InputError without one, and says how to state arrays' addresses."""
     with open(source.path, "rb") as file:
         is_matlab = file.read(6) == b"MATLAB"
     try:
@@ -116,7 +116,8 @@ def _lengths(entry: str) -> hdf5.Lengths:
 
 
 def _turned(source: Hdf5Source, detector: str) -> assemble.Turned:
-    """Reads the flips that the file declares: half turns of the detector about its x axis (rows) and y axis (columns)."""
+    """Reads which image axes are flipped. y_flipped and half turns of the detector about its x axis flip rows; x_flipped and
+    half turns about its y axis flip columns. Two flips of one axis cancel."""
     flips = [False, False]
     for index, address in enumerate((f"{detector}/y_flipped", f"{detector}/x_flipped")):
         if source.find(address) is not None:
@@ -132,8 +133,8 @@ def _turned(source: Hdf5Source, detector: str) -> assemble.Turned:
 
 
 def _axis_columns(source: Hdf5Source, detector: str, turn: assemble.Turned, options: ImportOptions) -> float:
-    """Returns how many columns the panel's middle lies to the right of the axis. Files of the nxtomo package count the
-    axis' column from the panel's middle."""
+    """Returns how many columns the panel's middle lies to the right of the axis; 0 if the file does not state the axis.
+    Files of the nxtomo package state the axis' column relative to the panel's middle."""
     names = (f"{detector}/{name}" for name in ("x_rotation_axis_pixel_position", "estimated_cor_from_motor"))
     for address in [address for address in names if source.find(address) is not None][:1]:
         if column := h5.read_number(source, address):
@@ -145,8 +146,8 @@ def _axis_columns(source: Hdf5Source, detector: str, turn: assemble.Turned, opti
 def _motion(
     places: hdf5.Places, entry: str, used: np.ndarray, geometry: Geometry, options: ImportOptions
 ) -> tuple[assemble.Timing, CircularOrbit]:
-    """Reads timing and orbit. ``rotation_angle_end`` states the angle at the end of each frame's exposure. Without it, or
-    with angles or a frame time from the options, the angles of neighbouring frames give the speed."""
+    """Reads timing and orbit. used, bool (F,): which frames are projections. ``rotation_angle_end`` has the angle at the end
+    of each exposure. Without it, or with angles or a frame time from options, neighbouring frames' angles give the speed."""
     assert places.source is not None
     source, detector, angles = places.source, f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SAMPLE}/rotation_angle"
     sign = gantry_sign(options, h5.read_attribute(source, angles, "rotates") or "sample")
@@ -168,7 +169,7 @@ def _motion(
 
 
 def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
-    """Raises InputError for a sample that is shifted between projections, which the imported scan could not express."""
+    """Raises InputError for a sample that is shifted between projections, which a circular orbit cannot express."""
     for name in _MOVES:
         address = f"{entry}/{schema.SAMPLE}/{name}"
         if source.find(address) is None or source.dataset(address).size == 1:

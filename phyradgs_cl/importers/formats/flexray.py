@@ -1,8 +1,8 @@
 """Scans of TESCAN's FleX-ray scanners: "scan settings.txt" with TIFFs of counts, flats (io*) and darks (di*).
 
 Offsets in mm have the signs of the package flexdata: ver_ up, tra_ to the right seen from the source. A window of the panel,
-ROI (LTRB), shifts the image's middle. The sample turns clockwise seen from above, row 0 is on top, column 0 on the left.
-flexdata's corrections are not applied, since they hold for one scanner, at CWI, and for certain dates."""
+ROI (left, top, right, bottom), shifts the image's middle. The sample turns clockwise seen from above, row 0 is on top,
+column 0 on the left. flexdata's corrections are not applied: they hold for one scanner, at CWI, and for certain dates."""
 
 import logging
 from functools import partial
@@ -67,7 +67,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names: dict[str, str]) -> RotaryStage:
-    """Returns the stage that the settings describe. Heights count from the source, which is therefore at z = 0."""
+    """Returns the stage that the settings describe. Heights in the scan count from the source, which is at z = 0."""
     to_axis_mm = options.taken("source_to_axis_mm", partial(scan.length, "SOD"))
     to_detector_mm = options.taken("source_to_detector_mm", partial(scan.length, "SDD"))
 
@@ -90,7 +90,7 @@ def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names
 
 
 def _window_mm(scan: Settings) -> tuple[float, float]:
-    """Returns how far the middle of the window that was read lies to the right of and above the panel's middle, in mm."""
+    """Returns how far, in mm, the middle of the panel's window lies to the right of and above the panel's middle."""
     if not scan.has("ROI (LTRB)"):
         return 0.0, 0.0
     left, top, right, bottom = scan.listed("ROI (LTRB)", 4).tolist()

@@ -1,9 +1,9 @@
 """Scans of LEAP: the text file that its ``save_parameters`` writes, with line integrals as .npy (F, v, u) or TIFFs.
 
-At LEAP's angle φ = 0° the source stands at −y, so the gantry's angle is φ − 90°. Columns count in the direction of the
-turn, and row 0 is the lowest. The ray through the origin falls on centerRow and centerCol. ``tau`` shifts source and panel
-against the columns' direction. A modular beam is a table of sources, panel centres, and directions of rows and columns.
-Units: mm, degrees."""
+At LEAP's angle φ = 0° the source stands at −y, so the gantry's angle is φ − 90°. Columns count in the direction in which the
+gantry turns, and row 0 is the lowest. The ray through the origin falls on centerRow and centerCol. ``tau`` shifts source and
+panel against the columns' direction. A modular beam is a table of sources, panel centres, and directions of rows and
+columns. Units: mm, degrees."""
 
 from functools import partial
 from pathlib import Path

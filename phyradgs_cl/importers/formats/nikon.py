@@ -48,7 +48,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     sizes = ("Projections", "DetectorPixelsY", "DetectorPixelsX")
     count, *panel = (scan.count(name, _MOST_FRAMES) for name in sizes)
     prefix = scan.word("Name", default="") + scan.word("InputSeparator", default="_")
-    place, inside = folder, scan.word("InputFolderName", default="")  # often a folder of the scanner's disk, absent here
+    place, inside = folder, scan.word("InputFolderName", default="")  # ``inside`` is often on the scanner's disk only
     if (first := inside.replace("\\", "/").split("/")[0]) and folder.exists(first):
         place = SafeFolder(folder.root / checked_name(inside, scan.name("InputFolderName")))
     frames, at, said = read_numbered(place, prefix, (count, *panel), [*map(scan.name, sizes)], options, first=1)

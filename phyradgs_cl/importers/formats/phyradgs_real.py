@@ -58,7 +58,7 @@ class Circle:
 
     def at(self, view: int, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns a view's angles (T,) in rad and points (T, 3) on the circle in mm. share (T,): times after the opening of
-        the view's first line, in units of the exposure."""
+        the view's first line, divided by the exposure time."""
         start, closed, _ = self.angle_rad[view]
         angle = start + (closed - start) * share
         x, y = (self.centre[:, None] + self.radius * np.stack([np.cos(angle), np.sin(angle)])).tolist()
@@ -66,8 +66,8 @@ class Circle:
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a .json file other than R2-Gaussian's descriptions, or a folder with such a file, none of
-    these descriptions, and TIFF frames or a folder of projections."""
+    """Returns whether ``path`` is a .json file other than the descriptions of ``r2_gaussian``, or a folder. The folder must
+    hold a .json file, none of these descriptions, and TIFF frames or a folder ``projections``."""
     others = (synthetic.META, synthetic.META_WITH_TIMES)
     if not path.is_dir():
         return path.suffix.lower() == ".json" and path.name not in others
@@ -93,7 +93,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         expected, remedy = "a length in mm along v and along u", f"say {options.named('pixel_size_mm')}"
         raise InputError(f"{description} pixel size", "nothing", expected, remedy)
     share = np.linspace(0, shutter.span_s / shutter.exposure_s, _TIMES_A_FRAME)
-    poses = np.stack([  # of the images as stored, at T times of every frame, (F, T, 12)
+    poses = np.stack([  # (F, T, 12): poses of the images as stored, at T times of each frame
         _view_poses(view, source.at(i, share)[1], detector.at(i, share), detector.centre, panel, pitch)
         for i, view in enumerate(views)
     ])  # fmt: skip
@@ -114,8 +114,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 def _frames_and_views(
     description: Path, views: list[Fields], options: ImportOptions
 ) -> tuple[np.ndarray, list[Fields]]:
-    """Reads frames (F, v, u) as stored, and returns them with their views. The F views are all of the JSON's, or F from
-    ``first_view`` on. Raises InputError unless there is one frame per view."""
+    """Reads frames (F, v, u) as stored, and returns them with their views: all views of the JSON, or with the option
+    ``first_view`` the F views from this one on. Raises InputError unless there is one frame per view."""
     below = description.parent / PROJECTIONS
     folder = SafeFolder(below if below.exists() else description.parent)
     paths = folder.matching(*tiff.SUFFIXES)
@@ -133,7 +133,8 @@ def _frames_and_views(
 
 
 def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> ImportOptions:
-    """Returns options with a flat value: by default, with a warning, the brightest pixel, as in the published code."""
+    """Returns the options, completed by a flat value if the frames are counts without one: the brightest pixel, as in
+    PhyRadGS's published code, with a warning. Raises InputError for frames without a count above 0."""
     if options.flat_value is not None or options.quantity not in (None, "counts"):
         return options
     brightest = float(frames.max())
@@ -160,7 +161,7 @@ def _view_poses(
     panel: tuple[int, int], pitch: tuple[float, float],
 ) -> np.ndarray:
     """Returns a view's poses (T, 12), see ``PoseTable``. detector: the panel's angles (T,) in rad and centres (T, 3) in mm.
-    The panel is rotated about +z from the angle for which its matrix holds. centre: (x, y) in mm of the panel's circle."""
+    The panel is rotated about +z by its angle minus the angle at which its matrix holds. centre (2,): of its circle."""
     rotation, stands_at = _matrix(view)
     angle_rad, centre_mm = detector
     turned_rad = angle_rad - np.arctan2(stands_at[1] - centre[1], stands_at[0] - centre[0])

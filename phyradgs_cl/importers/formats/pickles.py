@@ -3,8 +3,8 @@ TIGRE: the tuple (projections, geometry, angles) that its loaders return, with a
 are line integrals with row 0 the lowest, as ``tigre.Ax`` gives them; angles are the gantry's in radians.
 
 Only plain containers, numbers, NumPy arrays and TIGRE's geometry are read. Every other name in a pickle is refused, so no
-code of the file runs. Arrays are built by the functions below, because NumPy's own constructors are not safe here: for some
-types they read memory at addresses that the file states."""
+code of the file runs. Functions of this module build the arrays, because NumPy's own constructors are not safe here: for
+some types they read memory at addresses that the file states."""
 
 import io
 import math
@@ -33,7 +33,7 @@ from phyradgs_cl.io.files import read_regular, regular_file
 from phyradgs_cl.io.tables import Fields, described
 
 OPTIONS = (*TIMING, "detector_model", "part")
-_PER_MM = 1e-3  # NAF's volumes are in 1/m
+_PER_MM = 1e-3  # 1/mm per 1/m, the unit of NAF's volumes
 _PARTS = {"train": ("train",), "test": ("val",), "all": ("train", "val")}
 TIGRE_MODULE, _END_BYTES = "tigre.utilities.geometry", 1 << 18
 OPTIONS_OF_TIGRE = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
@@ -114,7 +114,7 @@ def read_pickle(path: Path, unpickler: "type[PlainUnpickler] | None" = None) -> 
 
 
 class PlainUnpickler(pickle.Unpickler):
-    """An unpickler that calls none of the functions that a file names. A few functions of our own take their place."""
+    """An unpickler that calls no function that a file names. Functions of this module replace a few; others are refused."""
 
     def find_class(self, module: str, name: str) -> Any:
         """Returns this module's function that replaces an allowed one. Raises InputError for any other name."""
@@ -225,8 +225,8 @@ def _named(content: dict[object, Any], *words: str) -> Any:
 def _trajectory(
     geo: Any, poses: np.ndarray, angle_rad: np.ndarray, timing: Timing, subject: str
 ) -> tuple[CircularOrbit | PoseTable, Geometry]:
-    """Returns trajectory and geometry. The trajectory is a circular orbit if all ``poses`` (F, 12) lie on it, else a pose
-    table."""
+    """Returns trajectory and geometry. The trajectory is the circular orbit through ``angle_rad`` (F,) if this gives the
+    ``poses`` (F, 12), else a table of the poses."""
     rows, columns = np.ravel(geo.nDetector).tolist()
     pitch_v, pitch_u = np.ravel(geo.dDetector).tolist()
     off_v, off_u = np.resize(0.0 if geo.offDetector is None else geo.offDetector, 2).tolist()

@@ -2,8 +2,8 @@
 PhyRadGS: projections [v, u] with row 0 at +z, volumes [x, y, z].
 
 Synthetic folders of PhyRadGS also have the gantry's angles at which every frame's first line opens and closes and its last
-line closes, but no times. The exposure is the option ``exposure_s``, or 1 s. The gantry's speed is the mean angle of an
-exposure over this time."""
+line closes, but no times. The exposure is the option ``exposure_s``, or 1 s. The gantry's speed is the mean angle that it
+turns during an exposure / the exposure time."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,12 +29,12 @@ ROW_0 = "top"
 OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
 OPTIONS_WITH_TIMES = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
 _KEYS = ("first_line_start", "first_line_end", "last_line_end")
-_SAME = 1e-3  # the frames' ratios (readout time / exposure time) differ by at most this × max(1, largest ratio)
+_SAME = 1e-3  # the ratio readout time / exposure time may differ between frames by this × max(1, largest ratio)
 
 
 @dataclass(frozen=True, eq=False)
 class R2Folder:
-    """A folder of R2-Gaussian whose description and geometry have been read."""
+    """A folder of R2-Gaussian, with its description and geometry. unit_mm: the length of the scene's unit in mm."""
 
     folder: SafeFolder
     meta: Fields
@@ -43,7 +43,7 @@ class R2Folder:
 
     @classmethod
     def opened(cls, given: Path, usual: str, unit_mm: float) -> "R2Folder":
-        """Reads the description: the file ``given``, or ``usual`` in the folder ``given``. unit_mm: the scene's unit."""
+        """Reads the description: the file ``given``, or ``usual`` in the folder ``given``. unit_mm: mm per scene unit."""
         folder = SafeFolder(given if given.is_dir() else given.parent)
         name = usual if given.is_dir() else given.name
         path = folder.file(name, str(folder.root / name))
@@ -51,9 +51,9 @@ class R2Folder:
         return cls(folder, meta, read_geometry(meta.table("scanner"), unit_mm), unit_mm)
 
     def frame(self, entry: Fields) -> np.ndarray:
-        """Reads the projection (v, u) of an entry, as stored."""
+        """Reads the projection (v, u) that an entry of the description names, as stored."""
         name = entry.word("file_path")
-        first_copy = name.replace("_sim1", "")  # _sim1 marks a repeated simulation; the first one is read if it exists
+        first_copy = name.replace("_sim1", "")  # _sim1 marks a repetition; the first simulation is read if it is there
         path = self.folder.file(first_copy if self.folder.exists(first_copy) else name, entry.name("file_path"))
         image = read_npy(path, 2)
         checks.shape(str(path), image, self.geometry.detector_shape)
@@ -78,21 +78,21 @@ class R2Folder:
 
 
 def entries_of(meta: Fields, prefix: str, part: str) -> list[Fields]:
-    """Returns the entries of the frames in ``part``: "train", "test", or "all" for both in this order. prefix: precedes
-    train and test in the file's keys."""
+    """Returns the description's entries for the frames of ``part``: "train", "test", or "all" for both in this order.
+    prefix: precedes train and test in the description's keys."""
     parts = ("train", "test") if part == "all" else (part,)
     return [entry for name in parts for entry in meta.tables(f"{prefix}{name}")]
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a folder with R2-Gaussian's description, or the description itself."""
+    """Returns whether ``path`` is R2-Gaussian's description, or a folder with this description and without PhyRadGS's."""
     if path.is_dir():
         return (path / META).exists() and not (path / META_WITH_TIMES).exists()
     return path.name == META
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports the frames of the part that the options state: by default train, under the key ``proj_train``."""
+    """Imports the frames of the option ``part``: by default train, under the description's key ``proj_train``."""
     options.refuse_unused("r2", OPTIONS)
     opened = R2Folder.opened(path, META, options.unit_mm)
     entries = entries_of(opened.meta, "proj_", options.part)
@@ -103,8 +103,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def read_geometry(scanner: Fields, unit_mm: float) -> Geometry:
-    """Reads the beam from a scanner's table with lengths in ``unit_mm``. nDetector and dDetector are [v, u], offDetector is
-    [u, v]. The distances of mode "parallel" are not read, as in TIGRE."""
+    """Reads the beam from a scanner's table, whose lengths are multiples of ``unit_mm``. nDetector and dDetector are [v, u],
+    offDetector is [u, v]. The distances of mode "parallel" are not read, as in TIGRE."""
     rows, columns = scanner.counts("nDetector", 2)
     pitch_v, pitch_u = (float(p * unit_mm) for p in _pitches(scanner, "Detector", (rows, columns)))
     offset_u, offset_v = (float(o * unit_mm) for o in _offset(scanner, "offDetector", 2))
@@ -118,7 +118,7 @@ def read_geometry(scanner: Fields, unit_mm: float) -> Geometry:
 
 
 def read_grid(scanner: Fields, unit_mm: float) -> Grid:
-    """Reads the voxel grid from a scanner's table, with triples [x, y, z] and lengths in ``unit_mm``."""
+    """Reads the voxel grid from a scanner's table of triples [x, y, z], whose lengths are multiples of ``unit_mm``."""
     counts = scanner.counts("nVoxel", 3)
     size = _pitches(scanner, "Voxel", counts) * unit_mm
     origin = _offset(scanner, "offOrigin", 3) * unit_mm
@@ -134,8 +134,8 @@ def _pitches(scanner: Fields, what: str, counts: tuple[int, ...]) -> np.ndarray:
 
 
 def _offset(scanner: Fields, key: str, count: int) -> np.ndarray:
-    """Returns the first ``count`` numbers of ``key``, zeros without the key. offDetector may have an unused third number.
-    Raises InputError for fewer numbers."""
+    """Returns the first ``count`` numbers of ``key``; zeros if the key is missing. offDetector may have an unused third
+    number. Raises InputError for fewer numbers than ``count``."""
     if not scanner.has(key):
         return np.zeros(count)
     values = scanner.numbers(key)
@@ -145,8 +145,8 @@ def _offset(scanner: Fields, key: str, count: int) -> np.ndarray:
 
 
 def turned_volume(subject: str, volume: np.ndarray, grid: Grid, per_mm: float) -> np.ndarray:
-    """Returns a stored volume [x, y, z], whose unit is ``per_mm`` 1/mm, as (nz, ny, nx) float32 in 1/mm. Raises InputError
-    about ``subject`` for a shape other than the grid's, and for values that are not finite in float32."""
+    """Returns a stored volume [x, y, z] as (nz, ny, nx) float32 in 1/mm. per_mm: factor from the stored values to 1/mm.
+    Raises InputError about ``subject`` for a shape other than the grid's, and for values that are not finite in float32."""
     checks.shape(subject, volume, grid.shape[::-1])
     checks.finite(subject, volume)
     turned = np.transpose(volume, (2, 1, 0)).astype(np.float64) * per_mm
@@ -156,13 +156,13 @@ def turned_volume(subject: str, volume: np.ndarray, grid: Grid, per_mm: float) -
 
 
 def recognises_with_times(path: Path) -> bool:
-    """Returns whether ``path`` is a folder with PhyRadGS's description, or the description itself."""
+    """Returns whether ``path`` is a folder with the description of PhyRadGS's synthetic scans, or the description itself."""
     return (path / META_WITH_TIMES).exists() if path.is_dir() else path.name == META_WITH_TIMES
 
 
 def import_scan_with_times(path: Path, options: ImportOptions) -> Scan:
-    """Imports the frames of the part that the options state: by default train, under the key ``simulate_train``. Columns
-    are read out one after the other unless the options say rows."""
+    """Imports the frames of the option ``part``: by default train, under the description's key ``simulate_train``. Columns
+    are read out one after the other unless the option ``readout_axis`` says rows."""
     options.refuse_unused("phyradgs", OPTIONS_WITH_TIMES)
     opened = R2Folder.opened(path, META_WITH_TIMES, options.unit_mm)
     entries = entries_of(opened.meta, "simulate_", options.part)
@@ -174,8 +174,8 @@ def import_scan_with_times(path: Path, options: ImportOptions) -> Scan:
 
 
 def timing_of_marks(subject: Fields, marks_rad: np.ndarray, options: ImportOptions) -> Timing:
-    """Returns the timing from gantry angles (F, 3) in rad: when the first line opens, when it closes, and when the last
-    line closes. The first stored line is read first: column 0, or the top row if rows are read."""
+    """Returns the timing from gantry angles (F, 3) in rad: when the first line opens, when it closes, and when the last line
+    closes. Unless options say otherwise, the first stored line is read first: column 0, or the top row if rows are read."""
     exposure_s = exposure_of_blurred_s(options)
     ratio = readout_ratio(subject.subject, marks_rad[:, 1] - marks_rad[:, 0], marks_rad[:, 2] - marks_rad[:, 1])
     axis = options.readout_axis or "columns"
@@ -187,7 +187,7 @@ def timing_of_marks(subject: Fields, marks_rad: np.ndarray, options: ImportOptio
 
 
 def exposure_of_blurred_s(options: ImportOptions) -> float:
-    """Returns the options' exposure, or 1 s without it, because the files state none. Raises InputError for 0 s or less."""
+    """Returns the options' exposure, or 1 s without one, because files state none. Raises InputError for 0 s or less."""
     exposure_s = 1.0 if options.exposure_s is None else options.exposure_s
     if exposure_s <= 0:
         raise InputError(options.named("exposure_s"), f"{exposure_s:g}", "a time above 0 s", "the frames are blurred")
@@ -195,8 +195,8 @@ def exposure_of_blurred_s(options: ImportOptions) -> float:
 
 
 def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarray) -> float:
-    """Returns readout time / exposure time, from the gantry's arcs (F,) in rad during each. Raises InputError for a ratio
-    below 0, or one that differs between frames, and for exposures without a turn or with turns of both signs."""
+    """Returns readout time / exposure time, from the angles (F,) in rad that the gantry turns during each. Raises InputError
+    for a ratio below 0, or one that differs between frames, and for exposures without a turn or with turns of both signs."""
     if np.any(exposure_arc == 0) or np.any(np.sign(exposure_arc) != np.sign(exposure_arc[0])):
         found = f"arcs from {exposure_arc.min():.6g} to {exposure_arc.max():.6g} rad"
         raise InputError(f"{subject} exposure", found, "arcs that turn one way, none of them 0")
@@ -209,6 +209,6 @@ def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarra
 
 def start_times_s(first_rad: np.ndarray, closed_rad: np.ndarray, exposure_s: float) -> np.ndarray:
     """Returns opening times (F,) in s, from 0 on. first_rad, closed_rad (F,): the gantry's angles when each frame's first
-    line opens and closes. The gantry is taken to turn at the mean speed of the exposures all the time."""
+    line opens and closes. The gantry's speed is taken as constant: the mean over the exposures."""
     speed_rad_per_s = float(np.mean(closed_rad - first_rad)) / exposure_s
     return (first_rad - first_rad[0]) / speed_rad_per_s

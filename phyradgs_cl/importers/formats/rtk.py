@@ -38,14 +38,14 @@ _ANGLES = ("GantryAngle", "InPlaneAngle", "OutOfPlaneAngle")
 _RADIUS = "RadiusCylindricalDetector"
 _RAW, _ORA = (".his", ".hnd", ".hnc", ".xim"), ".ora.xml"  # endings of files that rtk_projections.py reads
 XIM_BELOW = "Acquisitions/*/*.xim"
-"""Pattern of the projections of Varian's TrueBeam, from the folder of its Scan.xml."""
+"""Pattern of the paths of Varian TrueBeam's projections, relative to the folder of Scan.xml."""
 # RTK's X, Y, Z are our y, z, x: the same right-handed frame with other names of its axes.
 _TO_WORLD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Projections (F, v, u) and their pixels on the panel: pixel (0, 0), and the steps along u and v, each (x, y) in mm."""
+    """Projections (F, v, u), and their pixels on the panel: the first one and the steps along u and v, each (x, y) in mm."""
 
     frames: np.ndarray
     origin_mm: np.ndarray
@@ -83,8 +83,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 def scan_of(
     rtk: "RtkGeometry", stack: Stack, options: ImportOptions, subjects: tuple[str, str], title: str, source: str
 ) -> Scan:
-    """Returns the scan of a geometry and its projections. subjects: the names of both for messages. Raises InputError if
-    their numbers of frames differ."""
+    """Returns the scan of a geometry and its projections. subjects: what messages call the geometry and the projections.
+    Raises InputError if their numbers of frames differ."""
     described, stored = subjects
     if len(stack.frames) != rtk.frames:
         found = f"{len(stack.frames)} frames, {rtk.frames} projections in {Path(described).name}"
@@ -133,7 +133,7 @@ def _trajectory(
 
 @dataclass(frozen=True, eq=False)
 class RtkGeometry:
-    """The numbers (F,) of all projections under RTK's names, with lengths in mm and angles in rad."""
+    """The geometry's numbers (F,), one per projection, by RTK's names: lengths in mm, angles in rad."""
 
     values: dict[str, np.ndarray]
 
@@ -158,8 +158,8 @@ class RtkGeometry:
     def poses(
         self, position: np.ndarray, origin_mm: np.ndarray, step_u: np.ndarray, step_v: np.ndarray
     ) -> np.ndarray:
-        """Returns poses (T, 12), see ``PoseTable``, at frame positions (T,), linear between and beyond frames. origin_mm
-        (2,): where pixel (0, 0) lies on the panel. step_u, step_v (2,): steps in mm to the next column and row."""
+        """Returns poses (T, 12), see ``PoseTable``, at frame positions (T,), interpolated or extrapolated linearly.
+        origin_mm (2,): where pixel (0, 0) lies on the panel. step_u, step_v (2,): steps in mm to the next column and row."""
         at = {name: along(np.unwrap(v) if name in _ANGLES else v, position) for name, v in self.values.items()}
         # rotates from the gantry's to RTK's fixed frame: the inverse of Rz(−in plane) Rx(−out of plane) Ry(−gantry)
         angles_rad = np.stack([at[name] for name in ("GantryAngle", "OutOfPlaneAngle", "InPlaneAngle")], -1)
@@ -177,7 +177,7 @@ class RtkGeometry:
 
 
 def read_rtk_xml(path: Path) -> RtkGeometry:
-    """Reads a geometry file. Without SourceToDetectorDistance it is a parallel beam, with a warning. Raises InputError
+    """Reads a geometry file of RTK. Without SourceToDetectorDistance the beam is parallel, with a warning. Raises InputError
     for numbers that are missing or impossible."""
     root = _root(path)
     common, projections = _numbers(path, root), [_numbers(path, e) for e in root.iterfind("Projection")]
@@ -214,7 +214,7 @@ def _root(path: Path) -> ElementTree.Element:
 
 
 def _numbers(path: Path, parent: ElementTree.Element) -> dict[str, float]:
-    """Returns the numbers directly below an element, by name. Raises InputError for a curved panel."""
+    """Returns the numbers directly below an XML element, by name. Raises InputError about ``path`` for a curved panel."""
     texts = Settings(f"{path}:", {e.tag: e.text or "" for e in parent})
     if radius := texts.position(_RADIUS):
         raise texts.error(_RADIUS, f"{radius:g}", "a flat panel")

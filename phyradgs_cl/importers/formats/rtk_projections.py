@@ -24,8 +24,7 @@ _COPIES = 12  # bytes of memory for every byte of the files: some makers pack im
 @dataclass(frozen=True)
 class _Maker:
     """A maker's files. description, suffixes: how names of the description and of projections end. reader: RTK's class that
-    reads the geometry. below: pattern of projections in folders below the description's. options: import options that
-    apply."""
+    reads the geometry. below: pattern of projections in folders below the description's. options: usable import options."""
 
     description: str
     suffixes: tuple[str, ...]
@@ -57,7 +56,7 @@ def _read_geometry(rtk: Any, reader_name: str, description: str, names: list[str
 
 
 def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a folder of one of the makers, or the description in it, with projections."""
+    """Returns whether ``path`` is a folder with a maker's description and projections, or this description in the folder."""
     return _located(path) is not None
 
 
@@ -77,7 +76,7 @@ def _located(path: Path) -> tuple[_Maker, Path, list[Path]] | None:
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
-    """Imports a maker's folder. ``path`` may also be the description in it."""
+    """Imports a folder with one maker's description and projections. ``path`` may also be the description in it."""
     if (located := _located(path)) is None:
         expected = ", ".join(f"*{maker.description} with *{maker.suffixes[0]}" for maker in _MAKERS)
         raise InputError(str(path), "no description with projections", expected)

@@ -3,7 +3,7 @@
 The maker publishes no description of the log. Distances and pixels are read as in TIGRE. A pixel of the camera is Image
 Pixel Size times the magnification; X/Y Ratio is its width over its height. The central ray falls on the row Optical Axis,
 counted from the bottom. Row 0 is on top, column 0 on the right seen from the source. The log writes CC for a sample that
-turns counterclockwise seen from above. It does not state the column of the axis."""
+turns counterclockwise seen from above. The log does not state the column of the axis."""
 
 import logging
 import re
@@ -36,7 +36,7 @@ _FIELDS = {
     "source_to_axis_mm": "Object to Source (mm)", "source_to_detector_mm": "Camera to Source (mm)",
     "exposure_s": "Exposure (ms)", "angles": "Rotation Step (deg)", "pixel_size_mm": "Image Pixel Size (um)",
 }  # fmt: skip
-_OFF = re.compile(r"OFF( *\(.*\))?", re.I)  # the log also writes OFF (n), where n would count if it were ON
+_OFF = re.compile(r"OFF( *\(.*\))?", re.I)  # the log may add the number that the setting would use: OFF (n)
 _SENSES = {"CC": 1, "CCW": 1, "CW": -1, "C": -1}
 _ASSUMED = {
     "Rotation Direction": "CC", "Optical Axis (line)": "the middle", "Scanning Start Angle": "0",
@@ -90,7 +90,7 @@ def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOp
         return width_mm / next((scan.length(name) for name in _RATIOS if scan.has(name)), 1.0), width_mm
 
     pitch_mm = options.taken("pixel_size_mm", stored_mm)
-    # the central ray may lie outside a cropped image; if it is more than the image's height beyond it, the log is wrong
+    # a cropped image may miss the central ray; a ray more than the image's height beyond its edge shows a wrong log
     up_mm = (panel[0] / 2 - scan.number("Optical Axis (line)", panel[0] / 2, -panel[0], 2 * panel[0])) * pitch_mm[0]
     if options.detector_offset_mm is None:
         settings.say_missing(scan, {"place of the axis": "the middle of the panel; check --fix-offset or calibrate find it"})
@@ -98,9 +98,9 @@ def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOp
 
 
 def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredTiming:
-    """Returns the exposure in s, summed over averaged frames. Leaves it out if the log has none, if an option replaces it,
-    and if the scanner stopped for each frame and no option gives a frame time. Raises InputError for a Frame Averaging that
-    is neither OFF nor ON with a count."""
+    """Returns the log's exposure in s, summed over averaged frames. Leaves it out if the log has none, if an option replaces
+    it, and if the scanner stopped for each frame and no option gives a frame time. Raises InputError for a Frame Averaging
+    that is neither OFF nor ON with a count."""
     motion = next((scan.word(name) for name in ("Type of Detector Motion", "Type of Motion") if scan.has(name)), "")
     averaging = scan.word("Frame Averaging", default="OFF")
     averaged = re.fullmatch(r"ON *\(([1-9]\d{0,5})\)", averaging, re.I)
@@ -114,8 +114,8 @@ def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredT
 
 def _white(scan: settings.Settings, frames: np.ndarray, options: ImportOptions) -> float | None:
     """Returns the counts of air: the option ``flat_value``, else Reference Intensity, else the largest that Depth (bits)
-    allows; None if the options say that frames are no counts. Without options, raises InputError for frames (F, v, u) that
-    are brighter than Reference Intensity, and for frames without flat-field correction."""
+    allows; None if the options say that frames are no counts. Without ``flat_value``, raises InputError for frames (F, v, u)
+    that are brighter than Reference Intensity, and for frames without flat-field correction."""
     remedy = f"say {options.named('flat_value')}"
     if options.quantity not in (None, "counts"):
         return None

@@ -31,7 +31,7 @@ OWN_TABLES = {
     "timing": ("exposure_s", "readout_s", "frame_time_s", "start_s", "detector_model"),
 }
 _PER_FRAME, _ANGLES = ("values_deg", "file"), ("step_deg", "last_deg", "values_deg", "file")
-_KEYS = {  # by import option: the TOML's key for the same value
+_KEYS = {  # for each import option: the TOML's key of the same value
     **{name: f"[timing] {name}" for name in ("exposure_s", "readout_s", "frame_time_s")},
     **{name: f"[readout] {name}" for name in ("first", "fps", "readout_ms")},
     **{name: f"[frames] {name}" for name in ("quantity", "flat_value", "row_0", "column_0")},
@@ -85,8 +85,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _tables(path: Path) -> dict[str, Fields]:
-    """Returns the tables [frames], [angles], [timing] and [readout] by name, and under "" all tables that a scanner file
-    has too. Raises InputError for unknown names."""
+    """Reads the TOML. Returns the tables [frames], [angles], [timing] and [readout] by name, and under "" all tables that a
+    scanner file has too. Raises InputError for unknown names."""
     content = read_toml(path)
     for place in (content, content.get("frames")):  # angles = "FILE" is short for file = "FILE" in [angles]
         if isinstance(place, dict) and isinstance(place.get("angles"), str):
@@ -99,7 +99,7 @@ def _tables(path: Path) -> dict[str, Fields]:
 
 
 def in_words_of_file(options: ImportOptions) -> ImportOptions:
-    """Returns options whose error messages name a value by its key in the TOML, unless the user gave it as an option."""
+    """Returns options whose messages call a value by its key in the TOML, unless the user gave the value as an option."""
     given = options.given(FIELDS)
     return replace(
         options, named=lambda field: (None if field in given else _KEYS.get(field)) or options.named(field)
@@ -176,8 +176,8 @@ def _files(folder: SafeFolder, frames: Fields, name: str, default: str = "") -> 
 
 
 def _scanner(path: Path, scanner: Fields, panel: tuple[int, int], options: ImportOptions) -> Scanner:
-    """Returns the described scanner, with lengths of the options where given. Raises InputError where its panel has other
-    numbers of pixels than the images."""
+    """Returns the scanner of the TOML, with lengths of the options where given. panel: the images' (rows, columns). Raises
+    InputError where the TOML states another panel."""
     content = {name: dict(value) if isinstance(value, dict) else value for name, value in scanner.values.items()}
     source, detector = content.setdefault("source", {}), content.setdefault("detector", {})
     given: dict[str, dict[str, float | None]] = {

@@ -58,8 +58,8 @@ class Streams(Fields):
         return values[:count]
 
     def steady(self, name: str) -> float:
-        """Returns a length in mm without its sign. Images in which it is 0 do not count. Raises InputError if it differs
-        between the others, or is 0 in all images."""
+        """Returns the size in mm of a length that all images share. Images in which the length is 0 do not count. Raises
+        InputError if it differs between the others, or is 0 in all images."""
         lengths = np.abs(self.numbers(name))
         lengths = lengths[lengths > 0]
         if not len(lengths) or np.ptp(lengths) > _STEADY * lengths[0]:
@@ -105,8 +105,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def _taken(scan: Streams, count: int) -> int:
-    """Returns how many of ``count`` planned images were taken: all if the file does not state it, or states 0. Warns if the
-    scan stopped early."""
+    """Returns how many of ``count`` planned images were taken: all if the file states no number or 0. Warns if fewer."""
     taken = int(scan.first_of(f"{_INFO}/ImagesTaken", 0)) if scan.has(f"{_INFO}/ImagesTaken") else count
     if 0 < taken < count:
         _log.warning("%s: the scan stopped early: %d of %d images were taken", scan.subject, taken, count)

@@ -24,7 +24,7 @@ _CLOSE = 0.8  # a name this similar to another (0 to 1, by difflib) is a misspel
 LINKED = "--linked-folder"
 _UNLOCK = "set HDF5_USE_FILE_LOCKING=FALSE"
 BEING_WRITTEN = "a file that another program has open for writing"
-_REASONS = {  # by words in HDF5's message: what our message says was found, and its remedy
+_REASONS = {  # for words in HDF5's message: what our message says was found, and the remedy
     "truncated": ("a truncated HDF5 file", "copy or write it again"),
     "signature not found": ("a file that is not HDF5", "check the path or convert it"),
     **{f"unable to lock file, errno = {number}": (BEING_WRITTEN,
@@ -48,7 +48,7 @@ def open_hdf5(path: str | Path, linked_folder: Path | None = None) -> "Iterator[
         unknown = f"a file that HDF5 cannot open ({error})", ""
         found, remedy = next((known for words, known in _REASONS.items() if words in str(error)), unknown)
         raise InputError(subject, found, "a readable HDF5 file", remedy) from error
-    folders = filter(None, (path.parent, path.resolve().parent, linked_folder))  # the folders of a link and of its target
+    folders = filter(None, (path.parent, path.resolve().parent, linked_folder))  # path may be a link into another folder
     places = tuple(Path(place) for one in folders for place in (os.path.abspath(one), one.resolve()))
     with file:
         try:
@@ -74,7 +74,7 @@ class Hdf5Source:
 
     def find(self, address: str) -> h5py.Group | h5py.Dataset | None:
         """Returns the object at an absolute address; None if there is nothing. Raises InputError for damage, and for a link
-        to a file that is missing or in a folder that is not allowed."""
+        to a file that is missing or outside ``folders``."""
         try:
             thing = self.file[address]
         except _DAMAGE as error:
@@ -166,7 +166,7 @@ class Hdf5Source:
             raise self.error(address, f"a link to the file {place}", expected, f"say {LINKED} {place.parent} to trust it")
 
     def _check_linked(self, address: str, file: h5py.File, name: str, inside: str) -> None:
-        """Raises InputError if a linked file has no data at ``inside``; HDF5 itself would return nothing, or zeros."""
+        """Raises InputError if a linked file has no data at ``inside``, where HDF5 itself would return nothing, or zeros."""
         own = Path(file.filename)
         place = own if name == "." else own.parent / name
         if os.path.isabs(name) and not place.exists():  # HDF5 then looks for the name next to the linking file

@@ -25,8 +25,8 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Quantity:
-    """A physical quantity. factors: by unit, the factor that converts to the package's unit. assumed: the unit of datasets
-    that state none. largest: limit in the package's unit; larger numbers are damage and would overflow later."""
+    """A physical quantity. factors: for each unit, the factor that converts to the package's unit. assumed: the unit of
+    datasets that state none. largest: limit in the package's unit; larger numbers are damage and would overflow later."""
 
     name: str
     assumed: str
@@ -34,7 +34,7 @@ class Quantity:
     factors: MappingProxyType[str, float]
 
     def factor(self, unit: str) -> float | None:
-        """Returns the factor that converts ``unit``, in upper or lower case, to the package's; None if it is unknown."""
+        """Returns the factor from ``unit``, in upper or lower case, to the package's unit; None for an unknown unit."""
         return self.factors.get(unit.strip().rstrip(".").casefold())
 
     @property
@@ -158,7 +158,7 @@ def read_integers(source: Hdf5Source, address: str, shape: Sequence[int | None])
 def read_word(
     source: Hdf5Source, address: str, allowed: Collection[str] | None = None, default: str | None = None
 ) -> str:
-    """Reads a string, one of ``allowed`` if given. Raises InputError for others, and for a missing one without default."""
+    """Reads a string, one of ``allowed`` if given. Raises InputError for another value, and for none without ``default``."""
     if default is not None and source.optional(address) is None:
         return default
     dataset, word = source.dataset(address), None

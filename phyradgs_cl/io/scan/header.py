@@ -34,8 +34,8 @@ _DEEPEST_ENTRY = 3  # NXtomo entries and subentries are searched in groups neste
 class ScanHeader:
     """A checked scan without its arrays: ``scan.projections`` are zeros that take no memory.
 
-    entry: address of the NXtomo group. image_key (F,): types of all stored frames. mask_shape: None without a mask. states:
-    number of true volumes at several times. has_grid: the file states the grid."""
+    entry: address of the NXtomo group. image_key (F,): types of all stored frames. quantity, data_type: of the frames.
+    mask_shape: None without a mask. states: how many times have a true volume. has_grid: the file states a grid."""
 
     scan: Scan
     entry: str
@@ -190,8 +190,8 @@ def read_geometry(source: Hdf5Source, entry: str, detector_shape: tuple[int, int
 
 
 def _is_parallel(source: Hdf5Source, entry: str) -> bool:
-    """Returns whether the file says that the beam is parallel. A file of another program is also taken as parallel, with a
-    warning, if it has no source distance."""
+    """Returns whether the file says that the beam is parallel. The beam of another program's file is taken as parallel, with
+    a warning, if the file has no source distance."""
     beam, distance = f"{entry}/{schema.BEAM}", f"{entry}/{schema.SOURCE}/distance"
     has_distance = source.optional(distance) is not None
     if source.optional(beam) is not None:
@@ -207,13 +207,13 @@ def _is_parallel(source: Hdf5Source, entry: str) -> bool:
 
 
 def read_shutter(source: Hdf5Source, entry: str, used: np.ndarray, moving: bool) -> Shutter:
-    """Reads the shutter. Exposure and readout are required only if the gantry moves, and the order of lines only if lines
-    are read one after the other. used, bool (F,): which stored frames are projections."""
+    """Reads the shutter. Exposure and readout are required only if the gantry is ``moving``, and the order of lines only if
+    lines are read one after the other. used, bool (F,): which stored frames are projections."""
     exposure_s = read_duration(source, f"{entry}/{schema.DETECTOR}/count_time", used, moving)
     needed = moving and exposure_s > 0
     readout_s = read_duration(source, f"{entry}/{schema.DETECTOR}/detector_readout_time", used, needed)
     axis, direction = f"{entry}/{schema.EXTRA}/readout_axis", f"{entry}/{schema.EXTRA}/readout_direction"
-    rolling = needed and readout_s > 0  # otherwise the order of lines has no effect
+    rolling = needed and readout_s > 0  # if lines open together, their order has no effect
     word = h5.read_word(source, axis, AXES, default=None if rolling else "rows")
     number = h5.read_number(source, direction, default=None if rolling else 1.0)
     checks.one_of(source.name(direction), number, (1, -1))

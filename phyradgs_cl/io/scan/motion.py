@@ -19,9 +19,9 @@ from phyradgs_cl.io.hdf5 import datasets as h5
 _log = logging.getLogger(__name__)
 _KINEMATICS = (ConstantSpeed, SpeedRamp, EncoderTable, FrameSweeps)  # motions of a circular orbit that files can hold
 _RAMP_ERROR_RAD = 1e-9  # a speed ramp is stored as a table of angles, whose interpolation errs by at most this
-_MOST_RAMP_SAMPLES = 500_000  # rows of the longest such table, about 8 MB; a longer ramp is stored less exactly
-_SUSPECT_RAD = math.radians(5.0)  # encoder table and rotation_angle differ by more only if a sign or a zero is wrong
-_GAP = 1e-9  # fraction of an exposure, see ``_gap_s``
+_MOST_RAMP_SAMPLES = 500_000  # most rows of a speed ramp's table, about 8 MB; a longer ramp is stored less exactly
+_SUSPECT_RAD = math.radians(5.0)  # encoder table and rotation_angle differ by more only if one has a wrong sign or zero
+_GAP = 1e-9  # half of the time between a pose table's frames, as a fraction of an exposure
 _LEAST_SPAN_S = 1e-6  # least time that ``sampled`` covers in a frame: a table needs two times, even without any duration
 _MOST_SAMPLES = 1024  # ``sampled`` raises an error if a table of more samples per frame still misses the trajectory
 _AS_TABLE = "give it as a PoseTable"
@@ -87,20 +87,20 @@ def storable(scan: Scan) -> Scan:
 
 
 def overlaps(scan: Scan) -> bool:
-    """Returns whether frames share times. Frames of which one ends as the next begins do not."""
+    """Returns whether frames of a scan overlap in time. A frame that begins when another ends does not overlap it."""
     return bool(np.diff(np.sort(scan.frame_start_s)).min(initial=np.inf) < scan.shutter.span_s - _gap_s(scan))
 
 
 def _gap_s(scan: Scan) -> float:
-    """Returns half of the time in s that ``storable`` puts between frames: a billionth of an exposure, or 16 roundings of
-    float64 times."""
+    """Returns half of the time in s that ``storable`` puts between frames: a billionth of an exposure, but at least 16
+    roundings of the scan's latest time in float64."""
     latest_s = float(np.abs(scan.frame_start_s).max()) + scan.shutter.span_s
     return max(_GAP * scan.shutter.exposure_s, 16 * float(np.spacing(latest_s)))
 
 
 def _jumps(scan: Scan, error_mm: float) -> bool:
-    """Returns whether the pose jumps by more than ``error_mm`` where a frame ends and the next begins, as after
-    ``move_views``. A table has one pose at a time."""
+    """Returns whether a pose jumps by more than ``error_mm`` where a frame ends and the next begins, as after
+    ``move_views``. A pose table cannot express such a jump."""
     order, path = np.argsort(scan.frame_start_s, kind="stable"), scan.trajectory
     first_s = scan.frame_start_s[order]
     touches = np.abs(np.diff(first_s) - scan.shutter.span_s) <= _gap_s(scan)
@@ -135,7 +135,6 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
             overlap = np.any(np.sort(times[:, 0])[1:] < np.sort(times[:, -1])[:-1])
             remedy = "take frames that do not overlap in time: a file has one pose at a time" if overlap else _AS_TABLE
             raise InputError("trajectory", found, f"at most {error_mm:.3g} mm", remedy)
-        # Halves the intervals between samples.
         samples = 2 * samples - 1
 
 

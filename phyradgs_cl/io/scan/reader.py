@@ -20,7 +20,7 @@ from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5.datasets import ATTENUATION, read_array, read_grid, read_values
 from phyradgs_cl.io.scan.header import ScanHeader, read_header
 
-LARGEST_LINE_INTEGRAL = 1e6  # larger ones cannot be measured: in a scan file they are an error, and an import masks them
+LARGEST_LINE_INTEGRAL = 1e6  # larger line integrals cannot be measured: a scan file must have none, and an import masks them
 # Takes data (F, v, u), image_key (F,) and quantity; returns line integrals (P, v, u) and a mask of bad pixels or None.
 ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.ndarray | None]]
 
@@ -149,8 +149,8 @@ def _read_mask(source: Hdf5Source, header: ScanHeader, rows: slice | None) -> np
 def _read_frames(
     source: Hdf5Source, header: ScanHeader, mask: np.ndarray | None, rows: slice | None
 ) -> np.ndarray:
-    """Reads all stored frames (F, v, u), or their ``rows``. Raises InputError for NaN and infinity in valid frames, unless
-    they are masked."""
+    """Reads all stored frames (F, v, u), or their ``rows``. Raises InputError for unmasked NaN or infinity in valid
+    frames."""
     address = f"{header.entry}/{schema.DATA}"
     data = read_values(source, address, source.dataset(address), rows=rows)
     if data.dtype.kind == "f":

@@ -100,8 +100,8 @@ def _write_instrument(
 
 
 def _stored_durations(scan: Scan) -> tuple[float, float]:
-    """Returns exposure and readout in s for the file. Both are 0 for a stop-and-shoot scan with a pose table: with an
-    exposure it would be read as a fly-scan."""
+    """Returns exposure and readout in s for the file. Both are 0 for a stop-and-shoot scan with a pose table, because
+    readers take a pose table with an exposure for a fly-scan."""
     if not scan.is_fly and isinstance(scan.trajectory, PoseTable):
         return 0.0, 0.0
     return scan.shutter.exposure_s, scan.shutter.readout_s
