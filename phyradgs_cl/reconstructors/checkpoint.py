@@ -54,7 +54,7 @@ def _checksum(arrays: State) -> int:
 
 
 def _differences(then: object, now: object, name: str = "") -> Iterator[str]:
-    """Yields "NAME (old value, now new value)" for each value that differs between the nested tables ``then`` and ``now``."""
+    """Yields "NAME (old value, now new value)" for values that differ between the nested tables ``then`` and ``now``."""
     if isinstance(then, dict) and isinstance(now, dict):
         for key in sorted({*then, *now}):
             yield from _differences(then.get(key), now.get(key), f"{name}.{key}" if name else key)

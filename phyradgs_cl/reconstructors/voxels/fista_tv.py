@@ -15,10 +15,10 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 @dataclass(frozen=True)
 class FistaTvOptions(IterativeOptions):
-    """Options of FISTA-TV. tv_weight: λ as a fraction of the largest value of Aᵀp, so that it holds for any unit and dose.
+    """Options of FISTA-TV. tv_weight: λ/max|Aᵀp|, so that one value suits scans of any unit and dose.
 
-    tv_iterations: dual iterations per proximal map, which begins from the last dual field. transmission_weights: least
-    squares weighted by transmission t (PWLS), ½ Σ t (p − A x)², with λ a fraction of the largest value of Aᵀ t p."""
+    tv_iterations: dual iterations per proximal map, which begins from the dual field of the map before. transmission_weights:
+    least squares weighted by the transmission t (PWLS), ½ Σ t (p − A x)²; tv_weight is then λ/max|Aᵀ t p|."""
 
     iterations: int = 100
     tv_weight: float = ranged(0.001, 0, 1e6)
