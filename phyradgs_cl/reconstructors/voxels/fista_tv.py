@@ -17,8 +17,8 @@ from phyradgs_cl.reconstructors.voxels.system import System
 class FistaTvOptions(IterativeOptions):
     """Options of FISTA-TV. tv_weight: λ/max|Aᵀp|, so that one value suits scans of any unit and dose.
 
-    tv_iterations: dual iterations per proximal map, which begins from the dual field of the map before. transmission_weights:
-    least squares weighted by the transmission t (PWLS), ½ Σ t (p − A x)²; tv_weight is then λ/max|Aᵀ t p|."""
+    tv_iterations: dual iterations per proximal map, begun from the dual field of the map before. transmission_weights: least
+    squares weighted by the transmission t (PWLS), ½ Σ t (p − A x)²; tv_weight is then λ/max|Aᵀ t p|."""
 
     iterations: int = 100
     tv_weight: float = ranged(0.001, 0, 1e6)
