@@ -99,7 +99,7 @@ def _best(scan: Scan, turned: np.ndarray, frames: np.ndarray, pose: np.ndarray, 
 
 def _mean_squares(turned: np.ndarray, frames: np.ndarray, fan: np.ndarray, is_parallel: bool) -> np.ndarray | None:
     """Returns each view's mean squared difference (F,) of rays and their opposites; None if the axis lies less than a pixel
-    inside the outer columns. turned (F,): views' angles in rad. fan (columns,): fan angles in rad; parallel rays' are in mm."""
+    inside the outer columns. turned (F,): angles of the views in rad. fan (columns,): ``fan_angle`` of the columns."""
     columns = np.arange(fan.size)
     if fan[-1] < fan[0]:
         fan, columns = fan[::-1], columns[::-1]
