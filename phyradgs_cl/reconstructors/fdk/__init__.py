@@ -309,8 +309,8 @@ def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _measured(scan: Scan) -> np.ndarray:
-    """Returns the numbers (n,) of the frames with more than half as many valid pixels as the frame with most. The views
-    beside a frame without a number here stand for its angle. With one mask or no valid pixel, all frames are returned."""
+    """Returns the numbers (n,) of the frames with more than half as many valid pixels as the frame with most. Views beside a
+    frame that is left out stand for its angle. With one mask for all frames, or no valid pixel, none is left out."""
     if np.asarray(scan.pixel_mask).ndim == 3 and (valid := scan.valid.mean(axis=(1, 2))).any():
         return np.flatnonzero(valid > valid.max() / 2)
     return np.arange(scan.frames)

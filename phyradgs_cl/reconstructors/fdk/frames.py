@@ -47,7 +47,7 @@ def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
     least = _NOISE * float(np.percentile(frames, 99.9))
     curvature = _curvature(frames)
     sides = []
-    for rows in (frames[..., ::-1], frames):  # reversed for the first side: rows then end at the panel's edge
+    for rows in (frames[..., ::-1], frames):  # reversed for the first side, so that rows end at its edge
         pixels = min(_SLOPE_PIXELS, rows.shape[-1])
         end = rows[..., -pixels:].astype(np.float64)
         edge, slope = end.mean(-1, keepdims=True), (end[..., -1:] - end[..., :1]) / max(pixels - 1, 1)

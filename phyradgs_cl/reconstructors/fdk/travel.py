@@ -19,8 +19,8 @@ from phyradgs_cl.reconstructors.fdk.views import pose_of_pixels, view_angles
 
 log = logging.getLogger(__name__)
 
-# An orbit travels along z if the image of the origin moves by more than this fraction of the panel's height.
-# Less travel only matters at the ends of the volume.
+# An orbit travels along z if the image of the origin moves by more than this fraction of the panel's height, and by more
+# than one row. Less travel only matters at the ends of the volume.
 _TRAVEL = 0.05
 _CLASS_RAD = np.deg2rad(15)  # angular width of a class of ray directions about z, unless views are few
 _VIEWS_A_CLASS = 2.0  # classes are made so wide that each contains at least this many views of one turn
@@ -180,7 +180,7 @@ def _directions(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool) -> 
 
 
 def _row_weight(rows: int) -> np.ndarray:
-    """Returns the weights (rows,) of the panel's rows: 1 in the middle, falling as cos² towards the first and last row."""
+    """Returns the weights (rows,) of the panel's rows: 1 in the middle, falling as cos² to 0.02 at both outermost rows."""
     away = np.abs(np.arange(rows) - (rows - 1) / 2) / max((rows - 1) / 2, 0.5)
     falling = np.cos(np.pi / 2 * np.clip((away - _EVEN) / (1 - _EVEN), 0, 1)) ** 2
     return np.maximum(falling, _LEAST_ROW)
