@@ -57,8 +57,8 @@ def overlap(one: Grid, other: Grid) -> tuple[float, float]:
 
 
 def reference_on(grid: Grid, reference: Values, reference_grid: Grid) -> Values | None:
-    """Returns the reference (nz, ny, nx) on ``grid`` by the rule of ``aligned``; None where ``aligned`` would resample the
-    volume."""
+    """Returns the reference (nz, ny, nx) on ``grid``, averaged over blocks if its voxels are smaller; None where ``aligned``
+    would resample the volume, or has nothing to compare."""
     if grid.is_close(reference_grid):
         return reference
     blocks = _blocks(grid, reference_grid)

@@ -1,5 +1,5 @@
 """Tests the error bars of voxels (standard deviations σ in 1/mm) against a true volume: the fraction of errors within the
-bars, and the ratio mean σ / RMS error."""
+bars, and (mean σ)/(RMS error)."""
 
 from pathlib import Path
 

@@ -30,7 +30,7 @@ SIGMA = 1.5  # standard deviation in voxels of the Gaussian weights in SSIM's wi
 K1, K2 = 0.01, 0.03  # SSIM's constants for means and for variances, as fractions of the data range (Wang et al. 2004)
 _VOXELS_PER_BATCH = 1 << 20  # voxels compared at a time: SSIM holds about ten float64 arrays of them, 80 MB
 _EDGE = 0.25  # motions are compared at edges, which show them: where the slope is at least this fraction of the steepest
-_MOST_POINTS = 2000  # most voxels at which motions are compared: enough for a mean and a percentile
+_MOST_POINTS = 2000  # most voxels at which motions are compared: enough for a mean and a 95th percentile
 _INCH = 3.2  # side of a slice in the figure, in inches
 _DPI = 110
 
@@ -119,7 +119,7 @@ def ssim(result: ArrayLike, reference: ArrayLike, data_range: float | None = Non
 
 
 def ssim_map(result: ArrayLike, reference: ArrayLike, data_range: float) -> Array:
-    """Returns the structural similarity (..., v, u) float64 at every pixel of two stacks of images (..., v, u)."""
+    """Returns SSIM (..., v, u) float64 at every pixel of two stacks of images (..., v, u). data_range: L, as in ``ssim``."""
     a, b = np.asarray(result, dtype=np.float64), np.asarray(reference, dtype=np.float64)
     c1, c2 = (K1 * data_range) ** 2, (K2 * data_range) ** 2
     mean_a, mean_b = _blur(a), _blur(b)

@@ -287,7 +287,7 @@ def _in_rows(
     filled = ceil_div(fast.size, field.segment) * field.segment
     fast = np.concatenate([fast, fast[-1] + fine.voxel_size_mm[2] * np.arange(1, filled - fast.size + 1)])
     slows, middles, fasts = grid.shape
-    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # coordinates of each row on the first two axes
+    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # each row's place on the first two axes
     rows[..., 0], rows[..., 1] = slow.reshape(slows, 1, points, 1), middle.reshape(1, middles, 1, points)
     rows = rows.reshape(slows * middles, points**2, 2)
     values = np.empty((slows * middles, fasts), np.float32)

@@ -183,7 +183,7 @@ def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
 class Progress:
     """One report of a running method: ``iteration`` of ``iterations`` is finished, after ``seconds`` in s.
 
-    - loss: the dimensionless measure that ``quantity`` names. gaussians: their number, or 0.
+    - loss: the dimensionless measure that ``quantity`` names. gaussians: the number of Gaussians, or 0.
     - state returns the state from which the run can resume. volume returns the present volume (nz, ny, nx) in 1/mm and its
       grid. frames returns a given number of measured frames, spread evenly, with those computed from the present volume.
       These three may be called during the report only.

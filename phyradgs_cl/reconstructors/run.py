@@ -196,7 +196,7 @@ def _with_metal(result: Reconstruction, metal: Metal) -> Reconstruction:
 
 
 def _check_margin(plan: RunPlan) -> None:
-    """Raises InputError for a margin with a method in which voxels outside the box do not help the voxels inside."""
+    """Raises InputError for a margin with a method in which the voxels of the margin do not affect the others."""
     if (way := getattr(plan.options, "extrapolate", None)) not in (None, "reprojected"):
         found = f"--method {plan.method_name} with extrapolate={way}, whose voxels do not depend on each other"
         remedy = "add --set extrapolate=reprojected, or leave it out"
@@ -254,7 +254,7 @@ def _size_that_fits(rt: Runtime, scan: Scan, method: str, options: Any) -> int:
     if held is not None:
         free = min(free, _DEVICE_SHARE * rt.ledger.limit_bytes)
         if hasattr(options, "prior"):
-            from phyradgs_cl.reconstructors.voxels.priors import kind_of  # here, because it loads SciPy
+            from phyradgs_cl.reconstructors.voxels.priors import kind_of  # here, as it loads SciPy
 
             held += kind_of(options.prior).volumes
         voxels = (free - _STACKS * scan.projections.nbytes) / (4 * held * states)

@@ -228,7 +228,7 @@ def fdk_volume(
             )
     if circle:
         _, y_mm, x_mm = grid.axes_mm()
-        radius_mm = seen_mm + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # up to the edge of the last pixel
+        radius_mm = seen_mm + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # up to the outer edge of the last pixel
         volume[:, np.hypot(y_mm[:, None], x_mm) > radius_mm] = 0
     return volume
 

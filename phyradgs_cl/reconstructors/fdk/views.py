@@ -37,7 +37,7 @@ _NO_PLANE_DEG = 45.0
 _LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the plane of the rotation
 _NO_LEAN_DEG = 10.0
 _ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: at 3° densities are 0.1 % too low
-_NO_ROLL_DEG = 10.0  # at 10° densities are 1.5 % too low, at 90° they are 0
+_NO_ROLL_DEG = 10.0  # densities are 1.5 % too low at 10°, and 0 at 90°
 _UNLIKE = 0.1  # a warning comes if the fan's ends differ among the views by more than this fraction of the fan
 _LEAST_OVERLAP = 2.0  # a warning comes if a displaced panel reaches less than this many columns beyond the axis
 # A smaller missing angle causes no warning: nearly parallel rays have so narrow a fan that half a turn is enough.
@@ -166,7 +166,7 @@ def distinct_views(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     is_new = np.diff(turned[order], prepend=-np.inf) > tolerance
     index = np.cumsum(is_new) - 1
     centre = turned[order][is_new]
-    if centre.size > 1 and centre[0] + 2 * np.pi - turned[order[-1]] <= tolerance:  # such angles are one, as 0° and 360° are
+    if centre.size > 1 and centre[0] + 2 * np.pi - turned[order[-1]] <= tolerance:  # both are one angle, as 0° and 360° are
         index[index == centre.size - 1] = 0
         centre = centre[:-1]
     cell = np.empty(turned.size, np.int64)

@@ -17,7 +17,7 @@ from phyradgs_cl.reconstructors.fits.residuals import fit_squares, vertex
 from phyradgs_cl.runtime import Runtime
 
 _ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # shifts of the panel that are tried first, in coarse pixels
-_ROUGH_ITERATIONS = 8  # iterations of CGLS for each coarse shift: few are enough to tell them apart
+_ROUGH_ITERATIONS = 8  # iterations of CGLS for each coarse shift: few are enough to tell the shifts apart
 _STEP = 0.25  # distance between the three shifts that bracket the best one, in coarse pixels
 _MOST_STEPS = 8  # the three trial shifts move at most this many times, so that a search without a minimum ends
 ANYWHERE = (-math.inf, math.inf)  # limits in pixels that allow every shift
@@ -27,8 +27,8 @@ _BEYOND = 1.5  # at an end of the scan, a view's opposite may lie up to this man
 WIDEST_STEP_RAD = math.radians(10.0)  # views further apart differ too much to be interpolated
 # Smoothing along rows (std, in pixels). Without it, interpolation would lower noise between pixels, which biases shifts.
 SMOOTHING_PX = 1.0
-_CORRELATED_PX = 2 * math.sqrt(math.pi) * SMOOTHING_PX  # columns over which ``SMOOTHING_PX`` correlates noise
-_LEAST_OVERLAP = 0.25  # a view and its mirrored opposite must overlap in this fraction of the columns
+_CORRELATED_PX = 2 * math.sqrt(math.pi) * SMOOTHING_PX  # number of columns over which the smoothing correlates noise
+_LEAST_OVERLAP = 0.25  # a view and its mirrored opposite must overlap in at least this fraction of the columns
 _LEAST_ENERGY = 0.2  # an overlap whose sum of squares is below this fraction of the largest sum counts as air alone
 _STEPS = 12  # most steps of Gauss–Newton
 _SETTLED_PX = 1e-3  # Gauss–Newton ends after a step shorter than this, in pixels

@@ -149,8 +149,8 @@ def reconstruct_splats(
     """Runs a splatting method and returns its result. method: its name in the facts, ``phyradgs`` or ``r2``.
 
     resume: continues an interrupted run of the same scan and options from its state. initial: the volume (nz, ny, nx) in
-    1/mm from which the cloud is drawn; None: an FDK volume. deformation: how the object moves; the cloud and the volume then
-    show its reference state."""
+    1/mm from which the Gaussians are drawn; None: an FDK volume. deformation: how the object moves; Gaussians and volume
+    then show its reference state."""
     started = time.perf_counter()
     if deformation is not None and deformation.is_still:
         deformation = None

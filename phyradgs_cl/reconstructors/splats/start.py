@@ -1,4 +1,4 @@
-"""The start of a splatting run: its internal units, and the first cloud, drawn from an FDK volume."""
+"""The start of a splatting run: its internal units, and its first Gaussians, drawn from a volume such as FDK's."""
 
 import logging
 

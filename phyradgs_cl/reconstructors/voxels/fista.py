@@ -41,10 +41,10 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.algebra import HostSpace
 
 log = logging.getLogger(__name__)
-_VOLUMES = 16  # volumes that a run with the prior ``dct`` holds in memory at one time
-_FRAMES = 3  # arrays of all frames that a run holds in memory at one time
-_HELD = 9  # volumes that the maps of the prior ``dct`` keep on the device, even if the run's arrays are on the host
-_COPIES = 2  # volumes on the device, input and result, while a prior maps a volume of the host
+_VOLUMES = 16  # number of volumes that a run with the prior ``dct`` holds in memory at one time
+_FRAMES = 3  # number of arrays of all frames that a run holds in memory at one time
+_HELD = 9  # number of volumes that the prior ``dct`` keeps on the device, even if the run's arrays are on the host
+_COPIES = 2  # number of volumes, input and result, that a map of a prior needs on the device for a volume of the host
 # These values were chosen by measurement: docs/results/settings.md.
 _COARSE_SHARE = 6 / 13  # fraction of the iterations that are coarse: all before the voxels are divided
 _COARSE_PASSES = 2  # number of passes in a coarse iteration: they cost little, and scans with few views or photons need many

@@ -30,8 +30,8 @@ class FistaTv(Accelerated):
     """FISTA with TV on all frames at once. An iteration's residual belongs to its new volume.
 
     A is linear, so A y at the extrapolated point y follows from A xₖ and A xₖ₋₁. The intensity model replaces A x by the
-    expected I(x), and Aᵀ by its transposed derivative Jᵀ at x. I is not linear between the two points; the error vanishes
-    with the steps."""
+    expected I(x), and Aᵀ by Jᵀ, with the derivative J of I at xₖ. I is not linear, so that I(y) has an error, which vanishes
+    as the steps become shorter."""
 
     ARRAYS = ("volume", "previous", "projected", "projected_previous")
 

@@ -103,7 +103,7 @@ class PriorWeight:
         self.noise_mm, self.common_mm = adjoint_response(system)
 
     def at(self, volume: Any) -> float:
-        """Returns the prior's weight at a volume (nz, ny, nx) in 1/mm, in the unit of the data term's gradient, mm."""
+        """Returns the prior's weight, in mm as the data term's gradient, at a volume (nz, ny, nx) in 1/mm."""
         by_noise = self.error.noise * self.noise_mm
         by_edges = self.error.edges_mm * _density(self.space, volume) * self.common_mm
         return max(self.strength * math.hypot(by_noise, by_edges), self.least)
@@ -145,8 +145,8 @@ class PriorInputs:
     def dct_then_ridge(self) -> "Prior":
         """Returns ``dct`` with steps of the learned ridge regulariser, or ``dct`` alone on grids too small for them.
 
-        For scans that stop for each projection the steps are stronger, the more so the lower the noise. In fly-scans,
-        stronger steps would cost slab-shaped objects quality."""
+        For scans that stop for each projection the ridge steps are stronger, and grow as the noise falls. In fly-scans
+        stronger steps would lower the quality of slab-shaped objects."""
         if min(self.grid.shape) < RIDGE_EDGE:
             return self.tv_and_dct()
         ridge = RidgeStep(self.rt, self.grid.shape, learned_ridge())

@@ -42,8 +42,8 @@ class Sart(Algorithm):
     """SART, x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i of the frames, with the rays' W = 1/(Aᵢ 1) and the voxels' V =
     1/(Aᵢᵀ 1).
 
-    The intensity model replaces Aᵢ x by the expected Iᵢ(x), and Aᵢᵀ by its transposed derivative Jᵢᵀ. The residual combines
-    all subsets, each before its correction."""
+    The intensity model replaces Aᵢ x by the expected Iᵢ(x), and Aᵢᵀ by Jᵢᵀ, with the derivative Jᵢ of Iᵢ. An iteration's
+    residual combines those of all subsets, each before its correction."""
 
     NUMBERS = ("relaxation",)
 
@@ -105,7 +105,7 @@ class SirtOptions(IterativeOptions):
 
 class Sirt(Algorithm):
     """SIRT, x ← x + λ C Aᵀ R (p − A x), with R = 1/(A 1) and C = 1/(Aᵀ 1). The intensity model replaces A x by the expected
-    I(x), and Aᵀ by its transposed derivative Jᵀ.
+    I(x), and Aᵀ by Jᵀ, with the derivative J of I.
 
     An iteration's residual is the one before its correction. Weighted by √R, its norm falls in every step."""
 
