@@ -50,7 +50,7 @@ def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid)
 
 
 def overlap(one: Grid, other: Grid) -> tuple[float, float]:
-    """Returns (volume that both boxes share)/(volume of one box) for the boxes of the two grids, first for ``one``."""
+    """Returns (space that the two grids' boxes share)/(box of ``one``), and (the same space)/(box of ``other``)."""
     low, high = np.maximum(one.box_mm[:, 0], other.box_mm[:, 0]), np.minimum(one.box_mm[:, 1], other.box_mm[:, 1])
     shared_mm3 = float(np.prod(np.maximum(high - low, 0)))
     return shared_mm3 / math.prod(one.size_mm), shared_mm3 / math.prod(other.size_mm)

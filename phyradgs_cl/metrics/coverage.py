@@ -20,7 +20,7 @@ _OBJECT, _AROUND = 0.01, 2  # errors count where the true volume exceeds 1 % of 
 
 
 def object_voxels(truth: Array) -> NDArray[np.bool_]:
-    """Returns the object's voxels, bool (nz, ny, nx): those above 1 % of the maximum of ``truth``, and up to two around."""
+    """Returns the object's voxels, bool (nz, ny, nx): those above 1 % of the maximum of ``truth``, and two around them."""
     return np.asarray(scipy.ndimage.binary_dilation(truth > _OBJECT * truth.max(), iterations=_AROUND))
 
 

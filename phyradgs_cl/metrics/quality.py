@@ -208,7 +208,7 @@ def _scores(result: Floats, reference: Floats) -> str:
 
 
 def draw_slices(figure: "FigureBase", volume: Floats, truth: Floats | None, grid: Grid | None) -> None:
-    """Draws the middle slices of a volume (z, y, x), with a ``truth`` also its slices and the difference. grid: adds mm."""
+    """Draws a volume's middle slices (z, y, x); with ``truth`` also its slices and the difference; with ``grid`` in mm."""
     if truth is not None:
         checks.shape("reference", truth, volume.shape)
         checks.finite("reference", truth)

@@ -20,7 +20,7 @@ from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
 _ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # orders of a volume's axes z, y, x: line segments run along the last axis
-_WIDER = 4  # feed-forward layers of a transformer are this many times as wide as the values between its blocks
+_WIDER = 4  # (width of a transformer's feed-forward layers)/(width of its input and output)
 _FACTORS = (1, 2_654_435_761, 805_459_861)  # factors of x, y, z in the hash (Müller et al., Eq. 4)
 _FIRST_FEATURES = 1e-4  # initial table entries are random, between −1e-4 and 1e-4 (Müller et al., NAF)
 

@@ -23,7 +23,7 @@ _FINEST = 2**24  # with more grid cells along a side, float32 coordinates have n
 
 @dataclass(frozen=True)
 class NeuralOptions(MotionOptions):
-    """Options of a field, of a hash encoding and a small network, that is fitted to rays.
+    """Options of a field that is fitted to rays. The field consists of a hash encoding and a small network.
 
     - iterations: passes over all frames, with one step per frame. rays: pixels per step.
     - samples: number along each ray in the volume. 0: 1.5 per voxel of the longest side, 1.2 if a pixel has several times.

@@ -61,7 +61,7 @@ class Trainer:
 
     @property
     def iteration(self) -> int:
-        """How often the training has used all frames."""
+        """Number of times that the training has used all frames."""
         return self.steps // self.scan.frames
 
     @property
@@ -313,7 +313,7 @@ def box_span(
     source: torch.Tensor, direction: torch.Tensor, half_sides: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Returns at which distance (R,) from its source each ray enters a box of ``half_sides`` (3,) about 0, and its length
-    (R,) in the box, 0 if it misses the box. source, direction: (R, 3). Directions have length 1. Rays begin at sources."""
+    (R,) in the box, 0 if it misses the box. Rays begin at ``source`` (R, 3), and ``direction`` (R, 3) has length 1."""
     tiny = torch.finfo(direction.dtype).tiny
     slope = torch.where(direction.abs() < tiny, torch.full_like(direction, tiny), direction)
     one, other = (-half_sides - source) / slope, (half_sides - source) / slope
@@ -323,7 +323,7 @@ def box_span(
 
 
 def sample_shifts(rays: int, samples: int, jitter: str, rng: np.random.Generator) -> np.ndarray:
-    """Returns places of samples in their intervals, 0 to 1: (R, samples), or (R, 1) if one place serves a ray's samples."""
+    """Returns places of samples in their intervals, 0 to 1: (R, samples), or (R, 1) for one place in all of a ray's."""
     if jitter == "none":
         return np.full((rays, 1), 0.5, np.float32)
     return rng.random((rays, samples if jitter == "sample" else 1), np.float32)

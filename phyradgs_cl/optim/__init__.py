@@ -13,7 +13,7 @@ from phyradgs_cl.fields import Activation
 from phyradgs_cl.fields import gaussians as g
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
-_RANGE = (1e-12, 10)  # least and largest learning rate: a rate of 0 cannot decay by a factor; 1e-12 moves no float32
+_RANGE = (1e-12, 10)  # least and largest learning rate: 0 could not decay by a factor; 1e-12 changes no float32 parameter
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray
 
 
 def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:
-    """Draws one child (11, S) of each Gaussian (11, S): smaller, half as dense, its centre drawn from the parent."""
+    """Draws one child of each Gaussian, both (11, S): smaller, half as dense, with a centre drawn from its parent."""
     child: np.ndarray = rows.copy()
     child[g.MEAN] += rotate(rows[g.QUATERNION], rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE])
     child[g.SCALE] /= control.split_factor

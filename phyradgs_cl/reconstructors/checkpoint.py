@@ -16,7 +16,7 @@ RUN, _CHECKSUM = "run", "checksum"
 """Names of two arrays in a state: the identity of the run, as JSON, and the checksum of all other arrays."""
 _REMEDY = "start without --resume"
 _MOST_DIFFERENCES = 3  # an error names at most this many differences between two runs
-_LONGEST_NAME = 60  # an error cuts the name of an option that differs after this many characters
+_LONGEST_NAME = 60  # in an error, the name of each difference is cut to this many characters
 
 
 def with_identity(state: State, identity: Mapping[str, Any]) -> State:

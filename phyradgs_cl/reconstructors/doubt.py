@@ -48,14 +48,14 @@ _DENSEST = 3.0  # a voxel's density counts as at most this many times the object
 LEAST = 0.01  # least error bar σ of a voxel, as a fraction of the RMS of σ over the volume
 # Filter along one axis, which gives (slope per voxel)/4 of the spline whose mean over each voxel is the voxel's value.
 _SLOPES = (0.00387, -0.01443, 0.05385, -0.20096, 0, 0.20096, -0.05385, 0.01443, -0.00387)
-_KEPT = "doubt."  # prefix of the names of arrays in a state that come from complete runs
+_KEPT = "doubt."  # prefix of the names of those arrays in a state that belong to complete runs
 _PARTS = {"gaussians": Gaussians, "deformation": Deformation, "states": States}
 _CHECKED_FRAMES = 16  # number of frames whose held-out pixels correct σ
 _AROUND = 9  # a pixel's squared error bar is averaged over a square of so many pixels a side: two runs give a rough bar
 _UNEXPLAINED = 2.0  # a residual above this many times the noise causes a warning; simulations had at most 1.2
 # A larger quotient noise/(line integrals) causes a warning: at 0.05 to 0.06, σ held 43 to 59 % of errors, not 68 %.
 _NOISY = 0.03
-_WIDEST = 4.0  # σ is multiplied by at most this factor: larger errors of held-out pixels have other causes than doubt
+_WIDEST = 4.0  # σ is multiplied by at most this factor: still larger errors of held-out pixels have other causes
 # (Number of views)/(voxels along a slice's longer side) from which on a law needs no factor for few views.
 _USUAL_VIEWS = 25 / 64
 _FEWEST_VIEWS = 0.1  # a smaller quotient counts as this one, because no law was measured with fewer views
@@ -66,8 +66,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Law:
-    """Fitted factors of the four parts of σ that ``spread`` adds: shape, noise, density, slope. near: standard deviation of
-    ``spread``'s smoothing, in voxels. multiple_95: (95 % bar)/σ. sparse: how much σ grows if views are few (``factor``)."""
+    """Fitted factors of the four parts of σ whose squares ``spread`` adds: shape, noise, density, slope. near: standard
+    deviation of its smoothing in voxels. multiple_95: (95 % bar)/σ. sparse: growth of σ if views are few (``factor``)."""
 
     shape: float
     noise: float
@@ -117,7 +117,7 @@ def spread(first: Array, second: Array, third: Array, law: Law) -> Array:
 def finer(volume: Array) -> NDArray[np.float32]:
     """Returns a volume (nz, ny, nx) on voxels of half the side. The mean of the eight parts of a voxel is the voxel's value.
 
-    Along an axis, the two halves of a voxel are means of a spline, whose mean over each voxel is its value (histospline)."""
+    Along an axis, both halves of a voxel are means of a spline whose mean over the voxel is its value (histospline)."""
     for axis in range(3):
         half = scipy.ndimage.correlate1d(volume, _SLOPES, axis, mode="nearest")
         halves = np.stack([volume - half, volume + half], axis + 1)
@@ -198,7 +198,7 @@ class Doubter:
             yield from frame_pairs(self.rt, self.whole, volume, grid, chosen[at : at + FRAMES_AT_A_TIME], moves)
 
     def finished(self, results: list[Reconstruction]) -> Reconstruction:
-        """Returns the first run's result with its error bars σ, facts about them, and the seconds of all runs together."""
+        """Returns the first run's result with σ, facts about σ and the seconds of all runs; unchanged if all runs agree."""
         law, first = fitted_law(self.kind).for_views(self.scan.frames, self.scan.grid), results[0]
         if all(np.array_equal(first.volume, other.volume) for other in results[1:]):
             log.warning("all three runs have the same volume: there are no error bars; give the method more iterations")

@@ -17,7 +17,7 @@ from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport
 from phyradgs_cl.signals import stop_on_interrupt
 
-SILENT_S = 10.0  # this many seconds after its last report, a run in one process reports each iteration that ends
+SILENT_S = 10.0  # if its last report is this many seconds old, a run in one process reports its next finished iteration
 
 
 class Stepwise(Protocol):
@@ -138,6 +138,6 @@ class Loop:
         return False
 
     def _reaches(self, every: int, before: int) -> bool:
-        """Returns whether the step that began at iteration ``before`` reached a multiple of ``every``, or the last one."""
+        """Returns whether the step that began at iteration ``before`` reached a multiple of ``every``, or the run's end."""
         now = self.method.iteration
         return now // every > before // every or now == self.method.iterations

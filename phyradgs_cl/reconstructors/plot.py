@@ -27,7 +27,7 @@ def plot_result(
     device: str | Runtime | None, note: str, moves: Deformation | States | None = None
 ) -> "Figure":
     """Returns a figure of the middle slices of a volume (nz, ny, nx) in 1/mm, of the convergence ``record`` and, with a
-    scan, of the frame number ``frame`` and its residual. The slices of the scan's reference are added if it has one.
+    scan, of frame number ``frame`` and its residual. A reference of the scan is added if it can be brought onto ``grid``.
 
     device: projects the volume for the residual. note: text added to the residual's title. moves: how the object moves or
     changes. Raises InputError for a scan that is no Scan, and for a frame out of range."""

@@ -48,7 +48,7 @@ class Preprocessing(PrepareOptions, GridChoice):
         return {**stated, **self.step_facts()}
 
     def check_written(self) -> None:
-        """Raises InputError if ``holdout`` or ``doubt`` is set: a scan that is only written to a file meets no method."""
+        """Raises InputError if ``holdout`` or ``doubt`` is set: both need a method, but the scan is only to be written."""
         for one in (one for one in fields(self) if "of_method" in one.metadata and getattr(self, one.name)):
             found, remedy = "a scan that is prepared, without a method", "give it to the reconstruction instead"
             raise InputError(flag_of(one.name), found, "a reconstruction", remedy)
@@ -58,7 +58,7 @@ class Preprocessing(PrepareOptions, GridChoice):
 def prepared(scan: Scan, options: Preprocessing, rt: Runtime | None = None) -> Scan:
     """Returns the prepared scan, on the grid of ``options`` with its margin; the scan itself if there is nothing to do.
 
-    ``rt``: the device for the steps that reconstruct and project. These steps raise InputError if it is None."""
+    ``rt``: the device for the steps that reconstruct and project. These steps raise InputError if ``rt`` is None."""
     return prepare(regrid_and_remove_lag(scan, options), options, partial(reprojection, rt))
 
 

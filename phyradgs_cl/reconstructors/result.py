@@ -169,7 +169,7 @@ class Reconstruction:
 def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
     """Returns a KeyboardInterrupt whose attribute ``partial`` is the result so far, or None if there is no volume yet.
 
-    It is no subclass: only after KeyboardInterrupt itself does Python end by the signal SIGINT, which also stops a shell."""
+    It is no subclass: only after KeyboardInterrupt itself does Python end by SIGINT, so that a calling shell stops too."""
     kept = "before there was a volume"
     if partial is not None:
         when = f"after {partial.interrupted_at}" if partial.interrupted_at else "at its end"
@@ -259,7 +259,7 @@ def function_name(function: object) -> str:
 
 
 def option_facts(options: Any) -> dict[str, object]:
-    """Returns a method's options by name, as facts of its result. For a function among them its name stands."""
+    """Returns a method's options by name, as facts of its result. A function among them is stated as ``module:name``."""
     own = {"motion": motion_facts(options.motion)} if hasattr(options, "motion") else {}
     given = {name: getattr(options, name) for name in getattr(options, "FUNCTIONS", ())}
     named = {name: function_name(value) for name, value in given.items() if callable(value)}

@@ -34,7 +34,7 @@ from phyradgs_cl.runtime import Runtime
 WAYS = ("none", "cosine", "cylinder", "reprojected")
 _SHARE = 0.5  # "cosine" and "cylinder" extend rows at each side by this fraction of the panel's columns
 _SLOPE_PIXELS = 5  # the slope at a row's end is taken over this many pixels, to lower its noise
-_NOISE = 0.01  # a row whose end is below this fraction of the line integrals' 99.9th percentile ends in air: it stays 0
+_NOISE = 0.01  # a row that ends below this fraction of the line integrals' 99.9th percentile ends in air: 0 continues it
 _UNEVEN = 0.02  # views are evenly spaced if no angular step differs from the median step by more than this fraction
 _REACH = 8  # the end views of an arc are repeated over this many times an exposure's arc, so that the filter meets no edge
 _FULL_TURN = 1.5  # if a gap is wider than this many median steps, the views cover less than a full turn
@@ -71,7 +71,7 @@ def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: 
 
 
 def _curvature(frames: np.ndarray) -> np.ndarray:
-    """Returns a ≥ 0 (F, v, 1), the median over frames of a in parabolas … − a d² through a row's squares at d pixels."""
+    """Returns a ≥ 0 (F, v, 1): the median over frames of a in fits c + b d − a d² to each row's squares at d pixels."""
     u = np.linspace(-1, 1, frames.shape[2])
     basis = np.stack([np.ones_like(u), u, u**2], axis=1)
     squares = np.maximum(frames, 0).astype(np.float64) ** 2

@@ -12,7 +12,7 @@ import numpy as np
 # Wang's transition covers all rays that are measured twice: it was up to 15 % noisier, with no fewer artefacts.
 TRANSITION = 1.0
 _SYMMETRIC = 0.01  # a panel whose two sides differ by at most this, in pixels, is symmetric about the axis
-# A panel whose two sides differ by less than this fraction of the fan sees the whole object: no displacement was intended.
+# A panel whose two sides differ by less than this fraction of the fan counts as misaligned, not as displaced on purpose.
 _ASIDE = 0.1
 
 _PART_EDGE_RAD = np.deg2rad(15)  # beside a gap, the weights of views rise from 0 to full over an arc of this width

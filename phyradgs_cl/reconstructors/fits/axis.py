@@ -54,8 +54,8 @@ NOT_FOUND = AxisShift(math.nan, math.nan, np.empty(0))
 
 
 def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHERE) -> AxisShift:
-    """Returns that one of up to five shifts, one coarse pixel apart and within ``limits_px``, which has the least residual
-    after few iterations. Its deviation is NaN."""
+    """Returns the shift with the least residual after few iterations, of up to five shifts one coarse pixel apart within
+    ``limits_px``. Its deviation is NaN."""
     block = columns_per_block(scan)
     shifts_px = [block * shift for shift in _ROUGH_SHIFTS if limits_px[0] <= block * shift <= limits_px[1]]
     trials = [fit_squares(rt, shifted(scan, shift_px), _ROUGH_ITERATIONS) for shift_px in shifts_px]
@@ -187,7 +187,7 @@ def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 
 def _few_rows(scan: Scan, frame: int) -> np.ndarray:
     """Returns a frame's means over at most ``_MOST_ROWS`` blocks of rows, (blocks, columns) float64, smoothed along rows.
-    Masked pixels are interpolated along their row before."""
+    Masked pixels are first interpolated along their rows."""
     image = np.asarray(scan.projections[frame], np.float64)
     if scan.pixel_mask is not None:
         columns = np.arange(image.shape[1])

@@ -1,6 +1,6 @@
 """Finds the axis of rotation near the edge of a displaced panel, from the rays that a full turn measures twice.
 
-The residual of a fit does not show the axis there: the fewer rays a shift makes appear twice, the smaller it is. Here each
+The residual of a fit cannot find the axis there: it is always smaller for a shift with fewer rays measured twice. Here each
 ray is compared with its opposite, half a turn and twice its fan angle away. The mean of the squared differences does not
 depend on the number of rays."""
 
@@ -19,12 +19,12 @@ from phyradgs_cl.reconstructors.fits.axis import NOT_FOUND, SMOOTHING_PX, WIDEST
 _COARSE_COLUMNS = 128  # shifts are first tried on frames of at most this many columns
 _MOST_PX = 16.0  # largest shift of the panel that is tried, in coarse pixels: an eighth of the panel
 _STEP_PX = 0.5  # distance between neighbouring trial shifts, in pixels of the compared frames
-_NEAR_PX = 2.0  # full frames are then tried at shifts up to this far from the best coarse shift, in coarse pixels
+_NEAR_PX = 2.0  # full frames are tried with shifts up to this far from the best coarse shift, in coarse pixels
 _FEWEST_VIEWS = 24  # with fewer views, the opposite of a ray cannot be interpolated between views
 _MOST_VIEWS = 360  # most views that are compared, to save time
 _MOST_ROWS = 32  # most rows that are compared, to save time
 _MOST_PAIRS = 48  # most pairs of opposite rays that are compared in a row, to save time
-_LEAST_PX = 1.0  # the axis must lie at least this many pixels inside the outermost column's middle: else too few opposites
+_LEAST_PX = 1.0  # a shift is left out unless it puts the axis this many pixels inside the outermost column's middle
 _BLOCKS = 12  # the jackknife leaves out one of this many blocks of views at a time
 _BIAS_PX = 0.05  # standard deviation of the shift's error without noise, in pixels: half-fan scans, features 2 pixels wide
 

@@ -74,8 +74,8 @@ class MotionField:
 
 @dataclass(eq=False)
 class FieldProblem:
-    """The misfit ‖p − A v‖² of a scan, as a function of the object's displacement field. motion: the gantry's motion model.
-    bending: weight γ of the field's bending, relative to how strongly frames respond to a control vector."""
+    """The misfit ‖frames − projections of a volume‖², as a function of the object's displacement field. motion: the gantry's
+    motion model. bending: γ, weight of the field's bending, relative to how strongly frames respond to a control vector."""
 
     rt: Runtime
     scan: Scan
@@ -107,7 +107,7 @@ class FieldProblem:
         return WarpedOperator(self.rt, self.scan.grid, shape, tables, warp=warp, subrays=subrays)
 
     def residual(self, one: MotionField, volume: np.ndarray) -> np.ndarray:
-        """Returns the residual p − A v (F, rows, columns), dimensionless, of a volume v; 0 at pixels that are not valid."""
+        """Returns frames − projections of ``volume`` under the field ``one``, (F, rows, columns); 0 where not valid."""
         return self._masked(self.scan.projections - self.operator(one).forward(volume))
 
     def space_step(self, one: MotionField, volume: np.ndarray) -> MotionField:

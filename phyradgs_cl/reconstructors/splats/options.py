@@ -20,9 +20,9 @@ _COARSE_ERROR = 0.1  # the other coarse iterations have at least this ``time_err
 
 @dataclass(frozen=True, repr=False)
 class SplatOptions(MotionOptions):
-    """Options of a splatting run; lengths in half-sides of the volume, densities relative to FDK's 99.9th percentile.
+    """Options of a splatting run. Unit of length: half the volume's longest side; of density: FDK's 99.9th percentile.
 
-    - gaussians: number at the start; 0 chooses it from the grid. The options *_weight are λ in the paper's Eq. 4.
+    - gaussians: number at the start; 0 chooses it from the grid. The *_weight options weight terms of the paper's Eq. 4.
       tv_edge: side in voxels of the random sub-volume for total variation. scale_min_voxels: (least scale)/(voxel side).
     - detector_model: what the detector averages over a line's times: line integrals (log), intensity, or what the scan
       states (scan).
@@ -108,7 +108,7 @@ _QUICK = SplatOptions(
 )
 
 PRESETS = {"default": SplatOptions(), "quick": _QUICK, "paper": _PAPER}
-# R2-Gaussian's constants, but with our default number of iterations in place of 30,000. Its rates decay over our number.
+# R2-Gaussian's constants, but our default number of iterations, not its 30,000. The learning rates decay over our number.
 R2_PUBLISHED = SplatOptions(
     motion=Exact(), affine=True, gaussians=50_000, ssim_weight=0.25, tv_weight=0.05, density_weight=0.0,
     rates=PUBLISHED_RATES, control=PUBLISHED_CONTROL,

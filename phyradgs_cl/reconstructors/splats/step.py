@@ -25,7 +25,7 @@ from phyradgs_cl.runtime.layout import pad_rows
 
 _PEAK_PERCENTILE = 99.9  # percentile of the line integrals that counts as their peak; their maximum is often noise
 _ROWS = 11  # number of a Gaussian's parameters, which are the rows of dL/d(parameters)
-_STATISTICS = 2  # rows of statistics for density control: each Gaussian's sum of gradient norms, and their number
+_STATISTICS = 2  # number of rows of statistics: each Gaussian's sum of gradient norms, and how many of them exceed 0
 # Number of rows of ``cloud.gradients``: the 11 of dL/d(parameters), then dL/d(projected centre) along and across a line, in
 # units of half the image's size.
 _DERIVED = 13
@@ -46,7 +46,7 @@ class Scale:
 
 
 class DeviceCloud:
-    """The Gaussians of a run on the device: arrays of ``gaussians.stride`` columns, of which the first ``count`` count."""
+    """A run's Gaussians on the device: the first ``count`` of the ``gaussians.stride`` columns of every array."""
 
     def __init__(self, rt: Runtime, population: Population) -> None:
         self.rt, self.count = rt, population.count

@@ -126,7 +126,7 @@ class PriorInputs:
 
     - tv_iterations: dual iterations per map of total variation. is_fly: frames expose over an arc (fly-scan).
     - noise: standard deviation of line integrals behind the object.
-    - image (nz, ny, nx) in 1/mm: the prior image of the prior piccs. share: the weight, 0 to 1, of the change from it."""
+    - image (nz, ny, nx) in 1/mm: the prior image of the prior piccs. share: weight, 0 to 1, of the change from image."""
 
     rt: Runtime
     grid: Grid
