@@ -58,7 +58,7 @@ _NOISY = 0.03
 _WIDEST = 4.0  # σ is multiplied by at most this factor: still larger errors of held-out pixels have other causes
 # (Number of views)/(voxels along a slice's longer side) from which on a law needs no factor for few views.
 _USUAL_VIEWS = 25 / 64
-_FEWEST_VIEWS = 0.1  # a smaller quotient counts as this one, because no law was measured with fewer views
+_FEWEST_VIEWS = 0.1  # least value of that quotient in a law's factor: no law was measured with fewer views
 _SHARE, _NORMAL_95 = 0.68, 1.96  # fraction of errors within σ; standard deviations that hold 95 % of normal noise
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
@@ -260,7 +260,7 @@ def _warn_of(residual_square: float, noise_square: float, square: float, mean: f
 
 
 def _counted(progress: Progress, results: list[Reconstruction]) -> Progress:
-    """Returns progress that counts the iterations of all runs together. Later runs show the volume of the first."""
+    """Returns progress that counts the iterations of all runs together. It always shows the volume of the first run."""
     done, each = progress.iteration + len(results) * progress.iterations, RUNS * progress.iterations
     progress = progress.mapped(state=lambda state: {**state, **_kept(results)}, iteration=done, iterations=each)
     if not results:

@@ -106,7 +106,7 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
 
 def _implied_motion(usual: str, counts: Mapping[str, Any], models: Mapping[str, Any]) -> str:
     """Returns the name of the model that takes the numbers of strips and times in ``counts``: ``usual`` if it does, else the
-    only model that does, else ``usual``. A static ``usual`` is always returned, as only ``motion`` replaces it."""
+    only model that does, else ``usual``. A static ``usual`` is always returned: only an explicit ``motion`` replaces it."""
     if usual.startswith("static") or all(_has(models[usual], key) for key in counts):
         return usual
     having = [name for name, m in models.items() if m.is_implied and all(_has(m, key) for key in counts)]
@@ -253,7 +253,7 @@ def _geometry(scan: Scan) -> Iterator[np.ndarray]:
     yield np.round(scan.frame_start_s, _DECIMALS)
     span_s = np.array([0.0, scan.shutter.span_s])
     for frame, start_s in enumerate(scan.frame_start_s):
-        yield np.round(scan.trajectory.pose(frame, start_s + span_s), _DECIMALS) + 0.0  # + 0.0 makes a 0 of a -0
+        yield np.round(scan.trajectory.pose(frame, start_s + span_s), _DECIMALS) + 0.0  # adding 0.0 turns -0 into 0
 
 
 def _deformation_digest(one: Deformation) -> str:

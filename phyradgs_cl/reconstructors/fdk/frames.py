@@ -34,7 +34,7 @@ from phyradgs_cl.runtime import Runtime
 WAYS = ("none", "cosine", "cylinder", "reprojected")
 _SHARE = 0.5  # "cosine" and "cylinder" extend rows at each side by this fraction of the panel's columns
 _SLOPE_PIXELS = 5  # the slope at a row's end is taken over this many pixels, to lower its noise
-_NOISE = 0.01  # a row that ends below this fraction of the line integrals' 99.9th percentile ends in air: 0 continues it
+_NOISE = 0.01  # a row that ends below this fraction of the line integrals' 99.9th percentile ends in air, and continues as 0
 _UNEVEN = 0.02  # views are evenly spaced if no angular step differs from the median step by more than this fraction
 _REACH = 8  # the end views of an arc are repeated over this many times an exposure's arc, so that the filter meets no edge
 _FULL_TURN = 1.5  # if a gap is wider than this many median steps, the views cover less than a full turn

@@ -166,7 +166,7 @@ def distinct_views(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     is_new = np.diff(turned[order], prepend=-np.inf) > tolerance
     index = np.cumsum(is_new) - 1
     centre = turned[order][is_new]
-    if centre.size > 1 and centre[0] + 2 * np.pi - turned[order[-1]] <= tolerance:  # both are one angle, as 0° and 360° are
+    if centre.size > 1 and centre[0] + 2 * np.pi - turned[order[-1]] <= tolerance:  # first and last are one, as 0° and 360°
         index[index == centre.size - 1] = 0
         centre = centre[:-1]
     cell = np.empty(turned.size, np.int64)

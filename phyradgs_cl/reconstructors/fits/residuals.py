@@ -101,7 +101,7 @@ class AugmentedOperator:
         return self.operator.frames_shape
 
     def system(self, measured: np.ndarray, valid: np.ndarray | None) -> System:
-        """Returns the system with this operator and measured frames (F, rows, columns). It has no subsets. valid: 1 at
+        """Returns the system of this operator and measured frames (F, rows, columns), which has no subsets. valid: 1 at
         usable pixels, else 0; None: all are usable."""
         return System(self, measured, valid)  # type: ignore[arg-type]
 

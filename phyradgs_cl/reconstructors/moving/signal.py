@@ -23,7 +23,7 @@ _FEWEST_CYCLES = 5  # a signal with fewer cycles in the scan counts as one witho
 _BAND = 0.25  # rates within this fraction of the dominant rate count as the same, since breaths differ in length
 # A signal repeats if at least this fraction of its power lies about one rate (``_BAND``), beyond the part of white noise.
 _PERIODIC_SHARE = 0.5
-_FEWEST_FRAMES = 16  # a scan of fewer frames shows no period
+_FEWEST_FRAMES = 16  # a scan of fewer frames counts as one without a period
 _FEWEST = 4  # a file must have at least this many values to be a signal
 _KNOTS_PER_PERIOD = 6  # weights that follow a signal have this many knots per period
 _SLOWER = 0.95  # without a period, knots follow a stated signal up to the frequency below which this share of its power lies
@@ -168,7 +168,7 @@ def _spectrum(times_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, floa
 
 
 def _evenly(times_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns even times, spaced by the median step of ``times_s`` (n,), and ``values`` (n,) interpolated linearly there."""
+    """Returns evenly spaced times, at the median step of ``times_s`` (n,), and ``values`` (n,) interpolated at them."""
     length_s = float(times_s[-1] - times_s[0])
     step_s = max(float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0, length_s / _MOST_EVEN)
     even_s = times_s[0] + step_s * np.arange(round(length_s / step_s) + 1 if step_s > 0 else 1)

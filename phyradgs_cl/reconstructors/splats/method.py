@@ -33,7 +33,7 @@ from phyradgs_cl.reconstructors.splats.step import Batch, DeviceCloud, FrameStep
 from phyradgs_cl.runtime import Runtime
 
 REPORT_EVERY = 50  # iterations between progress reports; lines of the convergence record are as far apart or closer
-LEAST_RECORDED = 20  # short runs record more often: the convergence record has this many lines, or one per iteration
+LEAST_RECORDED = 20  # short runs record more often, so that a run of at least this many iterations has this many lines
 
 
 class SplatRun:
@@ -184,8 +184,8 @@ def first_cloud(
     rt: Runtime, scan: Scan, options: SplatOptions, seed: int, initial: np.ndarray | None = None,
     deformation: Deformation | None = None,
 ) -> tuple[Scale, Population, np.random.Generator]:
-    """Returns the internal units, the first Gaussians, and the random generator that drew them. They are drawn from
-    ``initial`` (nz, ny, nx) in 1/mm; if it is None, from FDK's volume."""
+    """Returns the internal units, the first Gaussians, and the random generator that drew them. The Gaussians are drawn from
+    the volume ``initial`` (nz, ny, nx) in 1/mm; if that is None, from FDK's volume."""
     first = static_fdk(rt, scan, deformation) if initial is None else initial
     scale = internal_scale(first, scan.grid)
     rng = np.random.default_rng(seed)

@@ -76,8 +76,8 @@ class SplatOptions(MotionOptions):
         return int(min(max(voxels / 16, 1000), 50_000))
 
     def motion_at(self, share: float) -> Motion:
-        """Returns the motion model after the fraction ``share`` of the run: a coarser one before ``exact_from``, where exact
-        motion would gain nothing."""
+        """Returns the motion model after the fraction ``share`` of the run. In place of ``exact`` it is a coarser one before
+        ``exact_from``, where exact motion would gain nothing."""
         if not isinstance(self.motion, Exact) or share >= self.exact_from:
             return self.motion
         is_first = share < _STATIC_SHARE * self.exact_from

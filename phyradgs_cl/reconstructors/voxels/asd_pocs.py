@@ -34,7 +34,7 @@ class AsdPocsOptions(SartOptions):
 
 
 class AsdPocs(Algorithm):
-    """ASD-POCS. An iteration's residual belongs to the volume between the SART pass and the TV steps."""
+    """ASD-POCS. An iteration's residual is that of the volume after its SART pass, before its TV steps."""
 
     def __init__(self, system: System, options: AsdPocsOptions, descend: TvDescent, epsilon: float) -> None:
         super().__init__(system)

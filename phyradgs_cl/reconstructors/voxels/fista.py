@@ -117,7 +117,7 @@ class Accelerated(Algorithm):
         self.prior = prior
         self.previous = self.volume
         self.momentum = 1.0  # tₖ of Beck and Teboulle, 1 for the first step
-        self.curvature = (_tight_curvature if has_long_steps else _curvature)(system) or 1.0  # L, a Lipschitz constant
+        self.curvature = (_tight_curvature if has_long_steps else _curvature)(system) or 1.0  # L ≥ ‖AᵀA‖
 
     def start_from(self, volume: Any) -> None:
         self.volume = self.previous = volume

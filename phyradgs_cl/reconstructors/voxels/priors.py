@@ -30,23 +30,23 @@ from phyradgs_cl.runtime import Runtime, Space
 _SPREAD = 2.83
 _EDGES = 0.09  # (error of a ray's path length in the object, because voxels show edges coarsely)/(voxel's side)
 _LEAST = 1e-4  # least weight of the prior, as a fraction of the largest value of Aᵀp: without noise it would be 0
-# Settings of the priors, measured (docs/results/settings.md). A weight or threshold is a factor on the prior's weight.
-_TV_ALONE = 1.6  # weight of TV in the prior ``tv``
-_TV_BEFORE_DCT = 0.8  # weight of TV in the prior ``dct``
-_DCT = 1.5  # threshold of the block cosine transforms in the prior ``dct``
-_TV_AT_REST = 0.5  # weight of TV before ridge steps, for scans that stop for each projection
-_DCT_AT_REST = 1.35  # threshold of the block cosine transforms before ridge steps, for scans that stop
+# The following settings of the priors were measured (docs/results/settings.md).
+_TV_ALONE = 1.6  # (weight of TV in the prior ``tv``)/(prior's weight)
+_TV_BEFORE_DCT = 0.8  # (weight of TV in the prior ``dct``)/(prior's weight)
+_DCT = 1.5  # (threshold of the block cosine transforms in the prior ``dct``)/(prior's weight)
+_TV_AT_REST = 0.5  # (weight of TV before ridge steps)/(prior's weight), for scans that stop for each projection
+_DCT_AT_REST = 1.35  # (threshold of the cosine transforms before ridge steps)/(prior's weight), for scans that stop
 _RIDGE_NOISE = 17.0  # (noise that a ridge step assumes)/(part of the prior's weight that is due to noise), for fly-scans
-_RIDGE_NOISE_AT_REST = 20.0  # the quotient of _RIDGE_NOISE, for scans that stop for each projection
+_RIDGE_NOISE_AT_REST = 20.0  # (noise that a ridge step assumes)/(part of the weight due to noise), for scans that stop
 _RIDGE_LENGTH = 0.5  # length of a ridge step: factor on the regulariser's gradient
-_RIDGE_EVERY = 4  # a ridge step follows every so many maps of the prior ``dct``
+_RIDGE_EVERY = 4  # number of maps of the prior ``dct`` from one ridge step to the next
 # _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals. For another noise, _TV_AT_REST is multiplied,
 # and _RIDGE_NOISE_AT_REST divided, by (noise/_USUAL_NOISE)^(1/6).
 _USUAL_NOISE = 0.01
 _LEAST_NOISE = 0.001  # least noise of line integrals that the prior ``ridge`` assumes, because some scans have none
 _LEAST_NOISE_SHARE = 0.1  # a ridge step takes at least this fraction of the prior's weight as noise: some scans have none
 _SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result; the larger voxels of earlier passes have the rest
-_SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels with the prior ``ridge``, which leaves less noise
+_SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels in the result with the prior ``ridge``: it leaves less noise
 
 
 @dataclass(frozen=True)

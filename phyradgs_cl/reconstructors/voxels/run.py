@@ -55,7 +55,7 @@ class IterativeOptions(MotionOptions):
 class Algorithm:
     """An iterative method on a system. ``volume`` (nz, ny, nx) in 1/mm is an array of the system's space.
 
-    A subclass writes ``step``, and names the attributes that a state must hold: ``ARRAYS`` (of the space), ``NUMBERS``."""
+    A subclass defines ``step``, and names the attributes that a state must hold: ``ARRAYS`` (of the space), ``NUMBERS``."""
 
     ARRAYS: ClassVar[tuple[str, ...]] = ("volume",)
     NUMBERS: ClassVar[tuple[str, ...]] = ()
