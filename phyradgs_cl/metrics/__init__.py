@@ -1,4 +1,4 @@
-"""Compares a reconstruction with the true volume."""
+"""Compares a reconstruction, and its error bars, with the true volume."""
 
 from phyradgs_cl.metrics.align import (
     VOXEL_BY_VOXEL,

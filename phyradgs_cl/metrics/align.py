@@ -1,4 +1,4 @@
-"""Brings a volume and its reference, the true volume, to one grid, by one rule for every PSNR."""
+"""Brings a volume and its reference, the true volume, onto one grid, by the same rule for every PSNR."""
 
 import math
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from phyradgs_cl.fields import Grid, triple
 
 Values = NDArray[np.floating]
 VOXEL_BY_VOXEL = "voxel by voxel"
-_ROUNDING = 1e-6  # a voxel's centre at most this far outside a box, in voxels, counts as inside, because centres are rounded
+_ROUNDING = 1e-6  # a rounded voxel centre that lies at most this far outside a box, in voxel sides, counts as inside
 
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
-    """A volume and a reference (nz, ny, nx), both on ``grid``. how: how they came onto one grid, in words. share: fraction
-    of the reference's box that is compared."""
+    """A volume and a reference, both (nz, ny, nx) on ``grid``. how: the way in which they came onto one grid, in words.
+    share: fraction of the reference's voxels that is compared."""
 
     volume: Values
     reference: Values
@@ -50,15 +50,15 @@ def aligned(volume: Values, grid: Grid, reference: Values, reference_grid: Grid)
 
 
 def overlap(one: Grid, other: Grid) -> tuple[float, float]:
-    """Returns the space that the boxes of two grids share, as a fraction of the first box and of the other."""
+    """Returns (space that the two grids' boxes share)/(box of ``one``), and (the same space)/(box of ``other``)."""
     low, high = np.maximum(one.box_mm[:, 0], other.box_mm[:, 0]), np.minimum(one.box_mm[:, 1], other.box_mm[:, 1])
     shared_mm3 = float(np.prod(np.maximum(high - low, 0)))
     return shared_mm3 / math.prod(one.size_mm), shared_mm3 / math.prod(other.size_mm)
 
 
 def reference_on(grid: Grid, reference: Values, reference_grid: Grid) -> Values | None:
-    """Returns the reference (nz, ny, nx) on ``grid`` by the rule of ``aligned``; None where ``aligned`` would resample the
-    volume."""
+    """Returns the reference (nz, ny, nx) on ``grid``, averaged over blocks if its voxels are smaller; None where ``aligned``
+    would resample the volume, or has nothing to compare."""
     if grid.is_close(reference_grid):
         return reference
     blocks = _blocks(grid, reference_grid)
@@ -66,7 +66,7 @@ def reference_on(grid: Grid, reference: Values, reference_grid: Grid) -> Values 
 
 
 def block_means(values: Values, factors: tuple[int, int, int]) -> Values:
-    """Returns means over blocks of ``factors`` (z, y, x) voxels of a volume that whole blocks fill."""
+    """Returns the means of a volume over blocks of ``factors`` (z, y, x) voxels. Whole blocks must fill the volume."""
     if factors == (1, 1, 1):
         return values
     split = [part for n, factor in zip(values.shape, factors, strict=True) for part in (n // factor, factor)]
@@ -74,7 +74,7 @@ def block_means(values: Values, factors: tuple[int, int, int]) -> Values:
 
 
 def in_words(grid: Grid) -> str:
-    """Returns a grid in a few words, in the order x y z as in all texts for users."""
+    """Describes a grid in a few words for users: voxels, voxel sides and centre, in the order x y z."""
     sizes, offsets = (v[::-1] for v in (grid.voxel_size_mm, grid.offset_mm))
     digits = 3 - math.floor(math.log10(min(sizes)))  # an offset below a thousandth of a voxel is not shown
     words = f"{_times(grid.shape)} voxels (x y z) of {'×'.join(f'{s:.4g}' for s in sizes)} mm"
@@ -82,8 +82,8 @@ def in_words(grid: Grid) -> str:
 
 
 def _blocks(grid: Grid, finer: Grid) -> tuple[tuple[int, int, int], tuple[slice, slice, slice]] | None:
-    """Returns how many voxels (z, y, x) of ``finer`` fill one of ``grid``, and the slices of ``finer`` that fill ``grid``;
-    None if a voxel of ``finer`` would be cut, or a voxel of ``grid`` lies outside ``finer``."""
+    """Returns how many voxels (z, y, x) of ``finer`` fill one voxel of ``grid``, and the block of ``finer`` that fills
+    ``grid``; None if a voxel of ``finer`` would be cut, or a voxel of ``grid`` lies outside ``finer``."""
     factors = triple(max(1, round(d / f)) for d, f in zip(grid.voxel_size_mm, finer.voxel_size_mm, strict=True))
     counts = triple(n * factor for n, factor in zip(grid.shape, factors, strict=True))
     if any(n > most for n, most in zip(counts, finer.shape, strict=True)):

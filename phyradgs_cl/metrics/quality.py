@@ -1,8 +1,8 @@
 """Compares a volume with a reference by PSNR and structural similarity (SSIM), and a motion with the true motion.
 
 SSIM (Z. Wang et al., IEEE Trans. Image Process. 13(4), 600-612, 2004) is taken in 2D, with an 11×11 Gaussian window of sigma
-1.5 and zeros beyond the border. As in the published tables of radiative Gaussian splatting, it is averaged over the slices
-across each axis, except those that are 0 throughout in the reference, and then over the axes."""
+1.5 and zeros beyond the border. As in the published tables of radiative Gaussian splatting, SSIM is averaged over the slices
+across each axis, except slices that are 0 throughout in the reference, and then over the axes."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -29,8 +29,8 @@ WINDOW = 11  # SSIM's window, in voxels a side (Wang et al. 2004)
 SIGMA = 1.5  # standard deviation in voxels of the Gaussian weights in SSIM's window (Wang et al. 2004)
 K1, K2 = 0.01, 0.03  # SSIM's constants for means and for variances, as fractions of the data range (Wang et al. 2004)
 _VOXELS_PER_BATCH = 1 << 20  # voxels compared at a time: SSIM holds about ten float64 arrays of them, 80 MB
-_EDGE = 0.25  # motion shows at edges only, so it is compared where the slope is at least this fraction of the steepest slope
-_MOST_POINTS = 2000  # most voxels at which motions are compared: enough for a mean and a percentile
+_EDGE = 0.25  # motions are compared at edges, which show them: where the slope is at least this fraction of the steepest
+_MOST_POINTS = 2000  # most voxels at which motions are compared: enough for a mean and a 95th percentile
 _INCH = 3.2  # side of a slice in the figure, in inches
 _DPI = 110
 
@@ -53,13 +53,13 @@ class Metric:
 
 
 METRICS = {"psnr_db": Metric("PSNR", "dB", ".2f"), "ssim": Metric("SSIM", "", ".4f")}
-"""Which results of ``compare`` are printed, and how."""
+"""The results of ``compare`` that are printed, and how each is printed."""
 HELD_OUT = {"holdout_rms": Metric("held-out RMS", "", ".4g"), "holdout_noise_rms": Metric("noise RMS", "", ".4g")}
-"""Errors, in line integrals, on pixels held out from the method; only some runs hold out pixels."""
+"""How results of ``holdout_errors`` are printed, in line integrals: the residual at held-out pixels, and their noise."""
 
 
 def printed(metrics: Mapping[str, object], names: Mapping[str, Metric] = METRICS) -> Iterator[tuple[str, str]]:
-    """Yields (title, value with unit) of the metrics that are present and are numbers."""
+    """Yields (title, value with unit) for each of ``names`` whose entry in ``metrics`` is a number."""
     for name, metric in names.items():
         value = metrics.get(name)
         if isinstance(value, int | float):
@@ -94,7 +94,7 @@ def psnr(result: ArrayLike, reference: ArrayLike, data_range: float | None = Non
 
 
 def checked_pair(result: ArrayLike, reference: ArrayLike, data_range: float | None) -> tuple[Floats, Floats, float]:
-    """Returns both arrays with at least one axis, and the data range. Raises InputError as ``psnr`` does."""
+    """Returns both arrays, with at least one axis, and the data range of ``psnr``. Raises InputError as ``psnr`` does."""
     pair = {"result": result, "reference": reference}
     a, b = (np.atleast_1d(checks.real_array(name, values, "biuf")) for name, values in pair.items())
     checks.shape("result", a, b.shape)
@@ -119,7 +119,7 @@ def ssim(result: ArrayLike, reference: ArrayLike, data_range: float | None = Non
 
 
 def ssim_map(result: ArrayLike, reference: ArrayLike, data_range: float) -> Array:
-    """Returns the structural similarity (..., v, u) float64 at every pixel of two stacks of images (..., v, u)."""
+    """Returns SSIM (..., v, u) float64 at every pixel of two stacks of images (..., v, u). data_range: L, as in ``ssim``."""
     a, b = np.asarray(result, dtype=np.float64), np.asarray(reference, dtype=np.float64)
     c1, c2 = (K1 * data_range) ** 2, (K2 * data_range) ** 2
     mean_a, mean_b = _blur(a), _blur(b)
@@ -153,7 +153,7 @@ def _blur(images: Array) -> Array:
 
 
 def edge_points_mm(volume: np.ndarray, grid: Grid) -> np.ndarray:
-    """Returns the centres (n, 3), x y z, of at most 2,000 voxels at which a volume (nz, ny, nx) changes steeply."""
+    """Returns the centres (n, 3) in mm, x y z, of at most 2,000 voxels at which a volume (nz, ny, nx) changes steeply."""
     axes = [axis for axis, count in enumerate(volume.shape) if count > 1]
     slopes = [np.gradient(volume, grid.voxel_size_mm[axis], axis=axis) for axis in axes]
     steepness = np.sqrt(np.sum(np.square(slopes), axis=0)) if axes else np.zeros(volume.shape)
@@ -165,7 +165,7 @@ def edge_points_mm(volume: np.ndarray, grid: Grid) -> np.ndarray:
 def displaced_mm(deformation: Deformation, points_mm: np.ndarray, times_s: np.ndarray) -> np.ndarray:
     """Returns the displacement (K − 1, n, 3) in mm of matter at points (n, 3), from the first of K times to each other time.
 
-    The result does not depend on the moment that the reference volume shows, so two descriptions of one motion agree."""
+    The result does not depend on the time that the reference volume shows, so that two descriptions of one motion agree."""
     weights = deformation.weights_at(times_s)
     reference_mm = points_mm + deformation.displacement_mm(points_mm, weights[0])
     return np.stack([reference_mm + deformation.inverse_mm(reference_mm, other) - points_mm for other in weights[1:]])
@@ -208,7 +208,7 @@ def _scores(result: Floats, reference: Floats) -> str:
 
 
 def draw_slices(figure: "FigureBase", volume: Floats, truth: Floats | None, grid: Grid | None) -> None:
-    """Draws the three middle slices of a volume (z, y, x) in 1/mm; with a ``truth``, also its slices and the difference."""
+    """Draws a volume's middle slices (z, y, x); with ``truth`` also its slices and the difference; with ``grid`` in mm."""
     if truth is not None:
         checks.shape("reference", truth, volume.shape)
         checks.finite("reference", truth)

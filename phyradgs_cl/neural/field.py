@@ -19,10 +19,10 @@ from phyradgs_cl.errors import DeviceError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
-_ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # each axis of a volume (z, y, x) comes last once: line segments run along it
-_WIDER = 4  # feed-forward layers of a transformer are this many times as wide as its other layers
+_ORDERS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # orders of a volume's axes z, y, x: line segments run along the last axis
+_WIDER = 4  # (width of a transformer's feed-forward layers)/(width of its input and output)
 _FACTORS = (1, 2_654_435_761, 805_459_861)  # factors of x, y, z in the hash (Müller et al., Eq. 4)
-_FIRST_FEATURES = 1e-4  # initial features are random, between ± this (Müller et al., NAF)
+_FIRST_FEATURES = 1e-4  # initial table entries are random, between −1e-4 and 1e-4 (Müller et al., NAF)
 
 
 def torch_device(name: str) -> torch.device:
@@ -41,8 +41,8 @@ def torch_device(name: str) -> torch.device:
 
 @contextmanager
 def repeatable(device: torch.device) -> Iterator[None]:
-    """Makes PyTorch on CUDA use algorithms that give the same bits in every run. On CPUs this package sums in a fixed order
-    anyway, and PyTorch's switch would only slow it down."""
+    """Makes PyTorch on CUDA use algorithms that give the same bits in every run; changes nothing on other devices. On CPUs
+    this package sums in a fixed order anyway, and PyTorch's switch would only slow it down."""
     if device.type != "cuda":
         yield
         return
@@ -66,8 +66,8 @@ def to_array(tensor: torch.Tensor) -> np.ndarray:
 
 
 class LineAttention(nn.Module):
-    """Multi-head attention within line segments: groups of ``segment`` successive rows of values (P, width), which belong to
-    successive points of a line. ``segment`` divides P."""
+    """Multi-head attention within line segments. A segment is a group of ``segment`` successive rows of the values (P,
+    width), which belong to successive points of a line. ``segment`` divides P."""
 
     def __init__(self, width: int, segment: int, heads: int, head_width: int) -> None:
         super().__init__()
@@ -93,8 +93,8 @@ class LineAttention(nn.Module):
 
 
 class LineAttentionBlocks(nn.Module):
-    """Alternates attention and feed-forward layers on values (P, width), each with a layer norm before it and a skip
-    connection."""
+    """Alternates attention and feed-forward layers on values (P, width). Each has a layer norm before it and a skip
+    connection around it. blocks: number of layers of each kind."""
 
     def __init__(self, width: int, segment: int, heads: int, head_width: int, blocks: int) -> None:
         super().__init__()
@@ -121,8 +121,8 @@ class LineAttentionBlocks(nn.Module):
 class AttenuationNetwork(nn.Module):
     """Maps features (P, inputs) to attenuation (P,) in the unit of ``options.density_bound``.
 
-    middle: the modules between the first and the last layer. skip: the index of the layer whose input also contains the
-    features; −1 for none. ``options.last_activation`` follows the last layer, a leaky ReLU every other layer."""
+    middle: the layers between the first and the last. skip: the index, among all layers, of the layer whose input also
+    contains the features; −1: none. ``options.last_activation`` follows the last layer, a leaky ReLU every other layer."""
 
     def __init__(self, inputs: int, middle: list[nn.Module], skip: int, options: NeuralOptions) -> None:
         super().__init__()
@@ -148,8 +148,8 @@ class AttenuationNetwork(nn.Module):
 
 
 def network_of(inputs: int, options: NeuralOptions) -> AttenuationNetwork:
-    """Returns NAF's linear layers. For ``LineOptions`` line-segment attention replaces all layers but the first, the last
-    and the skip layer: number layers // 2, counted from 0, of three or more. Its input contains the encoding too."""
+    """Returns NAF's linear layers. Layer number layers // 2, counted from 0, of three or more is the skip layer, whose input
+    also contains the features. For ``LineOptions``, attention replaces all layers but the first, the last and this one."""
     skip, width = options.layers // 2 if options.layers > 2 else -1, options.width
     middle: list[nn.Module] = []
     for number in range(1, options.layers - 1):
@@ -193,8 +193,8 @@ class HashEncoding(nn.Module):
 
 
 def corners(positions: torch.Tensor, cells: int, size: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns table entries (8, P) int64, and interpolation weights (8, P), of the corners around positions (P, 3). The
-    level has ``cells`` grid cells along a side and ``size`` entries."""
+    """Returns the numbers (8, P) int64 of the table entries of the eight corners around positions (P, 3), and the corners'
+    interpolation weights (8, P). The level has ``cells`` grid cells along a side and ``size`` entries."""
     scaled = positions.t() * cells
     low = scaled.floor().clamp_(0, cells - 1)
     high_share = scaled - low  # distance from the cell's lower corner, in sides of a cell, (3, P)
@@ -216,13 +216,13 @@ def _corner_shape(axis: int) -> tuple[int, int, int, int]:
 
 
 def weighted_rows(table: torch.Tensor, index: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Returns Σ weight · table[index] over the last axis of index (B, 8), for devices that lack ``embedding_bag``."""
+    """Returns Σ weight · table[index] over the last axis of index and weight (B, 8), where ``embedding_bag`` is missing."""
     rows = table.index_select(0, index.reshape(-1)).reshape(*index.shape, table.shape[1])
     return torch.einsum("bkf,bk->bf", rows, weight)
 
 
 class _Interpolate(torch.autograd.Function):
-    """Returns Σ weight · table[index] over 8 corners, for index and weight (B, 8). Only the table has a gradient. It is
+    """Computes Σ weight · table[index] over 8 corners, for index and weight (B, 8). Only the table gets a gradient, which is
     summed in a fixed order, so that every run gives the same bits."""
 
     @staticmethod
@@ -246,7 +246,7 @@ class _Interpolate(torch.autograd.Function):
 
 
 class NeuralField(nn.Module):
-    """Maps positions (P, 3), x y z in [−1, 1] along the longest side of the volume, to attenuation (P,).
+    """Maps positions (P, 3), x y z in units of half the volume's longest side about its centre, to attenuation (P,).
 
     segment: how many successive positions influence each other; 1: none do."""
 
@@ -263,9 +263,9 @@ def voxel_values(
 ) -> np.ndarray:
     """Returns the field in all voxels (nz, ny, nx) float32. ``grid``: centred, in units of half the longest side.
 
-    A voxel is the mean over the centres of its ``points``³ equal parts. With line segments, a point's value depends on its
-    neighbours along the segment. The result is then the mean over segments along x, y and z. points_at_once: most points
-    that are evaluated together."""
+    A voxel's value is the mean over the centres of its ``points``³ equal parts. With line segments, a point's value depends
+    on the other points of its segment. The result is then the mean of three: for segments along x, y and z. points_at_once:
+    most points that are evaluated together."""
     orders = _ORDERS if field.segment > 1 else _ORDERS[:1]
     values = np.zeros(grid.shape, np.float32)
     for order in orders:
@@ -280,14 +280,14 @@ def _in_rows(
     field: NeuralField, grid: Grid, order: tuple[int, int, int], device: torch.device, points_at_once: int,
     points: int,
 ) -> np.ndarray:
-    """Returns the voxels of a grid whose axes are z, y, x in another ``order``, with line segments along the last axis. A
-    row of points is extended beyond its end to fill the last segment."""
+    """Returns the values of a grid's voxels, with line segments along its last axis. The grid's axes are z, y, x in another
+    ``order``. A row of points is extended beyond the grid to fill its last segment."""
     fine = grid.finer(points)
     slow, middle, fast = fine.axes_mm()
     filled = ceil_div(fast.size, field.segment) * field.segment
     fast = np.concatenate([fast, fast[-1] + fine.voxel_size_mm[2] * np.arange(1, filled - fast.size + 1)])
     slows, middles, fasts = grid.shape
-    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # coordinates of each row on the first two axes
+    rows: np.ndarray = np.empty((slows, middles, points, points, 2))  # each row's place on the first two axes
     rows[..., 0], rows[..., 1] = slow.reshape(slows, 1, points, 1), middle.reshape(1, middles, 1, points)
     rows = rows.reshape(slows * middles, points**2, 2)
     values = np.empty((slows * middles, fasts), np.float32)

@@ -13,7 +13,7 @@ from phyradgs_cl.errors import InputError
 JITTERS = ("ray", "sample", "none")
 LAST_ACTIVATIONS = ("sigmoid", "leaky-relu")
 TORCH_DEVICES = ("auto", "cpu", "cuda", "mps")
-# Densities of grid cells and samples, unless options state them.
+# Numbers of grid cells and samples per voxel, used unless options state the numbers.
 CELLS_PER_VOXEL = 1.0  # grid cells of the encoding's finest level per voxel of the longest side
 SAMPLES_PER_VOXEL = 1.5  # samples along a ray per voxel of the longest side: NAF takes 192 for 128 voxels
 # If a pixel has rays at several times, fewer samples per ray are enough: only the mean over the rays must be exact.
@@ -23,12 +23,12 @@ _FINEST = 2**24  # with more grid cells along a side, float32 coordinates have n
 
 @dataclass(frozen=True)
 class NeuralOptions(MotionOptions):
-    """A field on a hash encoding and a small network, fitted to rays.
+    """Options of a field that is fitted to rays. The field consists of a hash encoding and a small network.
 
     - iterations: passes over all frames, with one step per frame. rays: pixels per step.
     - samples: number along each ray in the volume. 0: 1.5 per voxel of the longest side, 1.2 if a pixel has several times.
-    - jitter: random shift of the samples, one per ``ray``, one per ``sample`` inside its own interval, or ``none``.
-    - times: how many of the times in a line's exposure a step uses, drawn for each pixel; 0: all of them.
+    - jitter: random shift of samples in their intervals: one shift per ``ray``, one per ``sample``, or ``none``.
+    - times: how many of the times in a line's exposure a step uses, drawn for each pixel; 0: all of the times.
     - positive_only: use only pixels with a line integral above 0.
     - voxel_points: points along each side of a voxel. The voxel's value is the field's mean over all of its points.
 
@@ -76,7 +76,7 @@ class NeuralOptions(MotionOptions):
             raise InputError("levels", found, f"at most {_FINEST}", remedy)
 
     def levels_for(self, longest_voxels: int) -> int:
-        """Returns the number of levels of the encoding for a volume of ``longest_voxels`` along its longest side."""
+        """Returns the encoding's number of levels for a volume of ``longest_voxels`` voxels along its longest side."""
         if self.levels or self.level_growth == 1:
             return max(self.levels, 1)
         steps = math.log(CELLS_PER_VOXEL * longest_voxels / self.base_resolution, self.level_growth)
@@ -91,8 +91,8 @@ class NeuralOptions(MotionOptions):
     def times_for(self, count: int, model: str) -> int:
         """Returns how many of the ``count`` times in a line's exposure a step uses. model: what the detector averages.
 
-        Raises InputError for a subset that would bias the loss. The log model must estimate a variance, which takes two
-        times. In the intensity model, the logarithm of a mean is not the mean over subsets of the logarithm."""
+        Raises InputError for a subset of the times that would bias the loss. The log model must estimate a variance, which
+        takes two times. In the intensity model, log(mean over all times) is not the mean of log(mean over a subset)."""
         if self.times == 0:
             return count
         if self.times < count and model == "intensity":

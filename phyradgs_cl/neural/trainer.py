@@ -1,4 +1,4 @@
-"""Fits a field to a scan's rays, step by step. The state between two steps can be stored.
+"""Fits a neural field to a scan's rays, step by step. The state between two steps can be stored.
 
 A step's pixels are scattered ones and whole windows: SAX-NeRF's masked local–global sampling (Cai et al., CVPR 2024)."""
 
@@ -17,16 +17,16 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.neural.field import NeuralField, repeatable, to_array, to_tensor, voxel_values
 from phyradgs_cl.neural.options import LineOptions, NeuralOptions
 
-_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's decay rates of both moments, and the constant in its denominator
-_POINTS_ON_CPU = 2**14  # a CPU evaluates the field at this many points at once: its cache holds them
-_POINTS_ELSEWHERE = 2**20  # another device evaluates more points at once: the memory of a GPU holds them
-_BEYOND_VOLUME = 2.0  # parallel rays begin this far from the volume's middle, in halves of its longest side: beyond corners
+_BETAS, _EPSILON = (0.9, 0.999), 1e-8  # Adam's decay rates of both moments, and the constant added to its denominator
+_POINTS_ON_CPU = 2**14  # most points at which a CPU evaluates the field at once: their values fit in its cache
+_POINTS_ELSEWHERE = 2**20  # most points at which any other device evaluates the field at once: they fit in a GPU's memory
+_BEYOND_VOLUME = 2.0  # parallel rays begin this many halves of the volume's longest side from its centre: beyond its corners
 Field = Callable[[torch.Tensor], torch.Tensor]
 
 
 class Trainer:
-    """Fits a field to a scan's rays, in steps that ``reconstructors.loop`` runs. A step takes one frame, an iteration all.
-    A trainer holds what changes from step to step: the field, its optimiser and the random draws.
+    """Fits a field to a scan's rays, in steps that ``reconstructors.loop`` runs. A step uses one frame, an iteration uses
+    all frames. A trainer holds what changes from step to step: the field, its optimiser and the random draws.
 
     Lengths are in units of half the volume's longest side, attenuation in units of ``density_per_mm``."""
 
@@ -48,7 +48,7 @@ class Trainer:
         self.rays = [ExposureRays.of_cells(table, scan.grid) for table in tables]
         times = self.rays[0].times
         stated = scan.detector_model if options.detector_model == "scan" else options.detector_model
-        self.model = stated if times > 1 else "log"  # for a single time the log and the intensity model agree
+        self.model = stated if times > 1 else "log"  # with a single time the log model and the intensity model agree
         self.times = options.times_for(times, self.model)
         self.samples = options.samples_for(max(scan.grid.shape), times)
         self.points_at_once = _POINTS_ON_CPU if device.type == "cpu" else _POINTS_ELSEWHERE
@@ -61,7 +61,7 @@ class Trainer:
 
     @property
     def iteration(self) -> int:
-        """How many times the training has used all frames."""
+        """Number of times that the training has used all frames."""
         return self.steps // self.scan.frames
 
     @property
@@ -112,7 +112,7 @@ class Trainer:
         }
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Restores what ``state`` returned: draws, the field's parameters (n,) and Adam's moments (2, n)."""
+        """Continues from what ``state`` returned, with the field's parameters (n,) and Adam's moments (2, n)."""
         self.rng.bit_generator.state = json.loads(str(state["rng"]))
         self.steps, self.updates = int(state["steps"]), int(state["updates"])
         self.queue, self.losses = state["queue"].tolist(), state["losses"].tolist()
@@ -159,7 +159,7 @@ class Trainer:
         shifts = sample_shifts(times.size, self.samples, self.options.jitter, self.rng)
         shifts = shifts.reshape(*times.shape, -1)
         measured = self.scan.projections[frame][tuple(pixels.T)].astype(np.float32) / np.float32(self.unit)
-        # Pixels are taken in chunks, which need less memory. Their gradients add up to the whole one.
+        # Pixels are taken in chunks, to save memory. The chunks' gradients add up to the gradient of all pixels.
         at_once = max(self.points_at_once // (self.samples * self.times), 1)
         total = 0.0
         for start in range(0, len(pixels), at_once):
@@ -203,7 +203,7 @@ class ExposureRays:
     """The rays of one frame's pixels.
 
     - pose (C, 12): the pose of each time cell, in units of half the volume's longest side about the volume's centre.
-    - cell (K, lines): the time cell of each of a line's K times, which have equal weights.
+    - cell (K, lines): the number of the time cell for each of a line's K times. All times have equal weights.
     - axis: whether lines are rows or columns. is_parallel: poses begin with the direction of the rays."""
 
     pose: np.ndarray
@@ -237,10 +237,10 @@ class ExposureRays:
         return len(self.cell)
 
     def __call__(self, pixels: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the sources and unit directions (R, s, 3) of s rays for each pixel. pixels (R, 2): row and column. times
-        (R, s): which of a line's K times each ray has.
+        """Returns the sources and unit directions (R, s, 3) of s rays for each of R pixels. pixels (R, 2): row and column.
+        times (R, s): which of a line's K times each ray has.
 
-        Parallel rays begin in front of the volume."""
+        The source of a parallel ray is a point on the ray in front of the volume."""
         rows, columns = pixels.T
         line = rows if self.axis == "rows" else columns
         pose = self.pose[self.cell[times, line[:, None]]]  # the pose of each ray, (R, s, 12)
@@ -266,7 +266,7 @@ class ExposureRays:
             place = np.full(to_corner.shape, np.nan)
         scale, column, row = np.moveaxis(place, -1, 0)
         is_behind = not self.is_parallel and np.any(scale <= 0)
-        if is_behind or not np.all(np.isfinite(scale)):  # a corner that no ray meets: take all pixels
+        if is_behind or not np.all(np.isfinite(scale)):  # no ray meets some corner: all pixels are taken
             return slice(0, detector_shape[0]), slice(0, detector_shape[1])
         return _within(row, detector_shape[0]), _within(column, detector_shape[1])
 
@@ -277,7 +277,7 @@ def _within(place: np.ndarray, count: int) -> slice:
 
 
 def scattered_pixels(usable: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draws ``count`` different pixels, (R, 2) row and column, or fewer if fewer are ``usable``, bool (rows, columns)."""
+    """Draws up to ``count`` different pixels, (R, 2) row and column, from the ``usable`` ones, bool (rows, columns)."""
     where = np.flatnonzero(usable)
     chosen = rng.choice(where, min(count, where.size), replace=False, shuffle=False)
     return np.stack(np.unravel_index(chosen, usable.shape), -1)
@@ -302,8 +302,8 @@ def windows_and_scattered_pixels(
 
 
 def chosen_times(pixels: int, times: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draws ``count`` different numbers below ``times`` for each pixel, (pixels, count), all equally likely. If ``count`` is
-    at least ``times``, returns all numbers."""
+    """Draws ``count`` different numbers from 0 to ``times`` − 1 for each pixel, (pixels, count), all equally likely. If
+    ``count`` is at least ``times``, returns all these numbers, (pixels, times)."""
     if count >= times:
         return np.broadcast_to(np.arange(times), (pixels, times))
     return np.argsort(rng.random((pixels, times)), axis=1)[:, :count]
@@ -312,8 +312,8 @@ def chosen_times(pixels: int, times: int, count: int, rng: np.random.Generator) 
 def box_span(
     source: torch.Tensor, direction: torch.Tensor, half_sides: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns the distance (R,) at which rays (R, 3) enter a box of ``half_sides`` (3,) about 0, and the length (R,) inside,
-    0 if they miss it. Directions have unit length, and a ray begins at its source."""
+    """Returns at which distance (R,) from its source each ray enters a box of ``half_sides`` (3,) about 0, and its length
+    (R,) in the box, 0 if it misses the box. Rays begin at ``source`` (R, 3), and ``direction`` (R, 3) has length 1."""
     tiny = torch.finfo(direction.dtype).tiny
     slope = torch.where(direction.abs() < tiny, torch.full_like(direction, tiny), direction)
     one, other = (-half_sides - source) / slope, (half_sides - source) / slope
@@ -323,7 +323,7 @@ def box_span(
 
 
 def sample_shifts(rays: int, samples: int, jitter: str, rng: np.random.Generator) -> np.ndarray:
-    """Returns the places of samples in their intervals, 0 to 1: (R, samples), or (R, 1) if all of a ray have the same."""
+    """Returns places of samples in their intervals, 0 to 1: (R, samples), or (R, 1) for one place in all of a ray's."""
     if jitter == "none":
         return np.full((rays, 1), 0.5, np.float32)
     return rng.random((rays, samples if jitter == "sample" else 1), np.float32)
@@ -351,10 +351,10 @@ def intensity_average(integrals: torch.Tensor, unit: float) -> torch.Tensor:
 
 
 def log_squares(integrals: torch.Tensor, measured: torch.Tensor, times: int) -> torch.Tensor:
-    """Returns squared errors (R,) of a pixel's mean over all K ``times``, estimated from line integrals (R, s) at s of them.
+    """Returns squared errors (R,) of pixels' means over all K ``times``, estimated from line integrals (R, s) at s times.
 
-    The squared error of a subset's mean is too large by the variance of that mean. This is estimated as the s samples'
-    variance times (1/s − 1/K), and subtracted. Expectation and gradient are then the same as with all K times."""
+    The squared error of a subset's mean is too large by the variance of that mean. This variance is estimated as (1/s − 1/K)
+    times the variance of the s values, and subtracted. In expectation, error and gradient are then those of all K times."""
     count = integrals.shape[1]
     squares = (integrals.mean(1) - measured) ** 2
     return squares if count == times else squares - (1 / count - 1 / times) * integrals.var(1, unbiased=True)

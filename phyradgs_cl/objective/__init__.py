@@ -1,4 +1,4 @@
-"""The objective (paper, Eq. 4): image loss, total variation, mean density. Also the priors of voxel methods."""
+"""The objective of splatting (paper, Eq. 4): image loss, total variation, mean density. Also the priors of voxel methods."""
 
 from phyradgs_cl.objective.dct_prox import DctProx
 from phyradgs_cl.objective.ridge import RidgeStep, learned_ridge

@@ -1,11 +1,11 @@
 """Shrinks the cosine transforms of all blocks of 4³ voxels: a prior that keeps textures, which total variation flattens.
 
-B_s v are the cosine transforms of the blocks of a volume v if the blocks are shifted by s. The result is the average of
+B_s v are the cosine transforms of the blocks that divide a volume v, shifted by s voxels. The result is the average of
 B_sᵀ T(B_s v) over all s (Coifman and Donoho, "Translation-invariant de-noising", 1995; block DCT: Guleryuz, IEEE Trans.
 Image Process. 16 (2007) 3020). T is a soft threshold that keeps each block's mean. Only blocks inside the volume count.
 
-Each call takes a quarter of the shifts, in turn. Over iterations the average is the same (cycle spinning; Kamilov, Bostan
-and Unser, IEEE Signal Process. Lett. 21 (2014) 1326)."""
+Each call uses a quarter of the shifts. Four successive calls use all of them (cycle spinning; Kamilov, Bostan and Unser,
+IEEE Signal Process. Lett. 21 (2014) 1326)."""
 
 import itertools
 
@@ -17,7 +17,7 @@ from phyradgs_cl.runtime import DeviceArray, Runtime, SameArray
 from phyradgs_cl.runtime.layout import GUARD, beside, brought_to, padded_zeros, pitch_of
 
 EDGE = 4  # voxels along each side of a block
-_SAMPLES = 8  # a voxel takes as long as this many ray samples, by which ``launch`` divides long launches
+_SAMPLES = 8  # a voxel takes as long as this many ray samples; ``launch`` divides launches of too many samples
 # TURNS[turn][z]: the blocks' shift along y, in voxels, for their shift z along z. Four turns contain all 16 pairs once.
 TURNS = ((0, 1, 2, 3), (1, 3, 0, 2), (2, 0, 3, 1), (3, 2, 1, 0))
 
@@ -43,8 +43,8 @@ class DctProx:
         """Returns the shrunk volume (nz, ny, nx) float32. threshold: by how much T shrinks coefficients of the orthonormal
         transform, in the volume's unit.
 
-        turn: 0 to 3, chooses a quarter of the blocks' shifts. nonnegative: clips the result at 0. For a device array the
-        result is a device array (``out``, if given)."""
+        turn: 0 to 3, chooses a quarter of the blocks' shifts. nonnegative: clips the result at 0. If ``volume`` is a device
+        array, the result is one too (``out``, if given)."""
         rt, (nz, ny, nx) = self.rt, self.shape
         observed, result = beside(rt, volume, out)
         voxels, by_voxel = (nx, ny, nz), rt.group(on_cpu=16)
@@ -65,7 +65,7 @@ class DctProx:
 
 
 def dct_prox(volume: np.ndarray, threshold: float, turn: int, *, nonnegative: bool) -> np.ndarray:
-    """Returns the shrunk volume (nz, ny, nx) float64: the twin of a call of ``DctProx``, whose arguments it takes."""
+    """Returns the shrunk volume (nz, ny, nx) float64: the NumPy twin of ``DctProx.__call__``, with the same arguments."""
     volume = np.asarray(volume, np.float64)
     if min(volume.shape) < EDGE:
         return np.asarray(np.maximum(volume, 0) if nonnegative else volume)

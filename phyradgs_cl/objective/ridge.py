@@ -19,18 +19,18 @@ from phyradgs_cl.runtime.layout import GUARD, Strides, beside, brought_to, move,
 
 EDGE = 5
 """Voxels along each side of a filter."""
-_SAMPLES = 200  # a voxel takes at most as long as this many ray samples, by which ``launch`` divides long launches
+_SAMPLES = 200  # a voxel takes at most as long as this many ray samples; ``launch`` divides launches of too many samples
 _SLICES = 2  # slices computed at a time: channels and responses of a whole volume would take 24 volumes of memory
-_RING = _SLICES + 2  # slices kept in memory: correlating two slices needs one more on either side
+_RING = _SLICES + 2  # number of slices kept in memory: correlating two slices needs one more slice on either side
 
 
 @dataclass(frozen=True, eq=False)
 class Ridge:
-    """The float32 numbers of a regulariser Σ_i Σ_p ψ_i((W_i x)_p) of a volume x with noise σ. Filter W_i correlates with
-    ``first`` (4, 3, 3, 3) and then with ``second[i]`` (16, 4, 3, 3, 3), axes z, y, x.
+    """The float32 numbers of a regulariser Σ_i Σ_p ψ_i((W_i x)_p) of a volume x with noise σ. Filter W_i correlates x with
+    ``first`` (4, 3, 3, 3), and the 4 results with ``second[i]``; ``second`` is (16, 4, 3, 3, 3). Axes are z, y, x.
 
-    A potential's slope at the filter response t: ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i] clip(t, ±σ
-    knot_down[i]). Slopes and knots (16,) are at least 0."""
+    The potential ψ_i has at the filter's response t the slope ψ_i'(t) = slope_up[i] clip(t, ±σ knot_up[i]) − slope_down[i]
+    clip(t, ±σ knot_down[i]). Slopes and knots (16,) are at least 0."""
 
     first: np.ndarray
     second: np.ndarray
@@ -40,8 +40,8 @@ class Ridge:
     knot_down: np.ndarray
 
     def table(self) -> np.ndarray:
-        """Returns filters, slopes and knots in one float32 array, in the order in which the kernels read them. ``second`` is
-        in it twice, with its axes in two orders."""
+        """Returns filters, slopes and knots in one float32 array, in the order in which the kernels read them. The array
+        contains ``second`` twice, with its axes in two orders."""
         filters = np.moveaxis(self.first, 0, -1), np.moveaxis(self.second, 0, -1), np.moveaxis(self.second, (0, 1), (-2, -1))
         curves = self.slope_up, self.knot_up, self.slope_down, self.knot_down
         return np.concatenate([part.ravel() for part in (*filters, *curves)]).astype(np.float32)
@@ -56,13 +56,13 @@ class Ridge:
 
 @cache
 def learned_ridge() -> Ridge:
-    """Returns the regulariser of ``data/ridge.json``, where benchmarks/train_ridge.py has stored the numbers in
-    thousandths."""
+    """Returns the regulariser of ``data/ridge.json``, in which benchmarks/train_ridge.py has stored each number times
+    1,000."""
     stored = json.loads((resource("data") / "ridge.json").read_text(encoding="utf-8"))
     first, second, *curves = (np.array(stored[name]) / 1000 for name in Ridge.__dataclass_fields__)
     first, second = first.reshape(-1, 3, 3, 3), second.reshape(len(curves[0]), -1, 3, 3, 3)
-    # The weights of a chained filter must sum to 0, so that flat volumes stay. The stored numbers are rounded, so their
-    # small sums are removed.
+    # The weights of a chained filter must sum to 0, so that a step leaves flat volumes as they are. The stored numbers are
+    # rounded, and their sums are near 0, so the sums are removed.
     sums = first.sum((1, 2, 3))
     second -= np.multiply.outer(second.sum((2, 3, 4)) @ sums, sums / (27 * sums @ sums))[..., None, None, None]
     return Ridge(*(values.astype(np.float32) for values in (first, second, *curves)))
@@ -73,7 +73,7 @@ class RidgeStep:
     get no step."""
 
     VOLUMES = 4
-    """Most memory of a step, counted in volumes of floats, for volumes of at least 50 slices and 64 voxels a row."""
+    """Most memory of a step, counted in float32 volumes; holds for volumes of at least 50 slices and 64 voxels a row."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], ridge: Ridge) -> None:
         self.rt, self.shape = rt, shape
@@ -100,7 +100,7 @@ class RidgeStep:
         move(self.rt, (observed, Strides.plain(self.shape)), padded, self.shape)
         is_thin = min(self.shape) < EDGE  # the volume is thinner than a filter, so the gradient stays 0
         end = np.float32(step), np.int32(nonnegative), result
-        # A response needs three slices of channels, so responses are computed two slices behind the channels.
+        # A slice of responses needs three slices of channels, so responses are computed two slices after the channels.
         for first in range(0, nz + 2, _SLICES):
             if not is_thin:
                 self._launch(self._channels_of, first, 2, self._padded, ends=(self._channels,))
@@ -110,7 +110,7 @@ class RidgeStep:
         return brought_to(self.rt, volume, result)
 
     def _launch(self, kernel: Kernel, first: int, less: int, *sources: DeviceArray, ends: tuple[object, ...]) -> None:
-        """Runs a kernel for those of the ``_SLICES`` slices from ``first`` on that its result has. The result has ``less``
+        """Runs a kernel for the ``_SLICES`` slices from ``first`` on, as far as the result has them. The result has ``less``
         voxels fewer than the volume along each axis. sources, ends: the kernel's first and last arguments."""
         nz, ny, nx = (count - less for count in self.shape)
         start, stop = max(first, 0), min(first + _SLICES, nz)

@@ -1,4 +1,4 @@
-"""Terms of the objective (paper, Eq. 4): image loss, total variation of a small volume, mean density.
+"""Terms of the objective (paper, Eq. 4): image loss, total variation of a sub-volume, mean density.
 
 A frame's image loss is L1 + λ (1 − SSIM): mean absolute error and structural similarity. Eq. 4 prints "+ SSIM", but the
 paper minimises 1 − SSIM, as this module does. SSIM follows Wang et al. 2004 (IEEE Trans. Image Process. 13, 600), with an
@@ -19,13 +19,13 @@ from phyradgs_cl.runtime.layout import GUARD
 
 WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
 WINDOW /= WINDOW.sum()
-C1 = 0.01**2  # keeps SSIM finite where means are 0; for images with values from 0 to 1
-C2 = 0.03**2  # keeps SSIM finite where variances are 0; for images with values from 0 to 1
+C1 = 0.01**2  # keeps SSIM finite where means are 0; this value is for images with values from 0 to 1
+C2 = 0.03**2  # keeps SSIM finite where variances are 0; this value is for images with values from 0 to 1
 
 
 class ImageLoss:
-    """Computes the loss of a frame of ``lines`` × ``width`` pixels in padded layout, and its gradient. pitch: floats from
-    line to line. ssim_weight, l1_weight: the factors of 1 − SSIM and of L1."""
+    """Computes the loss of a frame of ``lines`` × ``width`` pixels, and its gradient. pitch: number of floats from one line
+    to the next in memory. ssim_weight, l1_weight: the factors of 1 − SSIM and of L1."""
 
     def __init__(
         self, rt: Runtime, lines: int, width: int, pitch: int, ssim_weight: float, l1_weight: float = 1.0
@@ -45,7 +45,7 @@ class ImageLoss:
     def evaluate(
         self, rendered: DeviceArray, measured: DeviceArray, mask: DeviceArray, pixels: float
     ) -> DeviceArray:
-        """Returns dL/d(rendered), valid until the next call. mask: 1 at valid pixels, else 0. pixels: number of 1s."""
+        """Returns dL/d(rendered), valid until the next call. mask: 1 at valid pixels, else 0. pixels: their number."""
         rt = self.rt
         vectors = ceil_div(self.width, rt.lanes)
         size = (np.int32(self.lines), np.int32(self.width), np.int32(self.pitch))
@@ -78,7 +78,7 @@ class ImageLoss:
 def image_loss(
     rendered: np.ndarray, measured: np.ndarray, mask: np.ndarray, ssim_weight: float, l1_weight: float = 1.0
 ) -> tuple[float, np.ndarray]:
-    """Returns the loss and dL/d(rendered) of images (lines, width): the float64 twin of ``ImageLoss``."""
+    """Returns the loss, and dL/d(rendered) (lines, width), of images (lines, width): the float64 twin of ``ImageLoss``."""
     x, y = rendered * mask, measured * mask
     mx, my = _blur(x), _blur(y)
     xx, yy, xy = _blur(x * x) - mx * mx, _blur(y * y) - my * my, _blur(x * y) - mx * my
@@ -99,8 +99,8 @@ def _blur(image: np.ndarray) -> np.ndarray:
 
 
 class TotalVariation:
-    """Computes the total variation of volumes of one ``shape`` (nz, ny, nx), and its gradient. pitch: floats from row to
-    row."""
+    """Computes the total variation of volumes of one ``shape`` (nz, ny, nx), and its gradient. pitch: number of floats from
+    one row to the next in memory."""
 
     def __init__(self, rt: Runtime, shape: tuple[int, int, int], pitch: int) -> None:
         self.rt, self.shape, self.pitch = rt, shape, pitch
@@ -112,7 +112,7 @@ class TotalVariation:
         self.gradient = rt.zeros(2 * GUARD + nz * ny * pitch)
 
     def evaluate(self, volume: DeviceArray) -> DeviceArray:
-        """Returns dTV/d(volume), valid until the next call."""
+        """Returns dTV/d(volume) in the layout of ``volume``, valid until the next call."""
         nz, ny, _ = self.shape
         items, tile, _ = self.rt.shape_of_lines(self._kernel, self.pitch, ny, nz)
         self.rt.launch(
@@ -147,8 +147,8 @@ def _axis_weights(shape: tuple[int, ...]) -> list[float]:
 
 
 def mean_density(rows: np.ndarray, weight: float) -> tuple[float, np.ndarray]:
-    """Returns ``weight`` times the mean density of parameter rows (11, G), and its gradient (11, G) for these rows: the
-    float64 twin of the term in ``chain_activations``."""
+    """Returns ``weight`` times the mean density of G Gaussians with parameters ``rows`` (11, G), and its gradient (11, G) by
+    these parameters: the float64 twin of this term in the kernel ``chain_activations``."""
     gradient = np.zeros_like(rows)
     if (count := rows.shape[1]) == 0:
         return 0.0, gradient

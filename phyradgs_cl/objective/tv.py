@@ -5,8 +5,8 @@ dual (Beck and Teboulle, IEEE Trans. Image Process. 18 (2009) 2419). Axis weight
 cubes. For an object that changes, the sum of |differences| between successive states is added.
 
 ``TvDescent`` takes steps of a fixed length, as ASD-POCS does (Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777), with TIGRE's
-backward differences. TV's gradient divides by the lengths of differences, which may be 0. So a number far below the volume's
-values is added to the lengths."""
+backward differences. TV's gradient divides by the lengths of voxels' difference vectors, which may be 0. So a number far
+below the volume's values is added to the lengths."""
 
 import math
 from collections.abc import Callable
@@ -21,8 +21,8 @@ from phyradgs_cl.runtime.layout import beside, brought_to
 class TvProx:
     """The proximal map of TV for volumes of a fixed ``shape``: (nz, ny, nx), or (K, nz, ny, nx) for K states.
 
-    Each call starts from the dual field at which the last one ended. axis_weights: factors of differences along z, y, x; for
-    states, the factor in time comes first."""
+    Each call starts from the dual field with which the call before ended. axis_weights: factors of the differences along z,
+    y, x; for states, the factor of the differences in time comes first."""
 
     def __init__(
         self, rt: Runtime, shape: tuple[int, ...], axis_weights: tuple[float, ...] = (1.0, 1.0, 1.0)
@@ -41,7 +41,7 @@ class TvProx:
 
     @property
     def dual(self) -> np.ndarray:
-        """The dual field, with vectors of length at most 1: (3, nz, ny, nx) along x, y, z; for states (4, K, nz, ny, nx)."""
+        """The dual field: vectors of length ≤ 1, (3, nz, ny, nx) along x, y, z; for states (4, K, nz, ny, nx), time last."""
         return self.rt.download(self._dual)
 
     @dual.setter
@@ -54,7 +54,7 @@ class TvProx:
         """Returns the proximal map of a volume of ``shape``, float32, after ``iterations`` steps from the last dual field.
         weight: in the volume's unit.
 
-        nonnegative: maps to x ≥ 0. For a device array the result is a device array (``out``, if given)."""
+        nonnegative: maps to x ≥ 0. If ``volume`` is a device array, the result is one too (``out``, if given)."""
         observed, result = beside(self.rt, volume, out)
         weight = max(weight, 0.0)
         steps = np.float32(np.array(_steps(self.axis_weights)) / (weight or 1.0))
@@ -83,7 +83,7 @@ def tv_prox(
     volume: np.ndarray, weight: float, iterations: int, *, nonnegative: bool,
     axis_weights: tuple[float, ...] = (1.0, 1.0, 1.0),
 ) -> np.ndarray:
-    """Returns the proximal map of TV of a volume, float64: the twin of ``TvProx``. Its dual always starts from zeros."""
+    """Returns the proximal map of TV of a volume, float64: the NumPy twin of ``TvProx``, with a dual that starts from 0."""
     b = np.asarray(volume, np.float64)
     dual = np.zeros((b.ndim, *b.shape))
     moved = dual.copy()
@@ -94,7 +94,7 @@ def tv_prox(
         changes = differences(x, axis_weights) / weight
         q = moved + np.concatenate([time_step * changes[:-3], step * changes[-3:]])
         new = q / np.maximum(1, np.linalg.norm(q[-3:], axis=0))
-        new[:-3] = np.clip(q[:-3], -1, 1)  # differences in time are scalars, not vectors: clipped one by one
+        new[:-3] = np.clip(q[:-3], -1, 1)  # differences in time are scalars, not vectors: each is clipped by itself
         t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
         moved = new + (t - 1) / t_next * (new - dual)
         dual, t = new, t_next
@@ -123,17 +123,17 @@ def _primal_of(
 
 
 def _steps(axis_weights: tuple[float, ...]) -> tuple[float, float]:
-    """Returns the dual's steps in space and in time: 1/(upper bound of the squared norm of the differences in space, or in
-    time). For states both are halved. A common step for all differences would be short in space if the weight in time is
-    large."""
+    """Returns the dual's steps in space and in time: 1/(upper bound of the squared norm of the difference operator in space,
+    or in time). For states both steps are halved. If the weight in time is large, a common step would be too short in
+    space."""
     *time, z, y, x = axis_weights
     in_space = 1 / (4 * (z * z + y * y + x * x))
     return (in_space / 2, 1 / (8 * time[0] ** 2)) if any(time) else (in_space, 0.0)
 
 
 # TV's gradient divides by (length of differences, which may be 0) + max(_SMALLEST · RMS of the volume, _NOTHING).
-_SMALLEST = 1e-6  # relative to the RMS, so that units do not matter
-_NOTHING = 1e-30  # in 1/mm, for a volume of zeros, whose RMS is 0
+_SMALLEST = 1e-6  # (added length)/(RMS of the volume): a quotient, so that units do not matter
+_NOTHING = 1e-30  # least added length in 1/mm, for a volume of zeros, whose RMS is 0
 
 
 class TvDescent:
@@ -147,12 +147,12 @@ class TvDescent:
         self._space = DeviceSpace(rt)
 
     def gradient(self, volume: SameArray) -> SameArray:
-        """Returns dTV/d(volume), (nz, ny, nx) float32. For a device array the result is a device array."""
+        """Returns dTV/d(volume), (nz, ny, nx) float32; on the device if ``volume`` is a device array."""
         return self._where_it_is(lambda x: self._gradient(x, self._least(x)), volume)
 
     def __call__(self, volume: SameArray, step: float, count: int) -> SameArray:
-        """Returns a volume (nz, ny, nx) after ``count`` steps downhill of Euclidean length ``step``, in the volume's unit.
-        For a device array the result is a device array."""
+        """Returns a volume (nz, ny, nx) after ``count`` steps downhill, each of Euclidean length ``step`` in the volume's
+        unit. If ``volume`` is a device array, the result is one too."""
 
         def descended(x: DeviceArray) -> DeviceArray:
             least = self._least(x)
@@ -179,8 +179,8 @@ class TvDescent:
 
 
 def tv_gradient(volume: np.ndarray, least: float | None = None) -> np.ndarray:
-    """Returns the gradient of Σ |backward difference|, (nz, ny, nx): the float64 twin of ``TvDescent.gradient``. least: a
-    small number added to the length of differences; None: chosen from the volume."""
+    """Returns the gradient (nz, ny, nx) of Σ |vector of backward differences|: the float64 twin of ``TvDescent.gradient``.
+    least: a small number that is added to the vectors' lengths; None: chosen from the volume."""
     volume = np.asarray(volume, np.float64)
     least = _least_of(volume) if least is None else least
     difference = np.stack([np.diff(volume, axis=a, prepend=volume.take([0], axis=a)) for a in range(3)])
@@ -197,7 +197,7 @@ def _least_of(volume: np.ndarray) -> float:
 
 
 def tv_descent(volume: np.ndarray, step: float, count: int) -> np.ndarray:
-    """Returns a volume after ``count`` steps downhill of length ``step``: the float64 twin of ``TvDescent``."""
+    """Returns a volume after ``count`` steps down its TV, each of length ``step``: the float64 twin of ``TvDescent``."""
     result = np.array(volume, np.float64)
     least = _least_of(result)
     for _ in range(count):

@@ -1,8 +1,8 @@
-"""Optimises Gaussians by Adam (Kingma and Ba 2015), with decaying learning rates for each kind of parameter. Adaptive
-density control clones and splits Gaussians that the gradient would move most in the image, and removes faint and thin ones.
+"""Optimises Gaussians by Adam (Kingma and Ba 2015), with decaying learning rates for each kind of parameter. Density control
+clones or splits those Gaussians that the gradient would move most in the image, and removes faint and thin ones.
 
 Density control follows Kerbl et al. 2023 in R2-Gaussian's radiative form. Its statistic is the mean norm of dL/d(projected
-centre), with the centre in halves of the detector's size. A clone or split gives two Gaussians of half the density."""
+centre), with the centre in units of half the detector's size. A clone or split gives two Gaussians of half the density."""
 
 from dataclasses import dataclass
 
@@ -13,12 +13,12 @@ from phyradgs_cl.fields import Activation
 from phyradgs_cl.fields import gaussians as g
 from phyradgs_cl.runtime import DeviceArray, Runtime
 
-_RANGE = (1e-12, 10)  # least and largest learning rate: 0 could not decay by a factor, and 1e-12 moves nothing in float32
+_RANGE = (1e-12, 10)  # least and largest learning rate: 0 could not decay by a factor; 1e-12 changes no float32 parameter
 
 
 @dataclass(frozen=True)
 class Rates(checks.Checked):
-    """The (first, last) learning rate of each kind of parameter, in internal units (half-sides of the volume).
+    """The (first, last) learning rate of each kind of parameter, in internal units (half the volume's longest side).
 
     The default rates are four to ten times the published ones, which are made for 20,000 iterations and more. After 3,000
     iterations at the published rates, the PSNR is 1 to 2 dB lower (docs/results/settings.md)."""
@@ -49,10 +49,10 @@ EPSILON = 1e-15  # added to the root of the second moment, which may be 0, befor
 
 
 def folded_rates(rates: np.ndarray, step: int) -> np.ndarray:
-    """Returns the learning rates (11,) times both of Adam's bias corrections. step: the number t of the step, from 1.
+    """Returns the learning rates (11,) times the factor √(1−β2^t)/(1−β1^t) of Adam's bias corrections. step: t, from 1 on.
 
-    With the moments m and v, and m̂ and v̂ after bias correction, m̂/√v̂ = m/√v · √(1−β2^t)/(1−β1^t). The factor scales ε as
-    well, which does not matter at 1e-15."""
+    With the moments m and v, and m̂ and v̂ after bias correction, m̂/√v̂ is m/√v times this factor. The factor thus scales ε
+    in Adam's denominator too, which does not matter for an ε of 1e-15."""
     return np.asarray(rates * np.sqrt(1 - BETA2**step) / (1 - BETA1**step))
 
 
@@ -77,7 +77,7 @@ class DeviceAdam:
         self._step = rt.kernel("adam", "adam_step")
 
     def activate(self, raw: DeviceArray, parameters: DeviceArray, count: int, stride: int) -> None:
-        """Computes parameters (11, stride) from raw ones. The first ``count`` columns are Gaussians, others padding."""
+        """Computes ``parameters`` (11, stride) from ``raw``. The first ``count`` columns are Gaussians, the rest padding."""
         self.rt.launch(
             self._activate, stride // self.rt.lanes, raw, count, stride,
             np.float32(self.activation.scale_min), np.float32(self.activation.scale_max), parameters,
@@ -88,8 +88,8 @@ class DeviceAdam:
         self, raw: DeviceArray, parameters: DeviceArray, gradients: DeviceArray, statistics: DeviceArray,
         count: int, stride: int, *, density_weight: float,
     ) -> None:
-        """Turns dL/d(parameters) in ``gradients`` into dL/d(raw). Adds the gradient of ``density_weight`` times the mean
-        density there, and this iteration's part to density control's ``statistics``."""
+        """Turns dL/d(parameters) in ``gradients`` into dL/d(raw), with L extended by ``density_weight`` times the mean
+        density. Adds one frame's gradient norms to density control's ``statistics``."""
         share = 1.0 / max(count, 1)
         self.rt.launch(
             self._chain, stride // self.rt.lanes, raw, parameters, count, stride,
@@ -112,7 +112,7 @@ class DeviceAdam:
 
 @dataclass(frozen=True)
 class DensityControl(checks.Checked):
-    """When Gaussians are cloned, split and removed, and which. Lengths are in half-sides of the volume.
+    """When Gaussians are cloned, split and removed, and which. The unit of length is half the volume's longest side.
 
     ``every``: iterations between two rounds of cloning, splitting and removing; 0 keeps the first population. Rounds begin
     after ``start_iteration``, end before the fraction ``stop_fraction`` of the run, and add Gaussians up to
@@ -135,13 +135,13 @@ class DensityControl(checks.Checked):
     max_gaussians: int = checks.ranged(500_000, 1, 100_000_000)
 
     def allows(self, scale: np.ndarray) -> np.ndarray:
-        """Returns which Gaussians of scales (3, G) are not too thin, bool (G,)."""
+        """Returns which Gaussians of scales (3, G) are not too thin for ``prune_aspect``, bool (G,)."""
         if self.prune_aspect <= 0:
             return np.ones(scale.shape[1], bool)
         return np.asarray(scale.max(0) <= self.prune_aspect * scale.min(0))
 
     def is_due(self, iteration: int, iterations: int) -> bool:
-        """Returns whether Gaussians are to be cloned, split and pruned after ``iteration`` (from 1) of ``iterations``."""
+        """Returns whether a round of density control is due after ``iteration``, counted from 1, of ``iterations``."""
         inside = self.start_iteration < iteration < self.stop_fraction * iterations
         return self.every > 0 and inside and iteration % self.every == 0
 
@@ -202,8 +202,8 @@ def prune(
 
 
 def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray:
-    """Returns which statistics reach the threshold, bool (G,). If more than ``room`` do, only the ``room`` largest are
-    chosen."""
+    """Returns which numbers in ``statistic`` reach the threshold, bool (G,). If more than ``room`` do, returns only the
+    ``room`` largest."""
     chosen = statistic >= threshold
     if int(chosen.sum()) > room:
         order = np.argsort(-statistic, kind="stable")[:room]
@@ -213,7 +213,7 @@ def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray
 
 
 def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:
-    """Draws one child of each Gaussian, both (11, S): smaller, half as dense, its centre drawn from the parent's density."""
+    """Draws one child of each Gaussian, both (11, S): smaller, half as dense, with a centre drawn from its parent."""
     child: np.ndarray = rows.copy()
     child[g.MEAN] += rotate(rows[g.QUATERNION], rng.normal(size=(3, rows.shape[1])) * rows[g.SCALE])
     child[g.SCALE] /= control.split_factor

@@ -1,4 +1,4 @@
-"""States of interrupted runs: named arrays with the run's identity and a checksum, which a run checks before it resumes."""
+"""States of interrupted runs: named arrays, with the run's identity and a checksum that are checked before a run resumes."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -13,10 +13,10 @@ from phyradgs_cl.errors import InputError
 State = Mapping[str, np.ndarray]
 """The named arrays from which an interrupted run resumes. Each method has its own names."""
 RUN, _CHECKSUM = "run", "checksum"
-"""Names of the arrays that hold the identity of the run, as JSON, and the checksum of the other arrays."""
+"""Names of two arrays in a state: the identity of the run, as JSON, and the checksum of all other arrays."""
 _REMEDY = "start without --resume"
 _MOST_DIFFERENCES = 3  # an error names at most this many differences between two runs
-_LONGEST_NAME = 60  # in an error, names of differences are cut after this many characters
+_LONGEST_NAME = 60  # in an error, the name of each difference is cut to this many characters
 
 
 def with_identity(state: State, identity: Mapping[str, Any]) -> State:
@@ -28,8 +28,8 @@ def with_identity(state: State, identity: Mapping[str, Any]) -> State:
 def without_identity(
     state: State, identity: Mapping[str, Any], completed: Callable[[dict[str, Any]], dict[str, Any]]
 ) -> State:
-    """Returns the method's state as it was before ``with_identity``. completed: adds to a stored identity the defaults of
-    options that did not exist yet. Raises InputError for a damaged state, and for the state of another run."""
+    """Returns the method's state as it was before ``with_identity``. completed: adds to the identity that is stored in
+    ``state`` the defaults of newer options. Raises InputError for a damaged state, and for the state of another run."""
     arrays = {name: array for name, array in state.items() if name != _CHECKSUM}
     if not np.array_equal(state.get(_CHECKSUM, -1), _checksum(arrays)):
         raise InputError("checkpoint", "arrays that do not match their checksum", "a whole checkpoint", _REMEDY)
@@ -54,7 +54,7 @@ def _checksum(arrays: State) -> int:
 
 
 def _differences(then: object, now: object, name: str = "") -> Iterator[str]:
-    """Yields "NAME (then, now)" for every value that differs between two nested tables."""
+    """Yields "NAME (old value, now new value)" for values that differ between the nested tables ``then`` and ``now``."""
     if isinstance(then, dict) and isinstance(now, dict):
         for key in sorted({*then, *now}):
             yield from _differences(then.get(key), now.get(key), f"{name}.{key}" if name else key)

@@ -1,15 +1,15 @@
-"""Error bars of voxels: the method runs on two more scans, which are made of the first scan and its volume.
+"""Error bars of voxels: the method runs on the scan, and then on two more scans that are made from it.
 
-- Iterative methods get scans that are synthesised from the volume and the residual. How far their volumes differ from the
-  first shows the noise, other causes of the residual, and what the method does to such an object: blur, prior, missing
-  views. This is a wild bootstrap (Wu, Ann. Stat. 14 (1986) 1261): each frame's residual keeps its size and shape, but gets a
-  random sign. The second scan has the opposite signs (antithetic variables).
-- Analytic methods get every second view, and then the other half. Half the difference of both volumes has the noise of the
-  whole scan's volume, and the streaks of missing views. A synthesised scan would not show these streaks: FDK returns them
-  unchanged.
+- Iterative methods get two scans that are synthesised from the first volume and its residual. How far their volumes differ
+  from the first shows the noise, other causes of the residual, and what the method does to such an object: blur, prior,
+  missing views. This is a wild bootstrap (Wu, Ann. Stat. 14 (1986) 1261): each frame's residual keeps its size and shape,
+  but gets a random sign. The second synthesised scan has the opposite signs (antithetic variables).
+- Analytic methods get every second view, and then the other views. Half the difference of both volumes has the noise of the
+  whole scan's volume, and the streaks that missing views cause. FDK's volume of a synthesised scan would have the same
+  streaks as the first, so that the difference would not show them.
 
-The factors that turn these differences into σ come from procedural volumes (benchmarks/doubt.py), and from held-out pixels
-if there are any."""
+Factors turn these differences into σ. They were fitted to procedural volumes (benchmarks/doubt.py), and are corrected at
+held-out pixels if there are any."""
 
 import json
 import logging
@@ -40,25 +40,25 @@ from phyradgs_cl.text import without_warnings
 
 # Methods whose error bars were checked against true volumes. The laws of ``fitted_law`` come from runs of the first 3.
 MEASURED = ("fista", "fista-tv", "fdk", "asd-pocs", "cgls", "os-sart", "sart", "sirt")
-RUNS = 3  # times that the method runs: on the scan, and on two scans made from it
+RUNS = 3  # number of runs of the method: on the scan, and on two scans that are made from it
 PARTS = 2  # a voxel's side is divided into this many parts before projection, because projecting large voxels blurs
 FEWEST_FRAMES = 4  # analytic methods need this many frames: with one in each half, bars were 3 times too narrow
 _EDGE = 0.8  # standard deviation, in voxels, of the Gaussian whose derivative gives the slope of edges
-_DENSEST = 3.0  # matter denser than this many times the object's mean density counts as this dense
+_DENSEST = 3.0  # a voxel's density counts as at most this many times the object's mean density
 LEAST = 0.01  # least error bar σ of a voxel, as a fraction of the RMS of σ over the volume
-# Filter along one axis. It gives 1/4 of the slope per voxel of the spline whose mean over each voxel is the voxel's value.
+# Filter along one axis, which gives (slope per voxel)/4 of the spline whose mean over each voxel is the voxel's value.
 _SLOPES = (0.00387, -0.01443, 0.05385, -0.20096, 0, 0.20096, -0.05385, 0.01443, -0.00387)
-_KEPT = "doubt."  # prefix of the arrays that a state keeps from complete runs
+_KEPT = "doubt."  # prefix of the names of those arrays in a state that belong to complete runs
 _PARTS = {"gaussians": Gaussians, "deformation": Deformation, "states": States}
 _CHECKED_FRAMES = 16  # number of frames whose held-out pixels correct σ
-_AROUND = 9  # side in pixels of the squares over which a pixel's bar is averaged, because a bar of two samples is rough
+_AROUND = 9  # a pixel's squared error bar is averaged over a square of so many pixels a side: two runs give a rough bar
 _UNEXPLAINED = 2.0  # a residual above this many times the noise causes a warning; simulations had at most 1.2
 # A larger quotient noise/(line integrals) causes a warning: at 0.05 to 0.06, σ held 43 to 59 % of errors, not 68 %.
 _NOISY = 0.03
-_WIDEST = 4.0  # σ is widened by at most this factor: held-out pixels farther off have other causes
-# Number of views per voxel of a slice's longer side from which on a law needs no factor for few views: 25 for 64 voxels.
+_WIDEST = 4.0  # σ is multiplied by at most this factor: still larger errors of held-out pixels have other causes
+# (Number of views)/(voxels along a slice's longer side) from which on a law needs no factor for few views.
 _USUAL_VIEWS = 25 / 64
-_FEWEST_VIEWS = 0.1  # fewer views per voxel count as this many, because no law was measured there
+_FEWEST_VIEWS = 0.1  # least value of that quotient in a law's factor: no law was measured with fewer views
 _SHARE, _NORMAL_95 = 0.68, 1.96  # fraction of errors within σ; standard deviations that hold 95 % of normal noise
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
@@ -66,8 +66,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Law:
-    """Fitted factors with which ``spread`` computes σ: of its parts shape, noise, density and slope. near: the smoothing's
-    standard deviation in voxels. multiple_95: (95 % bar)/σ. sparse: how much σ grows if views are few (``factor``)."""
+    """Fitted factors of the four parts of σ whose squares ``spread`` adds: shape, noise, density, slope. near: standard
+    deviation of its smoothing in voxels. multiple_95: (95 % bar)/σ. sparse: growth of σ if views are few (``factor``)."""
 
     shape: float
     noise: float
@@ -78,13 +78,13 @@ class Law:
     sparse: float = 0.0
 
     def factor(self, views: int, grid: Grid) -> float:
-        """Returns the factor by which σ grows with only ``views`` views on ``grid``. All runs of a scan lack the same views.
-        With few views, the differences between the runs therefore show too little of what is missing."""
+        """Returns the factor, at least 1, by which σ grows with only ``views`` views on ``grid``. All runs of a scan lack
+        the same views, so that the differences between runs show too little of the errors that missing views cause."""
         of_voxel = max(views / max(grid.shape[1:]), _FEWEST_VIEWS)
         return 1 + self.sparse * max(_USUAL_VIEWS / of_voxel - 1, 0)
 
     def for_views(self, views: int, grid: Grid) -> "Law":
-        """Returns the law with shape, noise and slope times ``factor``. Density needs no factor: it multiplies their sum."""
+        """Returns the law with shape, noise and slope times ``factor``. ``density`` stays: it multiplies the others' sum."""
         factor = self.factor(views, grid)
         return replace(self, shape=factor * self.shape, noise=factor * self.noise, slope=factor * self.slope)
 
@@ -97,11 +97,11 @@ def fitted_law(kind: str) -> Law:
 def spread(first: Array, second: Array, third: Array, law: Law) -> Array:
     """Returns the error bar σ (nz, ny, nx) of the first of three volumes, or of the first of three images.
 
-    The mean difference of the second and third from the first is what the method does to the object. Half the difference
-    between the second and third is noise, which has opposite signs in them. The squares of both, smoothed over ``near``
-    voxels, are weighted by ``shape``² and ``noise``². Dense matter may have texture that all three lack: it gets
-    ``density``² of the object's mean variance, in proportion to its density. Edges may be blurred in all three: they get
-    ``slope``² times the squared change of density per voxel. σ is at least a hundredth of its RMS."""
+    (second + third)/2 − first is what the method does to the object. (second − third)/2 is noise, which has opposite signs
+    in the two. The squares of both, smoothed over ``near`` voxels, are weighted by ``shape``² and ``noise``². Dense matter
+    may have texture that all three lack: it gets ``density``² of the object's mean variance, in proportion to its density.
+    Edges may be blurred in all three: they get ``slope``² times the squared change of density per voxel. σ is at least a
+    hundredth of its RMS over the volume."""
     one, two = (other.astype(np.float64) - first for other in (second, third))
     shape, noise = (scipy.ndimage.gaussian_filter(part**2 / 4, law.near) for part in (one + two, one - two))
     variance = law.shape**2 * shape + law.noise**2 * noise
@@ -115,9 +115,9 @@ def spread(first: Array, second: Array, third: Array, law: Law) -> Array:
 
 
 def finer(volume: Array) -> NDArray[np.float32]:
-    """Returns a volume (nz, ny, nx) on voxels of half the side. The eight parts of an old voxel have its value as mean.
+    """Returns a volume (nz, ny, nx) on voxels of half the side. The mean of the eight parts of a voxel is the voxel's value.
 
-    Along an axis, the two halves of a voxel are means of a spline that has the means of all voxels (histospline)."""
+    Along an axis, both halves of a voxel are means of a spline whose mean over the voxel is its value (histospline)."""
     for axis in range(3):
         half = scipy.ndimage.correlate1d(volume, _SLOPES, axis, mode="nearest")
         halves = np.stack([volume - half, volume + half], axis + 1)
@@ -128,9 +128,9 @@ def finer(volume: Array) -> NDArray[np.float32]:
 def halves(scan: Scan) -> tuple[Array, Array]:
     """Returns the frame numbers of both halves of a scan: every second view in the order of angles, and the others.
 
-    Views of one angle go to the same half: if both halves had them, their streaks would not differ. Frames are divided in
-    the order of time if there are fewer than 4 angles, or if the orbit travels along the axis: each turn then sees another
-    height."""
+    Views of one angle go to the same half: if both halves had this angle, their streaks would not differ. Every second frame
+    in the order of time is taken if there are fewer than 4 angles, or if the orbit travels along the axis, since each turn
+    then sees another height."""
     pose = middle_poses(scan)
     view, angles_rad = distinct_views(azimuth_rad(pose))
     if len(angles_rad) < FEWEST_FRAMES or travels(pose[:, None, None], scan.projections.shape[1], scan.is_parallel):
@@ -140,9 +140,9 @@ def halves(scan: Scan) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Doubter:
-    """Runs a method three times, and computes error bars from the results. scan: what the method sees. whole: the scan with
-    its held-out pixels. hidden: bool (F, rows, columns), marks these pixels. deformation: how the object moves. kind:
-    ``iterative`` or ``analytic``, as in ``fitted_law``."""
+    """Runs a method three times, and computes error bars from the results. scan: the scan without its held-out pixels.
+    whole: the scan with them. hidden: bool (F, rows, columns), True at held-out pixels; None: there are none. deformation:
+    how the object moves. seed: draws the signs of residuals. kind: ``iterative`` or ``analytic``, as in ``fitted_law``."""
 
     rt: Runtime
     scan: Scan
@@ -153,13 +153,13 @@ class Doubter:
     kind: str = "iterative"
 
     def run(self, once: Callable[..., Reconstruction], report: Report, resume: State | None) -> Reconstruction:
-        """Returns the method's result with ``doubt``. once: runs the method on a scan, from a state or from the start.
-        resume: the state of the run that was interrupted."""
+        """Returns the method's result with ``doubt``, or a partial result after an interruption. once: runs the method on a
+        scan, from a state or, with None, from the start. resume: the state of an interrupted ``run``."""
         arrays = dict(resume or {})
         results = _restored({name: arrays.pop(name) for name in list(arrays) if name.startswith(_KEPT)}, self.scan.grid)
         while len(results) < RUNS:
             scan = self.scan_of_run(results[0], len(results)) if results else self.scan
-            half = without_warnings() if results and self.kind == "analytic" else nullcontext()  # half the views have gaps
+            half = without_warnings() if results and self.kind == "analytic" else nullcontext()  # FDK warns of half scans
             with report.through(partial(_counted, results=results)), half:
                 result = once(scan, arrays or None)
             if result.state is not None:
@@ -168,9 +168,9 @@ class Doubter:
         return self.finished(results)
 
     def scan_of_run(self, result: Reconstruction, number: int) -> Scan:
-        """Returns the scan of run ``number`` 1 or 2: a half of the frames for an analytic method, else a synthesised one.
+        """Returns the scan for run ``number``, 1 or 2: half of the frames for an analytic method, else a synthesised scan.
 
-        A synthesised frame is the volume's projection plus the residual with a random sign. Run 2 has the opposite signs."""
+        A synthesised frame is ``result``'s projection, plus its residual with a random sign, which is opposite in run 2."""
         if self.kind == "analytic":
             return some_frames(self.scan, halves(self.scan)[number - 1])
         frames, sums = np.zeros(self.scan.projections.shape, np.float32), np.zeros(5)
@@ -188,8 +188,8 @@ class Doubter:
         return replace(self.scan, projections=self.rt.ranks.bcast(frames))
 
     def _pairs(self, result: Reconstruction, count: int) -> Iterator[FramePair]:
-        """Yields ``count`` measured frames, each with the frame computed from a result's volume on finer voxels
-        (``finer``)."""
+        """Yields ``count`` evenly spread measured frames, each with the frame computed from the result's volume on voxels of
+        half the side (``finer``)."""
         chosen, moves = spread_frames(self.whole.frames, count), result.moves or self.deformation
         volume, grid = finer(result.volume), result.grid.finer(PARTS)
         if isinstance(moves, States):
@@ -198,7 +198,7 @@ class Doubter:
             yield from frame_pairs(self.rt, self.whole, volume, grid, chosen[at : at + FRAMES_AT_A_TIME], moves)
 
     def finished(self, results: list[Reconstruction]) -> Reconstruction:
-        """Returns the first run's result with σ, facts about σ, and the seconds of all runs."""
+        """Returns the first run's result with σ, facts about σ and the seconds of all runs; unchanged if all runs agree."""
         law, first = fitted_law(self.kind).for_views(self.scan.frames, self.scan.grid), results[0]
         if all(np.array_equal(first.volume, other.volume) for other in results[1:]):
             log.warning("all three runs have the same volume: there are no error bars; give the method more iterations")
@@ -238,17 +238,17 @@ class Doubter:
 
 
 def widening(errors: Array, noise: Array, bars: Array) -> float:
-    """Returns the factor of ``bars`` (n,), at least 1, with which 68 % of the errors (n,) would be within noise and bars
-    together. Two standard errors of this fraction are allowed: where bars are far below the noise, chance alone would
-    multiply them."""
+    """Returns the factor k ≥ 1 of ``bars`` (n,) with which 68 % of the errors (n,) have |error| ≤ √(noise² + k² bar²). The
+    fraction may lie two of its standard errors below 68 %, because chance alone would otherwise widen bars that are far
+    below the noise."""
     share = _SHARE - 2 * np.sqrt(_SHARE * (1 - _SHARE) / len(errors))
     ratios = (errors**2 - noise**2) / np.maximum(bars, 1e-30) ** 2
     return float(np.sqrt(max(np.quantile(ratios, max(share, 0.0)), 1.0)))
 
 
 def _warn_of(residual_square: float, noise_square: float, square: float, mean: float) -> None:
-    """Warns if error bars may be too narrow. Takes means over the valid pixels: of the squares of residual, noise and line
-    integrals, and of the size of line integrals."""
+    """Warns if error bars may be too narrow. The arguments are means over the valid pixels of residual², noise², (line
+    integral)² and |line integral|."""
     unexplained, noisy = (residual_square / noise_square) ** 0.5, noise_square**0.5 / (square / mean)
     if unexplained > _UNEXPLAINED:
         text = "the volume leaves %.3g times the noise of the projections unexplained: error bars hold what causes that in "
@@ -260,7 +260,7 @@ def _warn_of(residual_square: float, noise_square: float, square: float, mean: f
 
 
 def _counted(progress: Progress, results: list[Reconstruction]) -> Progress:
-    """Returns progress that counts the iterations of all runs together. Later runs show the volume of the first."""
+    """Returns progress that counts the iterations of all runs together. It always shows the volume of the first run."""
     done, each = progress.iteration + len(results) * progress.iterations, RUNS * progress.iterations
     progress = progress.mapped(state=lambda state: {**state, **_kept(results)}, iteration=done, iterations=each)
     if not results:
@@ -272,14 +272,14 @@ def _counted(progress: Progress, results: list[Reconstruction]) -> Progress:
 
 
 def _interrupted(result: Reconstruction, results: list[Reconstruction]) -> Reconstruction:
-    """Returns the first run's result, with the state of the interrupted run and of the complete runs before it."""
+    """Returns the first run's result, with a state of the interrupted run ``result`` and of the complete runs before it."""
     first, run = (*results, result)[0], {"interrupted_in_run": f"{len(results) + 1} of {RUNS}"}
     facts = {**first.facts, "interrupted_at": result.facts["interrupted_at"], DOUBT: run}
     return replace(first, state={**(result.state or {}), **_kept(results)}, facts=facts)
 
 
 def _kept(results: list[Reconstruction]) -> State:
-    """Returns what a state keeps of complete runs: all parts of the first one, volume and seconds of the others."""
+    """Returns the arrays by which a state keeps complete runs: all parts of the first, volume and seconds of the others."""
     if not results:
         return {}
     first, seconds = results[0], [one.facts["seconds"] for one in results]

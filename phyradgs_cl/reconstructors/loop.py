@@ -1,7 +1,7 @@
 """The loop of every iterative method: progress, convergence record, Ctrl-C, stopping, resuming.
 
-A method is a class with the attributes of ``Stepwise``. ``Loop`` runs it, in one process or in ranks (MPI processes) that do
-the same."""
+A method is a class with the attributes of ``Stepwise``. ``Loop`` runs the method in one process, or in several ranks (MPI
+processes), which all take the same steps."""
 
 import json
 import time
@@ -17,21 +17,21 @@ from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport
 from phyradgs_cl.signals import stop_on_interrupt
 
-SILENT_S = 10.0  # longest time in s between two reports of a run with slow iterations
+SILENT_S = 10.0  # if its last report is this many seconds old, a run in one process reports its next finished iteration
 
 
 class Stepwise(Protocol):
-    """What ``Loop`` needs of an iterative method between its start and its result. iterations: how many a whole run has."""
+    """The interface by which ``Loop`` runs an iterative method. iterations: the number of iterations of a complete run."""
 
     iterations: int
 
     @property
     def quantity(self) -> str:
-        """The name of the measure of convergence, ``loss`` or ``residual``, which must stay finite."""
+        """The name of the measure of convergence in ``measures``, ``loss`` or ``residual``. Its value must stay finite."""
 
     @property
     def remedy(self) -> str:
-        """Advice for the error that is raised if ``quantity`` is not finite."""
+        """The advice in the error that ``Loop`` raises if the value of ``quantity`` is not finite."""
 
     @property
     def iteration(self) -> int:
@@ -44,13 +44,13 @@ class Stepwise(Protocol):
     def step(self) -> None: ...
 
     def measures(self) -> Mapping[str, float]:
-        """Returns the numbers of a line of the convergence record: ``quantity`` and others, by name."""
+        """Returns, by name, the numbers for a line of the convergence record. One of the names is ``quantity``."""
 
     def state(self) -> dict[str, np.ndarray]:
         """Returns the arrays from which ``restore`` continues with the next step."""
 
     def restore(self, state: State) -> None:
-        """Restores what ``state`` returned. Raises InputError for a state that this run cannot have written."""
+        """Restores the method from arrays that ``state`` returned. Raises InputError for arrays of another run."""
 
     def present_volume(self) -> tuple[np.ndarray, Grid]:
         """Returns the present volume (nz, ny, nx) in 1/mm, and its grid in mm."""
@@ -59,9 +59,9 @@ class Stepwise(Protocol):
 class Loop:
     """Runs a method to its end, an interruption, or its own reason to stop, and records its convergence.
 
-    stopped_by: ``iterations``, ``interrupt``, or the method's reason. record_every, report_every: number of iterations
-    between lines of the record, and between reports, which come sooner if iterations are slow. started: the
-    ``time.perf_counter`` from which seconds count."""
+    stopped_by: ``iterations``, ``interrupt``, or the text of the method's ``finished``. record_every: iterations from one
+    line of the record to the next. report_every: iterations from one report to the next; slow runs report sooner. started:
+    the value of ``time.perf_counter`` from which seconds count."""
 
     def __init__(
         self, method: Stepwise, ranks: Communicator, report: ProgressReport, started: float,
@@ -75,8 +75,8 @@ class Loop:
         self._reported = time.perf_counter()
 
     def run(self, resume: State | None) -> None:
-        """Makes all steps, or all that follow the state ``resume``. Ctrl-C, or a report that raises KeyboardInterrupt, ends
-        the run after the present step, unless that is the last."""
+        """Takes all steps of the method, or those that follow the state ``resume``. Ctrl-C, or a report that raises
+        KeyboardInterrupt, ends the run after the present step, unless that step is the last."""
         method = self.method
         if resume is not None:
             method.restore(resume)
@@ -110,10 +110,10 @@ class Loop:
         return self.state() if self.stopped_by == "interrupt" else None
 
     def _tell(self, before: int) -> bool:
-        """Records and reports the step that began at iteration ``before``. Returns True if the report asks to stop. Raises
-        NumericalError if the method's ``quantity`` is not finite."""
+        """Records and reports the step that began at iteration ``before``, where these are due. Returns True if the report
+        raises KeyboardInterrupt. Raises NumericalError if the value of the method's ``quantity`` is not finite."""
         is_recorded = self._reaches(self.record_every, before)
-        is_slow = time.perf_counter() - self._reported > SILENT_S and self.ranks.size == 1  # ranks have clocks of their own
+        is_slow = time.perf_counter() - self._reported > SILENT_S and self.ranks.size == 1  # clocks of ranks differ
         is_reported = self._reaches(self.report_every, before) or (is_slow and self.method.iteration > before)
         if not (is_recorded or is_reported):
             return False
@@ -138,6 +138,6 @@ class Loop:
         return False
 
     def _reaches(self, every: int, before: int) -> bool:
-        """Returns whether the step that began at ``before`` reached a multiple of ``every``, or the last iteration."""
+        """Returns whether the step that began at iteration ``before`` reached a multiple of ``every``, or the run's end."""
         now = self.method.iteration
         return now // every > before // every or now == self.method.iterations

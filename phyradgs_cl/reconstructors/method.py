@@ -57,9 +57,9 @@ class OwnOptions:
 
 
 def own_method(name: str, function: Any) -> Method:
-    """Returns a user's function as a method, with the defaults of its options' class.
+    """Returns a user's function as the method ``name``. Its default options have the defaults of their class.
 
-    Raises InputError for anything but a function (scan, options, rt, …), and for options that lack a default."""
+    Raises InputError for anything but a function (scan, options, rt, …), and for a class with options without a default."""
     subject = f"--method {name}"
     try:
         parameters = inspect.signature(function).parameters
@@ -89,7 +89,7 @@ def own_method(name: str, function: Any) -> Method:
 
 def imported(text: str, subject: str = "--method") -> Any:
     """Imports the object ``package.module:name`` and returns it. Modules in the present folder are found too, as by ``python
-    -m``. Raises InputError, which names ``subject``, if the import fails."""
+    -m``. Raises InputError about ``subject`` if the module or the object cannot be imported."""
     module, _, name = text.partition(":")
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
@@ -108,7 +108,7 @@ def imported(text: str, subject: str = "--method") -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Returns a value that JSON can hold: numbers and texts unchanged, mappings of such values, the repr of all others."""
+    """Returns ``value`` as JSON can hold it: numbers, texts and None unchanged, mappings value by value, else its repr."""
     if isinstance(value, Mapping):
         return {key: _plain(one) for key, one in value.items()}
     return value if isinstance(value, int | float | str | None) else repr(value)
@@ -140,7 +140,7 @@ def _result(subject: str, made: object, scan: Scan) -> Reconstruction:
 
 
 class _Methods(UserDict[str, Any]):
-    """Methods by name. Each is imported when it is first used, because imports take time."""
+    """The methods by name. Each method is imported at its first use, because imports take time."""
 
     def __getitem__(self, name: str) -> Method:
         entry = self.data[name]
@@ -188,7 +188,7 @@ def method_name(method: object) -> str:
 
 def check_able(option: str, method: object, ability: str, kind: str, remedy: str = "choose one of them") -> None:
     """Raises InputError about ``option`` if the method lacks ``ability``, a field of ``Method``, which the option needs.
-    kind: what the error calls the methods that have the ability."""
+    kind: what the error calls methods with this ability. remedy: the error's advice."""
     if not getattr(method_of(method), ability):
         names = ", ".join(name for name, one in METHODS.items() if getattr(one, ability))
         raise InputError(option, f"--method {method_name(method)}", f"{kind}: {names}", remedy)

@@ -23,7 +23,7 @@ def reconstruct_neural(
     scan: Scan, options: NeuralOptions, rt: Runtime, *, method: str, seed: int = 0,
     report: ProgressReport = ignore_progress, resume: State | None = None,
 ) -> Reconstruction:
-    """Returns the volume of a neural field fitted to a scan. The seed draws first parameters, frames, pixels and samples.
+    """Returns the volume of a neural field fitted to a scan. ``seed`` sets the random parameters, frames, pixels, samples.
 
     ``rt`` computes the FDK volume that sets the unit of attenuation; PyTorch does the rest. ``resume`` continues an
     interrupted run of the same scan and options from its state. Raises InputError where PyTorch is not installed, and

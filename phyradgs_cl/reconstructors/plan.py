@@ -22,12 +22,12 @@ from phyradgs_cl.removed import refuse_removed
 from phyradgs_cl.text import flag_of, suggest_name
 
 _COUNTS = tuple(dict.fromkeys(f.name for model in MODELS for f in fields(model) if f.init))
-"""Fields of motion models, such as the number of times per line, which are also options, under the same names."""
+"""Names of motion models' fields, such as the number of times per line, which are also names of options."""
 _ALL = motions_for(RAYS, SPLATS)  # a user's own method may take any motion model
 LARGEST_SEED = 2**63
-_DECIMALS = 6  # decimals of mm and s in a run's identity: a scan keeps its identity when it is stored and read
+_DECIMALS = 6  # a run's identity rounds mm and s to this many decimals, so that it stays when a scan is stored and read
 _SUBJECT = "--object-motion"
-_MOST_VOXELS = 24  # most voxels a side of the grid on which a deformation is checked: deformations are smooth
+_MOST_VOXELS = 24  # most voxels along a side of the grid on which a deformation is checked; deformations are smooth
 _LEAST_DETERMINANT = 0.05  # a deformation w(y) with a smaller det(I + ∂w/∂y) is refused: at 0 matter folds
 _LEAST_COVERED = 0.5  # a deformation that covers less than this fraction of the scan's time is refused
 _MOSTLY_COVERED = 0.98  # a deformation that covers less than this fraction of the scan's time causes a warning
@@ -70,7 +70,7 @@ def preprocessing_of(changes: Mapping[str, Any]) -> Preprocessing:
 
 
 def _models(options: Any) -> dict[str, Any]:
-    """Returns by name the motion models that a method's options allow. The options' own model keeps its strips and times."""
+    """Returns by name the motion models that ``options`` allow; the model that is set in ``options`` with its settings."""
     own = [options.motion] if hasattr(options.motion, "name") else []
     return {model.name: model for model in (*getattr(options, "MOTIONS", _ALL), *own)}
 
@@ -80,8 +80,8 @@ def _has(model: Any, count: str) -> bool:
 
 
 def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> Motion:
-    """Returns the motion model named ``motion``, with the numbers of strips and times in ``counts``, or the user's own
-    model. Raises InputError for an unknown name, and for numbers that the model lacks."""
+    """Returns the motion model named ``motion``, with the numbers of strips and times in ``counts``; ``motion`` itself if it
+    is the user's own model. Raises InputError for an unknown name, and for numbers that the model lacks."""
     if callable(getattr(motion, "cells", None)) and not counts:
         return motion
     models = _models(options)
@@ -105,8 +105,8 @@ def _motion(method: str, options: Any, motion: Any, counts: dict[str, Any]) -> M
 
 
 def _implied_motion(usual: str, counts: Mapping[str, Any], models: Mapping[str, Any]) -> str:
-    """Returns the name of the usual model if it takes the given numbers of strips and times, else the only other model that
-    does. A method that is usually static stays static unless ``motion`` is given."""
+    """Returns the name of the model that takes the numbers of strips and times in ``counts``: ``usual`` if it does, else the
+    only model that does, else ``usual``. A static ``usual`` is always returned: only an explicit ``motion`` replaces it."""
     if usual.startswith("static") or all(_has(models[usual], key) for key in counts):
         return usual
     having = [name for name, m in models.items() if m.is_implied and all(_has(m, key) for key in counts)]
@@ -120,7 +120,7 @@ def _motion_options(options: Any) -> list[str]:
 
 
 def _changed(options: Any, changes: Mapping[str, Any], subject: str) -> Any:
-    """Returns ``options`` with ``changes`` by field name. subject: the method or table that an error names."""
+    """Returns ``options`` with ``changes`` by field name. subject: what the InputError for a wrong name or value names."""
     known = {f.name: getattr(options, f.name) for f in fields(options) if f.name != "motion"}
     values: dict[str, Any] = {}
     for key, value in changes.items():
@@ -184,7 +184,7 @@ _EXPECTED: dict[type, tuple[str, Callable[[Any], bool]]] = {
 
 @dataclass(frozen=True, eq=False)
 class InitialVolume:
-    """A volume (nz, ny, nx) in 1/mm from which a method starts, and its grid. facts: the file from which it came."""
+    """A volume (nz, ny, nx) in 1/mm from which a method starts, and its grid. facts: the file from which the volume came."""
 
     values: np.ndarray
     grid: Grid
@@ -253,7 +253,7 @@ def _geometry(scan: Scan) -> Iterator[np.ndarray]:
     yield np.round(scan.frame_start_s, _DECIMALS)
     span_s = np.array([0.0, scan.shutter.span_s])
     for frame, start_s in enumerate(scan.frame_start_s):
-        yield np.round(scan.trajectory.pose(frame, start_s + span_s), _DECIMALS) + 0.0  # + 0.0 makes a 0 of a -0
+        yield np.round(scan.trajectory.pose(frame, start_s + span_s), _DECIMALS) + 0.0  # adding 0.0 turns -0 into 0
 
 
 def _deformation_digest(one: Deformation) -> str:
@@ -272,10 +272,10 @@ def plan_run(
     seed: int = 0, initial: InitialVolume | None = None, object_motion: ObjectMotion | None = None,
     of_preprocessing: Collection[str] = (),
 ) -> RunPlan:
-    """Returns the plan of a run: the method's preset with changes ``values``, by name.
+    """Returns the plan of a run. values: options of the method, which change its ``preset``, and of the preprocessing.
 
-    A name that both the method and the preprocessing have is the method's, except for names in ``of_preprocessing``. Raises
-    InputError for a method, preset, option or value that does not exist."""
+    A name that both have is taken as the method's option, unless ``of_preprocessing`` contains it. Raises InputError for an
+    unknown method, preset or option, and for a value that an option does not take."""
     own, base = dict(values or {}), preset_of(method, preset)
     names = [f.name for f in fields(Preprocessing) if f.name in of_preprocessing or not hasattr(base, f.name)]
     preprocessing = preprocessing_of({name: own.pop(name) for name in names if name in own})
@@ -286,7 +286,7 @@ def plan_run(
 
 def check_object_motion(deformation: Deformation, scan: Scan) -> None:
     """Raises InputError for a deformation whose position, times or unit do not fit the scan, and for one that folds matter
-    or compresses it to nothing."""
+    or compresses it to nothing. Logs a warning if its times leave out part of the scan."""
     _check_times(deformation, scan)
     grid = scan.grid.in_shape(triple(min(n, _MOST_VOXELS) for n in scan.grid.shape))
     if not deformation.control_mm.any():

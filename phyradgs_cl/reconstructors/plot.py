@@ -26,11 +26,11 @@ def plot_result(
     volume: np.ndarray, grid: Grid, record: list[dict[str, float]], scan: Scan | None, frame: int,
     device: str | Runtime | None, note: str, moves: Deformation | States | None = None
 ) -> "Figure":
-    """Returns a figure of a volume's middle slices, the convergence record and, with a scan, frame ``frame`` and its
-    residual.
+    """Returns a figure of the middle slices of a volume (nz, ny, nx) in 1/mm, of the convergence ``record`` and, with a
+    scan, of frame number ``frame`` and its residual. A reference of the scan is added if it can be brought onto ``grid``.
 
-    note: text added to the residual's title. moves: how the object moves or changes, for the residual. Raises InputError for
-    a scan that is no Scan, and for a frame out of range."""
+    device: projects the volume for the residual. note: text added to the residual's title. moves: how the object moves or
+    changes. Raises InputError for a scan that is no Scan, and for a frame out of range."""
     if not (scan is None or isinstance(scan, Scan)):
         raise InputError("scan", checks.short_repr(scan), "the Scan of the result, or None")
     truth = None
@@ -62,7 +62,7 @@ def plot_result(
 
 
 def _draw_record(axes: "Axes", record: list[dict[str, float]]) -> None:
-    """Draws the residual, or else the loss, over the iterations; nothing if the record has fewer than two lines."""
+    """Draws the record's residual, or its loss if it has none, over the iterations; nothing for fewer than two lines."""
     name = next((key for key in ("residual", "loss") if record and key in record[-1]), None)
     if name is None or len(record) < 2:
         axes.set_axis_off()

@@ -26,11 +26,11 @@ _DOUBT = "Run twice more, for an error bar of every voxel: dataset doubt of the 
 
 @dataclass(frozen=True)
 class Preprocessing(PrepareOptions, GridChoice):
-    """What happens to a scan before the method.
+    """Options of what happens to a scan before the method reconstructs it.
 
     - size, voxel_mm, roi_mm, margin_mm: the grid, as in ``GridChoice``. ignore_lag: leave the panel's lag in the frames.
     - holdout: percentage of the pixels that the method does not use, to measure its error on them.
-    - doubt: run the method on two more scans, made from this one, for error bars of voxels.
+    - doubt: run the method also on two scans that are made from this one, for error bars of voxels.
     - steps, and a table for each: as in ``PrepareOptions``."""
 
     ignore_lag: bool = False
@@ -48,7 +48,7 @@ class Preprocessing(PrepareOptions, GridChoice):
         return {**stated, **self.step_facts()}
 
     def check_written(self) -> None:
-        """Raises InputError for ``holdout`` and ``doubt``, which mean nothing for a scan that is written to a file."""
+        """Raises InputError if ``holdout`` or ``doubt`` is set: both need a method, but the scan is only to be written."""
         for one in (one for one in fields(self) if "of_method" in one.metadata and getattr(self, one.name)):
             found, remedy = "a scan that is prepared, without a method", "give it to the reconstruction instead"
             raise InputError(flag_of(one.name), found, "a reconstruction", remedy)
@@ -56,28 +56,28 @@ class Preprocessing(PrepareOptions, GridChoice):
 
 @each_warning_once()
 def prepared(scan: Scan, options: Preprocessing, rt: Runtime | None = None) -> Scan:
-    """Returns the scan for a method, on a grid with its margin; the scan itself if there is nothing to do.
+    """Returns the prepared scan, on the grid of ``options`` with its margin; the scan itself if there is nothing to do.
 
-    ``rt``: the device for steps that reconstruct and project, which raise InputError without one."""
+    ``rt``: the device for the steps that reconstruct and project. These steps raise InputError if ``rt`` is None."""
     return prepare(regrid_and_remove_lag(scan, options), options, partial(reprojection, rt))
 
 
 def stages(scan: Scan, options: Preprocessing, rt: Runtime) -> Iterator[tuple[str, Scan, Facts]]:
-    """Yields (name, scan, numbers): the scan before the steps of ``options``, then each step's name, result and numbers."""
+    """Yields (name, scan, numbers): ("", scan before the steps of ``options``, {}), then each step's name, scan, numbers."""
     scan = regrid_and_remove_lag(scan, options)
     yield "", scan, {}
     yield from one_by_one(scan, options, partial(reprojection, rt))
 
 
 def regrid_and_remove_lag(scan: Scan, options: Preprocessing) -> Scan:
-    """Returns the scan on its grid with its margin, and without lag unless the options leave it in."""
+    """Returns the scan on the grid of ``options`` with its margin, and without the panel's lag unless ``ignore_lag``."""
     scan = scan.with_grid(options)
     scan = scan.on_grid(options.with_margin(scan.grid))
     return scan if options.ignore_lag else without_lag(scan)
 
 
 def reprojection(rt: Runtime | None, scan: Scan) -> Model:
-    """Returns the reconstructions and projections that ``prepare`` calls. FDK takes each line at its mid-exposure."""
+    """Returns the functions with which ``prepare`` reconstructs and projects frames. Raises InputError if ``rt`` is None."""
     if rt is None:
         raise InputError("--steps", "a step that reconstructs, without a device", "a Runtime", "pass one")
     from phyradgs_cl.operators import RayOperator  # imported here because methods are slow to import
@@ -98,7 +98,7 @@ def reprojection(rt: Runtime | None, scan: Scan) -> Model:
         moving = with_times(PerRow(), scan)
         cells = [moving.cells(scan, frame) for frame in range(scan.frames)]
         whole = RayOperator(rt, scan.grid, scan.geometry.detector_shape, cells, subrays=subrays_of(scan.grid, cells))
-        near = scipy.ndimage.binary_dilation(inside)  # so that rays count that graze a voxel, or meet it between two times
+        near = scipy.ndimage.binary_dilation(inside)  # rays that graze a voxel, or meet it between two times, count too
         return whole.forward(near.astype(np.float32)) > 0
 
     return Model(

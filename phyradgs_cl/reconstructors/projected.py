@@ -1,7 +1,7 @@
 """Computes frames from a volume to compare them with the measured frames, also at held-out pixels.
 
 Held-out pixels measure quality without a true volume, by cross-validation over pixels (Golub, Heath and Wahba, Technometrics
-21 (1979) 215, for one parameter). They are the same for all methods, options and seeds, so that errors can be compared."""
+21 (1979) 215, for one parameter). All methods, options and seeds hold out the same pixels, to make errors comparable."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.operators.warp.operator import projector_of
 from phyradgs_cl.runtime import Runtime
 
-TIMES_PER_LINE = 16  # number of times of a line's exposure at which it is projected: the error is then far below the noise
+TIMES_PER_LINE = 16  # a line is projected at this many times of its exposure: the error is then far below the noise
 _HOLDOUT_SEED = 20  # seed that draws the held-out pixels, the same in all runs
 FRAMES_AT_A_TIME = 8  # frames are projected in groups of at most this many, to limit memory
 Image = NDArray[np.float32]
@@ -26,7 +26,8 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """A measured frame and the same frame computed from a volume: line integrals (rows, columns), 0 where not ``valid``."""
+    """Frame number ``frame`` as measured, and as computed from a volume: line integrals (rows, columns), 0 where not valid.
+    valid: bool (rows, columns)."""
 
     frame: int
     measured: Image
@@ -40,7 +41,7 @@ class FramePair:
 
     @property
     def rms(self) -> float:
-        """Root mean square of the residual over the valid pixels."""
+        """Root mean square of the residual over the valid pixels, dimensionless; 0 without valid pixels."""
         return _rms(self.residual[self.valid])
 
     @property
@@ -63,10 +64,9 @@ def frame_pairs(
     rt: Runtime, scan: Scan, volume: np.ndarray, grid: Grid, frames: Sequence[int],
     moves: Deformation | States | None = None,
 ) -> list[FramePair]:
-    """Returns the frames of a scan with those computed from a volume (nz, ny, nx) in 1/mm, under the motion of gantry and
-    object (``moves``). If ``moves`` is States, their volumes are used in place of ``volume``.
-
-    If the detector averages intensity, so do the computed frames."""
+    """Returns the ``frames`` of a scan, each with the frame computed from a volume (nz, ny, nx) in 1/mm, under the motions
+    of the gantry and of the object (``moves``). If ``moves`` is States, their volumes are used in place of ``volume``. If
+    the scan's detector averages intensity, so do the computed frames."""
     motion = PerRow(sub_intervals=TIMES_PER_LINE)
     tables = [motion.cells(scan, frame) for frame in frames]
     if isinstance(moves, States):
@@ -87,8 +87,8 @@ def frame_pairs(
 
 
 def held_out(scan: Scan, percent: float) -> np.ndarray:
-    """Draws about ``percent`` % of the valid pixels, bool (F, v, u), the same in every run. Raises InputError if it draws
-    none."""
+    """Returns about ``percent`` % of the valid pixels, drawn at random but the same in every run, as bool (F, v, u). Raises
+    InputError if no pixel is drawn."""
     drawn = np.random.default_rng(_HOLDOUT_SEED).random(scan.projections.shape, np.float32) < percent / 100
     held: np.ndarray = drawn & scan.valid
     if not held.any():
@@ -100,8 +100,8 @@ def holdout_errors(
     rt: Runtime, scan: Scan, held: np.ndarray, volume: np.ndarray, grid: Grid,
     moves: Deformation | States | None = None,
 ) -> dict[str, float]:
-    """Returns by name: the RMS residual of a volume (nz, ny, nx) in 1/mm at held-out pixels (F, v, u), the noise of these
-    pixels, and their number.
+    """Returns by name: the RMS residual of a volume (nz, ny, nx) in 1/mm at held-out pixels ``held``, bool (F, v, u), the
+    RMS noise of these pixels, and their number.
 
     Residual and noise are dimensionless, as line integrals are. A perfect volume would leave the noise as its residual."""
     squares = 0.0

@@ -28,20 +28,20 @@ VolumeMap = Callable[[np.ndarray, Grid], tuple[np.ndarray, Grid]]
 HELD_OUT = "held_out"
 """Key of a result's facts: the errors on held-out pixels, as ``holdout_errors`` returns them."""
 COMPARED = "compared"
-"""Key of facts: how the volume was compared with the scan's reference, if not voxel by voxel."""
+"""Key of a result's facts: how the volume was compared with the scan's reference, if not voxel by voxel."""
 MOTION_FOUND = "motion_found"
-"""Key of facts: what a method has found about the motion of the object."""
+"""Key of a result's facts: what a method has found about the motion of the object."""
 MARGIN_MM = "margin_mm"
-"""Key of facts: the width (z, y, x) in mm of the margin around the volume that was reconstructed and discarded."""
+"""Key of a result's facts: the width (z, y, x) in mm of the margin around the volume, reconstructed and discarded."""
 DOUBT = "doubt"
-"""Key of facts about the error bars, or about which of their runs was interrupted."""
+"""Key of a result's facts about its error bars, or about which of the runs for error bars was interrupted."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Reconstruction:
     """A volume (nz, ny, nx) float32 in 1/mm on ``grid``, whose lengths are in mm.
 
-    - gaussians: the cloud in mm, for methods that have one. record: the convergence record, one dict per line.
+    - gaussians: the Gaussians in mm of a splatting method. record: the convergence record, one dict per line.
     - facts: what is needed to repeat the reconstruction (method, options, scales), and its seconds.
     - state: the arrays from which an interrupted run resumes.
     - deformation: how the object moves, for ``moving``, whose volume is its reference state.
@@ -78,7 +78,7 @@ class Reconstruction:
 
     @property
     def moves(self) -> Deformation | States | None:
-        """How the object moves, or changes, as the method has found it."""
+        """How the object changes (``states``) or moves (``deformation``), as the method found it; None without both."""
         return self.deformation if self.states is None else self.states
 
     @property
@@ -97,7 +97,7 @@ class Reconstruction:
         return f", stopped after {done} of {asked} iterations ({reason})"
 
     def complete(self) -> "Reconstruction":
-        """Returns the result. Raises KeyboardInterrupt if the run was interrupted, so that no part passes for the whole."""
+        """Returns the result. Raises KeyboardInterrupt if the run was interrupted, since the result is then incomplete."""
         if self.facts.get("interrupted_at") is not None:
             raise KeyboardInterrupt
         return self
@@ -169,7 +169,7 @@ class Reconstruction:
 def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
     """Returns a KeyboardInterrupt whose attribute ``partial`` is the result so far, or None if there is no volume yet.
 
-    It is no subclass, because only after KeyboardInterrupt itself does Python end by the signal, so that shells stop too."""
+    It is no subclass: only after KeyboardInterrupt itself does Python end by SIGINT, so that a calling shell stops too."""
     kept = "before there was a volume"
     if partial is not None:
         when = f"after {partial.interrupted_at}" if partial.interrupted_at else "at its end"
@@ -183,7 +183,7 @@ def interrupted(partial: Reconstruction | None) -> KeyboardInterrupt:
 class Progress:
     """One report of a running method: ``iteration`` of ``iterations`` is finished, after ``seconds`` in s.
 
-    - loss: the dimensionless measure that ``quantity`` names. gaussians: their number, or 0.
+    - loss: the dimensionless measure that ``quantity`` names. gaussians: the number of Gaussians, or 0.
     - state returns the state from which the run can resume. volume returns the present volume (nz, ny, nx) in 1/mm and its
       grid. frames returns a given number of measured frames, spread evenly, with those computed from the present volume.
       These three may be called during the report only.
@@ -207,8 +207,8 @@ class Progress:
     def mapped(
         self, state: "Callable[[State], State] | None" = None, volume: "VolumeMap | None" = None, **changes: Any
     ) -> "Progress":
-        """Returns the report with ``changes`` of its fields. ``state`` and ``volume``, if given, change what the report's
-        own functions of that name return."""
+        """Returns the report with ``changes`` of its fields. The functions ``state`` and ``volume``, if given, are applied
+        to what the report's own functions of the same name return."""
         own_state, own_volume = self.state, self.volume
         if state is not None and own_state is not None:
             changes["state"] = lambda: state(own_state())
@@ -221,7 +221,7 @@ ProgressReport = Callable[[Progress], None]
 
 
 class Report:
-    """Passes a method's progress on to listeners. While the body of ``through`` runs, a hook may change the progress."""
+    """Passes a method's progress on to listeners. Hooks that ``through`` installs may change the progress before."""
 
     def __init__(self, *listeners: ProgressReport) -> None:
         self.listeners = listeners
@@ -240,7 +240,7 @@ class Report:
 
     @contextmanager
     def through(self, hook: Callable[[Progress], Progress]) -> Iterator[None]:
-        """Sends progress through ``hook`` while the body runs, before the hooks that are there already."""
+        """Sends progress through ``hook``, and then through earlier hooks, while the body of the with statement runs."""
         self._hooks.append(hook)
         try:
             yield
@@ -259,7 +259,7 @@ def function_name(function: object) -> str:
 
 
 def option_facts(options: Any) -> dict[str, object]:
-    """Returns a method's options as facts of its result, with functions by name."""
+    """Returns a method's options by name, as facts of its result. A function among them is stated as ``module:name``."""
     own = {"motion": motion_facts(options.motion)} if hasattr(options, "motion") else {}
     given = {name: getattr(options, name) for name in getattr(options, "FUNCTIONS", ())}
     named = {name: function_name(value) for name, value in given.items() if callable(value)}

@@ -44,12 +44,12 @@ from phyradgs_cl.text import each_warning_once
 
 log = logging.getLogger(__name__)
 
-# Most volumes that each voxel method holds in memory at one time, two of them for the intensity model (docs/large.md).
-# The methods also hold _STACKS arrays of all frames, and need one buffer of _ONE_BUFFER volumes.
+# Largest number of volumes that each voxel method holds at one time, two of them for the intensity model (docs/large.md).
+# Each method also holds _STACKS arrays of all frames, and needs a buffer as large as _ONE_BUFFER volumes.
 _HELD = {"sirt": 8, "sart": 28, "os-sart": 28, "cgls": 11, "asd-pocs": 32, "fista-tv": 16}
 _HELD |= {"fista": 20, "moving": 28, "changing": 22}
 _STACKS, _ONE_BUFFER = 12, 3
-_OF_OTHERS = 4  # memory of other methods in volumes: the result, and copies in which it is made, checked and written
+_OF_OTHERS = 4  # number of volumes that any other method holds: its result, and copies while it is made, checked, written
 _DEVICE_SHARE = 0.9  # fraction of the device's memory limit that a proposed --size may fill
 _ROUND = 8  # a proposed --size is rounded down to a multiple of this
 
@@ -62,7 +62,7 @@ def reconstruct(
     """Runs a plan on a scan and returns the result. resume: the state of an interrupted run of the same plan.
 
     The plan's first volume is resampled onto the scan's grid. Raises InputError for a scan or state that the plan cannot
-    take, and OutOfMemoryError where memory is short."""
+    take, and OutOfMemoryError if the memory of the host or the device is too small."""
     run, report = _Prepared(scan, plan, rt, resume), Report.of(report)
     method, state = method_of(plan.method), run.arguments.pop("resume", None)
 
@@ -84,15 +84,15 @@ def reconstruct(
 
 
 def check_scan(scan: Scan, plan: RunPlan) -> None:
-    """Raises InputError for a scan that the plan's method, or its error bars, cannot take. It gives no warnings."""
+    """Raises InputError for a scan that the plan's method or its error bars cannot take. Logs no warnings."""
     method_of(plan.method).check(scan, plan.options)
     if plan.preprocessing.doubt and not hasattr(plan.options, "iterations") and scan.frames < FEWEST_FRAMES:
         raise InputError("--doubt", f"frames: {scan.frames}", f"{FEWEST_FRAMES} or more, two in each half", "leave it out")
 
 
 class _Prepared:
-    """A run that is ready for its method: ``scan`` after preprocessing, with its margin; ``visible``, the scan without
-    held-out pixels; ``options`` and further ``arguments``."""
+    """A run that is ready for its method: ``scan`` after preprocessing, with its margin; ``visible``, that scan with its
+    held-out pixels masked; the method's ``options`` and its further ``arguments``."""
 
     def __init__(self, scan: Scan, plan: RunPlan, rt: Runtime, resume: State | None) -> None:
         preprocessing, self.plan, self.rt = plan.preprocessing, plan, rt
@@ -101,7 +101,7 @@ class _Prepared:
             _check_ranks(plan.method_name, rt)
         if preprocessing.margin_mm is not None:
             _check_margin(plan)
-        self.identity = cache(partial(plan.identity, scan))  # not computed before it is needed, since that reads all frames
+        self.identity = cache(partial(plan.identity, scan))  # computed only when needed, because it reads all frames
         self.arguments: dict[str, Any] = {}
         if resume is not None:
             check_resumable(plan)
@@ -132,7 +132,7 @@ class _Prepared:
     def shown(self, progress: Progress) -> Progress:
         """Returns progress with the run's identity in its state, with frames, and with its volume without the margin."""
         progress = progress.mapped(state=lambda state: with_identity(state, self.identity()))
-        if progress.volume is not None and self.rt.ranks.size == 1:  # several ranks can only project together
+        if progress.volume is not None and self.rt.ranks.size == 1:  # ranks can project only together
             whole = cache(progress.volume)
             progress = replace(progress, volume=whole, frames=partial(self._pairs, progress, whole))
         box = self.box
@@ -143,7 +143,7 @@ class _Prepared:
         return frame_pairs(self.rt, self.scan, *volume(), spread_frames(self.scan.frames, count), moves)
 
     def finished(self, result: Reconstruction) -> Reconstruction:
-        """Returns the method's result with the run's identity and facts, without the margin."""
+        """Returns the method's result without the margin, with its metal, the run's identity in its state, and facts."""
         if result.state is not None:
             result = replace(result, state=with_identity(result.state, self.identity()))
         if self.hidden is not None and self.rt.ranks.rank == 0:
@@ -165,7 +165,7 @@ def check_resumable(plan: RunPlan) -> None:
 
 
 def _with_defaults(identity: dict[str, Any]) -> dict[str, Any]:
-    """Returns an earlier run's identity, with the defaults of preprocessing options that did not exist yet."""
+    """Returns an earlier run's identity, with the defaults of preprocessing options that its version did not have."""
     with suppress(InputError):  # an earlier version may have had options that this one lacks
         return {**identity, "input": preprocessing_of(identity["input"]).facts()}
     return identity
@@ -185,7 +185,7 @@ def _initial(plan: RunPlan, initial: InitialVolume, grid: Grid) -> np.ndarray:
 
 
 def _with_metal(result: Reconstruction, metal: Metal) -> Reconstruction:
-    """Puts the metal that ``prepare`` has found into the result's volume and states, in place; not into its Gaussians."""
+    """Overwrites voxels of the result's volume and states with the metal that ``prepare`` found, and returns the result."""
     amount, _ = resampled((metal.values != 0).astype(np.float32), metal.grid, result.grid)
     values, _ = resampled(metal.values, metal.grid, result.grid)
     inside = amount >= 0.5
@@ -196,7 +196,7 @@ def _with_metal(result: Reconstruction, metal: Metal) -> Reconstruction:
 
 
 def _check_margin(plan: RunPlan) -> None:
-    """Raises InputError for a margin with a method in which voxels outside the box do not help the voxels inside."""
+    """Raises InputError for a margin with a method in which the voxels of the margin do not affect the others."""
     if (way := getattr(plan.options, "extrapolate", None)) not in (None, "reprojected"):
         found = f"--method {plan.method_name} with extrapolate={way}, whose voxels do not depend on each other"
         remedy = "add --set extrapolate=reprojected, or leave it out"
@@ -204,8 +204,8 @@ def _check_margin(plan: RunPlan) -> None:
 
 
 def _within(volume: np.ndarray, grid: Grid, box: Grid) -> tuple[np.ndarray, Grid]:
-    """Returns the part of a volume (nz, ny, nx) that lies in ``box``, and the part's grid. Voxels may be coarser than those
-    of ``box``."""
+    """Returns the part of a volume (nz, ny, nx) whose voxel centres lie in ``box``, and the part's grid; the whole volume if
+    none do. The voxels may be coarser than those of ``box``."""
     if (part := shared_slices(grid, box)) is None:
         return volume, grid
     inner = volume[part]
@@ -247,14 +247,14 @@ def _naming_size_that_fits(rt: Runtime, scan: Scan, plan: RunPlan) -> Iterator[N
 
 
 def _size_that_fits(rt: Runtime, scan: Scan, method: str, options: Any) -> int:
-    """Returns the number of voxels along the grid's longest side for which the memory suffices; 0 if it is unknown."""
+    """Returns for how many voxels along the grid's longest side the memory is enough; 0 if this is unknown or none."""
     free, held = HOST_SHARE * free_bytes(), _HELD.get(method)
     voxels = (free - scan.projections.nbytes) / (4 * _OF_OTHERS)
     states = min(getattr(options, "states", 1), scan.frames)
     if held is not None:
         free = min(free, _DEVICE_SHARE * rt.ledger.limit_bytes)
         if hasattr(options, "prior"):
-            from phyradgs_cl.reconstructors.voxels.priors import kind_of  # here, because it loads SciPy
+            from phyradgs_cl.reconstructors.voxels.priors import kind_of  # here, as it loads SciPy
 
             held += kind_of(options.prior).volumes
         voxels = (free - _STACKS * scan.projections.nbytes) / (4 * held * states)

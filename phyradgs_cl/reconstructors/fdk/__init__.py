@@ -1,5 +1,5 @@
-"""FDK (Feldkamp, Davis and Kress 1984), and filtered backprojection of parallel beams, FBP, in the same steps: ray weights,
-ramp filter, backprojection, which FDK weights by distance.
+"""FDK (Feldkamp, Davis and Kress 1984), and filtered backprojection of parallel beams (FBP), both in three steps: weights of
+rays, ramp filter, backprojection. FDK's backprojection is weighted by distance.
 
 The ramp filter is Ram-Lak's in its space-domain form, with windows on its spectrum: A. C. Kak and M. Slaney, Principles of
 Computerized Tomographic Imaging, IEEE Press 1988, Eq. 61 of chapter 3."""
@@ -71,8 +71,8 @@ class FdkOptions(MotionOptions):
     """Options of FDK. window: the window of the ramp filter, one of ``WINDOWS``. extrapolate: how rows continue beyond the
     panel, one of ``WAYS``.
 
-    motion: static (one pose per frame, mid-window), static-start (the frame's first pose) or per-row (every line at the
-    middle of its own exposure). Of a model with several poses per line FDK uses the middle pose."""
+    motion: static (one pose per frame, midway between first and last light), static-start (at its first light) or per-row
+    (every line at the middle of its own exposure). Of a model with several poses per line FDK uses the middle one."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(LINE_POSES)
     METHOD: ClassVar[str] = "fdk"
@@ -98,8 +98,8 @@ def fdk(
     deformation: Deformation | None = None,
 ) -> Reconstruction:
     """Returns the FDK volume of a scan in 1/mm, or with ``FbpOptions`` the filtered backprojection of a parallel beam. Both
-    take short scans, full turns, and full turns with the axis near the panel's edge. Of a moving object the volume shows the
-    reference state.
+    take short scans, full turns, and full turns with the axis near the panel's edge. The volume of a moving object shows the
+    object's reference state.
 
     ``seed`` has no effect. report: gets progress only with extrapolate ``reprojected``. deformation: how the object moves.
 
@@ -132,7 +132,7 @@ def fdk(
 
 def _without_dark_sides(scan: Scan, frames: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns frames (F, rows, columns) and poses without the columns at both sides that are masked in all frames. Values
-    there would be guesses, while a narrower panel gets ray weights of its own. A scan with metal keeps all columns."""
+    there would be guesses. A panel without them gets the ray weights of a narrower panel. A scan with metal keeps them."""
     seen = np.flatnonzero(scan.valid.any(axis=(0, 1)))
     if scan.metal is not None or len(seen) in (0, frames.shape[2]):
         return frames, pose
@@ -147,7 +147,7 @@ def _without_dark_sides(scan: Scan, frames: np.ndarray, pose: np.ndarray) -> tup
 def _moving(
     rt: Runtime, scan: Scan, motion: Motion, numbers: np.ndarray, deformation: Deformation
 ) -> MovingBackprojector | None:
-    """Returns the backprojector of a moving object, which takes each frame at its mean time; None for an object at rest."""
+    """Returns the backprojector of a moving object for frames ``numbers``, each at its mean time; None for one at rest."""
     times_s = np.array([motion.cells(scan, f).time_s.mean() for f in numbers])
     states = MotionStates.of_times(deformation, scan.grid, times_s)
     return None if states.is_at_rest else MovingBackprojector(rt, states, states.shares(times_s))
@@ -172,13 +172,13 @@ def fdk_volume(
     axis: str = "rows", extrapolate: str = "none", whole: Callable[[], np.ndarray] | None = None,
     is_parallel: bool = False, circle: bool = False, moving: MovingBackprojector | None = None,
 ) -> np.ndarray:
-    """Returns FDK, or FBP of parallel beams, of line integrals (F, rows, columns) on ``grid``, (nz, ny, nx) float32 in 1/mm.
+    """Returns the volume (nz, ny, nx) float32 in 1/mm on ``grid``, by FDK or, for parallel beams, by FBP, from line
+    integrals ``frames`` (F, rows, columns).
 
     pose: (F, 12) mm, or (F, lines, 12) with a pose for every line along ``axis``. Displaced detectors (full turns) and short
-    scans are recognised and weighted. whole: reconstructs the complete object (nz, ny, nx) in 1/mm on ``grid``, which
-    extrapolate ``reprojected`` needs. circle, for parallel beams: sets voxels outside of the circle that the panel reaches
-    to 0. moving: backprojects an object that moves. Logs a warning where data are missing. Raises InputError for a source on
-    the rotation axis."""
+    scans are recognised and weighted. whole: returns the complete object (nz, ny, nx) in 1/mm on ``grid``, which extrapolate
+    ``reprojected`` needs. circle: sets voxels outside of the circle that the panel reaches to 0. moving: backprojects an
+    object that moves. Logs a warning if data are missing. Raises InputError for a source on the rotation axis."""
     by_pixel, canonical, fan, arc = _seen(pose, frames, axis, is_parallel)
     if extrapolate != "none" and fan.is_put_aside:
         log.warning("%s: the rows of a displaced detector are not extrapolated", "FBP" if is_parallel else "FDK")
@@ -187,7 +187,7 @@ def fdk_volume(
             frames, count = reprojected(rt, frames, pose, axis, whole(), grid, is_parallel)
         else:
             frames, count = extrapolated(frames, extrapolate)
-        # from here on the frames are those of a wider panel
+        # from here on, frames and poses are those of a wider panel
         pose, circle = extended(pose, axis, (count, count)), False
         by_pixel, canonical, fan, arc = _seen(pose, frames, axis, is_parallel)
     shape = (frames.shape[1], frames.shape[2])
@@ -218,7 +218,7 @@ def fdk_volume(
             volume[start:stop] *= travel.all_over_seen(rt, middle, shape, weight, slab, is_parallel)
     if circle:
         _, y_mm, x_mm = grid.axes_mm()
-        radius_mm = seen_mm + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # up to the edge of the last pixel
+        radius_mm = seen_mm + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # up to the outer edge of the last pixel
         volume[:, np.hypot(y_mm[:, None], x_mm) > radius_mm] = 0
     return volume
 
@@ -240,14 +240,14 @@ def _of_views(
 def _seen(
     pose: np.ndarray, frames: np.ndarray, axis: str, is_parallel: bool
 ) -> tuple[np.ndarray, np.ndarray, weights.Fan, Arc]:
-    """Returns the poses as ``pose_of_pixels`` does, the same poses rotated back to one angle, the fan that they see, and the
-    arc of all views. Raises InputError for a source on the rotation axis."""
+    """Returns the poses as ``pose_of_pixels`` does, these poses rotated about z to one gantry angle, the fan that all views
+    see, and the arc that they cover. Raises InputError for a source on the rotation axis."""
     by_pixel = pose_of_pixels(pose, axis)
     if np.any(np.hypot(by_pixel[..., 0], by_pixel[..., 1]) <= 0):
         raise InputError("poses", "a source on the rotation axis", "a source beside it")
     angle_rad = view_angles(by_pixel)
     canonical = travel.still_along_z(weights.turned_back(by_pixel, angle_rad), is_parallel)
-    # on a circle all views are equal after the rotation, so one set of weights serves all
+    # on a circular orbit all rotated poses are equal, so that one set of ray weights serves all views
     if np.ptp(canonical, axis=0).max() <= _SAME_POSE * np.abs(canonical).max():
         canonical = canonical[:1]
     fan = weights.measured_fan(canonical, (frames.shape[1], frames.shape[2]), is_parallel)
@@ -257,9 +257,9 @@ def _seen(
 def _filtered(
     frames: np.ndarray, weight: RayWeight, missing: tuple[int, int], window: str, spare: int = 0
 ) -> np.ndarray:
-    """Returns weighted and filtered frames (F, rows, columns + missing) float32. weight: gives a view's weights (rows,
-    columns). missing: numbers of columns added at both ends. They make a displaced detector symmetric, because the filter's
-    response continues beyond its rows. spare: number of rows of zeros added at both ends."""
+    """Returns weighted and filtered frames (F, rows + 2 spare, columns + Σ missing) float32. weight: returns the weights
+    (rows, columns) of a view. missing: numbers of columns added at the two ends, to hold the filter's response beyond a
+    displaced detector. spare: number of rows of zeros added at both ends."""
     views, rows, columns = frames.shape
     width = columns + sum(missing)
     filtered = np.zeros((views, rows + 2 * spare, width), np.float32)
@@ -277,7 +277,7 @@ def ramp_spectrum(length: int, window: str = "ram-lak") -> np.ndarray:
     """Returns the ramp filter's real spectrum (length // 2 + 1,) for a pixel pitch of 1 and a period of ``length`` samples.
 
     It comes from the space-domain kernel: sampling |frequency| instead would add a wrong constant to every row."""
-    # distance from sample 0, counted around the period: its second half stands for negative distances
+    # distance from sample 0, counted around the period: samples of the second half have negative distances
     n = np.minimum(np.arange(length), length - np.arange(length))
     kernel = np.where(n % 2 == 1, -1.0 / (np.pi * np.maximum(n, 1)) ** 2, 0.0)
     kernel[0] = 0.25
@@ -286,9 +286,9 @@ def ramp_spectrum(length: int, window: str = "ram-lak") -> np.ndarray:
 
 
 def ramp_filter(rows: np.ndarray, spacing_mm: float, window: str = "ram-lak") -> np.ndarray:
-    """Applies the ramp filter along the last axis of (..., width), zero-padded so that nothing wraps around.
+    """Applies the ramp filter along the last axis of ``rows`` (..., width), zero-padded so that nothing wraps around.
 
-    Returns the same shape in float32 and units of ``rows`` per mm. Float32 rows stay float32 throughout."""
+    The result has the same shape, in float32, in the unit of ``rows`` per mm. Float32 rows are filtered in float32."""
     width = rows.shape[-1]
     length = scipy.fft.next_fast_len(2 * width, real=True)
     spectrum = scipy.fft.rfft(rows, length, axis=-1, workers=_WORKERS)
@@ -313,8 +313,8 @@ def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _measured(scan: Scan) -> np.ndarray:
-    """Returns the numbers (n,) of the frames with more than half as many valid pixels as the best frame. Neighbouring views
-    stand for the angles of the others. Returns all numbers if all frames have one mask, or if no pixel is valid."""
+    """Returns the numbers (n,) of the frames with more than half as many valid pixels as the frame with most. Views beside a
+    frame that is left out stand for its angle. With one mask for all frames, or no valid pixel, none is left out."""
     if np.asarray(scan.pixel_mask).ndim == 3 and (valid := scan.valid.mean(axis=(1, 2))).any():
         return np.flatnonzero(valid > valid.max() / 2)
     return np.arange(scan.frames)

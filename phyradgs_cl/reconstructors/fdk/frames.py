@@ -1,6 +1,6 @@
 """Changes frames before FDK's filter: continues detector rows beyond the panel, and removes motion blur along the angle.
 
-Rows continue so that the filter does not ring where they are cut off. Only the way ``reprojected`` knows the object there.
+Rows continue so that the filter does not ring where they are cut off. Only the way ``reprojected`` uses the object itself.
 
 - cosine: rows fall to 0 along a quarter of a cosine (similar to Ohnesorge et al., Med. Phys. 27 (2000) 39).
 - cylinder: rows continue as chords of a cylinder, from their last values and slope (Hsieh et al., Med. Phys. 31 (2004)
@@ -34,20 +34,20 @@ from phyradgs_cl.runtime import Runtime
 WAYS = ("none", "cosine", "cylinder", "reprojected")
 _SHARE = 0.5  # "cosine" and "cylinder" extend rows at each side by this fraction of the panel's columns
 _SLOPE_PIXELS = 5  # the slope at a row's end is taken over this many pixels, to lower its noise
-_NOISE = 0.01  # a row that ends below this fraction of the line integrals' 99.9th percentile ends in air
+_NOISE = 0.01  # a row that ends below this fraction of the line integrals' 99.9th percentile ends in air, and continues as 0
 _UNEVEN = 0.02  # views are evenly spaced if no angular step differs from the median step by more than this fraction
 _REACH = 8  # the end views of an arc are repeated over this many times an exposure's arc, so that the filter meets no edge
 _FULL_TURN = 1.5  # if a gap is wider than this many median steps, the views cover less than a full turn
 
 
 def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
-    """Continues line integrals (F, v, u) beyond both sides, ``way`` cosine or cylinder. Returns (F, v, u + 2 n), and n."""
+    """Returns ``frames`` (F, v, u) continued by n columns at both sides, (F, v, u + 2 n), and n. way: cosine or cylinder."""
     count = max(1, round(_SHARE * frames.shape[2]))
     beyond = np.arange(1, count + 1)
     least = _NOISE * float(np.percentile(frames, 99.9))
     curvature = _curvature(frames)
     sides = []
-    for rows in (frames[..., ::-1], frames):  # reversed for the first side: rows then end at the panel's edge
+    for rows in (frames[..., ::-1], frames):  # reversed for the first side, so that rows end at its edge
         pixels = min(_SLOPE_PIXELS, rows.shape[-1])
         end = rows[..., -pixels:].astype(np.float64)
         edge, slope = end.mean(-1, keepdims=True), (end[..., -1:] - end[..., :1]) / max(pixels - 1, 1)
@@ -60,10 +60,10 @@ def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:
 
 
 def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: np.ndarray) -> np.ndarray:
-    """Returns line integrals p (F, v, n) at d pixels beyond the panel: p² = edge² + 2 edge slope d − a d².
+    """Returns line integrals p (F, v, n) at distances d (n,) in pixels beyond the panel: p² = edge² + 2 edge slope d − a d².
 
-    edge, slope: line integral and its change per pixel at a row's end. A rising slope counts as 0. curvature: a, raised
-    until p reaches 0 within the n pixels. beyond: d."""
+    edge, slope: line integral at a row's end, and its change per pixel. A rising slope counts as 0. curvature: a, which is
+    raised so that p reaches 0 within the n pixels. beyond: d."""
     falling, reach = np.minimum(slope, 0), beyond[-1]
     widest = (edge**2 + 2 * reach * edge * falling) / reach**2
     squares = edge**2 + 2 * edge * falling * beyond - np.maximum(curvature, widest) * beyond**2
@@ -71,7 +71,7 @@ def _chords(edge: np.ndarray, slope: np.ndarray, curvature: np.ndarray, beyond: 
 
 
 def _curvature(frames: np.ndarray) -> np.ndarray:
-    """Returns the downward curvature (F, v, 1) of parabolas through the rows' squared values, as a median over frames."""
+    """Returns a ≥ 0 (F, v, 1): the median over frames of a in fits c + b d − a d² to each row's squares at d pixels."""
     u = np.linspace(-1, 1, frames.shape[2])
     basis = np.stack([np.ones_like(u), u, u**2], axis=1)
     squares = np.maximum(frames, 0).astype(np.float64) ** 2
@@ -118,14 +118,14 @@ def reprojected(
 
 
 def _cells(pose: np.ndarray, lines: int, axis: str, is_parallel: bool) -> TimeCells:
-    """Returns time cells of fixed pose: one pose (1, 12) for all lines, or (lines, 12), one for each."""
+    """Returns the time cells of a frame with fixed poses: ``pose`` (1, 12) for all lines, or (lines, 12), one for each."""
     ends = np.linspace(0, lines, len(pose) + 1).round().astype(np.int32)
     weight = np.ones(len(pose))
     return TimeCells(pose, 0 * weight, ends[:-1], ends[1:], weight, lines, axis, is_parallel=is_parallel)
 
 
 def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: bool) -> int:
-    """Returns how many columns to add at each side so that panels of poses (n, 12) see the grid's whole box."""
+    """Returns how many columns each side needs so that panels of poses (n, 12) see the whole grid; at most two widths."""
     source, first, step_u, step_v = (pose[:, None, i : i + 3] for i in (0, 3, 6, 9))
     corners = np.stack(np.meshgrid(*grid.box_mm[::-1], indexing="ij"), -1).reshape(1, 8, 3)
     normal = np.cross(step_u, step_v)
@@ -133,7 +133,7 @@ def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: boo
         ahead = ((first - corners) * normal).sum(-1) / (source * normal).sum(-1)
         hit = corners + ahead[..., None] * source - first
     else:
-        depth = ((corners - source) * normal).sum(-1) / ((first - source) * normal).sum(-1)  # divided by the panel's depth
+        depth = ((corners - source) * normal).sum(-1) / ((first - source) * normal).sum(-1)  # 1 in the panel's plane
         hit = (corners - source) / np.maximum(depth, 1e-6)[..., None] - (first - source)
     across = np.cross(step_v, normal)
     column = (hit * across).sum(-1) / (step_u * across).sum(-1)
@@ -142,8 +142,8 @@ def _columns_beyond(pose: np.ndarray, columns: int, grid: Grid, is_parallel: boo
 
 
 def deblurred(scan: Scan, frames: np.ndarray, angle_rad: np.ndarray, noise: float) -> np.ndarray:
-    """Returns frames (F, rows, columns) float32 without motion blur along the angle, as if the gantry stopped for each view.
-    angle_rad (F,): gantry angles at the frames' middles. noise: (power of noise)/(power of signal).
+    """Returns the frames (F, rows, columns) float32 without motion blur along the angle, as if the gantry stopped for each
+    view. angle_rad (F,): gantry angles at the frames' middles. noise: λ = (power of noise)/(power of signal).
 
     Raises InputError unless the views, in any order, are evenly spaced in angle, apart from one gap."""
     arc_rad = exposure_arc_rad(scan)
@@ -178,8 +178,8 @@ def deblurred(scan: Scan, frames: np.ndarray, angle_rad: np.ndarray, noise: floa
 
 
 def _mirrored(line: np.ndarray, scan: Scan) -> np.ndarray:
-    """Returns one row of all views, (F, columns), as seen from the other side: mirrored at the column of the axis. Columns
-    beyond the panel take its last value."""
+    """Returns one row of all views, ``line`` (F, columns), as seen from the other side: mirrored at the column of the axis.
+    Columns whose mirror image lies beyond the panel take the row's outermost value."""
     columns = line.shape[1]
     axis = (columns - 1) / 2 - scan.geometry.detector_offset_mm[1] / scan.geometry.pixel_size_mm[1]
     at = np.clip(2 * axis - np.arange(columns), 0, columns - 1)

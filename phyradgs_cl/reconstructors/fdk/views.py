@@ -12,34 +12,34 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.reconstructors.fdk import weights
 
-# A gap between views stands out if it is this many times as wide as another gap; one lost view makes a gap of 2 steps.
+# A gap between views stands out if it is wider than this many times another gap; one lost view makes a gap of 2 steps.
 # The widest gap is compared with the second widest: compared with the median, uneven full turns would look like short scans.
-# Any gap wider than _WIDE_RAD is compared with both of its neighbours.
+# Any gap wider than _WIDE_RAD is compared with both gaps beside it.
 SHORT_SCAN_GAP = 2.5
 _SAME_VIEW = 0.05  # views nearer to each other than this fraction of the mean gap count as one repeated view
 # A warning names filled gaps from this width on: narrower ones changed the density of large balls by less than 1 %.
 _NAMED_RAD = np.deg2rad(5)
-# All gaps up to this width but the widest are filled: dividing the arc there would cost more accuracy.
+# All gaps up to this width, except the widest, are filled: dividing the arc there would cost more accuracy.
 _WIDE_RAD = np.deg2rad(10)
 # A misaligned panel measures a strip of rays once only. Gaps up to this width are filled, so that the strip counts fully.
 _FILLED_RAD = np.deg2rad(15)
-# The same for a panel displaced on purpose, whose strip is wide. In wider gaps, short-scan weights were 0.2 to 10 dB better.
+# The same for a panel displaced on purpose, whose strip is wide. For wider gaps short-scan weights were 0.2 to 10 dB better.
 _FILLED_ASIDE_RAD = np.deg2rad(65)
-# Views nearer to a filled gap than this fraction of its width stand for it: more views smear, fewer draw streaks.
+# Views nearer to a filled gap than this fraction of its width stand for the gap: more views smear, fewer draw streaks.
 _FILL_REACH = 0.5
 log = logging.getLogger(__name__)
 
-# Limits of an orbit, in pairs. Beyond the first a warning is logged; beyond the second, _NO_…, InputError is raised.
+# Limits of an orbit, in pairs. Beyond the first limit a warning is logged; beyond the second, _NO_…, InputError is raised.
 _CIRCLE = 0.05  # (distance of source or panel from a circle about z)/(distance from source to panel)
 _NO_CIRCLE = 0.5
-_PLANE_DEG = 10.0  # elevation of the source above the plane z = 0, seen from the origin
+_PLANE_DEG = 10.0  # angle between the plane z = 0 and the line from the origin to the source
 _NO_PLANE_DEG = 45.0
 _LEAN_DEG = 0.5  # angle of parallel rays, or of their detector rows, from the plane of the rotation
 _NO_LEAN_DEG = 10.0
 _ROLL_DEG = 3.0  # angle of a cone beam's detector rows from the plane of the rotation: at 3° densities are 0.1 % too low
-_NO_ROLL_DEG = 10.0  # at 10° densities are 1.5 % too low, at 90° they are 0
+_NO_ROLL_DEG = 10.0  # densities are 1.5 % too low at 10°, and 0 at 90°
 _UNLIKE = 0.1  # a warning comes if the fan's ends differ among the views by more than this fraction of the fan
-_LEAST_OVERLAP = 2.0  # a displaced panel must reach this many columns beyond the axis, or a warning comes
+_LEAST_OVERLAP = 2.0  # a warning comes if a displaced panel reaches less than this many columns beyond the axis
 # A smaller missing angle causes no warning: nearly parallel rays have so narrow a fan that half a turn is enough.
 _TOLERATED_RAD = np.deg2rad(0.5)
 _PARTS = 16  # a short scan's weights are averaged over this many parts of a view's angular step
@@ -50,9 +50,9 @@ RayWeight = Callable[[int], np.ndarray]
 class Arc:
     """The angles that the views cover, and how much of them each view stands for.
 
-    - gap_rad (F,): the angle for which each view stands. coverage_rad: the angle for which all stand. is_full: a full turn.
-    - progress_rad (F,): each view's angle from the arc's start, half a step before the first view; the arc ends half a step
-      behind the last. In a full turn it counts from the view of the least angle.
+    - gap_rad (F,): the angle for which each view stands. coverage_rad: the angle that all views cover. is_full: a full turn.
+    - progress_rad (F,): each view's angle from the arc's start, which lies half a step before the first view. The arc ends
+      half a step behind the last view. In a full turn, progress is counted from the view of the least angle.
     - parts_rad (P, 2): progress at which each part between gaps begins and ends.
     - filled_rad: total width of the gaps for which neighbouring views stand."""
 
@@ -64,8 +64,8 @@ class Arc:
     filled_rad: float = 0.0
 
     def unseen_rad(self, fan_rad: float = 0.0) -> float:
-        """Returns how much of half a turn, in rad, is measured from neither side: the largest value for rays at fan angles
-        −fan_rad, 0 and fan_rad."""
+        """Returns the part of half a turn, in rad, in which neither a ray nor its opposite is measured: the largest value
+        of rays at fan angles −fan_rad, 0 and fan_rad."""
         at_rad = np.linspace(0, 2 * np.pi, 1440, endpoint=False)
         fans = (-fan_rad, 0.0, fan_rad)
         shares = [(self.covers(at_rad) | self.covers(at_rad + np.pi + 2 * fan)).mean() for fan in fans]
@@ -79,7 +79,7 @@ class Arc:
 
 def filled_gap_rad(fan: weights.Fan) -> float:
     """Returns the width in rad up to which the views at both sides fill gaps: 65° for a panel displaced on purpose, 15° for
-    a misaligned one, since some of a gap's rays have no opposite there; 0 for a symmetric panel."""
+    a misaligned panel, because some of a gap's rays then have no opposite; 0 for a symmetric panel."""
     if fan.is_put_aside:
         return _FILLED_ASIDE_RAD
     return _FILLED_RAD if fan.is_displaced else 0.0
@@ -111,8 +111,8 @@ def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
 
 
 def _stand_out(ahead: np.ndarray) -> np.ndarray:
-    """Returns which of the gaps (K,) from each view to the next are wide, bool (K,): the widest if it stands out from all
-    others, and any that stands out from its neighbours."""
+    """Returns which gaps ``ahead`` (K,), from each view to the next, are wide, bool (K,): the widest if it stands out from
+    all others, and any gap that stands out from the two gaps beside it."""
     wide = np.zeros(ahead.size, bool)
     if ahead.size < 2:
         return wide
@@ -123,8 +123,8 @@ def _stand_out(ahead: np.ndarray) -> np.ndarray:
 
 
 def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
-    """Returns which ``wide`` gaps ``ahead`` (K,) of at most 15° have a wide gap on the opposite side too, bool (K,). Views
-    at both sides fill these gaps, which have no opposite rays. The widest is none of them. centre (K,): views' angles."""
+    """Returns which ``wide`` gaps ``ahead`` (K,), at most 15°, have another wide gap opposite, bool (K,). No opposite rays
+    measure such a gap, so the views at its sides fill it. The widest gap is left out. centre (K,): angles of the views."""
     narrow = wide & (ahead <= _FILLED_RAD) & (np.arange(ahead.size) != np.argmax(ahead))
     opposite = centre + ahead / 2 + np.pi
     before = np.searchsorted(centre, np.mod(opposite - centre[0], 2 * np.pi) + centre[0], side="right") - 1
@@ -132,21 +132,21 @@ def _only_here(centre: np.ndarray, ahead: np.ndarray, wide: np.ndarray) -> np.nd
 
 
 def _steps(ahead: np.ndarray, wide: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the steps (K,) in rad from each view to the next, and from the view before to each: the gaps ``ahead`` (K,).
-    For a gap that is ``wide``, bool (K,), the step on the view's other side is used."""
+    """Returns the steps in rad from each view to the next (K,), and to each view from the one before (K,). They are the gaps
+    ``ahead`` (K,); a gap that is ``wide``, bool (K,), is replaced by the gap on the view's other side."""
     forward = np.where(wide, np.roll(ahead, 1), ahead)
     return forward, np.roll(np.where(wide, np.roll(ahead, -1), ahead), 1)
 
 
 def _filled_rad(ahead: np.ndarray) -> float:
-    """Returns the sum in rad over wide gaps of (gap − largest of the median gap and both neighbours). ahead (K,): gaps."""
+    """Returns Σ (gap − usual) in rad over wide gaps; usual: max(median gap, both gaps beside it). ahead (K,): all gaps."""
     usual = np.maximum(np.median(ahead) if ahead.size else 0.0, np.maximum(np.roll(ahead, 1), np.roll(ahead, -1)))
     return float((ahead - usual)[ahead > np.maximum(SHORT_SCAN_GAP * usual, _NAMED_RAD)].sum())
 
 
 def _filled_cells(ahead: np.ndarray, wide: np.ndarray) -> np.ndarray:
     """Returns the angle (K,) in rad for which each view of a full turn stands. A wide gap is divided among the views near
-    it, the nearer the more. ahead, wide: as in ``_steps``."""
+    it, with larger parts for nearer views. ahead, wide: as in ``_steps``."""
     forward, back = _steps(ahead, wide)
     known = (forward + back) / 2
     cells = known.copy()
@@ -166,7 +166,7 @@ def distinct_views(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     is_new = np.diff(turned[order], prepend=-np.inf) > tolerance
     index = np.cumsum(is_new) - 1
     centre = turned[order][is_new]
-    if centre.size > 1 and centre[0] + 2 * np.pi - turned[order[-1]] <= tolerance:  # such angles are one, as 0° and 360° are
+    if centre.size > 1 and centre[0] + 2 * np.pi - turned[order[-1]] <= tolerance:  # first and last are one, as 0° and 360°
         index[index == centre.size - 1] = 0
         centre = centre[:-1]
     cell = np.empty(turned.size, np.int64)
@@ -175,14 +175,14 @@ def distinct_views(angle_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pose_of_pixels(pose: np.ndarray, axis: str) -> np.ndarray:
-    """Returns poses (F, 12) or (F, lines, 12), lines along ``axis``, as a view that broadcasts to (F, rows, columns, 12)."""
+    """Returns poses (F, 12), or (F, lines, 12) along ``axis``, in a shape that broadcasts to (F, rows, columns, 12)."""
     if pose.ndim == 2:
         return pose[:, None, None]
     return pose[:, :, None] if axis == "rows" else pose[:, None]
 
 
 def view_angles(by_pixel: np.ndarray) -> np.ndarray:
-    """Returns each view's gantry angle (F,) in rad, the mean over its pixels' poses (F, r, c, 12)."""
+    """Returns each view's gantry angle (F,) in rad, the mean over the poses (F, r, c, 12) of the view's pixels."""
     angle_rad = azimuth_rad(by_pixel)
     first = angle_rad[:, :1, :1]
     return (first + wrapped(angle_rad - first).mean(axis=(1, 2), keepdims=True))[:, 0, 0]
@@ -216,7 +216,8 @@ def ray_weight(
 def opposite_weight(
     canonical: np.ndarray, shape: tuple[int, int], arc: Arc, is_parallel: bool
 ) -> Callable[[int], np.ndarray | float]:
-    """Returns a function from a view's index to weights (rows, columns). The weights of a ray and its opposite sum to 2."""
+    """Returns a function from a view's index to its redundancy weights (rows, columns), 1.0 in a full turn. The weights of a
+    ray and its opposite sum to 2. A displaced detector is not considered."""
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
 
     def weight(view: int) -> np.ndarray | float:
@@ -234,7 +235,7 @@ def _redundancy(view: int, angle_rad: np.ndarray, arc: Arc, fan: weights.Fan) ->
     if len(arc.parts_rad) > 1:
         return weights.parted_weight(progress_rad, angle_rad, arc.parts_rad)
     if not arc.is_full:
-        # A view stands for an angular step. If it is wide against the arc beyond half a turn, weights are averaged over it.
+        # A view stands for an angular step. If the step exceeds half of (arc − half a turn), weights are averaged over it.
         is_coarse = gap_rad > (arc.coverage_rad - np.pi) / 2 > 0
         within = gap_rad * (np.arange(_PARTS) - (_PARTS - 1) / 2) / _PARTS if is_coarse else (0.0,)
         at_rad = np.clip(progress_rad + np.asarray(within), 0, arc.coverage_rad)
@@ -243,11 +244,11 @@ def _redundancy(view: int, angle_rad: np.ndarray, arc: Arc, fan: weights.Fan) ->
 
 
 def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc, is_parallel: bool) -> np.ndarray:
-    """Returns the fan angle (rows, columns) on which a ray's opposite depends. In a parallel beam's short scan it is 0, and
-    in its full turn a distance from the axis.
+    """Returns the fan angle (rows, columns) that determines a ray's opposite. For a short scan of a parallel beam it is 0,
+    for a full turn of a parallel beam the distance in mm from the axis.
 
     If columns are read out one after the other, each has its own gantry angle. A short scan then begins at another angle for
-    each column, and a ray's opposite lies on another column. So the column's angle, relative to the frame's, is added."""
+    each column, and a ray's opposite lies on another column. So the column's angle relative to the frame's is added."""
     angle_rad = weights.fan_angle(pose, rays, is_parallel)
     if is_parallel and not arc.is_full:
         angle_rad = np.zeros_like(angle_rad)
@@ -269,9 +270,8 @@ def extended(pose: np.ndarray, axis: str, more: tuple[int, int], side: str = "co
 
 
 def check_beam(method: str, pose: np.ndarray, is_parallel: bool) -> None:
-    """Raises InputError for ``fdk`` in a parallel beam and ``fbp`` in a cone, and for orbits that they cannot reconstruct.
-
-    Poses (F, 12) or (F, lines, 12) that are so far from a circle about z that accuracy suffers cause a warning."""
+    """Raises InputError for ``fdk`` in a parallel beam, for ``fbp`` in a cone beam, and for orbits that ``method`` cannot
+    reconstruct. Logs a warning for poses (F, 12) or (F, lines, 12) so far from a circle about z that accuracy suffers."""
     if is_parallel != (method == "fbp"):
         found, expected, remedy = ("parallel", "cone", "fbp") if is_parallel else ("cone", "parallel", "fdk")
         raise InputError(f"--method {method}", f"a {found} beam", f"a {expected} beam", f"take --method {remedy}")
@@ -283,7 +283,7 @@ def check_beam(method: str, pose: np.ndarray, is_parallel: bool) -> None:
 
 
 def _check_directions(pose: np.ndarray) -> None:
-    """Raises InputError, or warns, if parallel rays or detector rows are off the plane of rotation: the filter is wrong."""
+    """Raises InputError, or warns, if parallel rays or detector rows leave the plane of rotation, in which FBP filters."""
     rise_deg = np.rad2deg(np.arcsin(np.clip(np.abs(pose[..., 2]), 0, 1)))
     worst_deg = float(max(rise_deg.max(), _row_lean_deg(pose).max()))
     remedy = "take an iterative or splatting method: they take any orbit"
@@ -296,12 +296,12 @@ def _check_directions(pose: np.ndarray) -> None:
 
 
 def _row_lean_deg(pose: np.ndarray) -> np.ndarray:
-    """Returns the angle (...) between the detector rows of poses (..., 12) and the plane of the rotation."""
+    """Returns the angle (...) in degrees between the detector rows of poses (..., 12) and the plane of the rotation."""
     return np.rad2deg(np.arctan2(np.abs(pose[..., 8]), np.linalg.norm(pose[..., 6:8], axis=-1)))
 
 
 def _check_rows(pose: np.ndarray) -> None:
-    """Raises InputError, or warns, if a cone's detector rows, along which FDK filters, are off the plane of the rotation."""
+    """Raises InputError, or warns, if a cone beam's detector rows, along which FDK filters, leave the plane of rotation."""
     roll_deg = float(_row_lean_deg(pose).max())
     if roll_deg > _NO_ROLL_DEG:
         found = f"detector rows {roll_deg:.1f}° off the plane of the rotation"
@@ -317,7 +317,7 @@ def _check_orbit(pose: np.ndarray) -> None:
     canonical = weights.turned_back(middle, azimuth_rad(middle)).reshape(-1, 4, 3)
     usual = np.median(canonical, axis=0)
     length_mm = float(np.linalg.norm(usual[1] - usual[0]))
-    off_mm = canonical[:, :2] - usual[:2]  # offsets of source and panel from their median positions
+    off_mm = canonical[:, :2] - usual[:2]  # offsets of source and panel from their median positions in the turned poses
     aside_mm = off_mm - np.eye(3)[2] * off_mm[:, :1, 2:]  # without travel along z, which only makes voxels miss views
     above_deg = float(np.rad2deg(np.arctan2(abs(usual[0, 2]), np.hypot(*usual[0, :2]))))
 
@@ -342,7 +342,7 @@ def _check_orbit(pose: np.ndarray) -> None:
 def warn_if_incomplete(
     arc: Arc, fan: weights.Fan, canonical: np.ndarray, grid: Grid, is_parallel: bool = False
 ) -> None:
-    """Logs a warning for each thing that the views do not cover."""
+    """Logs a warning for each kind of data that the views do not measure."""
     name = "FBP" if is_parallel else "FDK"
     if np.unique(arc.progress_rad).size == 1:
         log.warning("%s: all views are from one angle: the volume is a single backprojection", name)

@@ -1,4 +1,4 @@
-"""FDK's weights of rays: a measure of each ray, and the weights of displaced detectors and of short scans.
+"""FDK's weights of rays: a measure of each ray, and its redundancy weight for displaced detectors and short scans.
 
 The measure generalises FDK's cosine weight to any pose (docs/mathematics.md). Displaced detectors follow G. Wang, Med. Phys.
 29 (2002) 1634, in the fan angle. Short scans follow D. L. Parker, Med. Phys. 9 (1982) 254, with M. D. Silver's margin for
@@ -8,18 +8,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# (Width of the transition from rays measured twice to rays measured once)/(overhang of the panel's longer side).
+# Largest (width of the transition from rays measured twice to rays measured once)/(overhang of the panel's longer side).
 # Wang's transition covers all rays that are measured twice: it was up to 15 % noisier, with no fewer artefacts.
 TRANSITION = 1.0
 _SYMMETRIC = 0.01  # a panel whose two sides differ by at most this, in pixels, is symmetric about the axis
-# A panel less asymmetric than this fraction of the fan was not displaced on purpose, and sees both sides of the object.
+# A panel whose two sides differ by less than this fraction of the fan counts as misaligned, not as displaced on purpose.
 _ASIDE = 0.1
 
-_PART_EDGE_RAD = np.deg2rad(15)  # next to a gap, weights of views rise from 0 to full over an arc of this width
+_PART_EDGE_RAD = np.deg2rad(15)  # beside a gap, the weights of views rise from 0 to full over an arc of this width
 
 
 def turned_back(pose: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-    """Returns poses (F, ..., 12) rotated by −angle_rad (F,) about +z. All views of a circular orbit become equal."""
+    """Returns poses (F, ..., 12), each rotated by −angle_rad (F,) about +z. The poses of a circular orbit become equal."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     turn = np.zeros((len(angle_rad), 3, 3))
     turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1], turn[:, 2, 2] = c, s, -s, c, 1
@@ -39,9 +39,9 @@ def ray_measure(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -
     """Returns |ȧ·n| / D (v, u), which generalises FDK's cosine: how much each ray measures per radian of gantry angle and mm
     of detector, relative to the filter's own 1/mm².
 
-    ȧ is the source's motion per radian, n the ray's normal in the plane of ray and detector row, D the distance of the row
-    from the source. For a flat panel that faces the source the measure is DSO / |ray|, FDK's cosine. In a parallel beam it
-    is the sine of the angle between rays and row: 1 for a panel across the rays."""
+    ȧ is the source's motion in mm per radian, n the unit normal of the ray in the plane of ray and detector row, D the row's
+    distance from the source. For a flat panel that faces the source the measure is DSO / |ray|, FDK's cosine. In a parallel
+    beam it is the sine of the angle between rays and row: 1 for a panel across the rays."""
     if is_parallel:
         across = np.cross(pose[..., 0:3], pose[..., 6:9]) / np.linalg.norm(pose[..., 6:9], axis=-1, keepdims=True)
         return np.linalg.norm(across, axis=-1)
@@ -55,8 +55,8 @@ def ray_measure(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -
 
 
 def fan_angle(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -> np.ndarray:
-    """Returns the angle in rad (v, u) of each ray about +z, from the direction source to axis, counter-clockwise
-    positive. In a parallel beam: the distance in mm at which the ray passes the axis, positive on the same side."""
+    """Returns the angle in rad (v, u) of each ray about +z, counter-clockwise from the direction source to axis. In a
+    parallel beam returns the distance in mm at which each ray passes the axis, positive on the side of positive angles."""
     if is_parallel:
         along = pose[..., 0:2] / np.linalg.norm(pose[..., 0:2], axis=-1, keepdims=True)
         return along[..., 0] * rays[..., 1] - along[..., 1] * rays[..., 0]
@@ -66,10 +66,10 @@ def fan_angle(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -> 
 
 @dataclass(frozen=True)
 class Fan:
-    """The fan angles that every view sees; in a parallel beam distances in mm from the axis (see ``fan_angle``).
+    """The fan angles, low_rad to high_rad, that every view sees; in a parallel beam distances in mm from the axis.
 
-    missing_columns: columns that would make the panel symmetric about the axis, at its two ends. pixel_rad: the width of the
-    pixel at the shorter end. unlike: (largest change of an end of the fan among the views)/(width of the fan)."""
+    missing_columns: numbers of columns that would make the panel symmetric about the axis, at its two ends. pixel_rad: width
+    of the pixel at the shorter end. unlike: (largest change of an end of the fan among the views)/(width of the fan)."""
 
     low_rad: float
     high_rad: float
@@ -83,8 +83,8 @@ class Fan:
 
     @property
     def is_put_aside(self) -> bool:
-        """Whether the detector was displaced on purpose: its sides differ by over 10 % of the fan. Less may be a misaligned
-        panel that still sees the whole object."""
+        """Whether the detector was displaced on purpose: its two sides differ by over 10 % of the fan. A panel with less
+        difference may be misaligned, and still sees the whole object."""
         return abs(self.low_rad + self.high_rad) > _ASIDE * (self.high_rad - self.low_rad)
 
     @property
@@ -129,11 +129,11 @@ def measured_fan(pose: np.ndarray, shape: tuple[int, int], is_parallel: bool = F
 
 
 def displaced_weight(angle_rad: np.ndarray, fan: Fan) -> np.ndarray:
-    """Returns the weights of rays at fan angles of any shape: 1 ± sin where both sides of the axis are seen; beyond, 2 on
-    the seen side, else 0.
+    """Returns the weights of rays at fan angles of any shape. If the panel sees a ray and its opposite, they are 1 + s and
+    1 − s, with a sine s. Elsewhere they are 2 on the side that the panel sees, and 0 on the other.
 
     If the panel does not see the axis, every ray is measured once and counts 2. If the axis meets the panel's outermost
-    pixel, there is no room for a transition. A pixel then counts by which part of it lies on the long side."""
+    pixel, there is no room for a transition. A pixel's weight is then twice the fraction of it on the long side."""
     if not fan.sees_axis:
         return np.full(angle_rad.shape, 2.0)
     short = min(fan.high_rad, -fan.low_rad)
@@ -156,23 +156,22 @@ def short_scan_weight(progress_rad: float, angle_rad: np.ndarray, coverage_rad: 
 
 
 def parted_weight(progress_rad: float, angle_rad: np.ndarray, parts_rad: np.ndarray) -> np.ndarray:
-    """Returns the weight of rays at fan angles of any shape, for a view ``progress_rad`` into an arc of parts (P, 2).
-
-    The weights of a ray and its opposite add up to 2; the one whose view is deeper inside its part counts more. A ray
-    without an opposite counts 2. After F. Noo et al., Phys. Med. Biol. 47 (2002) 2525."""
+    """Returns the weights of rays at fan angles of any shape, for a view at ``progress_rad`` in an arc whose parts (P, 2)
+    begin and end at ``parts_rad``. The weights of a ray and its opposite add up to 2; the ray whose view is deeper inside
+    its part counts more. A ray without an opposite counts 2. After F. Noo et al., Phys. Med. Biol. 47 (2002) 2525."""
     here = max(float(_depth(np.array(progress_rad), parts_rad)), 1e-6)
     there = _depth(np.mod(progress_rad + np.pi + 2 * angle_rad, 2 * np.pi), parts_rad)
     return 2 * here / (here + there)
 
 
 def _depth(at_rad: np.ndarray, parts_rad: np.ndarray) -> np.ndarray:
-    """Returns a smooth weight (sin²) at angles (...): 0 at the ends of parts (P, 2) and outside, 1 deep inside."""
+    """Returns smooth weights (sin²) at angles ``at_rad`` (...): 0 at the ends of the parts (P, 2) and outside, 1 inside."""
     begin, end = parts_rad.T
     from_end = np.minimum(at_rad[..., None] - begin, end - at_rad[..., None])
     return _eased(from_end, np.minimum(_PART_EDGE_RAD, (end - begin) / 2) / 2).max(-1)
 
 
 def _eased(distance_rad: float | np.ndarray, half_width_rad: np.ndarray) -> np.ndarray:
-    """Returns a smooth weight (sin²), from 0 at the end of the arc to 1 at a distance of 2 · ``half_width_rad`` from it."""
+    """Returns smooth weights (sin²) at a distance from the end of an arc: 0 at the end, 1 from 2 · ``half_width_rad`` on."""
     share = np.clip(distance_rad / (2 * np.maximum(half_width_rad, 1e-12)), 0, 1)
     return np.sin(np.pi / 2 * share) ** 2

@@ -1,6 +1,6 @@
-"""Finds the shift of the panel that puts the rotation axis in its right place: the shift with which a coarse reconstruction
-explains the frames best. In a parallel beam at right angles to the axis, the shift also follows from views half a turn
-apart, which are mirror images."""
+"""Finds the shift of the panel along u that puts the rotation axis in its right place: the shift with which a coarse
+reconstruction explains the frames best. In a parallel beam at right angles to the axis, views half a turn apart are mirror
+images, from which the shift follows directly."""
 
 import math
 from dataclasses import dataclass
@@ -17,19 +17,19 @@ from phyradgs_cl.reconstructors.fits.residuals import fit_squares, vertex
 from phyradgs_cl.runtime import Runtime
 
 _ROUGH_SHIFTS = (-2.0, -1.0, 0.0, 1.0, 2.0)  # shifts of the panel that are tried first, in coarse pixels
-_ROUGH_ITERATIONS = 8  # iterations of CGLS for each coarse shift: few are enough to tell them apart
+_ROUGH_ITERATIONS = 8  # iterations of CGLS for each coarse shift: few are enough to tell the shifts apart
 _STEP = 0.25  # distance between the three shifts that bracket the best one, in coarse pixels
-_MOST_STEPS = 8  # most moves of the three trial shifts, so that a search without a minimum ends
+_MOST_STEPS = 8  # the three trial shifts move at most this many times, so that a search without a minimum ends
 ANYWHERE = (-math.inf, math.inf)  # limits in pixels that allow every shift
 _MOST_VIEWS = 60  # most views that are compared with their opposites, to save time
 _MOST_ROWS = 64  # most blocks of rows that are compared, to save time
-_BEYOND = 1.5  # at the scan's end, a view's opposite may lie this many angular steps beyond the last view
+_BEYOND = 1.5  # at an end of the scan, a view's opposite may lie up to this many angular steps beyond the outermost view
 WIDEST_STEP_RAD = math.radians(10.0)  # views further apart differ too much to be interpolated
 # Smoothing along rows (std, in pixels). Without it, interpolation would lower noise between pixels, which biases shifts.
 SMOOTHING_PX = 1.0
-_CORRELATED_PX = 2 * math.sqrt(math.pi) * SMOOTHING_PX  # columns over which ``SMOOTHING_PX`` correlates noise
-_LEAST_OVERLAP = 0.25  # a view and its mirrored opposite must overlap in this fraction of the columns
-_LEAST_ENERGY = 0.2  # an overlap whose sum of squares is below this fraction of the largest shows air alone
+_CORRELATED_PX = 2 * math.sqrt(math.pi) * SMOOTHING_PX  # number of columns over which the smoothing correlates noise
+_LEAST_OVERLAP = 0.25  # a view and its mirrored opposite must overlap in at least this fraction of the columns
+_LEAST_ENERGY = 0.2  # an overlap whose sum of squares is below this fraction of the largest sum counts as air alone
 _STEPS = 12  # most steps of Gauss–Newton
 _SETTLED_PX = 1e-3  # Gauss–Newton ends after a step shorter than this, in pixels
 _BIAS_PX = 0.02  # standard deviation of the error of a shift, in pixels, that the interpolation of views causes
@@ -38,8 +38,8 @@ _BIAS_PX = 0.02  # standard deviation of the error of a shift, in pixels, that t
 @dataclass(frozen=True, eq=False)
 class AxisShift:
     """A shift of the panel along u, and the fit that found it. pixels, deviation: the shift and its standard deviation in
-    pixels of the recorded scan, both NaN if no shift fits best. squares (F,): squared residuals of the frames in the trial
-    nearest to the shift."""
+    pixels of the recorded scan, both NaN if no shift fits best. squares (F,): mean squared residual of each frame, in the
+    trial whose shift is nearest; empty if there was no trial."""
 
     pixels: float
     deviation: float
@@ -54,8 +54,8 @@ NOT_FOUND = AxisShift(math.nan, math.nan, np.empty(0))
 
 
 def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHERE) -> AxisShift:
-    """Returns the best of five shifts within ``limits_px``, one coarse pixel apart: the least residual after few iterations.
-    Its deviation is NaN."""
+    """Returns the shift with the least residual after few iterations, of up to five shifts one coarse pixel apart within
+    ``limits_px``. Its deviation is NaN."""
     block = columns_per_block(scan)
     shifts_px = [block * shift for shift in _ROUGH_SHIFTS if limits_px[0] <= block * shift <= limits_px[1]]
     trials = [fit_squares(rt, shifted(scan, shift_px), _ROUGH_ITERATIONS) for shift_px in shifts_px]
@@ -66,8 +66,8 @@ def rough_shift(rt: Runtime, scan: Scan, limits_px: tuple[float, float] = ANYWHE
 def refined_shift(
     rt: Runtime, scan: Scan, rough: AxisShift, limits_px: tuple[float, float] = ANYWHERE
 ) -> AxisShift:
-    """Returns the shift near ``rough`` with the least residual, at the vertex of a parabola through three shifts. If it lies
-    outside of ``limits_px``, ``rough`` is fitted with all iterations and returned, with a deviation of NaN."""
+    """Returns the shift near ``rough`` with the least residual: the vertex of a parabola through three shifts. If the vertex
+    lies outside of ``limits_px``, ``rough`` is fitted with all iterations and returned, with a deviation of NaN."""
     block = columns_per_block(scan)
     centre = rough.pixels / block
     trials: dict[float, np.ndarray] = {}
@@ -96,8 +96,8 @@ def axis_shift(rt: Runtime, scan: Scan) -> AxisShift:
 
 
 def with_best_shift(rt: Runtime, scan: Scan) -> Scan:
-    """Returns the coarse scan with its panel shifted to the least residual, found from three shifts one coarse pixel apart
-    with few iterations each. If no shift fits best, returns the scan itself."""
+    """Returns the coarse scan with its panel shifted to the least residual, by a parabola through three shifts one coarse
+    pixel apart with few iterations each. If the parabola has no minimum, returns the scan itself."""
     block, start = columns_per_block(scan), altered_trajectory(scan).shift_px
     shifts = np.array([-1.0, 0.0, 1.0])
     trials = np.stack([fit_squares(rt, shifted(scan, start + block * shift), _ROUGH_ITERATIONS) for shift in shifts])
@@ -106,14 +106,14 @@ def with_best_shift(rt: Runtime, scan: Scan) -> Scan:
 
 
 def columns_per_block(scan: Scan) -> int:
-    """Returns how many columns of the recorded scan make up a column of the coarse scan."""
+    """Returns how many columns of the recorded scan were averaged to one column of the coarse ``scan``."""
     return altered_trajectory(scan).blocks[1]
 
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """A view and the mirror image of its opposite, both (rows, columns). apart_px: by how many columns the stated axis lies
-    further right in the view than in the mirror image."""
+    """A view and the mirror image of its opposite, both (rows, columns). apart_px: (column of the stated axis in the view) −
+    (its column in the mirror image)."""
 
     view: np.ndarray
     mirrored: np.ndarray
@@ -123,9 +123,9 @@ class _Pair:
 def opposite_shift(scan: Scan) -> AxisShift:
     """Returns the panel's shift along u under which views half a turn apart are mirror images, with its deviation.
 
-    A view's opposite is interpolated between its two neighbours in angle. A half turn has opposites at its ends only, where
-    they may be extrapolated by up to 1.5 steps. NaN for cone beams, panels that are rolled or move along the axis, and scans
-    without opposite views. NaN also if columns are read one after the other: mirrored columns then have other angles."""
+    A view's opposite is interpolated between the two views nearest to it in angle. A half turn has opposites at its ends
+    only, where they may be extrapolated by up to 1.5 steps. The shift is NaN for cone beams, for panels that are rolled or
+    move along the axis, for scans without opposite views, and if columns are read one after the other, at other angles."""
     if not has_opposite_views(scan) or (scan.shutter.axis == "columns" and scan.shutter.readout_s > 0):
         return NOT_FOUND
     pairs = _pairs(scan)
@@ -167,8 +167,8 @@ def _pairs(scan: Scan) -> list[_Pair]:
 
 
 def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Returns two frames' numbers, and weights with sum 1 that combine both to the view at angle 0; None if no frame is
-    near. away (F,): angles of the frames in rad."""
+    """Returns the numbers of two frames, and weights with sum 1 that combine both to the view at angle 0; None if no two
+    frames are near. away (F,): angles of the frames in rad, relative to that view."""
     order = np.argsort(away)
     step = float(np.median(np.abs(np.diff(away[order])))) if len(away) > 1 else math.inf
     above = int(np.searchsorted(away[order], 0.0))
@@ -186,8 +186,8 @@ def _opposite(away: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _few_rows(scan: Scan, frame: int) -> np.ndarray:
-    """Returns a frame's means over blocks of rows, (few rows, columns) float64, smoothed along rows. Masked pixels are
-    filled in."""
+    """Returns a frame's means over at most ``_MOST_ROWS`` blocks of rows, (blocks, columns) float64, smoothed along rows.
+    Masked pixels are first interpolated along their rows."""
     image = np.asarray(scan.projections[frame], np.float64)
     if scan.pixel_mask is not None:
         columns = np.arange(image.shape[1])
@@ -201,10 +201,10 @@ def _few_rows(scan: Scan, frame: int) -> np.ndarray:
 
 
 def _rough_shift(pairs: list[_Pair]) -> float:
-    """Returns the shift in pixels, in steps of 1/2, at which (sum of squared differences)/(sum of squares) of views and
-    mirror images is least where they overlap."""
+    """Returns the shift in pixels, in steps of 1/2, with the least Σ (view − mirror image)² / Σ (view² + mirror image²). The
+    sums run over all pairs, where the view and the shifted mirror image overlap."""
     columns = pairs[0].view.shape[1]
-    # a shift moves the view and the mirror image against each other, by twice its size
+    # a shift of the panel moves a view and its mirror image against each other, by twice the shift
     lags = np.arange(1 - columns, columns)  # column of the mirror image minus column of the view
     twice_px = lags.astype(np.float64)
     products, energies = np.zeros(lags.size), np.zeros(lags.size)
@@ -224,8 +224,8 @@ def _correlation(mirrored: np.ndarray, view: np.ndarray) -> np.ndarray:
 
 
 def _refined_shift(pair: _Pair, shift_px: float) -> tuple[float, float]:
-    """Returns the shift in pixels near ``shift_px`` with the least squared difference, by Gauss–Newton, and 1/variance. The
-    shift is NaN if the steps lead over 2 pixels away, or until too few columns overlap."""
+    """Returns the shift in pixels near ``shift_px`` with the least squared difference, by Gauss–Newton, and 1/(its
+    variance). Returns NaN and 0 if the steps lead over 2 pixels away, or so far that too few columns overlap."""
     last = pair.view.shape[1] - 1
     columns = np.arange(last + 1)
     view, mirrored = (CubicSpline(columns, image, axis=1) for image in (pair.view, pair.mirrored))
@@ -236,7 +236,7 @@ def _refined_shift(pair: _Pair, shift_px: float) -> tuple[float, float]:
         if middle.size < _LEAST_OVERLAP * columns.size:
             return math.nan, 0.0
         difference = view(middle - half_lag) - mirrored(middle + half_lag)
-        # d(difference)/d(shift), where a shift moves the two in opposite directions
+        # d(difference)/d(shift): the shift moves the view and the mirror image in opposite directions
         slope = -view(middle - half_lag, 1) - mirrored(middle + half_lag, 1)
         squares = float((slope**2).sum())
         step = -float((difference * slope).sum()) / max(squares, 1e-30)

@@ -14,18 +14,18 @@ from phyradgs_cl.reconstructors.voxels.cgls import Cgls
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.runtime import Runtime
 
-# In a fit, errors of flats have this fraction of the volume's effect on frames. At 1 they would explain motion too.
+# In a fit, unknown errors of flats have this fraction of the volume's effect on frames. At 1 they would explain motion too.
 _FREEDOM = 0.3
 _ITERATIONS = 20  # iterations of CGLS in a fit, by default
-_MOST_TIMES = 12  # most times per exposure at which a fit projects, to save time
-_DRAWS = 200  # number of resamplings in a bootstrap, which gives a standard deviation
-_TINY = 1e-30  # keeps divisions finite where residuals are 0
+_MOST_TIMES = 12  # a fit projects each line at no more than this many times of its exposure, to be fast
+_DRAWS = 200  # number of resamplings of the frames in a bootstrap, which gives a standard deviation
+_TINY = 1e-30  # least denominator: keeps divisions by squared residuals finite where these are 0
 
 
 @dataclass(frozen=True, eq=False)
 class FlatErrors:
     """Unknown errors b of flats: a pattern (rows, columns) that all frames share (noise of flats, air that is not 0) and a
-    level (F,) per frame (the source's brightness). pattern_unit, level_unit: line integral per unit of an unknown."""
+    level (F,), one per frame (the source's brightness). pattern_unit, level_unit: (line integral)/(unit of the unknown)."""
 
     frames_shape: tuple[int, int, int]
     pattern_unit: float
@@ -45,7 +45,7 @@ class FlatErrors:
         return math.prod(self.frames_shape[1:]) + self.frames_shape[0]
 
     def add_to(self, frames: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Returns frames (F, rows, columns) plus the effect of the unknowns ``values`` (count,) on them, which is B b in
+        """Returns frames (F, rows, columns) plus the effect on them of the unknowns ``values`` (count,): the term B b of
         ``AugmentedOperator``."""
         pattern, level = self.parts(values)
         return frames + pattern + level[:, None, None]
@@ -63,8 +63,8 @@ class FlatErrors:
 @dataclass(frozen=True, eq=False)
 class ViewParameters:
     """Unknown parameters of views, of K kinds such as shifts. The unknowns are coefficients b (n, K) of n functions of the
-    view, ``basis`` (F, n). View f has the values (basis @ b)[f]. signals (F, K, rows, columns): the Jacobian
-    d(frame)/d(values)."""
+    view, ``basis`` (F, n). The K parameters of view f are (basis @ b)[f]. signals (F, K, rows, columns): the Jacobian
+    d(frame)/d(its parameters)."""
 
     signals: np.ndarray
     basis: np.ndarray
@@ -80,14 +80,14 @@ class ViewParameters:
         return (self.basis.T @ np.einsum("fkvu,fvu->fk", self.signals, frames)).ravel()
 
     def parts(self, values: np.ndarray) -> np.ndarray:
-        """Returns flat unknowns (n · K,) as coefficients (n, K)."""
+        """Returns the unknowns ``values`` (n · K,) in the shape of the coefficients b (n, K)."""
         return values.reshape(self.basis.shape[1], self.signals.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
 class AugmentedOperator:
-    """Maps one vector (x, b), of a volume and further unknowns, to frames A x + B b. ``extra`` gives B. B should be about as
-    strong as A, because CGLS moves all unknowns together."""
+    """Maps a vector (x, b), of a volume x and further unknowns b, to frames A x + B b. operator: A. extra: B, which should
+    change frames about as strongly as A, because CGLS moves all unknowns together."""
 
     operator: LinearOperator
     extra: FlatErrors | ViewParameters
@@ -101,8 +101,8 @@ class AugmentedOperator:
         return self.operator.frames_shape
 
     def system(self, measured: np.ndarray, valid: np.ndarray | None) -> System:
-        """Returns the equations for measured frames (F, rows, columns), without subsets. valid: 1 at usable pixels, else 0;
-        None: all are usable."""
+        """Returns the system of this operator and measured frames (F, rows, columns), which has no subsets. valid: 1 at
+        usable pixels, else 0; None: all are usable."""
         return System(self, measured, valid)  # type: ignore[arg-type]
 
     def forward(self, vector: np.ndarray, out: None = None) -> np.ndarray:
@@ -133,7 +133,7 @@ class Fit:
 
 
 def fit(rt: Runtime, scan: Scan, iterations: int = _ITERATIONS) -> Fit:
-    """Reconstructs a coarse scan by CGLS with every line at its own times, together with the errors of its flats."""
+    """Fits a volume to a coarse scan by CGLS, with every line at its own times, together with errors of the scan's flats."""
     times = min(max(2, math.ceil(rim_travel_voxels(scan))), _MOST_TIMES)
     system = System.of_scan(rt, scan, PerRow(times), fewest_lines=FEWEST_LINES)
     flats = FlatErrors.beside(system.operator)
@@ -171,12 +171,12 @@ def residual_ratio(stated: np.ndarray, other: np.ndarray) -> float:
 
 
 def vertex(at: np.ndarray, squares: np.ndarray) -> tuple[float, float]:
-    """Returns the minimum of the parabola through three sums of squares, and its standard deviation by a bootstrap over
-    frames.
+    """Returns where the parabola through three sums of squares has its minimum, and the standard deviation of this place, by
+    a bootstrap over frames.
 
-    at (3,): evenly spaced, ascending values of a parameter. squares (3, F): each frame's squared residual there. The minimum
-    is limited to 3 steps from ``at[1]``, and NaN if the parabola has none. The deviation is NaN if half of the resamplings
-    or more have no minimum."""
+    at (3,): evenly spaced, ascending values of a parameter. squares (3, F): each frame's squared residual there. The place
+    is limited to 3 steps from ``at[1]``, and NaN if the parabola has no minimum. The deviation is NaN if half of the
+    resamplings or more have no minimum."""
     frames = squares.shape[1]
     draws = np.random.default_rng(0).integers(0, frames, (_DRAWS, frames))
     drawn = np.array([_minimum(at, squares[:, draw].sum(1)) for draw in draws])

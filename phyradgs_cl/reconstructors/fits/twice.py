@@ -1,8 +1,8 @@
 """Finds the axis of rotation near the edge of a displaced panel, from the rays that a full turn measures twice.
 
-The residual of a fit is no help there: it is always smaller for a shift with fewer rays measured twice. Here each ray is
-compared with its opposite, half a turn and twice its fan angle away. The mean of the squared differences does not depend on
-the number of rays."""
+The residual of a fit cannot find the axis there: it is always smaller for a shift with fewer rays measured twice. Here each
+ray is compared with its opposite, half a turn and twice its fan angle away. The mean of the squared differences does not
+depend on the number of rays."""
 
 import math
 
@@ -19,22 +19,22 @@ from phyradgs_cl.reconstructors.fits.axis import NOT_FOUND, SMOOTHING_PX, WIDEST
 _COARSE_COLUMNS = 128  # shifts are first tried on frames of at most this many columns
 _MOST_PX = 16.0  # largest shift of the panel that is tried, in coarse pixels: an eighth of the panel
 _STEP_PX = 0.5  # distance between neighbouring trial shifts, in pixels of the compared frames
-_NEAR_PX = 2.0  # distance from the best coarse shift up to which full frames are tried, in coarse pixels
-_FEWEST_VIEWS = 24  # fewer views cannot be interpolated to the opposite of each ray
+_NEAR_PX = 2.0  # full frames are tried with shifts up to this far from the best coarse shift, in coarse pixels
+_FEWEST_VIEWS = 24  # with fewer views, the opposite of a ray cannot be interpolated between views
 _MOST_VIEWS = 360  # most views that are compared, to save time
 _MOST_ROWS = 32  # most rows that are compared, to save time
 _MOST_PAIRS = 48  # most pairs of opposite rays that are compared in a row, to save time
-_LEAST_PX = 1.0  # the axis must lie this far inside the middle of the outer column, in pixels, or no ray has an opposite
+_LEAST_PX = 1.0  # a shift is left out unless it puts the axis this many pixels inside the outermost column's middle
 _BLOCKS = 12  # the jackknife leaves out one of this many blocks of views at a time
-_BIAS_PX = 0.05  # standard deviation of the shift without noise, in pixels, in half-fan scans of features two pixels wide
+_BIAS_PX = 0.05  # standard deviation of the shift's error without noise, in pixels: half-fan scans, features 2 pixels wide
 
 
 def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
     """Returns the panel's shift along u under which rays and their opposites agree best, its deviation by a jackknife over
-    the views, and the mean squares (F,) of their differences.
+    the views, and the mean squared differences (n,) in the n views that are compared.
 
-    NaN for views more than 10° apart, for columns read one after the other, and if no shift within an eighth of the panel is
-    best."""
+    The shift is NaN for fewer than 24 views, for views more than 10° apart, for columns read one after the other, and if no
+    shift within an eighth of the panel is best."""
     if scan.shutter.axis == "columns" and scan.shutter.readout_s > 0:
         return NOT_FOUND  # a ray and its opposite lie on different columns, read at different times
     poses = middle_poses(scan)
@@ -53,8 +53,8 @@ def shift_by_rays_seen_twice(scan: Scan) -> AxisShift:
 
 
 def _level_rows(scan: Scan, views: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Returns frames (n, few rows, columns) of ``views``, with the rows nearest to the plane of the source: there, opposite
-    rays meet the same matter."""
+    """Returns the frames (n, few rows, columns) of ``views`` (n,), with only the rows nearest to the plane of the source: in
+    this plane, opposite rays meet the same matter. pose (12,): that of one view."""
     rows = scan.projections.shape[1]
     level_mm = pose[5] + np.arange(rows) * pose[11] - (0.0 if scan.is_parallel else pose[2])
     near = np.sort(np.argsort(np.abs(level_mm), kind="stable")[: max(1, min(_MOST_ROWS, rows // 2))])
@@ -65,7 +65,7 @@ def _level_rows(scan: Scan, views: np.ndarray, pose: np.ndarray) -> np.ndarray:
 
 
 def _binned(frames: np.ndarray, pose: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns frames averaged over blocks of ``block`` columns and smoothed, and the pose (12,) of the coarser panel."""
+    """Returns frames averaged over blocks of ``block`` columns and smoothed, and the pose (12,) of their coarser panel."""
     columns = frames.shape[2] // block
     means = frames[:, :, : columns * block].reshape(*frames.shape[:2], columns, block).mean(-1)
     coarse = pose.copy()
@@ -75,8 +75,8 @@ def _binned(frames: np.ndarray, pose: np.ndarray, block: int) -> tuple[np.ndarra
 
 
 def _best(scan: Scan, turned: np.ndarray, frames: np.ndarray, pose: np.ndarray, shifts_px: np.ndarray) -> AxisShift:
-    """Returns the best of the shifts, in pixels of ``frames``, refined by a parabola. NaN if it is the first or last, or if
-    fewer than three shifts give rays an opposite."""
+    """Returns the best of the shifts ``shifts_px``, in pixels of ``frames``, refined by a parabola. NaN if the first or last
+    shift is best, or if fewer than three shifts give rays an opposite."""
     scores, shifts = [], []
     row, columns = np.array([(scan.projections.shape[1] - 1) / 2]), np.arange(frames.shape[2])
     for shift_px in shifts_px:
@@ -98,8 +98,8 @@ def _best(scan: Scan, turned: np.ndarray, frames: np.ndarray, pose: np.ndarray, 
 
 
 def _mean_squares(turned: np.ndarray, frames: np.ndarray, fan: np.ndarray, is_parallel: bool) -> np.ndarray | None:
-    """Returns the mean squared differences (F,) of rays and their opposites; None if the axis lies less than a pixel inside
-    the outer columns. turned (F,): views' angles in rad. fan (columns,): fan angles, in a parallel beam distances in mm."""
+    """Returns each view's mean squared difference (F,) of rays and their opposites; None if the axis lies less than a pixel
+    inside the outer columns. turned (F,): angles of the views in rad. fan (columns,): ``fan_angle`` of the columns."""
     columns = np.arange(fan.size)
     if fan[-1] < fan[0]:
         fan, columns = fan[::-1], columns[::-1]
@@ -117,7 +117,7 @@ def _mean_squares(turned: np.ndarray, frames: np.ndarray, fan: np.ndarray, is_pa
 
 
 def _at_column(frames: np.ndarray, column: float) -> np.ndarray:
-    """Returns frames (F, rows) at a fractional column, by the cubic through four columns."""
+    """Returns the frames' values (F, rows) at a fractional ``column``, on the cubic through the four columns around it."""
     low = int(np.clip(np.floor(column), 1, frames.shape[2] - 3))
     t = column - low
     weights = np.array([

@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from typing import Any
 
 # An object counts as moving if its field lowers the squared residual by over this fraction. Objects at rest reached 0.02.
-# A breath of a third of a voxel reached 0.06 in a clear scan, and gained 1.2 dB, but 0.03 in a noisy one, without any gain.
+# Breathing by a third of a voxel reached 0.06 and gained 1.2 dB in a scan with little noise; in a noisy scan 0.03 and 0 dB.
 LEAST_GAIN = 0.03
 
 
 def motion_line(found: Mapping[str, Any]) -> str:
-    """Returns a line of text that says what a run has ``found`` about the motion of the object."""
+    """Returns a line of text about the object's motion. found: the entry ``motion_found`` of a result's facts."""
     gain = f"squared residual {100 * found['gain']:.2g} % below that at rest"
     if not found["moves"]:
         if found["gain"] > LEAST_GAIN:

@@ -2,9 +2,9 @@
 
     min over U, φ of ‖p − Σ_k P_k W_k v‖² + γ bending(U) + β roughness(φ)
 
-p: frames. W_k deforms the volume v to state k, the object near one time, and P_k projects it. U: control vectors of the
-fields. φ: spline coefficients of the fields' weights in time. U and φ are improved in turn. A step is taken only if it
-lowers the sum and matter does not fold."""
+p: frames. W_k deforms the volume v to state k, which is the object near one time, and P_k projects state k. U: control
+vectors of the fields. φ: spline coefficients of the fields' weights in time. Steps of U and of φ alternate. A step is taken
+only if it lowers the sum and the stepped field does not fold matter."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
@@ -23,19 +23,19 @@ from phyradgs_cl.reconstructors.moving.signal import Bending, TemporalSplines
 from phyradgs_cl.runtime import Runtime
 
 _CG_STEPS = 8  # iterations of conjugate gradients for one step of the control vectors
-_DAMPING = 1e-3  # (Levenberg damping)/(mean diagonal of JᵀJ), J: derivative of frames; needed by control points without rays
+_DAMPING = 1e-3  # (Levenberg damping)/(mean diagonal of JᵀJ), J: derivative of frames; control points without rays need it
 _ROUGHNESS = 1e-2  # β, weight of the roughness in time, relative to the mean diagonal of JᵀJ (J: derivative of frames)
-_SHORTER = (1.0, 0.5, 0.25)  # backtracking line search: fractions of a step, tried in turn until one lowers the misfit
+_SHORTER = (1.0, 0.5, 0.25)  # backtracking line search: fractions of a step, tried in turn until one lowers the objective
 _LEAST_DETERMINANT = 0.1  # least det(I + ∂w/∂y) of the displacement w(y) after a step: at 0 matter folds
-_LEAST_VOXELS = 1.0  # a weight's change by 1 counts as a displacement of at least this many voxels, also in fields of zeros
+_LEAST_VOXELS = 1.0  # if a field's weight in time changes by 1, matter counts as moved by at least this many voxels
 _SUPPORT = 4  # number of intervals between knots over which a cubic spline in time extends
 
 
 @dataclass(frozen=True, eq=False)
 class MotionField:
     """A displacement field during its search: R fields in space, each times a weight in time. control_mm: the fields'
-    control vectors (R, cz, cy, cx, 3), as in ``Deformation``. temporal (count, R): coefficients of the fields' weights in
-    the ``count`` splines of time."""
+    control vectors (R, cz, cy, cx, 3). control_mm, origin_mm, spacing_mm: as in ``Deformation``. temporal (count, R):
+    coefficients by which the ``count`` splines in time sum to the R weights."""
 
     control_mm: np.ndarray
     origin_mm: tuple[float, float, float]
@@ -45,7 +45,8 @@ class MotionField:
 
     @classmethod
     def at_rest(cls, scan: Scan, spacing_mm: float, splines: TemporalSplines, temporal: np.ndarray) -> "MotionField":
-        """Returns a field of zeros over the scan's grid. The weights ``temporal`` (count, R) get mean 0, largest size 1."""
+        """Returns a field of zeros over the scan's grid, with coefficients ``temporal`` (count, R) of weights in time. The
+        weights are shifted to mean 0 and scaled to largest size 1."""
         origin_mm, counts = control_points(scan.grid, spacing_mm)
         centred = temporal - splines.at(splines.node_times_s).mean(0) @ temporal  # splines sum to 1: the weights get mean 0
         control_mm = np.zeros((temporal.shape[1], *counts, 3))
@@ -64,7 +65,7 @@ class MotionField:
         return replace(self, control_mm=control_mm, temporal=self.temporal / factor)
 
     def refined(self, scan: Scan, spacing_mm: float) -> "MotionField":
-        """Returns the field on closer control points, ``spacing_mm`` apart, fitted to the displacements of the voxels."""
+        """Returns the field on closer control points, ``spacing_mm`` apart, fitted to its displacements at the voxels."""
         coarse = self.deformation()
         units_mm = np.stack([coarse.on_grid_mm(scan.grid, unit) for unit in np.eye(coarse.rank)])
         control_mm, origin_mm = fitted_control_mm(units_mm, scan.grid, spacing_mm)
@@ -73,8 +74,8 @@ class MotionField:
 
 @dataclass(eq=False)
 class FieldProblem:
-    """The misfit of a scan under the gantry's motion model, as a function of the object's displacement field. bending:
-    weight γ of the field's bending, relative to how strongly frames respond to a control vector."""
+    """The misfit ‖frames − projections of a volume‖², as a function of the object's displacement field. motion: the gantry's
+    motion model. bending: γ, weight of the field's bending, relative to how strongly frames respond to a control vector."""
 
     rt: Runtime
     scan: Scan
@@ -95,8 +96,8 @@ class FieldProblem:
     def operator(
         self, one: MotionField, tables: list[TimeCells] | None = None, warp: VolumeWarp | StateStack | None = None
     ) -> WarpedOperator:
-        """Returns the projector of an object that moves by the field ``one``. With the ``warp`` of an earlier projector,
-        ``tables`` may differ from the scan's time cells, but not in their times."""
+        """Returns the projector A of an object that moves by the field ``one``. warp: that of an earlier projector, to save
+        its computation. tables: time cells in place of the scan's; with a ``warp`` they must have the same times."""
         if warp is None:
             states = MotionStates.of_times(one.deformation(), self.scan.grid, self.times_s, _LEAST_VOXELS)
             warp = VolumeWarp(self.rt, states)
@@ -106,11 +107,11 @@ class FieldProblem:
         return WarpedOperator(self.rt, self.scan.grid, shape, tables, warp=warp, subrays=subrays)
 
     def residual(self, one: MotionField, volume: np.ndarray) -> np.ndarray:
-        """Returns the residual p − A v, (F, rows, columns), dimensionless, at the valid pixels; 0 elsewhere."""
+        """Returns frames − projections of ``volume`` under the field ``one``, (F, rows, columns); 0 where not valid."""
         return self._masked(self.scan.projections - self.operator(one).forward(volume))
 
     def space_step(self, one: MotionField, volume: np.ndarray) -> MotionField:
-        """Returns the field after a step of its control vectors; the field itself if no step lowers misfit plus bending."""
+        """Returns the field after a step of its control vectors; the field itself if no step lowers misfit + bending."""
         operator = self.operator(one)
         residual = self._masked(self.scan.projections - operator.forward(volume))
         derivative = FieldDerivative(operator, volume)
@@ -137,7 +138,7 @@ class FieldProblem:
         return self._first_better(one, residual, candidates, volume, penalty)
 
     def time_step(self, one: MotionField, volume: np.ndarray) -> MotionField:
-        """Returns the field after a step of its weights in time; the field itself if no step lowers misfit plus penalty."""
+        """Returns the field after a step of its weights in time; the field itself if no step lowers misfit + roughness."""
         operator = self.operator(one)
         residual = self._masked(self.scan.projections - operator.forward(volume))
         hessian, downhill = self._temporal_equations(one, operator, volume, residual)
@@ -165,10 +166,10 @@ class FieldProblem:
         """Returns the normal equations of the coefficients in time: JᵀJ (count, R, count, R), and Jᵀ r (count, R), with the
         frames' derivative J and the residual r (F, rows, columns).
 
-        Splines that no frame sees together are projected together."""
+        One projection serves several splines if no frame sees two of them."""
         count, rank = one.temporal.shape
         spans_s = max(float(np.ptp(table.time_s)) for table in self.tables)
-        # splines of one colour lie so far apart in time that a frame sees at most one: one projection serves all of them
+        # splines of one colour lie so far apart in time that a frame sees at most one of them: they share a projection
         colours = min(count, _SUPPORT + int(np.ceil(spans_s / one.splines.step_s)) + 1)
         values = [one.splines.at(table.time_s) for table in self.tables]
         derivative = FieldDerivative(operator, volume)
@@ -200,11 +201,11 @@ class FieldProblem:
         self, one: MotionField, residual: np.ndarray, candidates: Iterable[MotionField], volume: np.ndarray,
         penalty: Callable[[MotionField], float],
     ) -> MotionField:  # fmt: skip
-        """Returns the first field of ``candidates`` that does not fold matter and has a smaller sum of squared residual and
-        ``penalty`` than the field ``one``; if none does, ``one``."""
+        """Returns the first field of ``candidates`` that does not fold matter and has a smaller ‖residual‖² + ``penalty``
+        than the field ``one``; if none has, ``one``. residual: that of ``one``."""
         before = sum_squares(residual) + penalty(one)
         for candidate in candidates:
-            # a field that folds has no inverse, so it is passed over however well its frames fit
+            # a field that folds matter has no inverse, so it is left out however well its frames fit
             if candidate.deformation().smallest_determinant() < _LEAST_DETERMINANT:
                 continue
             if sum_squares(self.residual(candidate, volume)) + penalty(candidate) < before:
@@ -220,7 +221,7 @@ def sum_squares(values: np.ndarray) -> float:
 
 
 def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], right: np.ndarray, steps: int) -> np.ndarray:
-    """Solves ``apply``(x) = ``right`` from x = 0 in ``steps`` steps, or fewer if the residual falls to 1 % of ``right``."""
+    """Solves ``apply``(x) = ``right`` from x = 0 in ``steps`` steps, or fewer if ‖residual‖ falls to 1 % of ‖right‖."""
     solution, residual = np.zeros_like(right), right.copy()
     direction, squares = residual.copy(), sum_squares(residual)
     least = 1e-4 * squares

@@ -4,8 +4,8 @@ First the field is sought on a coarse copy of the scan. Each round makes a few p
 then a Gauss-Newton step of the field and a step of its weights (``field.py``). Motion and image together: J. Wang and X. Gu,
 Simultaneous motion estimation and image reconstruction (SMEIR) for 4D cone-beam CT, Med. Phys. 40, 101912 (2013).
 
-Then ``fista`` reconstructs the reference volume with that field, as it does with ``--object-motion``. An object that shows
-no motion gets the volume of ``fista`` at rest."""
+Then ``fista`` reconstructs the reference volume with that field, as it does with ``--object-motion``. If the search finds no
+motion, the result is the volume of ``fista`` for an object at rest."""
 
 import math
 from dataclasses import dataclass, fields, replace
@@ -43,13 +43,13 @@ _MOST_COLUMNS = 64  # most pixels along the longer side of the coarse scan's pan
 _MOST_VOXELS = 32  # most voxels along the longest side of the coarse scan's grid
 _MOST_FRAMES = 600  # most frames of the coarse scan, unless the signal has more knots
 _TIMES_PER_PERIOD = 12  # an exposure is sampled at this many times per period of the motion
-_MOST_TIMES = 6  # most times per exposure that a short period may require: each costs a projection
+_MOST_TIMES = 6  # most times per exposure that a short period may require, because each time costs a projection
 _FIRST_PASSES = 8  # passes of fista before the first round, for an object at rest: the field needs a volume to start from
-_PASSES = 3  # passes of fista in each round, which let the volume follow the field
+_PASSES = 3  # passes of fista in each later round, which fit the volume to the present field
 _WEIGHT = 0.42  # prior weight of fista in the search
 _TV_ITERATIONS = 5  # dual iterations of total variation (TV) per pass of fista in the search
-_COARSE_SPACINGS = 2  # the first rounds find coarse motion, with this many spacings of control points along the longest side
-_FINE_SPACINGS = 4  # the last rounds refine that motion with closer control points: this many spacings
+_COARSE_SPACINGS = 2  # number of spacings between control points along the longest side in the first, coarse rounds
+_FINE_SPACINGS = 4  # number of spacings between control points along the longest side in the last rounds
 # Finer control points need a larger bending weight γ, by this factor, so that the field is as stiff in mm as before.
 _FINE_BENDING = (_FINE_SPACINGS / _COARSE_SPACINGS) ** 4
 _COARSE_SHARE = 0.6  # fraction of the rounds that have coarse control points
@@ -57,12 +57,12 @@ _FREE_KNOTS = 6  # number of intervals between spline knots in time, if weights 
 _AT_REST = "no motion found"
 # One in five iterations is a round of the search for the field: of the default 33, 7 rounds, then 26 passes of fista.
 _ITERATIONS_PER_ROUND = 5
-_STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")  # names in saved states
+_STORED = ("field_control", "field_place", "field_times", "field_weights", "field_gain")  # names of the field's arrays
 
 
 def coarse_scan(scan: Scan, most_frames: int = _MOST_FRAMES) -> Scan:
-    """Returns a smaller scan for the search: binned pixels, smoothed before, fewer voxels in the same box, and at most
-    ``most_frames`` frames."""
+    """Returns a smaller scan for the search: at most ``most_frames`` frames, smoothed and then binned to fewer pixels, and
+    fewer voxels in the same box."""
     block = math.ceil(max(scan.geometry.detector_shape) / _MOST_COLUMNS)
     small = binned(smooth(fewer_frames(scan, most_frames), SMOOTHING * block if block > 1 else 0.0), block)
     least_mm = max(max(scan.grid.size_mm) / _MOST_VOXELS, min(scan.grid.voxel_size_mm))
@@ -70,8 +70,8 @@ def coarse_scan(scan: Scan, most_frames: int = _MOST_FRAMES) -> Scan:
 
 
 def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: float) -> MotionField:
-    """Returns a field at rest over the times from ``first_s`` to ``last_s``. Its weights follow ``signal`` if that has a
-    knot spacing, else two curves: a straight line in time and its square."""
+    """Returns a field at rest over the times from ``first_s`` to ``last_s``. Its two weights follow ``signal`` and its
+    quadrature if ``signal.knot_s`` is set, else a straight line in time and its square."""
     spacing_mm = max(scan.grid.size_mm) / _COARSE_SPACINGS
     if signal.knot_s is not None:
         between_s = float(np.median(np.diff(signal.times_s)))
@@ -84,8 +84,8 @@ def initial_field(scan: Scan, signal: MotionSignal, last_s: float, first_s: floa
 
 
 class FieldSearch:
-    """Searches the displacement field on a coarse copy of the scan, in ``rounds``, which are iterations of a ``Loop``.
-    signal: what the field follows at first. bending: the field's stiffness."""
+    """Searches the displacement field on a coarse copy of the scan. rounds: number of iterations by a ``Loop``. signal: what
+    the field's weights in time follow at first. bending: the field's stiffness, γ in ``FieldProblem``."""
 
     quantity, remedy = "residual", "check the scan for extreme values"
 
@@ -152,9 +152,9 @@ class FieldSearch:
         return resampled(self.volume, self.scan.grid, self.grid)[0], self.grid
 
     def finding(self) -> tuple[Deformation, float]:
-        """Returns the field, and its gain: the fraction by which it lowers the squared residual, compared with an object at
-        rest after as many passes. The field is zeros unless the gain is above ``LEAST_GAIN``, and above twice the share of
-        noise that as many parameters explain."""
+        """Returns the field and its gain, 1 − (squared residual with the field)/(squared residual at rest, after as many
+        passes). The field is zeros unless the gain exceeds both ``LEAST_GAIN`` and 2 · (parameters of the field)/(valid
+        pixels), twice the share of the noise that so many parameters explain."""
         if not self.field.control_mm.any():
             return self.field.deformation(), 0.0
         moving = self._reconstructed(self.field, self.volume, _PASSES)
@@ -170,8 +170,8 @@ class FieldSearch:
         return sum_squares(self.problem.residual(one, volume))
 
     def _reconstructed(self, one: MotionField, volume: np.ndarray | None, passes: int) -> np.ndarray:
-        """Returns the volume (nz, ny, nx) after ``passes`` passes of ``fista`` on the coarse scan, from ``volume`` (None:
-        the method's own start)."""
+        """Returns the volume (nz, ny, nx) after ``passes`` passes of ``fista`` on the coarse scan under the field ``one``,
+        from ``volume`` (None: from zeros)."""
         options = FistaOptions(
             motion=self.motion, iterations=passes, prior="dct", prior_weight=_WEIGHT, tv_iterations=_TV_ITERATIONS
         )
@@ -183,8 +183,8 @@ class FieldSearch:
 
 
 def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:
-    """Returns the motion model with as many times per exposure as the gantry and the signal's period need. How fast the
-    object moves is not known yet."""
+    """Returns the motion model with as many times per exposure as the gantry's motion needs and, for a default ``PerRow``,
+    the signal's period ``period_s``. How fast the object moves is not known yet."""
     timed = with_times(motion, scan)
     if motion != PerRow() or not isinstance(timed, PerRow) or period_s is None:
         return timed
@@ -193,8 +193,8 @@ def _with_times(motion: Motion, scan: Scan, period_s: float | None) -> Motion:
 
 
 def _difference(one: MotionField, other: MotionField) -> float:
-    """Returns √(a² + b²) for the relative changes a of the control vectors and b of the coefficients in time, in a round.
-    Arrays whose shape has changed, or that are all 0, do not count."""
+    """Returns √(a² + b²), with the relative changes from ``other`` to ``one`` of the control vectors, a, and of the
+    coefficients in time, b. A change counts as 0 if the array's shape has changed, or if the new array is all 0."""
     pairs = [(one.control_mm, other.control_mm), (one.temporal, other.temporal)]
     parts: list[Any] = [
         sum_squares(new - old) / sum_squares(new) for new, old in pairs if new.shape == old.shape and new.any()
@@ -208,8 +208,8 @@ class MovingOptions(FistaOptions):
 
     - iterations: a fifth are rounds of the search for the field, the rest passes of ``fista`` after it.
     - bending: stiffness of the field, relative to how strongly frames respond to it.
-    - gating: what the motion follows at first: ``auto`` (the signal of the frames, if it repeats), ``free`` (any smooth
-      curve in time), ``scan`` (the signal or phase that the scan states), or a file, NAME.csv (``load_gating``)."""
+    - gating: what the motion follows at first: ``auto`` (the signal of the frames if it repeats, else as ``free``), ``free``
+      (a line in time and its square), ``scan`` (the signal or phase that the scan states), or a file NAME.csv."""
 
     TRIALS: ClassVar[tuple[int, int]] = (1, 7)
     """Iterations of the two short runs that ``estimate`` times: one round alone, and two rounds with five passes."""
@@ -227,27 +227,27 @@ class MovingOptions(FistaOptions):
 
     @property
     def rounds(self) -> int:
-        """Rounds of the search; the other iterations are passes of ``fista``."""
+        """Number of rounds of the search; the other iterations are passes of ``fista``."""
         return ceil_div(self.iterations, _ITERATIONS_PER_ROUND)
 
     def of_passes(self) -> FistaOptions:
-        """Returns the options of the ``fista`` passes after the search: this method's own, with the iterations that the
-        search leaves."""
+        """Returns the options of the ``fista`` passes after the search: those of this method, with ``iterations`` less the
+        rounds of the search."""
         own = {one.name: getattr(self, one.name) for one in fields(FistaOptions)}
         return FistaOptions(**{**own, "iterations": self.iterations - self.rounds})
 
 
 @dataclass
 class _Field:
-    """Hands the field from the search to the passes of ``fista``. Their state holds the field too, so that they can
-    resume."""
+    """Hands the field from the search to the passes of ``fista``. States of these passes hold the field too, so that an
+    interrupted run can resume."""
 
     deformation: Deformation | None = None
     gain: float = 0.0
 
     @property
     def for_passes(self) -> Deformation | None:
-        """The field as a deformation; None if nothing moves."""
+        """The field as a deformation; None before the search has ended, and if nothing moves."""
         return None if self.deformation is None or self.deformation.is_still else self.deformation
 
     def take(self, search: Any) -> None:
@@ -270,7 +270,7 @@ class _Field:
 
 
 def moving(scan: Scan, options: MovingOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Returns the reference volume in 1/mm, with the object's ``deformation``. ``arguments``: fields of ``MethodRun``."""
+    """Returns the reference volume in 1/mm, with the object's ``deformation``. arguments: other fields of ``MethodRun``."""
     run, one = MethodRun(scan, options, rt, **arguments), _Field()
     if run.resume is not None:
         run = replace(run, resume=one.restore(run.resume))
@@ -305,8 +305,8 @@ METHOD = Method(
 
 
 def _signal_of(scan: Scan, gating: str) -> MotionSignal:
-    """Returns the signal of the scan, of a file, or of the frames; with ``free`` it has no period. Raises InputError if the
-    scan should state a signal and does not, and for a file or signal that does not fit the scan."""
+    """Returns the signal that ``gating`` names: ``scan``, a file, or (``auto``, ``free``) that of the frames, for ``free``
+    without a period. Raises InputError if the scan states no signal, and for a file or signal that does not fit the scan."""
     if gating == "scan":
         if scan.gating is None:
             remedy = "take --set gating=auto, or a file NAME.csv"
@@ -319,7 +319,7 @@ def _signal_of(scan: Scan, gating: str) -> MotionSignal:
 
 
 def _motion_facts(one: _Field, signal: MotionSignal, scan: Scan) -> dict[str, object]:
-    """Returns what the search found, for the result's facts. Displacements count from matter's mean position."""
+    """Returns what the search found, for the result's facts. rms_mm is the RMS displacement from mean positions in time."""
     moves = one.for_passes is not None
     follows = signal.knot_s is not None
     facts: dict[str, object] = {"moves": moves, "follows": follows, "period_s": signal.period_s, "gain": one.gain}

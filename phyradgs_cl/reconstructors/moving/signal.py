@@ -1,9 +1,9 @@
-"""The motion signal of a scan: from its frames, or stated in the scan or in a file of comma-separated values. Also cubic
+"""The motion signal of a scan: from its frames, or as the scan or a file of comma-separated values states it. Also cubic
 B-splines in time, for the weights of a displacement field that follows the signal.
 
 From frames the signal is the first principal component of the Amsterdam shroud: the mean of each detector row in each frame.
-A displacement along the rotation axis shows in it from all sides, while the turning gantry changes it slowly. L. Zijp et
-al., Extraction of the respiratory signal from sequential thorax cone-beam X-ray images, Proc. ICCR (2004) 507."""
+Views from all sides show a displacement along the rotation axis in these means, while the gantry's turn changes them slowly.
+L. Zijp et al., Extraction of the respiratory signal from sequential thorax cone-beam X-ray images, Proc. ICCR (2004) 507."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,18 +16,18 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Gating
 
-_NODES = 4  # a field's weights are stored at this many times per interval between knots, and linear between these
+_NODES = 4  # a field's weights are stored at this many times per interval between knots, and linear between these times
 _STRETCH = 0.02  # weight of first differences in the bending energy: without it, a field could grow linearly in air
 _HARMONICS = 6  # number of harmonics of the gantry's angle that are removed, because an object at rest causes them too
-_FEWEST_CYCLES = 5  # a motion with fewer cycles in the scan is fitted freely in time, without a period
+_FEWEST_CYCLES = 5  # a signal with fewer cycles in the scan counts as one without a period
 _BAND = 0.25  # rates within this fraction of the dominant rate count as the same, since breaths differ in length
 # A signal repeats if at least this fraction of its power lies about one rate (``_BAND``), beyond the part of white noise.
 _PERIODIC_SHARE = 0.5
-_FEWEST_FRAMES = 16  # a scan of fewer frames shows no period
+_FEWEST_FRAMES = 16  # a scan of fewer frames counts as one without a period
 _FEWEST = 4  # a file must have at least this many values to be a signal
 _KNOTS_PER_PERIOD = 6  # weights that follow a signal have this many knots per period
-_SLOWER = 0.95  # a stated signal that does not repeat gets knots for the low frequencies that have this share of its power
-_MOST_EVEN = 100_000  # a signal is interpolated to at most this many even steps
+_SLOWER = 0.95  # without a period, knots follow a stated signal up to the frequency below which this share of its power lies
+_MOST_EVEN = 100_000  # a signal is interpolated at evenly spaced times, with at most this many steps
 _FORMS = f"at least {_FEWEST} lines: time in s, value; or one value for each frame"
 
 
@@ -64,28 +64,28 @@ class TemporalSplines:
         return BSpline(knots_s, np.eye(self.count), 3)(np.clip(times_s, self.first_s, self.last_s))
 
     def fit(self, times_s: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Returns coefficients (count, R) whose splines follow ``values`` (n, R) at times (n,) in s, linear in between."""
+        """Returns coefficients (count, R) with which the splines follow R curves, ``values`` (n, R) at ``times_s`` (n,)."""
         nodes_s = self.node_times_s
         wanted = np.stack([np.interp(nodes_s, times_s, column) for column in values.T], -1)
         return np.asarray(np.linalg.lstsq(self.at(nodes_s), wanted, rcond=None)[0])
 
     def roughness(self) -> np.ndarray:
-        """Returns the matrix K (count, count): cᵀ K c is the sum of squared second differences of coefficients c."""
+        """Returns the matrix K (count, count) that gives cᵀ K c, the sum of squared second differences of coefficients c."""
         return _difference_squares(self.count, 2)
 
 
 class Bending:
-    """Half the gradient of the bending energy Σ ‖∂²U/∂i∂j‖² + ``_STRETCH`` Σ ‖∂U/∂i‖² of control vectors U, by differences
-    between neighbours.
+    """Computes half the gradient of the bending energy Σ ‖∂²U/∂i∂j‖² + ``_STRETCH`` Σ ‖∂U/∂i‖² of control vectors U. Axes i
+    and j are z, y, x. Derivatives are differences between neighbours.
 
-    counts: (cz, cy, cx) of the control points."""
+    counts: numbers (cz, cy, cx) of control points."""
 
     def __init__(self, counts: tuple[int, ...]) -> None:
         self._first = [_difference_squares(n, 1) for n in counts]
         self._second = [_difference_squares(n, 2) for n in counts]
 
     def __call__(self, control: np.ndarray) -> np.ndarray:
-        """Returns K c for control vectors c (R, cz, cy, cx, 3); the energy is cᵀ K c."""
+        """Returns half the gradient, K U, for control vectors U (R, cz, cy, cx, 3); the energy is Uᵀ K U."""
         total = np.zeros_like(control)
         for axis in range(3):
             along = _apply(self._first[axis], control, axis)
@@ -96,7 +96,7 @@ class Bending:
 
 
 def _difference_squares(count: int, order: int) -> np.ndarray:
-    """Returns DᵀD (count, count), where D takes the differences of ``order`` between neighbours."""
+    """Returns DᵀD (count, count), where D takes the first or second (``order``) differences of ``count`` numbers."""
     differences = np.diff(np.eye(count), order, axis=0)
     return np.asarray(differences.T @ differences)
 
@@ -111,7 +111,7 @@ class MotionSignal:
 
     - times_s (F,): the middles of the frames, rising. values (F,): mean 0, largest size 1, without a unit or a sign.
     - period_s: mean length of a cycle in s; None if no cycle repeats.
-    - later (F,): the quadrature, a quarter of a cycle later; None derives it from ``values``.
+    - later (F,): the quadrature, a quarter of a cycle later; if None, ``pair`` derives it from ``values``.
     - knot_s: time in s between two spline knots of weights that follow the signal; None if weights need not follow it."""
 
     times_s: np.ndarray
@@ -121,7 +121,7 @@ class MotionSignal:
     knot_s: float | None = None
 
     def pair(self) -> np.ndarray:
-        """Returns (F, 2) the signal and its quadrature, a quarter of a cycle later. Both together can follow hysteresis."""
+        """Returns the signal and its quadrature, a quarter of a cycle later, (F, 2). Sums of both can follow hysteresis."""
         later = self.later
         if later is None:
             even_s, even = _evenly(self.times_s, self.values)
@@ -161,14 +161,14 @@ def period_of(times_s: np.ndarray, values: np.ndarray) -> float | None:
 
 
 def _spectrum(times_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns the power of a signal (n,) at 0, 1, 2 … cycles in its time span, and this span in s."""
+    """Returns the power of a signal (n,) at 0, 1, 2 … cycles in its time span, and the length of this span in s."""
     even_s, even = _evenly(times_s, values)
     power = np.abs(np.fft.rfft((even - even.mean()) * np.hanning(len(even)))) ** 2
     return power, float(even_s[-1] - even_s[0]) * len(even) / max(len(even) - 1, 1)
 
 
 def _evenly(times_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns times evenly spaced at the median step of ``times_s`` (n,), and ``values`` interpolated linearly at them."""
+    """Returns evenly spaced times, at the median step of ``times_s`` (n,), and ``values`` (n,) interpolated at them."""
     length_s = float(times_s[-1] - times_s[0])
     step_s = max(float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0, length_s / _MOST_EVEN)
     even_s = times_s[0] + step_s * np.arange(round(length_s / step_s) + 1 if step_s > 0 else 1)
@@ -182,8 +182,8 @@ def _shroud(scan: Scan) -> np.ndarray:
 
 
 def _gantry(scan: Scan, times_s: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """Returns the terms (F, n) that explain a row's mean for an object at rest: a constant, a line in time, harmonics of the
-    gantry's angle. n is at most a quarter of F."""
+    """Returns the n terms (F, n) that explain a row's mean for an object at rest: a constant, a line in time, harmonics of
+    the gantry's angle. n is at most max(1, F/4). order (F,): frame numbers by time."""
     poses = np.stack([scan.trajectory.pose(int(f), np.array([t]))[0] for f, t in zip(order, times_s, strict=True)])
     towards = poses[:, :3] - (0.0 if scan.is_parallel else np.array(scan.grid.offset_mm[::-1]))
     angle_rad = np.arctan2(towards[:, 1], towards[:, 0])
@@ -201,8 +201,8 @@ def scaled(values: np.ndarray) -> np.ndarray:
 
 
 def load_gating(path: str, scan: Scan) -> Gating:
-    """Loads a file with lines ``time in s, value``, or with one value for each frame in their order, with or without a
-    heading. Values whose heading is ``phase`` are phases in cycles. Raises InputError for other files."""
+    """Loads a file with lines ``time in s, value``, or with one value for each frame of ``scan`` in their order. A heading
+    may come first. Values with the heading ``phase`` are phases in cycles. Raises InputError for other files."""
     subject = f"gating {path}"
     try:
         # utf-8-sig: spreadsheets begin a file with a byte order mark
@@ -234,7 +234,7 @@ def load_gating(path: str, scan: Scan) -> Gating:
 
 
 def signal_of(gating: Gating, scan: Scan, subject: str) -> MotionSignal:
-    """Returns the motion signal of stated values or phases. Its period comes from the phases, or from ``period_of``.
+    """Returns the motion signal of the values or phases in ``gating``. Its period comes from the phases, or ``period_of``.
 
     Raises InputError, which names ``subject``, for times that do not cover the scan and for values that do not change."""
     times_s, values = gating.times_s, gating.values

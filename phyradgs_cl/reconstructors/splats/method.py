@@ -1,8 +1,8 @@
 """The splatting methods ``phyradgs`` and ``r2``: radiative Gaussians that are optimised against a scan's frames.
 
 phyradgs is the paper's method, exact splats that follow the gantry's motion; with a static motion it is the paper's "w/o
-ST". r2 is R2-Gaussian (Zha et al. 2024): affine splats with its published constants, static by default; micro-views make it
-the paper's "R2 w/ ST".
+ST". r2 is R2-Gaussian (Zha et al. 2024): affine splats with its published constants. With micro-views r2 is the paper's "R2
+w/ ST".
 
 Internally, lengths are divided by half the volume's longest side and densities by a reference (FDK's 99.9th percentile), so
 that learning rates, thresholds and SSIM's constants hold for every scan."""
@@ -33,7 +33,7 @@ from phyradgs_cl.reconstructors.splats.step import Batch, DeviceCloud, FrameStep
 from phyradgs_cl.runtime import Runtime
 
 REPORT_EVERY = 50  # iterations between progress reports; lines of the convergence record are as far apart or closer
-LEAST_RECORDED = 20  # short runs record more often, so that the convergence record has at least this many lines
+LEAST_RECORDED = 20  # short runs record more often, so that a run of at least this many iterations has this many lines
 
 
 class SplatRun:
@@ -72,7 +72,7 @@ class SplatRun:
             self.control_density()
 
     def motion_at(self, iteration: int) -> Motion:
-        """Returns the motion model of an iteration. In a fly-scan of an object at rest it is coarse in early iterations."""
+        """Returns the motion model of an iteration: coarse in early iterations, if the object of a fly-scan is at rest."""
         is_coarse = self.frames.scan.is_fly and self.frames.deformation is None
         return self.options.motion_at(iteration / max(self.iterations, 1)) if is_coarse else self.options.motion
 
@@ -86,7 +86,7 @@ class SplatRun:
         return found
 
     def next_batch(self) -> Batch:
-        """Draws the frames of a step in random order, each once per pass over all frames."""
+        """Draws the frames of the next step: all frames follow in random order, before any of them is drawn again."""
         frames = []
         for _ in range(min(self.batch, max(self.iterations - self.iteration, 1))):
             if not self._queue:
@@ -100,7 +100,7 @@ class SplatRun:
 
     def control_density(self) -> None:
         sums = self.cloud.read_statistics().astype(np.float64)
-        begun = time.perf_counter()  # after the download, which waits for the device, so that only density control is timed
+        begun = time.perf_counter()  # after the download, which waits for the device: only density control is timed
         statistic = sums[0] / np.maximum(sums[1], 1)
         population, box = self.cloud.population(), box_of(self.grid)
         self._load(control_density(population, statistic, self.activation, self.options.control, box, self.rng))
@@ -121,7 +121,7 @@ class SplatRun:
         }  # fmt: skip
 
     def restore(self, state: State) -> None:
-        """Continues from ``state``, on any number of ranks up to the number of frames in a batch."""
+        """Continues from ``state``. Raises InputError for more ranks than a batch has frames."""
         self.iteration, self.batch = int(state["iteration"]), int(state["batch"])
         self.sharing = sharing_of(self.rt.ranks, self.batch)
         self.rng.bit_generator.state = json.loads(str(state["rng"]))
@@ -130,7 +130,7 @@ class SplatRun:
         self._queue = state["queue"].tolist()
 
     def present_cloud(self) -> Gaussians:
-        """Returns the Gaussians in internal units, without those that density control would remove as too thin."""
+        """Returns the Gaussians in internal units, without those too thin for density control (``prune_aspect``)."""
         rows = self.activation.apply(self.cloud.population().raw.astype(np.float64))
         return Gaussians.from_rows(rows[:, self.options.control.allows(rows[SCALE])])
 
@@ -149,12 +149,12 @@ def reconstruct_splats(
     """Runs a splatting method and returns its result. method: its name in the facts, ``phyradgs`` or ``r2``.
 
     resume: continues an interrupted run of the same scan and options from its state. initial: the volume (nz, ny, nx) in
-    1/mm from which the cloud is drawn; None: an FDK volume. deformation: how the object moves; the cloud and the volume then
-    show its reference state."""
+    1/mm from which the Gaussians are drawn; None: an FDK volume. deformation: how the object moves; Gaussians and volume
+    then show its reference state."""
     started = time.perf_counter()
     if deformation is not None and deformation.is_still:
         deformation = None
-    # rank 0 makes the first volume and sends it to the others
+    # rank 0 makes the first Gaussians and sends them to the other ranks
     of_reference = (rt, scan, options, seed, initial, deformation)
     scale, population, rng = rt.ranks.bcast(first_cloud(*of_reference) if rt.ranks.rank == 0 else None)
     first_count = population.count
@@ -174,7 +174,7 @@ def reconstruct_splats(
         "ranks": rt.ranks.size,
     }  # fmt: skip
     if isinstance(options.motion, Exact):
-        # frames may differ in their number of segments: the largest is stated
+        # frames may have different numbers of segments: the largest number is stated
         facts |= {"segments": run.frames.most_cells, "motion_phases": run.phases()}
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
     return Reconstruction(volume, scan.grid, cloud, loop.record, facts, loop.state_if_interrupted())
@@ -184,8 +184,8 @@ def first_cloud(
     rt: Runtime, scan: Scan, options: SplatOptions, seed: int, initial: np.ndarray | None = None,
     deformation: Deformation | None = None,
 ) -> tuple[Scale, Population, np.random.Generator]:
-    """Returns the internal units, the Gaussians to start from, and the random generator that drew them. The Gaussians come
-    from ``initial`` (nz, ny, nx) in 1/mm or, without, from FDK's volume."""
+    """Returns the internal units, the first Gaussians, and the random generator that drew them. The Gaussians are drawn from
+    the volume ``initial`` (nz, ny, nx) in 1/mm; if that is None, from FDK's volume."""
     first = static_fdk(rt, scan, deformation) if initial is None else initial
     scale = internal_scale(first, scan.grid)
     rng = np.random.default_rng(seed)

@@ -13,23 +13,23 @@ from phyradgs_cl.operators import DEFAULT_CUTOFF_SIGMA
 from phyradgs_cl.optim import PUBLISHED_RATES, DensityControl, Rates
 from phyradgs_cl.text import repr_of_changes
 
-# Iterations before ``exact_from`` model motion coarsely, which loses nothing (docs/results/motion_models.md).
-_STATIC_SHARE = 0.4  # fraction of these coarse iterations, the first ones, that have one pose per frame
-_COARSE_ERROR = 0.1  # least ``time_error`` (relative RMS error) of the other coarse iterations
+# Iterations before ``exact_from`` model motion coarsely, without any loss of quality (docs/results/motion_models.md).
+_STATIC_SHARE = 0.4  # the first coarse iterations, this fraction of them, have one pose per frame
+_COARSE_ERROR = 0.1  # the other coarse iterations have at least this ``time_error`` (relative RMS error)
 
 
 @dataclass(frozen=True, repr=False)
 class SplatOptions(MotionOptions):
-    """Options of a splatting run; lengths in half-sides of the volume, densities relative to FDK's 99.9th percentile.
+    """Options of a splatting run. Unit of length: half the volume's longest side; of density: FDK's 99.9th percentile.
 
-    - gaussians: number at the start; 0 chooses it from the grid. The weights are λ of the paper's Eq. 4. tv_edge: side in
-      voxels of the random sub-volume for total variation. scale_min_voxels: least scale as a fraction of a voxel.
+    - gaussians: number at the start; 0 chooses it from the grid. The *_weight options weight terms of the paper's Eq. 4.
+      tv_edge: side in voxels of the random sub-volume for total variation. scale_min_voxels: (least scale)/(voxel side).
     - detector_model: what the detector averages over a line's times: line integrals (log), intensity, or what the scan
       states (scan).
-    - exact_from: in iterations before this fraction of the run, the motion ``exact`` is coarse: first one pose for each
-      frame, then one segment of few times. 0: it is exact throughout.
-    - iterations: frames used; a step of Adam takes ``batch`` of them (0: as many as there are ranks) at rates × √batch. The
-      same batch gives the same bits on any number of ranks (docs/cluster.md)."""
+    - exact_from: before this fraction of the run, the motion ``exact`` is coarse: first one pose for each frame, then one
+      segment of few times. 0: it is exact throughout.
+    - iterations: number of frames used, with repetitions. batch: frames per step of Adam, at learning rates × √batch; 0: one
+      per rank. The same batch gives the same bits on any number of ranks (docs/cluster.md)."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(SPLATS)
 
@@ -64,7 +64,7 @@ class SplatOptions(MotionOptions):
             raise InputError("scale_max", f"{self.scale_max:g}", f"more than scale_min ({self.scale_min:g})")
 
     def activation(self, grid: Grid) -> Activation:
-        """Returns the map from raw to actual parameters, with the limits of scales on ``grid`` (in internal units)."""
+        """Returns the map from raw to actual parameters, with the limits of scales on ``grid``, all in internal units."""
         smallest = max(self.scale_min, self.scale_min_voxels * min(grid.voxel_size_mm))
         return Activation(smallest, max(self.scale_max, 2 * smallest))
 
@@ -76,23 +76,23 @@ class SplatOptions(MotionOptions):
         return int(min(max(voxels / 16, 1000), 50_000))
 
     def motion_at(self, share: float) -> Motion:
-        """Returns the motion model after the fraction ``share`` of the run: a coarse one in early iterations, which gain
-        nothing from exact motion."""
+        """Returns the motion model after the fraction ``share`` of the run. In place of ``exact`` it is a coarser one before
+        ``exact_from``, where exact motion would gain nothing."""
         if not isinstance(self.motion, Exact) or share >= self.exact_from:
             return self.motion
         is_first = share < _STATIC_SHARE * self.exact_from
         return Static() if is_first else Exact(1, max(_COARSE_ERROR, self.motion.time_error))
 
     def batch_for(self, frames: int, ranks: int) -> int:
-        """Returns how many frames a step takes: the option or, for 0, one per rank. Raises InputError for more than the scan
-        has."""
+        """Returns how many frames a step takes: the option ``batch`` or, for 0, one per rank. Raises InputError for a batch
+        of more frames than the scan has."""
         if self.batch > frames:
             raise InputError("batch", str(self.batch), f"no more than the scan's {frames} frames")
         return self.batch or min(ranks, frames)
 
     @property
     def asks_for_gaussians(self) -> bool:
-        """Whether the user chose the number of Gaussians at the start. A number that a preset has counts as the preset's."""
+        """Whether the user chose the number of Gaussians at the start. A number that is in a preset counts as not chosen."""
         return self.gaussians not in {0, *(preset.gaussians for preset in (*PRESETS.values(), R2_PUBLISHED))}
 
 
@@ -108,7 +108,7 @@ _QUICK = SplatOptions(
 )
 
 PRESETS = {"default": SplatOptions(), "quick": _QUICK, "paper": _PAPER}
-# R2-Gaussian's constants, but with our default number of iterations, not its 30,000; its rates decay over these.
+# R2-Gaussian's constants, but our default number of iterations, not its 30,000. The learning rates decay over our number.
 R2_PUBLISHED = SplatOptions(
     motion=Exact(), affine=True, gaussians=50_000, ssim_weight=0.25, tv_weight=0.05, density_weight=0.0,
     rates=PUBLISHED_RATES, control=PUBLISHED_CONTROL,

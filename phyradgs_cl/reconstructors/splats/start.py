@@ -1,4 +1,4 @@
-"""The start of a splatting run: its internal units, and the first cloud, drawn from an FDK volume."""
+"""The start of a splatting run: its internal units, and its first Gaussians, drawn from a volume such as FDK's."""
 
 import logging
 
@@ -12,12 +12,12 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.splats.step import Scale
 
 log = logging.getLogger(__name__)
-_REFERENCE_PERCENTILE = 99.9  # percentile of the first volume that is the unit of density: its maximum would be noise
+_REFERENCE_PERCENTILE = 99.9  # percentile of the first volume that is the unit of density; the maximum is often noise
 
 
 def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:
-    """Returns the internal units: half the longest side in mm, and the 99.9th percentile of an FDK volume in 1/mm. If the
-    percentile is not positive, 1/(half the longest side) replaces it. Raises NumericalError if it is not finite."""
+    """Returns the internal units: half the grid's longest side in mm, and the 99.9th percentile of an FDK volume (nz, ny,
+    nx) in 1/mm; if that is not above 0, 1/(half the longest side). Raises NumericalError if it is not finite."""
     reference = float(np.percentile(fdk, _REFERENCE_PERCENTILE))
     if not np.isfinite(reference):
         raise NumericalError("projections", "values that overflow in FDK", "line integrals of order 1")
@@ -27,7 +27,7 @@ def internal_scale(fdk: np.ndarray, grid: Grid) -> Scale:
 def first_population(
     volume: np.ndarray, grid: Grid, options: SplatOptions, rng: np.random.Generator
 ) -> Population:
-    """Returns the raw parameters of the first cloud, drawn from a volume (nz, ny, nx), all in internal units."""
+    """Returns the raw parameters of the first Gaussians, drawn from a volume (nz, ny, nx) and pruned; in internal units."""
     activation = options.activation(grid)
     requested = options.gaussians_for(grid)
     cloud = initial_cloud(
@@ -50,9 +50,9 @@ def initial_cloud(
 ) -> Gaussians:
     """Draws up to ``count`` isotropic Gaussians at different voxels above ``threshold``, all in internal units.
 
-    volume (nz, ny, nx). A Gaussian's density is ``density_share`` of the voxel's value. Its scale is ``scale_factor`` × the
-    RMS distance to its three nearest neighbours, within ``scale_bounds``. If no voxel is above ``threshold``, draws one
-    faint Gaussian in the middle, so that there is something to optimise."""
+    volume (nz, ny, nx). A Gaussian's density is ``density_share`` × its voxel's value. Its scale is ``scale_factor`` × the
+    RMS distance to its three nearest neighbours, within ``scale_bounds``. If no voxel is above ``threshold``, returns one
+    Gaussian of density ``density_share`` × ``threshold`` in the middle, so that there is something to optimise."""
     candidates = np.flatnonzero(volume.ravel() > threshold)
     if candidates.size == 0:
         log.warning(
@@ -71,7 +71,7 @@ def initial_cloud(
 
 
 def neighbour_distance(points: np.ndarray, fallback: float) -> np.ndarray:
-    """Returns the RMS distance (G,) from each point (G, 3) to its three nearest others; ``fallback`` for a single point."""
+    """Returns the RMS distance (G,) from each point (G, 3) to its three nearest neighbours; ``fallback`` for one point."""
     neighbours = min(4, len(points))
     if neighbours < 2:
         return np.full(len(points), fallback)

@@ -1,6 +1,6 @@
-"""One step of a splatting run on the device: its Gaussians and frames there, and the gradient, summed over ranks.
+"""One step of a splatting run: its Gaussians and frames on the device, and its gradient, summed over ranks.
 
-All of it is in ``FrameStep.gradient``: render a frame, compare it, differentiate, add total variation, apply the chain rule.
+``FrameStep.gradient`` renders a frame, compares it, differentiates, adds total variation, and applies the chain rule.
 Each rank (MPI process) has all Gaussians, and some frames of the batch. The bits of summed gradients depend on the batch,
 not on the number of ranks."""
 
@@ -23,9 +23,9 @@ from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.runtime import DeviceArray, Runtime
 from phyradgs_cl.runtime.layout import pad_rows
 
-_PEAK_PERCENTILE = 99.9  # percentile of the line integrals that counts as their peak: their maximum would be noise
+_PEAK_PERCENTILE = 99.9  # percentile of the line integrals that counts as their peak; their maximum is often noise
 _ROWS = 11  # number of a Gaussian's parameters, which are the rows of dL/d(parameters)
-_STATISTICS = 2  # numbers per Gaussian for density control: a sum of gradient norms, and from how many frames they are
+_STATISTICS = 2  # number of rows of statistics: each Gaussian's sum of gradient norms, and how many of them exceed 0
 # Number of rows of ``cloud.gradients``: the 11 of dL/d(parameters), then dL/d(projected centre) along and across a line, in
 # units of half the image's size.
 _DERIVED = 13
@@ -46,7 +46,7 @@ class Scale:
 
 
 class DeviceCloud:
-    """The Gaussians of a run on the device: the first ``count`` of the ``gaussians.stride`` columns of each array."""
+    """A run's Gaussians on the device: the first ``count`` of the ``gaussians.stride`` columns of every array."""
 
     def __init__(self, rt: Runtime, population: Population) -> None:
         self.rt, self.count = rt, population.count
@@ -82,7 +82,7 @@ class DeviceCloud:
 
 
 class DeviceFrames:
-    """All frames on the device, each with its time cells, its measured line integrals in internal units, and its mask."""
+    """All frames of a scan on the device: their time cells, measured line integrals in internal units, and masks."""
 
     def __init__(
         self, rt: Runtime, scan: Scan, options: SplatOptions, scale: Scale, deformation: Deformation | None = None
@@ -98,7 +98,7 @@ class DeviceFrames:
         self._mask, self._pixels = _upload_masks(rt, scan)
 
     def follow(self, motion: Motion) -> bool:
-        """Uploads the time cells of a motion model. Returns whether frames average intensities over a line's cells."""
+        """Uploads the time cells of a motion model. Returns whether frames are averages of intensity over a line's cells."""
         tables, merges = tables_of(self.scan, motion, self._model, self.deformation)
         of_object = self.deformation
         states = [None if of_object is None else states_of(table, of_object) for table in tables]
@@ -111,7 +111,7 @@ class DeviceFrames:
         return max(cells.count for cells in self._cells)
 
     def get(self, frame: int) -> tuple[DeviceCells, DeviceArray, DeviceArray, float]:
-        """Returns a frame's time cells, measurement, mask (1 at valid pixels) and number of valid pixels."""
+        """Returns the time cells, measurement, mask (1 at valid pixels) and number of valid pixels of frame ``frame``."""
         mask = frame if len(self._mask) > 1 else 0
         return self._cells[frame], self._measured[frame], self._mask[mask], self._pixels[mask]
 
@@ -119,9 +119,9 @@ class DeviceFrames:
 def tables_of(
     scan: Scan, motion: Motion, model: str, deformation: Deformation | None = None
 ) -> tuple[list[TimeCells], bool]:
-    """Returns the time cells of every frame in mm, and whether frames average intensities over a line's cells.
+    """Returns the time cells of every frame in mm, and whether frames are averages of intensity over a line's cells.
 
-    If ``exact`` chooses the number of segments, an object that moves gets as many as its paths need."""
+    If the model ``exact`` chooses its number of segments, a moving object raises it to what the object's paths need."""
     peak = float(np.percentile(scan.projections, _PEAK_PERCENTILE)) if model == "intensity" else 0.0
     cells = partial(motion.cells, intensity_peak=peak) if isinstance(motion, Exact) else motion.cells
     tables = [cells(scan, frame) for frame in range(scan.frames)]
@@ -131,7 +131,7 @@ def tables_of(
             needed = segments_for_object(deformation, start_s + lit_s, voxel_mm)
             if needed > tables[frame].count:
                 tables[frame] = replace(motion, segments=needed).cells(scan, frame)
-    # for a single time the log and the intensity model agree
+    # for lines with a single time, the log model and the intensity model agree
     return tables, model == "intensity" and any(table.averages for table in tables)
 
 
@@ -145,9 +145,9 @@ def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[floa
 
 @dataclass(frozen=True)
 class Batch:
-    """The frames of one step by number. corners: for each frame, the first voxel of the sub-volume whose total variation
-    counts; None if total variation has no weight. ``late``: whether the iteration has reached ``parameter_terms_from``, from
-    which on the density term applies."""
+    """The numbers of one step's frames. corners: for each frame, the first voxel of the sub-volume whose total variation
+    counts; None if total variation has no weight. late: whether the density term applies, as it does from iteration
+    ``parameter_terms_from`` on."""
 
     frames: list[int]
     corners: list[Corner | None]
@@ -180,7 +180,7 @@ class FrameStep:
         self.adam = DeviceAdam(rt, options.activation(grid))
 
     def follow(self, motion: Motion) -> None:
-        """Renders frames with another motion model from the next step on."""
+        """Makes later steps render frames with the motion model ``motion``."""
         if motion != self.motion:
             self.motion = motion
             self.frames.follow(motion)
@@ -213,7 +213,7 @@ class FrameStep:
 
 
 class Alone:
-    """A step in one process, which takes one frame at a time."""
+    """The gradient and the loss of steps that take one frame, in one process."""
 
     def differentiate(self, step: FrameStep, cloud: DeviceCloud, batch: Batch) -> None:
         """Writes dL/d(raw parameters) of the batch into the cloud's gradients, and adds to its statistics."""
@@ -224,7 +224,7 @@ class Alone:
 
 
 class SharedFrames(Alone):
-    """A step of several frames that ranks share: rank r takes the frames r, r + ranks, … of the batch."""
+    """The gradient and the loss of steps that take several frames: rank r takes frames r, r + ranks, … of the batch."""
 
     def __init__(self, ranks: Communicator) -> None:
         self.ranks = ranks
@@ -240,7 +240,7 @@ class SharedFrames(Alone):
             self._losses[place] = step.loss.value()
             own.append(np.concatenate([rt.download(cloud.gradients)[:_ROWS], rt.download(statistics)]))
         total = exact_sum(self.ranks, own, (_ROWS + _STATISTICS, stride), count)
-        # rows of dL/d(centre on the panel) are 0 here, because the statistics include them already
+        # the rows of dL/d(projected centre) are set to 0: the statistics contain them already
         rt.write(cloud.gradients, np.pad(total[:_ROWS], ((0, _DERIVED - _ROWS), (0, 0))))
         rt.write(cloud.statistics, rt.download(cloud.statistics) + total[_ROWS:])
 
@@ -251,7 +251,7 @@ class SharedFrames(Alone):
 
 
 def sharing_of(ranks: Communicator, batch: int) -> Alone:
-    """Returns how ``ranks`` share steps of ``batch`` frames. Raises InputError if a rank would have no frame."""
+    """Returns the object that computes steps of ``batch`` frames on ``ranks``. Raises InputError if a rank has no frame."""
     if ranks.size > batch:
         found = f"{batch} for {ranks.size} ranks"
         raise InputError("batch", found, "a frame for every rank", "raise it, or take fewer ranks")

@@ -1,4 +1,4 @@
-"""ASD-POCS: a SART pass, then a few steps down the total variation (TV), whose lengths are kept in balance.
+"""ASD-POCS: a SART pass, then a few steps down the total variation (TV), kept in balance with the pass's change.
 
 Sidky and Pan, Phys. Med. Biol. 53 (2008) 4777, with the step control of TIGRE (Biguri et al. 2016)."""
 
@@ -34,7 +34,7 @@ class AsdPocsOptions(SartOptions):
 
 
 class AsdPocs(Algorithm):
-    """ASD-POCS. An iteration's residual belongs to the volume between the SART pass and the TV steps."""
+    """ASD-POCS. An iteration's residual is that of the volume after its SART pass, before its TV steps."""
 
     def __init__(self, system: System, options: AsdPocsOptions, descend: TvDescent, epsilon: float) -> None:
         super().__init__(system)
@@ -80,5 +80,5 @@ def _started(system: System, options: AsdPocsOptions, run: MethodRun) -> AsdPocs
 
 METHOD = voxel_method(
     "asd-pocs", AsdPocsOptions(), _started, frames=2,
-    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # 4 more than SART, to compare lengths of steps
+    volumes=lambda scan, options: held_volumes(scan, options) + 4,  # SART's, and 4 to compare lengths of steps
 )

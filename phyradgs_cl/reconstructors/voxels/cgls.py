@@ -11,7 +11,7 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 @dataclass(frozen=True)
 class CglsOptions(IterativeOptions):
-    """Options of CGLS. noise_stop: the run ends once the residual is at most this many times the estimated noise.
+    """Options of CGLS. noise_stop: the run ends once the residual is at most this many times the estimated noise; 0: never.
     nonnegative must stay False, because CGLS does not clip."""
 
     iterations: int = 60
@@ -27,9 +27,9 @@ class CglsOptions(IterativeOptions):
 class Cgls(Algorithm):
     """Minimises ‖p − A x‖ over the Krylov spaces of AᵀA from x = 0. An iteration's residual is the one after its step.
 
-    In the intensity model the residual is p − I(x), with I(x) the expected measurement, and its derivative J replaces A.
-    Directions then combine as in nonlinear conjugate gradients (Polak and Ribière 1969), which is the same iteration where I
-    is linear."""
+    In the intensity model the residual is p − I(x), with I(x) the expected measurement, and the derivative J of I replaces
+    A. Directions then combine as in nonlinear conjugate gradients (Polak and Ribière 1969). For a linear I both iterations
+    are the same."""
 
     ARRAYS = ("volume", "residual", "direction", "gradient")
     NUMBERS = ("gamma",)

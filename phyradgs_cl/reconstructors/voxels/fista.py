@@ -3,14 +3,14 @@
 Each subset S, one of M, makes one step. FISTA's is xₖ = prox(yₖ + M/L · A_Sᵀ (p_S − A_S yₖ)), yₖ₊₁ = xₖ + βₖ₊₁ (xₖ − xₖ₋₁)
 (Beck and Teboulle, SIAM J. Imaging Sci. 2 (2009) 183, Eqs. 4.1 to 4.3). The proximal optimised gradient method, POGM, needs
 a third fewer steps (Taylor, Hendrickx and Glineur, SIAM J. Optim. 27 (2017) 1283; Kim and Fessler, J. Optim. Theory Appl.
-178 (2018) 240), but leaves more of the noise of subsets. So the last passes are FISTA's.
+178 (2018) 240), but leaves more of the noise that subsets cause. Therefore the last passes are FISTA's.
 
 The gradient of a subset, times the number of subsets, stands for that of all frames (Kim, Ramani and Fessler, IEEE Trans.
 Med. Imaging 34 (2015) 167). L is a Lipschitz constant of the gradient: it bounds the norm of AᵀA.
 
-On small grids the last 7 of 13 iterations run on smaller voxels, whose means make up most of the result (``stages.py``). The
-iterations before them only provide their first volume, so they are coarser: two quick passes each, with more subsets, and
-fewer times in an exposure. They are FISTA's, because POGM diverges with so many subsets.
+On small grids the last 7/13 of the iterations run on smaller voxels, whose means make up most of the result (``stages.py``).
+The first 6/13 only provide a first volume, so they are coarser: an iteration is two quick passes, with more subsets and
+fewer times in an exposure. All these passes are FISTA's, because POGM diverges with so many subsets.
 
 The calls of a run: ``MethodRun``, ``Stages``, ``fista_stage``; then ``Loop``, ``Iterations.step``, ``Fista.step``,
 ``System``, ``RayOperator``, a kernel. ``fista_stage`` projects first, for the ``PriorWeight`` and the step size."""
@@ -41,12 +41,12 @@ from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.runtime.algebra import HostSpace
 
 log = logging.getLogger(__name__)
-_VOLUMES = 16  # volumes that a run with the prior ``dct`` holds in memory at one time
-_FRAMES = 3  # arrays of all frames that a run holds in memory at one time
-_HELD = 9  # volumes that the maps of the prior ``dct`` keep on the device, even if the run's arrays are on the host
-_COPIES = 2  # volumes on the device, input and result, while a prior maps a volume of the host
+_VOLUMES = 16  # number of volumes that a run with the prior ``dct`` holds in memory at one time
+_FRAMES = 3  # number of arrays of all frames that a run holds in memory at one time
+_HELD = 9  # number of volumes that the prior ``dct`` keeps on the device, even if the run's arrays are on the host
+_COPIES = 2  # number of volumes, input and result, that a map of a prior needs on the device for a volume of the host
 # These values were chosen by measurement: docs/results/settings.md.
-_COARSE_SHARE = 6 / 13  # fraction of the iterations that are coarse: those before voxels are divided
+_COARSE_SHARE = 6 / 13  # fraction of the iterations that are coarse: all before the voxels are divided
 _COARSE_PASSES = 2  # number of passes in a coarse iteration: they cost little, and scans with few views or photons need many
 _COARSE_SUBSETS = 1.6  # (number of subsets in a coarse pass)/(option ``subsets``)
 _COARSE_TIMES = 1 / 3  # (times per exposure in a coarse pass)/(times in another pass); a coarse pass has at least two
@@ -54,8 +54,8 @@ _COARSE_TIMES = 1 / 3  # (times per exposure in a coarse pass)/(times in another
 # until the last _FULL_PASSES passes. In these every step has its map, which removes the noise of the passes before.
 _STEPS_PER_MAP = 3
 _FULL_PASSES = 5
-_MOST_OPTIMISED = 23  # most iterations by POGM: its momentum is never restarted, and the noise of subsets grows with it
-_CALM = 3  # number of last iterations by FISTA in a run on one grid: they remove the noise of subsets
+_MOST_OPTIMISED = 23  # most iterations by POGM: its momentum never restarts, and the noise that subsets cause grows with it
+_CALM = 3  # number of last iterations by FISTA in a run on one grid: they remove the noise that subsets cause
 _FAINTEST = 1e-6  # smaller row sums of AᵀA count as this fraction of the largest, since less would inflate the bound
 # Voxels are divided if a slice (y, x) has at most this many of them: dividing is worth its time at 64³, not at 128³.
 # Slices are not counted, so that thick and thin slabs of one scan are reconstructed in the same manner.
@@ -81,7 +81,7 @@ class FistaOptions(IterativeOptions):
     """Options that may be a function."""
 
     TRIALS: ClassVar[tuple[int, int]] = (2, 7)
-    """Iterations of the two short runs that ``estimate`` times. Of the five between, two are coarse, as in a whole run."""
+    """Numbers of iterations of the two short runs that ``estimate`` times. Of the five more, two are coarse: about 6/13."""
 
     motion: Motion = PerRow()
     iterations: int = 26
@@ -104,7 +104,7 @@ class FistaOptions(IterativeOptions):
 
 
 class Accelerated(Algorithm):
-    """A proximal gradient method with FISTA's momentum, which restarts when it has overshot a minimum.
+    """A proximal gradient method with FISTA's momentum, which restarts when it has carried a step past a minimum.
 
     The restart is the gradient scheme of O'Donoghue and Candès, Found. Comput. Math. 15 (2015) 715. has_long_steps: takes a
     smaller Lipschitz constant, found by one more pass, so that steps are longer."""
@@ -117,7 +117,7 @@ class Accelerated(Algorithm):
         self.prior = prior
         self.previous = self.volume
         self.momentum = 1.0  # tₖ of Beck and Teboulle, 1 for the first step
-        self.curvature = (_tight_curvature if has_long_steps else _curvature)(system) or 1.0  # L, a Lipschitz constant
+        self.curvature = (_tight_curvature if has_long_steps else _curvature)(system) or 1.0  # L ≥ ‖AᵀA‖
 
     def start_from(self, volume: Any) -> None:
         self.volume = self.previous = volume
@@ -168,9 +168,9 @@ def _tight_curvature(system: System) -> float:
 class Fista(Accelerated):
     """Passes over subsets by POGM, then by FISTA. A pass's residual combines all subsets, each at the point of its gradient.
 
-    passes: number of passes in an iteration, whose residual is the last one's. optimised: number of passes by POGM. sparing:
-    number of passes in which the prior's map follows only every third step and the last, with the weight of the steps since
-    the last map. ``previous`` and ``ahead`` are POGM's wₖ₋₁ and zₖ₋₁, ``momentum`` and ``length`` its θₖ₋₁ and L γₖ₋₁."""
+    passes: number of passes in an iteration, whose residual is that of its last pass. optimised: number of passes by POGM.
+    sparing: number of passes in which a map of the prior follows only every third step and the last, with the weights of all
+    steps since the map before. POGM's wₖ₋₁ is ``previous``, its zₖ₋₁ ``ahead``, θₖ₋₁ ``momentum``, and L γₖ₋₁ ``length``."""
 
     ARRAYS = ("volume", "previous", "ahead")
     NUMBERS = ("momentum", "length", "optimised", "sparing")
@@ -203,14 +203,14 @@ class Fista(Accelerated):
         update = self._optimised_update if self.optimised else self._update
         steps = (update(subset, weight, maps) for subset, maps in zip(self.subsets, self._maps(), strict=True))
         residual = self.system.space.sum_squares(steps) ** 0.5
-        # joined subsets have another step length, for which the momentum so far would be wrong
+        # joined subsets make steps of another length, for which the present momentum would be wrong
         if self.subsets.join_if_diverging(residual) or self.optimised == 1:
             self._rest()
         self.optimised, self.sparing = max(self.optimised - 1, 0), max(self.sparing - 1, 0)
         return residual
 
     def _maps(self) -> list[int]:
-        """Returns for each step of a pass how many steps its map of the prior stands for; 0 for a step without a map."""
+        """Returns, for each step of a pass, for how many steps the map of the prior after it stands; 0 if no map follows."""
         count, spacing = len(self.subsets), _STEPS_PER_MAP if self.sparing else 1
         maps = [0 if step % spacing else spacing for step in range(1, count)]
         return [*maps, (count - 1) % spacing + 1]
@@ -222,8 +222,8 @@ class Fista(Accelerated):
         return self.system.space.add(point, downhill, len(self.subsets) / self.curvature), residual
 
     def _mapped(self, volume: Any, weight: float, maps: int) -> Any:
-        """Applies the prior's map with ``weight`` for each of ``maps`` steps; for 0 steps only clips at 0, if
-        ``nonnegative``."""
+        """Returns the prior's map of a volume, with ``maps`` · ``weight``, for that many steps at once. With ``maps`` 0 the
+        volume is only clipped at 0, if ``nonnegative``."""
         prior = self.prior if maps else Prior()
         return prior(self.system.space, volume, maps * weight, nonnegative=self.nonnegative)
 
@@ -259,8 +259,8 @@ class Fista(Accelerated):
 
 
 def fista(scan: Scan, options: FistaOptions, rt: Runtime, **arguments: Any) -> Reconstruction:
-    """Reconstructs a scan by the method ``fista``, in 1/mm. ``arguments``: further fields of ``MethodRun``; its seed has no
-    effect."""
+    """Returns the reconstruction in 1/mm of a scan by the method ``fista``. ``arguments``: further fields of ``MethodRun``,
+    of which ``seed`` has no effect."""
     run = MethodRun(scan, options, rt, **arguments)
     return run.result("fista", Stages(fista_stages(run, lambda: run), run))
 
@@ -269,8 +269,8 @@ METHOD = Method(fista, {"default": FistaOptions()}, is_shared=True, takes_initia
 
 
 def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
-    """Returns the stages of a run: on the scan's own voxels and, if options or grid ask for them, on smaller voxels. A stage
-    calls ``now`` for its run when it starts, because the motion of the object may be known only then."""
+    """Returns the stages of a run: on the scan's own voxels and, if the options or the grid's size ask for it, on smaller
+    voxels. A stage calls ``now`` for its run when it starts, because the object's motion may be known only then."""
     options = run.options
     parts = options.subvoxels or (2 if _gains_from_subvoxels(run, 2) else 1)
     first = round(_COARSE_SHARE * options.iterations) if parts > 1 else 0
@@ -287,7 +287,7 @@ def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
 
 
 def _few_times(motion: Motion) -> Motion:
-    """Returns a per-row model with a third of its times per exposure, for coarse passes; other models unchanged."""
+    """Returns a per-row model with a third of its times per exposure, two at least, for coarse passes; others unchanged."""
     if not isinstance(motion, PerRow) or motion.sub_intervals <= 2:
         return motion
     return replace(motion, sub_intervals=max(2, math.ceil(_COARSE_TIMES * motion.sub_intervals)))
@@ -297,10 +297,10 @@ def fista_stage(
     now: Callable[[], MethodRun], iterations: int, volume: np.ndarray | None, parts: int = 1, is_coarse: bool = False,
     optimised: int = 0,
 ) -> Iterations:  # fmt: skip
-    """Returns a stage's ``iterations`` from ``volume`` (nz, ny, nx; None: the method's own start), on a grid whose voxels
-    are divided into ``parts`` along each side. now: returns the run as it is when the stage starts. is_coarse: the
-    iterations only provide the first volume of the next stage. optimised: how many iterations use POGM; the others use
-    FISTA."""
+    """Returns a stage of ``iterations`` iterations, on a grid whose voxels are divided into ``parts`` along each side.
+    volume (nz, ny, nx): the first volume, on the undivided grid; None: zeros. now: returns the run as it is when the stage
+    starts. is_coarse: the iterations only provide the next stage's first volume. optimised: how many of the iterations, the
+    first ones, use POGM; the others use FISTA."""
     whole = now()
     scan = replace(whole.scan, grid=whole.scan.grid.finer(parts), reference=None, moving_truth=None)
     options, rt = replace(whole.options, iterations=iterations), whole.rt
@@ -330,8 +330,8 @@ def fista_stage(
 
 
 def _gains_from_subvoxels(run: MethodRun, parts: int) -> bool:
-    """Returns whether voxels divided into ``parts`` along a side are worth their time on this grid, and fit on every rank's
-    device. Logs a warning if only room is missing."""
+    """Returns whether voxels divided into ``parts`` along a side are worth their time on the run's grid, and fit on every
+    rank's device. Logs a warning if they are worth it and do not fit."""
     shape, rt = run.scan.grid.shape, run.rt
     if math.prod(shape[1:]) > _MOST_DIVIDED:
         return False

@@ -15,10 +15,10 @@ from phyradgs_cl.reconstructors.voxels.system import System
 
 @dataclass(frozen=True)
 class FistaTvOptions(IterativeOptions):
-    """Options of FISTA-TV. tv_weight: λ as a fraction of the largest value of Aᵀp, so that it holds for any unit and dose.
+    """Options of FISTA-TV. tv_weight: λ/max|Aᵀp|, so that one value suits scans of any unit and dose.
 
-    tv_iterations: dual iterations per proximal map, which begins from the last dual field. transmission_weights: least
-    squares weighted by transmission t (PWLS), ½ Σ t (p − A x)², with λ a fraction of the largest value of Aᵀ t p."""
+    tv_iterations: dual iterations per proximal map, begun from the dual field of the map before. transmission_weights: least
+    squares weighted by the transmission t (PWLS), ½ Σ t (p − A x)²; tv_weight is then λ/max|Aᵀ t p|."""
 
     iterations: int = 100
     tv_weight: float = ranged(0.001, 0, 1e6)
@@ -30,8 +30,8 @@ class FistaTv(Accelerated):
     """FISTA with TV on all frames at once. An iteration's residual belongs to its new volume.
 
     A is linear, so A y at the extrapolated point y follows from A xₖ and A xₖ₋₁. The intensity model replaces A x by the
-    expected I(x), and Aᵀ by its transposed derivative Jᵀ at x. I is not linear between the two points; the error vanishes
-    with the steps."""
+    expected I(x), and Aᵀ by Jᵀ, with the derivative J of I at xₖ. I is not linear, so that I(y) has an error, which vanishes
+    as the steps become shorter."""
 
     ARRAYS = ("volume", "previous", "projected", "projected_previous")
 

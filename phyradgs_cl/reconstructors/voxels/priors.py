@@ -1,5 +1,5 @@
 """The priors of ``fista`` as proximal maps, and their weight, relative to the error of the data term's gradient. To add a
-prior, add a line to ``PRIORS``: a class, whose map is in ``objective``, or ``OwnPrior`` of a function.
+prior, add a line to ``PRIORS``, with a subclass of ``Prior`` whose map is in ``objective``, or ``OwnPrior`` of a function.
 
 A pixel differs from the projection of the best volume by its noise and, at edges, by the discretisation error of voxels.
 Both reach the gradient through Aᵀ. The constants are fitted (docs/results/settings.md)."""
@@ -28,25 +28,25 @@ from phyradgs_cl.runtime import Runtime, Space
 
 # (Length of a path)/(standard deviation of five positions on it, at even times from its start to its end).
 _SPREAD = 2.83
-_EDGES = 0.09  # (error of a ray's path length in the object, as voxels cannot show the object's edges)/(voxel's side)
+_EDGES = 0.09  # (error of a ray's path length in the object, because voxels show edges coarsely)/(voxel's side)
 _LEAST = 1e-4  # least weight of the prior, as a fraction of the largest value of Aᵀp: without noise it would be 0
-# Settings of the priors, measured (docs/results/settings.md). A weight or threshold is a factor on the prior's weight.
-_TV_ALONE = 1.6  # weight of TV in the prior ``tv``
-_TV_BEFORE_DCT = 0.8  # weight of TV in the prior ``dct``
-_DCT = 1.5  # threshold of the block cosine transforms in the prior ``dct``
-_TV_AT_REST = 0.5  # weight of TV before ridge steps, for scans that stop for each projection
-_DCT_AT_REST = 1.35  # threshold of the block cosine transforms before ridge steps, for scans that stop
+# The following settings of the priors were measured (docs/results/settings.md).
+_TV_ALONE = 1.6  # (weight of TV in the prior ``tv``)/(prior's weight)
+_TV_BEFORE_DCT = 0.8  # (weight of TV in the prior ``dct``)/(prior's weight)
+_DCT = 1.5  # (threshold of the block cosine transforms in the prior ``dct``)/(prior's weight)
+_TV_AT_REST = 0.5  # (weight of TV before ridge steps)/(prior's weight), for scans that stop for each projection
+_DCT_AT_REST = 1.35  # (threshold of the cosine transforms before ridge steps)/(prior's weight), for scans that stop
 _RIDGE_NOISE = 17.0  # (noise that a ridge step assumes)/(part of the prior's weight that is due to noise), for fly-scans
-_RIDGE_NOISE_AT_REST = 20.0  # the same quotient for scans that stop for each projection
+_RIDGE_NOISE_AT_REST = 20.0  # (noise that a ridge step assumes)/(part of the weight due to noise), for scans that stop
 _RIDGE_LENGTH = 0.5  # length of a ridge step: factor on the regulariser's gradient
-_RIDGE_EVERY = 4  # number of maps of the prior ``dct`` for each ridge step
+_RIDGE_EVERY = 4  # number of maps of the prior ``dct`` from one ridge step to the next
 # _TV_AT_REST and _RIDGE_NOISE_AT_REST hold for this noise of line integrals. For another noise, _TV_AT_REST is multiplied,
 # and _RIDGE_NOISE_AT_REST divided, by (noise/_USUAL_NOISE)^(1/6).
 _USUAL_NOISE = 0.01
 _LEAST_NOISE = 0.001  # least noise of line integrals that the prior ``ridge`` assumes, because some scans have none
-_LEAST_NOISE_SHARE = 0.1  # least fraction of the prior's weight that a ridge step takes as noise: some scans have none
-_SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result; the larger voxels of the passes before have the rest
-_SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels with the prior ``ridge``, which leaves less noise
+_LEAST_NOISE_SHARE = 0.1  # a ridge step takes at least this fraction of the prior's weight as noise: some scans have none
+_SUBVOXELS = 2 / 3  # weight of the smaller voxels in the result; the larger voxels of earlier passes have the rest
+_SUBVOXELS_WITH_RIDGE = 0.85  # weight of the smaller voxels in the result with the prior ``ridge``: it leaves less noise
 
 
 @dataclass(frozen=True)
@@ -61,14 +61,14 @@ class FrameError:
 
 
 def frame_error(scan: Scan, motion: Motion) -> FrameError:
-    """Estimates the error of a scan's pixels on its grid. Motion blur averages out part of the error at edges."""
+    """Estimates the error of a scan's pixels on its grid. Motion blur lowers the part of the error that edges cause."""
     voxel_mm = max(scan.grid.voxel_size_mm[1:])
     edges_mm = _EDGES * voxel_mm / math.sqrt(1 + _blur_mm(scan, motion) / voxel_mm)
     return FrameError(noise_behind(np.asarray(scan.projections, np.float32), scan.valid), edges_mm)
 
 
 def _blur_mm(scan: Scan, motion: Motion) -> float:
-    """Returns the length in mm of a line's motion blur half-way between the volume's centre and its side."""
+    """Returns the length in mm of the motion blur in a middle line, half-way between the volume's centre and its side."""
     cells = motion.cells(scan, scan.frames // 2).still()
     line = cells.lines // 2
     serving = [c for c, lines in enumerate(cells.ranges) if lines.start <= line < lines.stop]
@@ -82,8 +82,8 @@ def _blur_mm(scan: Scan, motion: Motion) -> float:
 
 
 def adjoint_response(system: System) -> tuple[float, float]:
-    """Returns how strongly the backprojection Aᵀ responds to errors of frames, in mm, in a volume's middle half: its
-    standard deviation for independent unit noise in every ray, and its mean for a unit error in all rays."""
+    """Returns how strongly the backprojection Aᵀ e responds to errors e of frames, in mm, in the middle half of each axis:
+    its standard deviation if e is independent noise with standard deviation 1, and its mean if e is 1 in all rays."""
     noise = np.random.default_rng(0).standard_normal(system.measured.shape, np.float32)
     by_noise = system.adjoint(system.masked(system.apply_weights(system.space.array(noise))))
     by_ones = system.column_sums()
@@ -93,8 +93,8 @@ def adjoint_response(system: System) -> tuple[float, float]:
 
 
 class PriorWeight:
-    """The weight of a prior: ``strength`` times the estimated error of the data term's gradient Aᵀ(p − A x). The error comes
-    from noise, and from edges inside voxels, whose part is proportional to the object's density."""
+    """The weight of a prior: ``strength`` times the estimated error of the data term's gradient Aᵀ(p − A x). One part of
+    this error comes from noise. The other comes from edges inside voxels, and is proportional to the object's density."""
 
     def __init__(self, system: System, error: FrameError, strength: float) -> None:
         self.space, self.error, self.strength = system.space, error, strength
@@ -103,19 +103,19 @@ class PriorWeight:
         self.noise_mm, self.common_mm = adjoint_response(system)
 
     def at(self, volume: Any) -> float:
-        """Returns the prior's weight at a volume (nz, ny, nx) in 1/mm, in the unit of the data term's gradient, mm."""
+        """Returns the prior's weight, in mm as the data term's gradient, at a volume (nz, ny, nx) in 1/mm."""
         by_noise = self.error.noise * self.noise_mm
         by_edges = self.error.edges_mm * _density(self.space, volume) * self.common_mm
         return max(self.strength * math.hypot(by_noise, by_edges), self.least)
 
     def noise_share(self, weight: float) -> float:
-        """Returns which part of ``weight`` is due to noise, 0 to 1. With many views or photons, edges make up most of it."""
+        """Returns the fraction of ``weight`` due to noise, 0 to 1. With many views or photons most of it is due to edges."""
         by_noise = self.strength * self.error.noise * self.noise_mm
         return min(by_noise / weight, 1.0) if weight > 0 else 1.0  # frames of zeros give a weight of 0
 
 
 def _density(space: Space[Any], volume: Any) -> float:
-    """Returns the mean of a volume's values weighted by their squares, in 1/mm: Σ x³ / Σ x², to which air adds nothing."""
+    """Returns the mean of a volume's values x weighted by x², in 1/mm: Σ x³ / Σ x², to which air adds little."""
     squares = space.inner(volume, volume)
     return max(space.inner(space.multiply(volume, volume), volume) / squares, 0.0) if squares > 0 else 0.0
 
@@ -126,7 +126,7 @@ class PriorInputs:
 
     - tv_iterations: dual iterations per map of total variation. is_fly: frames expose over an arc (fly-scan).
     - noise: standard deviation of line integrals behind the object.
-    - image (nz, ny, nx) in 1/mm, share: the prior image of the prior piccs, and the weight of the change from that image."""
+    - image (nz, ny, nx) in 1/mm: the prior image of the prior piccs. share: weight, 0 to 1, of the change from image."""
 
     rt: Runtime
     grid: Grid
@@ -145,8 +145,8 @@ class PriorInputs:
     def dct_then_ridge(self) -> "Prior":
         """Returns ``dct`` with steps of the learned ridge regulariser, or ``dct`` alone on grids too small for them.
 
-        For scans that stop for each projection the steps are stronger, the more so the lower the noise. In fly-scans,
-        stronger steps would cost slab-shaped objects quality."""
+        For scans that stop for each projection the ridge steps are stronger, and grow as the noise falls. In fly-scans
+        stronger steps would lower the quality of slab-shaped objects."""
         if min(self.grid.shape) < RIDGE_EDGE:
             return self.tv_and_dct()
         ridge = RidgeStep(self.rt, self.grid.shape, learned_ridge())
@@ -158,16 +158,16 @@ class PriorInputs:
 
 
 class Prior:
-    """A proximal map, from x to argmin over x' of ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or an approximation of one.
+    """A proximal map, from x to argmin over x' of ½‖x' − x‖² + weight R(x'), x' ≥ 0 if asked, or an approximation of it.
 
-    A subclass that starts from its last result keeps that in ``state``. This class is the prior ``none``: only x ≥ 0."""
+    A subclass that needs arrays of its last call keeps these in ``state``. This class is the prior ``none``, with R = 0."""
 
     noise_share = 1.0
     """Fraction, 0 to 1, of this pass's weight that is due to noise; the rest is due to the discretisation of edges."""
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
-        """Maps a volume (nz, ny, nx) of ``space``. weight: the weight of one short step, in 1/mm: about 1/50 of the volume's
-        noise."""
+        """Maps a volume (nz, ny, nx) of ``space``. weight, in 1/mm: that of one short gradient step, about 1/50 of the
+        volume's noise. nonnegative: clips the result at 0."""
         return space.add(volume, volume, 0.0, nonnegative=nonnegative)
 
     def state(self) -> dict[str, np.ndarray]:
@@ -178,7 +178,7 @@ class Prior:
 
 
 class TvPrior(Prior):
-    """The prior tv: isotropic total variation, its weight multiplied by ``share``."""
+    """The prior tv: isotropic total variation, weighted by ``share`` times the prior's weight."""
 
     def __init__(self, prox: TvProx, iterations: int, share: float = 1.0) -> None:
         self.prox, self.iterations, self.share = prox, iterations, share
@@ -195,7 +195,7 @@ class TvPrior(Prior):
 
 
 class TvAndDct(Prior):
-    """The prior dct: total variation, then a shrinkage of block cosine transforms, which works best on a smooth volume.
+    """The prior dct: total variation (TV), then a shrinkage of block cosine transforms, which works best after TV.
 
     share: (threshold of the shrinkage)/(weight of the prior)."""
 
@@ -230,7 +230,7 @@ class ThenRidge(Prior):
         self.maps = (self.maps + 1) % _RIDGE_EVERY
         if self.maps:
             return volume
-        # only a part of the weight is due to noise: steps that took the part of edges for noise too lost 0.2 dB (180 views)
+        # only a part of the weight is due to noise: steps that counted the part of edges as noise lost 0.2 dB (180 views)
         sigma = self.noise_factor * weight * max(self.noise_share, _LEAST_NOISE_SHARE)
         out = space.place(self.ridge.shape)
         return self.ridge(volume, sigma=sigma, step=_RIDGE_LENGTH, nonnegative=nonnegative, out=out)
@@ -277,8 +277,8 @@ Denoiser = Callable[[np.ndarray, float], np.ndarray]
 
 
 class OwnPrior(Prior):
-    """A user's denoiser, a function on the host, in place of a proximal map (plug-and-play: Venkatakrishnan et al. 2013). It
-    gets small weights, and must give different volumes for different weights."""
+    """A user's denoiser, a function on the host, in place of a proximal map (plug-and-play: Venkatakrishnan et al. 2013).
+    The denoiser gets small weights, and must remove less noise the smaller the weight is."""
 
     def __init__(self, denoiser: Denoiser) -> None:
         self.denoiser, self.subject = denoiser, f"--prior {function_name(denoiser)}"
@@ -297,8 +297,8 @@ class OwnPrior(Prior):
 
 @dataclass(frozen=True)
 class PriorKind:
-    """A prior of ``PRIORS``. make: builds it. volumes: how many more volumes than ``dct`` it holds on the device.
-    subvoxel_share: weight, 0 to 1, of smaller voxels in a result, if the volume is thick enough for the prior."""
+    """An entry of ``PRIORS``. make: builds the prior. volumes: how many more volumes than ``dct`` it holds on the device.
+    subvoxel_share: weight, 0 to 1, of smaller voxels in a result; volumes too thin for ``ridge`` have ``_SUBVOXELS``."""
 
     make: Callable[[PriorInputs], Prior]
     volumes: int = 0
@@ -306,7 +306,7 @@ class PriorKind:
 
 
 PRIORS = {
-    # the larger voxels serve to average noise; ridge leaves less noise, so the smaller voxels get more weight
+    # the larger voxels lower noise in the result; ridge leaves less noise, so the smaller voxels get more weight
     "ridge": PriorKind(PriorInputs.dct_then_ridge, RidgeStep.VOLUMES, _SUBVOXELS_WITH_RIDGE),
     "dct": PriorKind(PriorInputs.tv_and_dct),
     "tv": PriorKind(lambda inputs: inputs.tv(_TV_ALONE)),
@@ -328,7 +328,7 @@ def prior_of(prior: str | Denoiser, inputs: PriorInputs) -> Prior:
 
 
 def kind_of(prior: str | Denoiser) -> PriorKind:
-    """Returns a prior's entry in ``PRIORS``; of a user's function, one without further volumes."""
+    """Returns a prior's entry in ``PRIORS``; for a user's function or its name, a new entry without further volumes."""
     own = PriorKind(lambda inputs: prior_of(prior, inputs))
     return PRIORS.get(prior, own) if isinstance(prior, str) else own
 
@@ -339,7 +339,7 @@ def subvoxel_share(prior: str | Denoiser, shape: tuple[int, int, int]) -> float:
 
 
 def axis_weights(grid: Grid) -> tuple[float, float, float]:
-    """Returns factors (z, y, x) that turn differences between voxels into slopes, 1 along the finest axis."""
+    """Returns (finest voxel side)/(voxel side) along (z, y, x), which makes differences of voxels proportional to slopes."""
     finest = min(grid.voxel_size_mm)
     z, y, x = (finest / pitch for pitch in grid.voxel_size_mm)
     return z, y, x

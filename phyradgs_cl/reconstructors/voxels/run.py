@@ -38,10 +38,10 @@ class IterativeOptions(MotionOptions):
       states (scan)."""
 
     transmission_weights: ClassVar[bool] = False
-    """Whether pixels are weighted by their transmission. Some methods have an option of this name."""
+    """Whether pixels are weighted by their transmission. Methods that can do so have an option of this name."""
 
     noise_stop: ClassVar[float] = 0.0
-    """The run ends if the residual is at most this many times the noise; 0: never. Some methods have it as an option."""
+    """The run ends if the residual is at most this many times the noise; 0: never. Some methods have this as an option."""
 
     MOTIONS: ClassVar[tuple[Motion, ...]] = motions_for(RAYS)
 
@@ -55,7 +55,7 @@ class IterativeOptions(MotionOptions):
 class Algorithm:
     """An iterative method on a system. ``volume`` (nz, ny, nx) in 1/mm is an array of the system's space.
 
-    A subclass writes ``step``, and names the attributes of its running state: ``ARRAYS`` of the space, and ``NUMBERS``."""
+    A subclass defines ``step``, and names the attributes that a state must hold: ``ARRAYS`` (of the space), ``NUMBERS``."""
 
     ARRAYS: ClassVar[tuple[str, ...]] = ("volume",)
     NUMBERS: ClassVar[tuple[str, ...]] = ()
@@ -82,7 +82,7 @@ class Algorithm:
         return {**arrays, **{name: np.array(getattr(self, name)) for name in self.NUMBERS}}
 
     def restore(self, state: State) -> None:
-        """Continues from ``state``, with the derivative of the intensity model taken at ``volume`` again."""
+        """Continues from what ``state`` returned. Raises InputError if an array is missing (a state of another version)."""
         if missing := {*self.ARRAYS, *self.NUMBERS} - {*state}:
             found = f"a run of another version, without {', '.join(sorted(missing))}"
             raise InputError("--resume", found, "the same version", "start without --resume")
@@ -90,7 +90,7 @@ class Algorithm:
             setattr(self, name, self.system.space.array(state[name]))
         for name in self.NUMBERS:
             setattr(self, name, state[name].item())
-        if self.system.intensity is not None:  # the derivative J depends on the volume
+        if self.system.intensity is not None:  # sets the derivative J, which depends on the volume
             self.system.expected(self.volume)
 
 
@@ -98,7 +98,7 @@ class WithFacts(Stepwise, Protocol):
     """A ``Stepwise`` method that adds facts to the result."""
 
     def facts(self, is_complete: bool) -> Mapping[str, object]:
-        """Returns the facts after the last step. is_complete: the run came to its end, without an interruption."""
+        """Returns the facts after the last step. is_complete: whether the run came to its end without an interruption."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +119,8 @@ class MethodRun:
     started: float = field(default_factory=time.perf_counter)
 
     def system(self, *, volumes: int, frames: int) -> System:
-        """Returns the scan's system. Its arrays are on the device if everything fits there: ``volumes`` volumes and
-        ``frames`` arrays of all frames, which the algorithm holds at one time, and the tables."""
+        """Returns the scan's system. Its arrays are on the device if the following fit there: the ``volumes`` volumes and
+        ``frames`` arrays of all frames that the algorithm holds at one time, and what the system itself holds."""
         system = System.of_scan(
             self.rt, self.scan, self.options.motion, self.options.detector_model, deformation=self.deformation,
             state_times_s=self.state_times_s, is_dense=self.initial is not None,
@@ -148,8 +148,8 @@ def voxel_method(
     name: str, default: IterativeOptions, make: Callable[[System, Any, MethodRun], Algorithm], *,
     volumes: int | Callable[[Scan, Any], int], frames: int,
 ) -> Method:
-    """Returns a method that runs the algorithm that ``make`` builds. volumes, frames: how many volumes and arrays of all
-    frames the algorithm holds at one time; volumes may be a function of scan and options."""
+    """Returns the method ``name``, which runs the algorithm that ``make`` builds. volumes: how many volumes the algorithm
+    holds at one time, or a function (scan, options) of this number. frames: how many arrays of all frames it holds."""
 
     def reconstruct(scan: Scan, options: Any, rt: Runtime, **arguments: Any) -> Reconstruction:
         run = MethodRun(scan, options, rt, **arguments)

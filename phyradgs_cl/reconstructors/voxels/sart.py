@@ -17,7 +17,7 @@ from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, voxel_method
 from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights, spread_order
 
-_WEIGHT_CACHE_BYTES = 1 << 29  # most bytes of column weights kept; those of other subsets are computed in every pass
+_WEIGHT_CACHE_BYTES = 1 << 29  # most bytes of column weights in memory; those of further subsets are computed in every pass
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Sart(Algorithm):
     """SART, x ← x + λ V Aᵢᵀ W (pᵢ − Aᵢ x) over subsets i of the frames, with the rays' W = 1/(Aᵢ 1) and the voxels' V =
     1/(Aᵢᵀ 1).
 
-    The intensity model replaces Aᵢ x by the expected Iᵢ(x), and Aᵢᵀ by its transposed derivative Jᵢᵀ. The residual combines
-    all subsets, each before its correction."""
+    The intensity model replaces Aᵢ x by the expected Iᵢ(x), and Aᵢᵀ by Jᵢᵀ, with the derivative Jᵢ of Iᵢ. An iteration's
+    residual combines those of all subsets, each before its correction."""
 
     NUMBERS = ("relaxation",)
 
@@ -63,7 +63,7 @@ class Sart(Algorithm):
         return float(np.sqrt(squares))
 
     def _corrections(self) -> Iterator[Any]:
-        """Corrects the volume for all subsets. Yields the residual of each just before its correction."""
+        """Corrects the volume with each subset in turn. Yields the subset's residual just before its correction."""
         space, clip = self.system.space, self.options.nonnegative
         for index, subset in enumerate(self.subsets):
             columns = self._columns(index)
@@ -79,12 +79,12 @@ class Sart(Algorithm):
 
 
 def _cached_columns(volume_shape: tuple[int, ...], subsets: int) -> int:
-    """Returns how many of ``subsets`` subsets keep their column weights, each as large as a volume."""
+    """Returns how many of ``subsets`` subsets keep their column weights in memory, an array as large as a volume each."""
     return min(subsets, max(_WEIGHT_CACHE_BYTES // (4 * math.prod(volume_shape)), 1))
 
 
 def held_volumes(scan: Scan, options: SartOptions) -> int:
-    """Returns how many volumes a run holds in memory at one time. Column weights that are kept count as volumes."""
+    """Returns how many volumes a run holds in memory at one time, with the column weights that ``Sart`` keeps there."""
     return 4 + _cached_columns(scan.grid.shape, checks.ceil_div(scan.frames, options.frames_per_subset))
 
 
@@ -105,7 +105,7 @@ class SirtOptions(IterativeOptions):
 
 class Sirt(Algorithm):
     """SIRT, x ← x + λ C Aᵀ R (p − A x), with R = 1/(A 1) and C = 1/(Aᵀ 1). The intensity model replaces A x by the expected
-    I(x), and Aᵀ by its transposed derivative Jᵀ.
+    I(x), and Aᵀ by Jᵀ, with the derivative J of I.
 
     An iteration's residual is the one before its correction. Weighted by √R, its norm falls in every step."""
 

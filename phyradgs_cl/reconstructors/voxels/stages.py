@@ -1,7 +1,7 @@
 """Runs of several stages: each stage starts from the volume of the stage before it.
 
-``fista`` reconstructs voxels, then smaller voxels, because large ones cannot represent edges: the last passes run on voxels
-half as large, whose block means make up most of the result."""
+``fista`` reconstructs voxels, then smaller voxels, because large voxels cannot represent edges: the last passes run on
+voxels of half the side. Their means over blocks as large as the first voxels make up most of the result."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -15,14 +15,14 @@ from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.voxels.run import MethodRun, WithFacts
 
-_STAGE, _VOLUME = "stage", "volume_before"  # names in a state: the stage's number and its first volume
+_STAGE, _VOLUME = "stage", "volume_before"  # names of arrays in a state: the stage's number, and its first volume
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a run. make: makes the stage's method from a first volume (nz, ny, nx), or from None for the method's own
-    start. merge: returns the run's volume, from this stage's volume and that of the stage before. end: called with the
-    finished method."""
+    """One stage of a run. make: returns the stage's method, which starts from the given volume (nz, ny, nx), or from its own
+    first volume if None is given. merge: returns the run's volume, from this stage's volume and that of the stage before.
+    end: is called with the stage's method when the stage ends."""
 
     name: str
     iterations: int
@@ -34,7 +34,7 @@ class Stage:
 class Stages:
     """Several stages, one after the other, which a ``Loop`` runs, reports, stops and resumes as if they were one method.
 
-    The first stage starts from the run's first volume, if any."""
+    The first stage starts from ``run.initial``; if that is None, from its method's own first volume."""
 
     def __init__(self, stages: Sequence[Stage], run: MethodRun) -> None:
         self.stages, self.grid = stages, run.scan.grid
@@ -73,7 +73,7 @@ class Stages:
         self.method.step()
 
     def advance(self) -> None:
-        """Ends the present stage. Frees its memory before the next stage takes its own: both together may not fit."""
+        """Ends the present stage and begins the next. Frees the old stage's memory first, since both may not fit at once."""
         self.before, _ = self.present_volume()
         self.stage.end(self.method)
         self._note()
@@ -88,8 +88,8 @@ class Stages:
         self._facts.update(self.method.facts(True))
 
     def facts(self, is_complete: bool) -> Mapping[str, object]:
-        """Returns the facts of the last stage, with each stage's iterations and its seconds in this process. In a complete
-        run, stages before the last are ended first, in case the last one has no iterations."""
+        """Returns the facts of the last stage that ran, with each stage's iterations, and its seconds in this process. A
+        complete run first ends all stages before the last, since a last stage of 0 iterations has not begun yet."""
         while is_complete and not self.is_last:
             self.advance()
         self._note()

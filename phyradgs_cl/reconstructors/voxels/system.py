@@ -1,7 +1,7 @@
 """The linear system A x = p of a scan under a motion model, for the iterative methods.
 
-Its arrays are on the device if all fit there (``resident``), else on the host. A method computes with either through the
-system's ``space``. Each rank (MPI process) projects its own frames; frames are gathered, volumes summed."""
+Its arrays are on the device if all fit there (``resident``), else on the host. The system's ``space`` computes with arrays
+of either kind. Each rank (MPI process) projects its own frames; then all frames are gathered, and volumes summed."""
 
 import logging
 import math
@@ -24,9 +24,9 @@ from phyradgs_cl.runtime import DeviceSpace, HostSpace, MemoryShortage, Runtime,
 
 log = logging.getLogger(__name__)
 
-_SHORTEST_PATH = 0.1  # shorter rays count as this fraction of the longest path: a division by less amplifies noise
-_FAINTEST = 1e-6  # voxels that rays hardly meet count as if their sum of path lengths were this fraction of the largest
-_GROWTH = 1.2  # steps of subsets diverge if a pass's residual exceeds this many times the least residual so far
+_SHORTEST_PATH = 0.1  # a ray's path counts as at least this fraction of the longest: division by less amplifies noise
+_FAINTEST = 1e-6  # the sum of path lengths in a voxel that rays meet counts as at least this fraction of the largest sum
+_GROWTH = 1.2  # steps count as diverging if a pass's residual exceeds this many times the least residual of earlier passes
 S = TypeVar("S", bound="SharedOperator")
 
 
@@ -59,8 +59,8 @@ class System:
         (K,): times in s of an object that changes; volumes are then stacks (K, nz, ny, nx).
 
         detector_model: log, intensity, or scan for the scan's own. fewest_lines: how many lines a pose must serve for the
-        fast kernels (``upright_of``), for an object at rest. is_dense: volumes have the object's density from the start,
-        which ``subrays_of`` uses."""
+        fast kernels (``upright_of``), for an object at rest. is_dense: the first volume has the object's density already,
+        so that a pixel needs fewer rays (``subrays_of``)."""
         tables = [motion.cells(scan, f).still() for f in range(scan.frames)]
         shape = scan.geometry.detector_shape
         projector = projector_of(rt, scan.grid, tables, deformation, state_times_s)
@@ -148,13 +148,13 @@ class System:
         return self.operator.forward if self.intensity is None else self.intensity.expected
 
     def derivative(self, change: Any) -> Any:
-        """Returns the change of ``expected`` for a change d of the volume last compared, by the Jacobian: A d or, in the
-        intensity model, J d."""
+        """Returns the linear change of ``expected`` for a change d of its last volume: A d or, in the intensity model, with
+        the Jacobian J of I at that volume, J d; 0 at invalid pixels."""
         operator = self.operator if self.intensity is None else self.intensity
         return self.masked(operator.forward(change, self.space.place(self.operator.frames_shape)))
 
     def back(self, frames: Any) -> Any:
-        """Returns the transpose of ``derivative``: Aᵀ y, or Jᵀ y, of frames that are 0 at invalid pixels."""
+        """Returns the transpose of ``derivative``, Aᵀ y or Jᵀ y (nz, ny, nx), for frames y that are 0 at invalid pixels."""
         operator = self.operator if self.intensity is None else self.intensity
         return operator.adjoint(frames, self.space.place(self.volume_shape))
 
@@ -172,7 +172,7 @@ class System:
         return float(noise_level(measured, valid) * np.sqrt(pixels))
 
     def row_sums(self) -> Any:
-        """Returns the length of every ray in the volume, A 1 (F, rows, columns) in mm."""
+        """Returns the length of every ray in the volume, A 1 (F, rows, columns) in mm; 0 at invalid pixels."""
         return self.forward(self.space.full(self.volume_shape, 1.0))
 
     def column_sums(self) -> Any:
@@ -200,7 +200,7 @@ class System:
 
 
 def row_weights(system: System) -> Any:
-    """Returns the inverse length 1/(A 1) of every ray in 1/mm.
+    """Returns the inverse length 1/(A 1) of every ray in 1/mm, (F, rows, columns); 0 for rays beside the volume.
 
     A ray shorter than a tenth of the longest counts as that tenth. A ray that only grazes an edge of the volume would
     otherwise put its noise on one or two voxels, and corners of the volume would become bright. TIGRE measures paths in a
@@ -209,12 +209,12 @@ def row_weights(system: System) -> Any:
 
 
 def column_weights(system: System) -> Any:
-    """Returns 1/(Aᵀ 1) of every voxel in 1/mm; 0 where no ray passes."""
+    """Returns 1/(Aᵀ 1) of every voxel, (nz, ny, nx) in 1/mm; 0 where no ray passes."""
     return system.space.reciprocal(system.column_sums(), _FAINTEST)
 
 
 def spread_order(count: int) -> list[int]:
-    """Returns the numbers 0 … count − 1, each far from the few before it, in steps near the golden section of ``count``."""
+    """Returns the numbers 0 … count − 1, each far from the few before it: steps of about 0.618 ``count``, mod ``count``."""
     step = next(s for s in range(max(round(0.618 * count), 1), 2 * count + 1) if np.gcd(s, count) == 1)
     return [(i * step) % count for i in range(count)]
 
@@ -238,8 +238,8 @@ class OrderedSubsets:
         self._systems = [self.system.subset(range(first, frames, count)) for first in spread_order(count)]
 
     def join_if_diverging(self, residual: float) -> bool:
-        """Joins subsets two by two if their steps diverge: if the ``residual`` of a pass exceeds ``_GROWTH`` times the least
-        one so far. Returns whether they were joined."""
+        """Halves the number of subsets if their steps diverge: if the ``residual`` of a pass exceeds ``_GROWTH`` times the
+        least residual of earlier passes. Returns whether it did."""
         diverges = residual > _GROWTH * self.least_residual and len(self) > 1
         if diverges:
             self.split(ceil_div(len(self), 2))
@@ -250,8 +250,8 @@ class OrderedSubsets:
 class SharedOperator:
     """A ``LinearOperator`` whose frames the ranks divide among them; ``whole`` is the operator of all frames.
 
-    Volumes and frames are complete on every rank, so that methods do the same on each. Sums of volumes do not depend on
-    their order, only on the number of frames per rank."""
+    Volumes and frames are complete on every rank, so that methods do the same on each rank. The bits of a sum of volumes do
+    not depend on the order of the ranks, only on which frames each rank projects."""
 
     def __init__(self, ranks: Communicator, whole: LinearOperator) -> None:
         self.ranks, self.whole = ranks, whole
