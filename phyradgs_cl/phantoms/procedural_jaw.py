@@ -59,7 +59,7 @@ def jaw(grid_shape: int, seed: int) -> Field:
     lattice = Lattice(int(grid_shape))
     ripple = np.float32(0.005) * implicit.texture(lattice, (0.15, 0.4), 48, rng)
     bone = _bone_distance(lattice) + ripple
-    volume = _soft_tissue(lattice, bone, teeth, rng)
+    volume = _soft_tissue(lattice, bone, rng)
     _fill_bone(volume, lattice, bone, rng)
     for tooth in teeth:
         _add_tooth(volume, lattice, tooth)
@@ -138,7 +138,7 @@ def _bone_distance(lattice: Lattice) -> Field:
     return implicit.union_distance(union, _BONE_BLEND)
 
 
-def _soft_tissue(lattice: Lattice, bone: Field, teeth: list[Tooth], rng: np.random.Generator) -> Field:
+def _soft_tissue(lattice: Lattice, bone: Field, rng: np.random.Generator) -> Field:
     """Returns the attenuation of flesh around the bone, of the mouth's floor, tongue and throat, under fat. Air is 0."""
     x, y, z = lattice.points(lattice.everything)
     union = np.zeros_like(bone)
