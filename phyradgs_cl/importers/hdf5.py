@@ -160,7 +160,7 @@ class Places:
         quantity = replace(ANGLE, assumed=unit)
         asked = [options.angles] if options.angles else self.stated.get("angles", ())
         if options.angles and not is_address(options.angles):
-            asked = []  # ``angle_rad`` reads the option: a range or a text file
+            asked = []  # --angles states a range or a text file, which ``options.angle_rad`` reads below
         for text in asked:
             with self.opened("angles", text) as (source, address):
                 return h5.read_per_frame(source, address, used, quantity)

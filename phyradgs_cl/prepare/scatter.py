@@ -84,9 +84,10 @@ def remove_scatter(frames: np.ndarray, kernel: Kernel) -> np.ndarray:
 
 
 def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kernel:
-    """Fits the kernel by non-negative least squares: the scatter explains by how much the transmission exceeds 1 in ``air``,
-    bool (F, v, u), of line integrals (F, v, u). A ``reach`` other than 0 fixes the kernel's width. The light may vary
-    between frames; its mean is that of the flats."""
+    """Fits the kernel by non-negative least squares: in air the scatter is (transmission − 1).
+
+    frames: line integrals (F, v, u); air, bool (F, v, u): pixels without object. reach: the kernel's width as in ``_REACHES``;
+    0: to be fitted. The light of frames may vary, but its mean over the frames must be that of the flats."""
     numbers = _some(len(frames))
     recorded, where = np.exp(-frames[numbers].astype(np.float64)), air[numbers]
     terms = list(itertools.product((reach,) if reach > 0 else _REACHES, _POWERS))

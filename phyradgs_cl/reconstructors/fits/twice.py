@@ -24,7 +24,7 @@ _FEWEST_VIEWS = 24  # with fewer views, the opposite of a ray cannot be interpol
 _MOST_VIEWS = 360  # most views that are compared, to save time
 _MOST_ROWS = 32  # most rows that are compared, to save time
 _MOST_PAIRS = 48  # most pairs of opposite rays that are compared in a row, to save time
-_LEAST_PX = 1.0  # a shift is left out unless it puts the axis this many pixels inside the outermost column's middle
+_LEAST_PX = 1.0  # a shift of the panel is not tried if the axis is then nearer than this to a side of the panel, in pixels
 _BLOCKS = 12  # the jackknife leaves out one of this many blocks of views at a time
 _BIAS_PX = 0.05  # standard deviation of the shift's error without noise, in pixels: half-fan scans, features 2 pixels wide
 
