@@ -272,8 +272,8 @@ def _counted(progress: Progress, results: list[Reconstruction]) -> Progress:
 
 
 def _interrupted(result: Reconstruction, results: list[Reconstruction]) -> Reconstruction:
-    """Returns the first run's result, with what --resume needs: the state of the interrupted run ``result``, and the complete
-    runs before it."""
+    """Returns the first run's result, with all that --resume needs: the state of the interrupted run ``result`` and the
+    complete runs before it."""
     first, run = (*results, result)[0], {"interrupted_in_run": f"{len(results) + 1} of {RUNS}"}
     facts = {**first.facts, "interrupted_at": result.facts["interrupted_at"], DOUBT: run}
     return replace(first, state={**(result.state or {}), **_kept(results)}, facts=facts)

@@ -172,7 +172,8 @@ def use_library_target(device_address: int) -> str | None:
     """Makes PoCL 3.0 compile for the processor that its kernel library was built for, and returns this processor's name.
 
     Writes the name into PoCL's record of a CPU device. There, a pointer to LLVM's target triple is followed by a pointer to
-    the processor's name. Changes nothing and returns None without such a pair, or not on x86-64 Linux. PoCL 3.1 and later name the library's processor themselves."""
+    the processor's name. Changes nothing and returns None without such a pair, or not on x86-64 Linux. PoCL 3.1 and later
+    name the processor themselves."""
     target = library_target()
     if target is None or platform.system() != "Linux":
         return None

@@ -136,8 +136,8 @@ class RayOperator:
             merge_slots(self.rt, self._cells, slots, there, target, self._rays_shape, self._axis)
 
     def _slots_of(self, part: slice) -> Iterator[tuple[int, Slots]]:
-        """Divides the frames ``part`` into groups whose ``Slots``, one buffer per pose, fit into memory. Yields the number of
-        each group's first frame within ``part``, and its ``Slots``."""
+        """Divides the frames ``part`` into groups whose ``Slots``, one buffer per pose, fit into memory. Yields the number
+        of each group's first frame within ``part``, and its ``Slots``."""
         assert self._upright is not None and self._poses is not None
         for first in range(part.start, part.stop, self.memory.slot_frames):
             key = first, min(first + self.memory.slot_frames, part.stop)

@@ -287,7 +287,7 @@ def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
 
 
 def _few_times(motion: Motion) -> Motion:
-    """For coarse passes: returns a ``PerRow`` motion with a third of its times in an exposure, but at least two; others as given."""
+    """Returns a ``PerRow`` motion for coarse passes: a third of its times per exposure, but at least two; others as given."""
     if not isinstance(motion, PerRow) or motion.sub_intervals <= 2:
         return motion
     return replace(motion, sub_intervals=max(2, math.ceil(_COARSE_TIMES * motion.sub_intervals)))
