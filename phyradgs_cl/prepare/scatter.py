@@ -86,8 +86,8 @@ def remove_scatter(frames: np.ndarray, kernel: Kernel) -> np.ndarray:
 def fit_scatter(frames: np.ndarray, air: np.ndarray, reach: float = 0.0) -> Kernel:
     """Fits the kernel by non-negative least squares: in air the scatter is (transmission − 1).
 
-    frames: line integrals (F, v, u); air, bool (F, v, u): pixels without object. reach: as in ``_REACHES``; 0: to be fitted. The
-    light of frames may vary, but its mean over the frames must be that of the flats."""
+    frames: line integrals (F, v, u); air, bool (F, v, u): pixels without object. reach: as in ``_REACHES``; 0: to be fitted.
+    The light of frames may vary, but its mean over the frames must be that of the flats."""
     numbers = _some(len(frames))
     recorded, where = np.exp(-frames[numbers].astype(np.float64)), air[numbers]
     terms = list(itertools.product((reach,) if reach > 0 else _REACHES, _POWERS))

@@ -287,7 +287,7 @@ def fista_stages(run: MethodRun, now: Callable[[], MethodRun]) -> list[Stage]:
 
 
 def _few_times(motion: Motion) -> Motion:
-    """Returns a ``PerRow`` motion for coarse passes: a third of its times per exposure, but at least two; others as given."""
+    """Returns a ``PerRow`` motion for coarse passes: a third of its times, but at least two; others unchanged."""
     if not isinstance(motion, PerRow) or motion.sub_intervals <= 2:
         return motion
     return replace(motion, sub_intervals=max(2, math.ceil(_COARSE_TIMES * motion.sub_intervals)))
