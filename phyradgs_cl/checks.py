@@ -17,6 +17,12 @@ _LONGEST = 80  # most characters of a wrong value in a message; the text of a lo
 T = TypeVar("T")
 
 
+def few_sizes(count: int, most: int) -> int:
+    """Returns a work-group's size for ``count`` work-items on a CPU: the least power of 2 from ``count`` on, but at most
+    ``most``. A driver compiles a kernel once for each size."""
+    return min(1 << (count - 1).bit_length(), most)
+
+
 def ceil_div(count: int, divisor: int) -> int:
     """Returns count / divisor rounded up, for whole numbers of any size."""
     return -(-count // divisor)

@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 
-from phyradgs_cl.checks import ceil_div
+from phyradgs_cl.checks import ceil_div, few_sizes
 from phyradgs_cl.runtime.context import Runtime
 from phyradgs_cl.runtime.memory import Array, DeviceArray, SameArray
 
@@ -53,7 +53,7 @@ def move(
         return
     blocks = ceil_div(nx, rt.lanes)
     kernel = rt.kernel("layout", "move_rows", TILE=1)
-    rt.launch(kernel, (blocks, ny, nz), *ends, group=rt.group(on_cpu=min(blocks, 8)))
+    rt.launch(kernel, (blocks, ny, nz), *ends, group=rt.group(on_cpu=few_sizes(blocks, 8)))
 
 
 def beside(rt: Runtime, volume: Array, out: DeviceArray | None) -> tuple[DeviceArray, DeviceArray]:

@@ -5,7 +5,7 @@ Kernels: ``cl/rays.cl``, ``rays_adjoint_gpu.cl``, ``rays_adjoint_cpu.cl``."""
 import math
 from collections.abc import Iterator
 
-from phyradgs_cl.checks import ceil_div
+from phyradgs_cl.checks import ceil_div, few_sizes
 from phyradgs_cl.operators.rays.layout import RayCells, RayLayout
 from phyradgs_cl.runtime import DeviceArray, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD
@@ -29,7 +29,7 @@ def launch_forward(
     items = blocks, layout.lines, frame_list.size
     rt.launch(
         kernel, items, volume, cells.cells, cells.cell_lines, cells.line_cells, frame_list, cells.weights,
-        cells.weight_at, *layout.constants(), add, frames, group=rt.group(on_cpu=min(blocks, 8)),
+        cells.weight_at, *layout.constants(), add, frames, group=rt.group(on_cpu=few_sizes(blocks, 8)),
         samples=math.prod(items) * max(layout.brick.shape) * cells.most_per_line,
     )  # fmt: skip
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.checks import few_sizes
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.layout import RayCells, matrix_table, ray_constants
 from phyradgs_cl.runtime import DeviceArray, Runtime
@@ -171,7 +172,7 @@ def merge_slots(
         rt.kernel("rays_slots", "merge_slots", **{**slots.defines, "LEAN": 0}),
         (columns, slots.frames), integrals, slots.columns, slots.pitch, slots.slots, slots.frame_shares,
         slots.shares, cells.weights, axis == "rows", columns, rows, target[1], target[0],
-        group=min(columns, 8),
+        group=few_sizes(columns, 8),
     )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from phyradgs_cl.acquisition.time_cells import TimeCells
+from phyradgs_cl.checks import few_sizes
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.metrics.align import block_means
 from phyradgs_cl.runtime import DeviceArray, Runtime
@@ -77,7 +78,7 @@ def launch_means(
     rt.launch(
         rt.kernel("subrays", "subray_means"), (columns, rows, part.stop - part.start), fine, np.array(strides, np.int64),
         np.array(subrays[::-1], np.int32), frames, np.int32(part.start), np.int32(rows), np.int32(columns),
-        group=rt.group(on_cpu=min(columns, 8)),
+        group=rt.group(on_cpu=few_sizes(columns, 8)),
     )  # fmt: skip
 
 
@@ -90,5 +91,5 @@ def launch_spread(
     rt.launch(
         rt.kernel("subrays", "spread_subrays"), (columns, rows, part.stop - part.start), frames, np.int32(part.start),
         np.int32(rows), np.int32(columns), fine, np.array(strides, np.int64), np.array(subrays[::-1], np.int32),
-        group=rt.group(on_cpu=min(columns, 8)),
+        group=rt.group(on_cpu=few_sizes(columns, 8)),
     )  # fmt: skip

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.checks import ceil_div
+from phyradgs_cl.checks import ceil_div, few_sizes
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators.rays.layout import BORDER, RayLayout, ray_constants
 from phyradgs_cl.operators.rays.slots import Slots, UprightPoses
@@ -119,7 +119,7 @@ def launch_upright(
         rt.kernel("rays_upright", "rays_upright", **_defines(how)),
         (slots.count, slots.columns, ceil_div(slots.rows, how.block)), columns, poses.cells, slots.slots,
         shape, origin, pitch_of(layout.grid.shape[0]), pitch_mm, how.block, strides, array,
-        group=(1, min(slots.columns, _GROUP)),
+        group=(1, few_sizes(slots.columns, _GROUP)),
     )  # fmt: skip
 
 

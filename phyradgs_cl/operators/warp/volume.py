@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from phyradgs_cl.checks import ceil_div
+from phyradgs_cl.checks import ceil_div, few_sizes
 from phyradgs_cl.operators.warp.states import MotionStates
 from phyradgs_cl.runtime import DeviceArray, DeviceSpace, Kernel, Runtime
 from phyradgs_cl.runtime.layout import GUARD, Strides, move, pitch_of
@@ -77,7 +77,7 @@ class VolumeWarp:
         result, blocks = self.moved(), ceil_div(nx, self.rt.lanes)
         self.rt.launch(
             self.kernel("warp_forward"), (blocks, ny, nz), source, self._strides.vector(), self._fields,
-            self._shares[state], self._size(), result, group=self.rt.group(on_cpu=min(blocks, 8)),
+            self._shares[state], self._size(), result, group=self.rt.group(on_cpu=few_sizes(blocks, 8)),
             samples=_SAMPLES * nz * ny * nx,
         )  # fmt: skip
         return result
@@ -245,5 +245,5 @@ class FrameStack:
         """Adds the frames that ``of`` or ``take`` returned last to those of ``frames`` with the numbers ``places`` (n,)."""
         assert self._memory is not None
         count, pixels = self._shape[0], int(np.prod(self._shape[1:]))
-        group = self.rt.group(on_cpu=min(pixels, 64))
+        group = self.rt.group(on_cpu=few_sizes(pixels, 64))
         self.rt.launch(self._add, (pixels, count), self._memory, places, pixels, frames, group=group)
