@@ -23,6 +23,9 @@ VENV   ?= .venv
 OUT    ?= demo
 TORCH  ?= torch==2.13.0
 
+# Without bytecode, each of the tests' many processes would compile all modules again.
+unexport PYTHONDONTWRITEBYTECODE
+
 BIN      := $(VENV)/bin
 PHYRADGS := $(BIN)/phyradgs
 
