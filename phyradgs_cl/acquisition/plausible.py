@@ -31,7 +31,6 @@ _TIMES = 17  # number of times at which angles of an exposure are computed: no g
 _SLACK = 1e-3  # relative tolerance of times and angles, because users and files round them
 _MOST_RAD = 20 * np.pi  # angles that span more than these ten turns are most likely in another unit
 _MANY_FRAMES = 10  # fewer frames may lie within a few degrees on purpose, so they cause no warning about radians
-_ASIDE = 0.1  # a panel off centre by more than this fraction of its width was displaced for a wider field of view
 
 
 def summary(scan: "Scan") -> str:
@@ -48,9 +47,8 @@ def blur_facts(scan: "Scan") -> dict[str, float]:
     the image's largest distance from the axis. This is the first order in r/R, with R from source to axis: a point nearer
     to the source blurs up to R/(R − r) times as much, a point nearer to the panel down to R/(R + r) times as much.
 
-    Δθ is the arc while a line is open and the beam is on, as the median over the frames. The rim is the largest radius that
-    every view sees: the distance from the axis to the panel's nearer side. A panel more than a tenth of its width off centre
-    was displaced for a wider field of view, where opposite views complete each other: its rim is at the farther side."""
+    Δθ is the arc while a line is open and the beam is on, as the median over the frames. The rim is the default grid's:
+    as far from the axis as the panel's farther side sees."""
     if not scan.is_fly:
         return {}
     windows_s = scan.shutter.line_windows_s(scan.lines)
@@ -59,8 +57,8 @@ def blur_facts(scan: "Scan") -> dict[str, float]:
     arc_rad = abs(float(np.median(angle_rad[:, -1] - angle_rad[:, 0])))
     columns = scan.geometry.detector_shape[1]
     aside = abs(scan.geometry.detector_offset_mm[1] / scan.geometry.pixel_size_mm[1])
-    radius_px = columns / 2 - aside if aside <= _ASIDE * columns else columns / 2 + aside
-    return {"blur_at_rim_px": arc_rad * radius_px, "blur_at_half_radius_px": arc_rad * radius_px / 2}
+    rim_px = arc_rad * (columns / 2 + aside)
+    return {"blur_at_rim_px": rim_px, "blur_at_half_radius_px": rim_px / 2}
 
 
 def blur_line(scan: "Scan") -> str:

@@ -57,7 +57,7 @@ def states_section(run: Run) -> Markup | None:
     """Shows the middle slices of a changing object at some times."""
     if (states := run.stored.states) is None:
         return None
-    high = images.windows_of(run.stored.values, run.reference)["result"].high
+    high = max(images.grey_range(state)[1] for state in states.volumes)
     parts = [note(f"The volume is the mean of {len(states.times_s)} states. Some of them, in middle slices:")]
     for k in np.unique(np.linspace(0, len(states.times_s) - 1, _STATES).round().astype(int)).tolist():
         slices = images.middle_slices(states.volumes[k])

@@ -9,7 +9,7 @@ from phyradgs_cl.acquisition import CircularOrbit, LineMiddles, ParallelGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
-from phyradgs_cl.reconstructors.fdk import FbpOptions, fdk
+from phyradgs_cl.reconstructors.fdk import FbpOptions, fdk, fdk_volume
 
 SIDE, ROWS = 64, 5
 GRID = Grid((3, SIDE, SIDE), (1.0, 1.0, 1.0))
@@ -36,6 +36,21 @@ def test_a_disc_comes_out_with_its_density(rt, views, turn_deg, offset_mm, colum
     from_edge = np.abs(np.hypot(x - 6, y + 4) - 14)
     where = (np.hypot(x, y) < SIDE / 2 - 2) & (from_edge > 2)
     assert np.sqrt(np.mean((volume - DISC.density(x, y, z))[where] ** 2)) < 0.03 * 0.02
+
+
+@pytest.mark.parametrize(("slant_deg", "views", "turn_deg", "offset_mm"), [
+    (20, 90, 180, 0.0), (-40, 110, 220, 0.0), (50, 180, 360, 9.0),
+])  # fmt: skip
+def test_a_panel_slanted_to_the_rays_keeps_densities(rt, slant_deg, views, turn_deg, offset_mm) -> None:
+    """Its columns are nearer together across the rays."""
+    pose = scan_of(views, turn_deg, offset_mm).trajectory.pose(0, np.arange(float(views)))
+    across = np.cos(np.deg2rad(slant_deg)) * pose[:, 6:9] + np.sin(np.deg2rad(slant_deg)) * pose[:, :3]
+    side = 100
+    pose[:, 3:6] = (offset_mm - (side - 1) / 2) * across - (ROWS - 1) / 2 * pose[:, 9:12]
+    pose[:, 6:9] = across
+    frames = frames_of(DISC, pose, (ROWS, side), is_parallel=True)
+    volume, (_, y, x) = fdk_volume(rt, frames, pose, GRID, is_parallel=True), np.meshgrid(*GRID.axes_mm(), indexing="ij")
+    assert volume[np.hypot(x - 6, y + 4) < 11].mean() == pytest.approx(0.02, rel=0.01)
 
 
 @pytest.mark.parametrize(("views", "turn_deg", "offset_mm", "columns", "radius_mm"), [

@@ -299,11 +299,12 @@ def ramp_filter(rows: np.ndarray, spacing_mm: float, window: str = "ram-lak") ->
 
 def static_fdk(rt: Runtime, scan: Scan, deformation: Deformation | None = None) -> np.ndarray:
     """Returns the volume (nz, ny, nx) in 1/mm of FDK, or of FBP in a parallel beam, from each frame's mid-exposure pose.
-    Other methods start from it or scale by it. deformation: how the object moves; None: it rests."""
+    Other methods start from it or scale by it, without its warnings. deformation: how the object moves; None: it rests."""
     frames, numbers = _measured_frames(scan)
     pose = np.concatenate([Static().cells(scan, f).pose for f in numbers])
     moving = None if deformation is None else _moving(rt, scan, Static(), numbers, deformation)
-    return fdk_volume(rt, frames, pose, scan.grid, is_parallel=scan.is_parallel, moving=moving)
+    with without_warnings():  # they name densities of a volume that is no result
+        return fdk_volume(rt, frames, pose, scan.grid, is_parallel=scan.is_parallel, moving=moving)
 
 
 def _measured_frames(scan: Scan) -> tuple[np.ndarray, np.ndarray]:

@@ -41,10 +41,10 @@ def ray_measure(pose: np.ndarray, rays: np.ndarray, is_parallel: bool = False) -
 
     ȧ is the source's motion in mm per radian, n the unit normal of the ray in the plane of ray and detector row, D the row's
     distance from the source. For a flat panel that faces the source the measure is DSO / |ray|, FDK's cosine. In a parallel
-    beam it is the sine of the angle between rays and row: 1 for a panel across the rays."""
+    beam it is 1/(sine of the angle between rays and row): 1 for a panel across the rays."""
     if is_parallel:
         across = np.cross(pose[..., 0:3], pose[..., 6:9]) / np.linalg.norm(pose[..., 6:9], axis=-1, keepdims=True)
-        return np.linalg.norm(across, axis=-1)
+        return 1 / np.linalg.norm(across, axis=-1)
     row = pose[..., 6:9] / np.linalg.norm(pose[..., 6:9], axis=-1, keepdims=True)
     motion = np.stack([-pose[..., 1], pose[..., 0], np.zeros(pose.shape[:-1])], -1)
     length = np.linalg.norm(rays, axis=-1)
