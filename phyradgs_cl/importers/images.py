@@ -23,7 +23,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.fields.hounsfield import of_note
 from phyradgs_cl.importers.files import SafeFolder, check_room
-from phyradgs_cl.io.attenuation import VALUES
+from phyradgs_cl.io.attenuation import PER_MM, VALUES
 from phyradgs_cl.io.files import regular_file
 from phyradgs_cl.io.hdf5.datasets import LENGTH
 from phyradgs_cl.io.volume import Volume, finite_float32, shares_of_maximum
@@ -150,7 +150,7 @@ def read_image_volume(path: Path, state: int | None = None) -> Volume:
         raise InputError(f"{subject}: origin", str(list(image.GetOrigin()))[:80], "three lengths in mm")
     values = finite_float32(subject, sitk.GetArrayFromImage(image))
     grid = Grid(triple(values.shape), triple(size_mm[::-1].tolist()), triple(centre_mm[::-1].tolist()))
-    return Volume(values, grid, {VALUES: note} if of_note(note)[0] else {})
+    return Volume(values, grid, {VALUES: note} if PER_MM in note or of_note(note)[0] else {})
 
 
 def _resize_by_sform(subject: str, image: Any) -> None:

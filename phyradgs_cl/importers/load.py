@@ -18,7 +18,7 @@ from phyradgs_cl.importers import tiff
 from phyradgs_cl.importers.files import SafeFolder, read_json, read_npy
 from phyradgs_cl.importers.images import image_times_s, read_image_volume, read_zarr
 from phyradgs_cl.importers.options import ImportOptions
-from phyradgs_cl.io.attenuation import VALUES, check_attenuation, in_per_mm
+from phyradgs_cl.io.attenuation import PER_MM, VALUES, check_attenuation, in_per_mm
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 from phyradgs_cl.io.volume import Volume, finite_float32, read_volume, shares_of_maximum
 from phyradgs_cl.phantoms import Cylinder, Ellipsoid, EllipsoidPhantom
@@ -208,7 +208,7 @@ def _on_grid(
         return Volume(finite_float32(str(path), shares_of_maximum(values)), None)
     centre_mm = np.zeros(3) if first_mm is None else first_mm + (np.array(values.shape) - 1) / 2 * size_mm
     grid = Grid(triple(values.shape), triple(size_mm.tolist()), triple(centre_mm.tolist()))
-    return Volume(finite_float32(str(path), values), grid, {VALUES: note} if of_note(note)[0] else {})
+    return Volume(finite_float32(str(path), values), grid, {VALUES: note} if PER_MM in note or of_note(note)[0] else {})
 
 
 _READERS: dict[str, tuple[str, Callable[[Path], Volume]]] = {

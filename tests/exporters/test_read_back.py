@@ -16,7 +16,8 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters import export_volume, hu_scale
 from phyradgs_cl.fields import Hounsfield
 from phyradgs_cl.importers import foreign_volume, load_attenuation, load_volume
-from phyradgs_cl.io import read_volume
+from phyradgs_cl.io import read_volume, write_volume
+from phyradgs_cl.io.attenuation import attenuation_of
 
 pytestmark = pytest.mark.slow
 
@@ -54,6 +55,17 @@ def test_an_export_comes_back_bit_for_bit_and_in_its_place(exported, stored, nam
     with pytest.raises(InputError, match="Hounsfield.*--mu-water-per-mm"):
         load_volume(path)
     np.testing.assert_allclose(load_volume(path, 0.02).values, stored.values, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_values_of_any_size_come_back_where_their_file_notes_the_unit(stored, tmp_path, name) -> None:
+    """Of voxels of nanometres attenuation in 1/mm is as large as Hounsfield units."""
+    write_volume(tmp_path / "dense.h5", stored.values * np.float32(1e6), stored.grid, {})
+    dense = read_volume(tmp_path / "dense.h5")
+    path = export_volume(tmp_path / "dense.h5", NAMES[name], tmp_path / name)
+    assert_same(path, dense)
+    for loaded in (load_volume(path), load_volume(path, 0.02)):
+        assert attenuation_of(str(path), loaded) is loaded and np.abs(loaded.values).max() > 1000
 
 
 def test_a_volume_file_keeps_its_scale_and_all_else(volume_file, stored, tmp_path) -> None:
