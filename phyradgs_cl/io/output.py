@@ -192,14 +192,15 @@ def _flush_folder(folder: Path) -> None:
 
 
 def _output_error(target: Path, error: BaseException) -> OutputError:
-    code = getattr(error, "errno", None)
-    if code in NO_SPACE or any(f"errno = {number}," in str(error) for number in NO_SPACE):
+    code, words = getattr(error, "errno", None), str(error)
+    # HDF5 names the system's error in its text, and NumPy the part that was written
+    if code in NO_SPACE or " requested and " in words or any(f"errno = {number}," in words for number in NO_SPACE):
         found = f"no room left in folder {target.parent}"
         expected = "enough space on the disk"
         return OutputError(str(target), found, expected, "free some space or choose another folder")
     if code == errno.ENAMETOOLONG:
         return OutputError(str(target), "a file name that is too long", "a shorter name", "shorten the name")
-    found = getattr(error, "strerror", None) or str(error)
+    found = getattr(error, "strerror", None) or words
     return OutputError(str(target), found, "a file that can be written", "choose another folder")
 
 
