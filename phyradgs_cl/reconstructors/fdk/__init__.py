@@ -209,13 +209,10 @@ def fdk_volume(
         )
     else:
         volume = of_views(filtered, np.arange(len(filtered)))
-    if ends:  # one row's poses tell which slices a view sees, and how much the view counts
-        middle = pose if pose.ndim == 2 else pose[:, pose.shape[1] // 2]
-        counted = opposite_weight(canonical[:, [canonical.shape[1] // 2]], (1, shape[1]), arc, is_parallel)
+    if ends:
+        counted = opposite_weight(canonical[:, [canonical.shape[1] // 2]], (1, shape[1]), arc, is_parallel)  # of one row
         weight = share * [np.mean(counted(view)) for view in range(len(filtered))]
-        for start, stop in ends:
-            slab = grid.part((start, 0, 0), (stop - start, *grid.shape[1:]))
-            volume[start:stop] *= travel.all_over_seen(rt, middle, shape, weight, slab, is_parallel)
+        travel.fill_ends(rt, volume, ends, pose, shape, weight, grid, is_parallel)
     if circle:
         _, y_mm, x_mm = grid.axes_mm()
         radius_mm = seen_mm + np.linalg.norm(canonical[0, 0, 0, 6:9]) / 2  # up to the outer edge of the last pixel

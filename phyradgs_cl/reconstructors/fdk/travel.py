@@ -101,6 +101,18 @@ def seen_volume(
     return volume * np.divide(classes, covered, out=np.zeros_like(covered), where=covered > 0)
 
 
+def fill_ends(
+    rt: Runtime, volume: np.ndarray, slices: list[tuple[int, int]], pose: np.ndarray, shape: tuple[int, int],
+    weight: np.ndarray, grid: Grid, is_parallel: bool,
+) -> None:  # fmt: skip
+    """Multiplies the ``slices`` of FDK's volume (nz, ny, nx) by ``all_over_seen``, in place. pose (F, 12) mm, or (F, lines,
+    12), of which the middle line's tells which slices a view sees. Other arguments: as in ``all_over_seen``."""
+    middle = pose if pose.ndim == 2 else pose[:, pose.shape[1] // 2]
+    for start, stop in slices:
+        slab = grid.part((start, 0, 0), (stop - start, *grid.shape[1:]))
+        volume[start:stop] *= all_over_seen(rt, middle, shape, weight, slab, is_parallel)
+
+
 def all_over_seen(
     rt: Runtime, pose: np.ndarray, shape: tuple[int, int], weight: np.ndarray, grid: Grid, is_parallel: bool
 ) -> np.ndarray:
