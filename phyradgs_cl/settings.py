@@ -30,7 +30,7 @@ else:
 @dataclass(frozen=True)
 class Settings:
     """A run's options ``values`` by name, not yet checked. origins: where each was given, for messages. device: an index,
-    cpu, gpu or part of a name; None for the best. memory: limit of device memory in bytes; None for all."""
+    cpu, gpu or part of a name. memory: limit of device memory in bytes. None for either: as ``Runtime`` chooses."""
 
     values: Mapping[str, Any]
     origins: Mapping[str, str]

@@ -14,7 +14,7 @@ from phyradgs_cl.removed import removal
 from phyradgs_cl.text import suggest_name
 
 _STEP_PX = 0.25  # a central difference moves the image's edge by this many pixels to each side
-_TIMING_STEP = 0.1  # a central difference changes exposure or readout by at most this fraction of the stated time
+_TIMING_STEP = 0.1  # a central difference changes an exposure or readout above 0 by at most this fraction of it
 _LARGEST_CUT = 0.7  # the search shortens exposure or readout by at most this fraction, so that the time stays above 0
 _MOST_TILT_RAD = math.radians(2.0)  # a central difference changes an angle by at most this
 # ``Parameter.mismatch`` of parameters whose effect changes sign after half a turn. Errors of voxels keep their sign, so they

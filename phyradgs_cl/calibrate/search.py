@@ -156,7 +156,7 @@ def least_shares(problem: Reduced) -> dict[str, float]:
 
     No frame distinguishes a turn of all views from a turned object. Voxels do not follow such an object exactly, though:
     they leave some of the turn's signal unexplained, and as much of any other signal. So a parameter's share must be at
-    least 0.2, and twice that of the turn, or of a lift if the parameter moves the image along the axis."""
+    least 0.2, and twice min(0.2, the turn's share), or a lift's if the parameter moves the image along the axis."""
     remaining = {gauge.is_axial: float(problem.only([gauge.name]).shares[0]) for gauge in GAUGES}
     names = [name for name in problem.names if name in PARAMETERS]
     gauge_shares = {name: min(remaining[PARAMETERS[name].is_axial], _MOST_GAUGE) for name in names}

@@ -169,7 +169,8 @@ def _random_order(rt: Runtime, scan: Scan) -> float:
 
 
 def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -> Hypothesis | None:
-    """Returns the best hypothesis that leaves less than half of the stated scan's squared residual; None without one.
+    """Returns the best hypothesis under which the frames are consistent, with less than half of the stated scan's squared
+    residual; None without one.
 
     If the panel sees less than half of the rays twice, frames fit any geometry. Then the first hypothesis about sizes under
     which they are consistent is returned. Only without one, and if the panel sees the axis, all hypotheses are compared."""
@@ -190,7 +191,7 @@ def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -
 
     most: hypotheses whose rough fit leaves over 1.5 times this mean squared residual are left out. The factor is not 1
     because an offset between two coarse pixels hides other differences. Large shifts count against a hypothesis. Of several
-    hypotheses with the same factor of sizes, only the best counts."""
+    hypotheses with the same factor of sizes, other than 1, only the best counts."""
     tried: list[tuple[Hypothesis, Scan, axis.AxisShift]] = []
     for hypothesis in hypotheses.of_scan(scan, as_stated):
         other = hypothesis.scan()
@@ -258,8 +259,12 @@ def repeated_frames(scan: Scan) -> list[int]:
     if len(p) < _FEWEST_FRAMES:
         return []
     valid = np.broadcast_to(True if scan.pixel_mask is None else np.asarray(scan.pixel_mask) == 0, p.shape)
-    pairs = zip(p[:-1], p[1:], valid[:-1] & valid[1:], strict=True)
-    steps = np.array([_rms((b - a)[seen]) if seen.any() else np.inf for a, b, seen in pairs])
+
+    def apart(one: int, other: int) -> float:
+        seen = valid[one] & valid[other]
+        return _rms((p[other] - p[one])[seen]) if seen.any() else np.inf
+
+    steps = np.array([apart(frame, frame + 1) for frame in range(len(p) - 1)])
     azimuths_rad = start_azimuths_rad(scan)
     turned_rad = np.abs(wrapped(np.diff(azimuths_rad)))
     alike = np.flatnonzero((turned_rad > 1e-6) & (steps < _REPEATED * np.min(_neighbours(steps), axis=0)))
@@ -268,7 +273,7 @@ def repeated_frames(scan: Scan) -> list[int]:
     beside[order] = np.roll(order, -1)
     jumps = np.median(turned_rad) > _JUMP * np.median(np.abs(wrapped(azimuths_rad[beside] - azimuths_rad)))
     if alike.size and jumps:
-        from_beside = np.array([_rms(p[g] - frame) for frame, g in zip(p, beside, strict=True)])
+        from_beside = np.array([apart(frame, other) for frame, other in enumerate(beside.tolist())])
         alike = alike[from_beside[alike + 1] > _UNLIKE * np.median(from_beside)]
     return [int(f) + 1 for f in alike]
 

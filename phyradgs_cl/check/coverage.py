@@ -7,7 +7,7 @@ import scipy
 
 from phyradgs_cl.acquisition import ParallelGeometry, Scan
 from phyradgs_cl.acquisition.geometry import field_of_view_mm
-from phyradgs_cl.check.finding import FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, too_narrow
+from phyradgs_cl.check.finding import FEWEST_COLUMNS, OK, SUSPICIOUS, Finding, outer_median, too_narrow
 from phyradgs_cl.check.timing import is_full_turn
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.detector import noise_level
@@ -77,7 +77,7 @@ def _check_values(p: np.ndarray, valid: np.ndarray, largest: float, noise: float
         text = f"no object: line integrals reach {largest:.3g}, noise {noise:.3g}"
         advice = "was the object in the beam? Are the values line integrals, larger behind more material?"
         return Finding(_QUESTION, SUSPICIOUS, largest, noise, NO_OBJECT, text, advice)
-    air = float(np.median(p[:, :, [0, -1]]))
+    air = outer_median(p, valid)
     if air > _INVERTED * largest:
         text = f"values are largest, {air:.3g}, beside the object"
         advice = "are these transmissions, or inverted images? Declare them: import --quantity, or quantity of the data"

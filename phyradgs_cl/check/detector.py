@@ -8,7 +8,7 @@ from scipy.ndimage import median_filter
 
 from phyradgs_cl.acquisition import Saturation, Scan
 from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad
-from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding
+from phyradgs_cl.check.finding import CANNOT_TELL, OK, SUSPICIOUS, Finding, outer_median
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.detector.noise_level import clustered_share
 from phyradgs_cl.prepare.bad_pixels import LEAST_FRAMES, axis_column, find_dead
@@ -67,7 +67,7 @@ def check_saturation(scan: Scan, counts: CountReader | None = None) -> Finding:
         advice = "did counts overflow (65,536 becomes 0)? Read the frames as unsigned, or lower the exposure"
         return Finding(_SATURATION, SUSPICIOUS, jumps, _MOST_JUMPS, OVERFLOW, text, advice)
     lowest, highest = float(p[~masked].min()), float(p[~masked].max())
-    is_inverted = float(np.median(p[:, :, [0, -1]])) == highest  # ``check_coverage`` reports inverted images
+    is_inverted = outer_median(p, ~masked) == highest  # ``check_coverage`` reports inverted images
     at_least = clustered_share((p == lowest) & ~masked & (abs(lowest) > _ZERO))
     at_largest = 0.0
     if not is_inverted:

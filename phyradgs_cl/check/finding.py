@@ -2,6 +2,8 @@
 
 from dataclasses import asdict, dataclass
 
+import numpy as np
+
 OK, SUSPICIOUS, CANNOT_TELL = "ok", "suspicious", "cannot tell"
 PIXEL_SIZES = "x_pixel_size and y_pixel_size (--pixel-size-mm of import)"
 MIRROR_U, MIRROR_V = "--column-0 (left or right)", "--row-0 (top or bottom)"  # options of import that mirror frames
@@ -26,6 +28,12 @@ class Finding:
 
     def facts(self) -> dict[str, object]:
         return asdict(self)
+
+
+def outer_median(p: np.ndarray, valid: np.ndarray) -> float:
+    """Returns the median of the ``valid`` pixels in the outermost columns of p (F, v, u), or in all columns without one."""
+    outer = valid[..., [0, -1]]
+    return float(np.median(p[..., [0, -1]][outer] if outer.any() else p[valid]))
 
 
 def too_narrow(question: str, unit: str) -> Finding:

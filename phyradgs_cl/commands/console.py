@@ -120,7 +120,7 @@ def scores(metrics: Mapping[str, float | None]) -> str:
 
 
 def told(metrics: Mapping[str, object], *names: Any) -> list[str]:
-    """Returns the metrics that are present as texts such as "PSNR 31.2 dB". names: which metrics; by default ``METRICS``."""
+    """Returns the metrics that are present as texts such as "PSNR 31.20 dB". names: which; by default ``METRICS``."""
     from phyradgs_cl.metrics import printed  # imported here, because it loads SciPy, which takes time
 
     return [f"{title} {value}" for title, value in printed(metrics, *names)]
@@ -128,7 +128,7 @@ def told(metrics: Mapping[str, object], *names: Any) -> list[str]:
 
 def usage_text(error: Any, arguments: Sequence[str]) -> str:
     """Returns Typer's message ``error`` about wrong ``arguments``, with the value that Typer could not read. For an option
-    of an earlier version, returns what to write in place of the option."""
+    or a value of an earlier version, returns what to write instead."""
     flag, param = str(getattr(error, "option_name", "")), getattr(error, "param", None)
     value = _value_of(param, arguments)
     words = [(flag, ""), (flag.lstrip("-").replace("-", "_"), flag)]

@@ -121,7 +121,8 @@ _Launch = Callable[[Arguments, Brick, DeviceArray], None]
 
 def in_bricks(rt: Runtime, views: Views, grid: Grid, step: int, launch: _Launch) -> Array:
     """Returns the views' volume (nz, ny, nx). ``launch`` adds some views to a brick, a part of the volume. The volume is one
-    brick if it fits; else the bricks' sides along z are multiples of ``step``. Raises OutOfMemoryError if no brick fits."""
+    brick if it fits; else the sides along z of all bricks but the last are multiples of ``step``. Raises OutOfMemoryError
+    if no brick fits."""
     is_resident = isinstance(views.frames, DeviceArray)
     volume: Array = rt.empty(grid.shape) if is_resident else np.empty(grid.shape, np.float32)
 

@@ -172,7 +172,7 @@ class DeformedSource(FrameSource):
 
     def _volumes(self, weights: np.ndarray) -> Callable[[int], np.ndarray]:
         """Returns a function from a state's index to its volume (nz, ny, nx), for ``weights`` (K, R). The device deforms the
-        volumes if all buffers fit into half of its free memory, else the host."""
+        volumes if all buffers fit into half of ``Runtime.room``, else the host."""
         volume, rank = self._volume, self._deformation.rank
         if not self._rt.room().scaled(0.5).holds(3 * rank * volume.nbytes, *[2 * volume.nbytes] * 2):
             spline = SplineVolume(volume, self._grid)

@@ -63,6 +63,11 @@ def test_views_of_a_round_object_in_golden_order_are_not_repeated_ones() -> None
         assert repeated_frames(static_scan(seen, geometry, angles_deg)) == []
         seen[31] = frames[30] + np.random.default_rng(6).normal(0, noise, frames[30].shape)
         assert noise == 1e-3 or repeated_frames(static_scan(seen, geometry, angles_deg)) == [31]  # lost in noise
+        hot = np.zeros((12, 20), bool)
+        hot[:, :3] = True
+        seen[:, hot] = np.where(np.arange(60) == 32, 0, np.linspace(3, 9, 60))[:, None]
+        of_masked = replace(static_scan(seen, geometry, angles_deg), pixel_mask=hot)
+        assert noise == 1e-3 or repeated_frames(of_masked) == [31]
 
 
 def test_speed_within_frames_fits_the_steps_between_them_but_for_wandering(clean) -> None:
@@ -219,6 +224,10 @@ def test_frames_that_are_no_line_integrals_of_an_object(clean) -> None:
     ):
         finding = check_coverage(replace(clean, projections=values.astype(np.float32)))
         assert finding.verdict == SUSPICIOUS and said in finding.text and advised in finding.advice
+    dark = np.zeros(p.shape[1:], bool)
+    dark[:, [0, -1]] = True  # behind a collimator
+    finding = check_coverage(replace(clean, projections=np.where(dark, np.float32(13.8), p), pixel_mask=dark))
+    assert finding.verdict == check_coverage(clean).verdict
 
 
 def test_a_small_part_on_the_axis_is_not_a_dead_pixel(clean) -> None:

@@ -236,7 +236,7 @@ class SplatProjection(GaussianOperator):
             turn, along, across = by_pose(rows[:, : cloud.count], by_rows)
             shifts = [across / (self._projector.lines / 2), along / (self._projector.width / 2)]
             found[number] = turn, *(shifts[::-1] if self._images.turned else shifts)
-            if not (self._affine or cells.is_parallel):  # here a panel's shift does not change the rays' lengths
+            if not (self._affine or cells.is_parallel):  # only here a panel's shift changes the rays' lengths
                 found[number, 1:] += by_length(self._poses[self._chosen[number]], weighed[number])
         return found
 

@@ -54,7 +54,7 @@ class Arc:
     - progress_rad (F,): each view's angle from the arc's start, which lies half a step before the first view. The arc ends
       half a step behind the last view. In a full turn, progress is counted from the view of the least angle.
     - parts_rad (P, 2): progress at which each part between gaps begins and ends.
-    - filled_rad: total width of the gaps for which neighbouring views stand."""
+    - filled_rad: sum over the gaps above 5° for which neighbouring views stand of (gap − usual gap)."""
 
     gap_rad: np.ndarray
     progress_rad: np.ndarray
@@ -112,7 +112,7 @@ def view_arc(angle_rad: np.ndarray, filled_rad: float = 0.0) -> Arc:
 
 def _stand_out(ahead: np.ndarray) -> np.ndarray:
     """Returns which gaps ``ahead`` (K,), from each view to the next, are wide, bool (K,): the widest if it stands out from
-    all others, and any gap that stands out from the two gaps beside it."""
+    all others, and any gap above 10° that stands out from the two gaps beside it."""
     wide = np.zeros(ahead.size, bool)
     if ahead.size < 2:
         return wide

@@ -97,7 +97,7 @@ class FieldProblem:
         self, one: MotionField, tables: list[TimeCells] | None = None, warp: VolumeWarp | StateStack | None = None
     ) -> WarpedOperator:
         """Returns the projector A of an object that moves by the field ``one``. warp: that of an earlier projector, to save
-        its computation. tables: time cells in place of the scan's; with a ``warp`` they must have the same times."""
+        its computation. tables: time cells in place of the scan's, at the same times."""
         if warp is None:
             states = MotionStates.of_times(one.deformation(), self.scan.grid, self.times_s, _LEAST_VOXELS)
             warp = VolumeWarp(self.rt, states)

@@ -107,7 +107,7 @@ class Sirt(Algorithm):
     """SIRT, x ← x + λ C Aᵀ R (p − A x), with R = 1/(A 1) and C = 1/(Aᵀ 1). The intensity model replaces A x by the expected
     I(x), and Aᵀ by Jᵀ, with the derivative J of I.
 
-    An iteration's residual is the one before its correction. Weighted by √R, its norm falls in every step."""
+    An iteration's residual is the one before its correction. Weighted by √R, its norm never grows in the log model."""
 
     def __init__(self, system: System, options: SirtOptions) -> None:
         super().__init__(system)
