@@ -1,7 +1,8 @@
 """Corrects light that changes during a scan: its pattern by flats, its amount by the air in each frame.
 
 - mean: all flats are averaged.
-- time: flats taken one after another are averaged, and these means interpolated linearly in time.
+- time: flats without a projection between them are averaged, and these means interpolated linearly in time. Without times
+  the stored frames' numbers stand for them.
 - pca: each frame gets the combination of the flats' principal components that leaves the least total variation, in
   logarithms (Van Nieuwenhove et al., Opt. Express 23 (2015) 27975).
 
@@ -37,8 +38,9 @@ def flat_correction(way: str) -> ToAttenuation:
     """Returns the function that converts counts to line integrals for ``read_scan``. way: how the function uses the flats
     (``WAYS``).
 
-    The function takes data (F, v, u), image_key (F,) and the data's quantity. It returns line integrals (P, v, u) and bad
-    pixels. It raises InputError for too few flats and, with "time" or "pca", for other quantities than "counts"."""
+    The function takes data (F, v, u), image_key (F,), the data's quantity, and when frames were taken (F,), in any unit; by
+    default their numbers. It returns line integrals (P, v, u) and bad pixels. It raises InputError for too few flats and,
+    with "time" or "pca", for other quantities than "counts"."""
     checks.one_of("flats", way, WAYS)
     return counts_to_attenuation if way == "mean" else partial(_with_changing_flats, way)
 
@@ -50,7 +52,7 @@ def read_corrected(path: str | Path, flats: str = "mean", rows: tuple[int, int] 
 
 
 def _with_changing_flats(
-    way: str, data: Counts, image_key: np.ndarray, quantity: str
+    way: str, data: Counts, image_key: np.ndarray, quantity: str, at: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     flats = np.flatnonzero(image_key == FLAT)
     needed = 2 if way == "time" else 3
@@ -61,7 +63,8 @@ def _with_changing_flats(
     signal = np.maximum(data[flats].astype(np.float64) - dark, 0)
     numbers = np.flatnonzero(image_key == PROJECTION)
     counts = (data[frame] - dark for frame in numbers)
-    lights = _in_time(signal, flats, numbers) if way == "time" else _of_components(signal, counts)
+    at = np.arange(len(data)) if at is None else at
+    lights = _in_time(signal, at[flats], at[numbers]) if way == "time" else _of_components(signal, counts)
     result = np.empty((len(numbers), *data.shape[1:]), np.float32)
     bad = np.empty(result.shape, bool)
     for i, (frame, light) in enumerate(zip(numbers, lights, strict=True)):
@@ -69,13 +72,15 @@ def _with_changing_flats(
     return result, bad
 
 
-def _in_time(signal: np.ndarray, flats: np.ndarray, numbers: np.ndarray) -> Iterator[np.ndarray]:
-    """Yields each projection's flat (v, u): the means of flats taken one after another, interpolated by frame number."""
-    groups = np.split(np.arange(len(flats)), np.flatnonzero(np.diff(flats) > 1) + 1)
-    time = np.array([flats[group].mean() for group in groups])
+def _in_time(signal: np.ndarray, flats_at: np.ndarray, at: np.ndarray) -> Iterator[np.ndarray]:
+    """Yields each projection's flat (v, u): the means of flats without a projection between them, interpolated linearly.
+    flats_at (n,), at (P,): when flats and projections were taken."""
+    place = np.searchsorted(np.sort(at), flats_at)
+    groups = [place == one for one in np.unique(place)]
+    time = np.array([flats_at[group].mean() for group in groups])
     means = np.stack([signal[group].mean(axis=0) for group in groups])
-    for number in numbers:
-        share = np.array([np.interp(number, time, unit) for unit in np.eye(len(time))])
+    for moment in at:
+        share = np.array([np.interp(moment, time, unit) for unit in np.eye(len(time))])
         yield np.tensordot(share, means, axes=1)
 
 
