@@ -1,8 +1,8 @@
 """Converts frames of any format to line integrals, with row 0 the lowest and bad pixels masked. Flats and darks that are
 unlike most are left out; the median of the rest is used.
 
-Flats of several times, such as before and after the scan, are interpolated linearly in time, or over the frames' numbers where
-nothing states the times."""
+Flats of several times, such as before and after the scan, are interpolated linearly in time, or over the frames' numbers
+where nothing states the times."""
 
 import logging
 from collections.abc import Mapping, Sequence

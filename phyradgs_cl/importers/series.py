@@ -209,8 +209,8 @@ def _column(place: int, numbers: tuple[re.Match[str], ...]) -> Iterator[_Column]
 
 
 def flat_places(flats: list[Path], darks: list[Path], series: Series) -> tuple[np.ndarray, np.ndarray] | None:
-    """Returns when flats and projections were taken (``frames.Moments``). Words such as "before" in the flats' names show it,
-    or numbers that continue through flats, darks and projections. Returns None if neither does."""
+    """Returns when flats and projections were taken (``frames.Moments``). Words such as "before" in the flats' names show
+    it, or numbers that continue through flats, darks and projections. Returns None if neither does."""
     ends = [[bool(words.search(path.stem)) for path in flats] for words in (_BEFORE, _AFTER)]
     if flats and all(map(np.logical_xor, *ends)):
         return np.where(ends[0], -0.5, len(series.paths) - 0.5), np.arange(len(series.paths))
