@@ -35,7 +35,8 @@ class ScanHeader:
     """A checked scan without its arrays: ``scan.projections`` are zeros that take no memory.
 
     entry: address of the NXtomo group. image_key (F,): types of all stored frames. taken_at (F,): see the function.
-    quantity, data_type: of the frames. mask_shape: None without a mask. states: how many times have a true volume. has_grid: the file states a grid."""
+    quantity, data_type: of the frames. mask_shape: None without a mask. states: how many times have a true volume. has_grid:
+    the file states a grid."""
 
     scan: Scan
     entry: str
