@@ -7,8 +7,8 @@ random sample are separate functions: counts = Poisson(expected) + N(0, electron
   synthetic scans have this noise (TIGRE's CTnoise; Biguri et al., Biomed. Phys. Eng. Express 2 055010, 2016).
 - Beer-Lambert: expected = dose · exp(−p), as in a real panel.
 
-Lag is one exponential from frame to frame: y_f = (1 − λ) x_f + λ y_(f−1), with y = 0 before the first frame, unless frames say
-that the beam was on. Its effect on reconstructions is in Tilley et al., arXiv:1805.11631."""
+Lag is one exponential from frame to frame: y_f = (1 − λ) x_f + λ y_(f−1), with y = 0 before the first frame, unless frames
+say that the beam was on. Its effect on reconstructions is in Tilley et al., arXiv:1805.11631."""
 
 import logging
 from dataclasses import replace
@@ -138,9 +138,9 @@ def light_before(scan: Scan) -> tuple[Array, str]:
     """Returns the transmissions (v, u) that a panel with lag recorded before the scan's first frame, and words for them: 0
     and "" if the beam was off.
 
-    The second frame does not depend on them. With a beam that was on, the first one would come out brighter than it, by
-    about 1/(1 − λ) wherever it is bright, and than no other. Then the panel had recorded the same image, or air as in flats: whichever makes the first frame more
-    like the second."""
+    The second frame does not depend on them. Of a beam that was on the first one would come out brighter than that, by about
+    1/(1 − λ) where it is bright, and no other frame would. Then the panel had recorded the same image, or air as in flats:
+    whichever makes the first frame more like the second."""
     recorded = np.exp(-scan.projections[:_FIRST].astype(np.float64))
     off, usable = np.zeros(recorded.shape[1:]), scan.valid[:_FIRST].all(axis=0)
     if len(recorded) < 2 or not usable.any():

@@ -21,8 +21,8 @@ from phyradgs_cl.io.hdf5.datasets import ATTENUATION, read_array, read_grid, rea
 from phyradgs_cl.io.scan.header import ScanHeader, read_header
 
 LARGEST_LINE_INTEGRAL = 1e6  # larger line integrals cannot be measured: a scan file must have none, and an import masks them
-# Takes data (F, v, u), image_key (F,), quantity, and times or numbers of the frames (F,); returns line integrals (P, v, u) and
-# a mask of bad pixels or None.
+# Takes data (F, v, u), image_key (F,), quantity, and times or numbers of the frames (F,); returns line integrals (P, v, u)
+# and a mask of bad pixels or None.
 ToAttenuation = Callable[[np.ndarray, np.ndarray, str, np.ndarray], tuple[np.ndarray, np.ndarray | None]]
 
 
