@@ -40,7 +40,7 @@ class CountReader:
     at_ceiling: float = 0.0
 
     def __call__(
-        self, data: np.ndarray, image_key: np.ndarray, quantity: str
+        self, data: np.ndarray, image_key: np.ndarray, quantity: str, at: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         if quantity == "counts":
             frames = data[image_key == 0]

@@ -32,13 +32,13 @@ FILTER_MM = 5.0
 
 
 def counts_to_attenuation(
-    data: ArrayLike, image_key: ArrayLike, quantity: str
+    data: ArrayLike, image_key: ArrayLike, quantity: str, at: ArrayLike | None = None
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Converts the projections of a scan, data (F, v, u), to line integrals (P, v, u) float32, always finite.
 
     quantity: "counts": the transmission is (I − dark) / (flat − dark), with the mean flat and the mean dark (0 without
     darks). "transmission": data are the transmission. "attenuation": data are line integrals already. image_key (F,): 0
-    projection, 1 flat, 2 dark, 3 invalid.
+    projection, 1 flat, 2 dark, 3 invalid. at: not used, as the flats' mean has no time; see ``io.scan.reader``.
 
     The second result (P, v, u) is True where a value must not be used: it is not finite, the flat is not brighter than the
     dark, or the transmission is at most ``TRANSMISSION_FLOOR``. Raises InputError for counts without a flat."""

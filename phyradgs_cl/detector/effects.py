@@ -7,9 +7,10 @@ random sample are separate functions: counts = Poisson(expected) + N(0, electron
   synthetic scans have this noise (TIGRE's CTnoise; Biguri et al., Biomed. Phys. Eng. Express 2 055010, 2016).
 - Beer-Lambert: expected = dose · exp(−p), as in a real panel.
 
-Lag is one exponential from frame to frame: y_f = (1 − λ) x_f + λ y_(f−1), with y = 0 before the first frame. Its effect on
-reconstructions is in Tilley et al., arXiv:1805.11631."""
+Lag is one exponential from frame to frame: y_f = (1 − λ) x_f + λ y_(f−1), with y = 0 before the first frame, unless frames
+say that the beam was on. Its effect on reconstructions is in Tilley et al., arXiv:1805.11631."""
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
+from phyradgs_cl.detector.noise_level import robust_deviation
 
+_log = logging.getLogger(__name__)
 Array = NDArray[np.floating]
 # From this mean on, a rounded normal stands for Poisson (skewness off by < 4e-5): NumPy's own sampler fails near 9.2e18.
 NORMAL_FROM = 1e9
@@ -27,6 +30,8 @@ _LARGEST_EXPONENT = 700.0  # largest exponent: float64 overflows at very negativ
 _SPARK_HEIGHT = (0.3, 2.0)  # least and most light that a spark adds, relative to the light without object
 _SCATTER_REACH = 6.0  # (panel's longer side) / (length over which the scatter kernel falls to 1/e)
 _SCATTER_POWERS = (0.8, 1.5)  # powers a, b of scattered light ∝ P^a p^b, with primary light P and line integral p
+_FIRST = 6  # what was before the first frame is decided by this many frames
+_NEAR = 2.0  # standard deviation in pixels of the blur that takes their noise
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
 
 
@@ -102,7 +107,8 @@ def lagged(line_integrals: ArrayLike, lag: float) -> NDArray[np.float64]:
 
 
 def without_lag(scan: Scan) -> Scan:
-    """Returns the scan as a panel without lag would have recorded it. A scan whose lag is 0 is returned itself.
+    """Returns the scan as a panel without lag would have recorded it. A scan whose lag is 0 is returned itself. The beam was
+    off before the first frame, unless this frame would then be brighter than those that follow (``light_before``).
 
     Masked are transmissions at or below ``TRANSMISSION_FLOOR``, and values computed from a masked pixel of the same or the
     previous frame. Photon noise returns to its level without lag. Electronic noise grows by the factor √(1 + λ²)/(1 − λ)."""
@@ -110,7 +116,10 @@ def without_lag(scan: Scan) -> Scan:
         return scan
     projections = np.empty(scan.projections.shape, np.float32)
     bad = np.zeros(projections.shape, bool)
-    previous = np.zeros(projections.shape[1:])
+    previous, words = light_before(scan)
+    if words:
+        text = "lag %g: the first projection says that the beam was on before the scan: %s is taken as recorded before"
+        _log.warning(text, scan.lag, words)
     for f, frame in enumerate(scan.projections):  # a float64 copy of the whole scan would be large
         recorded = np.exp(-frame.astype(np.float64))
         signal = (recorded - scan.lag * previous) / (1 - scan.lag)
@@ -123,6 +132,38 @@ def without_lag(scan: Scan) -> Scan:
     if masked.ndim == 3:  # a masked pixel spoils the same pixel of the next frame too
         masked = masked | np.concatenate([masked[:1], masked[:-1]])
     return replace(scan, projections=projections, pixel_mask=masked | bad if bad.any() else masked, lag=0.0)
+
+
+def light_before(scan: Scan) -> tuple[Array, str]:
+    """Returns the transmissions (v, u) that a panel with lag recorded before the scan's first frame, and words for them: 0
+    and "" if the beam was off.
+
+    The second frame does not depend on them. Of a beam that was on the first one would come out brighter than that, by about
+    1/(1 − λ) where it is bright, and no other frame would. Then the panel had recorded the same image, or air as in flats:
+    whichever makes the first frame more like the second."""
+    recorded = np.exp(-scan.projections[:_FIRST].astype(np.float64))
+    off, usable = np.zeros(recorded.shape[1:]), scan.valid[:_FIRST].all(axis=0)
+    if len(recorded) < 2 or not usable.any():
+        return off, ""
+    blurred = scipy.ndimage.gaussian_filter(recorded, (0, _NEAR, _NEAR))
+    later = (blurred[1:] - scan.lag * blurred[:-1]) / (1 - scan.lag)
+    bright = usable & (later[0] >= np.median(later[0][usable]))
+    logs = np.log(np.maximum(later[:, bright], TRANSMISSION_FLOOR))
+
+    def first(light: Array) -> Array:
+        return (blurred[0] - scan.lag * light) / (1 - scan.lag)
+
+    def excess(light: Array) -> Array:
+        return np.log(np.maximum(first(light)[bright], TRANSMISSION_FLOOR)) - logs[0]
+
+    without, gain = excess(off), -float(np.log1p(-scan.lag))
+    usual = np.abs(np.median(np.diff(logs, axis=0), axis=1)).max(initial=0.0)
+    if np.median(without) < max(gain / 2, usual) or robust_deviation(without) > gain:
+        return off, ""
+    kinds = {"the same image": (recorded[0], blurred[0]), "air": (off + 1, off + 1)}
+    words = min(kinds, key=lambda kind: float(np.abs(first(kinds[kind][1]) - later[0])[usable].mean()))
+    is_like = abs(np.median(excess(kinds[words][1]))) < np.median(without) / 2
+    return (kinds[words][0], words) if is_like else (off, "")
 
 
 def pixel_gains(shape: tuple[int, int], spread: float, rng: np.random.Generator) -> Array:

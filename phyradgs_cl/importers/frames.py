@@ -1,7 +1,8 @@
 """Converts frames of any format to line integrals, with row 0 the lowest and bad pixels masked. Flats and darks that are
 unlike most are left out; the median of the rest is used.
 
-Flats of several times, such as before and after the scan, are interpolated linearly over the frames' numbers."""
+Flats of several times, such as before and after the scan, are interpolated linearly in time, or over the frames' numbers
+where nothing states the times."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -32,6 +33,8 @@ _PATTERN = 0.02  # first part of a frame's allowed mean difference of pixels: th
 _TIMES = 5.0  # second part of a frame's allowed mean difference of pixels: this × its median over all frames
 _BLOCK_BYTES = 1 << 26  # bytes of the rows whose median is computed at once: a float64 copy of all frames would be large
 Mask = np.ndarray | None
+Moments = tuple[np.ndarray, np.ndarray]
+"""When flats (n,) and projections (P,) were taken, both in one unit: their times, or places in the order of the frames."""
 TAKEN = "taken"
 """The provenance's key of a text that says which frames and flats were used."""
 _AIR = 0.2  # frames show air at their borders if |median line integral| or |median transmission − 1| is below this
@@ -51,29 +54,25 @@ class Light:
     said: str
 
 
-def places(is_flat: np.ndarray, is_projection: np.ndarray) -> np.ndarray:
-    """Returns the place (n,) of each flat among the projections: −0.5 is before the first, 9.5 between projections 9 and 10.
-    is_flat, is_projection: bool (F,), for frames in the order in which they were taken."""
-    return np.cumsum(is_projection)[is_flat] - 0.5
-
-
 def light_of(
     subject: str, flats: np.ndarray, darks: np.ndarray | None, count: int, options: ImportOptions,
-    at: np.ndarray | None = None, names: Mapping[str, Sequence[str]] | None = None,
+    at: Moments | None = None, names: Mapping[str, Sequence[str]] | None = None,
 ) -> Light:
     """Returns the flats and dark for ``count`` projections, from flats and darks (n, v, u). Of three or more, those that do
-    not fit the others are left out, with a warning. at (n,): flats' places, see ``places``; None: not stated. names: what
-    messages call the single "flats" and "darks". Raises InputError for the option flats "time" with flats of one time."""
-    at, assumed = _times(subject, len(flats), count, options, at)
+    not fit the others are left out, with a warning. at: None if not stated. Flats without a projection between them are of
+    one time. names: what messages call the single "flats" and "darks". Raises InputError for the option flats "time" with
+    flats of one time."""
+    flats_at, when, assumed = _times(subject, len(flats), count, options, at)
     light = max(float(np.median(_levels(flats)[1])), 1e-30)
-    times = [np.flatnonzero(at == time) for time in np.unique(at)]
+    group_of = _group_of(flats_at, when)
+    times = [np.flatnonzero(group_of == group) for group in np.unique(group_of)]
     said_by = (subject, light, names or {})
     times = [group[_fitting("flats", flats, group, _TOGETHER, *said_by)] for group in times]
     used = np.concatenate(times)
     if len(times) > 1:
         used = used[_fitting("flats", flats, used, _APART, *said_by)]
     times = [group for group in (np.intersect1d(group, used) for group in times) if len(group)]
-    place = np.interp(np.arange(count), [at[group[0]] for group in times], np.arange(len(times)))
+    place = np.interp(when, [np.median(flats_at[group]) for group in times], np.arange(len(times)))
     medians = np.stack([median(flats[group]) for group in times])
     said = f"flats: {len(used)} of {len(times)} times, interpolated between them{assumed}"
     said = said if len(times) > 1 else f"flats: the median of {len(used)}"
@@ -90,18 +89,25 @@ def median(stack: np.ndarray) -> np.ndarray:
     return np.concatenate([np.median(stack[:, start : start + rows].astype(np.float64), axis=0) for start in starts])
 
 
+def _group_of(flats_at: np.ndarray, when: np.ndarray) -> np.ndarray:
+    """Returns how many projections were taken before each flat, (n,)."""
+    return np.searchsorted(np.sort(when), flats_at)
+
+
 def _times(
-    subject: str, flats: int, count: int, options: ImportOptions, at: np.ndarray | None
-) -> tuple[np.ndarray, str]:
-    """Returns the places (n,) of n flats, see ``places``, and a text about assumed places. Flats of equal places will be
-    combined by their median. count: the number of projections."""
+    subject: str, flats: int, count: int, options: ImportOptions, at: Moments | None
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Returns when n flats (n,) and the ``count`` projections were taken, and a text about assumed moments."""
+    numbers = np.arange(count)
     if options.flats != "time":
-        return np.zeros(flats) if at is None or options.flats else at, ""
-    if flats < 2 or (at is not None and np.ptp(at) == 0):
+        return (np.full(flats, -0.5), numbers, "") if at is None or options.flats else (*at, "")
+    if flats < 2 or (at is not None and np.ptp(_group_of(*at)) == 0):
         found = f"{flats} of one time in {subject}"
         raise InputError(options.named("flats"), found, "flats of several times", "take their median: leave it out")
     before, said = (flats + 1) // 2, " (assumed: the first {} before the scan, the others after it)"
-    return (np.repeat([-0.5, count - 0.5], [before, flats - before]), said.format(before)) if at is None else (at, "")
+    if at is not None:
+        return *at, ""
+    return np.repeat([-0.5, count - 0.5], [before, flats - before]), numbers, said.format(before)
 
 
 def _levels(stack: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +160,7 @@ class LineIntegrals:
 def line_integrals(
     subject: str, frames: np.ndarray, options: ImportOptions, *, flats: np.ndarray | None = None,
     darks: np.ndarray | None = None, convention: str | None = None, is_corrected: bool = False,
-    flats_at: np.ndarray | None = None, names: Mapping[str, Sequence[str]] | None = None,
+    flats_at: Moments | None = None, names: Mapping[str, Sequence[str]] | None = None,
 ) -> LineIntegrals:
     """Converts ``frames`` (P, v, u) of any real type to line integrals. Masks clipped counts and values that no object
     can have, with a warning.

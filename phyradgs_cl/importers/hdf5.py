@@ -14,13 +14,13 @@ from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.assemble import Turned, cone, parallel
 from phyradgs_cl.importers.files import SafeFolder
-from phyradgs_cl.importers.frames import LineIntegrals, line_integrals, oriented, places
+from phyradgs_cl.importers.frames import LineIntegrals, Moments, line_integrals, oriented
 from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5.datasets import ANGLE, LENGTH
-from phyradgs_cl.io.scan.header import read_duration
+from phyradgs_cl.io.scan.header import read_duration, taken_at
 from phyradgs_cl.io.scan.reader import united
 
 _log = logging.getLogger(__name__)
@@ -109,11 +109,12 @@ class Places:
 
     def stacks(
         self, projections: str = "/", *, key: Sequence[str] = (), flats: Sequence[str] = (), darks: Sequence[str] = (),
-        mask: Sequence[str] = (),
+        mask: Sequence[str] = (), times: Sequence[str] = (),
     ) -> "Stacks":
         """Reads all frames from the stated addresses, else from the format's, which are the arguments. key: addresses, the
         first of which in the file has the frames' types (projection, flat, dark, invalid). Separate flats and darks replace
-        those among the projections. Raises InputError without projections, and for arrays that do not fit them."""
+        those among the projections. times: addresses, one of which may have the frames' times. Raises InputError without
+        projections, and for arrays that do not fit them."""
         if self.source is not None and "projections" not in self.stated:
             self.source.dataset(projections)  # raises an error if the dataset is missing, and names a similar one
         if (stored := self.stack("projections", [projections])) is None:
@@ -122,22 +123,30 @@ class Places:
         kinds = self._key(key, len(frames))
         used = kinds == schema.PROJECTION
         stacks = {"flats": frames[kinds == schema.FLAT], "darks": frames[kinds == schema.DARK]}
-        flats_at = places(kinds == schema.FLAT, used) if np.any(kinds == schema.FLAT) else None
+        flats_at = self._moments(times, kinds) if np.any(kinds == schema.FLAT) else None
         for name, addresses in (("flats", flats), ("darks", darks), ("mask", mask)):
             if parts := self.stack(name, addresses, panel):
                 stacks[name] = parts[0]
                 at = {"pre": -0.5, "post": int(used.sum()) - 0.5}  # flats' times, by the end of their address
                 ends = [text.rpartition("_")[2] for text in parts[1]]
                 if name == "flats":
-                    flats_at = np.repeat([at.get(end, np.nan) for end in ends], list(parts[1].values()))
-        if flats_at is not None and np.isnan(flats_at).any():
-            flats_at = None
+                    beside = np.repeat([at.get(end, np.nan) for end in ends], list(parts[1].values()))
+                    flats_at = None if np.isnan(beside).any() else (beside, np.arange(int(used.sum())))
         bad = stacks.get("mask")
         if bad is not None and len(bad) not in (1, len(used)):
             raise InputError("mask", f"{len(bad)} images", f"one, or {len(used)} as there are frames")
         if bad is not None:
             bad = None if not bad.any() else bad[0] if len(bad) == 1 else bad[used]
         return Stacks(frames if used.all() else frames[used], stacks["flats"], stacks["darks"], bad, used, flats_at)
+
+    def _moments(self, times: Sequence[str], kinds: np.ndarray) -> Moments:
+        """Returns the times of flats and projections at the first of the addresses that has them, else their numbers among
+        all stored frames of ``kinds`` (F,)."""
+        at = np.arange(len(kinds), dtype=np.float64)
+        if self.source is not None:
+            found = (taken_at(self.source, address, kinds) for address in times)
+            at = next((one for one in found if not np.array_equal(one, at)), at)
+        return at[kinds == schema.FLAT], at[kinds == schema.PROJECTION]
 
     def _key(self, usual: Sequence[str], frames: int) -> np.ndarray:
         """Reads the types (F,) of frames: 0 projection, 1 flat, 2 dark, 3 invalid. Without a key all are projections. Raises
@@ -182,7 +191,7 @@ class Stacks:
     darks: np.ndarray
     mask: np.ndarray | None
     used: np.ndarray
-    flats_at: np.ndarray | None
+    flats_at: Moments | None
 
     @property
     def panel(self) -> tuple[int, int]:

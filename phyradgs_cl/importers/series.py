@@ -208,16 +208,16 @@ def _column(place: int, numbers: tuple[re.Match[str], ...]) -> Iterator[_Column]
         yield _Column(place, np.array([int(one or 0) for one in decimals]), False)
 
 
-def flat_places(flats: list[Path], darks: list[Path], series: Series) -> np.ndarray | None:
-    """Returns when flats were taken (n,), as in ``frames.places``. Words such as "before" in the flats' names show it, or
-    numbers that continue through flats, darks and projections. Returns None if neither does."""
+def flat_places(flats: list[Path], darks: list[Path], series: Series) -> tuple[np.ndarray, np.ndarray] | None:
+    """Returns when flats and projections were taken (``frames.Moments``). Words such as "before" in the flats' names show
+    it, or numbers that continue through flats, darks and projections. Returns None if neither does."""
     ends = [[bool(words.search(path.stem)) for path in flats] for words in (_BEFORE, _AFTER)]
     if flats and all(map(np.logical_xor, *ends)):
-        return np.where(ends[0], -0.5, len(series.paths) - 0.5)
+        return np.where(ends[0], -0.5, len(series.paths) - 0.5), np.arange(len(series.paths))
     own = [_columns([path.stem for path in paths]) for paths in (flats, darks) if paths]
     if not flats or not all(own) or series.numbers is None:
         return None
     numbers = [*(columns[-1].values for columns in own), series.numbers]
     if np.any(np.diff(np.sort(np.concatenate(numbers))) != 1):
         return None
-    return np.asarray(np.searchsorted(np.sort(series.numbers), numbers[0]) - 0.5)
+    return numbers[0], series.numbers

@@ -1,7 +1,8 @@
 """Corrects light that changes during a scan: its pattern by flats, its amount by the air in each frame.
 
 - mean: all flats are averaged.
-- time: flats taken one after another are averaged, and these means interpolated linearly in time.
+- time: flats without a projection between them are averaged, and these means interpolated linearly in time. Without times
+  the stored frames' numbers stand for them.
 - pca: each frame gets the combination of the flats' principal components that leaves the least total variation, in
   logarithms (Van Nieuwenhove et al., Opt. Express 23 (2015) 27975).
 
@@ -19,6 +20,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.detector.attenuation import DARK, FLAT, PROJECTION, TRANSMISSION_FLOOR, mean_dark, minus_log
+from phyradgs_cl.detector.noise_level import robust_deviation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import ToAttenuation, read_scan
 from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
@@ -27,9 +29,20 @@ WAYS = ("mean", "time", "pca")
 _MOST_COMPONENTS, _CLEAR = 4, 4.0  # most components used; a component with less than 4 times the median variance is noise
 _REWEIGHTINGS = 12  # rounds of least squares, each with new weights
 _LEAST_PIXELS = 20  # with fewer pixels of air in a frame, their median is too noisy
+_FILTER_NORM = 1.5**0.5  # factor by which the filter (-1/2, 1, -1/2) multiplies the standard deviation of white noise
 _AROUND = np.ones((3, 3), bool)
 _MARGIN = 2  # pixels this near to the object are no air, because its edge is blurred
-_PASSES = 3  # rounds in which the threshold of air follows the air's median, which bright or dim light shifts
+_PASSES = 5  # rounds in which the threshold of air follows the air's median
+_DARK_SIDES = 5  # the first threshold follows this percentile of the sides, of which an object may cover the rest
+_DEVIATIONS = 3.0  # frames are blurred until the limit of air is this many standard deviations of the noise
+_FLAT_BLUR = 2 * np.sqrt(np.pi)  # a Gaussian of σ pixels divides the deviation of white noise by this times σ, from 0.5 on
+_LEAST_BLUR, _WIDEST_BLUR = 0.5, 1 / 16  # least σ in pixels; largest, as a fraction of the panel's longer side
+_SOME_FRAMES = 24  # range and noise are measured in at most this many frames, evenly spread
+_DARKEST = 0.25  # air with a larger line integral, of less than 78 % of the flats' light, is rather an object
+# Air has fewer pixels around it, of up to 3 times the limit, than this fraction of its own; the slope of an object has more.
+_SLOPE = 0.5
+_WHOLE = 90  # this percentile of the frames' sums of line integrals shows the whole object: some frames may lack a part
+_MISSING = 0.5  # an object whose line integrals sum to less than this fraction of that has been taken for air
 Counts = np.ndarray
 
 
@@ -37,8 +50,9 @@ def flat_correction(way: str) -> ToAttenuation:
     """Returns the function that converts counts to line integrals for ``read_scan``. way: how the function uses the flats
     (``WAYS``).
 
-    The function takes data (F, v, u), image_key (F,) and the data's quantity. It returns line integrals (P, v, u) and bad
-    pixels. It raises InputError for too few flats and, with "time" or "pca", for other quantities than "counts"."""
+    The function takes data (F, v, u), image_key (F,), the data's quantity, and when frames were taken (F,), in any unit; by
+    default their numbers. It returns line integrals (P, v, u) and bad pixels. It raises InputError for too few flats and,
+    with "time" or "pca", for other quantities than "counts"."""
     checks.one_of("flats", way, WAYS)
     return counts_to_attenuation if way == "mean" else partial(_with_changing_flats, way)
 
@@ -50,7 +64,7 @@ def read_corrected(path: str | Path, flats: str = "mean", rows: tuple[int, int] 
 
 
 def _with_changing_flats(
-    way: str, data: Counts, image_key: np.ndarray, quantity: str
+    way: str, data: Counts, image_key: np.ndarray, quantity: str, at: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     flats = np.flatnonzero(image_key == FLAT)
     needed = 2 if way == "time" else 3
@@ -61,7 +75,8 @@ def _with_changing_flats(
     signal = np.maximum(data[flats].astype(np.float64) - dark, 0)
     numbers = np.flatnonzero(image_key == PROJECTION)
     counts = (data[frame] - dark for frame in numbers)
-    lights = _in_time(signal, flats, numbers) if way == "time" else _of_components(signal, counts)
+    at = np.arange(len(data)) if at is None else at
+    lights = _in_time(signal, at[flats], at[numbers]) if way == "time" else _of_components(signal, counts)
     result = np.empty((len(numbers), *data.shape[1:]), np.float32)
     bad = np.empty(result.shape, bool)
     for i, (frame, light) in enumerate(zip(numbers, lights, strict=True)):
@@ -69,13 +84,15 @@ def _with_changing_flats(
     return result, bad
 
 
-def _in_time(signal: np.ndarray, flats: np.ndarray, numbers: np.ndarray) -> Iterator[np.ndarray]:
-    """Yields each projection's flat (v, u): the means of flats taken one after another, interpolated by frame number."""
-    groups = np.split(np.arange(len(flats)), np.flatnonzero(np.diff(flats) > 1) + 1)
-    time = np.array([flats[group].mean() for group in groups])
+def _in_time(signal: np.ndarray, flats_at: np.ndarray, at: np.ndarray) -> Iterator[np.ndarray]:
+    """Yields each projection's flat (v, u): the means of flats without a projection between them, interpolated linearly.
+    flats_at (n,), at (P,): when flats and projections were taken."""
+    place = np.searchsorted(np.sort(at), flats_at)
+    groups = [place == one for one in np.unique(place)]
+    time = np.array([flats_at[group].mean() for group in groups])
     means = np.stack([signal[group].mean(axis=0) for group in groups])
-    for number in numbers:
-        share = np.array([np.interp(number, time, unit) for unit in np.eye(len(time))])
+    for moment in at:
+        share = np.array([np.interp(moment, time, unit) for unit in np.eye(len(time))])
         yield np.tensordot(share, means, axes=1)
 
 
@@ -117,19 +134,20 @@ def _least_variation(frame: np.ndarray, components: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class AirOptions(checks.Checked):
-    """Options of the step ``air``. below: pixels are air if they lie below this fraction of the scan's largest line integral
-    and connect to the panel's left or right side. least: least fraction of air in every frame."""
+    """Options of the step ``air``. below: pixels are air if they exceed the air of their frame by less than this fraction of
+    the scan's range of line integrals, and connect to the panel's left or right side. least: least fraction of air in every
+    frame."""
 
     PREFIX = "air."
 
-    below: float = checks.ranged(0.05, 1e-4, 0.5)
+    below: float = checks.ranged(0.05, 1e-4, 0.2)
     least: float = checks.ranged(0.01, 0, 1)
 
 
 def normalise_air(scan: Scan, options: AirOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
     """Returns the scan with each frame shifted so that the median of its air is 0."""
     frames = unmasked_frames(scan)
-    air = enough_air(frames, options.below, options.least, "air", "raise air.below, or leave the step out")
+    air = enough_air(frames, options.below, options.least, "air", "leave the step out, or try another air.below")
     clean, value = with_air_at_0(frames, air)
     light = np.exp(-value)
     facts = {"light": [float(light.min()), float(light.max())], "air_share": float(air.mean())}
@@ -139,20 +157,56 @@ def normalise_air(scan: Scan, options: AirOptions, make_model: MakeModel) -> tup
 def find_air(frames: np.ndarray, *, below: float = 0.05) -> np.ndarray:
     """Returns the pixels of line integrals (F, v, u) that no object covers, bool (F, v, u).
 
-    They exceed the air's median by less than the fraction ``below`` of the largest line integral (99.9th percentile), are
-    connected with the first or last column through such pixels, and lie more than two pixels away from all others."""
-    limit = below * float(np.percentile(frames, 99.9))
+    They exceed their frame's level by less than the fraction ``below`` of the scan's range, are connected with the first or
+    last column through such pixels, and lie more than two pixels away from all others. The level is their median. Noise is
+    blurred first, until it hardly exceeds that limit. A frame has no air if its level is too dark for a drift, if the sides
+    are a slope, as of an object that reaches them, or if much of the object would be missing without what looks like air."""
+    blur, limit = _blur_and_limit(frames, below)
+    margin = _MARGIN + round(blur)
     air = np.empty(frames.shape, bool)
+    levels, total = np.full(len(frames), np.inf), frames.sum(axis=(1, 2), dtype=np.float64)
     for f, frame in enumerate(frames):
-        low, value = frame < limit, 0.0
+        smooth = scipy.ndimage.gaussian_filter(frame, blur) if blur else frame
+        level = float(np.percentile(smooth[:, [0, -1]], _DARK_SIDES))
         for _ in range(_PASSES):
-            sides = np.zeros_like(low)
-            sides[:, [0, -1]] = low[:, [0, -1]]
-            reached = scipy.ndimage.binary_propagation(sides, _AROUND, mask=low)
-            value = float(np.median(frame[reached])) if reached.any() else 0.0
-            low = frame < limit + value
-        air[f] = scipy.ndimage.binary_erosion(reached, _AROUND, iterations=_MARGIN, border_value=1)
+            reached = _from_sides(smooth < level + limit)
+            level = float(np.median(smooth[reached])) if reached.any() else np.inf
+        around = np.count_nonzero(_from_sides(smooth < level + 3 * limit)) - np.count_nonzero(reached)
+        if level < _DARKEST and around < _SLOPE * np.count_nonzero(reached):
+            levels[f] = level
+        air[f] = scipy.ndimage.binary_erosion(reached, _AROUND, iterations=margin, border_value=1)
+    left = total - levels * frames[0].size
+    usual = float(np.percentile(left[np.isfinite(levels)], _WHOLE)) if np.isfinite(levels).any() else 0.0
+    is_covered = (left < _MISSING * usual) & (levels > limit) & (np.abs(total - usual) < np.abs(left - usual))
+    air[is_covered | np.isinf(levels)] = False
     return air
+
+
+def _blur_and_limit(frames: np.ndarray, below: float) -> tuple[float, float]:
+    """Returns the blur σ in pixels of line integrals (F, v, u) that makes the air's noise small against the limit, and the
+    limit: how far above its frame's level air may be."""
+    some = frames[np.unique(np.linspace(0, len(frames) - 1, _SOME_FRAMES).round().astype(int))]
+    low, high = np.percentile(scipy.ndimage.gaussian_filter(some, (0, _MARGIN, _MARGIN)), (1, 99.9))
+    limit = below * float(high - low)
+    noise = float(np.median([_noise_of_brighter_half(frame) for frame in some]))
+    blur = min(_DEVIATIONS * noise / max(_FLAT_BLUR * limit, 1e-12), _WIDEST_BLUR * max(frames.shape[1:]))
+    if blur < _LEAST_BLUR:
+        return 0.0, limit
+    return blur, max(limit, _DEVIATIONS * noise / (_FLAT_BLUR * blur))
+
+
+def _noise_of_brighter_half(frame: np.ndarray) -> float:
+    middle = frame[:, 1:-1]
+    second = middle - 0.5 * (frame[:, :-2] + frame[:, 2:])
+    mean = scipy.ndimage.uniform_filter(frame, 5)[:, 1:-1]
+    return robust_deviation(second[mean <= np.median(mean)]) / _FILTER_NORM
+
+
+def _from_sides(low: np.ndarray) -> np.ndarray:
+    """Returns the pixels of ``low``, bool (v, u), that connect with the first or last column through such pixels."""
+    sides = np.zeros_like(low)
+    sides[:, [0, -1]] = low[:, [0, -1]]
+    return np.asarray(scipy.ndimage.binary_propagation(sides, _AROUND, mask=low))
 
 
 def enough_air(frames: np.ndarray, below: float, least: float, step: str, remedy: str) -> np.ndarray:
@@ -163,7 +217,8 @@ def enough_air(frames: np.ndarray, below: float, least: float, step: str, remedy
     needed = max(_LEAST_PIXELS, int(np.ceil(least * frames[0].size)))
     if counts.min() < needed:
         worst = int(np.argmin(counts))
-        raise InputError(f"--steps {step}", f"{counts[worst]} pixels of air in frame {worst}", f"at least {needed}", remedy)
+        expected = f"at least {needed} of one brightness at the panel's sides"
+        raise InputError(f"--steps {step}", f"{counts[worst]} pixels of air in frame {worst}", expected, remedy)
     return air
 
 

@@ -7,6 +7,7 @@ flats, while each frame's light may vary. This may underestimate scatter behind 
 too. A stronger kernel is taken if the frames that it corrects agree far better with their own reprojection."""
 
 import itertools
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -20,13 +21,15 @@ from phyradgs_cl.prepare import step
 from phyradgs_cl.prepare.light import enough_air, with_air_at_0
 from phyradgs_cl.prepare.step import Facts, MakeModel, Model
 
+log = logging.getLogger(__name__)
 Kernel = Mapping[tuple[float, int], float]
 """Strength of each Gaussian. Its key has its standard deviation, as a fraction of the panel's longer side, and the power n
 in the light P · (−ln P)ⁿ that it spreads."""
 _POWERS = (1, 2)  # powers of a ray's line integral to which scatter is fitted: the square tells thick rays from thin ones
 # Standard deviations of the fitted Gaussians, as fractions of the panel's longer side. Narrower ones would fit columns of
-# wrong gain.
-_REACHES = (0.12, 0.18, 0.27, 0.4)
+# wrong gain. The widest is an even haze.
+_REACHES = (0.12, 0.18, 0.27, 0.4, 2.0)
+_SHORT = 0.4  # wider Gaussians are cut off where no pixel of the panel is farther away, which saves time
 _PASSES = 6  # rounds that compute scatter from the primary light, then primary light from the scatter
 _LEAST_PRIMARY = 0.05  # overestimated scatter leaves at least this fraction of the light, so that its logarithm is finite
 _SHADOW = 0.1  # pixels above this fraction of the largest line integral lie behind the object
@@ -39,6 +42,8 @@ _TRIALS = 6  # most strengths tried in the final search, between the neighbours 
 _BETTER = 0.65
 _AS_WELL = 1.05  # no stronger kernel is tried after one that leaves over this many times the least unexplained rest so far
 _LEAST_RATIO = 0.01  # a ratio (scatter)/(primary light) behind the object below this is not told from 0
+# Light in air, beyond that of the flats, is unexplained if more than these fractions of the flats and of itself stay.
+_LEFT, _LEFT_OF_IT = 0.01, 0.3
 _LARGEST_HEIGHT = 1000.0  # no kernel for a stated to_primary is stronger than this
 _BISECTIONS = 26  # halvings of the interval from 0 to 1000 that give the strength for a stated to_primary to within 2e-5
 _SAME_RATIO = 0.25  # a kernel gives a stated to_primary if its ratio differs by at most this fraction
@@ -67,6 +72,8 @@ def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel)
         kernel = raised(fitted, frames, air, *step.coarse_model(scan, make_model))
     clean = remove_scatter(frames, kernel)
     ratio = _ratio(frames, clean)
+    if options.to_primary == 0:
+        _warn_of_rest(frames[air], clean[air])
     if options.to_primary == 0 and ratio < _LEAST_RATIO:
         return scan, {"result": "no scatter found in the light beside the object: the projections stay as they are"}
     if options.to_primary > 0 and abs(ratio - options.to_primary) > _SAME_RATIO * options.to_primary:
@@ -76,6 +83,14 @@ def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel)
     terms = {"reach": [reach for reach, _ in kernel], "power": [power for _, power in kernel]}
     facts = {**terms, "height": list(kernel.values()), "to_primary": ratio}
     return replace(scan, projections=clean), facts
+
+
+def _warn_of_rest(before: np.ndarray, after: np.ndarray) -> None:
+    """Warns if the kernel leaves much of the light in air beyond that of the flats. before, after: line integrals (n,)."""
+    light, left = (float(np.expm1(-np.median(air))) for air in (before, after))
+    if left > max(_LEFT, _LEFT_OF_IT * light):
+        text = "scatter: air has %.1f %% more light than the flats; %.1f %% stay, which no scatter of the object explains"
+        log.warning(text, 100 * light, 100 * left)
 
 
 def remove_scatter(frames: np.ndarray, kernel: Kernel) -> np.ndarray:
@@ -166,7 +181,8 @@ def _primary(recorded: np.ndarray, kernel: Kernel) -> np.ndarray:
 def _scattered(primary: np.ndarray, reach: float, power: int) -> np.ndarray:
     source = primary * np.maximum(-np.log(np.maximum(primary, 1e-12)), 0) ** power
     sigma = reach * max(primary.shape[1:])
-    return scipy.ndimage.gaussian_filter(source, (0, sigma, sigma), mode="constant")
+    truncate = 4.0 if reach <= _SHORT else 1 / reach
+    return scipy.ndimage.gaussian_filter(source, (0, sigma, sigma), mode="constant", truncate=truncate)
 
 
 def _some(frames: int) -> np.ndarray:

@@ -184,7 +184,7 @@ def test_raw_counts_stay_raw_in_the_copy(cli, clean, tmp_path) -> None:
     write_scan(path, clean, data=data, image_key=np.r_[1, np.zeros(clean.frames, int)], quantity="counts")
     cli.run(["check", str(path), "--fix-offset", "-o", str(fixed)])
     held = []
-    read_scan(fixed, lambda frames, keys, quantity: held.append((frames, quantity)) or (clean.projections, None))
+    read_scan(fixed, lambda frames, keys, quantity, at: held.append((frames, quantity)) or (clean.projections, None))
     assert held[0][1] == "counts" and np.array_equal(held[0][0], data)
 
 

@@ -1,5 +1,6 @@
 """Noise against the moments of its distributions, at any dose; lag on a step of light, and undone."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -113,6 +114,27 @@ def test_a_scan_gets_its_frames_back() -> None:
         np.testing.assert_allclose(clean.projections, p, atol=FLOAT32 * np.exp(4.0))
         assert (clean is recorded) == (lag == 0)
         assert lag == 0 or np.abs(recorded.projections - p).max() > lag
+
+
+@pytest.mark.parametrize("lag", [0.05, 0.3])
+@pytest.mark.parametrize("photons", [500, None])
+@pytest.mark.parametrize("covered", [False, True])
+@pytest.mark.parametrize("before", ["off", "the same image", "air"])
+def test_the_first_frame_says_whether_the_beam_was_on_before(before, covered, photons, lag, caplog) -> None:
+    """A ball that moves by a pixel a frame, or a body that leaves no air, in a beam that was off, on, or on without it."""
+    v, u = np.mgrid[-16:16, -16:16] / 16
+    p = np.stack([2 * np.sqrt(np.maximum(0.25 - (u - f / 16) ** 2 - v**2, 0)) + covered * (1 + 0.1 * v) for f in range(8)])
+    light = np.exp(-p)
+    if photons:
+        light = np.random.default_rng(1).poisson(photons * light) / photons
+    start = {"off": 0 * light[0], "the same image": light[0], "air": np.ones_like(light[0])}[before]
+    seen = (add_lag(light, lag) + lag ** np.arange(1, 9)[:, None, None] * start).clip(1e-4)
+    panel = replace(GEOMETRY, detector_shape=v.shape)
+    orbit = CircularOrbit(panel, ConstantSpeed(0.1, 0.25))
+    recorded = replace(scan(frames(8), lag=lag), geometry=panel, trajectory=orbit, projections=np.float32(-np.log(seen)))
+    clean = without_lag(recorded)
+    np.testing.assert_allclose(np.exp(-clean.projections)[clean.valid], light[clean.valid], atol=1e-3)
+    assert ("beam was on" in caplog.text) == (before != "off") and (before == "off" or before in caplog.text)
 
 
 def test_masks_follow_the_light_and_ghosts_are_masked() -> None:

@@ -68,10 +68,10 @@ def test_flats_have_places_by_words_and_by_numbers() -> None:
     series = series_of([Path(f"p_{i:03d}.tif") for i in range(12, 32)], "", "")
     flats = [Path(f"f_{i:03d}.tif") for i in (2, 3, 32, 33)]
     darks = [Path(f"d_{i:03d}.tif") for i in (*range(4, 12),)]
-    np.testing.assert_array_equal(flat_places(flats, darks, series), [-0.5, -0.5, 19.5, 19.5])
+    np.testing.assert_array_equal(np.concatenate(flat_places(flats, darks, series)), [2, 3, 32, 33, *range(12, 32)])
     assert flat_places(flats, darks[1:], series) is None
     words = [Path("flat_before_0.tif"), Path("flat_after_0.tif")]
-    np.testing.assert_array_equal(flat_places(words, [], series), [-0.5, 19.5])
+    np.testing.assert_array_equal(np.concatenate(flat_places(words, [], series)), [-0.5, 19.5, *range(20)])
 
 
 def toml_folder(

@@ -69,7 +69,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
             raise source.error(extra, "a scan file of this package", "a file of another program", "use it as it is")
         detector = f"{entry}/{schema.DETECTOR}"
         keys = [f"{detector}/{name}" for name in ("image_key_control", "image_key")]
-        stacks = places.stacks(f"{detector}/data", key=keys, mask=[f"{detector}/pixel_mask"])
+        times = [f"{detector}/{name}" for name in ("frame_start_time", "start_time")]
+        stacks = places.stacks(f"{detector}/data", key=keys, mask=[f"{detector}/pixel_mask"], times=times)
         turn = _turned(source, detector)
         columns = 0.0 if options.detector_offset_mm else _axis_columns(source, detector, turn, options)
         geometry = hdf5.beam(source, _lengths(entry), options, stacks.panel, columns)

@@ -34,12 +34,14 @@ _DEEPEST_ENTRY = 3  # NXtomo entries and subentries are searched in groups neste
 class ScanHeader:
     """A checked scan without its arrays: ``scan.projections`` are zeros that take no memory.
 
-    entry: address of the NXtomo group. image_key (F,): types of all stored frames. quantity, data_type: of the frames.
-    mask_shape: None without a mask. states: how many times have a true volume. has_grid: the file states a grid."""
+    entry: address of the NXtomo group. image_key (F,): types of all stored frames. taken_at (F,): see the function.
+    quantity, data_type: of the frames. mask_shape: None without a mask. states: how many times have a true volume. has_grid:
+    the file states a grid."""
 
     scan: Scan
     entry: str
     image_key: np.ndarray
+    taken_at: np.ndarray
     quantity: str
     data_type: str
     mask_shape: tuple[int, ...] | None
@@ -85,7 +87,8 @@ def read_header(source: Hdf5Source) -> ScanHeader:
     for address in (f"{entry}/{name}" for name in schema.IGNORED):
         if source.find(address) is not None:
             _log.warning("%s: not read by this package", source.name(address))
-    return ScanHeader(scan, entry, image_key, quantity, str(data.dtype), mask_shape, has_reference, states, has_grid)
+    at = taken_at(source, f"{entry}/{schema.DETECTOR}/frame_start_time", image_key)
+    return ScanHeader(scan, entry, image_key, at, quantity, str(data.dtype), mask_shape, has_reference, states, has_grid)
 
 
 def find_entry(source: Hdf5Source, asked: str | None = None) -> str:
@@ -264,6 +267,18 @@ def read_starts(
     if not moving and source.optional(address) is None:
         return np.arange(int(used.sum())) * max(shutter.span_s, 1.0)
     return h5.read_array(source, address, used.shape, TIME)[used]
+
+
+def taken_at(source: Hdf5Source, address: str, image_key: np.ndarray) -> np.ndarray:
+    """Returns when stored frames were taken (F,), for interpolation between flats: their times at ``address``, in any unit,
+    else their numbers. Times count if flats and projections all have their own: a writer that knows no time of a flat
+    repeats another frame's, or leaves 0."""
+    numbers, dataset = np.arange(len(image_key), dtype=np.float64), source.find(address)
+    if not isinstance(dataset, h5py.Dataset) or dataset.shape != image_key.shape or dataset.dtype.kind not in "iuf":
+        return numbers
+    times = h5.read_values(source, address, dataset).astype(np.float64)
+    own = times[(image_key == schema.PROJECTION) | (image_key == schema.FLAT)]
+    return times if np.isfinite(own).all() and len(np.unique(own)) == len(own) else numbers
 
 
 def check_mask(source: Hdf5Source, entry: str, data_shape: tuple[int, ...]) -> tuple[int, ...] | None:

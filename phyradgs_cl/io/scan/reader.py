@@ -21,8 +21,9 @@ from phyradgs_cl.io.hdf5.datasets import ATTENUATION, read_array, read_grid, rea
 from phyradgs_cl.io.scan.header import ScanHeader, read_header
 
 LARGEST_LINE_INTEGRAL = 1e6  # larger line integrals cannot be measured: a scan file must have none, and an import masks them
-# Takes data (F, v, u), image_key (F,) and quantity; returns line integrals (P, v, u) and a mask of bad pixels or None.
-ToAttenuation = Callable[[np.ndarray, np.ndarray, str], tuple[np.ndarray, np.ndarray | None]]
+# Takes data (F, v, u), image_key (F,), quantity, and times or numbers of the frames (F,); returns line integrals (P, v, u)
+# and a mask of bad pixels or None.
+ToAttenuation = Callable[[np.ndarray, np.ndarray, str, np.ndarray], tuple[np.ndarray, np.ndarray | None]]
 
 
 def read_scan_header(path: str | Path) -> Scan:
@@ -35,10 +36,10 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, 
     """Reads a scan file. rows: the detector rows [first, stop) to read, of a parallel-beam scan only, whose grid stays
     whole; None reads all.
 
-    to_attenuation: takes (data (F, v, u), image_key (F,), quantity) and returns line integrals (P, v, u) of the P
-    projections. It also returns a mask (v, u) or (P, v, u) of unusable values, or None. It leaves flat, dark and invalid
-    frames out. The scan has projections (P, v, u) float32 and a bool ``pixel_mask`` or None, from the file and the
-    conversion; values that are not finite must be masked.
+    to_attenuation: takes (data (F, v, u), image_key (F,), quantity, at (F,)) and returns line integrals (P, v, u) of the P
+    projections. at: when frames were taken, see ``header.taken_at``. It also returns a mask (v, u) or (P, v, u) of unusable
+    values, or None. It leaves flat, dark and invalid frames out. The scan has projections (P, v, u) float32 and a bool
+    ``pixel_mask`` or None, from the file and the conversion; values that are not finite must be masked.
 
     Everything else is checked before the pixels are read. Raises InputError for a missing, damaged or incomplete file; its
     subject is "FILE:/hdf5/path"."""
@@ -174,7 +175,7 @@ def _convert(
     if not valid.all():
         data = data[valid]
     try:
-        projections, bad = to_attenuation(data, header.image_key[valid], header.quantity)
+        projections, bad = to_attenuation(data, header.image_key[valid], header.quantity, header.taken_at[valid])
     except InputError as error:
         raise InputError(f"{subject} ({error.subject})", error.found, error.expected, error.remedy) from error
     if projections.shape != header.scan.projections.shape:
