@@ -32,6 +32,7 @@ _MOST_BESIDE = 0.01  # a grid is too small if a larger fraction of the rays thro
 _TOO_DENSE = 4.0  # (density that a ray would need in the grid) / (median density) from which it must meet matter beside it
 _MATTER, _NOISES = 0.1, 4.0  # matter is above this fraction of the largest value, and above so many deviations of the noise
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
+_AT_END = 0.1  # an object reaches beyond the first or last row if more than this fraction of its pixels shows matter
 Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
 _LEAST_SHARE = 0.1  # least (expected cost of a phase's remaining passes) / (their full cost) in the progress
@@ -168,8 +169,7 @@ class CoarseProblem(CoarseFrames):
     def matter_beside_grid(self) -> float:
         """Returns the fraction, 0 to 1, of the rays through matter that must meet some beside the grid, in the stated
         geometry: their path in the grid would need over four times the density that most paths need."""
-        noise = _NOISES * noise_level(self.measured, self.valid)
-        is_matter = self.measured > max(noise, _MATTER * float(np.percentile(self.measured, 99.9)))
+        is_matter = _is_matter(self.measured, self.valid)
         paths = self.operator(GeometryCorrection()).forward(np.ones(self.grid.shape, np.float32))[is_matter]
         integrals, inside = self.measured[is_matter], paths > 0
         if not inside.any():
@@ -259,6 +259,18 @@ def _around_view(grid: Grid, geometry: Geometry, reach: float) -> Grid:
     sides = zip(grid.shape, grid.voxel_size_mm, np.add(halves_mm, off_mm).tolist(), strict=True)
     nz, ny, nx = (n + 2 * max(0, math.ceil(wanted_mm / voxel_mm - n / 2)) for n, voxel_mm, wanted_mm in sides)
     return Grid((nz, ny, nx), grid.voxel_size_mm, grid.offset_mm)
+
+
+def reaches_ends(scan: Scan) -> bool:
+    """Returns whether the object reaches beyond the panel's first or last row."""
+    quick = coarse.coarse(scan, coarse.QUICK_COLUMNS)
+    shown = _is_matter(np.asarray(quick.projections), quick.valid)
+    return bool(shown[:, [0, -1]].mean((0, 2)).max() > _AT_END)
+
+
+def _is_matter(p: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
+    """Returns which line integrals p (F, rows, columns) belong to rays through matter."""
+    return p > max(_NOISES * noise_level(p, valid), _MATTER * float(np.percentile(p, 99.9)))
 
 
 def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:

@@ -38,7 +38,15 @@ from phyradgs_cl.calibrate.per_view import (
     passes_of_views,
 )
 from phyradgs_cl.calibrate.placing import WRONG_PHANTOM, bead_centres_mm, placements
-from phyradgs_cl.calibrate.problem import CoarseProblem, PassCounter, Passes, Report, Stage, pass_cost
+from phyradgs_cl.calibrate.problem import (
+    CoarseProblem,
+    PassCounter,
+    Passes,
+    Report,
+    Stage,
+    pass_cost,
+    reaches_ends,
+)
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, Calibration, ParameterEstimate, rms
 from phyradgs_cl.calibrate.search import Fallback, Problem, Search
 from phyradgs_cl.check import SUSPICIOUS
@@ -59,6 +67,9 @@ STAGES = (
     Stage(96, first=50, again=15, steps=3, project=30),
 )
 BEAD_STAGES = (Stage(48, first=8, again=4, steps=6, project=0), Stage(128, first=6, again=4, steps=6, project=0))
+# With matter beyond the first or last row ``project`` is so many times as large: a volume explains slowly what only some
+# views see, and with less of it removed a roll came out at half its value.
+_MORE_AT_ENDS = 3
 _FEWEST_FRAMES = 8  # with fewer frames a scan does not determine its geometry
 _FEWEST_COLUMNS = 12  # with fewer columns a scan does not determine its geometry
 _FEWEST_SPLINES = 4  # cubic splines need at least four coefficients
@@ -119,7 +130,8 @@ class _Calibrator:
         self.stated = self.ready  # the scans as stated: ``ready`` may later get the other readout direction
         stages = {one.block(self.scan): one for one in reversed(STAGES if self.phantom is None else BEAD_STAGES)}
         # on a small panel several stages have blocks of the same size: the first stage of each size is kept
-        self.stages = [replace(one, is_cut=self.is_cut) for one in reversed(stages.values())]
+        more = _MORE_AT_ENDS if self.phantom is None and reaches_ends(self.ready[0]) else 1
+        self.stages = [replace(one, is_cut=self.is_cut, project=more * one.project) for one in reversed(stages.values())]
         self.per_view: PerViewParameters | None = None
         if self.request.per_view == WOBBLE:
             self.per_view = WobbleParameters.of(self.ready[0], self.splines)

@@ -38,8 +38,9 @@ _GAUGE_FACTOR = 2.0
 # would count as determined.
 _MOST_GAUGE = 0.2
 DEVIATIONS = 3.0  # a parameter is corrected if |found − stated value| exceeds this many of its standard deviations
-# A parameter returns to its stated value only if no corrected one moves by more than this many standard deviations.
-_MOST_MOVED = 1.0
+# A parameter returns to its stated value only if no corrected one moves by more than this many standard deviations: √2, from
+# which on Akaike's criterion prefers the joint estimate of two parameters that resemble each other.
+_MOST_MOVED = math.sqrt(2.0)
 _MOST_PX = 2.0  # most coarse pixels by which a step moves the image's edge: a larger step's effect is not linear
 _SETTLED = 0.1  # the steps on a grid end when each parameter has (step) / (standard deviation) below this
 
@@ -305,7 +306,7 @@ class Search:
         """Returns the values that remain, by name, when parameters that are not in ``off`` go back to their stated values.
 
         Those in ``off`` then take over the errors of the stated values. So the other parameters go back in turn, the least
-        disturbing first, while no value in ``off`` moves by more than one of its standard deviations. found: value and
+        disturbing first, while no value in ``off`` moves by more than √2 of its standard deviations. found: value and
         deviation of each determined parameter, by name."""
         assert self.reduced is not None
         kept = {name: value for name, (value, _) in found.items()}

@@ -12,6 +12,7 @@ from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, pertur
 from phyradgs_cl.api import static_scan
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
 from phyradgs_cl.calibrate.parameters import BEYOND_PANEL
+from phyradgs_cl.calibrate.problem import reaches_ends
 from phyradgs_cl.calibrate.search import Reduced, Search
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
@@ -68,6 +69,11 @@ def test_a_right_scan_stays_and_planted_errors_are_found(rt, case) -> None:
 @pytest.mark.parametrize("what", ["motion", "wobble"])
 def test_a_cut_object_at_rest_does_not_move(rt, what) -> None:
     assert calibrate(CASES["cut"](), rt, what).corrected == []
+
+
+@pytest.mark.parametrize(("bodies", "rows", "is_cut"), [(WIDE, 10, True), (TALL, 24, True), (WIDE, 28, False)])
+def test_matter_beyond_the_first_and_last_row_takes_more_iterations(bodies, rows, is_cut) -> None:
+    assert reaches_ends(scan_of(bodies, (rows, 28))) == is_cut
 
 
 def test_no_stand_leans_by_more_than_ten_degrees() -> None:
