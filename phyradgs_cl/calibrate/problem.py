@@ -262,9 +262,12 @@ def _around_view(grid: Grid, geometry: Geometry, reach: float) -> Grid:
 
 
 def reaches_ends(scan: Scan) -> bool:
-    """Returns whether the object reaches beyond the panel's first or last row."""
+    """Returns whether the object reaches beyond the first or last row of a cone beam's panel, so that only some views see
+    matter near there."""
+    if scan.is_parallel:
+        return False
     quick = coarse.coarse(scan, coarse.QUICK_COLUMNS)
-    shown = _is_matter(np.asarray(quick.projections), quick.valid)
+    shown = _is_matter(np.where(quick.valid, quick.projections, 0), quick.valid)
     return bool(shown[:, [0, -1]].mean((0, 2)).max() > _AT_END)
 
 
