@@ -22,6 +22,8 @@ _MOST_TILT_RAD = math.radians(2.0)  # a central difference changes an angle by a
 _SMALL_MISMATCH = 1.3
 # An angle with a larger standard deviation counts as undetermined, because its sine is not linear over such a range.
 _LEAST_KNOWN_RAD = math.radians(10.0)
+# An estimated angle beyond this is an error of the model. A stand that leans so much is seen by eye, and poses state it.
+_MOST_LEAN_RAD = math.radians(10.0)
 _DEGREES = math.degrees(1.0)
 
 
@@ -58,6 +60,10 @@ class Parameter:
         """Returns whether a value with the standard deviation ``deviation``, in the field's unit, is of use. Only an angle
         can be too uncertain."""
         return self.unit != "deg" or deviation < _LEAST_KNOWN_RAD
+
+    def is_possible(self, value: float) -> bool:
+        """Returns whether a scanner may differ by ``value``, in the field's unit, from what its scan states."""
+        return self.unit != "deg" or abs(value) <= _MOST_LEAN_RAD
 
     def lowest(self, scan: Scan) -> float:
         """Returns the lowest correction that the search may try: −0.7 times a stated time above 0, otherwise −∞."""
@@ -139,6 +145,8 @@ PARAMETERS = {
     )
 }  # fmt: skip
 OFFSET_U = "offset-u"
+BEYOND_PANEL = ("offset-v", "tilt-v", "tilt-u")
+"""Parameters whose errors an object that reaches beyond the panel's sides resembles: they change how far each side sees."""
 TURN = Parameter("all angles", "turn_rad", "deg", _TURN, lambda s: 0.0, _edge_pixels, _DEGREES)
 LIFT = Parameter("all heights", "lift_mm", "mm", "a lower object", lambda s: 0.0, lambda s: 1 / _pitch_mm(s), is_axial=True)
 GAUGES = (TURN, LIFT)

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from phyradgs_cl.acquisition import PerRow, Scan
+from phyradgs_cl.acquisition import ConeGeometry, PerRow, Scan
 from phyradgs_cl.acquisition.altered import coarse
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb
+from phyradgs_cl.acquisition.geometry import Geometry, field_of_view_mm
 from phyradgs_cl.acquisition.motion import rim_travel_voxels
 from phyradgs_cl.checks import ceil_div
 from phyradgs_cl.detector import noise_level
@@ -26,7 +27,12 @@ from phyradgs_cl.runtime import Runtime
 
 _MOST_TIMES = 8  # most times per exposure, since each time costs a projection
 _VOXELS_PER_TIME = 2.0  # most voxels that the volume's rim moves between two times, if _MOST_TIMES times suffice
+_REACH_OF_CUT = 2.0  # (half width of the grid) / (radius of the field of view) for an object beyond the panel's sides
+_MOST_BESIDE = 0.01  # a grid is too small if a larger fraction of the rays through matter must meet some beside it
+_TOO_DENSE = 4.0  # (density that a ray would need in the grid) / (median density) from which it must meet matter beside it
+_MATTER, _NOISES = 0.1, 4.0  # matter is above this fraction of the largest value, and above so many deviations of the noise
 _TV = FistaTvOptions(tv_weight=0.0005, tv_iterations=8)
+_AT_END = 0.1  # an object reaches beyond the first or last row if more than this fraction of its pixels shows matter
 Report = Callable[[int, int, str, float], None]
 """A callback for progress: passes done, passes in all, the phase, and the fraction of the time that has passed."""
 _LEAST_SHARE = 0.1  # least (expected cost of a phase's remaining passes) / (their full cost) in the progress
@@ -39,13 +45,15 @@ class Stage:
     """One grid of a calibration: at most ``columns`` blocks of pixels along the panel's longer side.
 
     first, again: iterations for the first volume, and for each later one. steps: most Gauss–Newton steps. project: in each
-    step, the iterations of CGLS that remove from signals what a volume explains."""
+    step, the iterations of CGLS that remove from signals what a volume explains. is_cut: whether the object reaches beyond
+    the panel's sides."""
 
     columns: int
     first: int
     again: int
     steps: int = 3
     project: int = 20
+    is_cut: bool = False
 
     def block(self, scan: Scan) -> int:
         """Returns the number of pixels along a block's side."""
@@ -152,7 +160,22 @@ class CoarseProblem(CoarseFrames):
             measured=measured,
             valid=valid,
         )
-        return replace(problem, measured=problem.masked(measured))
+        problem = replace(problem, measured=problem.masked(measured))
+        if stage.is_cut or problem.matter_beside_grid() > _MOST_BESIDE:
+            grid = _around_view(problem.grid, scans[0].geometry, _REACH_OF_CUT if stage.is_cut else 1.0)
+            problem = replace(problem, grid=grid)
+        return problem
+
+    def matter_beside_grid(self) -> float:
+        """Returns the fraction, 0 to 1, of the rays through matter that must meet some beside the grid, in the stated
+        geometry: their path in the grid would need over four times the density that most paths need."""
+        is_matter = _is_matter(self.measured, self.valid)
+        paths = self.operator(GeometryCorrection()).forward(np.ones(self.grid.shape, np.float32))[is_matter]
+        integrals, inside = self.measured[is_matter], paths > 0
+        if not inside.any():
+            return 0.0
+        density = float(np.median(integrals[inside] / paths[inside]))
+        return float(np.mean(integrals > _TOO_DENSE * density * paths))
 
     def operator(self, correction: GeometryCorrection, views: Views | Sway | None = None) -> RayOperator:
         """Returns the projector A to the coarse frames of all scans, in the geometry after ``correction`` and ``views``.
@@ -219,6 +242,38 @@ class CoarseProblem(CoarseFrames):
             method.step()
             self.count_pass()
         return method.residual
+
+
+def _around_view(grid: Grid, geometry: Geometry, reach: float) -> Grid:
+    """Returns the grid with voxels added on all sides, so that it is ``reach`` times as wide as the panel's field of view,
+    and as high as what the panel sees of this width.
+
+    The frames show all matter that rays meet. If the grid has no place for some of it, wrong geometries fit better than the
+    right one."""
+    (low_mm, top_mm), (_, radius_mm), _ = field_of_view_mm(geometry).tolist()
+    half_mm = (top_mm - low_mm) / 2
+    if isinstance(geometry, ConeGeometry):  # the fan widens from the radius to the reach
+        half_mm *= (geometry.source_to_axis_mm + reach * radius_mm) / (geometry.source_to_axis_mm + radius_mm)
+    middles_mm, halves_mm = ((low_mm + top_mm) / 2, 0.0, 0.0), (half_mm, reach * radius_mm, reach * radius_mm)
+    off_mm = [abs(offset - middle) for offset, middle in zip(grid.offset_mm, middles_mm, strict=True)]
+    sides = zip(grid.shape, grid.voxel_size_mm, np.add(halves_mm, off_mm).tolist(), strict=True)
+    nz, ny, nx = (n + 2 * max(0, math.ceil(wanted_mm / voxel_mm - n / 2)) for n, voxel_mm, wanted_mm in sides)
+    return Grid((nz, ny, nx), grid.voxel_size_mm, grid.offset_mm)
+
+
+def reaches_ends(scan: Scan) -> bool:
+    """Returns whether the object reaches beyond the first or last row of a cone beam's panel, so that only some views see
+    matter near there."""
+    if scan.is_parallel:
+        return False
+    quick = coarse.coarse(scan, coarse.QUICK_COLUMNS)
+    shown = _is_matter(np.where(quick.valid, quick.projections, 0), quick.valid)
+    return bool(shown[:, [0, -1]].mean((0, 2)).max() > _AT_END)
+
+
+def _is_matter(p: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
+    """Returns which line integrals p (F, rows, columns) belong to rays through matter."""
+    return p > max(_NOISES * noise_level(p, valid), _MATTER * float(np.percentile(p, 99.9)))
 
 
 def _smoothing_px(scan: Scan, block: int) -> float | tuple[float, float]:

@@ -21,6 +21,7 @@ from phyradgs_cl.acquisition.altered.variants import reversed_readout
 from phyradgs_cl.acquisition.trajectory import continued
 from phyradgs_cl.calibrate.beads import BeadProblem
 from phyradgs_cl.calibrate.parameters import (
+    BEYOND_PANEL,
     DIRECTION,
     OFFSET_U,
     WOBBLE,
@@ -37,7 +38,15 @@ from phyradgs_cl.calibrate.per_view import (
     passes_of_views,
 )
 from phyradgs_cl.calibrate.placing import WRONG_PHANTOM, bead_centres_mm, placements
-from phyradgs_cl.calibrate.problem import CoarseProblem, PassCounter, Passes, Report, Stage, pass_cost
+from phyradgs_cl.calibrate.problem import (
+    CoarseProblem,
+    PassCounter,
+    Passes,
+    Report,
+    Stage,
+    pass_cost,
+    reaches_ends,
+)
 from phyradgs_cl.calibrate.result import AGREES, CANNOT_TELL, CORRECTED, Calibration, ParameterEstimate, rms
 from phyradgs_cl.calibrate.search import Fallback, Problem, Search
 from phyradgs_cl.check import SUSPICIOUS
@@ -58,6 +67,9 @@ STAGES = (
     Stage(96, first=50, again=15, steps=3, project=30),
 )
 BEAD_STAGES = (Stage(48, first=8, again=4, steps=6, project=0), Stage(128, first=6, again=4, steps=6, project=0))
+# Factor on ``project`` with matter beyond a cone beam's first or last row: a volume explains slowly what few views see,
+# and with less of it removed a roll came out at half its value. Of objects cut at the sides too little of a signal remained.
+_MORE_AT_ENDS = 3
 _FEWEST_FRAMES = 8  # with fewer frames a scan does not determine its geometry
 _FEWEST_COLUMNS = 12  # with fewer columns a scan does not determine its geometry
 _FEWEST_SPLINES = 4  # cubic splines need at least four coefficients
@@ -93,20 +105,22 @@ def calibrate(
         for one in (scan, *others)
     ]
     _check(ready, request, phantom, splines)
-    _warn(ready, phantom)
-    return _Calibrator(rt, scan, ready, request, phantom, splines, report, note).run()
+    is_cut = phantom is None and check_coverage(ready[0]).unit == CUT_OFF
+    _warn(ready, is_cut)
+    return _Calibrator(rt, scan, ready, request, phantom, is_cut, splines, report, note).run()
 
 
 @dataclass(eq=False)
 class _Calibrator:
     """One calibration: its inputs, its grids, and the progress of its phases. ``ready``: all scans, with lag removed and
-    encoder tables continued."""
+    encoder tables continued. is_cut: whether an object of unknown shape reaches beyond the panel's sides."""
 
     rt: Runtime
     scan: Scan
     ready: list[Scan]
     request: Request
     phantom: EllipsoidPhantom | None
+    is_cut: bool
     splines: int
     report: Report
     note: Callable[[str], None]
@@ -114,16 +128,18 @@ class _Calibrator:
     def __post_init__(self) -> None:
         self.placement = np.zeros(0)
         self.stated = self.ready  # the scans as stated: ``ready`` may later get the other readout direction
+        is_low = self.phantom is None and not self.is_cut and reaches_ends(self.ready[0])
+        more = _MORE_AT_ENDS if is_low else 1
         stages = {one.block(self.scan): one for one in reversed(STAGES if self.phantom is None else BEAD_STAGES)}
         # on a small panel several stages have blocks of the same size: the first stage of each size is kept
-        self.stages = list(stages.values())[::-1]
+        self.stages = [replace(one, is_cut=self.is_cut, project=more * one.project) for one in reversed(stages.values())]
         self.per_view: PerViewParameters | None = None
         if self.request.per_view == WOBBLE:
             self.per_view = WobbleParameters.of(self.ready[0], self.splines)
         elif self.request.per_view:
             self.per_view = MotionParameters.of(self.ready[0])
         self.passes = PassCounter(self.report, self._plan())
-        self.search = Search(self.request.parameters)
+        self.search = Search(self.request.parameters, held=BEYOND_PANEL if self.is_cut else ())
         self.views_estimates: dict[GeometryCorrection, ViewsEstimate] = {}
 
     def run(self) -> Calibration:
@@ -161,8 +177,14 @@ class _Calibrator:
         later_s = max(0.0, correction.exposure_s) + max(0.0, correction.readout_s)
         stated = replace(self.scan, trajectory=continued(self.scan.trajectory, later_s)) if later_s else self.scan
         corrected = perturb(stated, correction, views) if corrections or views is not None else self.scan
-        calibration = Calibration(corrected, table, self.search.alike, (rms(before), rms(after)), before, after, views)
+        alike = [*self.search.alike, *self._beyond_panel()]
+        calibration = Calibration(corrected, table, alike, (rms(before), rms(after)), before, after, views)
         return replace(calibration, scan=_with_provenance(corrected, self.scan, calibration))
+
+    def _beyond_panel(self) -> list[str]:
+        """Returns a line about the parameters that are not estimated because the object reaches beyond the panel's sides."""
+        names = [name for name in self.request.names if self.is_cut and name in BEYOND_PANEL]
+        return [f"{', '.join(names)}: looks like matter beyond the panel's sides"] if names else []
 
     def _start_from_axis(self) -> None:
         """Starts from the offset that ``check`` finds, because Gauss–Newton steps find the right offset only within a few
@@ -172,10 +194,10 @@ class _Calibrator:
         the offset there, so ``check``'s answer stands. The answer also stands if the panel sees less than half of the rays
         twice, because a wrong shift under which even fewer rays are seen twice would fit better."""
         if self.phantom is None and has_axis_near_edge(self.ready[0]):
-            self.search.held = (OFFSET_U,)
+            self.search.held += (OFFSET_U,)
         quick, pitch_mm = coarse(self.ready[0], QUICK_COLUMNS), self.scan.geometry.pixel_size_mm[1]
         shift, finding = centre_of(axis_shift(self.rt, quick), columns_per_block(quick), self.ready[0])
-        if not shift.is_found or (self.search.held and finding.verdict == CANNOT_TELL):
+        if not shift.is_found or (OFFSET_U in self.search.held and finding.verdict == CANNOT_TELL):
             return
         self.search.at[OFFSET_U] = shift.pixels * pitch_mm
         if finding.verdict != CANNOT_TELL and finding.unit != OTHER_CAUSE:
@@ -335,11 +357,11 @@ def _check(scans: Sequence[Scan], request: Request, phantom: EllipsoidPhantom | 
             raise InputError("--with: readout axis", other.shutter.axis, f"that of the first scan, {first.shutter.axis}")
 
 
-def _warn(scans: Sequence[Scan], phantom: EllipsoidPhantom | None) -> None:
+def _warn(scans: Sequence[Scan], is_cut: bool) -> None:
     first, *others = scans
-    if phantom is None and check_coverage(first).unit == CUT_OFF:
+    if is_cut:
         log.warning(
-            "calibrate: the object reaches beyond the panel, which can look like a shifted panel: "
+            "calibrate: the object reaches beyond the panel's sides: tilts and offset-v stay as stated; "
             "compare slices before and after"
         )
     for other in others:

@@ -11,6 +11,7 @@ signal ∂A/∂θ x is a central difference, from which CGLS removes the part P 
 the step and its standard deviations. A parameter's share is the fraction of its signal that remains; if it is too small, the
 frames do not determine the parameter."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -37,6 +38,9 @@ _GAUGE_FACTOR = 2.0
 # would count as determined.
 _MOST_GAUGE = 0.2
 DEVIATIONS = 3.0  # a parameter is corrected if |found − stated value| exceeds this many of its standard deviations
+# A parameter returns to its stated value only if no corrected one moves by more than this many standard deviations: √2, from
+# which on Akaike's criterion prefers the joint estimate of two parameters that resemble each other.
+_MOST_MOVED = math.sqrt(2.0)
 _MOST_PX = 2.0  # most coarse pixels by which a step moves the image's edge: a larger step's effect is not linear
 _SETTLED = 0.1  # the steps on a grid end when each parameter has (step) / (standard deviation) below this
 
@@ -224,8 +228,7 @@ class Search:
             linear = reduced(problem, operator, [*parameters, *more], self.at, volume, stage.project)
             if asks:
                 self._decide_determined(linear)
-            assert self.determined is not None
-            self.reduced = linear.relative_to_stated(self.at).only(self.determined)
+            self.reduced = self._possible(linear.relative_to_stated(self.at))
             if not self.determined or self._step(problem):
                 return
 
@@ -245,6 +248,18 @@ class Search:
         self.alike = [in_words(weights) for weights in indistinguishable(free, least)] if free.names else []
         for name, estimate in self.fixed.items():
             self.at[name] = estimate.correction
+
+    def _possible(self, linear: Reduced) -> Reduced:
+        """Returns the problem of the determined parameters. Those that would need an impossible value are no longer
+        determined."""
+        assert self.determined is not None
+        while True:
+            problem = linear.only(self.determined)
+            values = problem.step() if self.determined else ()
+            possible = tuple(n for n, v in zip(self.determined, values, strict=True) if PARAMETERS[n].is_possible(float(v)))
+            if possible == self.determined:
+                return problem
+            self.determined = possible
 
     def _step(self, problem: Problem) -> bool:
         """Moves the determined parameters by the Gauss–Newton step, each by at most two coarse pixels of the image's edge.
@@ -278,22 +293,34 @@ class Search:
         return values, resemblance * np.hypot(noise, DISCRETISATION * change)
 
     def corrections(self) -> dict[str, float]:
-        """Returns the corrections by name: found minus stated values of the parameters for which they exceed three standard
-        deviations, and significant fallbacks in use.
-
-        All other parameters go back to their stated values. This changes the remaining values, so the test is repeated
-        until all that remain exceed the limit."""
+        """Returns the corrections by name, found minus stated values: of the parameters for which they exceed three standard
+        deviations, of those that must be corrected together with these (``_back_to_stated``), and significant fallbacks in
+        use. All other parameters go back to their stated values."""
         values, deviations = self.estimates()
-        deviation = dict(zip(self.determined or (), deviations, strict=True))
-        names = self.determined or ()
-        while self.reduced is not None and names:
-            is_off = [abs(value) > DEVIATIONS * deviation[name] for name, value in zip(names, values, strict=True)]
-            if all(is_off):
-                break
-            names = tuple(name for name, off in zip(names, is_off, strict=True) if off)
-            values = self.reduced.only(names).step() if names else values[:0]
+        found = dict(zip(self.determined or (), zip(values.tolist(), deviations.tolist(), strict=True), strict=True))
         significant = {name: estimate.correction for name, estimate in self.fixed.items() if estimate.is_significant}
-        return significant | dict(zip(names, map(float, values), strict=True))
+        off = [name for name, (value, deviation) in found.items() if abs(value) > DEVIATIONS * deviation]
+        return significant | (self._back_to_stated(found, off) if off else {})
+
+    def _back_to_stated(self, found: Mapping[str, tuple[float, float]], off: Sequence[str]) -> dict[str, float]:
+        """Returns the values that remain, by name, when parameters that are not in ``off`` go back to their stated values.
+
+        Those in ``off`` then take over the errors of the stated values. So the other parameters go back in turn, the least
+        disturbing first, while no value in ``off`` moves by more than √2 of its standard deviations. found: value and
+        deviation of each determined parameter, by name."""
+        assert self.reduced is not None
+        kept = {name: value for name, (value, _) in found.items()}
+        while rest := [name for name in kept if name not in off]:
+            trials = []
+            for back in rest:
+                names = [name for name in kept if name != back]
+                trial = dict(zip(names, map(float, self.reduced.only(names).step()), strict=True))
+                trials.append((max(abs(trial[name] - found[name][0]) / found[name][1] for name in off), trial))
+            moved, trial = min(trials, key=lambda one: one[0])
+            if moved > _MOST_MOVED:
+                break
+            kept = trial
+        return kept
 
     def table(self, scan: Scan, corrections: Mapping[str, float]) -> list[ParameterEstimate]:
         """Returns an estimate per parameter in displayed units. corrections: the result of the method ``corrections``, whose
@@ -308,7 +335,9 @@ class Search:
                 table.append(ParameterEstimate(one.name, one.unit, stated, None, None, share, CANNOT_TELL))
                 continue
             value, deviation = estimates[one.name]
-            found = stated + corrections.get(one.name, value) * one.scale
+            corrected = corrections.get(one.name, value)
+            deviation = math.hypot(deviation, corrected - value)  # other parameters' stated values may be wrong
+            found = stated + corrected * one.scale
             verdict = CORRECTED if one.name in corrections else AGREES
             table.append(ParameterEstimate(one.name, one.unit, stated, found, deviation * one.scale, share, verdict))
         return table

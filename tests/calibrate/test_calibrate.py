@@ -10,6 +10,7 @@ from phyradgs_cl.acquisition import CircularOrbit, EncoderTable
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, perturb
 from phyradgs_cl.api import simulate
 from phyradgs_cl.calibrate import AGREES, CANNOT_TELL, CORRECTED, calibrate
+from phyradgs_cl.calibrate.parameters import PARAMETERS
 from phyradgs_cl.calibrate.problem import CoarseProblem, Stage
 from phyradgs_cl.calibrate.search import Reduced, Search
 from phyradgs_cl.errors import InputError
@@ -77,25 +78,29 @@ def test_a_thin_object_leaves_open_what_voxels_follow_badly(rt) -> None:
     assert verdicts == {"offset-u": AGREES, "offset-v": CANNOT_TELL, "tilt-v": AGREES, "tilt-u": CANNOT_TELL}
 
 
-@pytest.mark.parametrize("tilt, names", [(0.0, {"offset-u"}), (1.8, {"offset-u"}), (9.0, {"offset-u", "tilt-v"})])
-def test_what_differs_by_less_than_three_deviations_is_not_corrected_along(tilt, names) -> None:
+@pytest.mark.parametrize(("tilt", "names"), [
+    (0.0, ["offset-u"]), (0.6, ["offset-u"]), (-1.3, ["offset-u"]), (1.8, ["offset-u", "tilt-v"]),
+    (-2.7, ["offset-u", "tilt-v"]), (9.0, ["offset-u", "tilt-v"]),
+])  # fmt: skip
+def test_a_value_returns_to_what_is_stated_where_that_moves_no_other(right, tilt, names) -> None:
     """Signals of an offset and a tilt that resemble each other, the tilt off by so many of its deviations."""
     rng = np.random.default_rng(2)
     one, other, noise = (values / np.linalg.norm(values) for values in rng.normal(size=(3, 2000)))
     signals = np.array([one, 0.95 * one + 0.3 * other])
     noise -= noise @ np.linalg.pinv(signals) @ signals
-    count = len(signals)
-    problem = Reduced(("offset-u", "tilt-v"), np.ones(count), signals, np.ones(count), np.eye(count), 1e-2 * noise, 20, 1e-3)
+    problem = Reduced(("offset-u", "tilt-v"), np.ones(2), signals, np.ones(2), np.eye(2), 1e-2 * noise, 20, 1e-3)
     deviation = problem.deviations()
-    wrong = np.array([40.0, tilt]) * deviation @ signals
-    known = ("offset-u", "tilt-v")
-    shares = dict(zip(known, problem.shares.tolist(), strict=True))
-    off = replace(problem, residual=problem.residual + wrong)
-    kept = Search([], determined=known, shares=shares, reduced=off).corrections()
-    assert set(kept) == names
-    alone = problem.only(tuple(sorted(names)))
-    expected = replace(alone, residual=problem.residual + wrong).step()
-    assert list(kept.values()) == pytest.approx(expected.tolist())
+    wrong = np.array([40.0, tilt]) * deviation
+    known, shares = problem.names, dict(zip(problem.names, problem.shares.tolist(), strict=True))
+    off = replace(problem, residual=problem.residual + wrong @ signals)
+    search = Search([PARAMETERS["offset-u"]], determined=known, shares=shares, reduced=off)
+    kept = search.corrections()
+    assert list(kept) == names
+    assert list(kept.values()) == pytest.approx(off.only(names).step().tolist())
+    (offset,) = search.table(right, kept)
+    moved = kept["offset-u"] - wrong[0]
+    assert abs(moved) < 1.42 * deviation[0] and offset.deviation == pytest.approx(np.hypot(deviation[0], moved))
+    assert bool(abs(moved) > 0.5 * deviation[0]) == (tilt in (0.6, -1.3))
 
 
 def test_a_panel_of_one_row_tells_its_offset_and_no_turn(rt, right, monkeypatch, caplog) -> None:
