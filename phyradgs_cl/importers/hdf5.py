@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 
 from phyradgs_cl import checks
@@ -183,10 +184,13 @@ class Places:
             if text == "none":
                 return None
             with self.opened(name, text) as (source, address):
-                values = h5.read_values(source, address, source.dataset(address)).astype(np.float64)
-                kinds = self._key(key, frames) if values.shape == (frames,) else np.full(values.shape, schema.INVALID)
-                flats = values[(kinds == schema.FLAT) & ("flats" not in self.stated)]
-                return source.name(address), flats, values[kinds == schema.PROJECTION]
+                dataset, values = source.dataset(address), np.zeros(frames)
+                fits = dataset.shape == (frames,) and dataset.dtype.kind in "iuf"
+                if fits:
+                    values = h5.read_values(source, address, dataset).astype(np.float64)
+                kinds = self._key(key, frames)
+                flats = values[(kinds == schema.FLAT) & fits & ("flats" not in self.stated)]
+                return source.name(address), flats, values[(kinds == schema.PROJECTION) & fits]
         return None
 
 
@@ -273,10 +277,12 @@ def beam(
         at_sample, on_panel = sides_mm(lengths.at_sample), sides_mm(lengths.on_panel)
         if at_sample is None and on_panel is not None and (times := _magnification(source, lengths.optics)):
             at_sample = on_panel[0] / times, on_panel[1] / times
-        there = [address for address in lengths.binning if source.find(address) is not None]
-        if binned := [address for address in there if h5.read_number(source, address) > 1]:
-            text = "%s is %g and not used: say %s if the file's pixels are those without binning"
-            _log.warning(text, source.name(binned[0]), h5.read_number(source, binned[0]), options.named("pixel_size_mm"))
+        for address in lengths.binning:
+            thing = source.find(address)
+            if isinstance(thing, h5py.Dataset) and thing.dtype.kind in "iuf" and thing.size == 1 and np.max(thing[()]) > 1:
+                text = "%s is %d and not used: say %s if the file's pixels are those without binning"
+                _log.warning(text, source.name(address), np.max(thing[()]), options.named("pixel_size_mm"))
+                break
         if at_sample is None or at_sample == on_panel:
             if on_panel is None:
                 raise source.error(lengths.on_panel[0][0], "nothing", "a length")

@@ -303,13 +303,15 @@ def test_the_rate_that_a_file_states_is_named(tmp_path, caplog, values, words) -
     assert "an exposure of 0.1 s and 2 frames per second" in caplog.text
 
 
-def test_binning_and_axes_that_are_not_used_are_named(tmp_path, caplog) -> None:
-    path = exchange(tmp_path / "a.h5", measurement__instrument__detector__binning_y=4)
+@pytest.mark.parametrize("axes", ["y:theta:x", ["y", "theta", "x"]])
+def test_binning_and_axes_that_are_not_used_are_named(tmp_path, caplog, axes) -> None:
+    detector = "measurement__instrument__detector__"
+    path = exchange(tmp_path / "a.h5", **{f"{detector}binning_x": "1x1", f"{detector}binning_y": [4]})
     with h5py.File(path, "r+") as file:
-        file["exchange/data"].attrs["axes"] = "y:theta:x"
+        file["exchange/data"].attrs["axes"] = axes
     import_scan(path)
     assert "binning_y is 4 and not used: say pixel_size_mm" in caplog.text
-    assert "@axes is 'y:theta:x' and not used: say at axes=v,frame,u" in caplog.text
+    assert "@axes is y:theta:x and not used: say at axes=v,frame,u" in caplog.text
     caplog.clear()
     import_scan(path, ImportOptions(pixel_size_mm=(0.1, 0.1), at=("axes=frame,v,u",)))
     assert "not used" not in caplog.text

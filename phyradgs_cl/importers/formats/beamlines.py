@@ -197,11 +197,11 @@ def _clock(source: Hdf5Source, used: np.ndarray, *addresses: str) -> str:
     """Returns words for the frame rate at the first address that has numbers: a rate, a time from frame to frame, or the
     times of all frames, of which those ``used``, bool (F,), count."""
     for address in addresses:
-        if (dataset := source.optional(address)) is None or dataset.dtype.kind not in "iuf" or dataset.size == 0:
+        dataset, is_rate = source.find(address), address.endswith("rate")
+        if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "iuf" or dataset.size not in (1, used.size):
             continue
         values = h5.read_values(source, address, dataset).astype(np.float64).ravel()
-        times = np.diff(values[used]) if values.shape == used.shape and values.size > 1 else values[:1]
-        is_rate = address.endswith("rate")
+        times = values if values.size == 1 else np.diff(values[used])
         usual = float(np.median(times if is_rate else h5.in_unit(source, address, times, TIME))) if times.size else 0.0
         if np.isfinite(usual) and usual > 0:
             return f"{usual if is_rate else 1 / usual:.6g} frames per second ({source.name(address)})"
@@ -251,11 +251,14 @@ def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
             exposure_s=hdf5.exposure_s(source, f"{_DETECTOR}/exposure_time", stacks.used, options),
             clock=_clock(source, stacks.used, f"{_DETECTOR}/acquire_period", f"{_DETECTOR}/frame_rate"),
         )
-        axes = h5.read_attribute(source, f"{_EXCHANGE}/data", "axes") or "theta:y:x"
-        if "axes" not in places.stated and (order := [_AXES.get(name, name) for name in axes.split(":")]) != hdf5.AXES:
-            text = "%s @axes is %r and not used: say %s axes=%s if the data are stored so"
-            _log.warning(text, source.name(f"{_EXCHANGE}/data"), axes, options.named("at"), ",".join(order))
-        stacks, _ = brightness.evened(stacks, _flat_exposure(source, stacks), None)
+        if "axes" not in places.stated and "projections" not in places.stated:
+            axes = np.asarray(source.dataset(f"{_EXCHANGE}/data").attrs.get("axes", "")).astype(str).ravel()
+            order = [_AXES.get(name, name) for name in ":".join(axes).split(":")]
+            if sorted(order) == sorted(hdf5.AXES) and order != hdf5.AXES:
+                text = "%s @axes is %s and not used: say %s axes=%s if the data are stored so"
+                _log.warning(text, source.name(f"{_EXCHANGE}/data"), ":".join(axes), options.named("at"), ",".join(order))
+        if (options.quantity or "counts") == "counts" and options.flat_value is None:
+            stacks, _ = brightness.evened(stacks, _flat_exposure(source, stacks), None)
         title = h5.read_title(source, f"{_EXCHANGE}/title", path.stem)
     timing = assemble.make_timing(str(path), len(theta_rad), options, stored)
     integrals = stacks.line_integrals(f"{path}:{_EXCHANGE}/data", options, "top")
