@@ -231,11 +231,17 @@ def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
     """Imports the projections of /exchange, with the flats and darks taken before and after them."""
     options.refuse_unused("data-exchange", OF_HDF5)
     with open_hdf5(path, options.linked_folder) as source:
-        places, theta = hdf5.places_of(options, source), f"{_EXCHANGE}/theta"
+        places, data, theta = hdf5.places_of(options, source), f"{_EXCHANGE}/data", f"{_EXCHANGE}/theta"
         if "monitor" in places.stated:
             expected, remedy = "none: projections and flats are of separate arrays", "leave it out"
             raise InputError(f"{options.named('at')} monitor", places.stated["monitor"][0], expected, remedy)
-        stacks = places.stacks(f"{_EXCHANGE}/data", **{
+        if "axes" not in places.stated and "projections" not in places.stated and source.find(data) is not None:
+            axes = np.asarray(source.dataset(data).attrs.get("axes", "")).astype(str).ravel()
+            order = [_AXES.get(name, name) for name in ":".join(axes).split(":")]
+            if sorted(order) == sorted(hdf5.AXES) and order != hdf5.AXES:
+                text = "%s @axes is %s and not used: say %s axes=%s if the data are stored so"
+                _log.warning(text, source.name(data), ":".join(axes), options.named("at"), ",".join(order))
+        stacks = places.stacks(data, **{
             name: [f"{_EXCHANGE}/data_{kind}{when}" for when in ("", "_pre", "_post")]
             for name, kind in (("flats", "white"), ("darks", "dark"))
         })  # fmt: skip
@@ -251,17 +257,11 @@ def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
             exposure_s=hdf5.exposure_s(source, f"{_DETECTOR}/exposure_time", stacks.used, options),
             clock=_clock(source, stacks.used, f"{_DETECTOR}/acquire_period", f"{_DETECTOR}/frame_rate"),
         )
-        if "axes" not in places.stated and "projections" not in places.stated:
-            axes = np.asarray(source.dataset(f"{_EXCHANGE}/data").attrs.get("axes", "")).astype(str).ravel()
-            order = [_AXES.get(name, name) for name in ":".join(axes).split(":")]
-            if sorted(order) == sorted(hdf5.AXES) and order != hdf5.AXES:
-                text = "%s @axes is %s and not used: say %s axes=%s if the data are stored so"
-                _log.warning(text, source.name(f"{_EXCHANGE}/data"), ":".join(axes), options.named("at"), ",".join(order))
         if (options.quantity or "counts") == "counts" and options.flat_value is None:
             stacks, _ = brightness.evened(stacks, _flat_exposure(source, stacks), None)
         title = h5.read_title(source, f"{_EXCHANGE}/title", path.stem)
     timing = assemble.make_timing(str(path), len(theta_rad), options, stored)
-    integrals = stacks.line_integrals(f"{path}:{_EXCHANGE}/data", options, "top")
+    integrals = stacks.line_integrals(f"{path}:{data}", options, "top")
     trajectory = assemble.turning(geometry, gantry_sign(options, "sample") * theta_rad, timing)
     return assemble.assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
