@@ -52,7 +52,8 @@ class Timing:
 @dataclass(frozen=True, eq=False)
 class StoredTiming:
     """The timing that a file states; None for missing values. start_s (F,): opening times in s of a fly-scan's frames. axis,
-    direction: of the readout. written: names of values that a user wrote into the description; () for a scanner's header."""
+    direction: of the readout. written: names of values that a user wrote into the description; () for a scanner's header.
+    clock: words of what the file says about the frames' times, which does not say whether the gantry turned meanwhile."""
 
     exposure_s: float | None = None
     readout_s: float | None = None
@@ -63,6 +64,7 @@ class StoredTiming:
     pulse: tuple[float, float] | None = None  # start and length of the beam's pulse, as fractions of the exposure
     angle_at: str | None = None
     written: tuple[str, ...] = ()
+    clock: str = ""
 
 
 def make_timing(
@@ -127,9 +129,10 @@ def _check_rest(subject: str, shutter: Shutter, options: ImportOptions, stored: 
     for name in (*map(options.called, turns), *stored.written):
         expected = "both, or neither for frames taken at rest"
         raise InputError(name, "no time from frame to frame beside it", expected, f"say {frame_time}")
-    if shutter.exposure_s > 0:
-        text = "%s: an exposure of %g s and no time from frame to frame: taken at rest; say %s if the gantry did not stop"
-        _log.warning(text, subject, shutter.exposure_s, frame_time)
+    if shutter.exposure_s > 0 or stored.clock:
+        exposure = f"an exposure of {shutter.exposure_s:g} s" if shutter.exposure_s > 0 else "no exposure"
+        text = "%s: %s and %s: taken at rest; say %s if the gantry did not stop"
+        _log.warning(text, subject, exposure, stored.clock or "no time from frame to frame", frame_time)
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,13 @@
 """What formats in HDF5 share: reads the beam, and arrays at addresses that the format, options or a TOML file state."""
 
 import logging
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 
+import h5py
 import numpy as np
 
 from phyradgs_cl import checks
@@ -25,12 +26,14 @@ from phyradgs_cl.io.scan.reader import united
 
 _log = logging.getLogger(__name__)
 STACKS = ("projections", "flats", "darks", "mask")
-NAMES = (*STACKS, "image_key", "angles", "axes")
-_AXES = ("frame", "v", "u")
+NAMES = (*STACKS, "image_key", "angles", "monitor", "axes")
+AXES = ["frame", "v", "u"]
 _DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
 _LIKE = 0.1  # a larger relative difference between pixels on the panel and pixels at the sample × magnification is a warning
 _LEAST_MM = 1e-4  # no pixel is smaller than this: a smaller number without a unit must be in m
-_TIMES = replace(LENGTH, name="magnification", assumed="", factors=MappingProxyType({"": 1.0, "x": 1.0}))
+_MAGNIFICATION = re.compile(r"(\d+(?:\.\d+)?)\s*[x×]|^(\d+(?:\.\d+)?)$", re.I)  # 10, 10x, 7.5 X/0.2
+_FAR = 0.9e6  # a source as many pixels away, or more, is too far for a cone beam: ``geometry.check_distances``
+_FAN = 0.5  # pixels by which rays of a far source may miss those of a parallel beam at the object's rim
 
 
 def is_address(text: object) -> bool:
@@ -91,18 +94,18 @@ class Places:
         return (parts[0] if len(parts) == 1 else np.concatenate(parts)), {text: len(one) for text, one in stacks.items()}
 
     def _read(self, source: Hdf5Source, address: str, panel: tuple[int, int] | None) -> np.ndarray:
-        order = self.stated.get("axes", [",".join(_AXES)])[0].replace(",", " ").split()
-        if sorted(order) != sorted(_AXES):
+        order = self.stated.get("axes", [",".join(AXES)])[0].replace(",", " ").split()
+        if sorted(order) != sorted(AXES):
             remedy = "of a stack of sinograms say v,frame,u"
             raise InputError(f"{self.subject} axes", " ".join(order), "frame, v and u in the order of the data", remedy)
         dataset = source.dataset(address)
         long = [count for count in dataset.shape if count != 1]  # a file may have further axes of length 1
-        shape = dataset.shape if dataset.ndim <= len(_AXES) or len(long) > len(_AXES) else tuple(long)
-        if len(shape) == len(_AXES) - 1 and panel is not None:
+        shape = dataset.shape if dataset.ndim <= len(AXES) or len(long) > len(AXES) else tuple(long)
+        if len(shape) == len(AXES) - 1 and panel is not None:
             shape = tuple(np.insert(shape, order.index("frame"), 1).tolist())
-        if len(shape) != len(_AXES) or min(shape) < 1:
+        if len(shape) != len(AXES) or min(shape) < 1:
             raise source.error(address, f"shape {dataset.shape}", "three axes (frame, v, u), none of them empty")
-        values = h5.read_values(source, address, dataset).reshape(shape).transpose([order.index(name) for name in _AXES])
+        values = h5.read_values(source, address, dataset).reshape(shape).transpose([order.index(name) for name in AXES])
         if panel is not None and values.shape[1:] != panel:
             raise source.error(address, f"shape {dataset.shape}", f"(any, {panel[0]}, {panel[1]}), as the projections")
         return values
@@ -180,6 +183,25 @@ class Places:
 
         return options.angle_rad(int(used.sum()), stored_rad)
 
+    def per_frame(
+        self, name: str, usual: str, key: Sequence[str], frames: int
+    ) -> tuple[str, np.ndarray, np.ndarray] | None:
+        """Reads a number for each of the stored ``frames``: the address, and those of flats (n,) and of projections (P,).
+        Both are empty without one for each, flats' also with flats of other addresses. Returns None where no address of the
+        array ``name`` is stated, or none is the word, and the format's address (``usual``) is empty. key: see ``stacks``."""
+        for text in self._at(name, [usual])[:1]:
+            if text == "none":
+                return None
+            with self.opened(name, text) as (source, address):
+                dataset, values = source.dataset(address), np.zeros(frames)
+                fits = dataset.shape == (frames,) and dataset.dtype.kind in "iuf"
+                if fits:
+                    values = h5.read_values(source, address, dataset).astype(np.float64)
+                kinds = self._key(key, frames)
+                flats = values[(kinds == schema.FLAT) & fits & ("flats" not in self.stated)]
+                return source.name(address), flats, values[(kinds == schema.PROJECTION) & fits]
+        return None
+
 
 @dataclass(frozen=True, eq=False)
 class Stacks:
@@ -228,13 +250,15 @@ def places_of(options: ImportOptions, source: Hdf5Source) -> Places:
 @dataclass(frozen=True)
 class Lengths:
     """Addresses of a scan's lengths. source, detector: distances from the axis. at_sample, on_panel: pairs (v, u) of a
-    pixel's sides, of which the first that the file has is used. optics: the microscope's magnification."""
+    pixel's sides, of which the first that the file has is used. optics: the microscope's magnification, a number or a text;
+    the first that the file has is used. binning: how many pixels of the camera are one."""
 
     source: str
     detector: str
     at_sample: tuple[tuple[str, str], ...]
     on_panel: tuple[tuple[str, str], ...]
-    optics: str = ""
+    optics: tuple[str, ...] = ()
+    binning: tuple[str, ...] = ()
 
 
 def beam(
@@ -260,9 +284,14 @@ def beam(
     def pitch_mm() -> tuple[float, float]:
         """Returns a pixel's sides (v, u) in mm on the equivalent panel without optics, at the detector's distance."""
         at_sample, on_panel = sides_mm(lengths.at_sample), sides_mm(lengths.on_panel)
-        if at_sample is None and on_panel is not None and lengths.optics and source.find(lengths.optics) is not None:
-            times = h5.read_length(source, lengths.optics, _TIMES)
+        if at_sample is None and on_panel is not None and (times := _magnification(source, lengths.optics)):
             at_sample = on_panel[0] / times, on_panel[1] / times
+        for address in lengths.binning:
+            thing = source.find(address)
+            if isinstance(thing, h5py.Dataset) and thing.dtype.kind in "iuf" and thing.size == 1 and np.max(thing[()]) > 1:
+                text = "%s is %d and not used: say %s if the file's pixels are those without binning"
+                _log.warning(text, source.name(address), np.max(thing[()]), options.named("pixel_size_mm"))
+                break
         if at_sample is None or at_sample == on_panel:
             if on_panel is None:
                 raise source.error(lengths.on_panel[0][0], "nothing", "a length")
@@ -286,7 +315,30 @@ def beam(
         "source_to_detector_mm", lambda: to_axis_mm + h5.read_length(source, lengths.detector, quantity)
     )
     sides = options.taken("pixel_size_mm", pitch_mm)
+    at_axis = sides[0] * to_axis_mm / to_detector_mm, sides[1] * to_axis_mm / to_detector_mm
+    if to_axis_mm > _FAR * min(at_axis):
+        fan = max((count * side / 2) ** 2 for count, side in zip(panel, at_axis, strict=True)) / to_axis_mm / min(at_axis)
+        found = f"a source {to_axis_mm / 1000:.4g} m away, whose fan moves rays by {fan:.2g} pixels at the object's rim"
+        if fan > _FAN:
+            remedy = "import a TOML that names these arrays, with [source] beam = 'parallel', and bear the blur"
+            raise source.error(lengths.source, found, f"at most {_FAN:g} pixels, as a parallel beam has 0", remedy)
+        _log.warning("%s: %s: a parallel beam", source.name(lengths.source), found)
+        options = replace(options, source_to_axis_mm=None, source_to_detector_mm=None, pixel_size_mm=None)
+        return parallel(options, panel, at_axis, (0.0, axis_columns * at_axis[1]))
     return cone(options, to_axis_mm, to_detector_mm, panel, sides, (0.0, axis_columns * sides[1]))
+
+
+def _magnification(source: Hdf5Source, addresses: Sequence[str]) -> float | None:
+    """Returns the first magnification that the file states, as a number or a text; None without one, with a warning where
+    something else is stated."""
+    for address in [address for address in addresses if source.find(address) is not None][:1]:
+        is_number = source.dataset(address).dtype.kind in "iuf"
+        text = f"{h5.read_number(source, address):f}" if is_number else h5.read_word(source, address).strip()
+        found = _MAGNIFICATION.search(text)
+        if found and float(found[1] or found[2]) > 0:
+            return float(found[1] or found[2])
+        _log.warning("%s is %r, no magnification: the camera's pixels are taken", source.name(address), text)
+    return None
 
 
 def exposure_s(source: Hdf5Source, address: str, used: np.ndarray, options: ImportOptions) -> float | None:

@@ -39,6 +39,17 @@ _KINDS = {
     ),
     ("mat",): ("a file of MATLAB", "save its array as .npy or TIFF: scipy.io.loadmat and tifffile.imwrite"),
     ("fit", "fits"): ("FITS", "convert them to TIFF: astropy.io.fits and tifffile.imwrite"),
+    ("rek",): (
+        "projections or a volume of Fraunhofer's or YXLON's software",
+        "convert projections to TIFF, as in Fiji: File > Import > Raw, behind their header"
+    ),
+    ("nii",): ("NIfTI", "save projections of RTK as .mha: SimpleITK.WriteImage(SimpleITK.ReadImage('p.nii.gz'), 'p.mha')"),
+    ("his", "dbf"): (
+        "Elekta's projections without _Frames.xml of XVI 5", "copy it; rtkelektasynergygeometry reads FRAME.DBF"
+    ),
+    ("hnd", "hnc", "xim"): (
+        "Varian's projections without their description", "copy ProjectionInfo.xml, of .xim Scan.xml, into their folder"
+    ),
     ("xrm", "txm"): ("single images or a volume of Xradia", "import the scan's .txrm, or export TIFFs"),
 }  # fmt: skip
 # To name the format of a folder in an error, at most this many of its entries are looked at: more would take long.
@@ -50,7 +61,8 @@ def refuse_unread(path: Path, expected: str) -> None:
     and for a folder with such files. expected: what the error says was expected."""
     entries = [path] if path.is_file() else sorted(path.iterdir())[:_MOST_FILES] if path.is_dir() else []
     files = [file for file in entries if file.is_file()]
-    suffixes = Counter("dcm" if _is_dicom(file) else file.suffix.lower()[1:] for file in files)
+    plain = (Path(file.name.lower().removesuffix(".gz")).suffix[1:] for file in files)
+    suffixes = Counter("dcm" if _is_dicom(file) else suffix for file, suffix in zip(files, plain, strict=True))
     for suffix, _ in suffixes.most_common():
         for known, (what, remedy) in _KINDS.items():
             if suffix in known:
@@ -122,6 +134,8 @@ def recognise(path: Path) -> str:
         return names[0]
     tiffs = SafeFolder(path).matching(*tiff.SUFFIXES) if path.is_dir() else path.suffix.lower() in tiff.SUFFIXES
     if not names and tiffs:
+        if path.is_dir() and SafeFolder(path).exists(xre := "data settings XRE.txt"):
+            raise InputError(str(path), f"FleX-ray's '{xre}' alone", "'scan settings.txt' too", "copy it from the scanner")
         remedy = f"'phyradgs import {path if path.is_dir() else path.parent} --template' prints one to fill in"
         found = "TIFF images and no TOML that describes them"
         raise InputError(str(path), found, "geometry and angles in a TOML beside them", remedy)

@@ -21,8 +21,8 @@ T = TypeVar("T")
 _FILE, _FORMAT = "the file's", "the format's"
 DETECTOR_OFFSET = "Shift V,U of the panel's centre, mm: V > 0 up (rows), U > 0 right (columns), seen from the source."
 _AT = (
-    "An array in HDF5: NAME=FILE:/ADDRESS or NAME=/ADDRESS. NAME: projections, flats, darks, mask, image_key, angles; "
-    "axes=v,frame,u: their order."
+    "An array in HDF5: NAME=FILE:/ADDRESS or NAME=/ADDRESS. NAME: projections, flats, darks, mask, image_key, angles, "
+    "monitor (none: without it); axes=v,frame,u: their order."
 )
 _STEPS = re.compile(r"\s*([-+]?\d+(?:\.\d+)?)\s*(,|\.\.)\s*([-+]?\d+(?:\.\d+)?)\s*")
 _ANGLE_AT = "A frame's angle: at its first line's start or middle."

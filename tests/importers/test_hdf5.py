@@ -1,5 +1,6 @@
 """HDF5 files as beamlines have them: links, virtual datasets, bare arrays at addresses, pixels at the sample, units."""
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -189,6 +190,10 @@ def test_the_pixel_at_the_sample_counts_and_grows_with_a_cone_beam(tmp_path, add
     ({"detection_system/objective/resolution": (0.69, "")}, 0.00069),
     ({"detector/pixel_size_x": (6.5e-6, ""), "detection_system/objective/magnification": (10.0, "")}, 0.00065),
     ({"detector/pixel_size": (6.5, "um")}, 0.0065),
+    ({"detector/x_pixel_size": (2.4, "um"), "objective/magnification": (5.0, "")}, 0.00048),
+    ({"detector/pixel_size": (5.0, "um"), "detector/objective/magnification": (20, "")}, 0.00025),
+    ({"detector/pixel_size": (5.0, "um"), "detection_system/objective/magnification": (np.array([b"2.5X"]), "")}, 0.002),
+    ({"detector/pixel_size": (5.0, "um"), "detection_system/objective/camera_objective": ("Mitutoyo 5x", "")}, 0.001),
 ])  # fmt: skip
 def test_data_exchange_of_beamlines(tmp_path, added, side_mm, caplog) -> None:
     """Flats before and after, and no angles."""
@@ -209,6 +214,109 @@ def test_data_exchange_of_beamlines(tmp_path, added, side_mm, caplog) -> None:
     turned = import_scan(path, stated)  # --angles comes before --at
     last_deg = abs(float(np.rad2deg(turned.trajectory.angle_rad(5, np.array([5.0])))[0]))
     assert last_deg % 360 in (pytest.approx(150), pytest.approx(210))
+
+
+def exchange(path: Path, **values: object) -> Path:
+    """A Data Exchange file, flats twice as bright as ``same`` has them; ``values`` by address below /, with / as __."""
+    with h5py.File(path, "w") as file:
+        counts = np.choose(KEY, [20000, 99900, 100])[:, None, None] * np.ones((1, 4, 5))
+        counts[:, :, 1] = np.where(KEY == 0, 10000, counts[:, 0, 1])[:, None]
+        for name, kind in (("data", 0), ("data_white", 1), ("data_dark", 2)):
+            file[f"exchange/{name}"] = counts[kind == KEY]
+        file["exchange/theta"] = ANGLE_DEG[KEY == 0]
+        file["measurement/instrument/detector/pixel_size"] = 0.0065
+        for address, value in values.items():
+            file[address.replace("__", "/")] = value
+    return path
+
+
+DIFFERENT = "process__acquisition__flat_fields__different_flat_exposure"
+FLAT_S, FRAME_S = "process__acquisition__flat_fields__flat_exposure_time", "measurement__instrument__detector__exposure_time"
+
+
+@pytest.mark.parametrize("word", ["Different", np.frombuffer(b"Different\0\0", np.uint8)[None]])
+def test_flats_of_another_exposure_are_scaled_where_data_exchange_says_so(tmp_path, caplog, word) -> None:
+    same(exchange(tmp_path / "a.h5", **{DIFFERENT: word, FLAT_S: [0.06], FRAME_S: [0.03]}))
+    assert "flats are exposed 2 times as long as projections" in caplog.text
+    alike = import_scan(exchange(tmp_path / "b.h5", **{DIFFERENT: "Same", FLAT_S: [0.06], FRAME_S: [0.03]}))
+    np.testing.assert_allclose(alike.projections[:, 0, 0], np.log(99800 / 19900), rtol=1e-5)
+    with pytest.raises(InputError, match="flat_exposure_time: found nothing there"):
+        import_scan(exchange(tmp_path / "c.h5", **{DIFFERENT: "Different", FRAME_S: [0.03]}))
+
+
+def lit(path: Path, times: np.ndarray, flat_exposure: float = 1.0, **added: object) -> Path:
+    """The scan of ``nxtomo`` in light that varies by ``times`` (F,), its flats exposed ``flat_exposure`` times as long."""
+    light = times * np.where(KEY == 1, flat_exposure, 1.0)
+    nxtomo(path, added=added)
+    with h5py.File(path, "r+") as file:
+        del file["entry/instrument/detector/data"]
+        file["entry/instrument/detector/data"] = 100 + (FRAMES - 100) * light[:, None, None]
+    return path
+
+
+@pytest.mark.parametrize(("exposure", "is_rate"), [(1.0, True), (2.0, True), (0.25, True), (4.0, False), (1.0, False)])
+def test_exposures_and_the_monitor_of_the_beam_in_nxtomo(tmp_path, caplog, exposure, is_rate) -> None:
+    """A monitor counts over the exposure, or has the ring's current. Flats of two times see other light too."""
+    times = np.linspace(1.0, 0.7, len(KEY))
+    seconds = np.where(KEY == 2, np.nan, np.where(KEY == 1, 0.2 * exposure, 0.2))
+    monitor = 150 * times * (1.0 if is_rate else np.where(KEY == 1, exposure, 1.0))
+    added = {"instrument/detector/count_time": seconds, "control/data": monitor}
+    same(path := lit(tmp_path / "a.nxs", times, exposure, **added))
+    assert "control/data: frames are divided by it (0." in caplog.text and "say at monitor=none to leave" in caplog.text
+    assert ("times as long" in caplog.text) == (exposure != 1)
+    without = import_scan(path, ImportOptions(at=("monitor=none",)))
+    assert np.ptp(without.projections[:, 0, 0]) > 0.05
+
+
+NO_MONITORS = np.zeros(len(KEY)), np.ones(3), np.logspace(0, 2, len(KEY)), np.where(KEY == 1, np.nan, 1.0)
+
+
+@pytest.mark.parametrize("monitor", NO_MONITORS)
+def test_a_monitor_that_is_none_is_not_used(tmp_path, caplog, monitor) -> None:
+    same(nxtomo(tmp_path / "a.nxs", added={"control/data": monitor}))
+    assert "control/data is not used: it lacks a number above 0" in caplog.text
+
+
+def test_the_source_of_a_beamline_is_so_far_that_its_beam_is_parallel(tmp_path, caplog) -> None:
+    added = {"instrument/source/distance": -90.0, "instrument/detector/distance": 10.0}
+    path = nxtomo(tmp_path / "a.nxs", added=added, x_pixel_size=2e-5, y_pixel_size=1e-5)  # metres
+    scan = import_scan(path)
+    assert scan.is_parallel and scan.geometry.pixel_size_mm == pytest.approx((0.009, 0.018))
+    assert "a source 90 m away, whose fan moves rays by" in caplog.text and "a parallel beam" in caplog.text
+    given = ImportOptions(source_to_axis_mm=5e4, source_to_detector_mm=5.1e4)
+    assert import_scan(path, given).is_parallel
+    wide = {"data": np.ones((11, 1, 9000)) * FRAMES[:, :1, :1], "x_pixel_size": 9e-5, "y_pixel_size": 9e-5}
+    with pytest.raises(InputError, match=r"source/distance: found a source 90 m away.*\[source\] beam = 'parallel'"):
+        import_scan(nxtomo(tmp_path / "b.nxs", added=added, **wide))
+
+
+@pytest.mark.parametrize(("values", "words"), [
+    ({"acquire_period": 0.04}, "0.03 s and 25 frames per second .*acquire_period.*: taken at rest; say frame_time_s or fps"),
+    ({"frame_rate": [20.0]}, "and 20 frames per second .*frame_rate"), ({}, "0.03 s and no time from frame to frame: taken"),
+])  # fmt: skip
+def test_the_rate_that_a_file_states_is_named(tmp_path, caplog, values, words) -> None:
+    stated = {f"measurement__instrument__detector__{name}": value for name, value in values.items()}
+    import_scan(exchange(tmp_path / "a.h5", **{FRAME_S: [0.03]}, **stated))
+    assert re.search(words, caplog.text)
+    times = {"instrument/detector/count_time": 0.1, "instrument/detector/frame_start_time": 0.5 * np.arange(len(KEY))}
+    import_scan(nxtomo(tmp_path / "a.nxs", added=times))
+    assert "an exposure of 0.1 s and 2 frames per second" in caplog.text
+
+
+@pytest.mark.parametrize("axes", ["y:theta:x", ["y", "theta", "x"]])
+def test_binning_and_axes_that_are_not_used_are_named(tmp_path, caplog, axes) -> None:
+    detector = "measurement__instrument__detector__"
+    path = exchange(tmp_path / "a.h5", **{f"{detector}binning_x": "1x1", f"{detector}binning_y": [4]})
+    with h5py.File(path, "r+") as file:
+        file["exchange/data"].attrs["axes"] = axes
+    import_scan(path)
+    assert "binning_y is 4 and not used: say pixel_size_mm" in caplog.text
+    assert "@axes is y:theta:x and not used: say at axes=v,frame,u" in caplog.text
+    caplog.clear()
+    import_scan(path, ImportOptions(pixel_size_mm=(0.1, 0.1), at=("axes=frame,v,u",)))
+    assert "not used" not in caplog.text
+    with pytest.raises(InputError, match="at monitor: found /exchange/current; expected none"):
+        import_scan(path, ImportOptions(at=("monitor=/exchange/current",)))
 
 
 def test_measured_exposures_and_values_at_darks(tmp_path, caplog) -> None:

@@ -1,5 +1,6 @@
 """Scanners whose sample turns: their files against geometry by hand, and their pixels."""
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -68,7 +69,16 @@ def test_nikon_s_axis_is_offset_and_leans(tmp_path, make_truth, caplog) -> None:
     path = lab.write_nikon(tmp_path / "c", truth, ObjectOffsetX=None, InitialAngle=None, DetectorOffsetY=3)
     import_scan(path)
     assert "scan.xtekct: no ObjectOffsetX (the axis in the middle: detector_offset_mm, or calibrate)" in caplog.text
-    assert "no InitialAngle (0)" in caplog.text and "DetectorOffsetY is 3 and not used" in caplog.text
+    assert "no InitialAngle (0)" in caplog.text and "DetectorOffsetY 3: the panel's middle is 0 mm" in caplog.text
+
+
+def test_nikon_s_panel_moves_left_and_up_by_its_offsets_as_in_cil(tmp_path, make_truth) -> None:
+    """CIL puts it at (−DetectorOffsetX, DetectorOffsetY), x to the right seen from the source."""
+    truth = make_truth(geometry=CENTRED)
+    path = lab.write_nikon(tmp_path / "a", truth, DetectorOffsetX=4.5, DetectorOffsetY=-2, ObjectOffsetX=1.5)
+    falls_where(import_scan(path), truth.angle_rad, replace(CENTRED, detector_offset_mm=(-2.0, -4.5)), axis_mm=-1.5)
+    options = ImportOptions(detector_offset_mm=(1.0, 2.0))
+    assert import_scan(path, options).geometry.detector_offset_mm == pytest.approx((1.0, 2.0))
 
 
 def test_nikon_s_frames_may_lie_in_a_folder_of_their_own(tmp_path, make_truth) -> None:
@@ -107,6 +117,41 @@ def test_skyscan_s_pixels_are_not_square_and_its_sample_turns_either_way(tmp_pat
     fly = import_scan(path, ImportOptions(fps=0.8, flat_value=lab.WHITE))
     assert fly.is_fly and fly.shutter.exposure_s == 0.4
     np.testing.assert_array_equal(fly.projections, lab.line_integrals_of(lab.counts16(truth)))
+
+
+@pytest.mark.parametrize(("lines", "words"), [
+    ({"Type of Detector Motion": "CONTINUOUS"}, r"0.4 s and a sample that never stopped \(CONTINUOUS\), .* at rest; say"),
+    ({"Camera Offset": "ON"}, "Camera Offset is ON: only the images of this log"),
+    ({"Number of connected scans": 3}, "Number of connected scans is 3: only"),
+    ({"Camera Pixel Size (um)": 4000.0}, "2.5 mm on the panel, where the camera's pixels are 4 mm: else say pixel_size_mm"),
+    ({"Suggested HU": "1\n[Reconstruction]\nPostalignment=-1.50"}, "not by Postalignment, -1.50, whose sign"),
+    ({"Camera Pixel Size (um)": 1250.0, "Camera binning": "2x2", "Number of connected scans": 1}, ""),
+])  # fmt: skip
+def test_what_a_skyscan_s_log_says_and_is_not_used_is_named(tmp_path, make_truth, caplog, lines, words) -> None:
+    geometry = ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5), (4.0, 0.0))
+    import_scan(lab.write_skyscan(tmp_path / "a", make_truth(geometry=geometry), **lines))
+    assert re.search(words, caplog.text)
+    assert words or not re.search("Camera|connected|Postalignment|never stopped", caplog.text)
+
+
+def test_the_flats_of_a_flexray_may_be_of_two_times(tmp_path, make_truth, caplog) -> None:
+    path = lab.write_flexray(tmp_path / "a", make_truth(geometry=CENTRED))
+    import_scan(path)
+    assert "the 2 flats count as of one time; say flats time if the second half" in caplog.text
+    caplog.clear()
+    assert "of 2 times" in import_scan(path, ImportOptions(flats="time")).provenance["taken"]
+    assert "count as of one time" not in caplog.text
+
+
+def test_zeiss_s_reference_of_another_exposure_is_scaled(tmp_path, make_truth, caplog) -> None:
+    truth, usual = make_truth(geometry=CENTRED), np.float32([0.5] * 6)
+    for flat_s, words in ((0.125, "that of the images 0.5 s"), (0.5, "")):
+        white = np.full(CENTRED.detector_shape, lab.WHITE * flat_s / 0.5, np.float32)
+        streams = {"ReferenceData/Image": white, "ReferenceData/ExpTime": np.float32(flat_s), "ImageInfo/ExpTimes": usual}
+        scan = import_scan(lab.write_zeiss(tmp_path / f"{flat_s}", truth, **streams))
+        np.testing.assert_allclose(scan.projections, truth.scan.projections, atol=2e-4)
+        assert words in caplog.text and ("txrm2tiff" in caplog.text) == bool(words)
+        caplog.clear()
 
 
 def test_flexray_s_tube_stage_and_panel_stand_anywhere(tmp_path, make_truth, caplog) -> None:

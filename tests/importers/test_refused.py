@@ -316,6 +316,18 @@ def test_what_is_not_recognised_is_said(tmp_path) -> None:
             import_scan(tmp_path / case / "what")
 
 
+@pytest.mark.parametrize(("names", "words"), [
+    (("FRAME.DBF", "a.HIS"), "Elekta's projections without _Frames.xml"), (("p1.xim",), "Varian's .* Scan.xml"),
+    (("geometry.xml", "p.nii.gz"), r"NIfTI \(.nii\), which is not read; .* save projections of RTK as .mha"),
+    (("a.rek",), "Fraunhofer"), (("data settings XRE.txt", "s.tif"), "XRE.txt' alone; expected 'scan settings.txt'"),
+])  # fmt: skip
+def test_known_projections_without_their_description_are_told_what_is_missing(tmp_path, names, words) -> None:
+    for name in names:
+        (tmp_path / name).write_bytes(b"\0" * 200)
+    with pytest.raises(InputError, match=words):
+        import_scan(tmp_path)
+
+
 def test_notes_and_logs_that_are_links_or_folders_do_not_matter(tmp_path, make_truth) -> None:
     """Files that any folder may have, and that some formats describe their scans with."""
     path = w.write_tiff(tmp_path / "tiff", make_truth())

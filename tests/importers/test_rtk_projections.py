@@ -213,6 +213,61 @@ def test_the_counts_of_air_replace_those_that_rtk_takes(maker, suffix, make_file
     np.testing.assert_allclose(difference, np.log(2), atol=1e-3)
 
 
+def test_the_counts_of_air_that_nothing_states_are_said(make_files, caplog) -> None:
+    path, _ = make_files("obi-16-bits")
+    import_scan(path)
+    assert "air is taken for 65535 counts, as RTK does; say flat_value" in caplog.text
+    caplog.clear()
+    import_scan(path, ImportOptions(flat_value=60000.0))
+    assert "air" not in caplog.text
+
+
+@pytest.mark.parametrize(("maker", "value"), [("obi", 0), ("obi-16-bits", 0), ("probeam", 0)])
+def test_pixels_without_counts_are_masked(maker, value, tmp_path, make_truth, monkeypatch) -> None:
+    """RTK's own line integral of them is 0, as of air."""
+
+    def spoilt(integrals: np.ndarray, air: float, whole: Callable[..., np.ndarray] = counts) -> np.ndarray:
+        image = whole(integrals, air)
+        image[2, 5] = value
+        return image
+
+    monkeypatch.setitem(globals(), "counts", spoilt)
+    truth = make_truth(geometry=GEOMETRIES[maker]) if maker in GEOMETRIES else make_truth()
+    scan = import_scan(MAKERS[maker][0](tmp_path / maker, truth))
+    assert np.argwhere(np.atleast_3d(scan.pixel_mask)[..., 0] != 0).tolist() in ([[2, 5]], [[7, 5]])
+
+
+@pytest.mark.parametrize(("dose", "words"), [
+    ([800, 900, 1000, 1100, 1200, 1000], "divided by KVNormChamber, 0.8 to 1.2 of its median"),
+    ([7, 7, 7, 7, 7, 7], ""), ([5, 5, 0, 5, 5, 5], "KVNormChamber is not used"),
+])  # fmt: skip
+def test_the_dose_of_a_truebeam_s_frames(tmp_path, make_truth, caplog, dose, words) -> None:
+    truth = make_truth()
+    path, times = write_probeam(tmp_path / "a", truth), np.array(dose) / np.median(dose)
+    for file, one in zip(sorted(path.glob("*/*/*.xim")), dose, strict=True):
+        name, data = b"KVNormChamber", file.read_bytes()
+        count = data.rindex(struct.pack("<I11s", 11, b"KVSourceRtn")) - 4
+        more = struct.pack("<I13sIi", len(name), name, 0, one)
+        file.write_bytes(data[:count] + struct.pack("<I", 6) + data[count + 4 :] + more)
+    scan = import_scan(path)
+    light = np.log(times if "divided" in words else np.ones(6))[:, None, None]
+    np.testing.assert_allclose(scan.projections - light, truth.scan.projections, atol=1e-4)
+    assert words in caplog.text and (words or "KVNormChamber" not in caplog.text)
+
+
+@pytest.mark.parametrize(("maker", "old", "new"), [
+    ("elekta", ("_Frames.xml", b"<Seq>1</Seq>"), b"<Seq>1</Seq><DeltaMs>182</DeltaMs>"), ("obi", None, b""),
+])  # fmt: skip
+def test_times_of_frames_are_named(make_files, caplog, maker, old, new) -> None:
+    path, _ = make_files(maker)
+    if old:
+        file = path / old[0]
+        file.write_bytes(file.read_bytes().replace(old[1], new))
+    import_scan(path)
+    said = "no exposure and frames' times (DeltaMs): taken at rest; say frame_time_s or fps if the gantry did not stop"
+    assert (said in caplog.text) == bool(old) and "DeltaMs" in caplog.text or not old
+
+
 def test_options_that_mean_nothing_are_refused(make_files) -> None:
     path, _ = make_files("ora")
     for options in (ImportOptions(flat_value=5e4), ImportOptions(quantity="counts")):

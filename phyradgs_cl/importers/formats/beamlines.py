@@ -17,7 +17,8 @@ from phyradgs_cl.acquisition import CircularOrbit, FrameSweeps, Scan
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.acquisition.plausible import question_unit
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers import assemble, hdf5
+from phyradgs_cl.importers import assemble, brightness, hdf5
+from phyradgs_cl.importers.brightness import Reading
 from phyradgs_cl.importers.frames import gantry_sign
 from phyradgs_cl.importers.options import OF_HDF5, ImportOptions
 from phyradgs_cl.io import scan as schema
@@ -30,18 +31,28 @@ _log = logging.getLogger(__name__)
 _NOWHERE = "/no entry"  # an address that no file has, for arrays without an entry: options then give all metadata
 _EXCHANGE = "/exchange"
 _INSTRUMENT = "/measurement/instrument"
-_DETECTOR, _OPTICS = f"{_INSTRUMENT}/detector", f"{_INSTRUMENT}/detection_system/objective"
+_DETECTOR = f"{_INSTRUMENT}/detector"
+_OPTICS = tuple(f"{_INSTRUMENT}/{place}objective" for place in ("detection_system/", "", "detector/"))
+_FLATS = "/process/acquisition/flat_fields"
+# where the acquisition programs of the APS say whether flats have their own exposure, and which
+_FLATS_DIFFER = tuple(f"{place}/different_flat_exposure" for place in (_DETECTOR, _FLATS))
+_FLAT_EXPOSURES = (
+    f"{_DETECTOR}/exposure_time_flat", f"{_FLATS}/flat_exposure_time", f"{_DETECTOR}/brightfield_exposure_time",
+)  # fmt: skip
 _LENGTHS = hdf5.Lengths(
-    source=f"{_INSTRUMENT}/source/distance", detector=f"{_DETECTOR}/distance", optics=f"{_OPTICS}/magnification",
+    source=f"{_INSTRUMENT}/source/distance", detector=f"{_DETECTOR}/distance",
+    optics=(*(f"{place}/magnification" for place in _OPTICS), *(f"{place}/camera_objective" for place in _OPTICS)),
+    binning=tuple(f"{_DETECTOR}/{name}" for name in ("binning_x", "binning_y", "x_binning", "y_binning")),
     at_sample=(
         (f"{_DETECTOR}/actual_pixel_size_y", f"{_DETECTOR}/actual_pixel_size_x"),
-        *((f"{place}/resolution",) * 2 for place in (_OPTICS, f"{_INSTRUMENT}/objective")),
+        *((f"{place}/resolution",) * 2 for place in _OPTICS),
     ),
     on_panel=(
         (f"{_DETECTOR}/pixel_size_y", f"{_DETECTOR}/pixel_size_x"),
         (f"{_DETECTOR}/y_pixel_size", f"{_DETECTOR}/x_pixel_size"), (f"{_DETECTOR}/pixel_size",) * 2,
     ),
 )  # fmt: skip
+_AXES = {"theta": "frame", "y": "v", "x": "u"}
 _MOVES = ("x_translation", "y_translation", "z_translation")
 
 
@@ -79,13 +90,26 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         if "projections" not in places.stated:
             quantity = h5.read_attribute(source, f"{detector}/data", "quantity")
         _refuse_moves(source, entry, stacks.used)
+        stacks, light = _evened(places, entry, keys, stacks, options, quantity)
         title = h5.read_title(source, f"{entry}/title", path.stem)
     if options.row_0 is None:
         text = "%s: row 0 is taken as the lowest, after flips that the file declares; say %s top if the volume is mirrored"
         _log.warning(text, path, options.named("row_0"))
     integrals = stacks.line_integrals(f"{path}:{detector}/data", options, "bottom", quantity, turn)
-    parts = integrals, trajectory, geometry, timing, options
+    parts = brightness.with_light(integrals, light), trajectory, geometry, timing, options
     return assemble.assemble_scan(*parts, title=title, source=str(path))
+
+
+def _evened(
+    places: hdf5.Places, entry: str, keys: list[str], stacks: hdf5.Stacks, options: ImportOptions, quantity: str | None
+) -> tuple[hdf5.Stacks, np.ndarray]:
+    """Returns what ``brightness.evened`` does, by the exposures and the monitor of the beam in the file."""
+    if (options.quantity or quantity or "counts") != "counts":
+        return stacks, np.zeros(len(stacks.projections))
+    addresses = (("exposures", f"{entry}/{schema.DETECTOR}/count_time"), ("monitor", f"{entry}/control/data"))
+    found = (places.per_frame(name, address, keys, len(stacks.used)) for name, address in addresses)
+    exposure, monitor = (Reading(*one) if one else None for one in found)
+    return brightness.evened(stacks, exposure, monitor, f"say {options.named('at')} monitor=none")
 
 
 def _entry(source: Hdf5Source, options: ImportOptions) -> str:
@@ -160,6 +184,7 @@ def _motion(
         exposure_s=hdf5.exposure_s(source, f"{detector}/count_time", used, options),
         readout_s=read_duration(source, f"{detector}/detector_readout_time", used, needed=False),
         start_s=start_s, angle_at="start" if sweeps else None,
+        clock=_clock(source, used, f"{detector}/frame_start_time"),
     )
     timing = assemble.make_timing(source.name(entry), int(used.sum()), options, stored)
     if not sweeps:
@@ -167,6 +192,21 @@ def _motion(
     last = sign * h5.read_per_frame(source, f"{angles}_end", used, ANGLE)
     sweep = FrameSweeps(timing.start_s, timing.shutter.exposure_s, angle, last)
     return timing, CircularOrbit(geometry, sweep)
+
+
+def _clock(source: Hdf5Source, used: np.ndarray, *addresses: str) -> str:
+    """Returns words for the frame rate at the first address that has numbers: a rate, a time from frame to frame, or the
+    times of all frames, of which those ``used``, bool (F,), count."""
+    for address in addresses:
+        dataset, is_rate = source.find(address), address.endswith("rate")
+        if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "iuf" or dataset.size not in (1, used.size):
+            continue
+        values = h5.read_values(source, address, dataset).astype(np.float64).ravel()
+        times = values if values.size == 1 else np.diff(values[used])
+        usual = float(np.median(times if is_rate else h5.in_unit(source, address, times, TIME))) if times.size else 0.0
+        if np.isfinite(usual) and usual > 0:
+            return f"{usual if is_rate else 1 / usual:.6g} frames per second ({source.name(address)})"
+    return ""
 
 
 def _refuse_moves(source: Hdf5Source, entry: str, used: np.ndarray) -> None:
@@ -192,8 +232,17 @@ def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
     """Imports the projections of /exchange, with the flats and darks taken before and after them."""
     options.refuse_unused("data-exchange", OF_HDF5)
     with open_hdf5(path, options.linked_folder) as source:
-        places, theta = hdf5.places_of(options, source), f"{_EXCHANGE}/theta"
-        stacks = places.stacks(f"{_EXCHANGE}/data", **{
+        places, data, theta = hdf5.places_of(options, source), f"{_EXCHANGE}/data", f"{_EXCHANGE}/theta"
+        if "monitor" in places.stated:
+            expected, remedy = "none: projections and flats are of separate arrays", "leave it out"
+            raise InputError(f"{options.named('at')} monitor", places.stated["monitor"][0], expected, remedy)
+        if "axes" not in places.stated and "projections" not in places.stated and source.find(data) is not None:
+            axes = np.asarray(source.dataset(data).attrs.get("axes", "")).astype(str).ravel()
+            order = [_AXES.get(name, name) for name in ":".join(axes).split(":")]
+            if sorted(order) == sorted(hdf5.AXES) and order != hdf5.AXES:
+                text = "%s @axes is %s and not used: say %s axes=%s if the data are stored so"
+                _log.warning(text, source.name(data), ":".join(axes), options.named("at"), ",".join(order))
+        stacks = places.stacks(data, **{
             name: [f"{_EXCHANGE}/data_{kind}{when}" for when in ("", "_pre", "_post")]
             for name, kind in (("flats", "white"), ("darks", "dark"))
         })  # fmt: skip
@@ -205,9 +254,31 @@ def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
             theta_rad = places.angles_rad(stacks.used, options, theta)
             question_unit(theta_rad, options.called("angles", {"angles": source.name(theta)}), "deg")
         geometry = hdf5.beam(source, _LENGTHS, options, stacks.panel)
-        exposure_s = hdf5.exposure_s(source, f"{_DETECTOR}/exposure_time", stacks.used, options)
+        stored = assemble.StoredTiming(
+            exposure_s=hdf5.exposure_s(source, f"{_DETECTOR}/exposure_time", stacks.used, options),
+            clock=_clock(source, stacks.used, f"{_DETECTOR}/acquire_period", f"{_DETECTOR}/frame_rate"),
+        )
+        if (options.quantity or "counts") == "counts" and options.flat_value is None:
+            stacks, _ = brightness.evened(stacks, _flat_exposure(source, stacks), None)
         title = h5.read_title(source, f"{_EXCHANGE}/title", path.stem)
-    timing = assemble.make_timing(str(path), len(theta_rad), options, assemble.StoredTiming(exposure_s=exposure_s))
-    integrals = stacks.line_integrals(f"{path}:{_EXCHANGE}/data", options, "top")
+    timing = assemble.make_timing(str(path), len(theta_rad), options, stored)
+    integrals = stacks.line_integrals(f"{path}:{data}", options, "top")
     trajectory = assemble.turning(geometry, gantry_sign(options, "sample") * theta_rad, timing)
     return assemble.assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
+
+
+def _flat_exposure(source: Hdf5Source, stacks: hdf5.Stacks) -> Reading | None:
+    """Returns the exposures of flats and projections where the file says that they differ. Raises InputError where it says
+    so, and states none of the flats."""
+    said = next((address for address in _FLATS_DIFFER if source.find(address) is not None), None)
+    if said is None or len(stacks.flats) == 0:
+        return None
+    if (dataset := source.dataset(said)).dtype.kind in "iu":  # codes of letters
+        word = bytes(h5.read_values(source, said, dataset).astype(np.uint8)).decode("latin-1")
+    else:
+        word = h5.read_word(source, said)
+    if word.strip("\0 ").lower() != "different":
+        return None
+    at = next((address for address in _FLAT_EXPOSURES if source.find(address) is not None), _FLAT_EXPOSURES[1])
+    flat_s, frame_s = (h5.read_length(source, address, TIME) for address in (at, f"{_DETECTOR}/exposure_time"))
+    return Reading(source.name(at), np.full(len(stacks.flats), flat_s), np.full(len(stacks.projections), frame_s))

@@ -47,6 +47,9 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     flats, darks = (
         read_numbered(folder, name, (None, *panel), str(folder.root / f"{name}*.tif"), options)[0] for name in ("io", "di")
     )
+    if len(flats) > 1 and options.flats is None:
+        text = "%s: the %d flats count as of one time; say %s time if the second half was taken after the scan"
+        _log.warning(text, path, len(flats), options.named("flats"))
     names = {
         "source_to_axis_mm": scan.name("SOD"), "source_to_detector_mm": scan.name("SDD"),
         "pixel_size_mm": scan.name("Binned pixel size" if scan.has("Binned pixel size") else "Voxel size"),

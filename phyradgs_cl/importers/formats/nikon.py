@@ -1,7 +1,8 @@
 """Scans of Nikon's XT H systems: a .xtekct file and 16-bit TIFFs of counts, corrected for darks and flats by the scanner.
 
 Signs are as in the readers of CIL and TIGRE: row 0 on top, column 0 on the right seen from the source, a sample that turns
-clockwise seen from above. ObjectOffsetX above 0 puts the axis to the left. Without it, the mean of CentreOfRotationTop and
+clockwise seen from above. ObjectOffsetX and DetectorOffsetX above 0 put the axis and the panel to the left, DetectorOffsetY
+puts the panel up. Without it, the mean of CentreOfRotationTop and
 CentreOfRotationBottom, measured on the panel, takes its place. ObjectRoll above 0 leans the axis' top to the right,
 ObjectTilt above 0 towards the panel. Lengths are in mm, angles in degrees."""
 
@@ -82,23 +83,24 @@ def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names
     def pitch_mm() -> tuple[float, float]:
         return scan.length("DetectorPixelSizeY"), scan.length("DetectorPixelSizeX")
 
-    geometry = cone(options, *lengths, panel, pitch_mm, (0.0, 0.0), names)
-    for name in ("DetectorOffsetX", "DetectorOffsetY"):
-        if scan.position(name) and options.detector_offset_mm is None:
-            text = "%s is %g and not used, for its sign is not documented; say %s if the panel was moved"
-            _log.warning(text, scan.name(name), scan.position(name), options.named("detector_offset_mm"))
+    offset_mm = scan.position("DetectorOffsetY"), 0.0 - scan.position("DetectorOffsetX")
+    geometry = cone(options, *lengths, panel, pitch_mm, offset_mm, names)
+    if any(offset_mm) and options.detector_offset_mm is None:
+        text = "%s %g, DetectorOffsetY %g: the panel's middle is %g mm right of the central ray and %g mm above; else say %s"
+        stated = -offset_mm[1], offset_mm[0], offset_mm[1], offset_mm[0]
+        _log.warning(text, scan.name("DetectorOffsetX"), *stated, options.named("detector_offset_mm"))
     top_mm, bottom_mm = (scan.position(name) for name in _ENDS)
-    offset_mm, name = (top_mm + bottom_mm) / 2 / geometry.magnification, _ENDS[0]
+    axis_mm, name = (top_mm + bottom_mm) / 2 / geometry.magnification, _ENDS[0]
     if scan.has("ObjectOffsetX"):
-        offset_mm, name = scan.position("ObjectOffsetX"), "ObjectOffsetX"
+        axis_mm, name = scan.position("ObjectOffsetX"), "ObjectOffsetX"
     elif not any(map(scan.has, _ENDS)):
         say_missing(scan, {"ObjectOffsetX": f"the axis in the middle: {options.named('detector_offset_mm')}, or calibrate"})
     height_mm, width_mm = np.multiply(panel, geometry.pixel_size_mm)
-    if abs(offset_mm * geometry.magnification + geometry.detector_offset_mm[1]) > width_mm / 2:
-        found = f"{offset_mm:g} mm, {abs(offset_mm * geometry.magnification):.4g} mm from the middle of the panel"
+    if abs(axis_mm * geometry.magnification + geometry.detector_offset_mm[1]) > width_mm / 2:
+        found = f"{axis_mm:g} mm, {abs(axis_mm * geometry.magnification):.4g} mm from the middle of the panel"
         raise scan.error(name, found, f"an axis that the panel of {width_mm:.4g} mm sees")
     usual_deg = -math.degrees(math.atan2(top_mm - bottom_mm, height_mm))
     roll_deg, tilt_deg = (
         scan.number(name, usual, lowest=-45, highest=45) for name, usual in (("ObjectRoll", usual_deg), ("ObjectTilt", 0.0))
     )
-    return RotaryStage(geometry, -offset_mm, math.radians(roll_deg), math.radians(tilt_deg))
+    return RotaryStage(geometry, -axis_mm, math.radians(roll_deg), math.radians(tilt_deg))

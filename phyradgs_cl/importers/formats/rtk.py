@@ -81,15 +81,16 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
 
 
 def scan_of(
-    rtk: "RtkGeometry", stack: Stack, options: ImportOptions, subjects: tuple[str, str], title: str, source: str
+    rtk: "RtkGeometry", stack: Stack, options: ImportOptions, subjects: tuple[str, str], title: str, source: str,
+    clock: str = "",
 ) -> Scan:
     """Returns the scan of a geometry and its projections. subjects: what messages call the geometry and the projections.
-    Raises InputError if their numbers of frames differ."""
+    clock: see ``StoredTiming``. Raises InputError if their numbers of frames differ."""
     described, stored = subjects
     if len(stack.frames) != rtk.frames:
         found = f"{len(stack.frames)} frames, {rtk.frames} projections in {Path(described).name}"
         raise InputError(stored, found, "one frame per projection")
-    timing = assemble.make_timing(described, rtk.frames, options)
+    timing = assemble.make_timing(described, rtk.frames, options, assemble.StoredTiming(clock=clock))
     trajectory, geometry, turn = _trajectory(rtk, stack, timing, described)
     convention = "attenuation" if stack.frames.dtype.kind == "f" and options.flat_value is None else None
     integrals = line_integrals(stored, turn.frames(stack.frames), options, convention=convention)

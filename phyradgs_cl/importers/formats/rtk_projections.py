@@ -1,9 +1,12 @@
 """Raw projections that the package itk-rtk reads: Elekta XVI 5, Varian OBI and ProBeam (TrueBeam), and ORA of medPhoton.
 
-RTK reads the geometry and the line integrals, and crops the edges of Elekta's images. Unless the options state the counts
-of air, RTK's constants are used; ORA's files hold the transmission and need none. RTK checks files less than the other
-readers here: import only files from people whom you trust."""
+RTK reads the geometry and the counts, and crops the edges of Elekta's images. Unless the options state the counts of air,
+RTK's constants are used; ORA's files hold the transmission and need none. The counts of .xim are divided by the dose that
+the chamber before the tube measured, as in TIGRE's reader. RTK checks files less than the other readers here: import only
+files from people whom you trust."""
 
+import logging
+import struct
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +21,10 @@ from phyradgs_cl.importers.files import SafeFolder, check_room, in_natural_order
 from phyradgs_cl.importers.formats.rtk import XIM_BELOW, read_rtk_xml, scan_of, stack_of
 from phyradgs_cl.importers.options import TIMING, ImportOptions
 
+_log = logging.getLogger(__name__)
+_AIR = {".his": 65536.0, ".hnd": 139000.0, ".hnc": 65535.0, ".xim": 139000.0}  # RTK's counts of air
+_CHAMBER = b"KVNormChamber"
+_TAIL_BYTES = 1 << 18  # bytes at the end of a .xim file in which its properties are sought
 _COPIES = 12  # bytes of memory for every byte of the files: some makers pack images, and RTK keeps several copies
 
 
@@ -95,13 +102,50 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         RTK.write_geometry(_read_geometry(RTK, maker.reader, str(description), names), str(written))
         geometry = read_rtk_xml(written)
         reader = RTK.ProjectionsReader[itk.Image[itk.F, 3]].New(FileNames=names)
-        if options.flat_value is not None:
-            reader.SetI0(options.flat_value)
+        reader.SetComputeLineIntegral(False)  # RTK's line integral of 0 counts is 0, as of air
         reader.Update()
         image = reader.GetOutput()
         direction = np.asarray(itk.array_from_matrix(image.GetDirection()))
         index = image.GetLargestPossibleRegion().GetIndex()  # above 0 where RTK has cropped the image
         places_mm = tuple(image.TransformIndexToPhysicalPoint(index)), tuple(image.GetSpacing())
         stack = stack_of(np.array(itk.array_from_image(image)), *places_mm, direction, str(path))
-    options = replace(options, flat_value=None)  # RTK has already divided by the flat value
-    return scan_of(geometry, stack, options, (str(description), str(path)), description.stem, str(path))
+    stack.frames[:] /= _air(path, projections, options)[:, None, None]
+    options = replace(options, flat_value=None, quantity="transmission")
+    clocks = (description, "DeltaMs"), (projections[0], "StartTime")
+    clock = next((f"frames' times ({word})" for file, word in clocks if word.encode() in _tail(file)), "")
+    return scan_of(geometry, stack, options, (str(description), str(path)), description.stem, str(path), clock)
+
+
+def _air(path: Path, projections: list[Path], options: ImportOptions) -> np.ndarray:
+    """Returns the counts of air (F,), with a line where nothing states them. The dose of a .xim file counts relative to the
+    median of all."""
+    usual, suffix = 1.0, projections[0].suffix.lower()
+    if suffix in _AIR:
+        usual = options.flat_value or _AIR[suffix]
+        if options.flat_value is None:
+            text = "%s: air is taken for %.0f counts, as RTK does; say %s if a frame without an object has others"
+            _log.warning(text, path, usual, options.named("flat_value"))
+    dose = np.array([*map(_dose, projections)]) if suffix == ".xim" else np.zeros(len(projections))
+    if dose.min() <= 0:
+        if dose.any():
+            _log.warning("%s: %s is not used: some frames have none above 0", path, _CHAMBER.decode())
+        return np.full(len(projections), usual)
+    times = dose / np.median(dose)
+    if np.ptp(times) > 0:
+        text = "%s: frames are divided by %s, %.4g to %.4g of its median"
+        _log.warning(text, path, _CHAMBER.decode(), times.min(), times.max())
+    return usual * times
+
+
+def _dose(file: Path) -> float:
+    """Returns the chamber's reading in a .xim file, a property of type 0, int32, or 1, float64; 0 without it."""
+    before, _, after = _tail(file).rpartition(_CHAMBER)
+    kind, value = after[:4], after[4:12].ljust(8, b"\0")
+    form = {b"\0\0\0\0": "<i", b"\1\0\0\0": "<d"}.get(kind) if before else None
+    return float(struct.unpack_from(form, value)[0]) if form else 0.0
+
+
+def _tail(file: Path) -> bytes:
+    with open(file, "rb") as opened:
+        opened.seek(max(0, file.stat().st_size - _TAIL_BYTES))
+        return opened.read()

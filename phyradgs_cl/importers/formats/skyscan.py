@@ -17,20 +17,22 @@ from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers import text as settings
 from phyradgs_cl.importers.assemble import RotaryStage, scan_on_stage
-from phyradgs_cl.importers.files import SafeFolder
+from phyradgs_cl.importers.files import SafeFolder, read_text
 from phyradgs_cl.importers.frames import gantry_sign
 from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
 from phyradgs_cl.importers.tiff import read_numbered
 from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
 
 _log = logging.getLogger(__name__)
+_SEVERAL = ("Camera Offset", "Number of connected scans", "Number Of Horizontal Offset Positions")
+_UNLIKE = 0.15  # Image Pixel Size may differ so much from Camera Pixel Size over the magnification: by 8 % in a SkyScan 1275
 _RATIOS = ("Camera X/Y Ratio", "CameraXYRatio")
 _NAMES = (
     *("Filename Prefix", "Number of Files", "Number of Rows", "Number of Columns", "Optical Axis (line)", *_RATIOS),
     *("Object to Source (mm)", "Camera to Source (mm)", "Image Pixel Size (um)", "Depth (bits)", "Exposure (ms)"),
     *("Rotation Step (deg)", "Rotation Direction", "Scanning Start Angle", "Scanning Trajectory", "Frame Averaging"),
     *("Reference Intensity", "Image Rotation", "Flat Field Correction", "Type of Detector Motion", "Type of Motion"),
-    "Random Movement",
+    *("Random Movement", "Camera Pixel Size (um)", "Camera binning", *_SEVERAL),
 )
 _FIELDS = {
     "source_to_axis_mm": "Object to Source (mm)", "source_to_detector_mm": "Camera to Source (mm)",
@@ -64,12 +66,19 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     frames, at, said = read_numbered(folder, *parts, pattern=r"\d{4,8}")
     names = {field: scan.name(name) for field, name in _FIELDS.items()}
     geometry = _geometry(scan, (rows, columns), options, names)
+    if options.detector_offset_mm is None:  # Postalignment is a setting of a reconstruction by the maker's program
+        found = re.search(r"^Postalignment *= *(\S+)", read_text(description), re.M | re.I)
+        place = f"not by Postalignment, {found[1][:20]}, whose sign is not documented; " if found else ""
+        remedy = f"the middle of the panel; {place}check --fix-offset or calibrate find it"
+        settings.say_missing(scan, {"place of the axis": remedy})
     if (sense := _SENSES.get(scan.word("Rotation Direction", default="CC").upper())) is None:
         raise scan.error("Rotation Direction", repr(scan.word("Rotation Direction")[:40]), "CC or CW")
     first_deg, step_deg = scan.number("Scanning Start Angle", 0.0), partial(scan.number, "Rotation Step (deg)")
     angle_rad = options.angle_rad(len(at), lambda: np.deg2rad(first_deg + step_deg() * at))
     angle_rad *= gantry_sign(options, "sample") * sense
     settings.say_missing(scan, _ASSUMED)
+    for name in [name for name in _SEVERAL if scan.has(name) and scan.word(name).upper() not in ("OFF", "0", "1")]:
+        _log.warning("%s is %s: only the images of this log are read, as one scan", scan.name(name), scan.word(name)[:40])
     if not _OFF.fullmatch(movement := scan.word("Random Movement", default="OFF")):
         text = "%s is %s: the log states no shifts, so none are used; details blur where the scanner has not undone them"
         _log.warning(text, scan.name("Random Movement"), movement[:40])
@@ -90,10 +99,14 @@ def _geometry(scan: settings.Settings, panel: tuple[int, int], options: ImportOp
         return width_mm / next((scan.length(name) for name in _RATIOS if scan.has(name)), 1.0), width_mm
 
     pitch_mm = options.taken("pixel_size_mm", stored_mm)
+    if scan.has("Camera Pixel Size (um)") and options.pixel_size_mm is None:
+        camera_mm = scan.measured("Camera Pixel Size (um)", LENGTH, "um")
+        binned = re.match(r"\d+", scan.word("Camera binning", default="1"))
+        if all(abs(pitch_mm[1] / (n * camera_mm) - 1) > _UNLIKE for n in (1, int(binned[0]) if binned else 1)):
+            text = "%s and the distances make %.4g mm on the panel, where the camera's pixels are %.4g mm: else say %s"
+            _log.warning(text, scan.name("Image Pixel Size (um)"), pitch_mm[1], camera_mm, options.named("pixel_size_mm"))
     # a cropped image may miss the central ray; a ray more than the image's height beyond its edge shows a wrong log
     up_mm = (panel[0] / 2 - scan.number("Optical Axis (line)", panel[0] / 2, -panel[0], 2 * panel[0])) * pitch_mm[0]
-    if options.detector_offset_mm is None:
-        settings.say_missing(scan, {"place of the axis": "the middle of the panel; check --fix-offset or calibrate find it"})
     return assemble.cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, (up_mm, 0.0), names)
 
 
@@ -109,7 +122,8 @@ def _timing(scan: settings.Settings, options: ImportOptions) -> assemble.StoredT
     stored_s = scan.measured("Exposure (ms)", TIME, "ms") if scan.has("Exposure (ms)") and not options.exposure_s else None
     if stored_s is None or ("STEP" in motion.upper() and options.frame_time_s is None):
         return assemble.StoredTiming()
-    return assemble.StoredTiming(exposure_s=stored_s * int(averaged[1] if averaged else 1))
+    clock = f"a sample that never stopped ({motion}), but no time from frame to frame" if "CONT" in motion.upper() else ""
+    return assemble.StoredTiming(exposure_s=stored_s * int(averaged[1] if averaged else 1), clock=clock)
 
 
 def _white(scan: settings.Settings, frames: np.ndarray, options: ImportOptions) -> float | None:

@@ -32,11 +32,12 @@ _log = logging.getLogger(__name__)
 _INFO, _ONE, _SEVERAL = "ImageInfo", "ReferenceData", "MultiReferenceData"
 _COUNTS = ("NoOfImages", "ImageHeight", "ImageWidth")
 _REAL = ("PixelSize", "Angles", "StoRADistance", "DtoRADistance", "ExpTimes")
+_EXPOSURES = (f"{_ONE}/ExpTime", f"{_INFO}/ExpTimes")
 _STREAMS = {
     **{f"{_INFO}/{name}": "<i4" for name in (*_COUNTS, "DataType", "XrayGeometry", "ImagesTaken")},
     **{f"{_INFO}/{name}": "<f4" for name in _REAL},
     "Alignment/X-Shifts": "<f4", "Alignment/Y-Shifts": "<f4", "ReconSettings/CenterShift": "<f4",
-    f"{_ONE}/DataType": "<i4", f"{_SEVERAL}/DataType": "<i4",
+    **dict.fromkeys(_EXPOSURES, "<f4"), f"{_ONE}/DataType": "<i4", f"{_SEVERAL}/DataType": "<i4",
 }  # fmt: skip
 _TYPES = {5: "<u2", 10: "<f4"}  # DataType's codes, as NumPy types
 _PER_FOLDER = 100  # images in each of the container's folders ImageData1, ImageData2, …
@@ -87,6 +88,12 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         whites = [name for name in whites if re.fullmatch(r"[^/]*/Image\d*", name)]
         kind = f"{whites[0].split('/')[0]}/DataType" if whites else ""
         flats = read_images(ole, path, whites, _type(scan, kind, 10), panel) if whites else None
+        if flats is not None and kind.startswith(_ONE) and all(map(scan.has, _EXPOSURES)):
+            flat_s, frame_s = (scan.first_of(name, 0) for name in _EXPOSURES)
+            if min(flat_s, frame_s) > 0 and abs(flat_s / frame_s - 1) > _STEADY:
+                text = "%s is %g s, that of the images %g s: the reference is divided by their ratio, as in txrm2tiff"
+                _log.warning(text, scan.name(_EXPOSURES[0]), flat_s, frame_s)
+                flats = np.float32(flats) * np.float32(frame_s / flat_s)
     said = f"frames: {len(at)} of {count} images"
     angles = f"{_INFO}/Angles"
     angle_rad = gantry_sign(options, "sample") * options.angle_rad(
