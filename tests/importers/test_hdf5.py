@@ -256,8 +256,8 @@ def lit(path: Path, times: np.ndarray, flat_exposure: float = 1.0, **added: obje
 
 @pytest.mark.parametrize(("exposure", "is_rate"), [(1.0, True), (2.0, True), (0.25, True), (4.0, False), (1.0, False)])
 def test_exposures_and_the_monitor_of_the_beam_in_nxtomo(tmp_path, caplog, exposure, is_rate) -> None:
-    """A monitor counts over the exposure, or has the ring's current. Flats of two times see other light too."""
-    times = np.linspace(1.0, 0.7, len(KEY))
+    """A monitor counts over the exposure, or has the ring's current. Flats of two times do not see the dip between them."""
+    times = 1 - 0.3 * np.sin(np.linspace(0.0, np.pi, len(KEY)))
     seconds = np.where(KEY == 2, np.nan, np.where(KEY == 1, 0.2 * exposure, 0.2))
     monitor = 150 * times * (1.0 if is_rate else np.where(KEY == 1, exposure, 1.0))
     added = {"instrument/detector/count_time": seconds, "control/data": monitor}
