@@ -7,11 +7,11 @@
 
 /* Loops over the tiles t that splat g touches: none if it is not drawn. */
 #define FOR_TILES(g, t)                                                                                                     \
-    for (int z_ = extents[4 * stride + g] / tile.z, z1_ = extents[5 * stride + g] / tile.z;                                 \
-         extents[stride + g] >= extents[g] && z_ <= z1_; ++z_)                                                              \
-        for (int y_ = extents[2 * stride + g] / tile.y, y1_ = extents[3 * stride + g] / tile.y; y_ <= y1_; ++y_)            \
-            for (int x_ = extents[g] / tile.x, x1_ = extents[stride + g] / tile.x, t = (z_ * tiles.y + y_) * tiles.x + x_;  \
-                 x_ <= x1_; ++x_, ++t)
+    for (int x0_ = extents[g] / tile.x, x1_ = extents[stride + g] / tile.x, y0_ = extents[2 * stride + g] / tile.y,         \
+             y1_ = extents[3 * stride + g] / tile.y, z_ = extents[4 * stride + g] / tile.z,                                 \
+             z1_ = extents[stride + g] < extents[g] ? INT_MIN : extents[5 * stride + g] / tile.z; z_ <= z1_; ++z_)          \
+        for (int y_ = y0_; y_ <= y1_; ++y_)                                                                                 \
+            for (int t = (z_ * tiles.y + y_) * tiles.x + x0_, end_ = t + x1_ - x0_; t <= end_; ++t)
 
 __kernel void bin_count(
     __global const int *extents, /* (6, stride): lo and hi along x, y, z, in pixels or voxels; empty if hi < lo */
