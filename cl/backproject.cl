@@ -1,11 +1,7 @@
 /* Voxel-driven backprojection with FDK's distance weight. Projections are interpolated bilinearly, and are zero outside.
    All kernels add to the volume, view after view, so that the bits do not depend on the number of launches. The volume may
-   be a part of the grid (a brick), with its first voxel at `origin`. Twins: operators/twins/rays.py.
-     backproject          any pose; a work-item takes LANES voxels along x and loops over the views
-     backproject_upright  detector columns parallel to the volume's z; a work-item takes a column of voxels
-     backproject_leaning  columns that lean a little against z, as on every calibrated panel
-     backproject_lines    every line of a frame has its own pose (rolling shutter); a work-item takes
-                          LANES voxels along x, or along z with ALONG_Z */
+   be a part of the grid (a brick), with its first voxel at `origin`. A work-item loops over the views, for LANES voxels
+   along x or, of upright and leaning detectors, for a column along z. Twins: operators/twins/rays.py. */
 #include "common/lanes.h"
 #include "common/line_backprojection.h"
 
@@ -164,8 +160,8 @@ ALWAYS_INLINE float2 narrowed(const float2 within, const float start, const floa
     return per_z > 0.0f ? (float2)(fmax(within.x, root), within.y) : (float2)(within.x, fmin(within.y, root));
 }
 
-/* As backproject_upright, but along z also the detector column and the depth change a little. LANES voxels project between
-   two detector columns, or pass from one column to the next. */
+/* As backproject_upright, for the slightly rolled panel of a calibrated scan: along z also the detector column and the depth
+   change a little. LANES voxels project between two detector columns, or pass from one to the next. */
 __kernel void backproject_leaning(
     __global const float *projections, __global const float *matrices, __global const float *weights,
     const int views, const int rows, const int width, const int image_pitch, const long image_step,

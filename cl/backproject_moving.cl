@@ -11,11 +11,7 @@
 
 static inline vf lerp(const vf low, const vf high, const vf share) { return low + share * (high - low); }
 
-#if LANES == 1
-#define V_BETWEEN(v, last) clamp((v), 0.0f, (float)(last))
-#else
 #define V_BETWEEN(v, last) clamp((v), (vf)(0.0f), (vf)((float)(last)))
-#endif
 
 /* Trilinear interpolation in a field (nz, ny, nx). Outside, the value of the nearest point of its surface is taken. */
 static inline vf sample_at(__global const float *field, const int4 shape, const vf x, const vf y, const vf z)

@@ -5,14 +5,6 @@
    On GPUs (_group) a work-group takes a chunk, with a work-item per splat, or a tile; bin_starts_group is one work-group. */
 #include "common/group_sums.h"
 
-/* Loops over the tiles t that splat g touches: none if it is not drawn. */
-#define FOR_TILES(g, t)                                                                                                     \
-    for (int x0_ = extents[g] / tile.x, x1_ = extents[stride + g] / tile.x, y0_ = extents[2 * stride + g] / tile.y,         \
-             y1_ = extents[3 * stride + g] / tile.y, z_ = extents[4 * stride + g] / tile.z,                                 \
-             z1_ = extents[stride + g] < extents[g] ? INT_MIN : extents[5 * stride + g] / tile.z; z_ <= z1_; ++z_)          \
-        for (int y_ = y0_; y_ <= y1_; ++y_)                                                                                 \
-            for (int t = (z_ * tiles.y + y_) * tiles.x + x0_, end_ = t + x1_ - x0_; t <= end_; ++t)
-
 __kernel void bin_count(
     __global const int *extents, /* (6, stride): lo and hi along x, y, z, in pixels or voxels; empty if hi < lo */
     const int stride, const int count, const int chunk, const int chunks,
@@ -27,9 +19,17 @@ __kernel void bin_count(
     for (int t = 0; t < total; ++t)
         counts[(size_t)t * chunks + k] = 0;
     const int stop = min(count, (k + 1) * chunk);
-    for (int g = k * chunk; g < stop; ++g)
-        FOR_TILES(g, t)
-            counts[(size_t)t * chunks + k] += 1;
+    for (int g = k * chunk; g < stop; ++g) {
+        if (extents[stride + g] < extents[g])
+            continue;
+        const int x0 = extents[g] / tile.x, x1 = extents[stride + g] / tile.x;
+        const int y0 = extents[2 * stride + g] / tile.y, y1 = extents[3 * stride + g] / tile.y;
+        const int z0 = extents[4 * stride + g] / tile.z, z1 = extents[5 * stride + g] / tile.z;
+        for (int z = z0; z <= z1; ++z)
+            for (int y = y0; y <= y1; ++y)
+                for (int x = x0; x <= x1; ++x)
+                    counts[(size_t)((z * tiles.y + y) * tiles.x + x) * chunks + k] += 1;
+    }
 }
 
 /* For each tile, replaces the chunks' counts by where each chunk begins in the tile's list. Writes the list's length to
@@ -72,12 +72,21 @@ __kernel void bin_fill(
     if (k >= chunks)
         return;
     const int stop = min(count, (k + 1) * chunk);
-    for (int g = k * chunk; g < stop; ++g)
-        FOR_TILES(g, t) {
-            const int position = tile_offsets[t] + counts[(size_t)t * chunks + k]++;
-            if (position < capacity)
-                tile_splat_ids[position] = g;
-        }
+    for (int g = k * chunk; g < stop; ++g) {
+        if (extents[stride + g] < extents[g])
+            continue;
+        const int x0 = extents[g] / tile.x, x1 = extents[stride + g] / tile.x;
+        const int y0 = extents[2 * stride + g] / tile.y, y1 = extents[3 * stride + g] / tile.y;
+        const int z0 = extents[4 * stride + g] / tile.z, z1 = extents[5 * stride + g] / tile.z;
+        for (int z = z0; z <= z1; ++z)
+            for (int y = y0; y <= y1; ++y)
+                for (int x = x0; x <= x1; ++x) {
+                    const int t = (z * tiles.y + y) * tiles.x + x;
+                    const int position = tile_offsets[t] + counts[(size_t)t * chunks + k]++;
+                    if (position < capacity)
+                        tile_splat_ids[position] = g;
+                }
+    }
 }
 
 /* Writes into `boxes` (6, items) the lowest and highest tile of the item's splat along x, y, z; an empty range if the splat
