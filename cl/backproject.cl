@@ -1,7 +1,6 @@
 /* Voxel-driven backprojection with FDK's distance weight. Projections are interpolated bilinearly, and are zero outside.
-   All kernels add to the volume, view after view, so that the bits do not depend on the number of launches. The volume may
-   be a part of the grid (a brick), with its first voxel at `origin`. A work-item loops over the views, for LANES voxels
-   along x or, of upright and leaning detectors, for a column along z. Twins: operators/twins/rays.py. */
+   A work-item adds the views one after the other, so that bits do not depend on the number of launches. The volume may be a
+   part of the grid (a brick), with its first voxel at `origin`. Twins: operators/twins/rays.py. */
 #include "common/lanes.h"
 #include "common/line_backprojection.h"
 
@@ -12,9 +11,9 @@
 #define BY_DISTANCE(weight, inv) (weight) * (inv) * (inv)
 #endif
 
+ALWAYS_INLINE vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
 /* Interpolates linearly at LANES places of a line in memory, with the weight wv of the next element. `fits`: two vectors from
    `least` on contain all places; if so, elements are looked up in them, else gathered. */
-ALWAYS_INLINE vf lerp_of(const vf low, const vf high, const vf share) { return fma(share, high - low, low); }
 #ifdef V_LOOKUP
 #define COLUMN_SAMPLES(column, least, place, wv, fits)                                                       \
     ((fits) ? lerp_lookup(V_LOAD((column) + (least)), V_LOAD((column) + (least) + LANES), (place) - (least), wv) \
@@ -68,9 +67,8 @@ __kernel void backproject(
 }
 
 #ifdef COLUMN_ROWS
-/* With EVEN_ROWS all pixels are 1 but those of the first and last row, which are 0: their value at row v needs no frame. */
+/* The value at row v with EVEN_ROWS, where pixels are 0 in the first and last row, else 1. It needs no frame. */
 #define EVEN_ROW(v) max(min(min(v, (float)(rows - 1) - (v)), 1.0f), 0.0f)
-
 /* Along z, a column of voxels keeps its detector column and depth, and v is linear. So two detector columns are blended
    once for LANES voxels; or once for all voxels, if LANES voxels project to more rows than two vectors contain. Images are
    transposed: (columns, pitch), v along a row. The host chooses `block` such that its voxels project to at most COLUMN_ROWS

@@ -28,6 +28,7 @@ from phyradgs_cl.reconstructors.fdk import travel, weights
 from phyradgs_cl.reconstructors.fdk.frames import (
     WAYS,
     deblurred,
+    extended,
     extrapolated,
     reprojected,
     whole_object,
@@ -36,7 +37,6 @@ from phyradgs_cl.reconstructors.fdk.views import (
     Arc,
     RayWeight,
     check_beam,
-    extended,
     filled_gap_rad,
     opposite_weight,
     pose_of_pixels,

@@ -25,7 +25,6 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.operators.rays.subrays import subrays_of
-from phyradgs_cl.reconstructors.fdk.views import extended
 from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Report
 from phyradgs_cl.reconstructors.voxels import fista_tv
 from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions
@@ -38,6 +37,18 @@ _NOISE = 0.01  # a row that ends below this fraction of the line integrals' 99.9
 _UNEVEN = 0.02  # views are evenly spaced if no angular step differs from the median step by more than this fraction
 _REACH = 8  # the end views of an arc are repeated over this many times an exposure's arc, so that the filter meets no edge
 _FULL_TURN = 1.5  # if a gap is wider than this many median steps, the views cover less than a full turn
+
+
+def extended(pose: np.ndarray, axis: str, more: tuple[int, int], side: str = "columns") -> np.ndarray:
+    """Returns the poses (F, 12), or (F, lines, 12) along ``axis``, of frames with ``more`` (first, last) columns or rows at
+    their ends. side: "columns" or "rows"."""
+    if more == (0, 0):
+        return pose
+    if pose.ndim == 3 and axis == side:
+        pose = np.pad(pose, ((0, 0), more, (0, 0)), mode="edge")
+    moved = pose.copy()
+    moved[..., 3:6] -= more[0] * (pose[..., 6:9] if side == "columns" else pose[..., 9:12])
+    return moved
 
 
 def extrapolated(frames: np.ndarray, way: str) -> tuple[np.ndarray, int]:

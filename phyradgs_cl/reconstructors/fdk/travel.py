@@ -16,7 +16,8 @@ from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import backproject
 from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.reconstructors.fdk import weights
-from phyradgs_cl.reconstructors.fdk.views import extended, pose_of_pixels, view_angles
+from phyradgs_cl.reconstructors.fdk.frames import extended
+from phyradgs_cl.reconstructors.fdk.views import pose_of_pixels, view_angles
 from phyradgs_cl.runtime import Runtime
 
 log = logging.getLogger(__name__)

@@ -51,8 +51,8 @@ class Arc:
     """The angles that the views cover, and how much of them each view stands for.
 
     - gap_rad (F,): the angle for which each view stands. coverage_rad: the angle that all views cover. is_full: a full turn.
-    - progress_rad (F,): each view's angle from the arc's start, which lies half a step before the first view. The arc ends
-      half a step behind the last view. In a full turn, progress is counted from the view of the least angle.
+    - progress_rad (F,): each view's angle from the arc's start. The arc is half a step longer than the views at both ends; a
+      full turn starts at the view of the least angle.
     - parts_rad (P, 2): progress at which each part between gaps begins and ends.
     - filled_rad: sum over the gaps above 5° for which neighbouring views stand of (gap − usual gap)."""
 
@@ -255,18 +255,6 @@ def _redundancy_angle(pose: np.ndarray, rays: np.ndarray, arc: Arc, is_parallel:
     if arc.is_full or pose.shape[1] == 1:
         return angle_rad
     return angle_rad + azimuth_rad(pose)
-
-
-def extended(pose: np.ndarray, axis: str, more: tuple[int, int], side: str = "columns") -> np.ndarray:
-    """Returns the poses (F, 12), or (F, lines, 12) along ``axis``, of frames with ``more`` (first, last) columns or rows at
-    their ends. side: "columns" or "rows"."""
-    if more == (0, 0):
-        return pose
-    if pose.ndim == 3 and axis == side:
-        pose = np.pad(pose, ((0, 0), more, (0, 0)), mode="edge")
-    moved = pose.copy()
-    moved[..., 3:6] -= more[0] * (pose[..., 6:9] if side == "columns" else pose[..., 9:12])
-    return moved
 
 
 def check_beam(method: str, pose: np.ndarray, is_parallel: bool) -> None:
