@@ -50,9 +50,9 @@ __kernel void backproject(
         const vf inv = 1.0f / depth;
         const vf u = (m[0] * x + (m[1] * y + m[2] * z + m[3])) * inv;
         const vf v = (m[4] * x + (m[5] * y + m[6] * z + m[7])) * inv;
-        const vi inside = (u >= 0.0f) & (u <= (float)(width - 1)) & (v >= 0.0f) & (v <= (float)(rows - 1)) & (depth > 0.0f);
+        const vi inside = IS_ON(u, width) & IS_ON(v, rows) & (depth > 0.0f);
         /* Positions outside are replaced before they are converted, because they may be too large for an integer. */
-        const vf us = V_PICK(0.0f, u, inside), vs = V_PICK(0.0f, v, inside);
+        const vf us = ONTO(V_PICK(0.0f, u, inside), width), vs = ONTO(V_PICK(0.0f, v, inside), rows);
         const vi column = min(V_INT(us), max(width - 2, 0)), row = min(V_INT(vs), max(rows - 2, 0));
         const vf wu = us - V_FLOAT(column), wv = vs - V_FLOAT(row);
         const vi at = row * image_pitch + column;
@@ -93,8 +93,8 @@ __kernel void backproject_upright(
         __global const float *m = matrices + (size_t)f * 12;
         const float depth = m[8] * x + (m[9] * y + m[11]);
         const float inv = 1.0f / depth;
-        const float u = (m[0] * x + (m[1] * y + m[3])) * inv;
-        if (!(u >= 0.0f && u <= (float)(width - 1) && depth > 0.0f))
+        const float place = (m[0] * x + (m[1] * y + m[3])) * inv, u = ONTO(place, width);
+        if (!(IS_ON(place, width) && depth > 0.0f))
             continue;
         const float step = m[6] * inv, start = (m[4] * x + (m[5] * y + m[6] * first + m[7])) * inv;
         const float weight = BY_DISTANCE(weights[f], inv);
@@ -110,11 +110,11 @@ __kernel void backproject_upright(
 #ifdef V_LOOKUP
         if (fabs(step) * (LANES - 1) < (float)(2 * LANES - 3)) { /* two vectors contain the rows of LANES voxels */
             for (int z = 0; z < count; z += LANES) {
-                const vf v = start + step * (V_IOTA + (float)z);
-                const vi inside = (v >= 0.0f) & (v <= (float)(rows - 1));
+                const vf place = start + step * (V_IOTA + (float)z), v = ONTO(place, rows);
+                const vi inside = fabs(place - v) <= ROUNDING;
                 if (!V_ANY(inside))
                     continue;
-                const vi row = V_INT(V_PICK(0.0f, v, inside));
+                const vi row = V_INT(v);
                 const int least = clamp((int)fmin(V_FIRST(v), V_LAST(v)), 0, max(rows + 1 - 2 * LANES, 0));
                 const vf lower = low * V_LOAD(a + least) + high * V_LOAD(b + least);
                 const vf upper = low * V_LOAD(a + least + LANES) + high * V_LOAD(b + least + LANES);
@@ -125,7 +125,8 @@ __kernel void backproject_upright(
             continue;
         }
 #endif
-        const float at_low = -start / step, at_high = ((float)(rows - 1) - start) / step; /* z at the first and last row */
+        /* z at the first and last row */
+        const float at_low = (-ROUNDING - start) / step, at_high = ((float)(rows - 1) + ROUNDING - start) / step;
         const int z_start = (int)clamp(ceil(fmin(at_low, at_high)), 0.0f, (float)count);
         const int z_stop = (int)clamp(floor(fmax(at_low, at_high)), -1.0f, (float)(count - 1)) + 1;
         if (z_start >= z_stop)
@@ -135,10 +136,12 @@ __kernel void backproject_upright(
         const int stop = min((int)fmax(v_start, v_last), rows - 1) + 2; /* row `rows` is padding, with zeros */
         for (int v = base; v < stop; v += LANES)
             V_STORE(low * V_LOAD(a + v) + high * V_LOAD(b + v), blended + (v - base));
+        if (stop > rows)
+            blended[rows - base] = blended[rows - 1 - base]; /* for v beyond the last row by rounding */
         const float shift = start - base;
         for (int z = z_start; z < z_stop; ++z) {
-            const float v = shift + step * z;
-            const int row = (int)v; /* 0 also if rounding has made v slightly negative */
+            const float v = fmax(shift + step * z, 0.0f);
+            const int row = (int)v;
             sum[z] += blended[row] + (v - row) * (blended[row + 1] - blended[row]);
         }
     }
@@ -156,6 +159,14 @@ ALWAYS_INLINE float2 narrowed(const float2 within, const float start, const floa
     if (per_z == 0.0f)
         return start < 0.0f ? (float2)(MAXFLOAT, -MAXFLOAT) : within;
     return per_z > 0.0f ? (float2)(fmax(within.x, root), within.y) : (float2)(within.x, fmin(within.y, root));
+}
+
+/* Narrows the range `within` of z to where u is on pixels 0 to `most`, by IS_ON. u · depth and depth are linear along z. */
+ALWAYS_INLINE float2 narrowed_to(
+    const float2 within, const float most, const float u, const float u_per_z, const float depth, const float depth_per_z)
+{
+    const float2 low = narrowed(within, fma(ROUNDING, depth, u), fma(ROUNDING, depth_per_z, u_per_z));
+    return narrowed(low, fma(most + ROUNDING, depth, -u), fma(most + ROUNDING, depth_per_z, -u_per_z));
 }
 
 /* As backproject_upright, for the slightly rolled panel of a calibrated scan: along z also the detector column and the depth
@@ -181,9 +192,8 @@ __kernel void backproject_leaning(
         __global const float *m = matrices + (size_t)f * 12;
         const float depth_0 = m[8] * x + (m[9] * y + m[10] * first + m[11]);
         const float u_0 = m[0] * x + (m[1] * y + m[2] * first + m[3]), v_0 = m[4] * x + (m[5] * y + m[6] * first + m[7]);
-        float2 seen = narrowed((float2)(-1.0f, (float)(count + LANES)), u_0, m[2]);
-        seen = narrowed(seen, fma(u_most, depth_0, -u_0), fma(u_most, m[10], -m[2]));
-        seen = narrowed(narrowed(seen, v_0, m[6]), fma(v_most, depth_0, -v_0), fma(v_most, m[10], -m[6]));
+        float2 seen = narrowed_to((float2)(-1.0f, (float)(count + LANES)), u_most, u_0, m[2], depth_0, m[10]);
+        seen = narrowed_to(seen, v_most, v_0, m[6], depth_0, m[10]);
         if (seen.x > seen.y + 2.0f * VOXEL_MARGIN)
             continue;
         const int start = (int)clamp(seen.x - VOXEL_MARGIN, 0.0f, (float)count) / LANES * LANES;
@@ -204,12 +214,13 @@ __kernel void backproject_leaning(
                 inv = fma(guess, fma(-depth, guess, (vf)(1.0f)), guess);
             } else
                 inv = 1.0f / depth;
-            const vf u = fma(z, (vf)(m[2]), (vf)(u_0)) * inv, v = fma(z, (vf)(m[6]), (vf)(v_0)) * inv;
+            const vf place = fma(z, (vf)(m[2]), (vf)(u_0)) * inv, v = fma(z, (vf)(m[6]), (vf)(v_0)) * inv;
             const int is_inside = (float)k >= seen.x + VOXEL_MARGIN && end <= seen.y - VOXEL_MARGIN;
             vi inside = (vi)(0);
-            vf vs = v;
+            vf u = place, vs = v;
             if (!is_inside) {
-                inside = (u >= 0.0f) & (u <= u_most) & (v >= 0.0f) & (v <= v_most) & (inv > 0.0f);
+                inside = IS_ON(u, width) & IS_ON(v, rows) & (inv > 0.0f);
+                u = ONTO(place, width);
                 vs = V_PICK(V_PICK(0.0f, v_most, v > v_most), v, (v >= 0.0f) & (v <= v_most));
             }
 #ifdef EVEN_ROWS
@@ -256,8 +267,8 @@ __kernel void backproject_leaning(
 ALWAYS_INLINE vf samples_of(__global const float *line, const vf u, const int width)
 {
     const vf most = (vf)(width - 1);
-    const vi inside = (u >= 0.0f) & (u <= most);
-    const vf us = V_PICK(V_PICK(0.0f, most, u > most), u, inside);
+    const vi inside = IS_ON(u, width);
+    const vf us = V_PICK(V_PICK(0.0f, most, u > most), u, (u >= 0.0f) & (u <= most));
     const vi place = min(V_INT(us), max(width - 2, 0));
     const int p0 = V_FIRST(place), p1 = V_LAST(place), fits = abs(p1 - p0) <= 2 * LANES - 2;
     const int least = min(min(p0, p1), max(width + 1 - 2 * LANES, 0));
@@ -326,14 +337,13 @@ __kernel void backproject_lines(
             const vf rate = fmax(1.0f - (next_v - v), LEAST_SPEED), on = (v - (float)line) / rate;
             const vi served = waits & (on < (vf)(line == to ? MAXFLOAT : 1.0f));
             waits &= ~served;
-            const vi is_open = served & (depth > 0.0f) & (next_depth > 0.0f) & (on >= (float)(-line))
-                               & (on <= (float)(lines - 1 - line));
+            const vi is_open = served & (depth > 0.0f) & (next_depth > 0.0f) & IS_ON(on + (float)line, lines);
             if (!V_ANY(is_open))
                 continue;
             const vf here = samples_of(pixels, PROJECTED(m, 0) * inv, width);
             const vf there = samples_of(pixels + next_line, PROJECTED(n, 0) * next_inv, width);
-            const vf between = depth + on * (next_depth - depth);
-            const vf value = BY_LINE(weights[f], between, filtered_across ? rate * rate : rate) * (here + on * (there - here));
+            const vf at = ONTO(on + (float)line, lines) - (float)line, between = depth + at * (next_depth - depth);
+            const vf value = BY_LINE(weights[f], between, filtered_across ? rate * rate : rate) * (here + at * (there - here));
             sum += V_PICK(0.0f, value, is_open);
         }
     }

@@ -103,8 +103,8 @@ __kernel void backproject_moving(
         const vf inv = 1.0f / depth;
         const vf u = (m[0] * x + m[1] * y + m[2] * z + m[3]) * inv;
         const vf v = (m[4] * x + m[5] * y + m[6] * z + m[7]) * inv;
-        const vi inside = (u >= 0.0f) & (u <= (float)(width - 1)) & (v >= 0.0f) & (v <= (float)(rows - 1)) & (depth > 0.0f);
-        const vf us = V_PICK(0.0f, u, inside), vs = V_PICK(0.0f, v, inside);
+        const vi inside = IS_ON(u, width) & IS_ON(v, rows) & (depth > 0.0f);
+        const vf us = ONTO(V_PICK(0.0f, u, inside), width), vs = ONTO(V_PICK(0.0f, v, inside), rows);
         const vi column = min(V_INT(us), max(width - 2, 0)), row = min(V_INT(vs), max(rows - 2, 0));
         const vf wu = us - V_FLOAT(column), wv = vs - V_FLOAT(row);
         const vi at = row * image_pitch + column;

@@ -1,5 +1,11 @@
 /* Backprojects a view whose lines have their own poses to a voxel. For backproject.cl and backproject_moving.cl. */
 
+/* Rounding may move a voxel's image beyond the outermost pixels' centres. IS_ON counts it as seen, ONTO takes it back: else
+   a panel of one row would not see voxels at its height. */
+#define ROUNDING 1e-3f
+#define IS_ON(u, count) (((u) >= -ROUNDING) & ((u) <= (float)((count) - 1) + ROUNDING))
+#define ONTO(u, count) clamp((u), 0.0f, (float)((count) - 1))
+
 #define LINE_STEPS 6      /* most Newton steps to find the line that sees a voxel */
 #define LEAST_SPEED 0.1f  /* least `speed` that counts, since the Newton steps divide by it */
 
@@ -9,10 +15,11 @@ static inline float line_position(__global const float *m, const float x, const 
     return (m[4] * x + m[5] * y + m[6] * z + m[7]) / *depth;
 }
 
-static inline float line_sample(__global const float *line, const float u, const int width)
+static inline float line_sample(__global const float *line, const float position, const int width)
 {
-    if (!(u >= 0.0f && u <= (float)(width - 1)))
+    if (!IS_ON(position, width))
         return 0.0f;
+    const float u = ONTO(position, width);
     const int column = min((int)u, max(width - 2, 0));
     return line[column] + (u - column) * (line[column + (width > 1)] - line[column]);
 }
@@ -58,8 +65,8 @@ static inline float line_added(
     const int step = lines > 1 ? 12 : 0;
     float t, speed, depth, next_depth;
     const int line = line_seeing(table, lines, max(lines - 2, 0) / 2, x, y, z, &t, &speed, &depth, &next_depth);
-    const float position = (float)line + t;
-    if (!(depth > 0.0f && next_depth > 0.0f && position >= 0.0f && position <= (float)(lines - 1)))
+    const float position = (float)line + t, on = ONTO(position, lines) - (float)line;
+    if (!(depth > 0.0f && next_depth > 0.0f && IS_ON(position, lines)))
         return sum;
     __global const float *m = table + (size_t)line * 12, *n = m + step;
     __global const float *pixels = image + (size_t)line * image_pitch;
@@ -67,6 +74,6 @@ static inline float line_added(
     const float next_u = (n[0] * x + n[1] * y + n[2] * z + n[3]) / next_depth;
     const float here = line_sample(pixels, u, width);
     const float there = line_sample(pixels + (step ? image_pitch : 0), next_u, width);
-    const float middle = depth + t * (next_depth - depth);
-    return sum + BY_LINE(weight, middle, filtered_across ? speed * speed : speed) * (here + t * (there - here));
+    const float middle = depth + on * (next_depth - depth);
+    return sum + BY_LINE(weight, middle, filtered_across ? speed * speed : speed) * (here + on * (there - here));
 }

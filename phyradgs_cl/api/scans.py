@@ -70,6 +70,8 @@ def fly_scan(
         raise InputError("exposure_deg", "0", "an arc other than 0", "use static_scan for a gantry that stops")
     is_timed, exposure_s = exposure_s is not None, 1.0 if exposure_s is None else exposure_s
     checks.positive("exposure_s", exposure_s)
+    # NumPy's numbers of 8 or 16 bits would overflow and lose digits below
+    exposure_deg, readout_ratio, exposure_s = float(exposure_deg), float(readout_ratio), float(exposure_s)
     pixels = _pixels(frames, geometry, flats, darks, mask, quantity)
     start_deg = checks.numbers("angles_deg", angles_deg, (len(pixels.values),))
     turned_deg = unwrapped(start_deg, 360.0)

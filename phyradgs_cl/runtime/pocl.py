@@ -52,6 +52,7 @@ _LIBRARIES = (
 /proc/cpuinfo. ``processor`` is LLVM's name of the processor for which the library was compiled."""
 _OLDEST_TARGET = "athlon64"  # the processor of the library that PoCL takes if no entry of ``_LIBRARIES`` fits
 THREADS_VARIABLE = "POCL_MAX_PTHREAD_COUNT"
+_ROOM_BYTES = 1 << 22  # a cache with less room is not used: LLVM ends the process if it cannot write a kernel
 _MOST_THREADS = 1024  # largest POCL_MAX_PTHREAD_COUNT that is accepted
 _NO_CACHE_VARIABLE = "PYOPENCL_NO_CACHE"
 _unusable: tuple[Path, str] | None = None
@@ -62,7 +63,7 @@ def prepare_environment() -> None:
     """Sets PoCL's kernel cache on Linux: the folder POCL_CACHE_DIR, or one of this program. Call it before pyopencl loads.
 
     PoCL's default cache is named after LLVM's target, so two unknown processors would share binaries. If the cache cannot be
-    written, PoCL finds no device. If the cache is on a mount with noexec, PoCL ends the process. In both cases a temporary
+    written, PoCL finds no device. If it is full, or on a mount with noexec, PoCL ends the process. In all cases a temporary
     folder is used instead. pyopencl's own cache is switched off where it cannot be written. Where several ranks share a
     machine, each rank's threads are limited. Raises InputError for a number of threads that PoCL would crash on or ignore,
     and for a cache on a mount with noexec if no temporary folder works."""
@@ -133,8 +134,7 @@ def _fault_of(folder: Path) -> str | None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
-            file.write(bytes(mmap.PAGESIZE))
-            file.flush()
+            os.posix_fallocate(file.fileno(), 0, _ROOM_BYTES)
             try:
                 mmap.mmap(file.fileno(), mmap.PAGESIZE, mmap.MAP_PRIVATE, mmap.PROT_READ | mmap.PROT_EXEC).close()
             except OSError:

@@ -59,6 +59,16 @@ def test_a_gantry_that_turns_clockwise_has_a_negative_exposure() -> None:
     assert np.all(np.diff(shuffled.frame_start_s) > 0)
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.int8, np.float16])
+def test_small_numbers_of_numpy_neither_overflow_nor_lose_digits(kind) -> None:
+    cone, frames, angles = ConeGeometry(5.0, 7.0, (6, 8), (0.2, 0.2)), np.zeros((12, 6, 8), np.float32), 30.0 * np.arange(12)
+    scan, exact = (
+        fly_scan(frames, cone, angles, exposure_deg=of(12), readout_ratio=of(2), exposure_s=of(100)) for of in (kind, float)
+    )
+    assert scan.shutter == exact.shutter and scan.shutter.span_s == 300
+    np.testing.assert_array_equal(poses(scan), poses(exact))
+
+
 def test_what_looks_like_radians_transmissions_or_percent_is_said(caplog) -> None:
     cone = ConeGeometry(5.0, 7.0, (6, 8), (0.2, 0.2))
     frames, turn_deg = np.zeros((20, 6, 8), np.float32), 18.0 * np.arange(20)

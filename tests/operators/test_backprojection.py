@@ -123,6 +123,26 @@ def test_single_lines_of_pixels(two_rt, make_geometry: Geometries) -> None:
         assert_same(backproject(two_rt, frames, pose, weight, grid), expected, least=0)
 
 
+@pytest.mark.parametrize("shape", [(1, 9), (9, 1), (1, 1), (5, 9)])
+def test_rounding_moves_no_voxel_off_the_panel(two_rt, make_geometry: Geometries, shape) -> None:
+    """The voxel lies on the first row, or the middle column, but for 0.0004 pixels; by upright, leaning and lines' kernels."""
+    frames, weight = random_frames(shape)
+    pose = make_geometry(*shape).pose(np.zeros(4))
+    pose[:, 3:6] += (shape[0] - 1) / 2 * pose[:, 9:12]
+    for tilt, away in product((0.0, 0.02, 0.3), (-4e-4, 4e-4)):
+        moved = pose + np.concatenate([np.zeros((4, 9)), tilt * pose[:, 6:9]], 1)
+        for side in (6, 9):
+            moved[:, 3:6] += away * moved[:, side : side + 3]
+        for voxel_mm in (0.1, 2.0):  # two ways of the upright kernel
+            grid = Grid((1, 1, 1), (voxel_mm, 0.1, 0.1))
+            expected = backprojection(frames, pose, weight, grid)
+            for found in (
+                backproject(two_rt, frames, moved, weight, grid), backprojection(frames, moved, weight, grid),
+                backproject_lines(two_rt, frames, np.repeat(moved[:, None], shape[0], 1), weight, grid),
+            ):  # fmt: skip
+                np.testing.assert_allclose(found, expected, rtol=5e-3)
+
+
 @pytest.mark.parametrize("axis", ["rows", "columns"])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_lines(any_rt, make_geometry: Geometries, shape, axis) -> None:

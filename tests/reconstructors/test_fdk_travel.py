@@ -100,6 +100,21 @@ def test_voxels_at_the_ends_have_the_mean_of_the_views_that_see_them(rt, axis, i
         assert np.linalg.norm(found - expected) < FDK_ENDS * np.linalg.norm(expected)
 
 
+@pytest.mark.parametrize("by_lines", [False, True])
+@pytest.mark.parametrize("geometry", [ParallelGeometry((1, 30), 0.05), ConeGeometry(10.0, 15.0, (1, 30), 0.075)])
+def test_rounding_does_not_hide_the_slice_of_a_single_row(rt, geometry, by_lines) -> None:
+    """It was 0, or had a fifth of its density, where the panel was higher by 1e-12 mm in some views."""
+    row = np.sqrt(np.maximum(16 - (np.arange(30) - 14.5) ** 2, 0))
+    frames, angle, volumes = np.tile(row.astype(np.float32), (40, 1, 1)), np.arange(40) * 2 * np.pi / 40, []
+    for away_mm in (0.0, 1e-12):
+        pose = geometry.pose(angle)
+        pose[:, 5] += away_mm * np.random.default_rng(0).uniform(-1, 1, 40)
+        pose = np.repeat(pose[:, None], 1, 1) if by_lines else pose
+        parallel = isinstance(geometry, ParallelGeometry)
+        volumes.append(fdk_volume(rt, frames, pose, Grid((1, 24, 24), (0.05,) * 3), is_parallel=parallel))
+    np.testing.assert_allclose(volumes[1], volumes[0], atol=1e-4 * volumes[0].max())
+
+
 def test_a_feed_that_leaves_voxels_with_less_than_half_a_turn_is_named(rt, caplog) -> None:
     reconstructed(rt, helix(5, 2.0))
     assert "of the voxels are seen from less than half a turn, the least from" in caplog.records[0].message

@@ -1,6 +1,7 @@
 """The processor that PoCL builds kernels for, on a device record made for the test, and its name in results files."""
 
 import ctypes
+import errno
 import os
 import platform
 import struct
@@ -97,22 +98,25 @@ def test_kernels_are_cached_per_processor_unless_told_otherwise(monkeypatch, tmp
     assert os.environ["POCL_CACHE_DIR"] == str(folder) and folder.is_dir()
 
 
-def test_a_cache_whose_files_may_not_be_executed_is_replaced(tmp_path, monkeypatch, caplog) -> None:
-    """As on a mount with noexec, where PoCL would end the process."""
-    mapped = pocl.mmap.mmap
+@pytest.mark.parametrize(("owner", "name", "code", "done"), [
+    (pocl.mmap, "mmap", errno.EPERM, "executed"), (os, "posix_fallocate", errno.ENOSPC, "written"),
+])
+def test_a_cache_that_would_end_the_process_is_replaced(owner, name, code, done, tmp_path, monkeypatch, caplog) -> None:
+    """As on a mount with noexec, or a full disk."""
+    called = getattr(owner, name)
 
     def refusing(file: int, *how: int) -> object:
         if os.readlink(f"/proc/self/fd/{file}").startswith(str(tmp_path)):
-            raise PermissionError(1, "Operation not permitted")
-        return mapped(file, *how)
+            raise OSError(code, os.strerror(code))
+        return called(file, *how)
 
-    monkeypatch.setattr(pocl.mmap, "mmap", refusing)
+    monkeypatch.setattr(owner, name, refusing)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv(pocl.CACHE_VARIABLE, "")
     pocl.prepare_environment()
     assert not os.environ[pocl.CACHE_VARIABLE].startswith(str(tmp_path))
     pocl.warn_of_cache()
-    assert f"kernel cache {tmp_path}/phyradgs-cl/pocl-haswell cannot be executed: kernels are kept in" in caplog.text
+    assert f"kernel cache {tmp_path}/phyradgs-cl/pocl-haswell cannot be {done}: kernels are kept in" in caplog.text
 
 
 def test_a_processor_is_named_with_what_tells_generations_apart(tmp_path) -> None:

@@ -19,6 +19,7 @@ from phyradgs_cl.operators.twins.splat import moving_frame, precision_matrices, 
 
 _REACH = 2  # distance in voxels up to which a spline coefficient acts: points further than this outside the volume get 0
 _BORDER = 4  # width in voxels around the volume in which spline coefficients are kept
+_ROUNDING = 1e-3  # as ROUNDING of cl/common/line_backprojection.h, in pixels
 Volume = np.ndarray
 
 
@@ -189,21 +190,25 @@ def _seen(
     """Returns what a frame adds to one voxel. u, ahead, depth (lines,), in the pose of each line: the voxel's pixel along
     the line, the line onto which it is projected minus the pose's own line, and its depth. power, speed_power: exponents of
     the depth, and of the rate at which the readout crosses the voxel's image."""
-    crossing = np.flatnonzero((ahead[:-1] >= 0) & (ahead[1:] <= 0))
+    lines, width = frame.shape
+    speeds = ahead[:-1] - ahead[1:]
+    line_of_seen = np.arange(lines - 1) + ahead[:-1] / np.where(speeds > 0, speeds, np.nan)
+    off = np.abs(line_of_seen - np.clip(line_of_seen, np.arange(lines - 1), np.arange(1, lines)))
+    crossing = np.flatnonzero((off == 0) | (off <= _ROUNDING) & ((line_of_seen < 0) | (line_of_seen > lines - 1)))
     if crossing.size == 0 or depth.min() <= 0:
         return 0.0
     line = int(crossing[0])
-    speed = ahead[line] - ahead[line + 1]
-    t = ahead[line] / speed
+    speed, t = speeds[line], np.clip(line_of_seen[line] - line, 0, 1)
     here, there = (
-        float(np.interp(u[r], np.arange(frame.shape[1]), frame[r], 0, 0)) for r in (line, line + 1)
+        float(np.interp(u[r], np.arange(width), frame[r])) * bool(_on(u[r], width)) for r in (line, line + 1)
     )
     middle = (1 - t) * depth[line] + t * depth[line + 1]
     return float(((1 - t) * here + t * there) / (middle**power * speed**speed_power))
 
 
 def _on(position: np.ndarray, count: int) -> np.ndarray:
-    return (position >= 0) & (position <= count - 1)
+    """Returns whether positions are on ``count`` pixels, but for rounding."""
+    return (position >= -_ROUNDING) & (position <= count - 1 + _ROUNDING)
 
 
 def warp_forward(volume: Volume, displacement: np.ndarray) -> Volume:
