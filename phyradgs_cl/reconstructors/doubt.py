@@ -56,7 +56,7 @@ _UNEXPLAINED = 2.0  # a residual above this many times the noise causes a warnin
 # A larger quotient noise/(line integrals) causes a warning: at 0.05 to 0.06, σ held 43 to 59 % of errors, not 68 %.
 _NOISY = 0.03
 _WIDEST = 4.0  # σ is multiplied by at most this factor: still larger errors of held-out pixels have other causes
-# (Number of views)/(voxels along a slice's longer side) from which on a law needs no factor for few views.
+# (Number of views)/(voxels along a slice's longer side) for which a law was fitted: here its factor is 1.
 _USUAL_VIEWS = 25 / 64
 _FEWEST_VIEWS = 0.1  # least value of that quotient in a law's factor: no law was measured with fewer views
 _SHARE, _NORMAL_95 = 0.68, 1.96  # fraction of errors within σ; standard deviations that hold 95 % of normal noise
@@ -67,7 +67,8 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class Law:
     """Fitted factors of the four parts of σ whose squares ``spread`` adds: shape, noise, density, slope. near: standard
-    deviation of its smoothing in voxels. multiple_95: (95 % bar)/σ. sparse: growth of σ if views are few (``factor``)."""
+    deviation of its smoothing in voxels. multiple_95: (95 % bar)/σ. sparse, dense: how σ
+    grows with fewer and falls with more views (``factor``)."""
 
     shape: float
     noise: float
@@ -76,12 +77,13 @@ class Law:
     near: float
     multiple_95: float
     sparse: float = 0.0
+    dense: float = 0.0
 
     def factor(self, views: int, grid: Grid) -> float:
-        """Returns the factor, at least 1, by which σ grows with only ``views`` views on ``grid``. All runs of a scan lack
-        the same views, so that the differences between runs show too little of the errors that missing views cause."""
-        of_voxel = max(views / max(grid.shape[1:]), _FEWEST_VIEWS)
-        return 1 + self.sparse * max(_USUAL_VIEWS / of_voxel - 1, 0)
+        """Returns σ from ``views`` views on ``grid``, over σ from the usual number. All runs of a scan lack the same views,
+        so that differences between runs show too little of the errors that missing views cause."""
+        missing = _USUAL_VIEWS / max(views / max(grid.shape[1:]), _FEWEST_VIEWS)
+        return 1 + self.sparse * (missing - 1) if missing > 1 else missing**self.dense
 
     def for_views(self, views: int, grid: Grid) -> "Law":
         """Returns the law with shape, noise and slope times ``factor``. ``density`` stays: it multiplies the others' sum."""

@@ -113,11 +113,11 @@ def test_bars_follow_slopes_density_shape_and_noise() -> None:
     assert np.sqrt(np.mean(spread(0 * one, 3 + one, 3 - one, LAW)[inner] ** 2)) == pytest.approx(10**0.5, rel=0.1)
 
 
-def test_bars_are_wider_with_few_views_for_the_grid() -> None:
-    """They stay from 25 views of 64 voxels on, the longer side of a slice. Fewer than 0.1 a voxel count as so many."""
-    law, grid = replace(LAW, sparse=0.25, slope=1.0), Grid((9, 32, 64), (1.0,) * 3)
+def test_bars_are_wider_with_few_views_for_the_grid_and_narrower_with_many() -> None:
+    """The factor is 1 with 25 views of 64 voxels, the longer side of a slice. Fewer than 0.1 a voxel count as so many."""
+    law, grid = replace(LAW, sparse=0.25, dense=0.5, slope=1.0), Grid((9, 32, 64), (1.0,) * 3)
     volume, one, two = np.random.default_rng(1).random((3, 8, 8, 8))
-    for views, times in ((25, 1.0), (50, 1.0), (10, 1.375), (1, 0.75 + 0.25 * 25 / 6.4)):
+    for views, times in ((25, 1.0), (100, 0.5), (10, 1.375), (1, 0.75 + 0.25 * 25 / 6.4)):
         bars = spread(volume, one, two, law.for_views(views, grid))
         np.testing.assert_allclose(bars, times * spread(volume, one, two, law), rtol=1e-6)
 
