@@ -158,9 +158,7 @@ def test_from_file_to_file(rt, scan, method, tmp_path, capsys) -> None:
     assert METHODS[method].is_resumable and list(METHODS[method].presets) == ["default", "published"]
     save_scan(tmp_path / "scan.h5", scan)
     settings = [f"--set={name}={value}" for name, value in SHORT[method].items() if name != "iterations"]
-    command = [
-        "reconstruct", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "volume.h5"), "--method", method,
-    ]
+    command = ["reconstruct", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "volume.h5"), "--method", method]
     assert load_cli().run([*command, *settings, "--iterations", "2", "--motion", "per-row"]) == 0
     assert "PSNR" in capsys.readouterr().out
     stored = read_volume(tmp_path / "volume.h5")

@@ -92,9 +92,7 @@ def test_smooth_fields_and_their_means_over_an_exposure(rays) -> None:
     ]:  # fmt: skip
         assert expected.max() > 0.2
         assert np.abs(integrals(field, rays, jitter) - expected).max() <= RAY_SAMPLES * expected.max()
-        mean, found = (
-            expected.reshape(-1, 5).mean(1), integrals(field, rays, "ray", times=5).reshape(-1, 5).mean(1),
-        )
+        mean, found = (expected.reshape(-1, 5).mean(1), integrals(field, rays, "ray", times=5).reshape(-1, 5).mean(1))
         assert np.abs(found - mean).max() <= RAY_SAMPLES * mean.max()
 
 
@@ -128,9 +126,7 @@ def test_rays_are_those_of_the_cells(scan) -> None:
             }
             assert {tuple(np.round(s, 6)) for s in source[number]} == expected
             for s, d in zip(source[number], direction[number], strict=True):
-                cell = next(
-                    c for c in serving if np.allclose((table.pose[c, :3] - centre) / grid.half_longest_mm, s)
-                )
+                cell = next(c for c in serving if np.allclose((table.pose[c, :3] - centre) / grid.half_longest_mm, s))
                 pixel = pixel_centres(table.pose[cell], scan.geometry.detector_shape)[row, column]
                 wanted = pixel - table.pose[cell, :3]
                 assert np.allclose(d, wanted / np.linalg.norm(wanted), atol=1e-12)

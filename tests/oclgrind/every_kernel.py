@@ -105,10 +105,7 @@ def cloud(count: int) -> np.ndarray:
     return rows
 
 
-OPTIONS = {
-    "exact": {}, "affine, whole": {"affine": True, "cutoff_sigma": 0.0},
-    "intensity": {"intensity_unit": 2.0},
-}
+OPTIONS = {"exact": {}, "affine, whole": {"affine": True, "cutoff_sigma": 0.0}, "intensity": {"intensity_unit": 2.0}}
 MODELS: dict[str, Callable[..., TimeCells]] = {
     "still": static_cells, "micro-views": lambda *where: micro_view_cells(*where, 2, 2),
     "moving": lambda *where: exact_cells(*where, 2),

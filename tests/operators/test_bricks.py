@@ -35,11 +35,10 @@ AXES = pytest.mark.parametrize("axis", ["rows", "columns"])
 Z_ONLY, Z_AND_Y = 320_000, 130_000  # bytes of room for TALL: cuts along z, and along both
 
 
-@pytest.mark.parametrize(
-    ("motion", "axis", "nbytes"),
-    [("static", "rows", Z_ONLY), ("static", "columns", Z_AND_Y),
-     ("per line", "columns", Z_ONLY), ("per line", "rows", Z_AND_Y)],
-)
+@pytest.mark.parametrize(("motion", "axis", "nbytes"), [
+    ("static", "rows", Z_ONLY), ("static", "columns", Z_AND_Y), ("per line", "columns", Z_ONLY),
+    ("per line", "rows", Z_AND_Y),
+])  # fmt: skip
 def test_rays(two_rt, motion, axis, nbytes) -> None:
     cells = tables(motion, SHAPE, axis, frames=5)
     operator = RayOperator(two_rt, TALL, SHAPE, cells)
@@ -78,11 +77,10 @@ def test_indices_of_64_bits_change_nothing_in_bricks(two_rt, monkeypatch) -> Non
         assert_near(long.adjoint(expected), back, BRICKS)
 
 
-@pytest.mark.parametrize(
-    ("pixels", "tilt", "axis"),
-    [((13, 18), 0.0, ""), ((13, 18), 0.05, ""), ((700, 7), 0.0, ""), ((13, 18), 0.0, "rows"), ((13, 18), 0.0, "columns")],
-    ids=["upright", "tilted", "blocks along z", "rows", "columns"],
-)
+@pytest.mark.parametrize(("pixels", "tilt", "axis"), [
+    ((13, 18), 0.0, ""), ((13, 18), 0.05, ""), ((700, 7), 0.0, ""), ((13, 18), 0.0, "rows"),
+    ((13, 18), 0.0, "columns"),
+], ids=["upright", "tilted", "blocks along z", "rows", "columns"])  # fmt: skip
 def test_backprojection(two_rt, make_geometry, pixels, tilt, axis) -> None:
     """Of frames, and of lines that have poses of their own."""
     grid, rng, count = Grid((11, 9, 19), (0.12, 0.2, 0.1)), np.random.default_rng(94), 9 if axis else 67
@@ -127,9 +125,8 @@ def test_a_refused_buffer_is_asked_for_once_more_in_bricks(
     calls = {
         "forward": lambda: RayOperator(rt, TALL, SHAPE, cells).forward(x),
         "adjoint": lambda: RayOperator(rt, TALL, SHAPE, cells).adjoint(y),
-        "fdk": lambda: backproject(rt, y, pose, np.ones(3), TALL),
-        "voxels": lambda: voxelise(rt, cloud, TALL),
-    }
+        "fdk": lambda: backproject(rt, y, pose, np.ones(3), TALL), "voxels": lambda: voxelise(rt, cloud, TALL),
+    }  # fmt: skip
     for call in calls.values():
         expected = call()
         caplog.clear()
@@ -177,11 +174,10 @@ def on_device(rt, call, values: np.ndarray) -> np.ndarray:
     return rt.download(found)
 
 
-@pytest.mark.parametrize(
-    ("motion", "grid", "axis"),
-    [("static", UPRIGHT, "rows"), ("static", UPRIGHT, "columns"),
-     ("per line", TALL, "columns"), ("micro-views", TALL, "rows")],
-)
+@pytest.mark.parametrize(("motion", "grid", "axis"), [
+    ("static", UPRIGHT, "rows"), ("static", UPRIGHT, "columns"), ("per line", TALL, "columns"),
+    ("micro-views", TALL, "rows"),
+])  # fmt: skip
 def test_rays_of_arrays_on_the_device(two_rt, motion, grid, axis) -> None:
     operator = RayOperator(two_rt, grid, SHAPE, tables(motion, SHAPE, axis, frames=4))
     for part in (operator, operator.subset([2, 0])):

@@ -35,13 +35,11 @@ def test_frames_and_volumes_are_the_twins(any_rt, motion) -> None:
     check_twins(RayOperator(any_rt, GRID, SHAPE, tables(motion, SHAPE, "columns", -1, frames=2)))
 
 
-@pytest.mark.parametrize(
-    ("motion", "shape", "beam"),
-    [
-        ("static", (1, 37), "cone"), ("micro-views", (1, 37), "cone"), ("per line", (1, 37), "cone"),
-        ("per line", (3, 40), "parallel"), ("per line at one time", (3, 40), "parallel"), ("common", (3, 40), "parallel"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("motion", "shape", "beam"), [
+    ("static", (1, 37), "cone"), ("micro-views", (1, 37), "cone"), ("per line", (1, 37), "cone"),
+    ("per line", (3, 40), "parallel"), ("per line at one time", (3, 40), "parallel"),
+    ("common", (3, 40), "parallel"),
+])  # fmt: skip
 def test_columns_of_few_rows(two_rt, motion, shape, beam) -> None:
     """Vectors run over columns that have weights of their own, and over the ends of their cells."""
     operator = RayOperator(two_rt, GRID, shape, tables(motion, shape, "columns", -1, 2, beam=beam))

@@ -122,13 +122,10 @@ def test_intensities(cpu_rt, motion) -> None:
     assert_frames(IntensityOperator(cpu_rt, GRID, TALL_PANEL, cells).expected(x), cells, x, model="intensity")
 
 
-@pytest.mark.parametrize(
-    ("motion", "axis", "lean_deg", "shape"),
-    [
-        ("static", "rows", (0.01, 0.0), (85, 40)), ("static", "rows", (5.0, -6.0), (40, 131)),
-        ("common", "rows", (-5.0, 3.0), (85, 40)), ("common", "columns", (0.3, 0.5), (40, 131)),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("motion", "axis", "lean_deg", "shape"), [
+    ("static", "rows", (0.01, 0.0), (85, 40)), ("static", "rows", (5.0, -6.0), (40, 131)),
+    ("common", "rows", (-5.0, 3.0), (85, 40)), ("common", "columns", (0.3, 0.5), (40, 131)),
+])  # fmt: skip
 def test_panels_that_lean(cpu_rt, motion, axis, lean_deg, shape) -> None:
     """Frames and adjoint; some columns have rays of both main axes."""
     grid = Grid((19, 14, 23), (0.11, 0.13, 0.08), (0.0, -0.05, 0.1))

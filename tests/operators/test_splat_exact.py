@@ -66,15 +66,10 @@ def error_of_peak(image: np.ndarray, rows: np.ndarray, pose: np.ndarray) -> floa
     return float(max(errors) / peak)
 
 
-@pytest.mark.parametrize(
-    ("smallest_px", "aspects", "tolerance"),
-    [
-        ((0.5, 15.0), (1.0, 3.0, 10.0), SPLAT_COMPACT),
-        ((0.1, 1.0), (30.0, 100.0, 300.0, 1000.0), SPLAT_NEEDLE),
-        ((0.02, 0.3), (1.0, 10.0, 1000.0), SPLAT_NEEDLE),
-    ],
-    ids=["compact", "needles", "below a pixel"],
-)
+@pytest.mark.parametrize(("smallest_px", "aspects", "tolerance"), [
+    ((0.5, 15.0), (1.0, 3.0, 10.0), SPLAT_COMPACT), ((0.1, 1.0), (30.0, 100.0, 300.0, 1000.0), SPLAT_NEEDLE),
+    ((0.02, 0.3), (1.0, 10.0, 1000.0), SPLAT_NEEDLE),
+], ids=["compact", "needles", "below a pixel"])  # fmt: skip
 def test_single_gaussians_on_512_pixels(two_rt, one_cell, smallest_px, aspects, tolerance) -> None:
     rng = np.random.default_rng(11)
     projector = SplatProjector(two_rt, SIDE, SIDE, cutoff_sigma=0.0)

@@ -4,15 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from kernel_kit import (
-    MODELS,
-    READOUTS,
-    assert_classes,
-    assert_near,
-    by_gaussian,
-    frame_cells,
-    random_weights,
-)
+from kernel_kit import MODELS, READOUTS, assert_classes, assert_near, by_gaussian, frame_cells, random_weights
 from tolerances import CUTOFF_EDGE_SIGMA, FLOAT64, GRADIENT
 
 from phyradgs_cl.acquisition import Shutter
@@ -46,9 +38,7 @@ def device_gradients(rt, rows: np.ndarray, table: TimeCells, h: np.ndarray, **op
 
 
 def expected_gradients(finite_differences, rows, table, h, affine: bool = False) -> np.ndarray:
-    return by_gaussian(
-        finite_differences, lambda r: (h * splat_frame(r, table, SHAPE, affine=affine)).sum(), rows
-    )
+    return by_gaussian(finite_differences, lambda r: (h * splat_frame(r, table, SHAPE, affine=affine)).sum(), rows)
 
 
 @MODELS

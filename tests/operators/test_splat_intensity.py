@@ -26,9 +26,7 @@ MakeTable = Callable[..., TimeCells]
 @pytest.fixture
 def make_table(make_geometry) -> MakeTable:
     geometry = make_geometry(*SHAPE, offset=(0.15, -0.25))
-    return lambda motion, *readout: frame_cells(
-        motion, geometry, shutter=Shutter(0.8, 0.6, *readout), speed=0.9
-    )
+    return lambda motion, *readout: frame_cells(motion, geometry, shutter=Shutter(0.8, 0.6, *readout), speed=0.9)
 
 
 @remembered
@@ -58,13 +56,10 @@ def projector(rt: Runtime, table: TimeCells, **options: object) -> SplatProjecto
     return SplatProjector(rt, *table.readout.shape(SHAPE), **options)
 
 
-@pytest.mark.parametrize(
-    ("motion", "axis", "direction"),
-    [
-        ("static", "rows", 1), ("micro-views", "columns", -1), ("exact", "rows", 1), ("exact", "columns", -1),
-        ("per-row", "rows", 1),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("motion", "axis", "direction"), [
+    ("static", "rows", 1), ("micro-views", "columns", -1), ("exact", "rows", 1), ("exact", "columns", -1),
+    ("per-row", "rows", 1),
+])  # fmt: skip
 def test_frames_are_the_twins(two_rt, make_cloud, make_table, motion, axis, direction) -> None:
     rows, table = make_cloud(5, 61, scale=(0.05, 0.2)), make_table(motion, axis, direction)
     cells, units = DeviceCells.upload(two_rt, table), ({}, {"intensity_unit": None})
@@ -76,10 +71,9 @@ def test_frames_are_the_twins(two_rt, make_cloud, make_table, motion, axis, dire
     assert (gap.max() > 0.02) == (motion != "static")
 
 
-@pytest.mark.parametrize(
-    ("motion", "affine"),
-    [("static", False), ("micro-views", True), ("exact", False), ("exact", True), ("per-row", False)],
-)
+@pytest.mark.parametrize(("motion", "affine"), [
+    ("static", False), ("micro-views", True), ("exact", False), ("exact", True), ("per-row", False),
+])  # fmt: skip
 def test_gradients(two_rt, make_cloud, make_table, finite_differences, motion, affine) -> None:
     """Shares depend on all Gaussians together, so that differences are taken of the whole cloud."""
     rows, table, h = make_cloud(2, 62, scale=(0.08, 0.3)), make_table(motion), random_weights(SHAPE)

@@ -15,10 +15,9 @@ from phyradgs_cl.runtime import Runtime
 
 pytestmark = pytest.mark.slow
 DIVIDED = {
-    "four frames per step": OPTIONS,
-    "exact in time": replace(OPTIONS, motion=Exact()),
+    "four frames per step": OPTIONS, "exact in time": replace(OPTIONS, motion=Exact()),
     "intensities": replace(OPTIONS, detector_model="intensity"),
-}
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")

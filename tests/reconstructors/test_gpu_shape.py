@@ -28,16 +28,15 @@ RUNS = [
     ("phyradgs", {**SPLATS, "motion": "exact"}),
     ("phyradgs", {**SPLATS, "motion": "micro-views", "strips": 3, "sub_intervals": 2}),
     ("r2", {**SPLATS, "motion": "static"}), ("fdk", {"motion": "static"}), ("fdk", {"motion": "per-row"}),
-    ("asd-pocs", {"iterations": 2, "motion": "static"}),
-    ("fista-tv", {"iterations": 2, "motion": "static"}),
+    ("asd-pocs", {"iterations": 2, "motion": "static"}), ("fista-tv", {"iterations": 2, "motion": "static"}),
     ("fista-tv", {"iterations": 1, "motion": "per-row"}),
     ("fista", {"iterations": 1, "motion": "per-row", "prior": "ridge"}),
     ("fista", {"iterations": 4, "motion": "static", "prior": "dct"}),
     ("changing", {"iterations": 2, "states": 2}),
     ("sirt", {"iterations": 2, "motion": "per-row", "moving": True}),
-    ("phyradgs", {**SPLATS, "motion": "exact", "moving": True}),
-    ("fdk", {"motion": "static", "moving": True}), ("fdk", {"motion": "per-row", "moving": True}),
-]
+    ("phyradgs", {**SPLATS, "motion": "exact", "moving": True}), ("fdk", {"motion": "static", "moving": True}),
+    ("fdk", {"motion": "per-row", "moving": True}),
+]  # fmt: skip
 # An object that moves between two states during the scan.
 FIELD = Deformation(
     0.1 * np.random.default_rng(0).normal(size=(2, 6, 6, 6, 3)), (-1.5,) * 3, 0.6, np.array([0.0, 16.0]), np.eye(2)

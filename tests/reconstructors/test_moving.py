@@ -16,11 +16,7 @@ from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, plan_run, r
 from phyradgs_cl.reconstructors.moving import motion_line
 from phyradgs_cl.reconstructors.moving import signal as signals
 from phyradgs_cl.reconstructors.moving.method import FieldSearch, coarse_scan, initial_field
-from phyradgs_cl.reconstructors.moving.signal import (
-    MotionSignal,
-    TemporalSplines,
-    motion_signal,
-)
+from phyradgs_cl.reconstructors.moving.signal import MotionSignal, TemporalSplines, motion_signal
 from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress
 
 pytestmark = pytest.mark.slow

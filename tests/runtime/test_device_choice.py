@@ -14,8 +14,7 @@ from phyradgs_cl.runtime.device import DEVICE_VARIABLE, choose_device, list_devi
 def fake_device(name: str, kind: str = "cpu", **changes: object) -> SimpleNamespace:
     types = {"cpu": cl.device_type.CPU, "gpu": cl.device_type.GPU, "accelerator": cl.device_type.ACCELERATOR}
     facts = {
-        "name": name, "version": "OpenCL 3.0", "type": types[kind], "available": True,
-        "compiler_available": True,
+        "name": name, "version": "OpenCL 3.0", "type": types[kind], "available": True, "compiler_available": True,
         "max_compute_units": 8, "global_mem_size": 1 << 33, "max_mem_alloc_size": 1 << 31, "extensions": "",
         "native_vector_width_float": 8, "native_vector_width_double": 4, "host_unified_memory": kind == "cpu",
         "int_ptr": 0,

@@ -48,13 +48,10 @@ def test_threads_launch_the_same_kernel_with_their_own_arguments(rt, monkeypatch
     assert rt.ledger.held_bytes == before
 
 
-@pytest.mark.parametrize(
-    ("shape", "sides"),
-    [
-        ((64, 5), (64, 1)), ((16, 16, 16), (16, 4, 1)), ((16, 6, 4), (16, 2, 2)), ((17, 4), (32, 2)), ((5, 3), (64, 1)),
-        ((3,), (64,)),
-    ],
-)
+@pytest.mark.parametrize(("shape", "sides"), [
+    ((64, 5), (64, 1)), ((16, 16, 16), (16, 4, 1)), ((16, 6, 4), (16, 2, 2)), ((17, 4), (32, 2)),
+    ((5, 3), (64, 1)), ((3,), (64,)),
+])  # fmt: skip
 def test_a_gpu_group_fills_other_axes_where_the_first_is_short(parts, shape, sides) -> None:
     rt = Runtime(**GPU)
     rt.launch(rt.kernel("rates", "multiply_add"), shape, 3, 0.5, rt.zeros(64), group=64)

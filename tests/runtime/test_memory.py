@@ -16,10 +16,7 @@ from phyradgs_cl.runtime.memory import MemoryLedger
 
 
 def test_sizes() -> None:
-    sizes = {
-        "2GiB": 2 << 30, "2gb": 2 * 10**9, "1.5 G": 3 << 29, "512M": 512 << 20, " 64 kib ": 65_536,
-        "100B": 100,
-    }
+    sizes = {"2GiB": 2 << 30, "2gb": 2 * 10**9, "1.5 G": 3 << 29, "512M": 512 << 20, " 64 kib ": 65_536, "100B": 100}
     for text, nbytes in {**sizes, "4096": 4096, 4096: 4096}.items():
         assert bytes_of(text, "--memory") == nbytes, text
     for text in ("", "GiB", "-1G", "0", "0.0MiB", "2 GiBs", "two", "1e3", "nan", "1" * 40, True, "2,5G"):
