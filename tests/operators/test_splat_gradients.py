@@ -51,14 +51,6 @@ def test_every_class_of_parameters(any_rt, make_cloud, make_geometry, finite_dif
     assert_classes(found, expected_gradients(finite_differences, rows, table, h, affine), GRADIENT)
 
 
-def test_quaternion_gradient_is_tangent(rt, make_cloud, make_table) -> None:
-    rows = make_cloud(6, 23)
-    found = device_gradients(rt, rows, make_table("micro-views"), random_weights(SHAPE))
-    along = (found[QUATERNION] * rows[QUATERNION]).sum(axis=0)
-    assert np.abs(along).max() <= GRADIENT * np.abs(found[QUATERNION]).max()
-    assert np.abs(found[QUATERNION]).max() > 0
-
-
 ROUNDING = 1 + 3e-6 * np.array([[1.0], [0.0], [-1.0]])  # what three equal steps of Adam may leave
 ROUNDED = [("static", {}), ("micro-views", {"affine": True}), ("exact", {}), ("exact", {"affine": True})]
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kernel_kit import assert_classes, assert_near, frame_cells, note_launches, random_weights
+from kernel_kit import assert_classes, assert_near, frame_cells, random_weights
 from remembered import remembered
 from tolerances import GRADIENT, INTENSITY_FRAME, SPLAT_CLOUD
 
@@ -95,9 +95,3 @@ def test_thin_and_opaque_objects_and_none(any_rt, make_cloud, make_table) -> Non
     frame = opaque.project(rows, cells)
     assert_near(frame, twin(rows, table, 1e4), SPLAT_CLOUD, frame.max())
     assert np.isfinite(opaque.project_adjoint(rows, cells, np.ones(SHAPE, np.float32))).all()
-
-
-def test_launches_do_not_grow_with_the_cells(banded_rt, make_cloud, make_table, monkeypatch) -> None:
-    names, table = note_launches(monkeypatch), make_table("exact")
-    projector(banded_rt, table).project(make_cloud(4, 65), DeviceCells.upload(banded_rt, table))
-    assert names.count("splat_forward_rows") == 1 and names.count("intensity_merge") == 1

@@ -113,16 +113,6 @@ def test_subsets_are_rows_and_devices_agree_with_the_host(rt) -> None:
     np.testing.assert_array_equal(rt.download(part.adjoint(rt.upload(y))), part.adjoint(y))
 
 
-def test_an_object_at_rest_has_the_bits_of_today(rt) -> None:
-    """Also one that has moved by zero before it is projected; splines of its backprojections round."""
-    cells, x, y = tables(), noise(GRID.shape), noise((4, *SHAPE))
-    plain, at_rest = RayOperator(rt, GRID, SHAPE, cells), deformation(0.0)
-    assert isinstance(projector_of(rt, GRID, cells, at_rest)(rt, GRID, SHAPE, cells), RayOperator)
-    operator = WarpedOperator(rt, GRID, SHAPE, cells, warp=VolumeWarp(rt, states_of(at_rest)))
-    np.testing.assert_array_equal(operator.forward(x), plain.forward(x))
-    assert_near(operator.adjoint(y), plain.adjoint(y), FLOAT32)
-
-
 def test_a_rigid_field_is_a_moved_scanner(rt) -> None:
     """Of whole voxels: the object at y is what the reference has at y + w, as a scanner sees it that is w further."""
     shift_mm = np.array([3 * 0.1, -0.25, 2 * 0.2])  # x, y, z

@@ -113,15 +113,6 @@ def test_the_faded_and_the_lost_are_pruned(population) -> None:
         assert (5.0 in pruned.moments[0, 0]) == kept, (row, value)
 
 
-def test_the_seed_decides_and_the_caller_keeps_his_population(population) -> None:
-    raw, moments = population.raw.copy(), population.moments.copy()
-    one, same, other = (run(population, [2, 2, 0, 2, 2], seed=seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one.raw, same.raw)
-    assert np.any(one.raw != other.raw)
-    np.testing.assert_array_equal(population.raw, raw)
-    np.testing.assert_array_equal(population.moments, moments)
-
-
 def test_when_it_acts() -> None:
     control = DensityControl(every=100, start_iteration=500, stop_fraction=0.75)
     due = [i for i in range(1, 2001) if control.is_due(i, 2000)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from balls import frames_of
 from scipy.spatial.transform import Rotation
-from tolerances import FDK_MEAN, FLOAT32
+from tolerances import FDK_MEAN, FLOAT32, FLOAT64, RAMP
 
 from phyradgs_cl import acquisition
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan, Shutter, Static
@@ -14,7 +14,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.prepare.step import fill_masked
-from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume, static_fdk
+from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume, ramp_filter, ramp_spectrum, static_fdk
 
 VIEWS, PIXELS, VOXELS = 90, 48, 32
 
@@ -85,11 +85,12 @@ def test_masked_pixels_are_filled_along_their_row() -> None:
     assert spoiled.max() == 1e6  # the caller's frames are left alone
 
 
-def test_orbits_that_are_no_circle_about_z_are_told_and_refused(rt, caplog) -> None:
-    """A circle, displaced, short, jittered or off by a pixel, is none of them. What is right is not spoken of."""
+def test_orbits_that_are_no_circle_about_z_and_rows_off_its_plane_are_told_and_refused(rt, caplog) -> None:
+    """A circle, displaced, jittered or turned over, is none of them. What is right is not spoken of. Of a panel on its side
+    the volume was zero, without a word."""
     geometry = ConeGeometry(5.0, 7.0, (12, 12), (0.3, 0.3))
     angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
-    circle = geometry.pose(angle)
+    circle, displaced = geometry.pose(angle), replace(geometry, detector_offset_mm=(0.0, 0.9))
 
     def lifted(feed_mm: float) -> np.ndarray:
         return circle + np.outer(feed_mm * (angle / np.pi - 1), np.eye(12)[2] + np.eye(12)[5])
@@ -101,40 +102,67 @@ def test_orbits_that_are_no_circle_about_z_are_told_and_refused(rt, caplog) -> N
         beam = turned("y", -deg, geometry.pose(0.0))[0].reshape(4, 3)
         return np.concatenate([(beam @ Rotation.from_euler("z", a).as_matrix().T).reshape(1, 12) for a in angle])
 
-    cases = {
-        "circle": (circle, 0), "half-fan": (replace(geometry, detector_offset_mm=(0.0, 0.9)).pose(angle), 0),
-        "shaken": (circle + 0.05 * np.random.default_rng(0).normal(size=(20, 1)) * np.eye(12)[3], 0),
-        "helix": (lifted(1.0), 1), "laminography": (tilted(20), 1), "steep": (tilted(50), 2),
-        "about y": (turned("x", 90), 2),
-    }  # fmt: skip
-    off, above = "off a circle about z", "above the middle of their circle"
-    wrong = {"helix": (off,), "laminography": (above,), "steep": (above,), "about y": (off,)}
-    for name, (poses, worst) in cases.items():
+    def rolled(deg: float) -> np.ndarray:
+        source, corner, across, up = circle.reshape(-1, 4, 3).swapaxes(0, 1)
+        c, s = np.cos(np.deg2rad(deg)), np.sin(np.deg2rad(deg))
+        u, v = c * across + s * up, c * up - s * across
+        return np.stack([source, corner + 5.5 * (across + up - u - v), u, v], 1).reshape(-1, 12)
+
+    off, above, rows = "off a circle about z", "above the middle of their circle", "detector rows"
+    for name, poses, said, is_refused in (
+        ("circle", circle, None, False), ("half-fan", displaced.pose(angle), None, False),
+        ("shaken", circle + 0.05 * np.random.default_rng(0).normal(size=(20, 1)) * np.eye(12)[3], None, False),
+        ("helix", lifted(1.0), off, False), ("laminography", tilted(20), above, False), ("steep", tilted(50), above, True),
+        ("about y", turned("x", 90), off, True), ("by 1°", rolled(1.0), None, False), ("by 5°", rolled(5.0), rows, False),
+        ("half", rolled(45.0), rows, True), ("on a side", rolled(90.0), rows, True), ("over", rolled(180.0), None, False),
+        ("the other side", rolled(-90.0), rows, True),
+    ):  # fmt: skip
         caplog.clear()
         scan = Scan.from_poses(np.ones((20, 12, 12), np.float32), poses, Grid.cube(8, 1.0))
-        if worst == 2:
-            with pytest.raises(InputError, match="any orbit") as refusal:
-                fdk(scan, FdkOptions(), rt)
-            text = refusal.value.found
-        else:
+        try:
             fdk(scan, FdkOptions(), rt)
-            text = caplog.text
-        assert tuple(words for words in (off, above) if words in text) == wrong.get(name, ()), (name, text)
+            refusal = None
+        except InputError as error:
+            refusal = error
+            assert ("off the plane of the rotation" if said == rows else "any orbit") in str(error), name
+        text = refusal.found if refusal else caplog.text
+        assert [words for words in (off, above, rows) if words in text] == [said] * bool(said), (name, text)
+        assert bool(refusal) == is_refused, name
 
 
-def test_rows_along_the_axis_are_refused(rt, caplog) -> None:
-    """FDK filters along detector rows: of a panel on its side the volume was zero, without a word."""
-    circle = ConeGeometry(6.0, 9.0, (12, 12), 0.5).pose(np.linspace(0, 2 * np.pi, 20, endpoint=False)).reshape(-1, 4, 3)
-    middle = circle[:, 1] + 5.5 * (circle[:, 2] + circle[:, 3])
-    for roll_deg, worst in ((1.0, 0), (5.0, 1), (45.0, 2), (90.0, 2), (180.0, 0), (-90.0, 2)):
-        caplog.clear()
-        c, s = np.cos(np.deg2rad(roll_deg)), np.sin(np.deg2rad(roll_deg))
-        u, v = c * circle[:, 2] + s * circle[:, 3], c * circle[:, 3] - s * circle[:, 2]
-        poses = np.stack([circle[:, 0], middle - 5.5 * (u + v), u, v], 1).reshape(-1, 12)
-        scan = Scan.from_poses(np.ones((20, 12, 12), np.float32), poses, Grid.cube(8, 1.0))
-        if worst == 2:
-            with pytest.raises(InputError, match="detector rows .* off the plane of the rotation"):
-                fdk(scan, FdkOptions(), rt)
-        else:
-            fdk(scan, FdkOptions(), rt)
-            assert ("detector rows" in caplog.text) == (worst == 1), roll_deg
+@pytest.mark.parametrize("width", [1, 2, 17, 64])
+def test_ramp_filter_is_a_convolution(width) -> None:
+    """Kak and Slaney's kernel h(0) = 1/4τ², h(odd n) = −1/(πnτ)², times τ, without wrapping around."""
+    spacing_mm, n, kernel = 0.37, np.arange(-(width - 1), width), np.zeros(2 * width - 1)
+    kernel[n % 2 != 0] = -1 / (np.pi * n[n % 2 != 0] * spacing_mm) ** 2
+    kernel[n == 0] = 1 / (4 * spacing_mm**2)
+    for dtype in (np.float32, np.float64):
+        rows = np.random.default_rng(63).normal(size=(3, width)).astype(dtype)
+        expected = np.stack([np.convolve(row, kernel) for row in rows])[:, width - 1 : 2 * width - 1] * spacing_mm
+        found = ramp_filter(rows, spacing_mm)
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, expected, rtol=0, atol=RAMP * np.abs(expected).max())
+
+
+def test_spectra_of_the_ramp_and_its_windows() -> None:
+    """And a row of odd length, which has no sample at that frequency."""
+    sinc = np.sin(np.pi / 4) / (np.pi / 4)
+    at = {"ram-lak": (1, 1), "shepp-logan": (sinc, 2 / np.pi), "cosine": (np.sqrt(0.5), 0), "hamming": (0.54, 0.08)}
+    for window, (quarter, nyquist) in {**at, "hann": (0.5, 0)}.items():
+        ratio = ramp_spectrum(256, window) / ramp_spectrum(256)
+        assert ratio[[0, 64, 128]] == pytest.approx([1, quarter, nyquist], rel=FLOAT64, abs=FLOAT64), window
+    ratio = ramp_spectrum(225, "hann") / ramp_spectrum(225)
+    np.testing.assert_allclose(ratio, 0.5 + 0.5 * np.cos(2 * np.pi * np.arange(113) / 225), rtol=FLOAT64)
+    spectrum = ramp_spectrum(256)
+    np.testing.assert_allclose(spectrum, np.arange(129) / 256, atol=0.01)
+    assert 0 < spectrum[0] < 0.002
+
+
+def test_noise_falls_from_window_to_window(rt) -> None:
+    geometry = ConeGeometry(6.0, 9.0, (8, 48), (0.075, 0.075))
+    pose = geometry.pose(np.arange(40) * 2 * np.pi / 40)
+    frames = np.random.default_rng(66).normal(size=(40, 8, 48)).astype(np.float32)
+    grid = Grid((2, 24, 24), (0.05, 0.06, 0.06))
+    windows = ["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]
+    noise = [fdk_volume(rt, frames, pose, grid, window=window).std() for window in windows]
+    assert all(after < 0.97 * before for before, after in zip(noise[:-1], noise[1:], strict=True))

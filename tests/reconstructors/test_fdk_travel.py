@@ -7,7 +7,7 @@ from tolerances import FDK_ENDS, FDK_PARTIAL
 
 from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Scan
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume, static_fdk
+from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume
 
 GRID = Grid((8, 26, 26), (0.06,) * 3)
 PHANTOM = balls(((0.4, 0, 0.05), 0.25), ((-0.3, 0.35, -0.05), 0.2), ((-0.2, -0.4, 0), 0.22), ((0, 0, 0), 0.2))
@@ -113,13 +113,6 @@ def test_few_views_a_turn_are_named(rt, views, said, caplog) -> None:
         caplog.clear()
         reconstructed(rt, poses_of(angle, 0.4 * (angle - angle.mean()) / (2 * np.pi)))
         assert [line[: len(said[0])] if said else line for line in caplog.messages] == said
-
-
-@pytest.mark.slow
-def test_where_other_methods_begin(rt) -> None:
-    scan = Scan.from_poses(frames_of(PHANTOM, pose := helix(3, 0.4), SHAPE), pose, GRID)
-    found = levels(PHANTOM, static_fdk(rt, scan), GRID)
-    np.testing.assert_allclose(found, reconstructed(rt, pose), atol=FDK_PARTIAL / 10)
 
 
 @pytest.mark.slow

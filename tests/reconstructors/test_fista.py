@@ -123,24 +123,6 @@ def test_the_weight_follows_what_comes_back_of_noise_and_edges(rt, scan) -> None
     assert weight(PerRow(), FrameError(0.03, 0.1), 0.4) == pytest.approx(np.hypot(noise, edges), rel=1e-6)
 
 
-def test_rays_that_are_wrong_alike_add_up_and_noise_averages(rt, scan) -> None:
-    """Of half the frames half as much of the first comes back, and √½ of the second."""
-    half = replace(scan, projections=scan.projections[::2], frame_start_s=scan.frame_start_s[::2])
-    whole, fewer = (priors.adjoint_response(System.of_scan(rt, one, Static())) for one in (scan, half))
-    assert fewer[1] == pytest.approx(whole[1] / 2, rel=0.01)
-    assert fewer[0] == pytest.approx(whole[0] / np.sqrt(2), rel=0.1)
-
-
-def test_voxels_miss_more_the_larger_they_are_and_less_behind_a_blur(scan) -> None:
-    grids = (replace(scan, grid=Grid.cube(n, 2.0), reference=None) for n in (12, 24))
-    coarse, fine = (priors.frame_error(one, Static()) for one in grids)
-    assert coarse.noise == fine.noise and coarse.edges_mm == pytest.approx(2 * fine.edges_mm)
-    smeared = 4 / 5 * np.deg2rad(18.0) * (2.0 / 4) / (2.0 / 24)  # voxels, half-way from the axis to the side
-    blurred = priors.frame_error(replace(scan, grid=Grid.cube(24, 2.0), reference=None), PerRow(5))
-    assert blurred.noise == fine.noise
-    assert blurred.edges_mm == pytest.approx(fine.edges_mm / np.sqrt(1 + smeared), rel=0.02)
-
-
 def test_the_ridge_step_follows_the_noise_in_the_weight_and_no_edges(scan, system) -> None:
     sigmas: list[float] = []
 

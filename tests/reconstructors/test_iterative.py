@@ -194,14 +194,6 @@ def run(rt, scan: Scan, method: str, **changes: object):
 
 
 @pytest.mark.parametrize("method", ITERATIVE)
-def test_knowing_the_motion_helps(rt, fly_scan, method) -> None:
-    iterations = {"sirt": 30, "os-sart": 30, "fista-tv": 40, "cgls": 6}.get(method, 8)
-    runs = (run(rt, fly_scan, method, motion=motion, iterations=iterations) for motion in ("static", "per-row"))
-    static, known = (psnr(one.volume, fly_scan.reference, float(fly_scan.reference.max())) for one in runs)
-    assert known > static + 0.3, (static, known)
-
-
-@pytest.mark.parametrize("method", ITERATIVE)
 def test_record_and_facts_and_an_interrupted_run_goes_on_with_the_same_bits(rt, fly_scan, method) -> None:
     changes: dict[str, object] = {"iterations": 6, "motion": "micro-views", "strips": 2, "sub_intervals": 2}
     changes["detector_model"] = "intensity"

@@ -1,7 +1,8 @@
-"""What is done to frames before a method sees them: lag undone or ignored, and the median filter."""
+"""What is done to frames before a method sees them, and states of checkpoints, taken only as a run has written them."""
 
 import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,14 +13,20 @@ from phyradgs_cl.detector.effects import lagged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors import Preprocessing, plan_run, preprocessing_of, reconstruct
+from phyradgs_cl.reconstructors import Preprocessing, Progress, plan_run, preprocessing_of, reconstruct
 from phyradgs_cl.reconstructors.checkpoint import RUN, with_identity
 from phyradgs_cl.reconstructors.preprocess import prepared
+from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
+from phyradgs_cl.workflow import load_scan
 
 pytestmark = pytest.mark.slow
 
 GEOMETRY = ConeGeometry(5.0, 7.0, (16, 16), (0.25, 0.25))
+
+
+def stop(progress: Progress) -> None:
+    raise KeyboardInterrupt
 
 
 @pytest.fixture(scope="module")
@@ -67,10 +74,6 @@ class Newer(Preprocessing):
 
 def test_a_checkpoint_from_before_an_option_is_taken_where_the_option_has_its_default(rt, scan) -> None:
     """Of the preprocessing, and of a step: the older checkpoint has neither."""
-
-    def stop(progress) -> None:
-        raise KeyboardInterrupt
-
     plan = plan_run("sirt", {"iterations": 3, "steps": "rings", "rings": {"window": 5}})
     state = dict(reconstruct(scan, plan, rt, report=stop).state)
     identity = json.loads(str(state.pop(RUN)))
@@ -83,3 +86,44 @@ def test_a_checkpoint_from_before_an_option_is_taken_where_the_option_has_its_de
     assert reconstruct(scan, usual, rt, resume=older).volume.any()
     with pytest.raises(InputError, match="other input.younger"):
         reconstruct(scan, replace(plan, preprocessing=Newer(steps="rings", younger=1.0)), rt, resume=older)
+
+
+def wrong_arrays(array: np.ndarray) -> dict[str, np.ndarray | None]:
+    """An array of a state in every way in which no run writes it."""
+    wrong: dict[str, np.ndarray | None] = {
+        "removed": None, "text": np.array("text"), "of another shape": np.stack([array] * 2),
+        "empty": array.reshape(-1)[:0], "complex": np.zeros(array.shape, complex), "truth": np.zeros(array.shape, bool),
+    }  # fmt: skip
+    if array.dtype.kind == "f" and array.size:
+        for number in (np.nan, np.inf, -np.inf):
+            wrong[str(number)] = array.copy()
+            wrong[str(number)].reshape(-1)[0] = number
+    return wrong
+
+
+@pytest.mark.parametrize("method", ["sirt", "cgls", "fista-tv", "os-sart", "phyradgs"])
+def test_every_array_of_a_methods_state_is_checked(rt: Runtime, tiny_scan: Path, method: str) -> None:
+    """Resumed with one array that is wrong, no method begins."""
+    changes = {"gaussians": 30, "iterations": 100, "motion": "static"} if method == "phyradgs" else {"iterations": 6}
+    scan, plan = load_scan(tiny_scan), plan_run(method, changes | ({"noise_stop": 0} if method == "cgls" else {}))
+    good = reconstruct(scan, plan, rt, report=stop).state
+    assert good is not None and reconstruct(scan, plan, rt, resume=good, report=stop).volume.any()
+    wrong = [(name, how, array) for name, values in good.items() for how, array in wrong_arrays(values).items()]
+    wrong += [("iteration", str(value), np.array(value)) for value in (-1, 10**6, 2**62)]
+    wrong += [("queue", str(value), np.array([value, 0])) for value in (-1, 4, 2**40) if "queue" in good]
+    for name, how, array in wrong:
+        if (name, how) == ("queue", "empty"):
+            continue  # a new pass begins
+        state = {other: values for other, values in (good | {name: array}).items() if values is not None}
+        with pytest.raises(InputError, match="checkpoint"):
+            reconstruct(scan, plan, rt, resume=state)
+            pytest.fail(f"taken: {name}, {how}")
+
+
+def test_a_state_of_another_version_is_refused(rt: Runtime, tiny_scan: Path) -> None:
+    scan, plan = load_scan(tiny_scan), plan_run("fista", {"iterations": 6})
+    good = reconstruct(scan, plan, rt, report=stop).state
+    assert good is not None
+    older = {name: array for name, array in good.items() if name not in ("ahead", RUN, "checksum")}
+    with pytest.raises(InputError, match="found a run of another version, without ahead"):
+        reconstruct(scan, plan, rt, resume=with_identity(older, json.loads(str(good[RUN]))))

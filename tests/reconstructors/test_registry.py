@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from refusals import assert_refused
 
+from phyradgs_cl import neural
+from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.acquisition import Exact, MicroViews, Scan, Static, TimeCells
-from phyradgs_cl.api import simulate
+from phyradgs_cl.api import save_scan, simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import METHODS, method_options, plan_run, reconstruct
 from phyradgs_cl.reconstructors.plan import _models
@@ -138,3 +140,16 @@ def test_strips_mean_micro_views_where_the_motion_is_exact() -> None:
     with pytest.raises(InputError, match="--strips|--segments"):  # counts of two models
         method_options("phyradgs", None, {"strips": 4, "segments": 3})
     assert method_options("sirt", None, {"strips": 4}).motion.name == "micro-views"
+
+
+@pytest.mark.parametrize("method", ["naf", "sax-nerf"])
+def test_a_run_says_in_one_line_what_to_install(rt, method, tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(neural, "has_torch", lambda: False)
+    scan = simulate("jaw", size=8, detector=12, views=3, device=rt)
+    with pytest.raises(InputError, match=f"--method {method}: found no PyTorch"):
+        reconstruct(scan, plan_run(method), rt)
+    save_scan(tmp_path / "scan.h5", scan)
+    command = ["reconstruct", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "out.h5"), "--method", method]
+    assert load_cli().run(command) == 2 and not (tmp_path / "out.h5").exists()
+    (said,) = (line for line in capsys.readouterr().err.splitlines() if "PyTorch" in line)
+    assert 'pip install "phyradgs-cl[neural]"' in said
