@@ -68,27 +68,27 @@ def test_frames_are_the_twins(cpu_rt, monkeypatch, motion, shape) -> None:
     assert_frames(frames, cells, x, shape)
 
 
-@pytest.mark.parametrize("voxels", [(1, 1, 1), (1, 33, 2), (40, 1, 17), (530, 3, 3)])
-def test_odd_volumes(cpu_rt, voxels) -> None:
+CLOSE = Grid((9, 30, 30), (0.05, 2 / 30, 2 / 30))
+ODD = [Grid(voxels, (1.9 / voxels[0], 0.2, 0.3)) for voxels in ((1, 1, 1), (1, 33, 2), (40, 1, 17), (530, 3, 3))]
+
+
+@pytest.mark.parametrize(("grid", "source_mm"), [*((grid, 5.0) for grid in ODD), (CLOSE, 0.4), (CLOSE, 1.3)])
+def test_odd_volumes_and_a_source_inside_or_close_to_one(cpu_rt, grid, source_mm) -> None:
     """Also one higher than what a work-item blends of it."""
-    grid, cells = Grid(voxels, (1.9 / voxels[0], 0.2, 0.3)), tables("static", TALL_PANEL, frames=3)
-    assert assert_same_bits(cpu_rt, grid, cells, noise(voxels, 102)).any()
+    cells = tables("static", TALL_PANEL, source_mm=source_mm)
+    assert assert_same_bits(cpu_rt, grid, cells, noise(grid.shape, 102)).any()
 
 
-@pytest.mark.parametrize("source_mm", [0.4, 1.3])
-def test_source_inside_or_close_to_the_volume(cpu_rt, source_mm) -> None:
-    grid, cells = Grid((9, 30, 30), (0.05, 2 / 30, 2 / 30)), tables("static", TALL_PANEL, source_mm=source_mm)
-    assert_same_bits(cpu_rt, grid, cells, noise(grid.shape, 103))
-
-
-def test_lines_without_cells_are_zero(banded_rt) -> None:
+def test_lines_without_cells_are_zero_and_give_nothing(banded_rt) -> None:
     whole, x = tables("micro-views", TALL_PANEL, frames=1)[0], noise(GRID.shape, 104)
     keep = whole.line_start != 17
     parts = {n: getattr(whole, n)[keep] for n in ("pose", "time_s", "line_start", "line_stop", "weight")}
-    cells = [replace(whole, **parts)]
+    cells, y = [replace(whole, **parts)], noise((1, *TALL_PANEL), 109)
     frames = RayOperator(banded_rt, GRID, TALL_PANEL, cells).forward(x)
     assert_frames(frames, cells, x)
     assert not frames[0, 17:34].any() and frames[0, :17].any() and frames[0, 34:].any()
+    for some in (cells, [whole]):
+        assert_volume(RayOperator(banded_rt, GRID, TALL_PANEL, some).adjoint(y), some, y)
 
 
 def test_a_subset_and_batches_of_frames(banded_rt) -> None:
@@ -128,7 +128,7 @@ def test_intensities(cpu_rt, motion) -> None:
 ])  # fmt: skip
 def test_panels_that_lean(cpu_rt, motion, axis, lean_deg, shape) -> None:
     """Frames and adjoint; some columns have rays of both main axes."""
-    grid = Grid((19, 14, 23), (0.11, 0.13, 0.08), (0.0, -0.05, 0.1))
+    grid = replace(GRID, offset_mm=(0.0, -0.05, 0.1))
     cells = leaning(tables(motion, shape, axis, frames=2, direction=-1), *lean_deg)
     operator = RayOperator(cpu_rt, grid, shape, cells)
     assert operator._upright is not None and operator._upright.leans
@@ -182,14 +182,6 @@ def test_the_adjoint_is_the_twins(cpu_rt, monkeypatch, case) -> None:
         found = RayOperator(cpu_rt, grid, shape, cells).adjoint(y)
     assert set(launched) == {"split_slots", "rays_upright_adjoint"}
     assert_volume(found, cells, y, grid)
-
-
-def test_strips_and_lines_without_cells_go_back_too(banded_rt) -> None:
-    (cells,), y = tables("micro-views", TALL_PANEL, frames=1), noise((1, *TALL_PANEL), 109)
-    first_of_each = np.unique(cells.line_start, return_index=True)[1][[0, 2, 4]]
-    parts = {n: getattr(cells, n)[first_of_each] for n in ("pose", "time_s", "line_start", "line_stop", "weight")}
-    for table in (replace(cells, **parts), cells):
-        assert_volume(RayOperator(banded_rt, GRID, TALL_PANEL, [table]).adjoint(y), [table], y)
 
 
 def test_the_adjoints_bits_do_not_tell_of_bricks_batches_or_where_frames_are(banded_rt) -> None:

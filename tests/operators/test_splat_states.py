@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kernel_kit import MODELS, assert_classes, assert_near, by_gaussian, frame_cells, random_weights, splat
+from kernel_kit import assert_classes, assert_near, by_gaussian, frame_cells, random_weights, splat
 from scipy.spatial.transform import Rotation
 from tolerances import FLOAT32, GRADIENT, MERGED_FRAME, SPLAT_MOVING
 
@@ -72,12 +72,15 @@ def test_a_cloud_in_every_state_is_its_twin(two_rt, make_cloud, make_geometry, c
 
 
 @pytest.mark.slow
-@MODELS
-@pytest.mark.parametrize(("motion", "counts"), [("micro-views", (2, 2)), ("exact", (2,))])
+@pytest.mark.parametrize(("motion", "counts", "beam", "affine"), [
+    ("micro-views", (2, 2), "cone", False), ("micro-views", (2, 2), "cone", True), ("exact", (2,), "cone", False),
+    ("exact", (2,), "cone", True), ("static", (), "parallel", False), ("exact", (1,), "parallel", False),
+])  # fmt: skip
 def test_frames_and_gradients_are_those_of_the_twin(
-    rt, make_cloud, make_geometry, finite_differences, motion, counts, affine
+    rt, make_cloud, make_geometry, finite_differences, motion, counts, beam, affine
 ) -> None:
-    table = frame_cells(motion, make_geometry(*SHAPE, offset=(0.15, -0.25)), *counts)
+    parallel = ParallelGeometry(SHAPE, (2.6 / 13, 2.7 / 18))
+    table = frame_cells(motion, make_geometry(*SHAPE, offset=(0.15, -0.25)) if beam == "cone" else parallel, *counts)
     check_frame_and_gradients(rt, finite_differences, make_cloud(2, 41, scale=(0.05, 0.3)), table, deformation(), affine)
 
 
@@ -85,15 +88,6 @@ def test_frames_and_gradients_are_those_of_the_twin(
 def test_in_every_build(any_rt, make_cloud, make_geometry, finite_differences) -> None:
     table = frame_cells("exact", make_geometry(*SHAPE), 1, shutter=Shutter(0.8, 0.6, "columns", -1))
     check_frame_and_gradients(any_rt, finite_differences, make_cloud(1, 42), table, deformation(rank=1))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("motion", ["static", "exact"])
-def test_parallel_rays(rt, make_cloud, finite_differences, motion) -> None:
-    orbit = CircularOrbit(ParallelGeometry(SHAPE, (2.6 / 13, 2.7 / 18)), ConstantSpeed(0.3, 0.5))
-    where = orbit, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0]
-    table = static_cells(*where) if motion == "static" else exact_cells(*where, 1)
-    check_frame_and_gradients(rt, finite_differences, make_cloud(1, 43), table, deformation())
 
 
 @pytest.mark.parametrize("motion", ["micro-views", "exact"])

@@ -31,7 +31,9 @@ def test_python_names_its_arguments() -> None:
         assert caught.value.subject == argument and "--" not in str(caught.value)
 
 
-def test_the_limit_holds_for_all_buffers_together() -> None:
+def test_the_limit_holds_for_all_buffers_together_and_the_environment_limits_what_no_option_does(monkeypatch) -> None:
+    monkeypatch.setenv(MEMORY_VARIABLE, "1MiB")
+    assert Runtime().ledger.limit_bytes == 1 << 20
     rt = Runtime(memory="64KiB")
     first = rt.empty(10_000)
     with pytest.raises(MemoryShortage, match=r"what is left of.*--memory or PHYRADGS_MEMORY"):
@@ -43,12 +45,6 @@ def test_the_limit_holds_for_all_buffers_together() -> None:
     with pytest.raises(MemoryShortage):
         rt.empty(16_385)
     assert rt.peak_bytes == 65_536
-
-
-def test_the_environment_limits_what_no_option_does(monkeypatch) -> None:
-    monkeypatch.setenv(MEMORY_VARIABLE, "1MiB")
-    assert Runtime().ledger.limit_bytes == 1 << 20
-    assert Runtime(memory="2MiB").ledger.limit_bytes == 2 << 20
 
 
 def test_without_a_limit_it_is_what_the_device_reports(rt) -> None:
