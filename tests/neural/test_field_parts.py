@@ -124,18 +124,6 @@ def test_bricks_of_voxels_do_not_matter_and_voxels_lie_where_the_grid_says(optio
         assert np.allclose(found, x + 10 * y + 100 * z, atol=1e-4)
 
 
-def test_a_voxel_is_the_mean_over_its_points() -> None:
-    field = first_field(NeuralOptions(), 16, 0)
-    with torch.no_grad():
-        field.encoding.table.uniform_(-1, 1)
-    grid = Grid((2, 3, 4), (0.5, 0.5, 0.5))
-    whole, size = voxel_values(field, grid, CPU, 10**6, 2), 0.25
-    fine = voxel_values(field, Grid((4, 6, 8), (size,) * 3), CPU, 10**6)
-    expected = fine.reshape(2, 2, 3, 2, 4, 2).mean((1, 3, 5))
-    assert np.allclose(whole, expected, rtol=FLOAT32)
-    assert not np.allclose(whole, voxel_values(field, grid, CPU, 10**6), rtol=0.01)
-
-
 def test_a_volume_does_not_depend_on_how_its_axes_are_called() -> None:
     """Attention couples neighbours, and voxels are to have them along every axis alike."""
     field = first_field(LineOptions(), 8, 0)

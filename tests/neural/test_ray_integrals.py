@@ -115,21 +115,16 @@ def test_rays_are_those_of_the_cells(scan) -> None:
     for axis in ("rows", "columns"):
         exposure = ExposureRays.of_cells(replace(table, axis=axis), grid)
         pixels = np.array([[0, 5], [7, 23], [23, 0], [12, 12]])
-        times = np.tile([[0, 1]], (4, 1))
-        source, direction = exposure(pixels, times)
-        for number, (row, column) in enumerate(pixels):
+        rays = exposure(pixels, np.tile([[0, 1]], (4, 1)))
+        for (row, column), source, direction in zip(pixels, *rays, strict=True):
             line = row if axis == "rows" else column
-            serving = np.flatnonzero((table.line_start <= line) & (line < table.line_stop))
-            centre = np.array(grid.offset_mm[::-1])
-            expected = {
-                tuple(np.round((table.pose[cell, :3] - centre) / grid.half_longest_mm, 6)) for cell in serving
-            }
-            assert {tuple(np.round(s, 6)) for s in source[number]} == expected
-            for s, d in zip(source[number], direction[number], strict=True):
-                cell = next(c for c in serving if np.allclose((table.pose[c, :3] - centre) / grid.half_longest_mm, s))
-                pixel = pixel_centres(table.pose[cell], scan.geometry.detector_shape)[row, column]
-                wanted = pixel - table.pose[cell, :3]
-                assert np.allclose(d, wanted / np.linalg.norm(wanted), atol=1e-12)
+            serving = table.pose[(table.line_start <= line) & (line < table.line_stop)]
+            expected = (serving[:, :3] - np.array(grid.offset_mm[::-1])) / grid.half_longest_mm
+            cells = [int(np.linalg.norm(expected - one, axis=1).argmin()) for one in source]
+            assert sorted(cells) == [0, 1] and np.allclose(source, expected[cells], atol=1e-6)
+            centres = [pixel_centres(pose, scan.geometry.detector_shape)[row, column] for pose in serving[cells]]
+            wanted = np.array(centres) - serving[cells, :3]
+            assert np.allclose(direction, wanted / np.linalg.norm(wanted, axis=1, keepdims=True), atol=1e-12)
 
 
 def test_the_way_through_the_box() -> None:

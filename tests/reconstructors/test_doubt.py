@@ -41,8 +41,11 @@ def test_the_volume_has_the_same_bits_with_error_bars_and_these_the_same_for_one
     assert not np.array_equal(one.doubt, other.doubt)
 
 
-def test_error_bars_cover_a_phantom_of_closed_form(rt, scan) -> None:
+def test_error_bars_cover_a_phantom_of_closed_form_and_their_mean_is_that_of_matter_where_noise_fills_the_air(rt) -> None:
+    scan = simulate("spheres", size=24, detector=32, views=24, noise="tigre", dose=1e3, device=rt)
     result = reconstruct(scan, "fdk", device=rt, report=False, doubt=True)
+    matter, air, mean = scan.reference > 0.1 * scan.reference.max(), scan.reference == 0, result.facts[DOUBT]["mean_per_mm"]
+    assert mean == pytest.approx(result.doubt[matter].mean(), rel=0.25) and mean > 1.3 * result.doubt[air].mean()
     covered = coverage(result.doubt, result.volume, scan.reference, result.facts[DOUBT]["multiple_95"])
     assert 0.5 < covered["within_doubt"] < 0.9 < covered["within_doubt_95"]
     assert 0.5 < covered["doubt_over_error"] < 2
@@ -212,14 +215,6 @@ def test_a_residual_far_above_the_noise_and_much_noise_are_warned_of(rt, caplog)
         reconstruct(one, **usual)
         assert ("times the noise of the projections unexplained" in caplog.text) == is_unexplained
         assert ("do not hold soft texture" in caplog.text) == is_noisy
-
-
-def test_the_mean_bar_is_that_of_matter_where_noise_fills_the_air(rt) -> None:
-    scan = simulate("spheres", size=24, detector=32, views=24, noise="tigre", dose=1e3, device=rt)
-    result = reconstruct(scan, "fdk", device=rt, doubt=True, report=False)
-    matter, air = scan.reference > 0.1 * scan.reference.max(), scan.reference == 0
-    mean = result.facts[DOUBT]["mean_per_mm"]
-    assert mean == pytest.approx(result.doubt[matter].mean(), rel=0.25) and mean > 1.3 * result.doubt[air].mean()
 
 
 def test_a_box_has_its_part_of_the_bars_and_a_scan_without_a_method_has_none(rt, scan) -> None:

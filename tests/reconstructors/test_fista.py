@@ -188,16 +188,13 @@ def test_fista_goes_on_with_the_same_bits_from_either_grid(rt, scan, at, prior) 
     assert [line["iteration"] for line in rest.record] == [line["iteration"] for line in whole.record] == list(range(1, 8))
 
 
-def test_a_ridge_step_follows_every_fourth_map_and_resumes_between_them(rt, scan) -> None:
+def test_a_ridge_step_follows_every_fourth_map_unless_a_volume_is_too_thin_and_resumes_between_them(rt, scan) -> None:
     first, resumed, other = (prior_of("ridge", priors.PriorInputs(rt, scan.grid, 5)) for _ in range(3))
     pairs = zip(*(maps(prior, rt, scan.grid.shape, 4) for prior in (first, other.before)), strict=True)
     assert [np.array_equal(*pair) for pair in pairs] == [True] * 3 + [False]
     maps(first, rt, scan.grid.shape, 2)
     resumed.restore(first.state())
     np.testing.assert_array_equal(*(maps(prior, rt, scan.grid.shape, 3) for prior in (first, resumed)))
-
-
-def test_ridge_is_dct_in_a_volume_thinner_than_its_filters(rt) -> None:
     inputs = priors.PriorInputs(rt, Grid((4, 12, 12), (0.1, 0.1, 0.1)), 5)
     np.testing.assert_array_equal(*(maps(prior_of(name, inputs), rt, (4, 12, 12), 4) for name in ("dct", "ridge")))
     share = priors.subvoxel_share
