@@ -138,15 +138,3 @@ def test_a_gpus_lists_are_a_cpus(monkeypatch, many) -> None:
         np.testing.assert_array_equal(found[0][0], found[1][0], str(count))
         np.testing.assert_array_equal(found[0][1], found[1][1], str(count))
         assert count < 2 or found[0][0][-1] > count
-
-
-def test_only_another_cloud_is_waited_for(rt, make_cloud, make_geometry) -> None:
-    projector, cells = SplatProjector(rt, 13, 18), DeviceCells.upload(rt, frame_cells("static", make_geometry(13, 18)))
-
-    def waits(count: int) -> int:
-        gaussians = DeviceGaussians.upload(rt, make_cloud(count, count))
-        before = rt.traffic.blocking
-        projector.forward(gaussians, cells)
-        return rt.traffic.blocking - before
-
-    assert [waits(count) for count in (30, 30, 30, 31, 31)] == [1, 0, 0, 1, 0]

@@ -135,16 +135,12 @@ def test_an_object_on_bent_paths_gets_more_segments(rt, make_cloud, make_geometr
     assert count > 2 and several < 0.1 * one
 
 
-def test_cells_that_do_not_fit_are_refused(make_geometry) -> None:
+def test_cells_that_do_not_fit_and_fields_without_an_inverse_are_refused(rt, make_geometry) -> None:
     with pytest.raises(InputError, match="--motion centres"):
         states_of(frame_cells("centres", make_geometry(*SHAPE)), deformation())
     table = replace(frame_cells("exact", make_geometry(*SHAPE)), end_times_s=None)
     with pytest.raises(InputError, match="end_times_s"):
         states_of(table, deformation())
-
-
-def test_a_field_without_an_inverse_is_refused(rt) -> None:
-    grid = Grid.cube(16, 2.0)
-    CloudStates(rt, deformation()).check_inverse(grid)
+    CloudStates(rt, deformation()).check_inverse(Grid.cube(16, 2.0))
     with pytest.raises(InputError, match="without an inverse"):
-        CloudStates(rt, deformation(2.0)).check_inverse(grid)
+        CloudStates(rt, deformation(2.0)).check_inverse(Grid.cube(16, 2.0))

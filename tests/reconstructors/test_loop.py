@@ -59,20 +59,6 @@ def test_lines_and_reports_come_when_their_number_is_reached() -> None:
     assert (loop.stopped_by, loop.interrupted_at, loop.state_if_interrupted()) == ("small enough", None, None)
 
 
-def test_a_report_stops_the_run_which_goes_on_from_there() -> None:
-    def stop(progress: Progress) -> None:
-        raise KeyboardInterrupt
-
-    stopped = loop_of(stop)
-    stopped.run(None)
-    assert (stopped.stopped_by, stopped.interrupted_at) == ("interrupt", 3)
-    resumed, whole = loop_of(lambda progress: None), loop_of(lambda progress: None)
-    resumed.run(stopped.state_if_interrupted())
-    whole.run(None)
-    assert [line["loss"] for line in resumed.record] == [line["loss"] for line in whole.record]
-    assert resumed.seconds > resumed.record[-1]["seconds"] >= stopped.record[-1]["seconds"]
-
-
 def test_a_loss_that_is_no_number_is_named() -> None:
     loop = loop_of(lambda progress: None)
     loop.method.loss = np.nan

@@ -13,7 +13,7 @@ from phyradgs_cl.detector.effects import lagged
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import shepp_logan
-from phyradgs_cl.reconstructors import Preprocessing, Progress, plan_run, preprocessing_of, reconstruct
+from phyradgs_cl.reconstructors import Preprocessing, Progress, plan_run, reconstruct
 from phyradgs_cl.reconstructors.checkpoint import RUN, with_identity
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.runtime import Runtime
@@ -56,13 +56,6 @@ def test_lag_is_undone_unless_it_is_to_be_ignored(rt, scan) -> None:
     volumes = [reconstruct(s, replace(plan_run("fdk"), preprocessing=before), rt).volume for s, before in cases]
     undone, ignored = (np.abs(volume - volumes[0]).max() for volume in volumes[1:])
     assert undone < 1e-3 * np.abs(volumes[0]).max() < ignored
-
-
-def test_options_by_name() -> None:
-    assert preprocessing_of({"holdout": 3, "ignore_lag": True}) == Preprocessing(ignore_lag=True, holdout=3.0)
-    assert preprocessing_of({"size": [4, 5, 6], "voxel_mm": 2}).facts() == {
-        "size": (4, 5, 6), "voxel_mm": (2.0, 2.0, 2.0), "ignore_lag": False
-    }  # fmt: skip
 
 
 @dataclass(frozen=True)

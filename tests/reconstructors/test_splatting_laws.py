@@ -70,14 +70,6 @@ def test_lengths_times_1024_change_no_bit_and_times_1000_nothing_else(rt, run) -
     assert difference(large.volume * 1000, run(STEADY).volume) <= SCALE_LAW
 
 
-def test_exact_motion_says_how_it_averaged(run) -> None:
-    """By K; with a loss like that of micro-views."""
-    result = run(OPTIONS, motion=Exact(segments=3))
-    assert result.facts["segments"] == 3
-    assert result.record[-1]["loss"] < 1.1 * run().record[-1]["loss"]
-    assert "segments" not in run(iterations=0).facts
-
-
 def test_the_cloud_is_the_volume(rt, scan, run) -> None:
     """Gaussians in mm and 1/mm, voxelised on the scan's own grid, are the volume that came along."""
     result, first = run(), run(iterations=0)

@@ -89,13 +89,3 @@ def test_memory_is_used_again_and_given_back() -> None:
     del space, x
     gc.collect()
     assert rt.ledger.held_bytes == 0
-
-
-def test_an_update_crosses_no_bus(rt) -> None:
-    space = DeviceSpace(rt)
-    x = space.array(np.ones(1000, np.float32))
-    before = rt.traffic.bytes_up, rt.traffic.bytes_down, rt.traffic.blocking
-    y = space.descend(space.multiply(space.add(x, x), x), x, 0.5)
-    assert (rt.traffic.bytes_up, rt.traffic.bytes_down, rt.traffic.blocking) == before
-    space.norm(y)
-    assert rt.traffic.bytes_down - before[1] == 8 and rt.traffic.blocking == before[2] + 1
