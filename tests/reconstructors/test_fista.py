@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tolerances import RAYS
 
-from phyradgs_cl.acquisition import Motion, ParallelGeometry, PerRow, Scan, Static
+from phyradgs_cl.acquisition import ParallelGeometry, PerRow, Scan
 from phyradgs_cl.api import simulate, static_scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -106,21 +106,6 @@ def test_a_prior_image_helps_where_it_is_right_and_costs_little_where_it_is_wron
     runs = (run(rt, few, "fista", image, prior="piccs", prior_share=share, **usual) for image, share in pairs)
     right, wrong = (quality(few, one.volume) for one in runs)
     assert right > max(plain, quality(few, changed)) + 1 and wrong > plain - 1
-
-
-def test_the_weight_follows_what_comes_back_of_noise_and_edges(rt, scan) -> None:
-    """A blur, which spreads a ray over voxels, averages noise."""
-
-    def weight(motion: Motion, error: FrameError, density: float = 0.0) -> float:
-        volume = np.zeros(scan.grid.shape, np.float32)
-        volume[4:9, 5:8] = density
-        return PriorWeight(System.of_scan(rt, scan, motion), error, 0.42).at(volume)
-
-    noise, edges = weight(PerRow(), FrameError(0.03)), weight(PerRow(), FrameError(0.0, 0.1), 0.4)
-    assert noise == pytest.approx(3 * weight(PerRow(), FrameError(0.01)), rel=1e-6)
-    assert noise < 0.95 * weight(Static(), FrameError(0.03))
-    assert edges == pytest.approx(weight(PerRow(), FrameError(0.0, 0.2), 0.2), rel=1e-6)
-    assert weight(PerRow(), FrameError(0.03, 0.1), 0.4) == pytest.approx(np.hypot(noise, edges), rel=1e-6)
 
 
 def test_the_ridge_step_follows_the_noise_in_the_weight_and_no_edges(scan, system) -> None:

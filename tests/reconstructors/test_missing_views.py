@@ -151,13 +151,3 @@ def test_a_ray_and_its_opposite_in_a_scan_of_parts_count_two() -> None:
         if parted.covers(np.array(there)):
             both = both + weights.parted_weight(there, np.array(-angle), parted.parts_rad)
         assert float(both) == pytest.approx(2.0, abs=1e-3)
-
-
-@pytest.mark.slow
-def test_views_at_random_around_their_places_are_seen_from_somewhere() -> None:
-    """The widest gap need not be one that stands out from its neighbours."""
-    rng = np.random.default_rng(0)
-    for spread_deg in (0.5, 1.5, 2.5, 4.0):
-        for _ in range(8):
-            arc = view_arc(np.deg2rad(np.arange(48) * 7.5 + rng.normal(0, spread_deg, 48)))
-            assert arc.unseen_rad() < np.deg2rad(20) and np.isfinite(arc.gap_rad).all()

@@ -8,21 +8,17 @@ import numpy as np
 import pytest
 from tolerances import FLOAT32
 
-from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
+from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.api import simulate
 from phyradgs_cl.detector.effects import lagged
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields import Grid
-from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors import Preprocessing, Progress, plan_run, reconstruct
 from phyradgs_cl.reconstructors.checkpoint import RUN, with_identity
 from phyradgs_cl.reconstructors.preprocess import prepared
 from phyradgs_cl.runtime import Runtime
-from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 from phyradgs_cl.workflow import load_scan
 
 pytestmark = pytest.mark.slow
-
-GEOMETRY = ConeGeometry(5.0, 7.0, (16, 16), (0.25, 0.25))
 
 
 def stop(progress: Progress) -> None:
@@ -30,10 +26,8 @@ def stop(progress: Progress) -> None:
 
 
 @pytest.fixture(scope="module")
-def scan() -> Scan:
-    options = SimulationOptions(protocol=Protocol(views=6, exposure_deg=10.0), peak=3.0)
-    grid = Grid.cube(12, 2.0)
-    return simulate(AnalyticSource(shepp_logan(1.0), GEOMETRY), GEOMETRY, grid, options)
+def scan(rt) -> Scan:
+    return simulate("jaw", size=12, detector=16, views=6, exposure_deg=10.0, peak=3.0, device=rt)
 
 
 @pytest.mark.parametrize("method", ["FDK", "Fista-TV", "phyradgs"])

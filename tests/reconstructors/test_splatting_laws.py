@@ -6,19 +6,18 @@ from functools import cache
 
 import numpy as np
 import pytest
+from parallel.shared_runs import small_scan
 from tolerances import CLOUD_VOLUME, FLOAT64, SCALE_LAW
 
-from phyradgs_cl.acquisition import ConeGeometry, Exact, MicroViews, Protocol, Scan, Static
+from phyradgs_cl.acquisition import Exact, MicroViews, Scan, Static
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import voxelise
 from phyradgs_cl.optim import DensityControl
-from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors.method import METHODS
 from phyradgs_cl.reconstructors.result import Progress, Reconstruction
 from phyradgs_cl.reconstructors.splats import method as splatting
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.reconstructors.splats.start import initial_cloud
-from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
 
 pytestmark = pytest.mark.slow
 
@@ -28,18 +27,9 @@ phyradgs, r2 = METHODS["phyradgs"].run, METHODS["r2"].run
 STEADY = replace(OPTIONS, control=DensityControl(every=0))
 
 
-def make_scan(half_size_mm: float = 1.0) -> Scan:
-    """Shepp–Logan, 6 frames of 24² over 20° each; attenuation goes as one over the size."""
-    pitch = 3.9 / 24 * half_size_mm
-    geometry = ConeGeometry(5 * half_size_mm, 7.5 * half_size_mm, (24, 24), (pitch, pitch))
-    source = AnalyticSource(shepp_logan(half_size_mm), geometry)
-    protocol = Protocol(views=6, exposure_deg=20.0)
-    return simulate(source, geometry, Grid.cube(16, 2 * half_size_mm), SimulationOptions(protocol))
-
-
 @pytest.fixture(scope="module")
 def scan() -> Scan:
-    return make_scan()
+    return small_scan()
 
 
 @pytest.fixture(scope="module")
@@ -62,11 +52,11 @@ def test_same_seed_same_bits(any_rt, scan) -> None:
 
 
 def test_lengths_times_1024_change_no_bit_and_times_1000_nothing_else(rt, run) -> None:
-    plain, large = run(), phyradgs(make_scan(1024.0), OPTIONS, rt, seed=1)
+    plain, large = run(), phyradgs(small_scan(1024.0), OPTIONS, rt, seed=1)
     np.testing.assert_array_equal(large.volume * np.float32(1024), plain.volume)
     np.testing.assert_allclose(large.gaussians.scale, plain.gaussians.scale * 1024, rtol=FLOAT64)
     np.testing.assert_allclose(large.gaussians.density, plain.gaussians.density / 1024, rtol=FLOAT64)
-    large = phyradgs(make_scan(1000.0), STEADY, rt, seed=1)
+    large = phyradgs(small_scan(1000.0), STEADY, rt, seed=1)
     assert difference(large.volume * 1000, run(STEADY).volume) <= SCALE_LAW
 
 
