@@ -143,7 +143,7 @@ def test_a_volume_does_not_depend_on_how_its_axes_are_called() -> None:
     assert expected.std() > 0.01 * expected.mean()
 
 
-def test_the_field_starts_at_its_share_of_the_bound() -> None:
+def test_the_field_starts_at_its_share_of_the_bound_and_leaves_others_draws_alone() -> None:
     positions = torch.rand(100, 3) * 2 - 1
     for share in (0.05, 0.5):
         options = NeuralOptions(first_share=share, density_bound=4.0)
@@ -151,9 +151,6 @@ def test_the_field_starts_at_its_share_of_the_bound() -> None:
         assert float(values.mean()) == pytest.approx(4 * share, rel=0.5) and float(values.max()) < 4
     leaky = first_field(NeuralOptions(last_activation="leaky-relu"), 16, 1)
     assert float(leaky(positions).detach().min()) > -1
-
-
-def test_a_field_leaves_others_draws_alone() -> None:
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)

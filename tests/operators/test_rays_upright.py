@@ -91,25 +91,19 @@ def test_lines_without_cells_are_zero_and_give_nothing(banded_rt) -> None:
         assert_volume(RayOperator(banded_rt, GRID, TALL_PANEL, some).adjoint(y), some, y)
 
 
-def test_a_subset_and_batches_of_frames(banded_rt) -> None:
+def test_a_subset_batches_of_frames_and_no_room_for_the_turned_volume(banded_rt, monkeypatch) -> None:
     rt = banded_rt
     cells, x = tables("static", TALL_PANEL, frames=5), noise(GRID.shape, 105)
     expected = RayOperator(rt, GRID, TALL_PANEL, cells).forward(x)
-    operator = RayOperator(rt, GRID, TALL_PANEL, cells)
-    layout = RayLayout.of_scan(rt, GRID, TALL_PANEL, "rows")
+    operator, layout = RayOperator(rt, GRID, TALL_PANEL, cells), RayLayout.of_scan(rt, GRID, TALL_PANEL, "rows")
     volumes = layout.volume_floats + columns_floats(GRID) + 5 * operator.slot_floats + 32
     with room_for(rt, int(4 * (volumes + layout.frames_floats(2) + 16) / PLANNED)):
         assert [part.stop for part in operator.memory.batches(5)] == [2, 4, 5]
         np.testing.assert_array_equal(operator.forward(x), expected)
         np.testing.assert_array_equal(operator.subset([4, 1]).forward(x), expected[[4, 1]])
-
-
-def test_without_room_for_the_turned_volume(banded_rt, monkeypatch) -> None:
-    rt = banded_rt
-    cells, x = tables("static", TALL_PANEL), noise(GRID.shape, 106)
-    expected = RayOperator(rt, GRID, TALL_PANEL, cells).forward(x)
-    operator, layout = RayOperator(rt, GRID, TALL_PANEL, cells), RayLayout.of_scan(rt, GRID, TALL_PANEL, "rows")
-    with room_for(rt, int(4 * (layout.volume_floats + layout.frames_floats(3) + 64) / PLANNED)):
+    del operator
+    operator = RayOperator(rt, GRID, TALL_PANEL, cells)
+    with room_for(rt, int(4 * (layout.volume_floats + layout.frames_floats(5) + 64) / PLANNED)):
         assert len(operator.memory.plan()) == 1
         launched = note_launches(monkeypatch)
         np.testing.assert_array_equal(operator.forward(x), expected)
@@ -208,6 +202,7 @@ def changed(roll: float, rise_mm: float = 0.0) -> list[TimeCells]:
 
 
 def test_where_it_applies() -> None:
+    """Of lines far apart in voxels a work-item takes fewer, and none where a vector of them is too many."""
     close = leaning(tables("static", TALL_PANEL, source_mm=1.3), 1.0, 0.0)
     cases = {
         "static": (tables("static", TALL_PANEL), False), "strips": (tables("micro-views", TALL_PANEL), False),
@@ -220,12 +215,7 @@ def test_where_it_applies() -> None:
         shape = (15, 85) if name == "few rows" else TALL_PANEL
         how = upright_of(GRID, cells, shape, 16)
         assert (None if how is None else how.leans) is leans, name
-
-
-def test_lines_far_apart_in_voxels() -> None:
-    """A work-item takes fewer lines then, and none where a vector of them is too many."""
     fine = [Grid((9, 14, 11), (pitch_mm,) * 3) for pitch_mm in (1e-2, 5e-3, 1e-3)]
-    cells = tables("static", TALL_PANEL)
-    ways = [upright_of(grid, cells, TALL_PANEL, 16) for grid in fine]
+    ways = [upright_of(grid, tables("static", TALL_PANEL), TALL_PANEL, 16) for grid in fine]
     spacing_mm = 3.9 / TALL_PANEL[0]
     assert [way and way.block for way in ways] == [85, int(508 / (spacing_mm / 5e-3)), None]

@@ -54,7 +54,7 @@ def test_what_lies_on_a_bound_is_chosen_and_kept(population) -> None:
     assert np.isclose(ACTIVATION.apply(grown.raw)[3], LARGE).sum() == 3  # no child is smaller
 
 
-def test_a_clone_shares_place_shape_and_mass(population) -> None:
+def test_a_clone_shares_place_shape_and_mass_and_a_split_gives_two_smaller_halves_from_within(population) -> None:
     grown = run(population, [0, 2, 0, 0, 0])
     pair = np.flatnonzero(np.isclose((rows := ACTIVATION.apply(grown.raw))[2], -0.2))
     assert grown.count == 6 and pair.size == 2
@@ -63,9 +63,6 @@ def test_a_clone_shares_place_shape_and_mass(population) -> None:
     np.testing.assert_allclose(rows[10, pair], 1.0, rtol=FLOAT64)  # half of 2 each
     assert rows[10].sum() == pytest.approx(15.7, rel=FLOAT64)
     assert sorted(grown.moments[0, 0, pair]) == [0.0, 2.0]  # the old one keeps its moments, the new one has none
-
-
-def test_a_split_gives_two_smaller_halves_from_within(population) -> None:
     grown = run(population, [0, 0, 0, 2, 0])
     rows, children = ACTIVATION.apply(grown.raw), np.flatnonzero(np.all(grown.moments == 0, axis=(0, 1)))
     assert grown.count == 6 and children.size == 2

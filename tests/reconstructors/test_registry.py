@@ -106,13 +106,9 @@ def test_motions_that_are_none_of_the_methods_are_refused() -> None:
     })  # fmt: skip
 
 
-def test_a_method_takes_its_own_motions() -> None:
-    """With what belongs to each: below."""
+def test_a_method_takes_its_own_motions_with_the_counts_that_they_have() -> None:
     assert MOTIONS["phyradgs"] == MOTIONS["r2"] == ("static", "static-start", "micro-views", "centres", "exact")
     assert "exact" not in MOTIONS["sirt"] + MOTIONS["fdk"] and "micro-views" not in MOTIONS["fdk"]
-
-
-def test_counts_belong_to_the_motions_that_have_them() -> None:
     strips = {"micro-views", "centres"}
     models = {"strips": strips, "sub_intervals": {*strips, "per-row", "own-times"}, "segments": {"exact"}}
     pairs = [(method, name) for method, names in MOTIONS.items() for name in names]
