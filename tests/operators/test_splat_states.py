@@ -110,26 +110,20 @@ def test_a_rigid_field_is_a_moved_scanner(rt, make_cloud, make_geometry, motion)
     assert_near(render(rt, rows, table, one), expected, MERGED_FRAME)
 
 
-def test_motion_within_an_exposure_is_followed(rt, make_cloud, make_geometry) -> None:
+def test_motion_within_an_exposure_is_followed_and_bent_paths_get_more_segments(rt, make_cloud, make_geometry) -> None:
     """A gantry that hardly turns, and an object that moves at constant speed: one segment has what thirty times have, but
     for conics that are those of its middle."""
-    geometry = make_geometry(*SHAPE)
-    orbit = CircularOrbit(geometry, ConstantSpeed(0.3, 1e-3))
+    orbit, times_s = CircularOrbit(make_geometry(*SHAPE), ConstantSpeed(0.3, 1e-3)), np.linspace(0, 2, 81)
     steady = Deformation(0.1 * np.ones((1, 11, 11, 11, 3)), (-2.5,) * 3, 0.5, np.array([0.0, 2.0]), np.array([[0.0], [1.0]]))
     where, rows = (orbit, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0]), make_cloud(8, 47)
     one = render(rt, rows, exact_cells(*where, 1), steady)
     many = render(rt, rows, per_line_cells(*where, 30), steady)
     still = render(rt, rows, static_cells(*where), steady)
     assert np.linalg.norm(one - many) <= 0.1 * np.linalg.norm(still - many)
-
-
-def test_an_object_on_bent_paths_gets_more_segments(rt, make_cloud, make_geometry) -> None:
-    orbit, times_s = CircularOrbit(make_geometry(*SHAPE), ConstantSpeed(0.3, 1e-3)), np.linspace(0, 2, 81)
     swing = Deformation(0.2 * np.ones((1, 11, 11, 11, 3)), (-2.5,) * 3, 0.5, times_s, np.cos(4 * times_s)[:, None])
     lit_s = 0.2 + np.array([0.0, 1.4])
     assert segments_for_object(deformation(0.0), lit_s, 0.1) == 1
     count = segments_for_object(swing, lit_s, 0.1)
-    where, rows = (orbit, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0]), make_cloud(8, 47)
     many = render(rt, rows, per_line_cells(*where, 30), swing)
     one, several = (np.linalg.norm(render(rt, rows, exact_cells(*where, n), swing) - many) for n in (1, count))
     assert count > 2 and several < 0.1 * one

@@ -64,17 +64,18 @@ def test_half_a_turn_beside_a_displaced_panel_is_a_short_scan(rt, kind, views, c
     assert f"from {2 * views}.0° the volume is right within {within} mm of the axis" in record.message
 
 
-@pytest.mark.parametrize("kind", ["fdk", "fbp"])
-def test_views_that_come_again_with_jitter_count_as_one(rt, kind) -> None:
-    """Every step between two of them was a gap, and densities went wrong by half."""
-    few, jitter = 12.0 * np.arange(30), np.random.default_rng(1).normal(0, 0.05, 60)
-    np.testing.assert_allclose(levels(rt, kind, np.tile(few, 2) + jitter, 52), levels(rt, kind, few, 52), atol=FDK_PARTIAL)
+FEW, JITTER = 12.0 * np.arange(30), np.random.default_rng(1).normal(0, 0.05, 60)
 
 
-def test_few_views_a_little_beyond_half_a_turn_do_not_count_twice(rt) -> None:
-    """Parallel rays: what half a step beyond half a turn measures again made densities 3.5 % too high."""
-    half, beyond = (levels(rt, "fbp", step * np.arange(12), 52) for step in (15.0, 15.5))
-    np.testing.assert_allclose(beyond, half, atol=FDK_PARTIAL)
+@pytest.mark.parametrize(("kind", "angles_deg", "same_deg"), [
+    ("fdk", np.tile(FEW, 2) + JITTER, FEW), ("fbp", np.tile(FEW, 2) + JITTER, FEW),
+    ("fbp", 15.5 * np.arange(12), 15.0 * np.arange(12)),
+])  # fmt: skip
+def test_views_that_come_again_with_jitter_and_few_beyond_half_a_turn_do_not_count_twice(rt, kind, angles_deg, same_deg):
+    """Every step between two of them was a gap, and densities went wrong by half. What half a step beyond half a turn of
+    parallel rays measures again made them 3.5 % too high."""
+    found, expected = (levels(rt, kind, angles, 52) for angles in (angles_deg, same_deg))
+    np.testing.assert_allclose(found, expected, atol=FDK_PARTIAL)
 
 
 @pytest.mark.parametrize("axis", ["rows", "columns"])
