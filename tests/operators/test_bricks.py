@@ -174,18 +174,6 @@ def on_device(rt, call, values: np.ndarray) -> np.ndarray:
     return rt.download(found)
 
 
-@pytest.mark.parametrize(("motion", "grid", "axis"), [
-    ("static", UPRIGHT, "rows"), ("static", UPRIGHT, "columns"), ("per line", TALL, "columns"),
-    ("micro-views", TALL, "rows"),
-])  # fmt: skip
-def test_rays_of_arrays_on_the_device(two_rt, motion, grid, axis) -> None:
-    operator = RayOperator(two_rt, grid, SHAPE, tables(motion, SHAPE, axis, frames=4))
-    for part in (operator, operator.subset([2, 0])):
-        x, y = noise(grid.shape, 31), noise(part.frames_shape, 32)
-        np.testing.assert_array_equal(on_device(two_rt, part.forward, x), part.forward(x))
-        np.testing.assert_array_equal(on_device(two_rt, part.adjoint, y), part.adjoint(y))
-
-
 @AXES
 def test_the_intensity_model_of_arrays_on_the_device(two_rt, axis) -> None:
     cells = tables("per line", SHAPE, axis, frames=3)

@@ -107,7 +107,7 @@ def test_fista_minimises_squares_weighed_by_light(rt) -> None:
 
 
 def test_asd_pocs_follows_the_published_steps(rt) -> None:
-    """TIGRE's loop in float64: a pass, its length, TV steps of a fixed length, and the reduction of that length. It ends when
+    """TIGRE's loop in float64: a pass, its length, TV steps of a fixed length and their reduction. It ends when
     data and TV pull against each other."""
     system, matrix, _ = dense_system(noise=0.2)
     options = AsdPocsOptions(tv_share=0.01, tv_steps=5, tv_ratio=0.2, relaxation_reduction=0.9)
