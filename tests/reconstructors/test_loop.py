@@ -32,12 +32,6 @@ class Halving:
     def measures(self) -> dict[str, float]:
         return {"loss": self.loss}
 
-    def state(self) -> dict[str, np.ndarray]:
-        return {"iteration": np.array(self.iteration), "loss": np.array(self.loss)}
-
-    def restore(self, state) -> None:
-        self.iteration, self.loss = int(state["iteration"]), float(state["loss"])
-
     def present_volume(self) -> tuple[np.ndarray, Grid]:
         return np.full((1, 1, 1), self.loss, np.float32), Grid.cube(1, 1.0)
 
