@@ -68,18 +68,15 @@ def test_the_map_is_the_minimum_of_its_objective(axis_weights) -> None:
     assert objective(np.maximum(volume, 0)) > lowest + 1
 
 
-def test_total_variation_by_hand() -> None:
+@pytest.mark.parametrize(("axis_weights", "step"), [((1.0, 1.0, 1.0), 1 / 12), ((3.0, 2.0, 1.0), 1 / 56)])
+def test_total_variation_and_the_first_step_by_hand(any_rt, axis_weights, step) -> None:
+    """One over 4 Σ weights², the largest step that is sure to converge: by so much two unequal neighbours approach."""
     volume = np.zeros((2, 2, 2))
     volume[1, 1, 1], volume[0, 0, 0] = 3.0, 4.0
     # backwards of the corner of 3 lie three steps of it; at the corner of 4 all three axes step at once
     for first, expected in ((1.0, 3 * 3 + 4 * np.sqrt(3)), (2.0, 3 * 4 + 4 * np.sqrt(6))):
         variation = np.linalg.norm(differences(volume, (first, 1.0, 1.0)), axis=0).sum()
         assert variation == pytest.approx(expected, rel=1e-12)
-
-
-@pytest.mark.parametrize(("axis_weights", "step"), [((1.0, 1.0, 1.0), 1 / 12), ((3.0, 2.0, 1.0), 1 / 56)])
-def test_the_first_step_by_hand(any_rt, axis_weights, step) -> None:
-    """One over 4 Σ weights², the largest step that is sure to converge: by so much two unequal neighbours approach."""
     volume = np.array([[[0.0, 1.0]]])
     found = TvProx(any_rt, volume.shape, axis_weights)(volume, 1.0, 1, nonnegative=False)
     twin = tv_prox(volume, 1.0, 1, nonnegative=False, axis_weights=axis_weights)

@@ -58,20 +58,15 @@ def adjoint(warp: VolumeWarp, state: int, values: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size_mm", [0.02, 0.3, 5.0])  # neighbours that move together, that part, far outside
-def test_warps_are_their_twins(two_rt, size_mm) -> None:
+def test_warps_are_their_twins_and_have_exact_transposes(two_rt, size_mm) -> None:
     states = states_of(deformation(size_mm))
     warp, volume = VolumeWarp(two_rt, states), noise(GRID.shape)
     displacement = np.tensordot(states.weights[1], states.fields_mm, 1) / GRID.voxel_size_mm[::-1]
     moved = two_rt.download(warp.forward(1, warp.source(two_rt.upload(volume))))
     assert_near(moved, warp_forward(volume, displacement), FLOAT32)
     assert_near(adjoint(warp, 1, volume), warp_adjoint(volume, displacement), FLOAT32)
-
-
-def test_warps_have_exact_transposes(rt) -> None:
-    """Also of values of either sign, whose sums nearly cancel."""
-    warp = VolumeWarp(rt, states_of(deformation(0.3)))
-    x, y = noise(GRID.shape, 2) - np.float32(0.5), noise(GRID.shape, 3) - np.float32(0.5)
-    forward = rt.download(warp.forward(0, warp.source(rt.upload(x)))).astype(np.float64)
+    x, y = noise(GRID.shape, 2) - np.float32(0.5), noise(GRID.shape, 3) - np.float32(0.5)  # sums that nearly cancel
+    forward = two_rt.download(warp.forward(0, warp.source(two_rt.upload(x)))).astype(np.float64)
     size = np.linalg.norm(forward) * np.linalg.norm(y)
     assert abs(np.vdot(forward, y) - np.vdot(x.astype(np.float64), adjoint(warp, 0, y))) <= ADJOINT * size
 

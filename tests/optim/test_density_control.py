@@ -98,7 +98,7 @@ def test_never_more_than_allowed_and_the_strongest_first(population) -> None:
     assert run(population, [9] * 5, replace(CONTROL, max_gaussians=3)).count == 5  # a full one is left in peace
 
 
-def test_the_faded_and_the_lost_are_pruned(population) -> None:
+def test_the_faded_the_lost_sheets_and_needles_are_pruned_unless_they_are_wanted(population) -> None:
     for row, value, kept in [
         (10, 0.5e-3, False), (10, 2e-3, True), (0, 1.01, False), (0, 0.99, True), (1, -1.01, False),
         (2, 1.2, False)
@@ -108,16 +108,6 @@ def test_the_faded_and_the_lost_are_pruned(population) -> None:
         pruned = prune(Population(ACTIVATION.invert(rows), population.moments), ACTIVATION, CONTROL, BOX)
         assert pruned.count == 4 + kept, (row, value)
         assert (5.0 in pruned.moments[0, 0]) == kept, (row, value)
-
-
-def test_when_it_acts() -> None:
-    control = DensityControl(every=100, start_iteration=500, stop_fraction=0.75)
-    due = [i for i in range(1, 2001) if control.is_due(i, 2000)]
-    assert due == list(range(600, 1500, 100))
-    assert not any(replace(control, every=0).is_due(i, 2000) for i in range(1, 2001))
-
-
-def test_sheets_and_needles_are_removed_unless_they_are_wanted() -> None:
     rows = np.tile([[0.0], [0.0], [0.0], [0.1], [0.1], [0.1], [1.0], [0.0], [0.0], [0.0], [1.0]], 4)
     rows[3:6] = np.array([[0.1, 0.1, 0.1], [0.5, 0.5, 0.005], [0.6, 0.01, 0.01], [0.49, 0.01, 0.02]]).T
     activation, box = Activation(0.001, 1.0), np.array([[-1.0] * 3, [1.0] * 3])
@@ -126,6 +116,13 @@ def test_sheets_and_needles_are_removed_unless_they_are_wanted() -> None:
         found = prune(population, activation, DensityControl(prune_aspect=aspect), box)
         scales = np.sort(activation.apply(found.raw)[3:6].max(0))
         np.testing.assert_allclose(scales, np.sort(rows[3:6].max(0)[kept]), rtol=1e-6)
+
+
+def test_when_it_acts() -> None:
+    control = DensityControl(every=100, start_iteration=500, stop_fraction=0.75)
+    due = [i for i in range(1, 2001) if control.is_due(i, 2000)]
+    assert due == list(range(600, 1500, 100))
+    assert not any(replace(control, every=0).is_due(i, 2000) for i in range(1, 2001))
 
 
 STEPS = 6
