@@ -16,8 +16,6 @@ from phyradgs_cl.runtime import Runtime
 
 SHAPE = (13, 18)
 START_S = 0.4
-AXES = pytest.mark.parametrize("axis", ["rows", "columns"])
-DIRECTIONS = pytest.mark.parametrize("direction", [1, -1])
 
 
 @pytest.fixture
@@ -29,8 +27,7 @@ def render(rt: Runtime, rows: np.ndarray, table: TimeCells, cutoff_sigma: float 
     return splat(rt, rows, table, SHAPE, cutoff_sigma=cutoff_sigma)
 
 
-@AXES
-@DIRECTIONS
+@pytest.mark.parametrize(("axis", "direction"), [("rows", 1), ("columns", -1)])
 def test_constant_speed_against_a_brute_force_average(rt, make_cloud, orbit, axis, direction) -> None:
     """Static projections at hundreds of times, each line averaging those within its own window."""
     shutter = Shutter(0.3, 0.4, axis, direction)

@@ -99,8 +99,9 @@ def test_halves_are_of_angles_and_not_of_time(rt) -> None:
     assert [half.tolist() for half in halves(helix)] == [[*range(0, 30, 2)], [*range(1, 30, 2)]]
 
 
-def test_bars_follow_slopes_density_shape_and_noise() -> None:
-    """What both runs do is shape, what they do oppositely is noise; dense matter has wider bars in proportion."""
+def test_bars_follow_slopes_density_shape_noise_and_views() -> None:
+    """What both runs do is shape, what they do oppositely is noise; dense matter has wider bars in proportion. They stay
+    from 25 views of 64 voxels on, the longer side of a slice. Fewer than 0.1 a voxel count as so many."""
     volume = np.repeat(np.array([0.0, 1.0, 2.0]), 10)[:, None, None] * np.ones((30, 24, 24))
     bars = spread(*[volume[:20]] * 3, replace(LAW, slope=1.0))
     assert bars[9, 3, 2] == bars[10, 3, 2] == bars.max() and bars[3, 3, 2] < 0.05 * bars.max()
@@ -114,10 +115,6 @@ def test_bars_follow_slopes_density_shape_and_noise() -> None:
         assert np.sqrt(np.mean(spread(0 * one, one, other, law)[inner] ** 2)) == pytest.approx(2, rel=0.1)
         assert not spread(0 * one, one, -other, law).any()
     assert np.sqrt(np.mean(spread(0 * one, 3 + one, 3 - one, LAW)[inner] ** 2)) == pytest.approx(10**0.5, rel=0.1)
-
-
-def test_bars_are_wider_with_few_views_for_the_grid() -> None:
-    """They stay from 25 views of 64 voxels on, the longer side of a slice. Fewer than 0.1 a voxel count as so many."""
     law, grid = replace(LAW, sparse=0.25, slope=1.0), Grid((9, 32, 64), (1.0,) * 3)
     volume, one, two = np.random.default_rng(1).random((3, 8, 8, 8))
     for views, times in ((25, 1.0), (50, 1.0), (10, 1.375), (1, 0.75 + 0.25 * 25 / 6.4)):

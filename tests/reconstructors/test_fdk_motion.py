@@ -41,8 +41,7 @@ def error_at_rest(rt) -> float:
     return error(fdk_volume(rt, frames_of(PHANTOM, pose, (PIXELS, PIXELS)), pose, GRID))
 
 
-@pytest.mark.parametrize("axis", ["rows", "columns"])
-@pytest.mark.parametrize("direction", [1, -1])
+@pytest.mark.parametrize(("axis", "direction"), [("rows", 1), ("columns", -1)])
 def test_per_row_undoes_the_readout(rt, error_at_rest, axis, direction) -> None:
     """As good as a gantry at rest, in either direction, where one pose per frame is clearly worse."""
     scan = rolling_scan(axis, direction)
@@ -53,8 +52,7 @@ def test_per_row_undoes_the_readout(rt, error_at_rest, axis, direction) -> None:
     assert static >= worse * per_row
 
 
-@pytest.mark.parametrize("axis", ["rows", "columns"])
-@pytest.mark.parametrize("readout_deg", [12.0, -12.0])
+@pytest.mark.parametrize(("axis", "readout_deg"), [("rows", -12.0), ("columns", 12.0)])
 def test_per_row_keeps_levels_in_short_scans(rt, axis, readout_deg) -> None:
     """No view from the other side hides a wrong weight here; without the filter's scale columns are 4 % off."""
     scan = rolling_scan(axis, readout_deg=readout_deg, arc_deg=220.0)
