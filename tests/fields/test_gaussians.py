@@ -47,4 +47,3 @@ def test_gaussians_and_rows_are_the_same_cloud_and_quaternions_of_any_length_rot
     for length in (1e-30, 1e30):
         short = np.float32(length) * cloud.quaternion.astype(np.float32)
         np.testing.assert_allclose(replace(cloud, quaternion=short).rows(), rows, rtol=1e-6, atol=1e-7)
-

@@ -168,6 +168,11 @@ def test_states_cover_the_motion(rt) -> None:
     control_mm = one.control_mm * np.array([10.0, 0.1]).reshape(2, 1, 1, 1, 1)
     other = states_of(Deformation(control_mm, one.origin_mm, one.spacing_mm, TIMES_S, one.weights * [0.1, 10.0]))
     np.testing.assert_allclose(other.weights, states.weights * [0.1, 10.0], atol=1e-9)
+    at_rest = deformation(0.0)  # has states to be moved from where they are asked for
+    assert states_of(at_rest).count == 1
+    states = MotionStates.of_times(at_rest, GRID, TIMES_S, least_voxels=1.0)
+    assert states.count > 3
+    np.testing.assert_allclose(states.shares(TIMES_S).sum(1), 1)
 
 
 def test_scans_of_more_frames_have_more_states(rt) -> None:
@@ -234,7 +239,7 @@ def projected(operator, changes: dict[int, np.ndarray]) -> np.ndarray:
     return rt.download(frames)
 
 
-def test_derivatives_are_differences(operator) -> None:
+def test_derivatives_are_differences_and_have_their_transpose(operator) -> None:
     volume, states = noise(GRID.shape), operator.warp.states
     derivative = FieldDerivative(operator, volume)
     change_mm = np.random.default_rng(3).normal(size=states.deformation.control_mm.shape)
@@ -248,20 +253,7 @@ def test_derivatives_are_differences(operator) -> None:
     for r, frames in enumerate(derivative.by_weights()):
         by_weight = {k: difference(volume, at[k], in_voxels(states.fields_mm[r])) for k in at}
         assert_near(frames, projected(operator, by_weight), 2 * RAYS)
-
-
-def test_derivatives_have_their_transpose(operator) -> None:
-    derivative = FieldDerivative(operator, noise(GRID.shape))
-    change_mm = np.random.default_rng(4).normal(size=operator.warp.states.deformation.control_mm.shape)
     frames = noise(operator.frames_shape, 5) - np.float32(0.5)
     forward = derivative.forward(change_mm).astype(np.float64)
     size = np.linalg.norm(forward) * np.linalg.norm(frames)
     assert abs(np.vdot(forward, frames) - np.vdot(change_mm, derivative.adjoint(frames))) <= ADJOINT * size
-
-
-def test_a_field_of_zeros_has_states_to_be_moved_from() -> None:
-    at_rest = deformation(0.0)
-    assert MotionStates.of_times(at_rest, GRID, at_rest.times_s).count == 1
-    states = MotionStates.of_times(at_rest, GRID, at_rest.times_s, least_voxels=1.0)
-    assert states.count > 3
-    np.testing.assert_allclose(states.shares(at_rest.times_s).sum(1), 1)

@@ -14,7 +14,6 @@ from phyradgs_cl.api import reconstruct, simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
-from phyradgs_cl.prepare.step import fill_masked
 from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume, ramp_filter, ramp_spectrum, static_fdk
 from phyradgs_cl.reconstructors.fdk.frames import extrapolated, reprojected
 
@@ -75,16 +74,6 @@ def test_frames_that_are_masked_whole_are_as_if_they_were_not_there(rt) -> None:
     for make in (lambda s: fdk(s, FdkOptions(), rt).volume, lambda s: static_fdk(rt, s)):
         volume = make(replace(scan, pixel_mask=lost, projections=np.where(lost, np.float32(9), frames)))
         assert abs(volume[body].mean() / make(scan)[body].mean() - 1) < 1e-3
-
-
-def test_masked_pixels_are_filled_along_their_row() -> None:
-    frames, mask = np.tile(np.arange(6, dtype=np.float32), (2, 3, 1)), np.zeros((2, 3, 6), bool)
-    mask[0, 1, 2:4] = mask[1, 2, 0] = mask[1, 0, :] = True
-    spoiled = np.where(mask, np.float32(1e6), frames)
-    filled, expected = fill_masked(spoiled, mask), frames.copy()
-    expected[1, 2, 0] = 1.0  # rows without a pixel: from those beside them
-    np.testing.assert_array_equal(filled, expected)
-    assert spoiled.max() == 1e6  # the caller's frames are left alone
 
 
 def test_orbits_that_are_no_circle_about_z_and_rows_off_its_plane_are_told_and_refused(rt, caplog) -> None:

@@ -81,4 +81,3 @@ def test_what_comes_back_is_the_gradient_of_the_misfit(rt, scan) -> None:
     assert found == pytest.approx(expected, rel=2e-3)
     by_derivative = float(np.vdot(system.derivative(d).astype(float), -system.residual(x)))
     assert by_derivative == pytest.approx(found, rel=1e-4)
-

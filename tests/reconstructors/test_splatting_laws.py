@@ -155,7 +155,7 @@ def test_centres_are_occupied_voxels_and_density_their_share(volume) -> None:
     np.testing.assert_array_equal(cloud.quaternion, np.tile([1.0, 0, 0, 0], (50, 1)))
 
 
-def test_scale_is_the_rms_distance_to_the_three_nearest(volume) -> None:
+def test_scale_is_the_rms_distance_to_the_three_nearest_and_hardly_anything_still_gives_a_cloud(volume) -> None:
     cloud = draw(volume, 40, scale_factor=0.7)
     apart = np.linalg.norm(cloud.mean[:, None] - cloud.mean[None], axis=-1)
     nearest = np.sort(apart, axis=1)[:, 1:4]
@@ -167,9 +167,6 @@ def test_scale_is_the_rms_distance_to_the_three_nearest(volume) -> None:
     one, same, other = (draw(volume, 20, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one.mean, same.mean)
     assert np.any(one.mean != other.mean)
-
-
-def test_hardly_anything_still_gives_a_cloud() -> None:
     for occupied in (0, 1, 2):
         cloud = draw((np.arange(np.prod(GRID.shape)) < occupied).reshape(GRID.shape) * 1.0, 30)
         assert cloud.count == max(occupied, 1)

@@ -12,7 +12,7 @@ from phyradgs_cl.runtime import MEMORY_VARIABLE, MemoryShortage, Room, Runtime, 
 from phyradgs_cl.runtime.memory import MemoryLedger
 
 
-def test_sizes() -> None:
+def test_sizes_and_the_names_of_pythons_arguments() -> None:
     sizes = {"2GiB": 2 << 30, "2gb": 2 * 10**9, "1.5 G": 3 << 29, "512M": 512 << 20, " 64 kib ": 65_536, "100B": 100}
     for text, nbytes in {**sizes, "4096": 4096, 4096: 4096}.items():
         assert bytes_of(text, "--memory") == nbytes, text
@@ -20,8 +20,6 @@ def test_sizes() -> None:
         with pytest.raises(InputError, match="--memory.*2GiB"):
             bytes_of(text, "--memory")
 
-
-def test_python_names_its_arguments() -> None:
     for argument, value in (("memory", "abc"), ("memory", -1), ("device", "no such device")):
         with pytest.raises(InputError) as caught:
             Runtime(**{argument: value})
