@@ -172,7 +172,8 @@ def test_pixels_and_times_are_drawn_evenly_and_each_once() -> None:
     assert np.array_equal(chosen_times(2, 3, 3, np.random.default_rng(0)), [[0, 1, 2]] * 2)
 
 
-def test_windows_are_whole_and_the_scattered_pixels_lie_outside_them() -> None:
+def test_windows_are_whole_and_favour_no_pixel_and_the_scattered_pixels_lie_outside_them() -> None:
+    """Every pixel is as likely as any other, so that windows change a step's noise and not what it fits."""
     rng = np.random.default_rng(0)
     usable = np.ones((17, 14), bool)
     usable[5, 5] = False
@@ -185,10 +186,6 @@ def test_windows_are_whole_and_the_scattered_pixels_lie_outside_them() -> None:
     assert usable[tuple(pixels.T)].all()
     every = windows_and_scattered_pixels(usable, 10_000, 100, 4, rng)
     assert len(every) == usable.sum()
-
-
-def test_windows_favour_no_pixel() -> None:
-    """Every pixel is as likely as any other, so that windows change a step's noise and not what it fits."""
     rng, usable, counts = np.random.default_rng(0), np.ones((16, 12), bool), np.zeros((16, 12))
     for _ in range(4000):
         counts[tuple(windows_and_scattered_pixels(usable, 40, 2, 4, rng).T)] += 1

@@ -142,6 +142,7 @@ def test_a_refused_buffer_is_asked_for_once_more_in_bricks(
 
 
 def test_lists_of_too_many_entries_are_made_for_smaller_bricks(rt, make_cloud, monkeypatch, caplog) -> None:
+    """Three tiles of 2^30 entries each: the sum is past 2^31, and must not turn negative but stay at the largest int."""
     rows = make_cloud(200, 102)
     whole = Voxeliser(rt, TALL.shape)
     expected = whole.voxelise(rows, TALL)
@@ -150,10 +151,6 @@ def test_lists_of_too_many_entries_are_made_for_smaller_bricks(rt, make_cloud, m
     with room_for(rt, 1_200_000):
         np.testing.assert_array_equal(voxelise(rt, rows, TALL), expected)
     assert warned(caplog) == 1
-
-
-def test_sums_of_entries_stay_at_the_largest_int(rt) -> None:
-    """Three tiles of 2^30 entries each: the sum is past 2^31, and must not turn negative."""
     starts = rt.upload(np.array([0, 2**30, 2**30, 2**30, 5]), np.int32)
     rt.launch(rt.kernel("binning", "bin_starts"), 1, np.int32(4), starts)
     largest = 2**31 - 1

@@ -99,17 +99,13 @@ def test_transpose_subsets_and_equal_states(two_rt) -> None:
     np.testing.assert_array_equal(one.adjoint(frames)[0], alone.adjoint(frames))
 
 
-def test_states_come_back(rt, scan) -> None:
+def test_states_come_back_and_help_each_other_by_a_price_of_change(rt, scan) -> None:
     truth, result, resting = changing_object(), run(rt, scan, states=10), run(rt, scan, "fista")
     np.testing.assert_allclose(result.states.times_s, 8.0 * np.arange(10) + 4.0, atol=0.1)
     np.testing.assert_allclose(result.volume, result.states.volumes.mean(0), atol=1e-6)
     gains_db = np.subtract(psnr_db(result, truth), psnr_db(resting, truth))
     assert gains_db.min() > 2 and gains_db.mean() > 5
     assert result.states.volumes.min() >= 0
-
-
-def test_without_a_price_of_change_states_do_not_help_each_other(rt, scan) -> None:
-    truth = changing_object()
     apart, together = (np.mean(psnr_db(run(rt, scan, states=20, iterations=15, time_weight=w), truth)) for w in (0.0, 3.0))
     assert together > apart + 3
 

@@ -102,7 +102,7 @@ BAD = {
 }
 
 
-def test_methods_of_objects_at_rest_and_fields_that_do_not_fit_are_refused(rt, scan) -> None:
+def test_methods_of_objects_at_rest_and_fields_that_do_not_fit_are_refused_or_warned_of(rt, scan, caplog) -> None:
     for method in (name for name, method in METHODS.items() if not method.takes_deformation):
         with pytest.raises(InputError, match=f"--method {method}"):
             plan_run(method, object_motion=ObjectMotion(breathing()))
@@ -111,13 +111,10 @@ def test_methods_of_objects_at_rest_and_fields_that_do_not_fit_are_refused(rt, s
     for found, change in BAD.items():
         with pytest.raises(InputError, match=f"--object-motion.*{found}"):
             reconstruct(scan, plan_of("sirt", change(breathing()), iterations=1), rt)
-
-
-@pytest.mark.parametrize(("share", "is_warned"), [(0.7, True), (1.0, False)])
-def test_a_field_of_a_part_of_the_scan_is_a_warning(scan, caplog, share, is_warned) -> None:
-    one, end_s = breathing(), share * (scan.frame_start_s.max() + scan.shutter.span_s)
-    check_object_motion(replace(one, times_s=np.linspace(0, end_s, len(one.times_s))), scan)
-    assert ("the object rests" in caplog.text) == is_warned
+    for share, is_warned in ((1.0, False), (0.7, True)):  # a part of the scan
+        times_s = np.linspace(0, share * (scan.frame_start_s.max() + scan.shutter.span_s), len(breathing().times_s))
+        check_object_motion(replace(breathing(), times_s=times_s), scan)
+        assert ("the object rests" in caplog.text) == is_warned
 
 
 def test_the_command(rt, cli, refused, scan, tmp_path) -> None:
