@@ -1,7 +1,5 @@
-"""Laws of every operator: adjoint, linear, additive over frames and time cells.
-
-Some on random geometries, shutters, motions, grids and clouds: a thousand cases of each in `make stress`.
-"""
+"""Laws of every operator: adjoint, linear, additive over frames and time cells. Some on random geometries, shutters,
+motions, grids and clouds: a thousand cases of each in `make stress`."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace

@@ -51,13 +51,6 @@ def test_columns_of_few_rows(two_rt, motion, shape, beam) -> None:
     assert np.abs(found - expected).max() <= RAYS * expected.max()
 
 
-@pytest.mark.parametrize("motion", ["static", "per line at one time"])
-def test_volumes_of_several_bricks(two_rt, motion) -> None:
-    """Samples between two owners count once; vectors of rays with two main axes; a detector of several vectors."""
-    grid, shape = Grid((17, 70, 37), (0.11, 0.03, 0.05), (0.05, 0.1, -0.1)), (7, 37)
-    check_twins(RayOperator(two_rt, grid, shape, tables(motion, shape, frames=2)))
-
-
 def pointing(axis: int) -> TimeCells:
     """A source before the volume on one axis, and the detector behind: all rays have this main axis."""
     along, b, c = np.eye(3)[[axis, (axis + 1) % 3, (axis + 2) % 3]]
@@ -73,16 +66,19 @@ def test_rays_along_each_axis_and_odd_detectors(rt) -> None:
         check_twins(RayOperator(rt, GRID, shape, tables("micro-views", shape, frames=1)))
 
 
-@pytest.mark.parametrize("source_mm", [0.4, 0.9, 1.3])
-@pytest.mark.parametrize("motion", ["static", "micro-views"])
-def test_source_inside_or_close_to_the_volume(two_rt, motion, source_mm) -> None:
-    """Planes behind the source do not count, and no bound exists for bricks that its plane cuts."""
-    check_twins(RayOperator(two_rt, Grid.cube(26, 2.0), SHAPE, tables(motion, frames=1, source_mm=source_mm)))
+SEVERAL, CUBE = Grid((17, 70, 37), (0.11, 0.03, 0.05), (0.05, 0.1, -0.1)), Grid.cube(26, 2.0)
+ODD = [Grid(shape, (0.9, 0.11, 0.13)) for shape in ((1, 1, 1), (1, 16, 1), (3, 1, 33), (24, 25, 24))]
 
 
-@pytest.mark.parametrize("shape", [(1, 1, 1), (1, 16, 1), (3, 1, 33), (24, 25, 24)])
-def test_odd_volumes(two_rt, shape) -> None:
-    check_twins(RayOperator(two_rt, Grid(shape, (0.9, 0.11, 0.13)), SHAPE, tables("per line", frames=1)))
+@pytest.mark.parametrize(("grid", "shape", "motion", "more"), [
+    *((grid, SHAPE, "per line", {"frames": 1}) for grid in ODD),
+    *((SEVERAL, (7, 37), motion, {"frames": 2}) for motion in ("static", "per line at one time")),
+    *((CUBE, SHAPE, how, {"frames": 1, "source_mm": mm}) for how in ("static", "micro-views") for mm in (0.4, 0.9, 1.3)),
+])  # fmt: skip
+def test_odd_volumes_of_several_bricks_and_around_or_close_to_the_source(two_rt, grid, shape, motion, more) -> None:
+    """Samples between two owners count once; vectors of rays with two main axes; a detector of several vectors. Planes
+    behind the source do not count, and no bound exists for bricks that its plane cuts."""
+    check_twins(RayOperator(two_rt, grid, shape, tables(motion, shape, **more)))
 
 
 def test_volumes_out_of_sight_and_other_arrays_than_float32_in_c_order(rt) -> None:

@@ -53,10 +53,8 @@ def part_of(pose: np.ndarray, first: tuple[float, float], step: int) -> np.ndarr
 
 
 def error_of_peak(image: np.ndarray, rows: np.ndarray, pose: np.ndarray) -> float:
-    """Largest deviation from the twin in a crop about the centre and on a coarse net over all, over the peak.
-
-    The peak is the ray's through the centre: no pixel may lie on a Gaussian much smaller than a pixel.
-    """
+    """Largest deviation from the twin in a crop about the centre and on a coarse net over all, over the peak: that of the
+    ray through the centre, as no pixel may lie on a Gaussian much smaller than a pixel."""
     centre = centre_on_detector(rows, pose)
     peak = splat_image(rows, part_of(pose, centre, 1), (1, 1))[0, 0]
     v, u = (int(np.clip(at - CROP / 2, 0, SIDE - CROP)) for at in centre)

@@ -106,8 +106,7 @@ def test_a_group_sums_what_one_item_sums(banded_rt, make_cloud, make_geometry, m
 def image_with_moved_centre(
     row: np.ndarray, pose: np.ndarray, shape: tuple[int, int], shift: np.ndarray
 ) -> np.ndarray:
-    """The detector-space splat with its centre moved by ``shift`` (v, u) pixels and nothing else changed.
-
+    """The detector-space splat with its centre moved by ``shift`` (v, u) pixels and nothing else changed:
     p = |d| ρ √(2π/α) exp(−q/2) / √Q with Q = 1 + 2 b·Δ + ΔᵀCΔ and q = ΔᵀSΔ/Q (design notes, section 3).
     """
     precision = precision_matrices(row[:, None])[0]

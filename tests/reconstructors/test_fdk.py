@@ -177,9 +177,8 @@ def test_rows_go_on_as_the_object_might(way, worst) -> None:
     assert off < worst * frames.max() and (found[..., [0, -1]] < 1e-5).all()
 
 
-def test_the_cut_rings_less_into_a_truncated_body(rt, caplog) -> None:
-    """A cylinder that the panel sees four fifths of, be the panel a pixel off centre as real ones are; one that is put aside
-    keeps its own weights, and that is said."""
+def test_the_cut_rings_less_into_a_truncated_body(rt) -> None:
+    """A cylinder that the panel sees four fifths of, be the panel a pixel off centre as real ones are."""
     angles = np.arange(60) * 2 * np.pi / 60
     body = EllipsoidPhantom((Ellipsoid((0.0, 0.0, 0.0), (1.0, 1.0, 8.0), 0.5),), "cylinder")
 
@@ -196,8 +195,6 @@ def test_the_cut_rings_less_into_a_truncated_body(rt, caplog) -> None:
             middle = volume(way, offset_mm)[0]
             rise[way] = middle[(radius_mm > 0.5) & (radius_mm < 0.7)].mean() / middle[radius_mm < 0.2].mean() - 1
         assert rise["none"] > 0.33 and max(rise["cosine"], rise["cylinder"]) < 0.65 * rise["none"]
-    np.testing.assert_array_equal(volume("cylinder", 0.4), volume("none", 0.4))
-    assert "displaced detector are not extrapolated" in caplog.text
 
 
 @pytest.mark.parametrize("axis", ["rows", "columns"])

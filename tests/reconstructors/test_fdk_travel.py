@@ -47,8 +47,8 @@ ORBITS = {
 @pytest.mark.parametrize("is_parallel", [False, True])
 @pytest.mark.parametrize("offset_mm", [0.0, 0.4])
 def test_densities_of_a_circle(rt, is_parallel, offset_mm, caplog) -> None:
-    """Every view counted as if it saw every voxel: two turns had two thirds of the density, six a fifth. Each side of a panel
-    off centre by a sixth is measured once by views half a turn apart."""
+    """Every view counted as if it saw every voxel: two turns had two thirds of the density, six a fifth. Each side of a
+    panel off centre by a sixth is measured once by views half a turn apart."""
     more = {"is_parallel": is_parallel, "offset_mm": offset_mm}
     circle = reconstructed(rt, poses_of(ANGLE[::3], 0 * ANGLE[::3], **more), is_parallel=is_parallel)
     others = {"displaced": helix(4, 0.25, **more)} if offset_mm else {"parallel": helix(3, 0.4, **more)}
