@@ -10,7 +10,7 @@ from phyradgs_cl.fields import Activation, Gaussians
 ACTIVATION = Activation(0.01, 0.5)
 
 
-def test_invert_is_the_inverse(make_cloud) -> None:
+def test_invert_is_the_inverse_and_any_raw_numbers_give_valid_parameters(make_cloud) -> None:
     rows = make_cloud(40, 81, scale=(0.02, 0.4))
     rows[10, :5] = [1e-9, 1e-5, 1e-2, 5.0, 80.0]
     np.testing.assert_allclose(ACTIVATION.apply(ACTIVATION.invert(rows)), rows, rtol=FLOAT32)  # of quaternions
@@ -18,9 +18,6 @@ def test_invert_is_the_inverse(make_cloud) -> None:
     raw[6:10] /= np.linalg.norm(raw[6:10], axis=0)
     again = ACTIVATION.invert(ACTIVATION.apply(raw))
     np.testing.assert_allclose(again, raw, rtol=ACTIVATION_INVERSE, atol=ACTIVATION_INVERSE)
-
-
-def test_any_raw_numbers_give_valid_parameters(make_cloud) -> None:
     raw = np.random.default_rng(83).normal(size=(11, 50)) * 30
     rows = ACTIVATION.apply(raw)
     assert np.all((rows[3:6] >= 0.01) & (rows[3:6] <= 0.5))

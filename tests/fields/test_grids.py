@@ -56,15 +56,12 @@ def test_what_is_chosen(choice, shape, voxel_mm, offset_mm) -> None:
     assert again.shape == shape and again.offset_mm == pytest.approx(found.offset_mm, abs=1e-12)
 
 
-def test_a_part_of_a_grid_knows_its_place() -> None:
+def test_a_part_of_a_grid_knows_its_place_and_a_margin_is_whole_voxels_around_the_box() -> None:
     part = GRID.part((1, 2, 3), (4, 5, 6))
     assert part.slices_in(GRID) == (slice(1, 5), slice(2, 7), slice(3, 9))
     assert GRID.slices_in(GRID) == tuple(slice(0, n) for n in GRID.shape)
     for other in (GRID, GRID.scaled(1.1), Grid(part.shape, part.voxel_size_mm, (1.2, 2.0, 3.0))):
         assert other.slices_in(part) is None
-
-
-def test_a_margin_is_whole_voxels_around_the_box() -> None:
     for margin_mm, shape in ((0, GRID.shape), (2, (14, 24, 42)), ((0, 0.1, 4.1), (10, 22, 46))):
         wide = GridChoice(margin_mm=margin_mm).with_margin(GRID)
         assert wide.shape == shape and wide.offset_mm == pytest.approx(GRID.offset_mm), margin_mm

@@ -127,12 +127,15 @@ def test_rays_are_those_of_the_cells(scan) -> None:
             assert np.allclose(direction, wanted / np.linalg.norm(wanted, axis=1, keepdims=True), atol=1e-12)
 
 
-def test_the_way_through_the_box() -> None:
+def test_the_way_through_the_box_and_the_shadow_of_the_volume_which_holds_every_ray_that_meets_it(scan) -> None:
     source = torch.tensor([[5.0, 0, 0], [5, 0, 0], [5, 3, 0], [0, 0, 0], [5, 0, 0]])
     direction = torch.tensor([[-1.0, 0, 0], [-0.8, 0.6, 0], [-1, 0, 0], [0, 0, 1], [1, 0, 0]])
     first, length = box_span(source, direction, torch.tensor([1.0, 1.0, 0.5]))
     assert np.allclose(first[[0, 3]].tolist(), [4, 0])
     assert np.allclose(length.tolist(), [2, 0, 0, 0.5, 0], atol=FLOAT32)
+    exposure, shape = ExposureRays.of_cells(OwnTimes().cells(scan, 2), scan.grid), scan.geometry.detector_shape
+    assert_shadowed(exposure, np.array([0.6, 0.5, 0.3]), shape)
+    assert exposure.shadow([10.0, 10.0, 10.0], shape) == (slice(0, shape[0]), slice(0, shape[1]))
 
 
 def assert_shadowed(exposure: ExposureRays, half: np.ndarray, shape: tuple[int, int]) -> None:
@@ -144,13 +147,6 @@ def assert_shadowed(exposure: ExposureRays, half: np.ndarray, shape: tuple[int, 
     inside = np.zeros(shape, bool)
     inside[exposure.shadow(half, shape)] = True
     assert meets.any() and not np.any(meets & ~inside) and inside.sum() < 0.5 * inside.size
-
-
-def test_the_shadow_of_the_volume_holds_every_ray_that_meets_it(scan) -> None:
-    exposure = ExposureRays.of_cells(OwnTimes().cells(scan, 2), scan.grid)
-    shape = scan.geometry.detector_shape
-    assert_shadowed(exposure, np.array([0.6, 0.5, 0.3]), shape)
-    assert exposure.shadow([10.0, 10.0, 10.0], shape) == (slice(0, shape[0]), slice(0, shape[1]))
 
 
 @pytest.mark.parametrize("make", [parallel_scan, laminography_scan])

@@ -98,7 +98,7 @@ def test_the_projector_is_the_sum_over_states_and_has_its_transpose(rt) -> None:
         assert_near(forward[frame], expected, 2 * RAYS)
 
 
-def test_subsets_are_rows_and_devices_agree_with_the_host(rt) -> None:
+def test_subsets_are_rows_devices_agree_with_the_host_and_bricks_are_refused(rt, monkeypatch) -> None:
     operator, x, y = warped(rt, deformation(0.1), tables()), noise(GRID.shape), noise((2, *SHAPE))
     part = operator.subset([3, 1])
     np.testing.assert_array_equal(part.forward(x), operator.forward(x)[[3, 1]])
@@ -106,6 +106,9 @@ def test_subsets_are_rows_and_devices_agree_with_the_host(rt) -> None:
     np.testing.assert_array_equal(again.forward(x), operator.forward(x)[[1]])
     np.testing.assert_array_equal(rt.download(part.forward(rt.upload(x))), part.forward(x))
     np.testing.assert_array_equal(rt.download(part.adjoint(rt.upload(y))), part.adjoint(y))
+    monkeypatch.setattr(RayMemory, "plan", lambda self, share=1.0: [whole(GRID.shape)] * 2)
+    with pytest.raises(OutOfMemoryError, match="2 bricks"):
+        operator.forward(x)
 
 
 def test_a_rigid_field_is_a_moved_scanner(rt) -> None:
@@ -200,13 +203,6 @@ def test_cubic_warps_hardly_blur(rt) -> None:
     assert errors[0] > 8 * errors[1], errors
     splines = deformed(blob, GRID, one, warp.states.weights[0])
     assert_near(np.maximum(there, 0), splines, FLOAT32)
-
-
-def test_a_volume_in_bricks_is_refused(rt, monkeypatch) -> None:
-    operator = warped(rt, deformation(0.1), tables())
-    monkeypatch.setattr(RayMemory, "plan", lambda self, share=1.0: [whole(GRID.shape)] * 2)
-    with pytest.raises(OutOfMemoryError, match="2 bricks"):
-        operator.forward(noise(GRID.shape))
 
 
 def in_voxels(fields_mm: np.ndarray) -> np.ndarray:

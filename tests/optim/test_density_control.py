@@ -118,11 +118,16 @@ def test_the_faded_the_lost_sheets_and_needles_are_pruned_unless_they_are_wanted
         np.testing.assert_allclose(scales, np.sort(rows[3:6].max(0)[kept]), rtol=1e-6)
 
 
-def test_when_it_acts() -> None:
+def test_when_it_acts_and_rates_decay_exponentially() -> None:
     control = DensityControl(every=100, start_iteration=500, stop_fraction=0.75)
     due = [i for i in range(1, 2001) if control.is_due(i, 2000)]
     assert due == list(range(600, 1500, 100))
     assert not any(replace(control, every=0).is_due(i, 2000) for i in range(1, 2001))
+    rates = Rates(position=(1e-2, 1e-4), scale=(4e-3, 4e-3), rotation=(1e-3, 1e-5), density=(1.0, 0.25))
+    first, middle, last = (rates.at(p) for p in (0.0, 0.5, 1.0))
+    np.testing.assert_allclose(first, [1e-2] * 3 + [4e-3] * 3 + [1e-3] * 4 + [1.0], rtol=FLOAT64)
+    np.testing.assert_allclose(last, [1e-4] * 3 + [4e-3] * 3 + [1e-5] * 4 + [0.25], rtol=FLOAT64)
+    np.testing.assert_allclose(middle, np.sqrt(first * last), rtol=FLOAT64)
 
 
 STEPS = 6
@@ -179,11 +184,3 @@ def test_kernel_is_its_twin(any_rt, problem) -> None:
     np.testing.assert_allclose(found[0], moments[0], rtol=FLOAT32)
     np.testing.assert_allclose(found[1], moments[1], rtol=ADAM_SECOND_MOMENT)
     np.testing.assert_array_equal(any_rt.download(device_raw)[:, 19:], 0)  # padding has no gradient
-
-
-def test_rates_decay_exponentially() -> None:
-    rates = Rates(position=(1e-2, 1e-4), scale=(4e-3, 4e-3), rotation=(1e-3, 1e-5), density=(1.0, 0.25))
-    first, middle, last = (rates.at(p) for p in (0.0, 0.5, 1.0))
-    np.testing.assert_allclose(first, [1e-2] * 3 + [4e-3] * 3 + [1e-3] * 4 + [1.0], rtol=FLOAT64)
-    np.testing.assert_allclose(last, [1e-4] * 3 + [4e-3] * 3 + [1e-5] * 4 + [0.25], rtol=FLOAT64)
-    np.testing.assert_allclose(middle, np.sqrt(first * last), rtol=FLOAT64)

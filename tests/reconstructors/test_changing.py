@@ -130,12 +130,10 @@ def test_computed_frames_and_held_out_pixels_are_those_of_the_states(rt, scan) -
     assert resting.facts["held_out"]["holdout_rms"] > 0.01
 
 
-def test_subsets_of_fewer_than_half_a_frame_for_each_state_are_joined(rt, scan) -> None:
+def test_no_state_is_in_a_pause_nor_are_there_more_than_frames_and_small_subsets_are_joined(rt, scan) -> None:
+    """Those of fewer than half a frame for each state."""
     eight, eighty = (run(rt, scan, states=20, iterations=1, subsets=n).states.volumes for n in (8, 80))
     np.testing.assert_array_equal(eight, eighty)
-
-
-def test_no_state_is_in_a_pause_nor_are_there_more_than_frames(rt) -> None:
     times_s = np.concatenate([np.arange(40.0), 1000 + np.arange(40.0)])
     paused = replace(empty_scan(), frame_start_s=times_s)
     found = run(rt, paused, states=8, iterations=1).states.times_s

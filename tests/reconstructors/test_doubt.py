@@ -223,7 +223,8 @@ def test_a_box_has_its_part_of_the_bars_and_a_scan_without_a_method_has_none(rt,
 
 
 def test_runs_whose_bars_would_not_hold_have_none_or_a_warning(rt, scan, caplog) -> None:
-    """All runs share a first volume's errors; a volume that never changes has no difference to learn from."""
+    """All runs share a first volume's errors; a volume that never changes has no difference to learn from. The three runs
+    warn of a scan once, and the next command warns again."""
     few = static_scan(scan.projections[:3], scan.geometry, np.array([0.0, 120.0, 240.0]), grid=scan.grid)
     usual = {"device": rt, "doubt": True}
     assert_refused({
@@ -234,9 +235,6 @@ def test_runs_whose_bars_would_not_hold_have_none_or_a_warning(rt, scan, caplog)
     caplog.clear()
     still = reconstruct(scan, lambda scan, options, rt: scan.reference, device=rt, doubt=True, report=False)
     assert still.doubt is None and "same volume" in caplog.text and "may be far too narrow" in caplog.text
-
-
-def test_the_three_runs_warn_of_a_scan_once_and_the_next_command_warns_again(rt, scan, caplog) -> None:
     one_angle = static_scan(scan.projections[:4], scan.geometry, np.zeros(4), grid=scan.grid)
     for count in (1, 2):
         reconstruct(one_angle, "fdk", device=rt, report=False, doubt=True)

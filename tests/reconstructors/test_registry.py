@@ -46,14 +46,12 @@ NUMBERS = [(method, *number) for method, options in BASES.items() for number in 
 MOTIONS = {method: tuple(_models(options)) for method, options in BASES.items()}
 
 
-def test_every_preset_is_taken_as_it_is() -> None:
+def test_every_preset_is_taken_as_it_is_and_every_number_has_a_checked_range_and_can_be_given_as_it_stands() -> None:
     for method, entry in METHODS.items():
         for name, options in entry.presets.items():
             assert method_options(method, name) == options, (method, name)
     assert method_options("phyradgs", "paper").motion == MicroViews(8, 5)
 
-
-def test_every_number_has_a_checked_range_and_can_be_given_as_it_stands() -> None:
     for method, path, current in NUMBERS:
         for name, absurd in ABSURD.items():
             value = [absurd] * len(current) if isinstance(current, tuple) else absurd
