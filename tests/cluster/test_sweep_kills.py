@@ -8,9 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import psutil
+import pytest
 from cluster.processes import free_port, stop, wait_until
 
 from phyradgs_cl.io import read_volume
+from phyradgs_cl.runtime import DEVICE_VARIABLE, list_devices
+from phyradgs_cl.workflow import sweep as sweep_run
 from phyradgs_cl.workflow.sweep import RESULTS, Line, plan_sweep, read_lines, run_sweep
 
 RUNS = 40
@@ -109,3 +112,46 @@ def test_a_sweep_goes_on_at_a_new_scheduler(sweep_folder, start, tmp_path) -> No
     wait_until(lambda: again.poll() is not None, 900, said)
     assert again.returncode == 0, said()
     check_all(sweep_folder, tmp_path)
+
+
+def where(run: object, device: str | None = None) -> Line:
+    """In place of a run: which process has which device."""
+    return {**run.facts, "metrics": {}, "seconds": 0.1, "device": os.environ[DEVICE_VARIABLE], "pid": os.getpid()}
+
+
+def deadly(run: object, device: str | None = None) -> Line:
+    """Kills the worker at one of the runs."""
+    if run.facts["seed"] == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return where(run)
+
+
+def lines_made(folder: Path, grid: str, workers: str, device: str) -> list[Line]:
+    (folder / "grid.toml").write_text(grid)
+    run_sweep(plan_sweep(folder / "grid.toml", folder / "out"), folder / "out", workers, device)
+    return read_lines(folder / "out" / "results.jsonl")
+
+
+def test_each_worker_has_a_device_and_dask_writes_its_page(sweep_folder, monkeypatch) -> None:
+    monkeypatch.setattr(sweep_run, "make_run", where)
+    lines = lines_made(sweep_folder, 'scans = ["*.h5"]\nseeds = [0, 1, 2, 3]\n[[runs]]\n', "2", "cpu,0")
+    index = next(str(one.index) for one in list_devices() if one.kind == "cpu")
+    assert len(lines) == 8 and {line["device"] for line in lines} == {index, "0"}
+    assert len({line["pid"] for line in lines}) == 2  # processes that stay
+    assert "<html" in (sweep_folder / "out" / "workers.html").read_text().lower()
+
+
+def test_a_run_that_kills_every_worker_is_given_up_and_the_others_are_made(sweep_folder, monkeypatch) -> None:
+    monkeypatch.setattr(sweep_run, "make_run", deadly)
+    lines = lines_made(sweep_folder, 'scans = ["a.h5"]\nseeds = [0, 1, 2, 3]\n[[runs]]\n', "1", "cpu")
+    failed = [line for line in lines if "error" in line]
+    assert len(lines) == 4 and [line["seed"] for line in failed] == [1] and "KilledWorker" in failed[0]["error"]
+
+
+def test_no_scheduler_is_one_line(cli, tiny_scan, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grid = tmp_path / "grid.toml"
+    grid.write_text(f'scans = ["{tiny_scan}"]\n[[runs]]\nmethod = "fdk"\n')
+    for address in (f"tcp://127.0.0.1:{free_port()}", "nonsense://x"):
+        assert cli.run(["sweep", str(grid), "-o", str(tmp_path / "out"), "--workers", address]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and f"--workers {address}: found no answer" in error

@@ -10,19 +10,14 @@ from phyradgs_cl.fields import Activation, Gaussians
 ACTIVATION = Activation(0.01, 0.5)
 
 
-def test_invert_is_the_inverse(make_cloud) -> None:
+def test_invert_is_the_inverse_and_any_raw_numbers_give_valid_parameters(make_cloud) -> None:
     rows = make_cloud(40, 81, scale=(0.02, 0.4))
     rows[10, :5] = [1e-9, 1e-5, 1e-2, 5.0, 80.0]
-    np.testing.assert_allclose(
-        ACTIVATION.apply(ACTIVATION.invert(rows)), rows, rtol=FLOAT32
-    )  # of quaternions
+    np.testing.assert_allclose(ACTIVATION.apply(ACTIVATION.invert(rows)), rows, rtol=FLOAT32)  # of quaternions
     raw = np.random.default_rng(82).normal(size=(11, 40))
     raw[6:10] /= np.linalg.norm(raw[6:10], axis=0)
     again = ACTIVATION.invert(ACTIVATION.apply(raw))
     np.testing.assert_allclose(again, raw, rtol=ACTIVATION_INVERSE, atol=ACTIVATION_INVERSE)
-
-
-def test_any_raw_numbers_give_valid_parameters(make_cloud) -> None:
     raw = np.random.default_rng(83).normal(size=(11, 50)) * 30
     rows = ACTIVATION.apply(raw)
     assert np.all((rows[3:6] >= 0.01) & (rows[3:6] <= 0.5))
@@ -37,21 +32,15 @@ def test_any_raw_numbers_give_valid_parameters(make_cloud) -> None:
     np.testing.assert_allclose(ACTIVATION.apply(raw)[3:6], bounded, rtol=0, atol=margin)
 
 
-def test_quaternions_of_any_length_are_rotations(make_cloud) -> None:
+def test_gaussians_and_rows_are_the_same_cloud_and_quaternions_of_any_length_rotations(make_cloud) -> None:
     rows = make_cloud(9, 86)
     cloud = Gaussians.from_rows(rows)
-    for length in (1e-300, 1e-200, 1e-9, 3.0, 1e200, 1e307):
-        np.testing.assert_allclose(replace(cloud, quaternion=cloud.quaternion * length).rows(), rows, rtol=FLOAT32)
-    for length in (1e-30, 1e30):
-        short = np.float32(length) * cloud.quaternion.astype(np.float32)
-        np.testing.assert_allclose(replace(cloud, quaternion=short).rows(), rows, rtol=1e-6, atol=1e-7)
-
-
-def test_gaussians_and_rows_are_the_same_cloud(make_cloud) -> None:
-    rows = make_cloud(7, 85)
-    cloud = Gaussians.from_rows(rows)
-    np.testing.assert_allclose(cloud.rows(), rows, rtol=FLOAT32)
     scaled = cloud.scaled(10.0, 0.1).rows()
     np.testing.assert_allclose(scaled[:6], 10 * rows[:6], rtol=FLOAT64)
     np.testing.assert_allclose(scaled[10], rows[10] / 10, rtol=FLOAT64)
     assert Gaussians.from_rows(np.zeros((11, 0))).rows().shape == (11, 0)
+    for length in (1e-300, 1e-200, 1e-9, 1.0, 3.0, 1e200, 1e307):
+        np.testing.assert_allclose(replace(cloud, quaternion=cloud.quaternion * length).rows(), rows, rtol=FLOAT32)
+    for length in (1e-30, 1e30):
+        short = np.float32(length) * cloud.quaternion.astype(np.float32)
+        np.testing.assert_allclose(replace(cloud, quaternion=short).rows(), rows, rtol=1e-6, atol=1e-7)

@@ -124,18 +124,6 @@ def test_bricks_of_voxels_do_not_matter_and_voxels_lie_where_the_grid_says(optio
         assert np.allclose(found, x + 10 * y + 100 * z, atol=1e-4)
 
 
-def test_a_voxel_is_the_mean_over_its_points() -> None:
-    field = first_field(NeuralOptions(), 16, 0)
-    with torch.no_grad():
-        field.encoding.table.uniform_(-1, 1)
-    grid = Grid((2, 3, 4), (0.5, 0.5, 0.5))
-    whole, size = voxel_values(field, grid, CPU, 10**6, 2), 0.25
-    fine = voxel_values(field, Grid((4, 6, 8), (size,) * 3), CPU, 10**6)
-    expected = fine.reshape(2, 2, 3, 2, 4, 2).mean((1, 3, 5))
-    assert np.allclose(whole, expected, rtol=FLOAT32)
-    assert not np.allclose(whole, voxel_values(field, grid, CPU, 10**6), rtol=0.01)
-
-
 def test_a_volume_does_not_depend_on_how_its_axes_are_called() -> None:
     """Attention couples neighbours, and voxels are to have them along every axis alike."""
     field = first_field(LineOptions(), 8, 0)
@@ -155,7 +143,7 @@ def test_a_volume_does_not_depend_on_how_its_axes_are_called() -> None:
     assert expected.std() > 0.01 * expected.mean()
 
 
-def test_the_field_starts_at_its_share_of_the_bound() -> None:
+def test_the_field_starts_at_its_share_of_the_bound_and_leaves_others_draws_alone() -> None:
     positions = torch.rand(100, 3) * 2 - 1
     for share in (0.05, 0.5):
         options = NeuralOptions(first_share=share, density_bound=4.0)
@@ -163,9 +151,6 @@ def test_the_field_starts_at_its_share_of_the_bound() -> None:
         assert float(values.mean()) == pytest.approx(4 * share, rel=0.5) and float(values.max()) < 4
     leaky = first_field(NeuralOptions(last_activation="leaky-relu"), 16, 1)
     assert float(leaky(positions).detach().min()) > -1
-
-
-def test_a_field_leaves_others_draws_alone() -> None:
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)
@@ -187,7 +172,8 @@ def test_pixels_and_times_are_drawn_evenly_and_each_once() -> None:
     assert np.array_equal(chosen_times(2, 3, 3, np.random.default_rng(0)), [[0, 1, 2]] * 2)
 
 
-def test_windows_are_whole_and_the_scattered_pixels_lie_outside_them() -> None:
+def test_windows_are_whole_and_favour_no_pixel_and_the_scattered_pixels_lie_outside_them() -> None:
+    """Every pixel is as likely as any other, so that windows change a step's noise and not what it fits."""
     rng = np.random.default_rng(0)
     usable = np.ones((17, 14), bool)
     usable[5, 5] = False
@@ -200,10 +186,6 @@ def test_windows_are_whole_and_the_scattered_pixels_lie_outside_them() -> None:
     assert usable[tuple(pixels.T)].all()
     every = windows_and_scattered_pixels(usable, 10_000, 100, 4, rng)
     assert len(every) == usable.sum()
-
-
-def test_windows_favour_no_pixel() -> None:
-    """Every pixel is as likely as any other, so that windows change a step's noise and not what it fits."""
     rng, usable, counts = np.random.default_rng(0), np.ones((16, 12), bool), np.zeros((16, 12))
     for _ in range(4000):
         counts[tuple(windows_and_scattered_pixels(usable, 40, 2, 4, rng).T)] += 1

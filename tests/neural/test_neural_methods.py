@@ -1,4 +1,4 @@
-"""naf and sax-nerf as methods: better than FDK, motion known better than not, repeatable, resumed to the same bits."""
+"""naf and sax-nerf as methods: better than FDK, motion known better than not, resumed to the same bits."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from parallel_kit import BODIES, parallel_scan
 
 from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.api import Scan, compare, reconstruct, save_scan
-from phyradgs_cl.errors import InputError, NumericalError
+from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import checkpoint_path, read_volume
 from phyradgs_cl.neural.field import first_field
 from phyradgs_cl.neural.trainer import Trainer
@@ -41,15 +41,6 @@ def test_a_field_beats_fdk_and_gains_from_the_motion(rt, scan, method, rays, pas
     for motion in [{"motion": "per-row"}, {"motion": "micro-views", "strips": 6}][: 2 if method == "naf" else 1]:
         moving = reconstruct(scan, method, device=rt, sub_intervals=3, **motion, **same)
         assert psnr(moving, scan) > static + gain_db
-
-
-@pytest.mark.parametrize("method", NEURAL)
-def test_the_same_seed_gives_the_same_bits_and_another_seed_others(rt, scan, method) -> None:
-    one, two, other = (reconstruct(scan, method, device=rt, seed=s, **SHORT[method]) for s in (1, 1, 2))
-    assert np.array_equal(one.volume, two.volume)
-    assert not np.array_equal(one.volume, other.volume)
-    assert [line["loss"] for line in one.record] == [line["loss"] for line in two.record]
-    assert one.facts["torch_device"] == "cpu" and one.facts["iterations"] == 3
 
 
 @pytest.mark.parametrize("method", NEURAL)
@@ -132,8 +123,6 @@ def test_the_intensity_model_takes_all_times(rt, scan) -> None:
     assert result.facts["detector_model"] == "intensity" and result.facts["times"] == 5
     changed = {**changes, "detector_model": "log", "times": 2}
     assert reconstruct(scan, "naf", device=rt, **changed).facts["times"] == 2
-    with pytest.raises(InputError, match="option times.*biased"):
-        reconstruct(scan, "naf", device=rt, times=2, **changes)
 
 
 @pytest.mark.parametrize("method", NEURAL)
@@ -145,22 +134,12 @@ def test_the_published_constants_run(rt, scan, method) -> None:
     assert np.isfinite(volume).all() and volume.min() >= 0
 
 
-def test_a_field_that_is_lost_is_told_in_one_line(scan) -> None:
-    run = small_run(scan)
-    with torch.no_grad():
-        run.method.field.encoding.table.fill_(float("nan"))
-    with pytest.raises(NumericalError, match="loss: found nan at iteration 1"):
-        run.run(None)
-
-
 @pytest.mark.parametrize("method", NEURAL)
 def test_from_file_to_file(rt, scan, method, tmp_path, capsys) -> None:
     assert METHODS[method].is_resumable and list(METHODS[method].presets) == ["default", "published"]
     save_scan(tmp_path / "scan.h5", scan)
     settings = [f"--set={name}={value}" for name, value in SHORT[method].items() if name != "iterations"]
-    command = [
-        "reconstruct", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "volume.h5"), "--method", method,
-    ]
+    command = ["reconstruct", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "volume.h5"), "--method", method]
     assert load_cli().run([*command, *settings, "--iterations", "2", "--motion", "per-row"]) == 0
     assert "PSNR" in capsys.readouterr().out
     stored = read_volume(tmp_path / "volume.h5")

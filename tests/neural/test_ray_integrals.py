@@ -92,9 +92,7 @@ def test_smooth_fields_and_their_means_over_an_exposure(rays) -> None:
     ]:  # fmt: skip
         assert expected.max() > 0.2
         assert np.abs(integrals(field, rays, jitter) - expected).max() <= RAY_SAMPLES * expected.max()
-        mean, found = (
-            expected.reshape(-1, 5).mean(1), integrals(field, rays, "ray", times=5).reshape(-1, 5).mean(1),
-        )
+        mean, found = (expected.reshape(-1, 5).mean(1), integrals(field, rays, "ray", times=5).reshape(-1, 5).mean(1))
         assert np.abs(found - mean).max() <= RAY_SAMPLES * mean.max()
 
 
@@ -117,31 +115,27 @@ def test_rays_are_those_of_the_cells(scan) -> None:
     for axis in ("rows", "columns"):
         exposure = ExposureRays.of_cells(replace(table, axis=axis), grid)
         pixels = np.array([[0, 5], [7, 23], [23, 0], [12, 12]])
-        times = np.tile([[0, 1]], (4, 1))
-        source, direction = exposure(pixels, times)
-        for number, (row, column) in enumerate(pixels):
+        rays = exposure(pixels, np.tile([[0, 1]], (4, 1)))
+        for (row, column), source, direction in zip(pixels, *rays, strict=True):
             line = row if axis == "rows" else column
-            serving = np.flatnonzero((table.line_start <= line) & (line < table.line_stop))
-            centre = np.array(grid.offset_mm[::-1])
-            expected = {
-                tuple(np.round((table.pose[cell, :3] - centre) / grid.half_longest_mm, 6)) for cell in serving
-            }
-            assert {tuple(np.round(s, 6)) for s in source[number]} == expected
-            for s, d in zip(source[number], direction[number], strict=True):
-                cell = next(
-                    c for c in serving if np.allclose((table.pose[c, :3] - centre) / grid.half_longest_mm, s)
-                )
-                pixel = pixel_centres(table.pose[cell], scan.geometry.detector_shape)[row, column]
-                wanted = pixel - table.pose[cell, :3]
-                assert np.allclose(d, wanted / np.linalg.norm(wanted), atol=1e-12)
+            serving = table.pose[(table.line_start <= line) & (line < table.line_stop)]
+            expected = (serving[:, :3] - np.array(grid.offset_mm[::-1])) / grid.half_longest_mm
+            cells = [int(np.linalg.norm(expected - one, axis=1).argmin()) for one in source]
+            assert sorted(cells) == [0, 1] and np.allclose(source, expected[cells], atol=1e-6)
+            centres = [pixel_centres(pose, scan.geometry.detector_shape)[row, column] for pose in serving[cells]]
+            wanted = np.array(centres) - serving[cells, :3]
+            assert np.allclose(direction, wanted / np.linalg.norm(wanted, axis=1, keepdims=True), atol=1e-12)
 
 
-def test_the_way_through_the_box() -> None:
+def test_the_way_through_the_box_and_the_shadow_of_the_volume_which_holds_every_ray_that_meets_it(scan) -> None:
     source = torch.tensor([[5.0, 0, 0], [5, 0, 0], [5, 3, 0], [0, 0, 0], [5, 0, 0]])
     direction = torch.tensor([[-1.0, 0, 0], [-0.8, 0.6, 0], [-1, 0, 0], [0, 0, 1], [1, 0, 0]])
     first, length = box_span(source, direction, torch.tensor([1.0, 1.0, 0.5]))
     assert np.allclose(first[[0, 3]].tolist(), [4, 0])
     assert np.allclose(length.tolist(), [2, 0, 0, 0.5, 0], atol=FLOAT32)
+    exposure, shape = ExposureRays.of_cells(OwnTimes().cells(scan, 2), scan.grid), scan.geometry.detector_shape
+    assert_shadowed(exposure, np.array([0.6, 0.5, 0.3]), shape)
+    assert exposure.shadow([10.0, 10.0, 10.0], shape) == (slice(0, shape[0]), slice(0, shape[1]))
 
 
 def assert_shadowed(exposure: ExposureRays, half: np.ndarray, shape: tuple[int, int]) -> None:
@@ -153,13 +147,6 @@ def assert_shadowed(exposure: ExposureRays, half: np.ndarray, shape: tuple[int, 
     inside = np.zeros(shape, bool)
     inside[exposure.shadow(half, shape)] = True
     assert meets.any() and not np.any(meets & ~inside) and inside.sum() < 0.5 * inside.size
-
-
-def test_the_shadow_of_the_volume_holds_every_ray_that_meets_it(scan) -> None:
-    exposure = ExposureRays.of_cells(OwnTimes().cells(scan, 2), scan.grid)
-    shape = scan.geometry.detector_shape
-    assert_shadowed(exposure, np.array([0.6, 0.5, 0.3]), shape)
-    assert exposure.shadow([10.0, 10.0, 10.0], shape) == (slice(0, shape[0]), slice(0, shape[1]))
 
 
 @pytest.mark.parametrize("make", [parallel_scan, laminography_scan])

@@ -72,11 +72,8 @@ def test_masked_pixels_pull_at_nothing(any_rt) -> None:
 
 
 def test_ssim_is_scikit_images() -> None:
-    """The same window (truncated at 5 pixels, σ 1.5), constants and population covariance, away from the borders.
-
-    scikit-image reflects at the border and the loss pads with zeros, so that the interior is compared: the twin's
-    own border is removed by comparing two losses that differ in the interior only.
-    """
+    """The same window (truncated at 5 pixels, σ 1.5), constants and population covariance. scikit-image reflects at the
+    border and the loss pads with zeros: two losses are compared that differ in the interior only."""
     rendered, measured = images((40, 44), 4)
     assert (C1, C2) == (0.01**2, 0.03**2) and WINDOW.size == 11
     border = np.ones((40, 44), bool)

@@ -9,7 +9,7 @@ from phyradgs_cl.fields import Activation
 from phyradgs_cl.objective.terms import mean_density
 from phyradgs_cl.optim import DeviceAdam
 
-WEIGHT = 0.3
+WEIGHT, ACTIVATION = 0.3, Activation(0.01, 0.6)
 
 
 def test_values_by_hand() -> None:
@@ -22,36 +22,33 @@ def test_values_by_hand() -> None:
     assert value == 0 and gradient.shape == (11, 0)
 
 
+def on_device(rt, raw: np.ndarray) -> tuple:
+    """Raw numbers (11, count): the optimiser, them as they are, their activation, zeros for gradients and statistics."""
+    count, stride = raw.shape[1], -(-raw.shape[1] // 16) * 16
+    padded = np.zeros((11, stride), np.float32)
+    padded[6], padded[:, :count] = 1.0, raw
+    adam, device_raw, parameters = DeviceAdam(rt, ACTIVATION), rt.upload(padded), rt.zeros((11, stride))
+    adam.activate(device_raw, parameters, count, stride)
+    return adam, device_raw, parameters, rt.zeros((13, stride)), rt.zeros((2, stride))
+
+
 @pytest.mark.parametrize("count", [1, 5, 16, 21])
 def test_kernel_chains_them_to_raw_numbers(two_rt, make_cloud, finite_differences, count) -> None:
-    activation = Activation(0.01, 0.6)
-    raw = activation.invert(make_cloud(count, 72, scale=(0.03, 0.3))).astype(np.float32).astype(float)
+    raw = ACTIVATION.invert(make_cloud(count, 72, scale=(0.03, 0.3))).astype(np.float32).astype(float)
     raw[6:10] *= 1.7  # raw quaternions need not be unit
-    stride = -(-count // 16) * 16
-    padded = np.zeros((11, stride), np.float32)
-    padded[6] = 1.0
-    padded[:, :count] = raw
-    adam, device_raw = DeviceAdam(two_rt, activation), two_rt.upload(padded)
-    parameters, gradients = two_rt.zeros((11, stride)), two_rt.zeros((13, stride))
-    statistics = two_rt.zeros((2, stride))
-    adam.activate(device_raw, parameters, count, stride)
+    adam, device_raw, parameters, gradients, statistics = on_device(two_rt, raw)
     active = two_rt.download(parameters)[:, :count]
-    np.testing.assert_allclose(active, activation.apply(raw), rtol=FLOAT32, atol=FLOAT32)
-    adam.chain(device_raw, parameters, gradients, statistics, count, stride, density_weight=WEIGHT)
+    np.testing.assert_allclose(active, ACTIVATION.apply(raw), rtol=FLOAT32, atol=FLOAT32)
+    adam.chain(device_raw, parameters, gradients, statistics, count, gradients.shape[1], density_weight=WEIGHT)
     found = two_rt.download(gradients)[:11, :count]
-    expected = finite_differences(lambda r: mean_density(activation.apply(r), WEIGHT)[0], raw)
+    expected = finite_differences(lambda r: mean_density(ACTIVATION.apply(r), WEIGHT)[0], raw)
     assert_near(found, expected, PARAMETER_GRADIENT)
     np.testing.assert_array_equal(two_rt.download(statistics), 0)  # nothing was in view
 
 
 def test_statistics_gather_norms_and_sightings(any_rt, make_cloud) -> None:
-    activation, count, stride = Activation(0.01, 0.6), 4, 16
-    raw = np.zeros((11, stride), np.float32)
-    raw[6] = 1.0
-    raw[:, :count] = activation.invert(make_cloud(count, 73))
-    adam, device_raw = DeviceAdam(any_rt, activation), any_rt.upload(raw)
-    statistics, parameters = any_rt.zeros((2, stride)), any_rt.zeros((11, stride))
-    adam.activate(device_raw, parameters, count, stride)
+    count, stride = 4, 16
+    adam, device_raw, parameters, _, statistics = on_device(any_rt, ACTIVATION.invert(make_cloud(count, 73)))
     for _ in range(3):
         by = np.zeros((13, stride), np.float32)
         by[11, :count], by[12, :count] = [3.0, 0.0, -6.0, 0.0], [4.0, 2.0, 8.0, 0.0]

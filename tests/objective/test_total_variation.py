@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+import scipy.fft
 from kernel_kit import random_weights
-from tolerances import FLOAT64, TV_GRADIENT, TV_MAP, TV_VALUE, TWIN_GRADIENT
+from tolerances import FLOAT32, FLOAT64, TV_GRADIENT, TV_MAP, TV_VALUE, TWIN_GRADIENT
 
 from phyradgs_cl.objective import TvDescent, TvProx
+from phyradgs_cl.objective.dct_prox import DctProx, dct_prox
 from phyradgs_cl.objective.terms import TotalVariation, total_variation
 from phyradgs_cl.objective.tv import differences, tv_descent, tv_gradient, tv_prox
 from phyradgs_cl.runtime.layout import pad_rows, pitch_of, unpad_rows
@@ -56,7 +58,7 @@ def test_the_map_is_the_minimum_of_its_objective(axis_weights) -> None:
         variation = np.linalg.norm(changes[-3:], axis=0).sum() + np.abs(changes[:-3]).sum()
         return 0.5 * float(((x - volume) ** 2).sum()) + weight * float(variation)
 
-    best = tv_prox(volume, weight, 3000, nonnegative=True, axis_weights=axis_weights)
+    best = tv_prox(volume, weight, 1000, nonnegative=True, axis_weights=axis_weights)
     assert best.min() >= 0
     lowest, rng = objective(best), np.random.default_rng(0)
     for length in (1e-1, 1e-2, 1e-3):
@@ -66,18 +68,15 @@ def test_the_map_is_the_minimum_of_its_objective(axis_weights) -> None:
     assert objective(np.maximum(volume, 0)) > lowest + 1
 
 
-def test_total_variation_by_hand() -> None:
+@pytest.mark.parametrize(("axis_weights", "step"), [((1.0, 1.0, 1.0), 1 / 12), ((3.0, 2.0, 1.0), 1 / 56)])
+def test_total_variation_and_the_first_step_by_hand(any_rt, axis_weights, step) -> None:
+    """One over 4 Σ weights², the largest step that is sure to converge: by so much two unequal neighbours approach."""
     volume = np.zeros((2, 2, 2))
     volume[1, 1, 1], volume[0, 0, 0] = 3.0, 4.0
     # backwards of the corner of 3 lie three steps of it; at the corner of 4 all three axes step at once
     for first, expected in ((1.0, 3 * 3 + 4 * np.sqrt(3)), (2.0, 3 * 4 + 4 * np.sqrt(6))):
         variation = np.linalg.norm(differences(volume, (first, 1.0, 1.0)), axis=0).sum()
         assert variation == pytest.approx(expected, rel=1e-12)
-
-
-@pytest.mark.parametrize(("axis_weights", "step"), [((1.0, 1.0, 1.0), 1 / 12), ((3.0, 2.0, 1.0), 1 / 56)])
-def test_the_first_step_by_hand(any_rt, axis_weights, step) -> None:
-    """One over 4 Σ weights², the largest step that is sure to converge: by so much two unequal neighbours approach."""
     volume = np.array([[[0.0, 1.0]]])
     found = TvProx(any_rt, volume.shape, axis_weights)(volume, 1.0, 1, nonnegative=False)
     twin = tv_prox(volume, 1.0, 1, nonnegative=False, axis_weights=axis_weights)
@@ -87,7 +86,7 @@ def test_the_first_step_by_hand(any_rt, axis_weights, step) -> None:
 
 def test_the_dual_goes_on_where_the_last_call_left_it(rt) -> None:
     volume = random_weights((5, 6, 7)).astype(np.float32)
-    goal, prox = tv_prox(volume, 0.4, 4000, nonnegative=False), TvProx(rt, volume.shape)
+    goal, prox = tv_prox(volume, 0.4, 1000, nonnegative=False), TvProx(rt, volume.shape)
     errors = [np.abs(prox(volume, 0.4, 8, nonnegative=False) - goal).max() for _ in range(6)]
     assert errors[-1] < 0.4 * errors[0]
     other = TvProx(rt, volume.shape)
@@ -133,3 +132,34 @@ def test_steps_of_the_size_of_rounding_count_less_in_every_unit(two_rt, unit, st
     volume[..., :20], volume[..., 20:22] = 1.0, (0.0, step / np.sqrt(2))
     for gradient in (tv_gradient(unit * volume), TvDescent(two_rt, volume.shape).gradient(unit * volume)):
         assert gradient[0, 0, 22] == pytest.approx(-share, rel=2e-4)
+
+
+BLOCK_SHAPES = [(5, 6, 7), (4, 4, 33), (17, 4, 20), (9, 11, 16), (3, 8, 8), (1, 1, 1)]
+
+
+@pytest.mark.parametrize("shape", BLOCK_SHAPES)
+def test_the_kernel_of_cosine_blocks_is_its_twin(two_rt, shape) -> None:
+    volume = np.random.default_rng(1).normal(size=shape).astype(np.float32)
+    prox, on_device = DctProx(two_rt, shape), two_rt.upload(volume)
+    for turn in range(4):
+        found, nonnegative = two_rt.empty(shape), turn % 2 == 0
+        assert prox(on_device, 0.4, turn, nonnegative=nonnegative, out=found) is found
+        expected = dct_prox(volume, 0.4, turn, nonnegative=nonnegative)
+        np.testing.assert_allclose(two_rt.download(found), expected, rtol=0, atol=FLOAT32)
+    np.testing.assert_array_equal(prox(volume, 0.4, turn, nonnegative=nonnegative), two_rt.download(found))
+    prox(on_device, 0.4, turn, nonnegative=nonnegative, out=on_device)  # in place, the same bits
+    np.testing.assert_array_equal(two_rt.download(on_device), two_rt.download(found))
+
+
+def test_four_turns_are_the_mean_over_all_blocks() -> None:
+    volume = np.random.default_rng(2).normal(size=(6, 5, 7))
+    shrunk, count = np.zeros_like(volume), np.zeros_like(volume)
+    for z, y, x in np.ndindex(3, 2, 4):
+        at = np.s_[z : z + 4, y : y + 4, x : x + 4]
+        values = scipy.fft.dctn(volume[at], norm="ortho")
+        less = np.sign(values) * np.maximum(np.abs(values) - 0.7, 0)
+        less[0, 0, 0] = values[0, 0, 0]
+        shrunk[at] += scipy.fft.idctn(less, norm="ortho")
+        count[at] += 1
+    mean_of_turns = np.mean([dct_prox(volume, 0.7, turn, nonnegative=False) for turn in range(4)], 0)
+    np.testing.assert_allclose(mean_of_turns, shrunk / count, atol=FLOAT64)

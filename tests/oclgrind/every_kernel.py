@@ -52,6 +52,7 @@ from phyradgs_cl.simulation import SimulationOptions, VolumeSource, simulate
 KERNELS = Path(__file__).resolve().parents[2] / "cl"
 SHAPE, GRID = (5, 7), Grid((5, 6, 7), (0.3, 0.28, 0.25), (0.1, 0.0, -0.1))
 GEOMETRY = ConeGeometry(5.0, 7.5, SHAPE, (3.9 / 5, 4.1 / 7), (0.1, 0.2))
+ORBIT, COLUMNS = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.6)), Shutter(0.5, 0.4, "columns", -1)
 SPLATTING = ("phyradgs", "r2")
 NEURAL = ("naf", "sax-nerf")  # PyTorch, no kernel of ours
 FREEZES = ("a GPU's", "a GPU's without float64")  # builds, and cases, in which unwritten memory cannot be looked for
@@ -105,10 +106,7 @@ def cloud(count: int) -> np.ndarray:
     return rows
 
 
-OPTIONS = {
-    "exact": {}, "affine, whole": {"affine": True, "cutoff_sigma": 0.0},
-    "intensity": {"intensity_unit": 2.0},
-}
+OPTIONS = {"exact": {}, "affine, whole": {"affine": True, "cutoff_sigma": 0.0}, "intensity": {"intensity_unit": 2.0}}
 MODELS: dict[str, Callable[..., TimeCells]] = {
     "still": static_cells, "micro-views": lambda *where: micro_view_cells(*where, 2, 2),
     "moving": lambda *where: exact_cells(*where, 2),
@@ -116,16 +114,14 @@ MODELS: dict[str, Callable[..., TimeCells]] = {
 
 
 def splats(rt: Runtime, model: str, options: str) -> None:
-    orbit, shutter = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.6)), Shutter(0.5, 0.4, "columns", -1)
-    table = MODELS[model](orbit, shutter, 0, 0.0, SHAPE[1])
+    table = MODELS[model](ORBIT, COLUMNS, 0, 0.0, SHAPE[1])
     projector = SplatProjector(rt, SHAPE[1], SHAPE[0], **OPTIONS[options])  # type: ignore[arg-type]
     projector.project_adjoint(cloud(3), DeviceCells.upload(rt, table), np.ones(SHAPE[::-1], np.float32))
 
 
 def operators(rt: Runtime) -> None:
     """Splats from and to plain arrays, as the Python API has them."""
-    orbit, shutter = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.6)), Shutter(0.5, 0.4, "columns", -1)
-    frames = SplatProjection(rt, SHAPE, [micro_view_cells(orbit, shutter, f, 0.0, SHAPE[1], 2, 2) for f in (0, 1)], 0.7)
+    frames = SplatProjection(rt, SHAPE, [micro_view_cells(ORBIT, COLUMNS, f, 0.0, SHAPE[1], 2, 2) for f in (0, 1)], 0.7)
     point = frames.rows.enter(rt.upload(cloud(3), np.float32))
     frames.back(point, frames.forward(point))
     ones = frames.rows.with_densities(point, rt.upload(np.ones(3, np.float32)))
@@ -136,8 +132,7 @@ def operators(rt: Runtime) -> None:
 
 
 def nothing(rt: Runtime) -> None:
-    orbit, shutter = CircularOrbit(GEOMETRY, ConstantSpeed(0.3, 0.6)), Shutter(0.5, 0.4, "rows", 1)
-    cells = DeviceCells.upload(rt, exact_cells(orbit, shutter, 0, 0.0, SHAPE[0], 2))
+    cells = DeviceCells.upload(rt, exact_cells(ORBIT, Shutter(0.5, 0.4, "rows", 1), 0, 0.0, SHAPE[0], 2))
     SplatProjector(rt, *SHAPE).project(np.zeros((11, 0)), cells)
     voxelise(rt, cloud(3), GRID)
     rt.launch(rt.kernel("rates", "multiply_add"), 4, np.int32(3), np.float32(0.5), rt.zeros(4))
@@ -170,30 +165,20 @@ def tiny_scan(rt: Runtime, model: str, geometry: ConeGeometry | ParallelGeometry
     return simulate(source, geometry, GRID, options)
 
 
-def method(rt: Runtime, name: str, motion: str, **more: object) -> None:
-    """A method on a scan of three frames, in the intensity model where it follows the motion."""
+def method(rt: Runtime, name: str, motion: str, *, is_moving: bool = False, **more: object) -> None:
+    """A method on a scan of three frames, in the intensity model where it follows the motion; or of an object that moves,
+    every frame between two states."""
     geometry = ParallelGeometry(SHAPE, (2.6 / 5, 2.7 / 7)) if name == "fbp" else GEOMETRY
-    scan = tiny_scan(rt, "log" if motion == "static" else "intensity", geometry)
+    scan = tiny_scan(rt, "log" if motion == "static" or is_moving else "intensity", geometry)
+    control_mm = 0.1 * np.random.default_rng(0).normal(size=(2, 5, 5, 5, 3))
+    moved = ObjectMotion(Deformation(control_mm, (-1.2,) * 3, 0.6, np.array([0.0, 14.0]), np.eye(2)))
     changes: dict[str, object] = {"motion": motion}
     if name in SPLATTING:
         control = {"every": 2, "start_iteration": 0, "threshold": 1e-9}
-        changes |= {"gaussians": 6, "tv_edge": 4, "parameter_terms_from": 0}
-        changes |= {"iterations": 3, "control": control}
+        changes |= {"gaussians": 6, "tv_edge": 4, "parameter_terms_from": 0, "iterations": 3, "control": control}
     elif name not in ("fdk", "fbp"):
         changes |= {"iterations": 1, **({"sub_intervals": 2} if motion == "per-row" else {})}
-    reconstruct(scan, plan_run(name, {**changes, **more}), rt)
-
-
-def moving(rt: Runtime, name: str, motion: str) -> None:
-    """A method on a scan of an object that moves: every frame between two states."""
-    control_mm = 0.1 * np.random.default_rng(0).normal(size=(2, 5, 5, 5, 3))
-    times_s = np.array([0.0, 14.0])
-    one = Deformation(control_mm, (-1.2,) * 3, 0.6, times_s, np.array([[1.0, 0.0], [0.0, 1.0]]))
-    more: dict[str, object] = {"phyradgs": {"iterations": 2, "gaussians": 6, "tv_edge": 4}, "fdk": {}}.get(
-        name, {"iterations": 1, "sub_intervals": 2}
-    )  # fmt: skip
-    changes: dict[str, object] = {"motion": motion, **more}
-    reconstruct(tiny_scan(rt, "log", GEOMETRY), plan_run(name, changes, object_motion=ObjectMotion(one)), rt)
+    reconstruct(scan, plan_run(name, {**changes, **more}, object_motion=moved if is_moving else None), rt)
 
 
 def cases() -> dict[str, Callable[[Runtime], None]]:
@@ -206,7 +191,7 @@ def cases() -> dict[str, Callable[[Runtime], None]]:
         for motion in ("static", "exact" if name in SPLATTING else "per-row"):
             found[f"{name} {motion}"] = partial(method, name=name, motion=motion)
     for name, motion in (("fdk", "static"), ("fdk", "per-row"), ("sirt", "per-row"), ("phyradgs", "exact")):
-        found[f"moving {name} {motion}"] = partial(moving, name=name, motion=motion)
+        found[f"moving {name} {motion}"] = partial(method, name=name, motion=motion, is_moving=True)
     found["fista ridge"] = partial(method, name="fista", motion="static", prior="ridge", iterations=6)  # after five maps
     return found
 

@@ -1,9 +1,9 @@
 """Volumes that do not fit the device are taken in bricks: the same result, within the limit, in every direction of a cut.
 
-Operators between device arrays: what they do to NumPy's, bit for bit, and nothing crosses the bus."""
+Backprojections of device arrays: what they make of NumPy's, bit for bit, and only poses cross the bus."""
 
 import logging
-from dataclasses import astuple, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from kernel_kit import assert_near
 from memory_limits import refuse_large, room_for
 from ray_tables import noise, tables
 from refusals import assert_refused
-from tolerances import BRICKS, RAYS
+from tolerances import BRICKS
 
 from phyradgs_cl.errors import OutOfMemoryError
 from phyradgs_cl.fields import Grid
@@ -30,16 +30,14 @@ pytestmark = pytest.mark.slow
 
 SHAPE = (7, 37)
 TALL = Grid((21, 70, 37), (0.09, 0.03, 0.05), (0.05, 0.1, -0.1))
-UPRIGHT = Grid((12, 17, 21), (0.1, 0.1, 0.1))
 AXES = pytest.mark.parametrize("axis", ["rows", "columns"])
 Z_ONLY, Z_AND_Y = 320_000, 130_000  # bytes of room for TALL: cuts along z, and along both
 
 
-@pytest.mark.parametrize(
-    ("motion", "axis", "nbytes"),
-    [("static", "rows", Z_ONLY), ("static", "columns", Z_AND_Y),
-     ("per line", "columns", Z_ONLY), ("per line", "rows", Z_AND_Y)],
-)
+@pytest.mark.parametrize(("motion", "axis", "nbytes"), [
+    ("static", "rows", Z_ONLY), ("static", "columns", Z_AND_Y), ("per line", "columns", Z_ONLY),
+    ("per line", "rows", Z_AND_Y),
+])  # fmt: skip
 def test_rays(two_rt, motion, axis, nbytes) -> None:
     cells = tables(motion, SHAPE, axis, frames=5)
     operator = RayOperator(two_rt, TALL, SHAPE, cells)
@@ -78,11 +76,10 @@ def test_indices_of_64_bits_change_nothing_in_bricks(two_rt, monkeypatch) -> Non
         assert_near(long.adjoint(expected), back, BRICKS)
 
 
-@pytest.mark.parametrize(
-    ("pixels", "tilt", "axis"),
-    [((13, 18), 0.0, ""), ((13, 18), 0.05, ""), ((700, 7), 0.0, ""), ((13, 18), 0.0, "rows"), ((13, 18), 0.0, "columns")],
-    ids=["upright", "tilted", "blocks along z", "rows", "columns"],
-)
+@pytest.mark.parametrize(("pixels", "tilt", "axis"), [
+    ((13, 18), 0.0, ""), ((13, 18), 0.05, ""), ((700, 7), 0.0, ""), ((13, 18), 0.0, "rows"),
+    ((13, 18), 0.0, "columns"),
+], ids=["upright", "tilted", "blocks along z", "rows", "columns"])  # fmt: skip
 def test_backprojection(two_rt, make_geometry, pixels, tilt, axis) -> None:
     """Of frames, and of lines that have poses of their own."""
     grid, rng, count = Grid((11, 9, 19), (0.12, 0.2, 0.1)), np.random.default_rng(94), 9 if axis else 67
@@ -101,9 +98,15 @@ def test_backprojection(two_rt, make_geometry, pixels, tilt, axis) -> None:
             np.testing.assert_array_equal(project(two_rt, views, *seen), expected)
 
 
-def test_what_does_not_fit_at_all_is_said(rt, make_cloud) -> None:
+def test_what_does_not_fit_at_all_is_said_of_the_memory_and_of_arrays_on_the_device(rt, make_cloud) -> None:
     grid = Grid.cube(32, 2.0)
     operator = RayOperator(rt, grid, SHAPE, tables("static", SHAPE))
+    x = rt.zeros(grid.shape)
+    assert_refused({
+        "volume": lambda: operator.forward(rt.zeros((1, 2, 3))),
+        "float32": lambda: operator.forward(rt.zeros(grid.shape, np.int32)), "shape": lambda: operator.forward(x, x),
+        "out": lambda: operator.forward(x, np.zeros(operator.frames_shape, np.float32)),
+    })  # fmt: skip
     with room_for(rt, 5_000):
         with pytest.raises(OutOfMemoryError, match="32×32×32 voxels.*--memory"):
             operator.adjoint(noise(operator.frames_shape, 97))
@@ -127,9 +130,8 @@ def test_a_refused_buffer_is_asked_for_once_more_in_bricks(
     calls = {
         "forward": lambda: RayOperator(rt, TALL, SHAPE, cells).forward(x),
         "adjoint": lambda: RayOperator(rt, TALL, SHAPE, cells).adjoint(y),
-        "fdk": lambda: backproject(rt, y, pose, np.ones(3), TALL),
-        "voxels": lambda: voxelise(rt, cloud, TALL),
-    }
+        "fdk": lambda: backproject(rt, y, pose, np.ones(3), TALL), "voxels": lambda: voxelise(rt, cloud, TALL),
+    }  # fmt: skip
     for call in calls.values():
         expected = call()
         caplog.clear()
@@ -145,6 +147,7 @@ def test_a_refused_buffer_is_asked_for_once_more_in_bricks(
 
 
 def test_lists_of_too_many_entries_are_made_for_smaller_bricks(rt, make_cloud, monkeypatch, caplog) -> None:
+    """Three tiles of 2^30 entries each: the sum is past 2^31, and must not turn negative but stay at the largest int."""
     rows = make_cloud(200, 102)
     whole = Voxeliser(rt, TALL.shape)
     expected = whole.voxelise(rows, TALL)
@@ -153,68 +156,10 @@ def test_lists_of_too_many_entries_are_made_for_smaller_bricks(rt, make_cloud, m
     with room_for(rt, 1_200_000):
         np.testing.assert_array_equal(voxelise(rt, rows, TALL), expected)
     assert warned(caplog) == 1
-
-
-def test_sums_of_entries_stay_at_the_largest_int(rt) -> None:
-    """Three tiles of 2^30 entries each: the sum is past 2^31, and must not turn negative."""
     starts = rt.upload(np.array([0, 2**30, 2**30, 2**30, 5]), np.int32)
     rt.launch(rt.kernel("binning", "bin_starts"), 1, np.int32(4), starts)
     largest = 2**31 - 1
     np.testing.assert_array_equal(rt.download(starts), [0, 2**30, largest, largest, largest])
-
-
-def on_device(rt, call, values: np.ndarray) -> np.ndarray:
-    """What ``call`` makes of a device array, after its second call, which moves nothing."""
-    x = rt.upload(values)
-    out = call(x)
-    before = astuple(rt.traffic)
-    found = call(x)
-    assert astuple(rt.traffic) == before
-    into = call(x, out)
-    assert into is out
-    np.testing.assert_array_equal(rt.download(out), rt.download(found))
-    np.testing.assert_array_equal(rt.download(x), values)
-    return rt.download(found)
-
-
-@pytest.mark.parametrize(
-    ("motion", "grid", "axis"),
-    [("static", UPRIGHT, "rows"), ("static", UPRIGHT, "columns"),
-     ("per line", TALL, "columns"), ("micro-views", TALL, "rows")],
-)
-def test_rays_of_arrays_on_the_device(two_rt, motion, grid, axis) -> None:
-    operator = RayOperator(two_rt, grid, SHAPE, tables(motion, SHAPE, axis, frames=4))
-    for part in (operator, operator.subset([2, 0])):
-        x, y = noise(grid.shape, 31), noise(part.frames_shape, 32)
-        np.testing.assert_array_equal(on_device(two_rt, part.forward, x), part.forward(x))
-        np.testing.assert_array_equal(on_device(two_rt, part.adjoint, y), part.adjoint(y))
-
-
-@AXES
-def test_the_intensity_model_of_arrays_on_the_device(two_rt, axis) -> None:
-    cells = tables("per line", SHAPE, axis, frames=3)
-    host, device = (IntensityOperator(two_rt, TALL, SHAPE, cells) for _ in range(2))
-    x, d = 4 * noise(TALL.shape, 33), noise(TALL.shape, 34)
-    for chosen in ([0, 1, 2], [2, 1]):
-        on_host, there = host.subset(chosen), device.subset(chosen)
-        y = noise(there.frames_shape, 35)
-        for name, values in (("forward", d), ("expected", x), ("forward", d), ("adjoint", y)):
-            expected = getattr(on_host, name)(values)
-            found = on_device(two_rt, getattr(there, name), values)
-            np.testing.assert_allclose(found, expected, rtol=0, atol=RAYS * np.abs(expected).max(), err_msg=name)
-    swapped = there.forward(d), two_rt.download(on_host.forward(two_rt.upload(d)))  # each has stood at the other's kind
-    np.testing.assert_allclose(*swapped, rtol=0, atol=RAYS * swapped[0].max())
-
-
-def test_arrays_on_the_device_that_do_not_fit_are_refused(rt) -> None:
-    operator = RayOperator(rt, UPRIGHT, SHAPE, tables("static", SHAPE))
-    x = rt.zeros(UPRIGHT.shape)
-    assert_refused({
-        "volume": lambda: operator.forward(rt.zeros((1, 2, 3))),
-        "float32": lambda: operator.forward(rt.zeros(UPRIGHT.shape, np.int32)),
-        "shape": lambda: operator.forward(x, x),
-        "out": lambda: operator.forward(x, np.zeros(operator.frames_shape, np.float32)),
-    })  # fmt: skip
 
 
 @AXES

@@ -48,11 +48,9 @@ class Leaning:
 
 
 BEAMS = {
-    "upright": Leaning(0.0, 0.0),
-    "rolled": Leaning(0.03, 0.0),
-    "rising": Leaning(0.02, -0.2),
+    "upright": Leaning(0.0, 0.0), "rolled": Leaning(0.03, 0.0), "rising": Leaning(0.02, -0.2),
     "laminography": Leaning(0.0, 1.0),
-}
+}  # fmt: skip
 
 
 def cells_of(trajectory, motion: str, axis: str = "rows", shape: tuple[int, int] = SHAPE) -> list[TimeCells]:
@@ -69,13 +67,10 @@ def cells_of(trajectory, motion: str, axis: str = "rows", shape: tuple[int, int]
     return tables
 
 
-@pytest.mark.parametrize(
-    ("beam", "motion", "axis"),
-    [
-        ("upright", "static", "rows"), ("rising", "static", "rows"), ("laminography", "common", "columns"),
-        ("rolled", "common", "columns"), ("rising", "own", "rows"), ("upright", "common", "rows"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("beam", "motion", "axis"), [
+    ("upright", "static", "rows"), ("rising", "static", "rows"), ("laminography", "common", "columns"),
+    ("rolled", "common", "columns"), ("rising", "own", "rows"), ("upright", "common", "rows"),
+])  # fmt: skip
 def test_rays_and_their_adjoint_are_the_twins(two_rt, beam: str, motion: str, axis: str) -> None:
     tables, volume, frames = cells_of(BEAMS[beam], motion, axis), noise(GRID.shape, 1), noise((2, *SHAPE), 2)
     operator = RayOperator(two_rt, GRID, SHAPE, tables)

@@ -53,7 +53,7 @@ def assert_volume(found: np.ndarray, cells: list[TimeCells], y: np.ndarray, grid
 
 @pytest.mark.parametrize(
     ("motion", "shape"),
-    [("static", TALL_PANEL), ("static", (131, 18)), ("static", (96, 1)), ("micro-views", (131, 18)), ("common", TALL_PANEL)],
+    [("static", TALL_PANEL), ("static", (131, 18)), ("static", (96, 1)), ("micro-views", (131, 6)), ("common", TALL_PANEL)],
 )
 def test_frames_are_the_twins(cpu_rt, monkeypatch, motion, shape) -> None:
     """Of a pose that serves all lines to the bits of the general kernel."""
@@ -68,48 +68,42 @@ def test_frames_are_the_twins(cpu_rt, monkeypatch, motion, shape) -> None:
     assert_frames(frames, cells, x, shape)
 
 
-@pytest.mark.parametrize("voxels", [(1, 1, 1), (1, 33, 2), (40, 1, 17), (530, 3, 3)])
-def test_odd_volumes(cpu_rt, voxels) -> None:
+CLOSE = Grid((9, 30, 30), (0.05, 2 / 30, 2 / 30))
+ODD = [Grid(voxels, (1.9 / voxels[0], 0.2, 0.3)) for voxels in ((1, 1, 1), (1, 33, 2), (40, 1, 17), (530, 3, 3))]
+
+
+@pytest.mark.parametrize(("grid", "source_mm"), [*((grid, 5.0) for grid in ODD), (CLOSE, 0.4), (CLOSE, 1.3)])
+def test_odd_volumes_and_a_source_inside_or_close_to_one(cpu_rt, grid, source_mm) -> None:
     """Also one higher than what a work-item blends of it."""
-    grid, cells = Grid(voxels, (1.9 / voxels[0], 0.2, 0.3)), tables("static", TALL_PANEL, frames=3)
-    assert assert_same_bits(cpu_rt, grid, cells, noise(voxels, 102)).any()
+    cells = tables("static", TALL_PANEL, source_mm=source_mm)
+    assert assert_same_bits(cpu_rt, grid, cells, noise(grid.shape, 102)).any()
 
 
-@pytest.mark.parametrize("source_mm", [0.4, 1.3])
-def test_source_inside_or_close_to_the_volume(cpu_rt, source_mm) -> None:
-    grid, cells = Grid((9, 30, 30), (0.05, 2 / 30, 2 / 30)), tables("static", TALL_PANEL, source_mm=source_mm)
-    assert_same_bits(cpu_rt, grid, cells, noise(grid.shape, 103))
-
-
-def test_lines_without_cells_are_zero(banded_rt) -> None:
+def test_lines_without_cells_are_zero_and_give_nothing(banded_rt) -> None:
     whole, x = tables("micro-views", TALL_PANEL, frames=1)[0], noise(GRID.shape, 104)
     keep = whole.line_start != 17
     parts = {n: getattr(whole, n)[keep] for n in ("pose", "time_s", "line_start", "line_stop", "weight")}
-    cells = [replace(whole, **parts)]
+    cells, y = [replace(whole, **parts)], noise((1, *TALL_PANEL), 109)
     frames = RayOperator(banded_rt, GRID, TALL_PANEL, cells).forward(x)
     assert_frames(frames, cells, x)
     assert not frames[0, 17:34].any() and frames[0, :17].any() and frames[0, 34:].any()
+    for some in (cells, [whole]):
+        assert_volume(RayOperator(banded_rt, GRID, TALL_PANEL, some).adjoint(y), some, y)
 
 
-def test_a_subset_and_batches_of_frames(banded_rt) -> None:
+def test_a_subset_batches_of_frames_and_no_room_for_the_turned_volume(banded_rt, monkeypatch) -> None:
     rt = banded_rt
     cells, x = tables("static", TALL_PANEL, frames=5), noise(GRID.shape, 105)
     expected = RayOperator(rt, GRID, TALL_PANEL, cells).forward(x)
-    operator = RayOperator(rt, GRID, TALL_PANEL, cells)
-    layout = RayLayout.of_scan(rt, GRID, TALL_PANEL, "rows")
+    operator, layout = RayOperator(rt, GRID, TALL_PANEL, cells), RayLayout.of_scan(rt, GRID, TALL_PANEL, "rows")
     volumes = layout.volume_floats + columns_floats(GRID) + 5 * operator.slot_floats + 32
     with room_for(rt, int(4 * (volumes + layout.frames_floats(2) + 16) / PLANNED)):
         assert [part.stop for part in operator.memory.batches(5)] == [2, 4, 5]
         np.testing.assert_array_equal(operator.forward(x), expected)
         np.testing.assert_array_equal(operator.subset([4, 1]).forward(x), expected[[4, 1]])
-
-
-def test_without_room_for_the_turned_volume(banded_rt, monkeypatch) -> None:
-    rt = banded_rt
-    cells, x = tables("static", TALL_PANEL), noise(GRID.shape, 106)
-    expected = RayOperator(rt, GRID, TALL_PANEL, cells).forward(x)
-    operator, layout = RayOperator(rt, GRID, TALL_PANEL, cells), RayLayout.of_scan(rt, GRID, TALL_PANEL, "rows")
-    with room_for(rt, int(4 * (layout.volume_floats + layout.frames_floats(3) + 64) / PLANNED)):
+    del operator
+    operator = RayOperator(rt, GRID, TALL_PANEL, cells)
+    with room_for(rt, int(4 * (layout.volume_floats + layout.frames_floats(5) + 64) / PLANNED)):
         assert len(operator.memory.plan()) == 1
         launched = note_launches(monkeypatch)
         np.testing.assert_array_equal(operator.forward(x), expected)
@@ -122,16 +116,13 @@ def test_intensities(cpu_rt, motion) -> None:
     assert_frames(IntensityOperator(cpu_rt, GRID, TALL_PANEL, cells).expected(x), cells, x, model="intensity")
 
 
-@pytest.mark.parametrize(
-    ("motion", "axis", "lean_deg", "shape"),
-    [
-        ("static", "rows", (0.01, 0.0), (85, 40)), ("static", "rows", (5.0, -6.0), (40, 131)),
-        ("common", "rows", (-5.0, 3.0), (85, 40)), ("common", "columns", (0.3, 0.5), (40, 131)),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("motion", "axis", "lean_deg", "shape"), [
+    ("static", "rows", (0.01, 0.0), (85, 40)), ("static", "rows", (5.0, -6.0), (40, 131)),
+    ("common", "rows", (-5.0, 3.0), (85, 40)), ("common", "columns", (0.3, 0.5), (40, 131)),
+])  # fmt: skip
 def test_panels_that_lean(cpu_rt, motion, axis, lean_deg, shape) -> None:
     """Frames and adjoint; some columns have rays of both main axes."""
-    grid = Grid((19, 14, 23), (0.11, 0.13, 0.08), (0.0, -0.05, 0.1))
+    grid = replace(GRID, offset_mm=(0.0, -0.05, 0.1))
     cells = leaning(tables(motion, shape, axis, frames=2, direction=-1), *lean_deg)
     operator = RayOperator(cpu_rt, grid, shape, cells)
     assert operator._upright is not None and operator._upright.leans
@@ -187,14 +178,6 @@ def test_the_adjoint_is_the_twins(cpu_rt, monkeypatch, case) -> None:
     assert_volume(found, cells, y, grid)
 
 
-def test_strips_and_lines_without_cells_go_back_too(banded_rt) -> None:
-    (cells,), y = tables("micro-views", TALL_PANEL, frames=1), noise((1, *TALL_PANEL), 109)
-    first_of_each = np.unique(cells.line_start, return_index=True)[1][[0, 2, 4]]
-    parts = {n: getattr(cells, n)[first_of_each] for n in ("pose", "time_s", "line_start", "line_stop", "weight")}
-    for table in (replace(cells, **parts), cells):
-        assert_volume(RayOperator(banded_rt, GRID, TALL_PANEL, [table]).adjoint(y), [table], y)
-
-
 def test_the_adjoints_bits_do_not_tell_of_bricks_batches_or_where_frames_are(banded_rt) -> None:
     rt = banded_rt
     cells, y = tables("static", TALL_PANEL, frames=5), noise((5, *TALL_PANEL), 110)
@@ -219,6 +202,7 @@ def changed(roll: float, rise_mm: float = 0.0) -> list[TimeCells]:
 
 
 def test_where_it_applies() -> None:
+    """Of lines far apart in voxels a work-item takes fewer, and none where a vector of them is too many."""
     close = leaning(tables("static", TALL_PANEL, source_mm=1.3), 1.0, 0.0)
     cases = {
         "static": (tables("static", TALL_PANEL), False), "strips": (tables("micro-views", TALL_PANEL), False),
@@ -231,12 +215,7 @@ def test_where_it_applies() -> None:
         shape = (15, 85) if name == "few rows" else TALL_PANEL
         how = upright_of(GRID, cells, shape, 16)
         assert (None if how is None else how.leans) is leans, name
-
-
-def test_lines_far_apart_in_voxels() -> None:
-    """A work-item takes fewer lines then, and none where a vector of them is too many."""
     fine = [Grid((9, 14, 11), (pitch_mm,) * 3) for pitch_mm in (1e-2, 5e-3, 1e-3)]
-    cells = tables("static", TALL_PANEL)
-    ways = [upright_of(grid, cells, TALL_PANEL, 16) for grid in fine]
+    ways = [upright_of(grid, tables("static", TALL_PANEL), TALL_PANEL, 16) for grid in fine]
     spacing_mm = 3.9 / TALL_PANEL[0]
     assert [way and way.block for way in ways] == [85, int(508 / (spacing_mm / 5e-3)), None]

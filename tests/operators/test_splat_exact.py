@@ -53,10 +53,8 @@ def part_of(pose: np.ndarray, first: tuple[float, float], step: int) -> np.ndarr
 
 
 def error_of_peak(image: np.ndarray, rows: np.ndarray, pose: np.ndarray) -> float:
-    """Largest deviation from the twin in a crop about the centre and on a coarse net over all, over the peak.
-
-    The peak is the ray's through the centre: no pixel may lie on a Gaussian much smaller than a pixel.
-    """
+    """Largest deviation from the twin in a crop about the centre and on a coarse net over all, over the peak: that of the
+    ray through the centre, as no pixel may lie on a Gaussian much smaller than a pixel."""
     centre = centre_on_detector(rows, pose)
     peak = splat_image(rows, part_of(pose, centre, 1), (1, 1))[0, 0]
     v, u = (int(np.clip(at - CROP / 2, 0, SIDE - CROP)) for at in centre)
@@ -66,15 +64,10 @@ def error_of_peak(image: np.ndarray, rows: np.ndarray, pose: np.ndarray) -> floa
     return float(max(errors) / peak)
 
 
-@pytest.mark.parametrize(
-    ("smallest_px", "aspects", "tolerance"),
-    [
-        ((0.5, 15.0), (1.0, 3.0, 10.0), SPLAT_COMPACT),
-        ((0.1, 1.0), (30.0, 100.0, 300.0, 1000.0), SPLAT_NEEDLE),
-        ((0.02, 0.3), (1.0, 10.0, 1000.0), SPLAT_NEEDLE),
-    ],
-    ids=["compact", "needles", "below a pixel"],
-)
+@pytest.mark.parametrize(("smallest_px", "aspects", "tolerance"), [
+    ((0.5, 15.0), (1.0, 3.0, 10.0), SPLAT_COMPACT), ((0.1, 1.0), (30.0, 100.0, 300.0, 1000.0), SPLAT_NEEDLE),
+    ((0.02, 0.3), (1.0, 10.0, 1000.0), SPLAT_NEEDLE),
+], ids=["compact", "needles", "below a pixel"])  # fmt: skip
 def test_single_gaussians_on_512_pixels(two_rt, one_cell, smallest_px, aspects, tolerance) -> None:
     rng = np.random.default_rng(11)
     projector = SplatProjector(two_rt, SIDE, SIDE, cutoff_sigma=0.0)
@@ -132,30 +125,6 @@ def test_cutoff_means_the_same_as_in_the_twin(two_rt, one_cell, make_cloud, make
     assert (high > 0).mean() < 1  # the cutoff leaves pixels without any splat
 
 
-def test_off_the_detector_only_the_tail_is_seen(two_rt, one_cell, make_cloud, make_geometry) -> None:
-    rows, pose = make_cloud(1, 5, scale=(0.1, 0.1)), make_geometry(20, 20).pose(0.0)
-    rows[:3, 0] = 0.0, 1.6, 0.0  # the detector sees up to 1.37 at the axis
-    tail = render(two_rt, rows, one_cell(pose, 20), (20, 20))
-    expected = splat_image(rows, pose, (20, 20), DEFAULT_CUTOFF_SIGMA)
-    assert expected.max() > 0
-    assert_near(tail, expected, SPLAT_CLOUD, rows[10, 0])
-    rows[1, 0] = 3.0
-    np.testing.assert_array_equal(render(two_rt, rows, one_cell(pose, 20), (20, 20)), 0)
-
-
-@pytest.mark.parametrize("affine", [False, True])
-def test_behind_the_source_nothing_is_seen(two_rt, one_cell, make_cloud, make_geometry, affine) -> None:
-    rows, pose = make_cloud(2, 6), make_geometry(20, 20).pose(0.0)
-    rows[:3, 1] = 9.0, 0.1, 0.2  # the source is at x = 5
-    for cutoff_sigma in (0.0, DEFAULT_CUTOFF_SIGMA):
-        both, alone = (
-            render(two_rt, some, one_cell(pose, 20), (20, 20), cutoff_sigma=cutoff_sigma, affine=affine)
-            for some in (rows, rows[:, :1])
-        )
-        np.testing.assert_array_equal(both, alone)
-        assert both.max() > 0
-
-
 def test_an_ellipsoid_across_the_source_plane_stays_finite(two_rt, one_cell, make_cloud, make_geometry) -> None:
     """At 3.7 σ those nearer than 1.85 contain a point at the source's own depth: they are not drawn."""
     rows, pose = make_cloud(1, 7, scale=(0.5, 0.5)), make_geometry(20, 20).pose(0.0)
@@ -210,7 +179,7 @@ def integrate(row: np.ndarray, source: np.ndarray, target: np.ndarray) -> float:
     return float((half * weight).ravel() @ density_at(row, source + at[:, None] * direction))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_twin_is_the_line_integral(make_cloud, make_geometry, seed) -> None:
     rows = make_cloud(1, seed, scale=(0.06, 0.3))
     geometry = make_geometry(24, 28, offset=(0.2, -0.3))

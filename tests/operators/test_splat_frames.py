@@ -2,20 +2,20 @@
 
 import numpy as np
 import pytest
-from kernel_kit import assert_near, note_launches, splat
-from tolerances import BRUTE_FORCE, MICRO_VIEWS_FINE, MICRO_VIEWS_ORDER, STANDING_PICTURE
+from kernel_kit import assert_near, frame_cells, note_launches, splat
+from tolerances import BRUTE_FORCE, MICRO_VIEWS_FINE, MICRO_VIEWS_ORDER
 
 from phyradgs_cl.acquisition import CircularOrbit, ConstantSpeed, Shutter
-from phyradgs_cl.acquisition.cells import exact_cells, micro_view_cells, per_line_cells, static_cells
+from phyradgs_cl.acquisition.cells import exact_cells, micro_view_cells, per_line_cells
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.operators import DeviceCells, SplatProjector
+from phyradgs_cl.fields import Grid
+from phyradgs_cl.operators import DeviceCells, DeviceGaussians, SplatProjector, Voxeliser
+from phyradgs_cl.operators.splats import binning
 from phyradgs_cl.operators.twins.splat import splat_image
 from phyradgs_cl.runtime import Runtime
 
 SHAPE = (13, 18)
 START_S = 0.4
-AXES = pytest.mark.parametrize("axis", ["rows", "columns"])
-DIRECTIONS = pytest.mark.parametrize("direction", [1, -1])
 
 
 @pytest.fixture
@@ -27,8 +27,7 @@ def render(rt: Runtime, rows: np.ndarray, table: TimeCells, cutoff_sigma: float 
     return splat(rt, rows, table, SHAPE, cutoff_sigma=cutoff_sigma)
 
 
-@AXES
-@DIRECTIONS
+@pytest.mark.parametrize(("axis", "direction"), [("rows", 1), ("columns", -1)])
 def test_constant_speed_against_a_brute_force_average(rt, make_cloud, orbit, axis, direction) -> None:
     """Static projections at hundreds of times, each line averaging those within its own window."""
     shutter = Shutter(0.3, 0.4, axis, direction)
@@ -57,17 +56,6 @@ def test_constant_speed_against_a_brute_force_average(rt, make_cloud, orbit, axi
     coarse, fine_error = error(1, 1), error(lines, 12)
     assert fine_error <= MICRO_VIEWS_FINE
     assert coarse >= MICRO_VIEWS_ORDER * fine_error
-
-
-def test_an_axially_symmetric_cloud_does_not_move(rt, make_geometry) -> None:
-    rows = np.zeros((11, 3))
-    rows[2], rows[3:5], rows[5] = [-0.5, 0.0, 0.4], [0.1, 0.3, 0.2], [0.2, 0.1, 0.3]
-    rows[6], rows[10] = 1.0, [1.0, 0.5, 2.0]
-    orbit = CircularOrbit(make_geometry(*SHAPE), ConstantSpeed(0.3, 0.6))
-    where = (orbit, Shutter(0.5, 0.4), 0, START_S, SHAPE[0])
-    static = render(rt, rows, static_cells(*where))
-    for table in (micro_view_cells(*where, 4, 5), per_line_cells(*where, 3)):
-        assert_near(render(rt, rows, table), static, STANDING_PICTURE)
 
 
 def test_launches_do_not_grow_with_the_micro_views(banded_rt, make_cloud, orbit, monkeypatch) -> None:
@@ -99,3 +87,51 @@ def test_a_gaussian_in_a_cell_takes_one_record(make_cloud, orbit) -> None:
             projector.project_adjoint(rows, cells, np.ones(SHAPE))
             held.append(rt.peak_bytes)
         assert record_bytes <= (held[1] - held[0]) / (40 * 512) < record_bytes + 2  # and a cell's constants
+
+
+GRID = Grid.cube(18, 2.0)
+
+
+@pytest.mark.parametrize("what", ["static", "exact", "intensity", "voxels"])
+def test_lists_that_do_not_fit_give_the_same_bits(two_rt, make_cloud, make_geometry, what) -> None:
+    rt, rows = two_rt, make_cloud(40, 7)
+    gaussians = DeviceGaussians.upload(rt, rows)
+    if what == "voxels":
+        operator = Voxeliser(rt, GRID.shape)
+        run = lambda: rt.download(operator.forward(gaussians, GRID))  # noqa: E731
+    else:
+        table = frame_cells("static" if what == "static" else "exact", make_geometry(40, 37))
+        operator, cells = SplatProjector(rt, 40, 37, intensity_unit=2.0 if what == "intensity" else None), None
+        cells = DeviceCells.upload(rt, table)
+        run = lambda: rt.download(operator.forward(gaussians, cells))  # noqa: E731
+    expected = run()
+    needed = int(rt.download(operator.lists.tile_offsets)[-1])
+    assert expected.any() and operator.lists.splat_ids.size > needed
+    rt.finish()
+    operator.lists.splat_ids = rt.empty(needed // 2, np.int32)
+    operator.lists._needed = None  # the last number is of lists that fitted
+    np.testing.assert_array_equal(run(), expected)
+    np.testing.assert_array_equal(run(), expected)
+    assert operator.lists.splat_ids.size > needed, "the number has come meanwhile"
+
+
+@pytest.mark.parametrize("many", [binning._MANY_COUNTS, 1], ids=["short chunks", "long chunks"])
+def test_a_gpus_lists_are_a_cpus(monkeypatch, many) -> None:
+    """Clouds of less and more than a group, all in one tile or everywhere; more chunks and tiles than one scan takes."""
+    monkeypatch.setattr(binning, "_MANY_COUNTS", many)
+    shapes, rng = (Runtime(), Runtime(lanes=1, pixel_items=True)), np.random.default_rng(3)
+    for count, tiles, largest in ((0, (3, 2, 1), 1), (1, (1, 1, 1), 1), (65, (9, 8, 2), 5), (9000, (5, 3, 1), 40)):
+        tile = (4, 3, 2)
+        size = np.multiply(tile, tiles)[:, None]
+        low = rng.integers(0, size, (3, count + 7))
+        high = np.minimum(low + rng.integers(-1, largest, low.shape), size - 1)
+        high[1:] = np.maximum(high[1:], low[1:])  # the first axis tells what is nowhere
+        extents, found = np.stack([low, high], 1).reshape(6, -1).astype(np.int32), []
+        for rt in shapes:
+            lists = binning.TileLists(rt, tile, tiles)
+            lists.build(rt.upload(extents), count, count + 7)
+            starts = rt.download(lists.tile_offsets)
+            found.append((starts, rt.download(lists.splat_ids)[: starts[-1]]))
+        np.testing.assert_array_equal(found[0][0], found[1][0], str(count))
+        np.testing.assert_array_equal(found[0][1], found[1][1], str(count))
+        assert count < 2 or found[0][0][-1] > count

@@ -4,15 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from kernel_kit import (
-    MODELS,
-    READOUTS,
-    assert_classes,
-    assert_near,
-    by_gaussian,
-    frame_cells,
-    random_weights,
-)
+from kernel_kit import MODELS, READOUTS, assert_classes, assert_near, by_gaussian, frame_cells, random_weights
 from tolerances import CUTOFF_EDGE_SIGMA, FLOAT64, GRADIENT
 
 from phyradgs_cl.acquisition import Shutter
@@ -46,9 +38,7 @@ def device_gradients(rt, rows: np.ndarray, table: TimeCells, h: np.ndarray, **op
 
 
 def expected_gradients(finite_differences, rows, table, h, affine: bool = False) -> np.ndarray:
-    return by_gaussian(
-        finite_differences, lambda r: (h * splat_frame(r, table, SHAPE, affine=affine)).sum(), rows
-    )
+    return by_gaussian(finite_differences, lambda r: (h * splat_frame(r, table, SHAPE, affine=affine)).sum(), rows)
 
 
 @MODELS
@@ -61,16 +51,8 @@ def test_every_class_of_parameters(any_rt, make_cloud, make_geometry, finite_dif
     assert_classes(found, expected_gradients(finite_differences, rows, table, h, affine), GRADIENT)
 
 
-def test_quaternion_gradient_is_tangent(rt, make_cloud, make_table) -> None:
-    rows = make_cloud(6, 23)
-    found = device_gradients(rt, rows, make_table("micro-views"), random_weights(SHAPE))
-    along = (found[QUATERNION] * rows[QUATERNION]).sum(axis=0)
-    assert np.abs(along).max() <= GRADIENT * np.abs(found[QUATERNION]).max()
-    assert np.abs(found[QUATERNION]).max() > 0
-
-
 ROUNDING = 1 + 3e-6 * np.array([[1.0], [0.0], [-1.0]])  # what three equal steps of Adam may leave
-ROUNDED = [("static", {}), ("micro-views", {"affine": True}), ("exact", {}), ("exact", {"affine": True})]
+ROUNDED = [("micro-views", {"affine": True}), ("exact", {})]
 
 
 @pytest.mark.slow
@@ -124,8 +106,7 @@ def test_a_group_sums_what_one_item_sums(banded_rt, make_cloud, make_geometry, m
 def image_with_moved_centre(
     row: np.ndarray, pose: np.ndarray, shape: tuple[int, int], shift: np.ndarray
 ) -> np.ndarray:
-    """The detector-space splat with its centre moved by ``shift`` (v, u) pixels and nothing else changed.
-
+    """The detector-space splat with its centre moved by ``shift`` (v, u) pixels and nothing else changed:
     p = |d| ρ √(2π/α) exp(−q/2) / √Q with Q = 1 + 2 b·Δ + ΔᵀCΔ and q = ΔᵀSΔ/Q (design notes, section 3).
     """
     precision = precision_matrices(row[:, None])[0]

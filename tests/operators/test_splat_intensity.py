@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kernel_kit import assert_classes, assert_near, frame_cells, note_launches, random_weights
+from kernel_kit import assert_classes, assert_near, frame_cells, random_weights
 from remembered import remembered
 from tolerances import GRADIENT, INTENSITY_FRAME, SPLAT_CLOUD
 
@@ -26,9 +26,7 @@ MakeTable = Callable[..., TimeCells]
 @pytest.fixture
 def make_table(make_geometry) -> MakeTable:
     geometry = make_geometry(*SHAPE, offset=(0.15, -0.25))
-    return lambda motion, *readout: frame_cells(
-        motion, geometry, shutter=Shutter(0.8, 0.6, *readout), speed=0.9
-    )
+    return lambda motion, *readout: frame_cells(motion, geometry, shutter=Shutter(0.8, 0.6, *readout), speed=0.9)
 
 
 @remembered
@@ -58,13 +56,10 @@ def projector(rt: Runtime, table: TimeCells, **options: object) -> SplatProjecto
     return SplatProjector(rt, *table.readout.shape(SHAPE), **options)
 
 
-@pytest.mark.parametrize(
-    ("motion", "axis", "direction"),
-    [
-        ("static", "rows", 1), ("micro-views", "columns", -1), ("exact", "rows", 1), ("exact", "columns", -1),
-        ("per-row", "rows", 1),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("motion", "axis", "direction"), [
+    ("static", "rows", 1), ("micro-views", "columns", -1), ("exact", "rows", 1), ("exact", "columns", -1),
+    ("per-row", "rows", 1),
+])  # fmt: skip
 def test_frames_are_the_twins(two_rt, make_cloud, make_table, motion, axis, direction) -> None:
     rows, table = make_cloud(5, 61, scale=(0.05, 0.2)), make_table(motion, axis, direction)
     cells, units = DeviceCells.upload(two_rt, table), ({}, {"intensity_unit": None})
@@ -76,10 +71,9 @@ def test_frames_are_the_twins(two_rt, make_cloud, make_table, motion, axis, dire
     assert (gap.max() > 0.02) == (motion != "static")
 
 
-@pytest.mark.parametrize(
-    ("motion", "affine"),
-    [("static", False), ("micro-views", True), ("exact", False), ("exact", True), ("per-row", False)],
-)
+@pytest.mark.parametrize(("motion", "affine"), [
+    ("static", False), ("micro-views", True), ("exact", False), ("exact", True), ("per-row", False),
+])  # fmt: skip
 def test_gradients(two_rt, make_cloud, make_table, finite_differences, motion, affine) -> None:
     """Shares depend on all Gaussians together, so that differences are taken of the whole cloud."""
     rows, table, h = make_cloud(2, 62, scale=(0.08, 0.3)), make_table(motion), random_weights(SHAPE)
@@ -101,9 +95,3 @@ def test_thin_and_opaque_objects_and_none(any_rt, make_cloud, make_table) -> Non
     frame = opaque.project(rows, cells)
     assert_near(frame, twin(rows, table, 1e4), SPLAT_CLOUD, frame.max())
     assert np.isfinite(opaque.project_adjoint(rows, cells, np.ones(SHAPE, np.float32))).all()
-
-
-def test_launches_do_not_grow_with_the_cells(banded_rt, make_cloud, make_table, monkeypatch) -> None:
-    names, table = note_launches(monkeypatch), make_table("exact")
-    projector(banded_rt, table).project(make_cloud(4, 65), DeviceCells.upload(banded_rt, table))
-    assert names.count("splat_forward_rows") == 1 and names.count("intensity_merge") == 1

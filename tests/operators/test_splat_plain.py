@@ -30,18 +30,6 @@ def test_rows_there_and_gradients_back(any_rt, make_cloud, line_integrals) -> No
     assert np.allclose(any_rt.download(total), 2 * units * gradients[:11, :21], rtol=FLOAT32)
 
 
-def test_densities_alone(two_rt, make_cloud) -> None:
-    rows = make_cloud(5).astype(np.float32)
-    plain = PlainRows(two_rt, LENGTH_MM, line_integrals=True)
-    before = plain.enter(two_rt.upload(rows))
-    density = np.arange(5, dtype=np.float32)
-    after = plain.with_densities(before, two_rt.upload(density)).gaussians
-    expected = two_rt.download(before.gaussians.rows)
-    expected[10, :5] = density * LENGTH_MM
-    assert np.array_equal(two_rt.download(after.rows), expected)
-    assert np.array_equal(two_rt.download(plain.densities(two_rt.upload(rows))), rows[10])
-
-
 @pytest.mark.parametrize("turned", [False, True])
 def test_images_there_and_back(two_rt, turned) -> None:
     images = np.random.default_rng(0).normal(size=(3, 5, 37)).astype(np.float32)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kernel_kit import MODELS, assert_classes, assert_near, by_gaussian, frame_cells, random_weights, splat
+from kernel_kit import assert_classes, assert_near, by_gaussian, frame_cells, random_weights, splat
 from scipy.spatial.transform import Rotation
 from tolerances import FLOAT32, GRADIENT, MERGED_FRAME, SPLAT_MOVING
 
@@ -72,12 +72,15 @@ def test_a_cloud_in_every_state_is_its_twin(two_rt, make_cloud, make_geometry, c
 
 
 @pytest.mark.slow
-@MODELS
-@pytest.mark.parametrize(("motion", "counts"), [("micro-views", (2, 2)), ("exact", (2,))])
+@pytest.mark.parametrize(("motion", "counts", "beam", "affine"), [
+    ("micro-views", (2, 2), "cone", False), ("micro-views", (2, 2), "cone", True), ("exact", (2,), "cone", False),
+    ("exact", (2,), "cone", True), ("static", (), "parallel", False), ("exact", (1,), "parallel", False),
+])  # fmt: skip
 def test_frames_and_gradients_are_those_of_the_twin(
-    rt, make_cloud, make_geometry, finite_differences, motion, counts, affine
+    rt, make_cloud, make_geometry, finite_differences, motion, counts, beam, affine
 ) -> None:
-    table = frame_cells(motion, make_geometry(*SHAPE, offset=(0.15, -0.25)), *counts)
+    parallel = ParallelGeometry(SHAPE, (2.6 / 13, 2.7 / 18))
+    table = frame_cells(motion, make_geometry(*SHAPE, offset=(0.15, -0.25)) if beam == "cone" else parallel, *counts)
     check_frame_and_gradients(rt, finite_differences, make_cloud(2, 41, scale=(0.05, 0.3)), table, deformation(), affine)
 
 
@@ -85,15 +88,6 @@ def test_frames_and_gradients_are_those_of_the_twin(
 def test_in_every_build(any_rt, make_cloud, make_geometry, finite_differences) -> None:
     table = frame_cells("exact", make_geometry(*SHAPE), 1, shutter=Shutter(0.8, 0.6, "columns", -1))
     check_frame_and_gradients(any_rt, finite_differences, make_cloud(1, 42), table, deformation(rank=1))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("motion", ["static", "exact"])
-def test_parallel_rays(rt, make_cloud, finite_differences, motion) -> None:
-    orbit = CircularOrbit(ParallelGeometry(SHAPE, (2.6 / 13, 2.7 / 18)), ConstantSpeed(0.3, 0.5))
-    where = orbit, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0]
-    table = static_cells(*where) if motion == "static" else exact_cells(*where, 1)
-    check_frame_and_gradients(rt, finite_differences, make_cloud(1, 43), table, deformation())
 
 
 @pytest.mark.parametrize("motion", ["micro-views", "exact"])
@@ -116,41 +110,31 @@ def test_a_rigid_field_is_a_moved_scanner(rt, make_cloud, make_geometry, motion)
     assert_near(render(rt, rows, table, one), expected, MERGED_FRAME)
 
 
-def test_motion_within_an_exposure_is_followed(rt, make_cloud, make_geometry) -> None:
+def test_motion_within_an_exposure_is_followed_and_bent_paths_get_more_segments(rt, make_cloud, make_geometry) -> None:
     """A gantry that hardly turns, and an object that moves at constant speed: one segment has what thirty times have, but
     for conics that are those of its middle."""
-    geometry = make_geometry(*SHAPE)
-    orbit = CircularOrbit(geometry, ConstantSpeed(0.3, 1e-3))
+    orbit, times_s = CircularOrbit(make_geometry(*SHAPE), ConstantSpeed(0.3, 1e-3)), np.linspace(0, 2, 81)
     steady = Deformation(0.1 * np.ones((1, 11, 11, 11, 3)), (-2.5,) * 3, 0.5, np.array([0.0, 2.0]), np.array([[0.0], [1.0]]))
     where, rows = (orbit, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0]), make_cloud(8, 47)
     one = render(rt, rows, exact_cells(*where, 1), steady)
     many = render(rt, rows, per_line_cells(*where, 30), steady)
     still = render(rt, rows, static_cells(*where), steady)
     assert np.linalg.norm(one - many) <= 0.1 * np.linalg.norm(still - many)
-
-
-def test_an_object_on_bent_paths_gets_more_segments(rt, make_cloud, make_geometry) -> None:
-    orbit, times_s = CircularOrbit(make_geometry(*SHAPE), ConstantSpeed(0.3, 1e-3)), np.linspace(0, 2, 81)
     swing = Deformation(0.2 * np.ones((1, 11, 11, 11, 3)), (-2.5,) * 3, 0.5, times_s, np.cos(4 * times_s)[:, None])
     lit_s = 0.2 + np.array([0.0, 1.4])
     assert segments_for_object(deformation(0.0), lit_s, 0.1) == 1
     count = segments_for_object(swing, lit_s, 0.1)
-    where, rows = (orbit, Shutter(0.8, 0.6), 0, 0.2, SHAPE[0]), make_cloud(8, 47)
     many = render(rt, rows, per_line_cells(*where, 30), swing)
     one, several = (np.linalg.norm(render(rt, rows, exact_cells(*where, n), swing) - many) for n in (1, count))
     assert count > 2 and several < 0.1 * one
 
 
-def test_cells_that_do_not_fit_are_refused(make_geometry) -> None:
+def test_cells_that_do_not_fit_and_fields_without_an_inverse_are_refused(rt, make_geometry) -> None:
     with pytest.raises(InputError, match="--motion centres"):
         states_of(frame_cells("centres", make_geometry(*SHAPE)), deformation())
     table = replace(frame_cells("exact", make_geometry(*SHAPE)), end_times_s=None)
     with pytest.raises(InputError, match="end_times_s"):
         states_of(table, deformation())
-
-
-def test_a_field_without_an_inverse_is_refused(rt) -> None:
-    grid = Grid.cube(16, 2.0)
-    CloudStates(rt, deformation()).check_inverse(grid)
+    CloudStates(rt, deformation()).check_inverse(Grid.cube(16, 2.0))
     with pytest.raises(InputError, match="without an inverse"):
-        CloudStates(rt, deformation(2.0)).check_inverse(grid)
+        CloudStates(rt, deformation(2.0)).check_inverse(Grid.cube(16, 2.0))

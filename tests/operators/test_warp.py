@@ -58,20 +58,15 @@ def adjoint(warp: VolumeWarp, state: int, values: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size_mm", [0.02, 0.3, 5.0])  # neighbours that move together, that part, far outside
-def test_warps_are_their_twins(two_rt, size_mm) -> None:
+def test_warps_are_their_twins_and_have_exact_transposes(two_rt, size_mm) -> None:
     states = states_of(deformation(size_mm))
     warp, volume = VolumeWarp(two_rt, states), noise(GRID.shape)
     displacement = np.tensordot(states.weights[1], states.fields_mm, 1) / GRID.voxel_size_mm[::-1]
     moved = two_rt.download(warp.forward(1, warp.source(two_rt.upload(volume))))
     assert_near(moved, warp_forward(volume, displacement), FLOAT32)
     assert_near(adjoint(warp, 1, volume), warp_adjoint(volume, displacement), FLOAT32)
-
-
-def test_warps_have_exact_transposes(rt) -> None:
-    """Also of values of either sign, whose sums nearly cancel."""
-    warp = VolumeWarp(rt, states_of(deformation(0.3)))
-    x, y = noise(GRID.shape, 2) - np.float32(0.5), noise(GRID.shape, 3) - np.float32(0.5)
-    forward = rt.download(warp.forward(0, warp.source(rt.upload(x)))).astype(np.float64)
+    x, y = noise(GRID.shape, 2) - np.float32(0.5), noise(GRID.shape, 3) - np.float32(0.5)  # sums that nearly cancel
+    forward = two_rt.download(warp.forward(0, warp.source(two_rt.upload(x)))).astype(np.float64)
     size = np.linalg.norm(forward) * np.linalg.norm(y)
     assert abs(np.vdot(forward, y) - np.vdot(x.astype(np.float64), adjoint(warp, 0, y))) <= ADJOINT * size
 
@@ -103,7 +98,7 @@ def test_the_projector_is_the_sum_over_states_and_has_its_transpose(rt) -> None:
         assert_near(forward[frame], expected, 2 * RAYS)
 
 
-def test_subsets_are_rows_and_devices_agree_with_the_host(rt) -> None:
+def test_subsets_are_rows_devices_agree_with_the_host_and_bricks_are_refused(rt, monkeypatch) -> None:
     operator, x, y = warped(rt, deformation(0.1), tables()), noise(GRID.shape), noise((2, *SHAPE))
     part = operator.subset([3, 1])
     np.testing.assert_array_equal(part.forward(x), operator.forward(x)[[3, 1]])
@@ -111,16 +106,9 @@ def test_subsets_are_rows_and_devices_agree_with_the_host(rt) -> None:
     np.testing.assert_array_equal(again.forward(x), operator.forward(x)[[1]])
     np.testing.assert_array_equal(rt.download(part.forward(rt.upload(x))), part.forward(x))
     np.testing.assert_array_equal(rt.download(part.adjoint(rt.upload(y))), part.adjoint(y))
-
-
-def test_an_object_at_rest_has_the_bits_of_today(rt) -> None:
-    """Also one that has moved by zero before it is projected; splines of its backprojections round."""
-    cells, x, y = tables(), noise(GRID.shape), noise((4, *SHAPE))
-    plain, at_rest = RayOperator(rt, GRID, SHAPE, cells), deformation(0.0)
-    assert isinstance(projector_of(rt, GRID, cells, at_rest)(rt, GRID, SHAPE, cells), RayOperator)
-    operator = WarpedOperator(rt, GRID, SHAPE, cells, warp=VolumeWarp(rt, states_of(at_rest)))
-    np.testing.assert_array_equal(operator.forward(x), plain.forward(x))
-    assert_near(operator.adjoint(y), plain.adjoint(y), FLOAT32)
+    monkeypatch.setattr(RayMemory, "plan", lambda self, share=1.0: [whole(GRID.shape)] * 2)
+    with pytest.raises(OutOfMemoryError, match="2 bricks"):
+        operator.forward(x)
 
 
 def test_a_rigid_field_is_a_moved_scanner(rt) -> None:
@@ -167,6 +155,7 @@ def test_backprojection_follows_matter(rt) -> None:
 
 
 def test_states_cover_the_motion(rt) -> None:
+    """A field counts by how far it moves, and not by its unit."""
     states = states_of(deformation(0.3))
     shares = states.shares(TIMES_S)
     assert 2 < states.count <= MOST_STATES
@@ -178,14 +167,15 @@ def test_states_cover_the_motion(rt) -> None:
     off = nearest.shares(TIMES_S) @ nearest.weights - states.deformation.weights_at(TIMES_S)
     assert (nearest.shares(TIMES_S) > 0).sum() == len(TIMES_S)
     assert np.sqrt(np.einsum("tr,rs,ts->t", off, states.metric, off)).max() < 1.0
-
-
-def test_a_field_counts_by_how_far_it_moves_and_not_by_its_unit() -> None:
-    one = deformation(0.3)
+    one = states.deformation
     control_mm = one.control_mm * np.array([10.0, 0.1]).reshape(2, 1, 1, 1, 1)
-    other = Deformation(control_mm, one.origin_mm, one.spacing_mm, TIMES_S, one.weights * [0.1, 10.0])
-    assert states_of(other).count == states_of(one).count
-    np.testing.assert_allclose(states_of(other).weights, states_of(one).weights * [0.1, 10.0], atol=1e-9)
+    other = states_of(Deformation(control_mm, one.origin_mm, one.spacing_mm, TIMES_S, one.weights * [0.1, 10.0]))
+    np.testing.assert_allclose(other.weights, states.weights * [0.1, 10.0], atol=1e-9)
+    at_rest = deformation(0.0)  # has states to be moved from where they are asked for
+    assert states_of(at_rest).count == 1
+    states = MotionStates.of_times(at_rest, GRID, TIMES_S, least_voxels=1.0)
+    assert states.count > 3
+    np.testing.assert_allclose(states.shares(TIMES_S).sum(1), 1)
 
 
 def test_scans_of_more_frames_have_more_states(rt) -> None:
@@ -213,13 +203,6 @@ def test_cubic_warps_hardly_blur(rt) -> None:
     assert errors[0] > 8 * errors[1], errors
     splines = deformed(blob, GRID, one, warp.states.weights[0])
     assert_near(np.maximum(there, 0), splines, FLOAT32)
-
-
-def test_a_volume_in_bricks_is_refused(rt, monkeypatch) -> None:
-    operator = warped(rt, deformation(0.1), tables())
-    monkeypatch.setattr(RayMemory, "plan", lambda self, share=1.0: [whole(GRID.shape)] * 2)
-    with pytest.raises(OutOfMemoryError, match="2 bricks"):
-        operator.forward(noise(GRID.shape))
 
 
 def in_voxels(fields_mm: np.ndarray) -> np.ndarray:
@@ -252,7 +235,7 @@ def projected(operator, changes: dict[int, np.ndarray]) -> np.ndarray:
     return rt.download(frames)
 
 
-def test_derivatives_are_differences(operator) -> None:
+def test_derivatives_are_differences_and_have_their_transpose(operator) -> None:
     volume, states = noise(GRID.shape), operator.warp.states
     derivative = FieldDerivative(operator, volume)
     change_mm = np.random.default_rng(3).normal(size=states.deformation.control_mm.shape)
@@ -266,20 +249,7 @@ def test_derivatives_are_differences(operator) -> None:
     for r, frames in enumerate(derivative.by_weights()):
         by_weight = {k: difference(volume, at[k], in_voxels(states.fields_mm[r])) for k in at}
         assert_near(frames, projected(operator, by_weight), 2 * RAYS)
-
-
-def test_derivatives_have_their_transpose(operator) -> None:
-    derivative = FieldDerivative(operator, noise(GRID.shape))
-    change_mm = np.random.default_rng(4).normal(size=operator.warp.states.deformation.control_mm.shape)
     frames = noise(operator.frames_shape, 5) - np.float32(0.5)
     forward = derivative.forward(change_mm).astype(np.float64)
     size = np.linalg.norm(forward) * np.linalg.norm(frames)
     assert abs(np.vdot(forward, frames) - np.vdot(change_mm, derivative.adjoint(frames))) <= ADJOINT * size
-
-
-def test_a_field_of_zeros_has_states_to_be_moved_from() -> None:
-    at_rest = deformation(0.0)
-    assert MotionStates.of_times(at_rest, GRID, at_rest.times_s).count == 1
-    states = MotionStates.of_times(at_rest, GRID, at_rest.times_s, least_voxels=1.0)
-    assert states.count > 3
-    np.testing.assert_allclose(states.shares(at_rest.times_s).sum(1), 1)

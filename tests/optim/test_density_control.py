@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tolerances import FLOAT64
+from tolerances import ADAM_KERNEL, ADAM_SECOND_MOMENT, ADAM_TEXTBOOK, FLOAT32, FLOAT64
 
 from phyradgs_cl.fields import Activation
-from phyradgs_cl.optim import DensityControl, Population, control_density, prune
+from phyradgs_cl.optim import DensityControl, DeviceAdam, Population, Rates, adam_step, control_density, prune
 
 ACTIVATION = Activation(0.01, 0.5)
 CONTROL = DensityControl(threshold=1.0, split_scale=0.2, prune_density=1e-3)
@@ -54,7 +54,7 @@ def test_what_lies_on_a_bound_is_chosen_and_kept(population) -> None:
     assert np.isclose(ACTIVATION.apply(grown.raw)[3], LARGE).sum() == 3  # no child is smaller
 
 
-def test_a_clone_shares_place_shape_and_mass(population) -> None:
+def test_a_clone_shares_place_shape_and_mass_and_a_split_gives_two_smaller_halves_from_within(population) -> None:
     grown = run(population, [0, 2, 0, 0, 0])
     pair = np.flatnonzero(np.isclose((rows := ACTIVATION.apply(grown.raw))[2], -0.2))
     assert grown.count == 6 and pair.size == 2
@@ -63,9 +63,6 @@ def test_a_clone_shares_place_shape_and_mass(population) -> None:
     np.testing.assert_allclose(rows[10, pair], 1.0, rtol=FLOAT64)  # half of 2 each
     assert rows[10].sum() == pytest.approx(15.7, rel=FLOAT64)
     assert sorted(grown.moments[0, 0, pair]) == [0.0, 2.0]  # the old one keeps its moments, the new one has none
-
-
-def test_a_split_gives_two_smaller_halves_from_within(population) -> None:
     grown = run(population, [0, 0, 0, 2, 0])
     rows, children = ACTIVATION.apply(grown.raw), np.flatnonzero(np.all(grown.moments == 0, axis=(0, 1)))
     assert grown.count == 6 and children.size == 2
@@ -101,7 +98,7 @@ def test_never_more_than_allowed_and_the_strongest_first(population) -> None:
     assert run(population, [9] * 5, replace(CONTROL, max_gaussians=3)).count == 5  # a full one is left in peace
 
 
-def test_the_faded_and_the_lost_are_pruned(population) -> None:
+def test_the_faded_the_lost_sheets_and_needles_are_pruned_unless_they_are_wanted(population) -> None:
     for row, value, kept in [
         (10, 0.5e-3, False), (10, 2e-3, True), (0, 1.01, False), (0, 0.99, True), (1, -1.01, False),
         (2, 1.2, False)
@@ -111,25 +108,6 @@ def test_the_faded_and_the_lost_are_pruned(population) -> None:
         pruned = prune(Population(ACTIVATION.invert(rows), population.moments), ACTIVATION, CONTROL, BOX)
         assert pruned.count == 4 + kept, (row, value)
         assert (5.0 in pruned.moments[0, 0]) == kept, (row, value)
-
-
-def test_the_seed_decides_and_the_caller_keeps_his_population(population) -> None:
-    raw, moments = population.raw.copy(), population.moments.copy()
-    one, same, other = (run(population, [2, 2, 0, 2, 2], seed=seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one.raw, same.raw)
-    assert np.any(one.raw != other.raw)
-    np.testing.assert_array_equal(population.raw, raw)
-    np.testing.assert_array_equal(population.moments, moments)
-
-
-def test_when_it_acts() -> None:
-    control = DensityControl(every=100, start_iteration=500, stop_fraction=0.75)
-    due = [i for i in range(1, 2001) if control.is_due(i, 2000)]
-    assert due == list(range(600, 1500, 100))
-    assert not any(replace(control, every=0).is_due(i, 2000) for i in range(1, 2001))
-
-
-def test_sheets_and_needles_are_removed_unless_they_are_wanted() -> None:
     rows = np.tile([[0.0], [0.0], [0.0], [0.1], [0.1], [0.1], [1.0], [0.0], [0.0], [0.0], [1.0]], 4)
     rows[3:6] = np.array([[0.1, 0.1, 0.1], [0.5, 0.5, 0.005], [0.6, 0.01, 0.01], [0.49, 0.01, 0.02]]).T
     activation, box = Activation(0.001, 1.0), np.array([[-1.0] * 3, [1.0] * 3])
@@ -138,3 +116,71 @@ def test_sheets_and_needles_are_removed_unless_they_are_wanted() -> None:
         found = prune(population, activation, DensityControl(prune_aspect=aspect), box)
         scales = np.sort(activation.apply(found.raw)[3:6].max(0))
         np.testing.assert_allclose(scales, np.sort(rows[3:6].max(0)[kept]), rtol=1e-6)
+
+
+def test_when_it_acts_and_rates_decay_exponentially() -> None:
+    control = DensityControl(every=100, start_iteration=500, stop_fraction=0.75)
+    due = [i for i in range(1, 2001) if control.is_due(i, 2000)]
+    assert due == list(range(600, 1500, 100))
+    assert not any(replace(control, every=0).is_due(i, 2000) for i in range(1, 2001))
+    rates = Rates(position=(1e-2, 1e-4), scale=(4e-3, 4e-3), rotation=(1e-3, 1e-5), density=(1.0, 0.25))
+    first, middle, last = (rates.at(p) for p in (0.0, 0.5, 1.0))
+    np.testing.assert_allclose(first, [1e-2] * 3 + [4e-3] * 3 + [1e-3] * 4 + [1.0], rtol=FLOAT64)
+    np.testing.assert_allclose(last, [1e-4] * 3 + [4e-3] * 3 + [1e-5] * 4 + [0.25], rtol=FLOAT64)
+    np.testing.assert_allclose(middle, np.sqrt(first * last), rtol=FLOAT64)
+
+
+STEPS = 6
+RATES = np.array([1e-2] * 3 + [2e-2] * 3 + [5e-3] * 4 + [3e-2])
+
+
+@pytest.fixture
+def problem() -> tuple[np.ndarray, list[np.ndarray]]:
+    """Raw parameters (11, 19) and gradients over six decades, some of them exactly zero."""
+    rng = np.random.default_rng(91)
+    raw = rng.normal(size=(11, 19)).astype(np.float32).astype(float)
+    gradients = []
+    for _ in range(STEPS):
+        g = rng.normal(size=(11, 19)) * 10.0 ** rng.uniform(-6, 0, (11, 19))
+        g[rng.uniform(size=g.shape) < 0.1] = 0
+        gradients.append(g.astype(np.float32).astype(float))
+    return raw, gradients
+
+
+def textbook(raw: np.ndarray, gradients: list[np.ndarray]) -> np.ndarray:
+    """Algorithm 1 of Kingma and Ba, bias corrections written out, ε = 1e-15."""
+    theta, m, v = raw.copy(), np.zeros_like(raw), np.zeros_like(raw)
+    for t, g in enumerate(gradients, start=1):
+        m = 0.9 * m + 0.1 * g
+        v = 0.999 * v + 0.001 * g * g
+        theta = theta - RATES[:, None] * (m / (1 - 0.9**t)) / (np.sqrt(v / (1 - 0.999**t)) + 1e-15)
+    return theta
+
+
+def test_twin_is_the_textbooks(problem) -> None:
+    raw, gradients = problem
+    theta, moments = raw, np.zeros((2, *raw.shape))
+    for step, g in enumerate(gradients, start=1):
+        theta, moments = adam_step(theta, g, moments, RATES, step)
+    np.testing.assert_allclose(theta, textbook(raw, gradients), rtol=0, atol=ADAM_TEXTBOOK * RATES.max())
+
+
+def test_kernel_is_its_twin(any_rt, problem) -> None:
+    raw, gradients = problem
+    stride = 32
+    padded = np.zeros((11, stride), np.float32)
+    padded[:, :19] = raw
+    device_raw, device_moments = any_rt.upload(padded), any_rt.zeros((2, 11, stride))
+    adam = DeviceAdam(any_rt, Activation(0.01, 0.5))
+    theta, moments = raw, np.zeros((2, *raw.shape))
+    for step, g in enumerate(gradients, start=1):
+        by = np.zeros((13, stride), np.float32)
+        by[:11, :19] = g
+        adam.step(device_raw, any_rt.upload(by), device_moments, stride, RATES, step)
+        theta, moments = adam_step(theta, g, moments, RATES, step)
+        moved = any_rt.download(device_raw)[:, :19] - raw
+        np.testing.assert_allclose(moved, theta - raw, rtol=0, atol=ADAM_KERNEL * RATES.max())
+    found = any_rt.download(device_moments)[:, :, :19]
+    np.testing.assert_allclose(found[0], moments[0], rtol=FLOAT32)
+    np.testing.assert_allclose(found[1], moments[1], rtol=ADAM_SECOND_MOMENT)
+    np.testing.assert_array_equal(any_rt.download(device_raw)[:, 19:], 0)  # padding has no gradient

@@ -1,4 +1,5 @@
-"""The scan and the runs of splats that ranks share, as threads (test_shared_runs.py) and under MPI (mpi_work.py)."""
+"""The scan and the runs of splats that ranks share, as threads (test_shared_runs.py) and under MPI (mpi_work.py); laws of
+splatting are asked of the same scan."""
 
 import numpy as np
 
@@ -17,11 +18,13 @@ CONTROL = DensityControl(every=6, start_iteration=5, threshold=1e-6)
 OPTIONS = SplatOptions(motion=MicroViews(4, 2), iterations=21, gaussians=300, tv_edge=8, batch=4, control=CONTROL)
 
 
-def small_scan() -> Scan:
-    geometry = ConeGeometry(5, 7.5, (24, 24), (3.9 / 24, 3.9 / 24))
-    source = AnalyticSource(shepp_logan(1.0), geometry)
+def small_scan(half_size_mm: float = 1.0) -> Scan:
+    """Shepp–Logan, 6 frames of 24² over 20° each; attenuation goes as one over the size."""
+    pitch_mm = 3.9 / 24 * half_size_mm
+    geometry = ConeGeometry(5 * half_size_mm, 7.5 * half_size_mm, (24, 24), (pitch_mm, pitch_mm))
+    source = AnalyticSource(shepp_logan(half_size_mm), geometry)
     options = SimulationOptions(Protocol(views=6, exposure_deg=20.0))
-    return simulate(source, geometry, Grid.cube(16, 2.0), options)
+    return simulate(source, geometry, Grid.cube(16, 2 * half_size_mm), options)
 
 
 def started(scan: Scan, options: SplatOptions, rt: Runtime) -> SplatRun:

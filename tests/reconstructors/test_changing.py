@@ -99,18 +99,15 @@ def test_transpose_subsets_and_equal_states(two_rt) -> None:
     np.testing.assert_array_equal(one.adjoint(frames)[0], alone.adjoint(frames))
 
 
-def test_states_come_back(rt, scan) -> None:
-    truth, result, resting = changing_object(), run(rt, scan, states=10), run(rt, scan, "fista")
+def test_states_come_back_and_help_each_other_by_a_price_of_change(rt, scan) -> None:
+    truth, few = changing_object(), {"iterations": 12}
+    result, resting = run(rt, scan, states=10, **few), run(rt, scan, "fista", **few)
     np.testing.assert_allclose(result.states.times_s, 8.0 * np.arange(10) + 4.0, atol=0.1)
     np.testing.assert_allclose(result.volume, result.states.volumes.mean(0), atol=1e-6)
     gains_db = np.subtract(psnr_db(result, truth), psnr_db(resting, truth))
     assert gains_db.min() > 2 and gains_db.mean() > 5
     assert result.states.volumes.min() >= 0
-
-
-def test_without_a_price_of_change_states_do_not_help_each_other(rt, scan) -> None:
-    truth = changing_object()
-    apart, together = (np.mean(psnr_db(run(rt, scan, states=20, iterations=15, time_weight=w), truth)) for w in (0.0, 3.0))
+    apart, together = (np.mean(psnr_db(run(rt, scan, states=20, iterations=6, time_weight=w), truth)) for w in (0.0, 3.0))
     assert together > apart + 3
 
 
@@ -134,12 +131,10 @@ def test_computed_frames_and_held_out_pixels_are_those_of_the_states(rt, scan) -
     assert resting.facts["held_out"]["holdout_rms"] > 0.01
 
 
-def test_subsets_of_fewer_than_half_a_frame_for_each_state_are_joined(rt, scan) -> None:
+def test_no_state_is_in_a_pause_nor_are_there_more_than_frames_and_small_subsets_are_joined(rt, scan) -> None:
+    """Those of fewer than half a frame for each state."""
     eight, eighty = (run(rt, scan, states=20, iterations=1, subsets=n).states.volumes for n in (8, 80))
     np.testing.assert_array_equal(eight, eighty)
-
-
-def test_no_state_is_in_a_pause_nor_are_there_more_than_frames(rt) -> None:
     times_s = np.concatenate([np.arange(40.0), 1000 + np.arange(40.0)])
     paused = replace(empty_scan(), frame_start_s=times_s)
     found = run(rt, paused, states=8, iterations=1).states.times_s

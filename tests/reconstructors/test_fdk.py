@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 from balls import frames_of
 from scipy.spatial.transform import Rotation
-from tolerances import FDK_MEAN, FLOAT32
+from tolerances import FDK_MEAN, FLOAT32, FLOAT64, RAMP
 
 from phyradgs_cl import acquisition
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, Scan, Shutter, Static
+from phyradgs_cl.api import reconstruct, simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
-from phyradgs_cl.prepare.step import fill_masked
-from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume, static_fdk
+from phyradgs_cl.reconstructors.fdk import FdkOptions, fdk, fdk_volume, ramp_filter, ramp_spectrum, static_fdk
+from phyradgs_cl.reconstructors.fdk.frames import extrapolated, reprojected
 
 VIEWS, PIXELS, VOXELS = 90, 48, 32
 
@@ -75,21 +76,12 @@ def test_frames_that_are_masked_whole_are_as_if_they_were_not_there(rt) -> None:
         assert abs(volume[body].mean() / make(scan)[body].mean() - 1) < 1e-3
 
 
-def test_masked_pixels_are_filled_along_their_row() -> None:
-    frames, mask = np.tile(np.arange(6, dtype=np.float32), (2, 3, 1)), np.zeros((2, 3, 6), bool)
-    mask[0, 1, 2:4] = mask[1, 2, 0] = mask[1, 0, :] = True
-    spoiled = np.where(mask, np.float32(1e6), frames)
-    filled, expected = fill_masked(spoiled, mask), frames.copy()
-    expected[1, 2, 0] = 1.0  # rows without a pixel: from those beside them
-    np.testing.assert_array_equal(filled, expected)
-    assert spoiled.max() == 1e6  # the caller's frames are left alone
-
-
-def test_orbits_that_are_no_circle_about_z_are_told_and_refused(rt, caplog) -> None:
-    """A circle, displaced, short, jittered or off by a pixel, is none of them. What is right is not spoken of."""
+def test_orbits_that_are_no_circle_about_z_and_rows_off_its_plane_are_told_and_refused(rt, caplog) -> None:
+    """A circle, displaced, jittered or turned over, is none of them. What is right is not spoken of. Of a panel on its side
+    the volume was zero, without a word."""
     geometry = ConeGeometry(5.0, 7.0, (12, 12), (0.3, 0.3))
     angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
-    circle = geometry.pose(angle)
+    circle, displaced = geometry.pose(angle), replace(geometry, detector_offset_mm=(0.0, 0.9))
 
     def lifted(feed_mm: float) -> np.ndarray:
         return circle + np.outer(feed_mm * (angle / np.pi - 1), np.eye(12)[2] + np.eye(12)[5])
@@ -101,40 +93,155 @@ def test_orbits_that_are_no_circle_about_z_are_told_and_refused(rt, caplog) -> N
         beam = turned("y", -deg, geometry.pose(0.0))[0].reshape(4, 3)
         return np.concatenate([(beam @ Rotation.from_euler("z", a).as_matrix().T).reshape(1, 12) for a in angle])
 
-    cases = {
-        "circle": (circle, 0), "half-fan": (replace(geometry, detector_offset_mm=(0.0, 0.9)).pose(angle), 0),
-        "shaken": (circle + 0.05 * np.random.default_rng(0).normal(size=(20, 1)) * np.eye(12)[3], 0),
-        "helix": (lifted(1.0), 1), "laminography": (tilted(20), 1), "steep": (tilted(50), 2),
-        "about y": (turned("x", 90), 2),
-    }  # fmt: skip
-    off, above = "off a circle about z", "above the middle of their circle"
-    wrong = {"helix": (off,), "laminography": (above,), "steep": (above,), "about y": (off,)}
-    for name, (poses, worst) in cases.items():
+    def rolled(deg: float) -> np.ndarray:
+        source, corner, across, up = circle.reshape(-1, 4, 3).swapaxes(0, 1)
+        c, s = np.cos(np.deg2rad(deg)), np.sin(np.deg2rad(deg))
+        u, v = c * across + s * up, c * up - s * across
+        return np.stack([source, corner + 5.5 * (across + up - u - v), u, v], 1).reshape(-1, 12)
+
+    off, above, rows = "off a circle about z", "above the middle of their circle", "detector rows"
+    for name, poses, said, is_refused in (
+        ("circle", circle, None, False), ("half-fan", displaced.pose(angle), None, False),
+        ("shaken", circle + 0.05 * np.random.default_rng(0).normal(size=(20, 1)) * np.eye(12)[3], None, False),
+        ("helix", lifted(1.0), off, False), ("laminography", tilted(20), above, False), ("steep", tilted(50), above, True),
+        ("about y", turned("x", 90), off, True), ("by 1°", rolled(1.0), None, False), ("by 5°", rolled(5.0), rows, False),
+        ("half", rolled(45.0), rows, True), ("on a side", rolled(90.0), rows, True), ("over", rolled(180.0), None, False),
+        ("the other side", rolled(-90.0), rows, True),
+    ):  # fmt: skip
         caplog.clear()
         scan = Scan.from_poses(np.ones((20, 12, 12), np.float32), poses, Grid.cube(8, 1.0))
-        if worst == 2:
-            with pytest.raises(InputError, match="any orbit") as refusal:
-                fdk(scan, FdkOptions(), rt)
-            text = refusal.value.found
-        else:
+        try:
             fdk(scan, FdkOptions(), rt)
-            text = caplog.text
-        assert tuple(words for words in (off, above) if words in text) == wrong.get(name, ()), (name, text)
+            refusal = None
+        except InputError as error:
+            refusal = error
+            assert ("off the plane of the rotation" if said == rows else "any orbit") in str(error), name
+        text = refusal.found if refusal else caplog.text
+        assert [words for words in (off, above, rows) if words in text] == [said] * bool(said), (name, text)
+        assert bool(refusal) == is_refused, name
 
 
-def test_rows_along_the_axis_are_refused(rt, caplog) -> None:
-    """FDK filters along detector rows: of a panel on its side the volume was zero, without a word."""
-    circle = ConeGeometry(6.0, 9.0, (12, 12), 0.5).pose(np.linspace(0, 2 * np.pi, 20, endpoint=False)).reshape(-1, 4, 3)
-    middle = circle[:, 1] + 5.5 * (circle[:, 2] + circle[:, 3])
-    for roll_deg, worst in ((1.0, 0), (5.0, 1), (45.0, 2), (90.0, 2), (180.0, 0), (-90.0, 2)):
-        caplog.clear()
-        c, s = np.cos(np.deg2rad(roll_deg)), np.sin(np.deg2rad(roll_deg))
-        u, v = c * circle[:, 2] + s * circle[:, 3], c * circle[:, 3] - s * circle[:, 2]
-        poses = np.stack([circle[:, 0], middle - 5.5 * (u + v), u, v], 1).reshape(-1, 12)
-        scan = Scan.from_poses(np.ones((20, 12, 12), np.float32), poses, Grid.cube(8, 1.0))
-        if worst == 2:
-            with pytest.raises(InputError, match="detector rows .* off the plane of the rotation"):
-                fdk(scan, FdkOptions(), rt)
-        else:
-            fdk(scan, FdkOptions(), rt)
-            assert ("detector rows" in caplog.text) == (worst == 1), roll_deg
+@pytest.mark.parametrize("width", [1, 2, 17, 64])
+def test_ramp_filter_is_a_convolution(width) -> None:
+    """Kak and Slaney's kernel h(0) = 1/4τ², h(odd n) = −1/(πnτ)², times τ, without wrapping around."""
+    spacing_mm, n, kernel = 0.37, np.arange(-(width - 1), width), np.zeros(2 * width - 1)
+    kernel[n % 2 != 0] = -1 / (np.pi * n[n % 2 != 0] * spacing_mm) ** 2
+    kernel[n == 0] = 1 / (4 * spacing_mm**2)
+    for dtype in (np.float32, np.float64):
+        rows = np.random.default_rng(63).normal(size=(3, width)).astype(dtype)
+        expected = np.stack([np.convolve(row, kernel) for row in rows])[:, width - 1 : 2 * width - 1] * spacing_mm
+        found = ramp_filter(rows, spacing_mm)
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, expected, rtol=0, atol=RAMP * np.abs(expected).max())
+
+
+def test_spectra_of_the_ramp_and_its_windows() -> None:
+    """And a row of odd length, which has no sample at that frequency."""
+    sinc = np.sin(np.pi / 4) / (np.pi / 4)
+    at = {"ram-lak": (1, 1), "shepp-logan": (sinc, 2 / np.pi), "cosine": (np.sqrt(0.5), 0), "hamming": (0.54, 0.08)}
+    for window, (quarter, nyquist) in {**at, "hann": (0.5, 0)}.items():
+        ratio = ramp_spectrum(256, window) / ramp_spectrum(256)
+        assert ratio[[0, 64, 128]] == pytest.approx([1, quarter, nyquist], rel=FLOAT64, abs=FLOAT64), window
+    ratio = ramp_spectrum(225, "hann") / ramp_spectrum(225)
+    np.testing.assert_allclose(ratio, 0.5 + 0.5 * np.cos(2 * np.pi * np.arange(113) / 225), rtol=FLOAT64)
+    spectrum = ramp_spectrum(256)
+    np.testing.assert_allclose(spectrum, np.arange(129) / 256, atol=0.01)
+    assert 0 < spectrum[0] < 0.002
+
+
+def test_noise_falls_from_window_to_window(rt) -> None:
+    geometry = ConeGeometry(6.0, 9.0, (8, 48), (0.075, 0.075))
+    pose = geometry.pose(np.arange(40) * 2 * np.pi / 40)
+    frames = np.random.default_rng(66).normal(size=(40, 8, 48)).astype(np.float32)
+    grid = Grid((2, 24, 24), (0.05, 0.06, 0.06))
+    windows = ["ram-lak", "shepp-logan", "cosine", "hamming", "hann"]
+    noise = [fdk_volume(rt, frames, pose, grid, window=window).std() for window in windows]
+    assert all(after < 0.97 * before for before, after in zip(noise[:-1], noise[1:], strict=True))
+
+
+BEYOND = 20  # pixels at each side of a panel of 41
+
+
+@pytest.mark.parametrize(("way", "worst"), [("cylinder", 0.4), ("cosine", 0.65)])
+def test_rows_go_on_as_the_object_might(way, worst) -> None:
+    """Two frames of two lines: a cylinder that is cut off, and one that ends inside of the panel, with air at both edges."""
+    u = np.arange(-20.0 - BEYOND, 21 + BEYOND)
+    wide = 0.1 * np.sqrt(np.maximum(np.array([[27.0], [12.0]]) ** 2 - u**2, 0))
+    frames = wide[:, BEYOND:-BEYOND].astype(np.float32)
+    found, count = extrapolated(np.stack([frames, frames]), way)
+    assert count == BEYOND and found.shape == (2, *wide.shape) and found.dtype == np.float32
+    np.testing.assert_array_equal(found[..., BEYOND:-BEYOND], np.stack([frames, frames]))
+    np.testing.assert_array_equal(found[:, 1], np.broadcast_to(np.pad(frames[1], BEYOND), (2, u.size)))
+    np.testing.assert_allclose(found[..., ::-1], found, atol=1e-5)  # as the object
+    off = np.abs(found[:, 0] - wide[0]).max()
+    assert off < worst * frames.max() and (found[..., [0, -1]] < 1e-5).all()
+
+
+def test_the_cut_rings_less_into_a_truncated_body(rt) -> None:
+    """A cylinder that the panel sees four fifths of, be the panel a pixel off centre as real ones are."""
+    angles = np.arange(60) * 2 * np.pi / 60
+    body = EllipsoidPhantom((Ellipsoid((0.0, 0.0, 0.0), (1.0, 1.0, 8.0), 0.5),), "cylinder")
+
+    def volume(way: str, offset_mm: float = 0.0) -> np.ndarray:
+        pose = ConeGeometry(8.0, 8.8, (4, 40), (0.044, 0.044), (0.0, offset_mm)).pose(angles)
+        return fdk_volume(rt, frames_of(body, pose, (4, 40)), pose, grid, extrapolate=way)
+
+    grid = Grid((1, 32, 32), (0.05, 0.05, 0.05))
+    y, x = np.meshgrid(*grid.axes_mm()[1:], indexing="ij")
+    radius_mm = np.hypot(x, y)
+    for offset_mm in (0.0, 0.06):
+        rise = {}
+        for way in ("none", "cosine", "cylinder"):
+            middle = volume(way, offset_mm)[0]
+            rise[way] = middle[(radius_mm > 0.5) & (radius_mm < 0.7)].mean() / middle[radius_mm < 0.2].mean() - 1
+        assert rise["none"] > 0.33 and max(rise["cosine"], rise["cylinder"]) < 0.65 * rise["none"]
+
+
+@pytest.mark.parametrize("axis", ["rows", "columns"])
+def test_rows_go_on_as_a_volume_has_them(rt, axis) -> None:
+    """Half the columns of a wide panel, with a pose for every line; lines beyond the panel have the pose of the last."""
+    body = EllipsoidPhantom((Ellipsoid((0.1, 0.0, 0.0), (0.7, 0.9, 0.6), 0.5),), "ball")
+    grid = Grid((24, 40, 40), (0.05, 0.05, 0.05))
+    lines = np.arange(8) if axis == "rows" else np.clip(np.arange(-10, 30), 0, 19)
+    angles = np.arange(3)[:, None] + 0.01 * lines
+    full, half = (ConeGeometry(8.0, 10.0, (8, columns), (0.15, 0.07)).pose(angles) for columns in (40, 20))
+    whole = frames_of(body, full, (8, 40), axis)
+    poses = half if axis == "rows" else half[:, 10:30]
+    frames = whole[..., 10:30]
+    found, count = reprojected(rt, frames, poses, axis, body.voxelise(grid), grid)
+    np.testing.assert_array_equal(found[..., count : count + 20], frames)
+    assert count >= 10 and np.abs(whole[..., :10]).max() > 0.1
+    off = found[..., count - 10 : count + 30] - whole
+    # a pixel three voxels high is the mean of its rays, where the frames have one in its middle
+    assert np.sqrt(np.mean(off**2)) < 0.03 * np.sqrt(np.mean(whole**2))
+    assert not found[..., [0, -1]].any()  # all of the grid is seen
+
+
+def test_rows_that_are_not_extrapolated_cost_no_reconstruction(rt, caplog) -> None:
+    aside = simulate("jaw", size=12, detector=16, views=12, detector_offset_mm=(0.0, 0.6), device=rt)
+    told = []
+    found = reconstruct(aside, "fdk", extrapolate="reprojected", device=rt, report=told.append)
+    assert "displaced detector are not extrapolated" in caplog.text and not any("beyond" in p.quantity for p in told)
+    np.testing.assert_array_equal(found.volume, reconstruct(aside, "fdk", device=rt, report=False).volume)
+
+
+def test_a_box_of_an_object_wider_than_the_panel(rt) -> None:
+    """Three quarters of what the lost columns cost are regained, and a whole panel's volume stays as it was; Ctrl-C ends
+    it before there is a volume."""
+    usual = {"size": 16, "detector": 24, "views": 24, "exposure_deg": 5.0, "device": rt}
+    whole, cut = simulate("jaw", **usual), simulate("jaw", **usual, truncation=0.6)
+    box = {"roi_mm": [0.375 * side for side in whole.grid.size_mm], "device": rt, "motion": "per-row"}
+    more = {"margin_mm": 3 * whole.grid.voxel_size_mm[0], "extrapolate": "reprojected"}
+    best, same, spoilt, regained = (
+        reconstruct(scan, "fdk", **box, **how).volume for scan in (whole, cut) for how in ({}, more)
+    )
+    np.testing.assert_allclose(same, best, atol=0.02 * best.max())
+    error = [float(np.sqrt(np.mean((volume - best) ** 2))) for volume in (spoilt, regained)]
+    assert error[1] < 0.25 * error[0], error
+
+    def stop(progress) -> None:
+        assert "beyond the panel" in progress.quantity and progress.state is None
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match="before there was a volume"):
+        reconstruct(cut, "fdk", **box, **more, report=stop)

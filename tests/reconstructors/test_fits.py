@@ -4,15 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from balls import frames_of
 
 from phyradgs_cl.acquisition import ConeGeometry, PerRow, Protocol
-from phyradgs_cl.api import static_scan
 from phyradgs_cl.fields import Grid
-from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom
 from phyradgs_cl.reconstructors.fits.axis import axis_shift
 from phyradgs_cl.reconstructors.fits.residuals import AugmentedOperator, FlatErrors, ViewParameters, fit
-from phyradgs_cl.reconstructors.fits.twice import shift_by_rays_seen_twice
 from phyradgs_cl.reconstructors.voxels.system import System
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
 
@@ -50,24 +46,3 @@ def test_levels_of_frames_and_the_axis_are_fitted(rt, scan) -> None:
     np.testing.assert_allclose(levels - levels.mean(), steps, atol=0.01)
     shift = axis_shift(rt, scan)
     assert shift.is_found and abs(shift.pixels) < 0.2
-
-
-PARTS = (
-    ((0.0, 0.0, 0.0), (16.0, 14.0, 6.0), 0.012), ((9.0, 3.0, 1.0), (1.6,) * 3, 0.02),
-    ((-4.0, 5.0, -1.0), (2.0,) * 3, 0.01), ((1.0, -3.0, 0.0), (1.2,) * 3, 0.03),
-)  # fmt: skip
-BODY = EllipsoidPhantom(tuple(Ellipsoid(*part) for part in PARTS), "body")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("true_px", "stated_px"), [(28.0, 27.0), (-25.0, -22.0), (20.0, 26.0)])
-def test_the_true_place_of_a_half_fans_panel(true_px, stated_px) -> None:
-    """From rays that are measured twice: no shift wins because it leaves fewer of them."""
-    shape, pitch_mm = (24, 64), (1.1, 0.56)
-    true, stated = (ConeGeometry(150.0, 220.0, shape, pitch_mm, (0.0, px * 0.56)) for px in (true_px, stated_px))
-    angles_deg = 3.0 * np.arange(120)
-    frames = frames_of(BODY, true.pose(np.deg2rad(angles_deg)), shape)
-    frames = frames + 0.003 * np.random.default_rng(0).standard_normal(frames.shape)
-    shift = shift_by_rays_seen_twice(static_scan(frames.astype(np.float32), stated, angles_deg))
-    assert shift.pixels == pytest.approx(true_px - stated_px, abs=0.1)
-    assert shift.deviation < 0.1

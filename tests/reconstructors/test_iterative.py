@@ -107,7 +107,8 @@ def test_fista_minimises_squares_weighed_by_light(rt) -> None:
 
 
 def test_asd_pocs_follows_the_published_steps(rt) -> None:
-    """TIGRE's loop in float64: a pass, its length, TV steps of a fixed length, the reduction of that length."""
+    """TIGRE's loop in float64: a pass, its length, TV steps of a fixed length and their reduction. It ends when
+    data and TV pull against each other."""
     system, matrix, _ = dense_system(noise=0.2)
     options = AsdPocsOptions(tv_share=0.01, tv_steps=5, tv_ratio=0.2, relaxation_reduction=0.9)
     epsilon = 0.1
@@ -130,12 +131,7 @@ def test_asd_pocs_follows_the_published_steps(rt) -> None:
     assert 0 < reductions < 5
     assert algorithm.tv_step == pytest.approx(step, rel=1e-4)
     np.testing.assert_allclose(algorithm.volume.ravel(), x, rtol=0, atol=ITERATIVE_TWIN)
-
-
-def test_asd_pocs_ends_when_data_and_tv_pull_against_each_other(rt) -> None:
-    system, _, _ = dense_system(noise=0.2)
-    options = AsdPocsOptions(tv_share=0.002, tv_steps=3)
-    algorithm = AsdPocs(system, options, TvDescent(rt, VOLUME), epsilon=1e9)
+    algorithm = AsdPocs(system, AsdPocsOptions(tv_share=0.002, tv_steps=3), TvDescent(rt, VOLUME), epsilon=1e9)
     assert any(stepped(algorithm, 1).finished for _ in range(200))
 
 
@@ -191,14 +187,6 @@ def fly_scan(rt) -> Scan:
 
 def run(rt, scan: Scan, method: str, **changes: object):
     return reconstruct(scan, plan_run(method, {"iterations": 8, **changes}), rt)
-
-
-@pytest.mark.parametrize("method", ITERATIVE)
-def test_knowing_the_motion_helps(rt, fly_scan, method) -> None:
-    iterations = {"sirt": 30, "os-sart": 30, "fista-tv": 40, "cgls": 6}.get(method, 8)
-    runs = (run(rt, fly_scan, method, motion=motion, iterations=iterations) for motion in ("static", "per-row"))
-    static, known = (psnr(one.volume, fly_scan.reference, float(fly_scan.reference.max())) for one in runs)
-    assert known > static + 0.3, (static, known)
 
 
 @pytest.mark.parametrize("method", ITERATIVE)

@@ -32,12 +32,6 @@ class Halving:
     def measures(self) -> dict[str, float]:
         return {"loss": self.loss}
 
-    def state(self) -> dict[str, np.ndarray]:
-        return {"iteration": np.array(self.iteration), "loss": np.array(self.loss)}
-
-    def restore(self, state) -> None:
-        self.iteration, self.loss = int(state["iteration"]), float(state["loss"])
-
     def present_volume(self) -> tuple[np.ndarray, Grid]:
         return np.full((1, 1, 1), self.loss, np.float32), Grid.cube(1, 1.0)
 
@@ -57,20 +51,6 @@ def test_lines_and_reports_come_when_their_number_is_reached() -> None:
     assert iterations_of(loop) == [3, 6, 9]
     assert seen == [(6, 2.0**-6)]
     assert (loop.stopped_by, loop.interrupted_at, loop.state_if_interrupted()) == ("small enough", None, None)
-
-
-def test_a_report_stops_the_run_which_goes_on_from_there() -> None:
-    def stop(progress: Progress) -> None:
-        raise KeyboardInterrupt
-
-    stopped = loop_of(stop)
-    stopped.run(None)
-    assert (stopped.stopped_by, stopped.interrupted_at) == ("interrupt", 3)
-    resumed, whole = loop_of(lambda progress: None), loop_of(lambda progress: None)
-    resumed.run(stopped.state_if_interrupted())
-    whole.run(None)
-    assert [line["loss"] for line in resumed.record] == [line["loss"] for line in whole.record]
-    assert resumed.seconds > resumed.record[-1]["seconds"] >= stopped.record[-1]["seconds"]
 
 
 def test_a_loss_that_is_no_number_is_named() -> None:

@@ -15,12 +15,8 @@ from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors import ObjectMotion, Reconstruction, plan_run, reconstruct
 from phyradgs_cl.reconstructors.moving import motion_line
 from phyradgs_cl.reconstructors.moving import signal as signals
-from phyradgs_cl.reconstructors.moving.method import FieldSearch, coarse_scan, initial_field
-from phyradgs_cl.reconstructors.moving.signal import (
-    MotionSignal,
-    TemporalSplines,
-    motion_signal,
-)
+from phyradgs_cl.reconstructors.moving.method import FieldSearch, initial_field
+from phyradgs_cl.reconstructors.moving.signal import MotionSignal, TemporalSplines, motion_signal
 from phyradgs_cl.reconstructors.result import MOTION_FOUND, Progress
 
 pytestmark = pytest.mark.slow
@@ -225,17 +221,3 @@ def test_splines_sum_to_one_and_bending_is_none_of_a_rigid_motion() -> None:
     np.testing.assert_allclose(bend(rigid), 0, atol=1e-12)
     x, y = np.random.default_rng(0).normal(size=(2, 2, 5, 4, 6, 3))
     assert np.vdot(bend(x), y) == pytest.approx(np.vdot(x, bend(y))) and np.vdot(bend(x), x) > 0
-
-
-def test_the_search_has_blocks_of_pixels_and_large_voxels_in_the_same_box() -> None:
-    geometry, start_s = ConeGeometry(5.0, 7.0, (128, 100), (0.03, 0.03)), np.arange(3.0)
-    frames = np.random.default_rng(0).uniform(size=(3, 128, 100)).astype(np.float32)
-    orbit, grid = CircularOrbit(geometry, ConstantSpeed(0.0, 0.1)), Grid((64, 48, 48), (0.04,) * 3, (0.1, 0.0, 0.0))
-    small = coarse_scan(Scan(frames, geometry, orbit, Shutter(0.4, 0.5), start_s, grid))
-    assert small.projections.shape == (3, 64, 50) and small.grid.shape == (32, 24, 24)
-    np.testing.assert_allclose(small.grid.size_mm, grid.size_mm)
-    assert small.grid.offset_mm == grid.offset_mm
-    assert small.projections.mean() == pytest.approx(frames.mean(), rel=0.01)
-    line_s = 0.5 / 127
-    np.testing.assert_allclose(small.frame_start_s, start_s + line_s / 2)
-    assert small.shutter.readout_s == pytest.approx(0.5 - line_s)

@@ -93,34 +93,28 @@ def test_held_out_pixels_are_compared_with_the_object_as_it_was(rt, scan) -> Non
     assert moved["holdout_rms"] < 0.75 * ignored["holdout_rms"]
 
 
-def test_methods_of_objects_at_rest_refuse(rt, scan) -> None:
+UP_AND_DOWN = 4 * (-1.0) ** np.arange(7)[:, None, None, None]  # from one control point along z to the next
+BAD = {
+    "moves nothing in the scan's grid": lambda one: replace(one, origin_mm=(50.0, 0.0, 0.0)),
+    "displacements of up to": lambda one: replace(one, control_mm=1000 * one.control_mm),
+    "matter that folds": lambda one: replace(one, control_mm=one.control_mm * UP_AND_DOWN),
+    "times from": lambda one: replace(one, times_s=1000 * one.times_s + 1e5),
+}
+
+
+def test_methods_of_objects_at_rest_and_fields_that_do_not_fit_are_refused_or_warned_of(rt, scan, caplog) -> None:
     for method in (name for name, method in METHODS.items() if not method.takes_deformation):
         with pytest.raises(InputError, match=f"--method {method}"):
             plan_run(method, object_motion=ObjectMotion(breathing()))
     with pytest.raises(InputError, match="extrapolate=reprojected"):
         reconstruct(scan, plan_of("fdk", breathing(), extrapolate="reprojected"), rt)
-
-
-UP_AND_DOWN = 4 * (-1.0) ** np.arange(7)[:, None, None, None]  # from one control point along z to the next
-BAD = {
-    "elsewhere": (lambda one: replace(one, origin_mm=(50.0, 0.0, 0.0)), "moves nothing in the scan's grid"),
-    "too large": (lambda one: replace(one, control_mm=1000 * one.control_mm), "displacements of up to"),
-    "folds": (lambda one: replace(one, control_mm=one.control_mm * UP_AND_DOWN), "matter that folds"),
-    "milliseconds": (lambda one: replace(one, times_s=1000 * one.times_s + 1e5), "times from"),
-}
-
-
-@pytest.mark.parametrize(("change", "found"), BAD.values(), ids=BAD)
-def test_a_field_that_does_not_fit_is_refused(rt, scan, change, found) -> None:
-    with pytest.raises(InputError, match=f"--object-motion.*{found}"):
-        reconstruct(scan, plan_of("sirt", change(breathing()), iterations=1), rt)
-
-
-@pytest.mark.parametrize(("share", "is_warned"), [(0.7, True), (1.0, False)])
-def test_a_field_of_a_part_of_the_scan_is_a_warning(scan, caplog, share, is_warned) -> None:
-    one, end_s = breathing(), share * (scan.frame_start_s.max() + scan.shutter.span_s)
-    check_object_motion(replace(one, times_s=np.linspace(0, end_s, len(one.times_s))), scan)
-    assert ("the object rests" in caplog.text) == is_warned
+    for found, change in BAD.items():
+        with pytest.raises(InputError, match=f"--object-motion.*{found}"):
+            reconstruct(scan, plan_of("sirt", change(breathing()), iterations=1), rt)
+    for share, is_warned in ((1.0, False), (0.7, True)):  # a part of the scan
+        times_s = np.linspace(0, share * (scan.frame_start_s.max() + scan.shutter.span_s), len(breathing().times_s))
+        check_object_motion(replace(breathing(), times_s=times_s), scan)
+        assert ("the object rests" in caplog.text) == is_warned
 
 
 def test_the_command(rt, cli, refused, scan, tmp_path) -> None:

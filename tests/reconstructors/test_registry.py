@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from refusals import assert_refused
 
+from phyradgs_cl import neural
+from phyradgs_cl.__main__ import load_cli
 from phyradgs_cl.acquisition import Exact, MicroViews, Scan, Static, TimeCells
-from phyradgs_cl.api import simulate
+from phyradgs_cl.api import save_scan, simulate
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.reconstructors import METHODS, method_options, plan_run, reconstruct
 from phyradgs_cl.reconstructors.plan import _models
@@ -44,14 +46,12 @@ NUMBERS = [(method, *number) for method, options in BASES.items() for number in 
 MOTIONS = {method: tuple(_models(options)) for method, options in BASES.items()}
 
 
-def test_every_preset_is_taken_as_it_is() -> None:
+def test_every_preset_is_taken_as_it_is_and_every_number_has_a_checked_range_and_can_be_given_as_it_stands() -> None:
     for method, entry in METHODS.items():
         for name, options in entry.presets.items():
             assert method_options(method, name) == options, (method, name)
     assert method_options("phyradgs", "paper").motion == MicroViews(8, 5)
 
-
-def test_every_number_has_a_checked_range_and_can_be_given_as_it_stands() -> None:
     for method, path, current in NUMBERS:
         for name, absurd in ABSURD.items():
             value = [absurd] * len(current) if isinstance(current, tuple) else absurd
@@ -104,15 +104,9 @@ def test_motions_that_are_none_of_the_methods_are_refused() -> None:
     })  # fmt: skip
 
 
-def test_a_method_takes_its_own_motions() -> None:
-    for method, names in MOTIONS.items():
-        for name in names:
-            assert method_options(method, None, {"motion": name}).motion.name == name, (method, name)
+def test_a_method_takes_its_own_motions_with_the_counts_that_they_have() -> None:
     assert MOTIONS["phyradgs"] == MOTIONS["r2"] == ("static", "static-start", "micro-views", "centres", "exact")
     assert "exact" not in MOTIONS["sirt"] + MOTIONS["fdk"] and "micro-views" not in MOTIONS["fdk"]
-
-
-def test_counts_belong_to_the_motions_that_have_them() -> None:
     strips = {"micro-views", "centres"}
     models = {"strips": strips, "sub_intervals": {*strips, "per-row", "own-times"}, "segments": {"exact"}}
     pairs = [(method, name) for method, names in MOTIONS.items() for name in names]
@@ -138,3 +132,16 @@ def test_strips_mean_micro_views_where_the_motion_is_exact() -> None:
     with pytest.raises(InputError, match="--strips|--segments"):  # counts of two models
         method_options("phyradgs", None, {"strips": 4, "segments": 3})
     assert method_options("sirt", None, {"strips": 4}).motion.name == "micro-views"
+
+
+@pytest.mark.parametrize("method", ["naf", "sax-nerf"])
+def test_a_run_says_in_one_line_what_to_install(rt, method, tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(neural, "has_torch", lambda: False)
+    scan = simulate("jaw", size=8, detector=12, views=3, device=rt)
+    with pytest.raises(InputError, match=f"--method {method}: found no PyTorch"):
+        reconstruct(scan, plan_run(method), rt)
+    save_scan(tmp_path / "scan.h5", scan)
+    command = ["reconstruct", str(tmp_path / "scan.h5"), "-o", str(tmp_path / "out.h5"), "--method", method]
+    assert load_cli().run(command) == 2 and not (tmp_path / "out.h5").exists()
+    (said,) = (line for line in capsys.readouterr().err.splitlines() if "PyTorch" in line)
+    assert 'pip install "phyradgs-cl[neural]"' in said

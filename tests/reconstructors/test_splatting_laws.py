@@ -6,18 +6,18 @@ from functools import cache
 
 import numpy as np
 import pytest
+from parallel.shared_runs import small_scan
 from tolerances import CLOUD_VOLUME, FLOAT64, SCALE_LAW
 
-from phyradgs_cl.acquisition import ConeGeometry, Exact, MicroViews, Protocol, Scan, Static
+from phyradgs_cl.acquisition import Exact, MicroViews, Scan, Static
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.operators import voxelise
 from phyradgs_cl.optim import DensityControl
-from phyradgs_cl.phantoms import shepp_logan
 from phyradgs_cl.reconstructors.method import METHODS
 from phyradgs_cl.reconstructors.result import Progress, Reconstruction
 from phyradgs_cl.reconstructors.splats import method as splatting
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
-from phyradgs_cl.simulation import AnalyticSource, SimulationOptions, simulate
+from phyradgs_cl.reconstructors.splats.start import initial_cloud
 
 pytestmark = pytest.mark.slow
 
@@ -27,18 +27,9 @@ phyradgs, r2 = METHODS["phyradgs"].run, METHODS["r2"].run
 STEADY = replace(OPTIONS, control=DensityControl(every=0))
 
 
-def make_scan(half_size_mm: float = 1.0) -> Scan:
-    """Shepp–Logan, 6 frames of 24² over 20° each; attenuation goes as one over the size."""
-    pitch = 3.9 / 24 * half_size_mm
-    geometry = ConeGeometry(5 * half_size_mm, 7.5 * half_size_mm, (24, 24), (pitch, pitch))
-    source = AnalyticSource(shepp_logan(half_size_mm), geometry)
-    protocol = Protocol(views=6, exposure_deg=20.0)
-    return simulate(source, geometry, Grid.cube(16, 2 * half_size_mm), SimulationOptions(protocol))
-
-
 @pytest.fixture(scope="module")
 def scan() -> Scan:
-    return make_scan()
+    return small_scan()
 
 
 @pytest.fixture(scope="module")
@@ -61,20 +52,12 @@ def test_same_seed_same_bits(any_rt, scan) -> None:
 
 
 def test_lengths_times_1024_change_no_bit_and_times_1000_nothing_else(rt, run) -> None:
-    plain, large = run(), phyradgs(make_scan(1024.0), OPTIONS, rt, seed=1)
+    plain, large = run(), phyradgs(small_scan(1024.0), OPTIONS, rt, seed=1)
     np.testing.assert_array_equal(large.volume * np.float32(1024), plain.volume)
     np.testing.assert_allclose(large.gaussians.scale, plain.gaussians.scale * 1024, rtol=FLOAT64)
     np.testing.assert_allclose(large.gaussians.density, plain.gaussians.density / 1024, rtol=FLOAT64)
-    large = phyradgs(make_scan(1000.0), STEADY, rt, seed=1)
+    large = phyradgs(small_scan(1000.0), STEADY, rt, seed=1)
     assert difference(large.volume * 1000, run(STEADY).volume) <= SCALE_LAW
-
-
-def test_exact_motion_says_how_it_averaged(run) -> None:
-    """By K; with a loss like that of micro-views."""
-    result = run(OPTIONS, motion=Exact(segments=3))
-    assert result.facts["segments"] == 3
-    assert result.record[-1]["loss"] < 1.1 * run().record[-1]["loss"]
-    assert "segments" not in run(iterations=0).facts
 
 
 def test_the_cloud_is_the_volume(rt, scan, run) -> None:
@@ -145,3 +128,46 @@ def test_exact_motion_is_coarse_at_first_and_goes_on_with_the_same_bits(rt, scan
         np.testing.assert_array_equal(rest.volume, whole.volume)
     throughout = phyradgs(scan, replace(options, exact_from=0.0, iterations=2), rt, seed=1)
     assert len(throughout.facts["motion_phases"]) == 1
+
+
+GRID = Grid((6, 7, 8), (0.1, 0.2, 0.3), (0.5, 0.0, -0.5))
+SETTINGS = {"threshold": 0.2, "density_share": 0.15, "scale_bounds": (0.001, 1.0), "scale_factor": 1.0}
+
+
+@pytest.fixture
+def volume() -> np.ndarray:
+    return np.random.default_rng(111).uniform(-0.5, 1.0, GRID.shape)
+
+
+def draw(volume: np.ndarray, count: int, seed: int = 0, **changes: object):
+    return initial_cloud(volume, GRID, count, rng=np.random.default_rng(seed), **(SETTINGS | changes))
+
+
+def test_centres_are_occupied_voxels_and_density_their_share(volume) -> None:
+    cloud = draw(volume, 50)
+    assert cloud.count == 50 and len({tuple(m) for m in cloud.mean}) == 50
+    near = zip(GRID.axes_mm(), cloud.mean.T[::-1], strict=True)
+    index = tuple(np.abs(axis[:, None] - c).argmin(axis=0) for axis, c in near)
+    expected = [axis[i] for axis, i in zip(GRID.axes_mm(), index, strict=True)]
+    np.testing.assert_allclose(cloud.mean.T[::-1], expected, rtol=0, atol=FLOAT64)
+    assert np.all(volume[index] > 0.2)
+    np.testing.assert_allclose(cloud.density, 0.15 * volume[index], rtol=FLOAT64)
+    np.testing.assert_array_equal(cloud.quaternion, np.tile([1.0, 0, 0, 0], (50, 1)))
+
+
+def test_scale_is_the_rms_distance_to_the_three_nearest_and_hardly_anything_still_gives_a_cloud(volume) -> None:
+    cloud = draw(volume, 40, scale_factor=0.7)
+    apart = np.linalg.norm(cloud.mean[:, None] - cloud.mean[None], axis=-1)
+    nearest = np.sort(apart, axis=1)[:, 1:4]
+    expected = 0.7 * np.sqrt((nearest**2).mean(axis=1))
+    np.testing.assert_allclose(cloud.scale, np.repeat(expected[:, None], 3, axis=1), rtol=FLOAT64)
+    bounded = draw(volume, 40, scale_bounds=(0.2, 0.25))
+    assert bounded.scale.min() == 0.2 and bounded.scale.max() == 0.25
+    assert draw(volume, 10**6).count == int((volume > 0.2).sum())  # no more than there are voxels
+    one, same, other = (draw(volume, 20, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.mean, same.mean)
+    assert np.any(one.mean != other.mean)
+    for occupied in (0, 1, 2):
+        cloud = draw((np.arange(np.prod(GRID.shape)) < occupied).reshape(GRID.shape) * 1.0, 30)
+        assert cloud.count == max(occupied, 1)
+        assert np.all(np.isfinite(cloud.scale)) and np.all(cloud.scale > 0) and np.all(cloud.density > 0)

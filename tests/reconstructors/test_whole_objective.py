@@ -1,8 +1,5 @@
-"""One iteration of the real loop against finite differences of the whole objective in float64.
-
-Raw numbers → activation → splats through time cells → L1 + weighed squares + SSIM, + total variation of a crop, + parameter
-terms.
-"""
+"""One iteration of the real loop against finite differences of the whole objective in float64: raw numbers → activation →
+splats through time cells → L1 + weighed squares + SSIM, + total variation of a crop, + parameter terms."""
 
 from dataclasses import replace
 

@@ -38,12 +38,6 @@ def test_elementwise_functions_are_their_twins(any_rt, shape) -> None:
         np.testing.assert_array_equal(space.numpy(after), before)
 
 
-def test_the_last_axes_are_repeated(two_rt) -> None:
-    space, x, y = DeviceSpace(two_rt), *operands((3, 5, 7))[:2]
-    found = space.multiply(space.array(x), space.array(y[0]))
-    np.testing.assert_array_equal(space.numpy(found), x * y[0])
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_numbers_are_their_twins(two_rt, shape) -> None:
     space, (x, y, z) = DeviceSpace(two_rt), operands(shape)
@@ -69,8 +63,10 @@ def test_sums_keep_what_float32_would_lose(any_rt) -> None:
     assert space.norm(space.array(values)) ** 2 == pytest.approx(expected, rel=SUMS)
 
 
-def test_a_step_of_a_length_that_the_device_knows(two_rt) -> None:
+def test_a_step_of_a_length_that_the_device_knows_and_last_axes_that_are_repeated(two_rt) -> None:
     space, (x, y, _) = DeviceSpace(two_rt), operands((5, 6, 7))
+    found = space.multiply(space.array(x), space.array(y[0]))
+    np.testing.assert_array_equal(space.numpy(found), x * y[0])
     found = space.numpy(space.descend(space.array(x), space.array(y), 0.25))
     np.testing.assert_allclose(found, x - 0.25 * y / HOST.norm(y), rtol=0, atol=FLOAT32)
     np.testing.assert_array_equal(space.numpy(space.descend(space.array(x), space.full(x.shape, 0), 0.25)), x)
@@ -89,13 +85,3 @@ def test_memory_is_used_again_and_given_back() -> None:
     del space, x
     gc.collect()
     assert rt.ledger.held_bytes == 0
-
-
-def test_an_update_crosses_no_bus(rt) -> None:
-    space = DeviceSpace(rt)
-    x = space.array(np.ones(1000, np.float32))
-    before = rt.traffic.bytes_up, rt.traffic.bytes_down, rt.traffic.blocking
-    y = space.descend(space.multiply(space.add(x, x), x), x, 0.5)
-    assert (rt.traffic.bytes_up, rt.traffic.bytes_down, rt.traffic.blocking) == before
-    space.norm(y)
-    assert rt.traffic.bytes_down - before[1] == 8 and rt.traffic.blocking == before[2] + 1

@@ -14,8 +14,7 @@ from phyradgs_cl.runtime.device import DEVICE_VARIABLE, choose_device, list_devi
 def fake_device(name: str, kind: str = "cpu", **changes: object) -> SimpleNamespace:
     types = {"cpu": cl.device_type.CPU, "gpu": cl.device_type.GPU, "accelerator": cl.device_type.ACCELERATOR}
     facts = {
-        "name": name, "version": "OpenCL 3.0", "type": types[kind], "available": True,
-        "compiler_available": True,
+        "name": name, "version": "OpenCL 3.0", "type": types[kind], "available": True, "compiler_available": True,
         "max_compute_units": 8, "global_mem_size": 1 << 33, "max_mem_alloc_size": 1 << 31, "extensions": "",
         "native_vector_width_float": 8, "native_vector_width_double": 4, "host_unified_memory": kind == "cpu",
         "int_ptr": 0,
@@ -50,42 +49,30 @@ def machine(monkeypatch):
     return install
 
 
-def test_by_capability(machine) -> None:
+def test_which_device_is_taken_by_capability_by_kind_by_part_of_a_name_and_by_index(machine) -> None:
     half = fake_platform("Half", fake_device("no compiler", "gpu", compiler_available=False))
-    for chosen, platforms in [
-        ("EPYC", (OCLGRIND, CPU)), ("EPYC", (FPGA, OCLGRIND, EMULATOR, CPU)), ("EPYC", (half, CPU)),
-        ("H200", (CPU, GPU)), ("H200", (GPU, CPU)), ("H200", (OCLGRIND, INTEGRATED, GPU, CPU)),
-        ("UHD", (CPU, INTEGRATED)),
+    for chosen, wish, *platforms in [
+        ("EPYC", None, OCLGRIND, CPU), ("EPYC", None, FPGA, OCLGRIND, EMULATOR, CPU), ("EPYC", None, half, CPU),
+        ("H200", None, CPU, GPU), ("H200", None, GPU, CPU), ("H200", None, OCLGRIND, INTEGRATED, GPU, CPU),
+        ("UHD", None, CPU, INTEGRATED), ("H200", "gpu", OCLGRIND, CPU, GPU), ("EPYC", "CPU", OCLGRIND, CPU, GPU),
+        ("EPYC", "epyc", CPU, GPU), ("H200", "some gpu", CPU, GPU), ("H200", "1", CPU, GPU), ("EPYC", "0", CPU, GPU),
     ]:  # fmt: skip
         machine(*platforms)
-        device, reason = choose_device()
-        assert device.name == chosen and "capability" in reason
+        device, reason = choose_device(wish)
+        assert device.name == chosen and (wish or "capability") in reason
 
 
-def test_never_a_checker_or_emulator_by_default_but_by_name(machine) -> None:
+def test_checkers_and_emulators_are_taken_by_name_alone_and_unknown_devices_are_named_with_the_known(machine) -> None:
     for platform in (OCLGRIND, FPGA, EMULATOR):
         machine(platform)
         name = platform.get_devices()[0].name
         with pytest.raises(DeviceError, match=re.escape(name)):
             choose_device()
         assert choose_device(name)[0].name == choose_device("0")[0].name == name
-
-
-def test_cpu_and_gpu_as_a_wish_leave_checkers_out(machine) -> None:
     machine(OCLGRIND, CPU)
     with pytest.raises(DeviceError, match="'gpu', which fits no device"):
         choose_device("gpu")
-    machine(OCLGRIND, CPU, GPU)
-    assert choose_device("gpu")[0].name == "H200"
-    assert choose_device("CPU")[0].name == "EPYC"
-
-
-def test_by_part_of_a_name_and_by_index(machine) -> None:
-    """An unknown one is named with those that are known."""
     machine(CPU, GPU)
-    for wish, name in {"epyc": "EPYC", "some gpu": "H200", "1": "H200", "0": "EPYC"}.items():
-        device, reason = choose_device(wish)
-        assert device.name == name and wish in reason
     for wish in ("no such thing", "7"):
         with pytest.raises(DeviceError) as raised:
             choose_device(wish)

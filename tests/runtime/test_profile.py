@@ -11,7 +11,7 @@ def profiled() -> Runtime:
     return Runtime(profile=True)
 
 
-def test_launches_time_and_bytes_are_counted_by_kernel(profiled) -> None:
+def test_launches_time_and_bytes_are_counted_by_kernel_and_long_runs_do_not_keep_every_event(profiled, monkeypatch) -> None:
     source = profiled.upload(np.ones(1000, np.float32))
     target = profiled.zeros(1000)
     profiled.kernel_uses()
@@ -30,9 +30,6 @@ def test_launches_time_and_bytes_are_counted_by_kernel(profiled) -> None:
     rt = Runtime()
     rt.zeros(10)
     assert rt.kernel_uses() == {}
-
-
-def test_long_runs_do_not_keep_every_event(profiled, monkeypatch) -> None:
     monkeypatch.setattr("phyradgs_cl.runtime.profile._FOLD_AT", 4)
     array = profiled.zeros(10)
     profiled.kernel_uses()
