@@ -165,9 +165,7 @@ def make_cloud() -> Cloud:
     Numbers are rounded to float32, so that kernels and float64 oracles see the same cloud.
     """
 
-    def make(
-        count: int, seed: int = 0, *, spread: float = 0.6, scale: tuple[float, float] = (0.05, 0.2)
-    ) -> np.ndarray:
+    def make(count: int, seed: int = 0, *, spread: float = 0.6, scale: tuple[float, float] = (0.05, 0.2)) -> np.ndarray:
         rng = np.random.default_rng(seed)
         quaternion = rng.normal(size=(4, count))
         parts = [
@@ -207,9 +205,7 @@ def one_cell() -> Callable[..., TimeCells]:
 def finite_differences() -> Callable[..., np.ndarray]:
     """Central differences (shape of ``at``) of a scalar function, one entry after the other."""
 
-    def differentiate(
-        function: Callable[[np.ndarray], float], at: np.ndarray, step: float = 1e-6
-    ) -> np.ndarray:
+    def differentiate(function: Callable[[np.ndarray], float], at: np.ndarray, step: float = 1e-6) -> np.ndarray:
         gradient = np.zeros(at.shape)
         for index in np.ndindex(*at.shape):
             ends = []

@@ -4,14 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConstantSpeed,
-    ParallelGeometry,
-    Scan,
-    Shutter,
-    pixel_centres,
-)
+from phyradgs_cl.acquisition import ParallelGeometry, Scan, Shutter, pixel_centres
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, ConstantSpeed
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, rotation_about_z
 

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import (
-    CircularOrbit,
     ConeGeometry,
-    ConstantSpeed,
     ParallelGeometry,
     Scan,
     Shutter,
@@ -25,6 +23,7 @@ from phyradgs_cl.acquisition.geometry import (
     misses,
     plain_geometry,
 )
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, ConstantSpeed
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, GridChoice
 

@@ -6,29 +6,23 @@ from itertools import product
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import (
-    Centres,
-    CircularOrbit,
-    ConeGeometry,
-    ConstantSpeed,
-    Exact,
-    LineMiddles,
-    MicroViews,
-    OwnTimes,
-    PerRow,
-    PoseTable,
-    Scan,
-    Shutter,
-    Static,
-    StaticStart,
-)
+from phyradgs_cl.acquisition import Scan, Shutter
 from phyradgs_cl.acquisition.cells import exact_cells, micro_view_cells, per_line_cells, segments_for
+from phyradgs_cl.acquisition.geometry import ConeGeometry
 from phyradgs_cl.acquisition.motion import (
     LINE_POSES,
     MODELS,
     MOTIONS,
     RAYS,
     SPLATS,
+    Centres,
+    Exact,
+    LineMiddles,
+    MicroViews,
+    OwnTimes,
+    PerRow,
+    Static,
+    StaticStart,
     check_own_motion,
     motion_facts,
     motion_from_facts,
@@ -36,6 +30,7 @@ from phyradgs_cl.acquisition.motion import (
     motions_for,
     rim_travel_voxels,
 )
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, ConstantSpeed, PoseTable
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 

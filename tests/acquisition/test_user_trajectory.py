@@ -6,14 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConeGeometry,
-    ConstantSpeed,
-    ParallelGeometry,
-    Scan,
-    Shutter,
-)
+from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Scan, Shutter
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, ConstantSpeed
 from phyradgs_cl.api import ray_operator, simulate, splat_operator
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid

@@ -8,14 +8,8 @@ from check_kit import some_frames
 from parallel_kit import BODIES, line_integrals, parallel_scan
 from scipy.ndimage import shift
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConeGeometry,
-    ConstantSpeed,
-    ParallelGeometry,
-    Scan,
-    Shutter,
-)
+from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Scan, Shutter
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, ConstantSpeed
 from phyradgs_cl.check.consistency import check_consistency, repeated_frames
 from phyradgs_cl.check.finding import OK, SUSPICIOUS
 from phyradgs_cl.check.run import quick_scan

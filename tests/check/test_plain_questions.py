@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 from check_kit import cropped, some_frames
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConeGeometry,
-    EncoderTable,
-    FrameSweeps,
-    PoseTable,
-    Saturation,
-    pixel_centres,
-)
+from phyradgs_cl.acquisition import ConeGeometry, Saturation, pixel_centres
 from phyradgs_cl.acquisition.altered.angles import exposure_arc_rad
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps, PoseTable
 from phyradgs_cl.api import static_scan
 from phyradgs_cl.check import OK, SUSPICIOUS, CountReader
 from phyradgs_cl.check.consistency import repeated_frames

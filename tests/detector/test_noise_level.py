@@ -85,9 +85,7 @@ def counts(noisy: bool, seed: int = 0) -> np.ndarray:
 
 
 def test_a_panel_that_clips_is_found() -> None:
-    for level, flat_too, dtype in product(
-        (40_000, 50_100), (False, True), (np.uint16, np.float32, np.float64)
-    ):
+    for level, flat_too, dtype in product((40_000, 50_100), (False, True), (np.uint16, np.float32, np.float64)):
         frames = np.minimum(counts(noisy=True) + 400, level).astype(dtype)
         found = find_saturation(frames, np.full(SHAPE[1:], min(AIR + 400, level) if flat_too else AIR + 400))
         assert found.level == level and found.share == np.mean(frames == level) > 0.3

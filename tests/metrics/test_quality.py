@@ -37,9 +37,7 @@ def _two_stacks() -> tuple[np.ndarray, np.ndarray]:
 
 def _reference_map(image: np.ndarray, truth: np.ndarray, data_range: float) -> np.ndarray:
     margin = 12  # more than the window reaches, so that mirroring only ever mirrors zeros
-    window = {
-        "gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": data_range,
-    }
+    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": data_range}
     _, full = structural_similarity(np.pad(image, margin), np.pad(truth, margin), full=True, **window)
     return full[margin:-margin, margin:-margin]
 
