@@ -169,11 +169,9 @@ def make_cloud() -> Cloud:
         rng = np.random.default_rng(seed)
         quaternion = rng.normal(size=(4, count))
         parts = [
-            rng.uniform(-spread, spread, (3, count)),
-            np.exp(rng.uniform(*np.log(scale), (3, count))),
-            quaternion / np.linalg.norm(quaternion, axis=0),
-            rng.uniform(0.5, 2.0, (1, count)),
-        ]
+            rng.uniform(-spread, spread, (3, count)), np.exp(rng.uniform(*np.log(scale), (3, count))),
+            quaternion / np.linalg.norm(quaternion, axis=0), rng.uniform(0.5, 2.0, (1, count)),
+        ]  # fmt: skip
         return np.concatenate(parts).astype(np.float32).astype(np.float64)
 
     return make

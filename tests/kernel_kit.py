@@ -23,8 +23,7 @@ MODELS = pytest.mark.parametrize("affine", [False, True], ids=["exact", "affine"
 READOUTS = [("rows", 1), ("rows", -1), ("columns", 1), ("columns", -1)]
 CELLS = {
     "static": (static_cells, ()), "micro-views": (micro_view_cells, (4, 3)), "exact": (exact_cells, (4,)),
-    "centres": (centre_cells, (4, 3)),
-    "per-row": (per_line_cells, (3,)),
+    "centres": (centre_cells, (4, 3)), "per-row": (per_line_cells, (3,)),
 }  # fmt: skip
 ROLLING = Shutter(0.8, 0.6)
 CPU_ONLY = {

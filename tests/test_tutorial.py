@@ -15,18 +15,12 @@ ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
 PIXELS = 32
 SMALLER = {
-    r"--size \d+": "--size 16",
-    r"--detector \d+": f"--detector {PIXELS}",
-    r"--iterations \d+": "--iterations 20",
+    r"--size \d+": "--size 16", r"--detector \d+": f"--detector {PIXELS}", r"--iterations \d+": "--iterations 20",
     r"(reconstruct \w+\.h5(?: --motion static)?) -o": r"\1 --iterations 20 -o",
-    r"iterations = \d+": "iterations = 20",
-    r"iterations=\d+": "iterations=20",
-    r"96j": "32j",
-    r"Grid\.cube\(64": "Grid.cube(16",
-    r"\[64, 64, 64\]": "[16, 16, 16]",
-    r"4 / 128": f"4 / {PIXELS}",
+    r"iterations = \d+": "iterations = 20", r"iterations=\d+": "iterations=20", r"96j": "32j",
+    r"Grid\.cube\(64": "Grid.cube(16", r"\[64, 64, 64\]": "[16, 16, 16]", r"4 / 128": f"4 / {PIXELS}",
     r"= 0\.03125": f"= {4 / PIXELS}",
-}
+}  # fmt: skip
 SHELL = ("python3 -m venv", ". ~", "pip install", "mkdir")  # what makes an environment
 
 

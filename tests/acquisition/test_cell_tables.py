@@ -131,11 +131,10 @@ def test_a_panel_that_turns_about_itself_needs_segments_too(steps) -> None:
 
 
 SHUTTERS = {
-    "rolling": Shutter(0.8, 0.6), "backwards": Shutter(0.8, 0.6, "rows", -1),
-    "slow readout": Shutter(0.2, 1.6), "global": Shutter(0.8, 0.0), "a moment": Shutter(0.0, 0.6),
-    "pulsed": Shutter(0.8, 0.6, pulse_s=(0.5, 0.4)),
+    "rolling": Shutter(0.8, 0.6), "backwards": Shutter(0.8, 0.6, "rows", -1), "slow readout": Shutter(0.2, 1.6),
+    "global": Shutter(0.8, 0.0), "a moment": Shutter(0.0, 0.6), "pulsed": Shutter(0.8, 0.6, pulse_s=(0.5, 0.4)),
     "pulse that misses lines": Shutter(0.2, 0.6, pulse_s=(0.3, 0.1)),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("shutter", SHUTTERS.values(), ids=SHUTTERS)

@@ -33,13 +33,10 @@ def scan_of(trajectory: object, geometry: ConeGeometry | ParallelGeometry = CONE
     return Scan(np.ones((3, 5, 6), np.float32), geometry, trajectory, shutter, np.arange(3.0), grid)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    ("change", "found"),
-    [
-        (lambda poses: poses[0], r"shape \(12,\)"), (lambda poses: poses[..., :9], r"shape \(\d+, 9\)"),
-        (lambda poses: np.nan * poses, "NaN"), (lambda poses: poses.astype(str), "expected numbers"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("change", "found"), [
+    (lambda poses: poses[0], r"shape \(12,\)"), (lambda poses: poses[..., :9], r"shape \(\d+, 9\)"),
+    (lambda poses: np.nan * poses, "NaN"), (lambda poses: poses.astype(str), "expected numbers"),
+])  # fmt: skip
 def test_poses_of_no_use_are_refused_by_every_operator(rt, change, found) -> None:
     scan = scan_of(Own(change))
     for made in (lambda: ray_operator(scan, "static"), lambda: ray_operator(scan), lambda: splat_operator(scan)):

@@ -73,9 +73,8 @@ def scanned(rt, phantom, axis="rows", model="log", noise="none", is_fly=True, vi
 
 
 @pytest.mark.parametrize(
-    ("axis", "model", "is_fly"),
-    [("rows", "log", True), ("columns", "intensity", True), ("rows", "log", False)],
-)
+    ("axis", "model", "is_fly"), [("rows", "log", True), ("columns", "intensity", True), ("rows", "log", False)],
+)  # fmt: skip
 def test_frames_are_those_of_the_simulator(rt, known, axis, model, is_fly) -> None:
     """Of bodies that are turned and shifted there, and poses that are here; two thirds as dense."""
     scan = scanned(rt, lying(known), axis, model, is_fly=is_fly, views=3)

@@ -81,15 +81,10 @@ def datasets(path) -> dict[str, object]:
     return found
 
 
-@pytest.mark.parametrize(
-    ("change", "touched"),
-    [
-        (NUMBERS, {"detector_offset", "detector/distance", "source/distance"}),
-        (TURNS, {"poses/pose", "poses/time_s"}),
-        (TIMES, TIMED),
-        (replace(TIMES, offset_u_mm=0.3), TIMED | {"detector_offset"}),
-    ],
-)
+@pytest.mark.parametrize(("change", "touched"), [
+    (NUMBERS, {"detector_offset", "detector/distance", "source/distance"}), (TURNS, {"poses/pose", "poses/time_s"}),
+    (TIMES, TIMED), (replace(TIMES, offset_u_mm=0.3), TIMED | {"detector_offset"}),
+])  # fmt: skip
 def test_a_copy_says_what_was_changed_and_nothing_else(right, tmp_path, change, touched) -> None:
     path, copy = tmp_path / "scan.h5", tmp_path / "copy.h5"
     counts = np.random.default_rng(0).integers(1, 60000, (17, 32, 32)).astype(np.uint16)

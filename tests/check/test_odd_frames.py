@@ -31,10 +31,9 @@ def answer(rt, scan: Scan) -> tuple[str, str]:
     return finding.verdict, finding.text.split(";")[0]
 
 
-@pytest.mark.parametrize(
-    ("arc", "at", "is_moved"),
-    [("half a turn", 0, True), ("cone, 216°", 18, True), ("cone, 216°", 35, False), ("cone, full", 0, True)],
-)
+@pytest.mark.parametrize(("arc", "at", "is_moved"), [
+    ("half a turn", 0, True), ("cone, 216°", 18, True), ("cone, 216°", 35, False), ("cone, full", 0, True),
+])  # fmt: skip
 def test_one_odd_frame_is_named_wherever_it_is(rt, arcs, arc, at, is_moved) -> None:
     """It is moved by two pixels or mirrored."""
     frames = arcs[arc].projections.copy()

@@ -97,15 +97,12 @@ def test_a_grid_of_another_size_than_the_object(clean) -> None:
 BLACK = "frame 7 is unlike all others"
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda p: np.where(np.arange(15)[:, None, None] == 7, np.float32(10), p), BLACK),
-        (lambda p: p[[*range(6), 5, *range(7, 15)]], "frame 6 is frame 5 recorded twice"),
-        (lambda p: p[[0, 1, 2, 10, *range(4, 10), 3, *range(11, 15)]], "frames 3 and 10 (from 0) fit if"),
-        (lambda p: p[np.random.default_rng(3).permutation(15)], "cause not found"),
-    ],
-)
+@pytest.mark.parametrize(("change", "said"), [
+    (lambda p: np.where(np.arange(15)[:, None, None] == 7, np.float32(10), p), BLACK),
+    (lambda p: p[[*range(6), 5, *range(7, 15)]], "frame 6 is frame 5 recorded twice"),
+    (lambda p: p[[0, 1, 2, 10, *range(4, 10), 3, *range(11, 15)]], "frames 3 and 10 (from 0) fit if"),
+    (lambda p: p[np.random.default_rng(3).permutation(15)], "cause not found"),
+])  # fmt: skip
 def test_frames_that_do_not_fit_together_are_named(rt, clean, change, said) -> None:
     """And nothing else is blamed: a black frame moves no panel."""
     found = check(replace(clean, projections=change(clean.projections)), rt)

@@ -121,10 +121,9 @@ def test_objects_that_reach_both_sides_are_no_air() -> None:
 
 
 @SLOW
-@pytest.mark.parametrize(
-    ("name", "distances", "arc_deg"),
-    [("head", CONE, 200.0), ("tube about the axis", CONE, 200.0), ("grains", PARALLEL, 360.0)],
-)
+@pytest.mark.parametrize(("name", "distances", "arc_deg"), [
+    ("head", CONE, 200.0), ("tube about the axis", CONE, 200.0), ("grains", PARALLEL, 360.0),
+])  # fmt: skip
 def test_a_clean_scan_stays_bit_for_bit(rt, closed_form, name, distances, arc_deg) -> None:
     clean = closed_form(name, distances, arc_deg)
     prepared = prepare(clean, DEFAULT_STEPS, device=rt)
@@ -153,14 +152,11 @@ def spoilt(clean: Scan, part: tuple[slice, slice], gain: float) -> Scan:
     return with_frames(clean, frames)
 
 
-@pytest.mark.parametrize(
-    ("name", "part", "gain", "words"),
-    [
-        ("head", np.s_[:, 8:9], 1.01, "1 column, gain off by 1.0 %"),
-        ("tube about the axis", np.s_[:, 31:32], 1.03, "1 column, gain off by 3.0 %"),
-        ("grains", np.s_[20:23, 5:8], 1.05, "9 pixels, gain off by 5."),
-    ],
-)
+@pytest.mark.parametrize(("name", "part", "gain", "words"), [
+    ("head", np.s_[:, 8:9], 1.01, "1 column, gain off by 1.0 %"),
+    ("tube about the axis", np.s_[:, 31:32], 1.03, "1 column, gain off by 3.0 %"),
+    ("grains", np.s_[20:23, 5:8], 1.05, "9 pixels, gain off by 5."),
+])  # fmt: skip
 def test_a_single_gain_is_regained_and_nothing_else_changes(rt, closed_form, name, part, gain, words) -> None:
     clean = closed_form(name, CONE)
     assert prepare(clean, "rings", device=rt).projections is clean.projections

@@ -36,14 +36,12 @@ def kinds(scan_maker, small_scan) -> dict[str, object]:
     table = PoseTable(times_s, small_scan.trajectory.pose(0, times_s))
     pulsed = make_protocol("rapid", views=8, exposure_deg=20.0, pulse=(0.86, 0.14))
     return {
-        "fly": small_scan,
-        "still": scan_maker(protocol=make_protocol("static", views=8)),
+        "fly": small_scan, "still": scan_maker(protocol=make_protocol("static", views=8)),
         "columns backwards": scan_maker(readout_axis="columns", readout_direction=-1),
-        "pulsed": scan_maker(protocol=pulsed),
-        "wobbling": replace(small_scan, trajectory=table),
+        "pulsed": scan_maker(protocol=pulsed), "wobbling": replace(small_scan, trajectory=table),
         "instant": replace(small_scan, shutter=Shutter(0.0)),
         "one frame": replace(small_scan, projections=small_scan.projections[:1], frame_start_s=np.zeros(1)),
-    }
+    }  # fmt: skip
 
 
 def test_every_kind_of_scan_is_drawn_with_finite_numbers(kinds) -> None:

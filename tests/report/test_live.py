@@ -54,8 +54,7 @@ def test_the_page_has_the_numbers_of_the_run(parse) -> None:
     assert not page.open and len(page.ids) == len(set(page.ids))
     tiles = dict(zip(page.texts["span"], [text for text in page.texts["b"] if text], strict=False))
     assert tiles == {
-        "iteration": "12 of 20", "residual": "0.2", "per minute": "120", "time left": "0:03",
-        "time so far": "0:15",
+        "iteration": "12 of 20", "residual": "0.2", "per minute": "120", "time left": "0:03", "time so far": "0:15",
     }  # fmt: skip
     assert "Residual: from 0.5 to 0.2 at iteration 12." in page.words and "relaxation" in page.words and "0.7" in page.words
     for link in page.all("a"):
