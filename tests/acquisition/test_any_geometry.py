@@ -100,8 +100,7 @@ def test_angles_that_count_on_beyond_a_turn_are_as_they_say(step_deg) -> None:
 
 def test_angles_that_jump_by_a_turn_are_put_together_again() -> None:
     time_s, angle_rad = np.linspace(0, 10, 101), np.linspace(0.1, 12.0, 101)
-    table = EncoderTable(time_s, angle_rad % (2 * np.pi))
-    between = np.linspace(0, 10, 333)
+    table, between = EncoderTable(time_s, angle_rad % (2 * np.pi)), np.linspace(0, 10, 333)
     np.testing.assert_allclose(table.angle_rad(0, between), np.interp(between, time_s, angle_rad), atol=FLOAT64)
     two = EncoderTable(np.array([0.0, 10.0]), np.array([0.0, 2 * np.pi]))  # a whole turn between two samples
     assert two.angle_rad(0, np.array(5.0)) == pytest.approx(np.pi)

@@ -161,8 +161,7 @@ def test_segments_hold_every_window_once(shutter, segments) -> None:
 
 
 def test_poses_are_those_of_the_middle_and_both_ends() -> None:
-    table = exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 4)
-    length_s = 1.4 / 4
+    table, length_s = exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 4), 1.4 / 4
     assert table.layer_numbers.max() > 0  # segments begin at different lines and still meet in one
     assert exact_cells(ORBIT, Shutter(0.8, 0.6), 0, START_S, LINES, 1).layer_numbers.max() == 0
     np.testing.assert_allclose(table.pose, ORBIT.pose(0, table.time_s), rtol=0, atol=FLOAT64)
@@ -200,7 +199,6 @@ def test_the_fastest_of_32_parts_of_a_frame_counts() -> None:
     steady = CircularOrbit(GEOMETRY, ConstantSpeed(0.0, 0.5))
     where = (Shutter(0.8, 0.6), 0, START_S, 0.002)
     assert segments_for(jerky, *where) == segments_for(steady, *where) > 1
-    ramp = CircularOrbit(GEOMETRY, SpeedRamp(0.0, 0.0, 3.0))
-    fastest_rad = 32 * 1.5 * (1 - (31 / 32) ** 2)
+    ramp, fastest_rad = CircularOrbit(GEOMETRY, SpeedRamp(0.0, 0.0, 3.0)), 32 * 1.5 * (1 - (31 / 32) ** 2)
     assert segments_for(ramp, Shutter(0.4, 0.6), 0, 0.0, 0.0005) == 75
     assert 74 < fastest_rad * np.sqrt(0.32 / 0.0005) < 75

@@ -78,8 +78,7 @@ def test_a_summary_shows_what_a_wrong_length_changes(rt) -> None:
     scan = simulate("spheres", size=8, detector=16, views=6, exposure_deg=60.0, device=rt)
     timing, sizes, blur = scan.summary().splitlines()
     assert timing == "timing: rows read in 860 ms, bottom first; 1 fps; exposure 60° in 1000 ms; averages line integrals"
-    numbers = [float(n) for n in re.findall(r"[\d.]+", sizes)]
-    largest = float(scan.projections.max())
+    numbers, largest = [float(n) for n in re.findall(r"[\d.]+", sizes)], float(scan.projections.max())
     assert numbers == pytest.approx([3.642, 2.747, 2.747, 31.9, 31.9, 0.25, largest], rel=1e-3)
     assert blur == "blur at the rim: 8.4 px, at half radius 4.2 px"  # π/3 · 8 columns
     still = static_scan(FRAMES, CONE, TURN_DEG).summary().splitlines()

@@ -68,8 +68,7 @@ def test_poses_between_samples_stay_on_a_circular_orbit(step_deg, tilts) -> None
 
 def test_an_encoder_table_goes_on_at_the_speed_of_its_ends() -> None:
     table = EncoderTable(np.array([0.0, 1.0, 3.0]), np.array([0.0, 0.1, 0.5]))
-    longer = continued(CircularOrbit(GEOMETRY, table), 2.0)
-    times_s = np.array([-2.0, 0.0, 0.5, 3.0, 5.0])
+    longer, times_s = continued(CircularOrbit(GEOMETRY, table), 2.0), np.array([-2.0, 0.0, 0.5, 3.0, 5.0])
     np.testing.assert_allclose(longer.angle_rad(0, times_s), [-0.2, 0.0, 0.05, 0.5, 0.9])
     steady = CircularOrbit(GEOMETRY, ConstantSpeed(0.0, 1.0))
     assert continued(steady, 2.0) is steady

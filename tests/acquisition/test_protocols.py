@@ -71,28 +71,17 @@ def test_the_gantry_wanders_in_straight_lines_between_one_knot_per_frame() -> No
             orbit(GEOMETRY, 0.2, generator)
 
 
-def scan(**changes) -> Scan:
-    protocol = Protocol(views=3)
-    fields = {
-        "projections": np.zeros((3, 4, 4), np.float32), "geometry": GEOMETRY, "grid": Grid.cube(4, 2.0),
-        "trajectory": protocol.orbit(GEOMETRY), "shutter": protocol.shutter(),
-        "frame_start_s": protocol.frame_start_s(),
-    }  # fmt: skip
-    return Scan(**(fields | changes))
-
-
 def test_timing_names_the_first_frame_that_a_table_misses() -> None:
-    start_s, span_s = np.array([0.0, 10.0, 20.0]), 1.86
-    for end_s, frame in ((20.0 + span_s, None), (21.8, 2), (11.8, 1)):
-        table = EncoderTable([0.0, end_s], [0.0, 1.0])
-        moving = scan(trajectory=CircularOrbit(GEOMETRY, table), frame_start_s=start_s)
+    frames, rest = np.zeros((3, 4, 4)), (Protocol().shutter(), np.array([0.0, 10.0, 20.0]), Grid.cube(4, 2.0))
+    for end_s, frame in ((20.0 + rest[0].span_s, None), (21.8, 2), (11.8, 1)):
+        moving = Scan(frames, GEOMETRY, CircularOrbit(GEOMETRY, EncoderTable([0.0, end_s], [0.0, 1.0])), *rest)
         if frame is None:
             moving.check_timing()
         else:
             with pytest.raises(InputError, match=f"frame {frame} needs"):
                 moving.check_timing()
     poses = PoseTable([0.0, 20.5], GEOMETRY.pose(np.array([0.0, 1.0])))
-    stopped = scan(trajectory=poses, frame_start_s=np.array([0.0, 10.0, 20.0]), is_fly=False)
+    stopped = Scan(frames, GEOMETRY, poses, *rest, is_fly=False)
     with pytest.raises(InputError, match="frame 2 needs"):
         stopped.check_timing()
     dataclasses.replace(stopped, shutter=Shutter(0.5, 0.5)).check_timing()

@@ -12,30 +12,6 @@ from phyradgs_cl.acquisition.trajectory import CircularOrbit, ConstantSpeed
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
-
-@pytest.mark.parametrize("lines", [2, 3, 64, 511])
-def test_delay_is_the_papers_fraction_of_the_readout(lines) -> None:
-    forward = Shutter(1.0, 0.86).delay_s(lines)
-    np.testing.assert_allclose(forward, [r / (lines - 1) * 0.86 for r in range(lines)], rtol=1e-14)
-    backward = Shutter(1.0, 0.86, direction=-1)
-    np.testing.assert_array_equal(backward.delay_s(lines), forward[::-1])
-    assert forward[-1] + 1.0 == pytest.approx(backward.span_s)
-    np.testing.assert_array_equal([*Shutter(1.0).delay_s(lines), *Shutter(1.0, 0.5).delay_s(1)], 0)
-
-
-@pytest.mark.parametrize("direction", [1, -1])
-def test_strip_of_a_line_is_floor_r_times_m_over_h(direction) -> None:
-    for lines, strips in [(8, 8), (10, 4), (7, 3), (512, 8), (511, 16), (3, 8), (1, 5), (5, 1)]:
-        ranges = Shutter(1.0, 0.5, direction=direction).strip_ranges(lines, strips)
-        assert len(ranges) == strips
-        strip_of = np.full(lines, -1)
-        for strip, (start, stop) in enumerate(ranges):
-            assert np.all(strip_of[start:stop] == -1), "a line in two strips"
-            strip_of[start:stop] = strip
-        order = np.arange(lines) if direction > 0 else np.arange(lines)[::-1]
-        np.testing.assert_array_equal(strip_of, order * strips // lines)
-
-
 SHAPE = (7, 10)
 GEOMETRY = ConeGeometry(50.0, 70.0, SHAPE, (0.6, 0.5))
 ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, 0.25))
@@ -48,13 +24,13 @@ def test_a_window_is_cut_by_the_pulse_or_missed() -> None:
     shutter = Shutter(0.8, 0.6, pulse_s=(0.3, 0.7))
     expected = [[max(0.1 * r, 0.3), min(0.1 * r + 0.8, 1.0)] for r in range(7)]
     np.testing.assert_allclose(shutter.line_windows_s(7), expected, atol=TIME_TOLERANCE_S)
-    assert shutter.lit_span_s == pytest.approx((0.3, 1.0))
-    assert shutter.middle_s == pytest.approx(0.65)
+    assert shutter.lit_span_s == pytest.approx((0.3, 1.0)) and shutter.middle_s == pytest.approx(0.65)
     seen = np.diff(expected)[:, 0]
     np.testing.assert_allclose(shutter.lit_share(7), seen / seen.max(), rtol=1e-12)
     windows_s, share = DARK_FROM.line_windows_s(7), DARK_FROM.lit_share(7)
     np.testing.assert_array_equal(share > 0, [True] * 5 + [False] * 2)  # line 5 opens at 1.0 s
     np.testing.assert_array_equal(windows_s[5:], 1.0)
+    assert Shutter(1.0, 0.5).delay_s(1) == Shutter(1.0, 0.5, direction=-1).delay_s(1) == 0  # a panel of one line
 
 
 def test_a_billionth_of_a_window_is_rounding() -> None:
@@ -120,7 +96,7 @@ def test_a_pulsed_scan_knows_when_it_needs_a_pose(is_fly) -> None:
 def test_pulses_that_no_frame_sees_are_refused() -> None:
     for pulse in [
         (0.0, 0.0), (0.2, 0.0), (0.0, -1.0), (0.2, -0.1), (1.5, 1.0), (2.0, 1.0), (-0.5, 0.5), (-3.0, 1.0),
-        (np.nan, 1.0), (0.0, np.inf),
+        (np.nan, 1.0), (0.0, np.inf), "0.2,0.5", 0.5, (0.1, 0.2, 0.3),
     ]:  # fmt: skip
         with pytest.raises(InputError, match="pulse"):
             Protocol(readout_ratio=0.5, pulse=pulse)

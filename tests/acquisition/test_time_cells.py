@@ -89,10 +89,6 @@ def test_motion_models_of_fly_and_stop_and_shoot_scans() -> None:
     with pytest.raises(InputError, match="micro-views"):
         motion_of("micro-view")
     assert [motion_of(name).name for name in MOTIONS] == list(MOTIONS) and motion_of(model := MicroViews(3)) is model
-    for model in MODELS:  # a name is no field that anybody sets
-        assert "name" not in repr(model())
-        with pytest.raises(TypeError, match="name"):
-            model(name="mine")
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 
 from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Scan, Shutter
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, ConstantSpeed
-from phyradgs_cl.api import ray_operator, simulate, splat_operator
+from phyradgs_cl.api import ray_operator, splat_operator
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
@@ -63,12 +63,6 @@ def test_angles_of_no_use_are_refused(angle) -> None:
 
     with pytest.raises(InputError, match="kinematics Kinematics"):
         scan_of(CircularOrbit(CONE, Kinematics())).trajectory.pose(0, np.zeros(2))
-
-
-@pytest.mark.parametrize("pulse", ["0.2,0.5", 0.5, (0.1, 0.2, 0.3)])
-def test_a_pulse_is_two_numbers(pulse) -> None:
-    with pytest.raises(InputError, match="pulse"):
-        simulate("spheres", size=8, detector=16, views=6, pulse=pulse)
 
 
 def test_a_grid_is_divided_by_whole_numbers_into_three_sides() -> None:

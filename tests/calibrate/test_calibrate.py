@@ -95,8 +95,7 @@ def test_a_value_returns_to_what_is_stated_where_that_moves_no_other(right, tilt
     off = replace(problem, residual=problem.residual + wrong @ signals)
     search = Search([PARAMETERS["offset-u"]], determined=known, shares=shares, reduced=off)
     kept = search.corrections()
-    assert list(kept) == names
-    assert list(kept.values()) == pytest.approx(off.only(names).step().tolist())
+    assert list(kept) == names and list(kept.values()) == pytest.approx(off.only(names).step().tolist())
     (offset,) = search.table(right, kept)
     moved = kept["offset-u"] - wrong[0]
     assert abs(moved) < 1.42 * deviation[0] and offset.deviation == pytest.approx(np.hypot(deviation[0], moved))

@@ -61,9 +61,9 @@ def test_an_axis_beside_which_others_are_searched_stays_where_it_is(rt, half_tur
 
 
 def half_fan():
-    shape, pitch_mm = (24, 64), (1.1, FAN_PITCH_MM)
+    shape, pitch_mm = (16, 64), (1.1, FAN_PITCH_MM)
     true, stated = (ConeGeometry(150.0, 220.0, shape, pitch_mm, (0.0, px * FAN_PITCH_MM)) for px in (TRUE_PX, STATED_PX))
-    angles_deg = 3.0 * np.arange(120)
+    angles_deg = 5.0 * np.arange(72)
     pose = true.pose(np.deg2rad(angles_deg))
     frames = BODY.line_integrals(pose[:, None, None, :3], pixel_centres(pose, shape))
     frames = frames + 0.002 * np.random.default_rng(0).standard_normal(frames.shape)

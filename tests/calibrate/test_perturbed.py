@@ -52,8 +52,7 @@ def test_turns_leave_the_middle_of_the_panel_where_it_is(right) -> None:
 def test_views_move_by_themselves(right) -> None:
     views = Views(np.zeros(15), np.zeros((15, 2)))
     views.turn_rad[3], views.shift_mm[5] = 0.01, (0.2, 0.0)
-    after = perturb(right, GeometryCorrection(), views)
-    time_s = np.array([1.0])
+    after, time_s = perturb(right, GeometryCorrection(), views), np.array([1.0])
     is_off = [not np.allclose(after.trajectory.pose(f, time_s), right.trajectory.pose(f, time_s)) for f in range(15)]
     assert np.flatnonzero(is_off).tolist() == [3, 5]
     shift = (after.trajectory.pose(5, time_s) - right.trajectory.pose(5, time_s))[0]

@@ -83,8 +83,7 @@ def test_a_wobble_does_not_pass_for_a_roll(rt, monkeypatch) -> None:
     """Asked together with what all views share, which is found beside it; found again, it is what is left, beside what had
     been found before."""
     how = {"size": 16, "detector": 24, "views": 24, "exposure_deg": 7.5, "noise": "tigre", "dose": 1e5}
-    scan = simulate("jaw", **how, device=rt)
-    course = np.cos(np.pi * np.linspace(0, 1, 24))
+    scan, course = simulate("jaw", **how, device=rt), np.cos(np.pi * np.linspace(0, 1, 24))
     parameters = WobbleParameters.of(scan)
     planted = parameters.without_gauges(np.stack([0 * course, 0.1 * course**2, 0.15 * course], -1))
     offset_mm = 0.2
@@ -111,8 +110,7 @@ def test_a_wobble_does_not_pass_for_a_roll(rt, monkeypatch) -> None:
 
 def test_an_object_that_moves_is_followed_and_the_file_has_its_poses(cli, rt, right, tmp_path, capsys) -> None:
     """Frames that overlap in time are no hindrance: a motion is of time alone."""
-    parameters = MotionParameters.of(right)
-    course = np.zeros((SPLINES, 6))
+    parameters, course = MotionParameters.of(right), np.zeros((SPLINES, 6))
     course[:, 3:] = 0.15 * np.random.default_rng(2).normal(size=(SPLINES, 3))
     planted = parameters.without_gauges(course)
     path, out = tmp_path / "scan.h5", tmp_path / "out.h5"
@@ -134,8 +132,7 @@ def test_an_object_that_moves_is_followed_and_the_file_has_its_poses(cli, rt, ri
 
 def test_gauges_are_what_an_object_elsewhere_or_a_larger_one_looks_like(right) -> None:
     """Of a motion, and of a wobble, in which the panel's offset shows."""
-    parameters = MotionParameters.of(right)
-    angle = np.deg2rad(24 * np.arange(15))
+    parameters, angle = MotionParameters.of(right), np.deg2rad(24 * np.arange(15))
     towards = np.linalg.lstsq(parameters.basis, np.stack([np.cos(angle), np.sin(angle)], -1), rcond=None)[0]
     gauges = np.tile(np.arange(6.0), (SPLINES, 1))
     gauges[:, 3:5] += towards

@@ -37,8 +37,7 @@ def test_expected_counts_follow_both_laws() -> None:
     p = np.array([[[0.0, 1.0], [2.0, 4.0]]])
     assert np.allclose(beer_lambert_counts(p, 1e4), 1e4 * np.exp(-p))
     expected, scale = tigre_counts(p, 1e4)
-    assert scale == 4.0
-    assert np.allclose(expected, 1e4 * np.exp([[[0, -0.25], [-0.5, -1]]]))
+    assert scale == 4.0 and np.allclose(expected, 1e4 * np.exp([[[0, -0.25], [-0.5, -1]]]))
 
 
 def test_spreads_are_those_of_error_propagation() -> None:
@@ -149,8 +148,7 @@ def test_masks_follow_the_light_and_ghosts_are_masked() -> None:
     p = frames(3)
     p[0, 1, 1], p[1, 1, 1] = 0.0, 9.0  # recorded: less than a tenth of the frame before
     clean = without_lag(scan(p, lag=0.1))
-    assert clean.pixel_mask[1, 1, 1] and np.isfinite(clean.projections).all()
-    assert not clean.pixel_mask[0].any()
+    assert clean.pixel_mask[1, 1, 1] and np.isfinite(clean.projections).all() and not clean.pixel_mask[0].any()
 
 
 def test_electronic_noise_grows_and_photon_noise_does_not() -> None:

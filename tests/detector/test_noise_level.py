@@ -42,8 +42,7 @@ def test_the_noise_behind_the_object_does_not_depend_on_the_air() -> None:
     u = np.linspace(-3, 3, 192)
     dome = np.maximum(1 - u**2, 0) ** 2 * np.ones((40, 40, 1))
     noisy = (dome + 0.02 * np.random.default_rng(0).normal(size=dome.shape)).astype(np.float32)
-    every = np.ones(noisy.shape, bool)
-    clipped = np.maximum(noisy, 0)
+    every, clipped = np.ones(noisy.shape, bool), np.maximum(noisy, 0)
     assert noise_level(clipped) < 0.8 * 0.02
     for frames in (noisy, clipped):
         assert noise_behind(frames, every) == pytest.approx(0.02, rel=0.08)

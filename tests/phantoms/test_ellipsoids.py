@@ -28,8 +28,7 @@ def _marched(phantom: EllipsoidPhantom, source: np.ndarray, target: np.ndarray, 
     points, total = source + t[:, None] * (target - source), np.zeros(n)
     for e in phantom.ellipsoids:
         r = np.array(e.rotation)
-        form = r @ np.diag(1 / np.array(e.semi_axes_mm) ** 2) @ r.T
-        d = points - np.array(e.centre_mm)
+        form, d = r @ np.diag(1 / np.array(e.semi_axes_mm) ** 2) @ r.T, points - np.array(e.centre_mm)
         total += e.attenuation_per_mm * (np.sum((d @ form) * d, axis=1) < 1)
     return float(total.mean() * np.linalg.norm(target - source))
 

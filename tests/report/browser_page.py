@@ -66,11 +66,6 @@ def reading(page: Page) -> str:
     return page.locator("#reading").inner_text()
 
 
-def test_nothing_is_wider_than_the_window(page) -> None:
-    assert page.evaluate("document.documentElement.scrollWidth") == page.viewport_size["width"]
-    assert page.evaluate("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
-
-
 def test_a_slider_moves_by_keys(page) -> None:
     slider = page.locator("#slider-axial")
     before = picture(page, "axial")
@@ -158,7 +153,9 @@ def test_zoom_keeps_the_crossing_in_sight_and_the_bar_true(page) -> None:
     assert seen["x"] <= line["x"] <= seen["x"] + seen["width"]
 
 
-def test_tab_reaches_every_control(page) -> None:
+def test_nothing_is_wider_than_the_window_and_tab_reaches_every_control(page) -> None:
+    assert page.evaluate("document.documentElement.scrollWidth") == page.viewport_size["width"]
+    assert page.evaluate("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
     reached = []
     for _ in range(40):
         page.keyboard.press("Tab")

@@ -76,8 +76,7 @@ def test_a_count_that_starts_again_is_another_curve() -> None:
 def test_pictures_are_those_of_the_volume_and_the_frames(parse) -> None:
     values, grid = volume(2.0)
     values[0, 0, 0] = 1.0
-    snapshot = Snapshot.of(8, values, grid, [pair(3)])
-    now = status(report(4), report(8))
+    snapshot, now = Snapshot.of(8, values, grid, [pair(3)]), status(report(4), report(8))
     page = parse(live_page(Status(**{**vars(now), "snapshot": snapshot}), 15.0))
     images = page.all("img")
     assert "after iteration 8" in page.words and "residual, RMS 0.25 (25 %)" in page.words

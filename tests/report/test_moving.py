@@ -62,8 +62,7 @@ def test_a_fine_field_and_many_times_stay_within_the_budget() -> None:
     grid = Grid.cube(40, 40.0)
     origin_mm, counts = control_points(grid, 1.0)
     z, y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in counts), indexing="ij")
-    control_mm = np.stack([np.sin(2 * z), x * y, np.cos(2 * x)], -1)[None]
-    times_s = np.arange(5000.0)
+    control_mm, times_s = np.stack([np.sin(2 * z), x * y, np.cos(2 * x)], -1)[None], np.arange(5000.0)
     fine = Deformation(control_mm, origin_mm, 1.0, times_s, np.sin(times_s / 500)[:, None])
     assert fine.control_mm.size > MOST_VALUES
     markup = object_in_motion(np.ones(grid.shape), grid, Window.of(0.0, 1.0, np.ones(1)), fine, (0.0, 4999.0))
