@@ -1,4 +1,4 @@
-"""PSNR against its definition, SSIM against scikit-image's with a margin of zeros, and both together."""
+"""PSNR by its definition, SSIM against scikit-image's with a margin of zeros, both together, and the figure of slices."""
 
 from importlib import import_module
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from phyradgs_cl.metrics import METRICS, compare, printed, psnr, ssim, ssim_map
+from phyradgs_cl.errors import OutputError
+from phyradgs_cl.metrics import METRICS, compare, printed, psnr, slices_png, ssim, ssim_map
 
 
 def test_equals_scikit_image() -> None:
@@ -64,3 +65,14 @@ def test_compare_uses_the_references_maximum_and_metrics_are_printed_with_their_
     assert found.keys() == {*METRICS, "data_range"}
     assert list(printed({"psnr_db": 22.126, "ssim": 1.0})) == [("PSNR", "22.13 dB"), ("SSIM", "1.0000")]
     assert list(printed({"psnr_db": "x", "ssim": None})) == []
+
+
+def test_the_picture_has_three_columns_also_of_nothing_and_a_missing_folder_is_named(tmp_path) -> None:
+    volume, nothing = np.random.default_rng(0).uniform(size=(6, 8, 10)).astype(np.float32), np.zeros((3, 3, 3))
+    for result, truth, least in ((volume + 0.1, volume, 600), (nothing, nothing, 1)):
+        slices_png(tmp_path / "a.png", result, truth, "title")
+        head = (tmp_path / "a.png").read_bytes()[:24]
+        assert head.startswith(b"\x89PNG\r\n\x1a\n")
+        assert int.from_bytes(head[16:20], "big") >= least and int.from_bytes(head[20:24], "big") > 0
+    with pytest.raises(OutputError, match="missing"):
+        slices_png(tmp_path / "missing" / "a.png", nothing, nothing, "title")

@@ -1,4 +1,4 @@
-"""The named phantoms: known numbers, symmetries, sameness at every resolution."""
+"""The named phantoms: known numbers, symmetries, sameness at every resolution, signed distances and textures."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ from refusals import assert_refused
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import PHANTOMS, foot, jaw, make_phantom, shepp_logan
+from phyradgs_cl.phantoms.implicit import Capsule, Lattice, capsule_distance, ellipsoid_distance, texture
 
 
 def test_shepp_logan_grey_levels_and_ventricles() -> None:
@@ -58,3 +59,23 @@ def test_unknown_names_and_sizes_are_refused() -> None:
         "resolution": lambda: make_phantom("foot", 1.0, 0), "variant": lambda: shepp_logan(1.0, "tofu"),
         "make the phantom at this resolution": lambda: make_phantom("jaw", 30.0, 16).voxelise(Grid.cube(17, 60.0)),
     })  # fmt: skip
+
+
+def test_covered_voxels_hold_the_volumes_of_a_capsule_and_an_ellipsoid() -> None:
+    """Edges count as if straight and axis-aligned: a rounded body gains somewhat less than a per cent."""
+    lattice = Lattice(48)
+    x, y, z = lattice.points((slice(0, 48),) * 3)
+    capsule = capsule_distance(Capsule((-0.3, 0, 0.1), (0.4, 0, 0.1), 0.25, 0.25), x, y, z)
+    ellipsoid = ellipsoid_distance((0.1, 0.0, -0.2), (0.6, 0.3, 0.4), x, y, z)
+    value = ((x - 0.1) / 0.6) ** 2 + (y / 0.3) ** 2 + ((z + 0.2) / 0.4) ** 2
+    assert ((ellipsoid < 0) == (value < 1)).mean() > 0.9999
+    exact = np.pi * 0.25**2 * 0.7 + 4 / 3 * np.pi * 0.25**3, 4 / 3 * np.pi * 0.6 * 0.3 * 0.4
+    volumes = [lattice.coverage(distance).sum() * lattice.step**3 for distance in (capsule, ellipsoid)]
+    assert volumes == pytest.approx(exact, rel=1e-2)
+
+
+def test_texture_has_unit_variance_and_coarse_is_the_mean_of_fine() -> None:
+    fine = texture(Lattice(64), (0.2, 0.5), 64, np.random.default_rng(1)).astype(np.float64)
+    coarse = texture(Lattice(32), (0.2, 0.5), 64, np.random.default_rng(1))
+    assert np.std(fine) == pytest.approx(1.0, abs=0.1)
+    assert np.allclose(fine.reshape(32, 2, 32, 2, 32, 2).mean(axis=(1, 3, 5)), coarse, atol=1e-4)
