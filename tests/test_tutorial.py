@@ -28,9 +28,7 @@ def steps(text: str) -> Iterator[tuple[str, str]]:
     """(command, "") of every command line in the page's shell blocks, ("cat > FILE", content) of its files."""
     for block in re.findall(r"```sh\n(.*?)```", text, re.S):
         whole = block.replace("\\\n", " ")
-        for file, content, command in re.findall(
-            r"^(?:cat > (\S+) <<'END'\n(.*?\n)END|(\S[^\n]*))$", whole, re.S | re.M
-        ):
+        for file, content, command in re.findall(r"^(?:cat > (\S+) <<'END'\n(.*?\n)END|(\S[^\n]*))$", whole, re.S | re.M):
             yield (f"cat > {file}", content) if file else (command, "")
 
 

@@ -43,9 +43,7 @@ def test_a_billionth_of_a_window_is_rounding() -> None:
 @pytest.mark.parametrize("direction", [1, -1])
 def test_every_time_lies_in_the_pulse_and_weights_stay_whole(direction) -> None:
     where = (ORBIT, replace(DARK_FROM, direction=direction), 0, START_S, 7)
-    tables = (
-        micro_view_cells(*where, 4, 3), per_line_cells(*where, 3), static_cells(*where), static_start_cells(*where),
-    )  # fmt: skip
+    tables = (micro_view_cells(*where, 4, 3), per_line_cells(*where, 3), static_cells(*where), static_start_cells(*where))
     for cells in tables:
         np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
         assert cells.time_s.min() >= START_S + 0.1 - TIME_TOLERANCE_S

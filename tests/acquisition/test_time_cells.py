@@ -41,12 +41,9 @@ ORBIT = CircularOrbit(GEOMETRY, ConstantSpeed(0.1, SPEED_RAD_PER_S))
 START_S = 3.0
 TIME_TOLERANCE_S = 1e-12
 
-AXES = pytest.mark.parametrize("axis", ["rows", "columns"])
-DIRECTIONS = pytest.mark.parametrize("direction", [1, -1])
 
-
-@AXES
-@DIRECTIONS
+@pytest.mark.parametrize("axis", ["rows", "columns"])
+@pytest.mark.parametrize("direction", [1, -1])
 def test_cells_have_the_times_of_eq_2_on_every_line(axis, direction) -> None:
     """Micro-views those of its strip, cells of one line (here: no strips) those of its own exposure."""
     shutter = Shutter(0.8, 0.3, axis, direction)

@@ -93,16 +93,13 @@ def test_a_placement_is_found_and_a_background_taken_out(rt, known) -> None:
     scan, slope = scanned(rt, lying(known), views=5), np.linspace(0, 0.3, 32, dtype=np.float32)
     mask = np.zeros((36, 32), bool)
     mask[10:14, 5:20] = True
-    for masked in (None, mask):
-        scan = replace(scan, projections=np.asarray(scan.projections) + slope, pixel_mask=masked)
-        problem = BeadProblem.of(known, np.array([*LYING, 1.0]) + 0.03, [scan], Stage(128, 6, 4))
-        operator = problem.operator(GeometryCorrection())
-        found = problem.reconstruct(operator, None, 10)
-        np.testing.assert_allclose(found[:6], LYING, atol=3e-3)
-        assert found[6] == pytest.approx(1, abs=0.02)
-        (left,) = problem.beyond_object(operator, found, [operator.forward(found) + slope], 0)
-        shown = np.abs(left if masked is None else left[:, ~masked])
-        assert shown.max() < 0.1 * slope.max()
+    scan = replace(scan, projections=np.asarray(scan.projections) + slope, pixel_mask=mask)
+    problem = BeadProblem.of(known, np.array([*LYING, 1.0]) + 0.03, [scan], Stage(128, 6, 4))
+    operator = problem.operator(GeometryCorrection())
+    found = problem.reconstruct(operator, None, 10)
+    np.testing.assert_allclose(found, [*LYING, 1.0], atol=3e-3)
+    (left,) = problem.beyond_object(operator, found, [operator.forward(found) + slope], 0)
+    assert np.abs(left[:, ~mask]).max() < 0.1 * slope.max()
 
 
 @pytest.mark.slow
@@ -119,13 +116,13 @@ def test_beads_are_told_from_spots_that_are_none_and_from_their_mirror_image(kno
 @pytest.mark.slow
 def test_a_scanner_is_found_by_what_it_shows_of_beads(cli, rt, file, known, tmp_path, capsys) -> None:
     """Rows read, from the other end than stated, one turn; another start of all frames is the phantom turned."""
-    scan = scanned(rt, lying(known), noise="tigre", views=6)
+    scan = scanned(rt, lying(known), noise="tigre", views=8)
     planted = {"readout": 0.09, "exposure": -0.17, "offset-u": 0.15, "detector-distance": -0.05, "direction": 2.0}
     off = GeometryCorrection(readout_s=0.09, exposure_s=-0.17, offset_u_mm=0.15, detector_distance_mm=-0.05)
     stated = perturb(scan, GeometryCorrection(**{name: -value for name, value in vars(off).items()}))
     path, out = tmp_path / "scan.h5", tmp_path / "out.h5"
     write_scan(path, replace(stated, shutter=replace(stated.shutter, direction=-1)))
-    what = "direction,offset-u,detector-distance,readout,exposure"
+    what = "direction,offset-u,distance,readout,exposure"
     assert cli.run(["calibrate", str(path), "--phantom", str(file), "--what", what, "-o", str(out), "--json"]) == 0
     lines = {one["name"]: one for one in json.loads(capsys.readouterr().out)["parameters"]}
     for name, one in lines.items():

@@ -105,9 +105,7 @@ def test_encoder_standing_gantry_and_views_are_copied_too(right, tmp_path) -> No
     table = EncoderTable(np.array([-1.0, 50.0]), np.array([0.0, 7.0]))
     encoded = replace(right, trajectory=CircularOrbit(right.geometry, table))
     views = Views(0.01 * np.arange(15), 0.1 * np.arange(30).reshape(15, 2))
-    for scan, change, off in (
-        (encoded, TIMES, None), (replace(right, is_fly=False), TURNS, None), (right, TURNS, views)
-    ):  # fmt: skip
+    for scan, change, off in ((encoded, TIMES, None), (replace(right, is_fly=False), TURNS, None), (right, TURNS, views)):
         write_scan(path, scan)
         changed = perturb(load_scan(path), change, off)
         copy_with_motion(path, copy, changed)

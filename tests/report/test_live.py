@@ -33,10 +33,6 @@ def pair(frame: int) -> FramePair:
     return FramePair(frame, ones, 0.75 * ones, ones > 0)
 
 
-def decoded(source: str) -> np.ndarray:
-    return imread(BytesIO(base64.b64decode(source.partition(",")[2])))
-
-
 def report(iteration: int, loss: float = 0.5, **more: object) -> Progress:
     return Progress(iteration, 20, loss, 0, 1.0, "residual", volume=volume, **more)
 
@@ -80,7 +76,8 @@ def test_pictures_are_those_of_the_volume_and_the_frames(parse) -> None:
     page = parse(live_page(Status(**{**vars(now), "snapshot": snapshot}), 15.0))
     images = page.all("img")
     assert "after iteration 8" in page.words and "residual, RMS 0.25 (25 %)" in page.words
-    axial, coronal, sagittal = (decoded(image["src"]) for image in images[:3])
+    pngs = (base64.b64decode(image["src"].partition(",")[2]) for image in images[:3])
+    axial, coronal, sagittal = (imread(BytesIO(png)) for png in pngs)
     assert axial[6 - 1 - 2, 4] == 255 and axial.astype(int).sum() == 255
     assert coronal.max() == sagittal.max() == 0  # y = 3 and x = 3 hold nothing
 
