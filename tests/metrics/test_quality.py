@@ -35,15 +35,11 @@ def _reference_map(image: np.ndarray, truth: np.ndarray, data_range: float) -> n
     return full[margin:-margin, margin:-margin]
 
 
-def test_map_equals_scikit_image_up_to_the_border() -> None:
+@pytest.mark.parametrize("data_range", [None, 1.0])
+def test_ssim_is_scikit_images_up_to_the_border_and_a_mean_over_slices_that_are_not_empty(data_range) -> None:
     result, truth = _two_stacks()
     expected = np.stack([_reference_map(a, b, 1.3) for a, b in zip(result, truth, strict=True)])
     assert np.allclose(ssim_map(result, truth, 1.3), expected, atol=1e-10)
-
-
-@pytest.mark.parametrize("data_range", [None, 1.0])
-def test_volume_equals_the_mean_over_slices_that_are_not_empty(data_range: float | None) -> None:
-    result, truth = _two_stacks()
     peak, means = data_range or truth.max(), []
     for axis in range(3):
         slices = zip(np.moveaxis(result, axis, 0), np.moveaxis(truth, axis, 0), strict=True)
