@@ -76,8 +76,7 @@ def test_finer_pixels_lie_inside_of_those_they_were_cut_from(factor) -> None:
     assert finer.lines == factor * LINES
     np.testing.assert_array_equal(finer.line_stop, factor * table.line_stop)
     np.testing.assert_array_equal(finer.line_start, factor * table.line_start)
-    coarse = pixel_centres(table.pose, (LINES, 7))
-    fine = pixel_centres(finer.pose, (factor * LINES, factor * 7))
+    coarse, fine = pixel_centres(table.pose, (LINES, 7)), pixel_centres(finer.pose, (factor * LINES, factor * 7))
     means = fine.reshape(table.count, LINES, factor, 7, factor, 3).mean(axis=(2, 4))
     np.testing.assert_allclose(means, coarse, rtol=0, atol=FLOAT64)
     np.testing.assert_array_equal(finer.pose[:, :3], table.pose[:, :3])

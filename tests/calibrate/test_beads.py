@@ -79,8 +79,7 @@ def test_frames_are_those_of_the_simulator(rt, known, axis, model, is_fly) -> No
     """Of bodies that are turned and shifted there, and poses that are here; two thirds as dense."""
     scan = scanned(rt, lying(known), axis, model, is_fly=is_fly, views=3)
     problem = BeadProblem.of(known, np.array([*LYING, 1.0]), [scan], Stage(128, 6, 4))
-    found = problem.operator(GeometryCorrection()).forward(problem.start)
-    largest = scan.projections.max()
+    found, largest = problem.operator(GeometryCorrection()).forward(problem.start), scan.projections.max()
     np.testing.assert_allclose(found, scan.projections, atol=0.05 * largest)
     assert np.sqrt(np.mean((found - scan.projections) ** 2)) < 0.003 * largest
     if model == "log":
@@ -104,8 +103,7 @@ def test_a_placement_is_found_and_a_background_taken_out(rt, known) -> None:
 
 @pytest.mark.slow
 def test_beads_are_told_from_spots_that_are_none_and_from_their_mirror_image(known) -> None:
-    grid = Grid.cube(40, 2.0)
-    spots = EllipsoidPhantom((Ellipsoid((0.7, -0.7, 0.0), (0.1,) * 3, 5.0),), "spots")
+    grid, spots = Grid.cube(40, 2.0), EllipsoidPhantom((Ellipsoid((0.7, -0.7, 0.0), (0.1,) * 3, 5.0),), "spots")
     first, *_ = placements(known, lying(known).voxelise(grid) + spots.voxelise(grid), grid)
     np.testing.assert_allclose(first, LYING, atol=0.03)
     bare = replace(known, ellipsoids=known.ellipsoids[:7])

@@ -196,8 +196,7 @@ def test_views_of_frames_that_overlap_have_no_place_in_a_file(refused, right, tm
 @pytest.mark.parametrize(("what", "protocol"), [("offset-u,direction", "rapid"), ("wobble", "static")])
 def test_a_calibration_ends_where_it_said_that_it_would(rt, what, protocol) -> None:
     """Every pass is counted, none twice, and there were no more than planned."""
-    scan = simulate("foot", size=12, detector=16, views=12, protocol=protocol, device=rt)
-    told = []
+    scan, told = simulate("foot", size=12, detector=16, views=12, protocol=protocol, device=rt), []
     calibrate(scan, rt, what, report=lambda *report: told.append(report))
     done, totals, words, shares = zip(*told, strict=True)
     assert list(done) == sorted(done) and list(shares) == sorted(shares) and done[-1] > 20

@@ -128,8 +128,7 @@ def test_counts_that_begin_again_at_zero(rt, clean) -> None:
 def test_an_object_that_looks_the_same_from_every_angle_raises_no_alarm(rt, clean) -> None:
     """Noise that flats share is not independent from frame to frame, and a cylinder has nothing else to show."""
     u = (np.arange(32) - 15.5) * 0.125 * 5 / 7
-    disc = np.sqrt(np.maximum(0.7**2 - u**2, 0)) * np.ones((32, 1))
-    rng = np.random.default_rng(5)
+    disc, rng = np.sqrt(np.maximum(0.7**2 - u**2, 0)) * np.ones((32, 1)), np.random.default_rng(5)
     p = disc + 0.01 * rng.normal(size=(32, 32)) + 0.01 * rng.normal(size=clean.projections.shape)
     found = check(replace(clean, projections=p.astype(np.float32)), rt)
     assert found.suspicious == [] and verdicts(found)["sign of rotation"] == CANNOT_TELL
@@ -144,8 +143,7 @@ def test_views_that_differ_by_less_than_their_noise_tell_nothing_and_an_oblong_o
     """A nearly round object was suspected with right frames. The oblong one has its frames in a wrong order."""
     body = EllipsoidPhantom((Ellipsoid((0, 0, 0), (0.6 * longer, 0.6, 0.6), 1.0),), "body")
     geometry = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125))
-    scan = scan_of(geometry, body, views=15, exposure_deg=24.0, readout_ratio=0.5)
-    random = np.random.default_rng(1)
+    scan, random = scan_of(geometry, body, views=15, exposure_deg=24.0, readout_ratio=0.5), np.random.default_rng(1)
     frames = scan.projections[random.permutation(15)] if verdict == SUSPICIOUS else scan.projections
     noisy = replace(scan, projections=(frames + noise * random.normal(size=frames.shape)).astype(np.float32))
     finding = consistency.check_consistency(rt, quick_scan(noisy), noisy).finding

@@ -6,7 +6,7 @@ from refusals import assert_refused
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import PHANTOMS, foot, jaw, make_phantom, shepp_logan
-from phyradgs_cl.phantoms.implicit import Capsule, Lattice, capsule_distance, ellipsoid_distance, texture
+from phyradgs_cl.phantoms.implicit import Capsule, Lattice, capsule_distance, ellipsoid_distance
 
 
 def test_shepp_logan_grey_levels_and_ventricles() -> None:
@@ -72,10 +72,3 @@ def test_covered_voxels_hold_the_volumes_of_a_capsule_and_an_ellipsoid() -> None
     exact = np.pi * 0.25**2 * 0.7 + 4 / 3 * np.pi * 0.25**3, 4 / 3 * np.pi * 0.6 * 0.3 * 0.4
     volumes = [lattice.coverage(distance).sum() * lattice.step**3 for distance in (capsule, ellipsoid)]
     assert volumes == pytest.approx(exact, rel=1e-2)
-
-
-def test_texture_has_unit_variance_and_coarse_is_the_mean_of_fine() -> None:
-    fine = texture(Lattice(64), (0.2, 0.5), 64, np.random.default_rng(1)).astype(np.float64)
-    coarse = texture(Lattice(32), (0.2, 0.5), 64, np.random.default_rng(1))
-    assert np.std(fine) == pytest.approx(1.0, abs=0.1)
-    assert np.allclose(fine.reshape(32, 2, 32, 2, 32, 2).mean(axis=(1, 3, 5)), coarse, atol=1e-4)

@@ -144,8 +144,7 @@ def test_zoom_keeps_the_crossing_in_sight_and_the_bar_true(page) -> None:
     bar, box = page.locator("#plane-axial .bar"), page.locator("#plane-axial .picture")
     page.locator("#zoom").focus()
     page.keyboard.press("End")
-    length_mm = float(bar.inner_text().split()[0])
-    share = bar.bounding_box()["width"] / box.bounding_box()["width"]
+    length_mm, share = float(bar.inner_text().split()[0]), bar.bounding_box()["width"] / box.bounding_box()["width"]
     assert share == pytest.approx(8 * length_mm / 2.0, rel=0.02)
     page.locator("#slider-sagittal").focus()
     page.keyboard.press("Home")

@@ -85,10 +85,8 @@ def test_the_orbit_is_that_of_the_scan_and_the_panel_ends_half_a_pixel_beyond_it
 
 def test_parallel_rays_come_from_their_direction_and_have_no_source() -> None:
     for scan in (parallel_scan(12, shutter=Shutter(0.1, 0.5)), laminography_scan(12)):
-        from_above, from_the_side = scan_charts.orbit_chart(scan), scan_charts.side_chart(scan)
-        for drawing in (from_above, from_the_side):
-            assert drawing.startswith("<svg") and "nan" not in drawing and "source" not in drawing
-        assert "12 directions of parallel rays" in from_above
+        drawings = scan_charts.orbit_chart(scan) + scan_charts.side_chart(scan)
+        assert "nan" not in drawings and "source" not in drawings and "12 directions of parallel rays" in drawings
         pose, drawn_pose = (poses[3] for poses in (middle_poses(scan), scan_charts.with_sources(scan, middle_poses(scan))))
         middle, reach_mm = scan_charts.panel_corners(drawn_pose, (SIDE, SIDE)).mean(0), np.linalg.norm(scan.grid.size_mm) / 2
         assert np.allclose(np.cross(middle - drawn_pose[:3], pose[:3]), 0)  # the middle ray

@@ -96,8 +96,7 @@ def test_pictures_wait_until_they_cost_less_than_their_share(tmp_path) -> None:
         time.sleep(0.02)
         return volume()
 
-    live = LivePage(tmp_path / "p.html", "v.h5", SETTINGS, every_s=0.0)
-    started_s = time.monotonic()
+    live, started_s = LivePage(tmp_path / "p.html", "v.h5", SETTINGS, every_s=0.0), time.monotonic()
     while (used_s := time.monotonic() - started_s) < 0.3:
         live(Progress(1, 9, 0.5, 0, 1.0, volume=slow))
     assert len(taken) == 1 and live.spent_s >= 0.02

@@ -93,8 +93,7 @@ def test_a_run_that_knew_the_motion_has_a_section_of_it(files, tmp_path, parse) 
     assert data["span_s"] == pytest.approx([times_s[0], times_s[-1] + run.scan.shutter.lit_span_s[1]])
     write_deformation(path, field)
     changed = load_run(tmp_path / "v.h5", files[0])
-    assert changed.deformation is None and "has changed since" in changed.notes[0]
-    assert motion_section(changed) is None
+    assert changed.deformation is None and "has changed since" in changed.notes[0] and motion_section(changed) is None
     write_volume(tmp_path / "found.h5", stored.values, stored.grid, stored.provenance, deformation=quiet)
     assert (load_run(tmp_path / "found.h5").deformation.control_mm == quiet.control_mm).all()
 

@@ -244,8 +244,7 @@ def test_steps_before_the_method_are_shown(rt, small_scan, tmp_path, parse) -> N
     section = text.split('id="preparation"')[1].split("</section>")[0]
     assert "sparks: frame 1" in section and "rings: frame" in section and "0.98" in section
     assert section.count("sparks: sinogram of row 5") == 1 and section.count("middle slice by fdk</h3>") == 2
-    assert section.count("<img") == 18 and section.count("Histogram of line integrals") == 2
-    assert not parse(text).open
+    assert section.count("<img") == 18 and section.count("Histogram of line integrals") == 2 and not parse(text).open
 
 
 def test_what_a_calibration_says_of_itself_may_be_anything(rt, small_scan, tmp_path, parse) -> None:
