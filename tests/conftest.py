@@ -165,17 +165,13 @@ def make_cloud() -> Cloud:
     Numbers are rounded to float32, so that kernels and float64 oracles see the same cloud.
     """
 
-    def make(
-        count: int, seed: int = 0, *, spread: float = 0.6, scale: tuple[float, float] = (0.05, 0.2)
-    ) -> np.ndarray:
+    def make(count: int, seed: int = 0, *, spread: float = 0.6, scale: tuple[float, float] = (0.05, 0.2)) -> np.ndarray:
         rng = np.random.default_rng(seed)
         quaternion = rng.normal(size=(4, count))
         parts = [
-            rng.uniform(-spread, spread, (3, count)),
-            np.exp(rng.uniform(*np.log(scale), (3, count))),
-            quaternion / np.linalg.norm(quaternion, axis=0),
-            rng.uniform(0.5, 2.0, (1, count)),
-        ]
+            rng.uniform(-spread, spread, (3, count)), np.exp(rng.uniform(*np.log(scale), (3, count))),
+            quaternion / np.linalg.norm(quaternion, axis=0), rng.uniform(0.5, 2.0, (1, count)),
+        ]  # fmt: skip
         return np.concatenate(parts).astype(np.float32).astype(np.float64)
 
     return make
@@ -207,9 +203,7 @@ def one_cell() -> Callable[..., TimeCells]:
 def finite_differences() -> Callable[..., np.ndarray]:
     """Central differences (shape of ``at``) of a scalar function, one entry after the other."""
 
-    def differentiate(
-        function: Callable[[np.ndarray], float], at: np.ndarray, step: float = 1e-6
-    ) -> np.ndarray:
+    def differentiate(function: Callable[[np.ndarray], float], at: np.ndarray, step: float = 1e-6) -> np.ndarray:
         gradient = np.zeros(at.shape)
         for index in np.ndindex(*at.shape):
             ends = []

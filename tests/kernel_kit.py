@@ -23,8 +23,7 @@ MODELS = pytest.mark.parametrize("affine", [False, True], ids=["exact", "affine"
 READOUTS = [("rows", 1), ("rows", -1), ("columns", 1), ("columns", -1)]
 CELLS = {
     "static": (static_cells, ()), "micro-views": (micro_view_cells, (4, 3)), "exact": (exact_cells, (4,)),
-    "centres": (centre_cells, (4, 3)),
-    "per-row": (per_line_cells, (3,)),
+    "centres": (centre_cells, (4, 3)), "per-row": (per_line_cells, (3,)),
 }  # fmt: skip
 ROLLING = Shutter(0.8, 0.6)
 CPU_ONLY = {
@@ -43,17 +42,13 @@ def frame_cells(
     return make(orbit, shutter, 0, 0.2, shutter.lines(geometry.detector_shape), *(counts or usual))
 
 
-def splat(
-    rt: Runtime, rows: np.ndarray, table: TimeCells, shape: tuple[int, int], **options: object
-) -> np.ndarray:
+def splat(rt: Runtime, rows: np.ndarray, table: TimeCells, shape: tuple[int, int], **options: object) -> np.ndarray:
     """The frame (rows, columns) of Gaussians (11, G), lines along the table's axis."""
     frame = SplatProjector(rt, *table.readout.shape(shape), **options)
     return table.readout.frames(frame.project(rows, DeviceCells.upload(rt, table)))
 
 
-def splat_gradients(
-    rt: Runtime, rows: np.ndarray, table: TimeCells, h: np.ndarray, **options: object
-) -> np.ndarray:
+def splat_gradients(rt: Runtime, rows: np.ndarray, table: TimeCells, h: np.ndarray, **options: object) -> np.ndarray:
     """(11, G) of L = Σ h · frame, with h (rows, columns)."""
     image = table.readout.frames(h)
     return SplatProjector(rt, *image.shape, **options).project_adjoint(

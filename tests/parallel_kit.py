@@ -4,14 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConstantSpeed,
-    ParallelGeometry,
-    Scan,
-    Shutter,
-    pixel_centres,
-)
+from phyradgs_cl.acquisition import ParallelGeometry, Scan, Shutter, pixel_centres
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, ConstantSpeed
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import Ellipsoid, EllipsoidPhantom, rotation_about_z
 
@@ -41,8 +35,7 @@ def parallel_scan(
     speed = np.deg2rad(turn_deg) / (views - 1 if with_end else views)
     starts_s, kinematics = np.arange(float(views)), ConstantSpeed(0.3, speed)
     truth = CircularOrbit(replace(GEOMETRY, detector_offset_mm=(0.0, true_offset_px * 0.1)), kinematics)
-    middles_s = (shutter or Shutter(0.0)).line_windows_s(SIDE).mean(1)
-    frames = np.empty((views, SIDE, SIDE))
+    middles_s, frames = (shutter or Shutter(0.0)).line_windows_s(SIDE).mean(1), np.empty((views, SIDE, SIDE))
     for frame, start_s in enumerate(starts_s):
         for middle_s in np.unique(middles_s):
             image = line_integrals(BODIES, truth.pose(frame, start_s + middle_s), (SIDE, SIDE))

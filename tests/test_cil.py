@@ -45,13 +45,11 @@ def _parallel() -> AcquisitionGeometry:
 
 
 GEOMETRIES = {
-    "cone": lambda: AcquisitionGeometry.create_Cone3D([0, -120, 0], [0, 60, 0]),
-    "cone, every offset and tilt": _cone,
-    "parallel, every offset and tilt": _parallel,
-    "flex": _flex,
+    "cone": lambda: AcquisitionGeometry.create_Cone3D([0, -120, 0], [0, 60, 0]), "cone, every offset and tilt": _cone,
+    "parallel, every offset and tilt": _parallel, "flex": _flex,
     "cone 2D": lambda: AcquisitionGeometry.create_Cone2D([2, -120], [-3, 60], [1, 0.05], [1.5, -2]),
     "parallel 2D": lambda: AcquisitionGeometry.create_Parallel2D([0.1, 1], [2, 30], [1, 0.05], [1.5, -2]),
-}
+}  # fmt: skip
 
 
 def _frames(name: str, origin: str = "bottom-left", labels: list[str] | None = None) -> AcquisitionGeometry:

@@ -45,8 +45,7 @@ def test_every_option_and_preset_is_described() -> None:
 def test_the_worked_example_of_a_method_works(rt, monkeypatch) -> None:
     scan = api.simulate("jaw", size=12, detector=16, views=8, exposure_deg=45.0, device=rt)
     blocks = re.findall(r"```python\n(.*?)```", (DOCS / "methods.md").read_text(encoding="utf-8"), re.S)
-    source = next(b for b in blocks if "class Landweber(" in b)
-    module = ModuleType("landweber_of_the_docs")
+    source, module = next(b for b in blocks if "class Landweber(" in b), ModuleType("landweber_of_the_docs")
     monkeypatch.setitem(sys.modules, module.__name__, module)
     exec(compile(source, "docs/methods.md", "exec"), module.__dict__)
     monkeypatch.setitem(METHODS, "landweber", module.METHOD)

@@ -44,8 +44,7 @@ def test_the_default_grid_of_a_helix_is_longer_by_its_travel() -> None:
     scan = Scan.from_poses(frames, helix(24.0, 5.0))
     (low, top), (alone_low, alone_top) = scan.grid.box_mm[0], alone.box_mm[0]
     assert low <= 5 + alone_low + FLOAT64 and top >= 29 + alone_top - FLOAT64
-    assert top - low <= 24 + alone_top - alone_low + alone.voxel_size_mm[0]
-    assert scan.grid.shape[1:] == alone.shape[1:]
+    assert top - low <= 24 + alone_top - alone_low + alone.voxel_size_mm[0] and scan.grid.shape[1:] == alone.shape[1:]
     assert Scan.from_poses(frames, helix(0.3)).grid.is_close(alone)  # half a voxel is no travel
     tilted = helix(0.0)
     tilted[:, 2] += 80.0
@@ -56,8 +55,7 @@ def test_the_default_grid_of_a_helix_is_longer_by_its_travel() -> None:
 def test_a_panel_scaled_to_the_axis_has_the_rays_of_the_real_one(tmp_path) -> None:
     scaled = replace(CONE, source_to_detector_mm=100.0, pixel_size_mm=(0.6, 0.4), detector_offset_mm=(1.0, 2.0))
     poses = scaled.pose(np.deg2rad(ANGLES))
-    scans = [scan_of(scaled), Scan.from_poses(np.ones((len(ANGLES), *SHAPE)), poses)]
-    wobbling = poses.copy()
+    scans, wobbling = [scan_of(scaled), Scan.from_poses(np.ones((len(ANGLES), *SHAPE)), poses)], poses.copy()
     wobbling[::2, :6] += np.tile([0.0, 0.0, 0.5], 2)
     scans.append(Scan.from_poses(np.ones((len(ANGLES), *SHAPE)), wobbling))
     for scan, given in zip(scans, (poses, poses, wobbling), strict=True):
@@ -100,8 +98,7 @@ def test_angles_that_count_on_beyond_a_turn_are_as_they_say(step_deg) -> None:
 
 def test_angles_that_jump_by_a_turn_are_put_together_again() -> None:
     time_s, angle_rad = np.linspace(0, 10, 101), np.linspace(0.1, 12.0, 101)
-    table = EncoderTable(time_s, angle_rad % (2 * np.pi))
-    between = np.linspace(0, 10, 333)
+    table, between = EncoderTable(time_s, angle_rad % (2 * np.pi)), np.linspace(0, 10, 333)
     np.testing.assert_allclose(table.angle_rad(0, between), np.interp(between, time_s, angle_rad), atol=FLOAT64)
     two = EncoderTable(np.array([0.0, 10.0]), np.array([0.0, 2 * np.pi]))  # a whole turn between two samples
     assert two.angle_rad(0, np.array(5.0)) == pytest.approx(np.pi)

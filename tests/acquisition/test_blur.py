@@ -5,15 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConeGeometry,
-    ConstantSpeed,
-    ParallelGeometry,
-    Scan,
-    Shutter,
-)
+from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Scan, Shutter
 from phyradgs_cl.acquisition.plausible import blur_facts, blur_line
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, ConstantSpeed
 from phyradgs_cl.fields import Grid
 
 COLUMNS, PITCH_MM = 200, 0.5
@@ -42,9 +36,7 @@ def test_an_arc_of_a_degree_on_two_hundred_columns() -> None:
     assert blur_facts(scan_of(pulse_s=(0.06, 0.02)))["blur_at_rim_px"] == pytest.approx(1.7453 / 5, rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("offset_mm", "radius_px"), [(2.5, 105), (-2.5, 105), (10.0, 120), (12.5, 125), (-60.0, 220)]
-)
+@pytest.mark.parametrize(("offset_mm", "radius_px"), [(2.5, 105), (-2.5, 105), (10.0, 120), (12.5, 125), (-60.0, 220)])
 def test_a_panel_off_centre(offset_mm, radius_px) -> None:
     """The rim is where the farther side looks, as the default grid has it."""
     assert blur_facts(scan_of(offset_mm))["blur_at_rim_px"] == pytest.approx(radius_px * np.pi / 180, rel=1e-6)

@@ -40,8 +40,7 @@ def test_shares_are_those_of_windows(name) -> None:
         assert served[cell, lines].all() and served[cell].sum() == lines.stop - lines.start
     windows_s = 1.0 + shutter.line_windows_s(table.lines)
     step_s = np.ptp(shutter.line_windows_s(table.lines), axis=1).max() / 7
-    mean_s = table.time_s @ table.line_share
-    is_lit = np.ptp(windows_s, axis=1) > 0
+    mean_s, is_lit = table.time_s @ table.line_share, np.ptp(windows_s, axis=1) > 0
     assert np.abs(mean_s - windows_s.mean(1))[is_lit].max() <= step_s / 4
     np.testing.assert_array_equal(table.pose, ORBIT.pose(1, table.time_s))
     assert np.abs(table.layer_weights.sum(0) - 1).max() < 1e-12

@@ -16,6 +16,7 @@ from phyradgs_cl.simulation import scanner_for, scanner_options
 CONE = ConeGeometry(500.0, 800.0, (6, 8), (0.4, 0.4))
 FRAMES, TURN_DEG = np.full((12, 6, 8), 0.5, np.float32), 30.0 * np.arange(12)
 SHEET = {"exposure_deg": 27.0, "exposure_s": 0.06}  # 15 frames per second
+RIGHT = SHEET | {"readout_ratio": 62 / 60}
 
 
 def test_the_first_line_states_axis_and_direction() -> None:
@@ -29,7 +30,7 @@ def test_the_first_line_states_axis_and_direction() -> None:
 
 
 def test_arc_and_time_of_an_exposure_state_the_times_of_a_fly_scan() -> None:
-    scan = fly_scan(FRAMES, CONE, TURN_DEG, **SHEET, readout_ratio=62 / 60, readout_direction=-1)
+    scan = fly_scan(FRAMES, CONE, TURN_DEG, **RIGHT, readout_direction=-1)
     assert np.allclose(np.diff(scan.frame_start_s), 1 / 15) and scan.shutter.readout_s == pytest.approx(0.062)
     ends = [scan.trajectory.angle_rad(3, scan.frame_start_s[3] + t) for t in (0.0, 0.06)]
     assert np.rad2deg(np.diff(ends)) == pytest.approx(27.0)
@@ -46,29 +47,18 @@ def test_a_simulation_takes_a_data_sheet() -> None:
     assert options.protocol.angle_start_rad()[1] == make_protocol("rapid").angle_start_rad()[1]
 
 
-def _tall() -> tuple[np.ndarray, ConeGeometry]:
-    """Frames of a panel with 120 rows, and its geometry."""
-    return np.full((12, 120, 8), 0.5, np.float32), ConeGeometry(500.0, 800.0, (120, 8), (0.4, 0.4))
-
-
 def test_numbers_that_hardly_a_scanner_has_are_warned_of(caplog) -> None:
-    opaque = FRAMES.copy()
+    opaque, high, tall = FRAMES.copy(), np.full((12, 120, 8), 0.5, np.float32), replace(CONE, detector_shape=(120, 8))
     opaque[..., :2] = 60.0
-    for words, make in {
-        "line integrals of up to 60: .* counts": lambda: static_scan(opaque, CONE, TURN_DEG, quantity="attenuation"),
-        "^readout_ratio: readout of 0.1 s, 1.5 times": lambda: fly_scan(
-            FRAMES, CONE, TURN_DEG, **SHEET, readout_ratio=100 / 60
-        ),
-        "^readout_ratio: readout of 0.062 ms for 120 lines: .*unit": lambda: fly_scan(
-            *_tall(), TURN_DEG, **SHEET, readout_ratio=0.062 / 60
-        ),
-        "^exposure_s: 1.5 fps and 30° from frame to frame": lambda: fly_scan(
-            FRAMES, CONE, TURN_DEG, exposure_deg=2.7, exposure_s=0.06, readout_ratio=62 / 60
-        ),
-        "": lambda: fly_scan(FRAMES, CONE, TURN_DEG, **SHEET, readout_ratio=62 / 60),
-    }.items():
+    for words, make, args, more in (
+        ("line integrals of up to 60: .* counts", static_scan, (opaque, CONE), {"quantity": "attenuation"}),
+        ("^readout_ratio: readout of 0.1 s, 1.5 times", fly_scan, (FRAMES, CONE), SHEET | {"readout_ratio": 100 / 60}),
+        ("^readout_ratio: readout of 0.06 ms for 120 .*unit", fly_scan, (high, tall), SHEET | {"readout_ratio": 1e-3}),
+        ("^exposure_s: 1.5 fps and 30° from frame to frame", fly_scan, (FRAMES, CONE), RIGHT | {"exposure_deg": 2.7}),
+        ("", fly_scan, (FRAMES, CONE), RIGHT),
+    ):
         caplog.clear()
-        make()
+        make(*args, TURN_DEG, **more)
         said = [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]
         assert len(said) == bool(words) and re.search(words, "".join(said)), (words, said)
 
@@ -88,8 +78,7 @@ def test_a_summary_shows_what_a_wrong_length_changes(rt) -> None:
     scan = simulate("spheres", size=8, detector=16, views=6, exposure_deg=60.0, device=rt)
     timing, sizes, blur = scan.summary().splitlines()
     assert timing == "timing: rows read in 860 ms, bottom first; 1 fps; exposure 60° in 1000 ms; averages line integrals"
-    numbers = [float(n) for n in re.findall(r"[\d.]+", sizes)]
-    largest = float(scan.projections.max())
+    numbers, largest = [float(n) for n in re.findall(r"[\d.]+", sizes)], float(scan.projections.max())
     assert numbers == pytest.approx([3.642, 2.747, 2.747, 31.9, 31.9, 0.25, largest], rel=1e-3)
     assert blur == "blur at the rim: 8.4 px, at half radius 4.2 px"  # π/3 · 8 columns
     still = static_scan(FRAMES, CONE, TURN_DEG).summary().splitlines()

@@ -4,16 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConeGeometry,
-    ConstantSpeed,
-    EncoderTable,
-    FrameSweeps,
-    PoseTable,
-    SpeedRamp,
-)
-from phyradgs_cl.acquisition.trajectory import continued
+from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, ConstantSpeed, EncoderTable, FrameSweeps
+from phyradgs_cl.acquisition.trajectory import PoseTable, SpeedRamp, continued
 from phyradgs_cl.errors import InputError
 
 GEOMETRY = ConeGeometry(1000.0, 1500.0, (4, 6), (0.7, 0.5), (3.0, -8.0))
@@ -47,10 +39,7 @@ def test_tables_are_linear_between_their_samples_and_never_continued() -> None:
 
 
 def test_rounding_of_stored_times_is_forgiven_up_to_a_slack() -> None:
-    time_s = np.array([0.1, 3.3])
-    encoder, poses = EncoderTable(time_s, [0.0, 1.0]), PoseTable(time_s, GEOMETRY.pose(np.array([0.0, 1.0])))
-    asked_s = np.array([0.1 - 1e-10, 3.3 + 1e-10])
-    np.testing.assert_allclose(encoder.angle_rad(0, asked_s), [0, 1])
+    poses, asked_s = PoseTable([0.1, 3.3], GEOMETRY.pose(np.array([0.0, 1.0]))), np.array([0.1 - 1e-10, 3.3 + 1e-10])
     np.testing.assert_allclose(poses.pose(0, asked_s), poses.table, atol=RIGID_TOLERANCE_MM)
     for times_s, slack_s in [([0.0, 0.25, 0.5], 1e-9), ([0.0, 1.0, 1000.0], 1e-6)]:
         encoder, last_s = EncoderTable(times_s, [0.0, 0.1, 0.2]), times_s[-1]
@@ -62,38 +51,24 @@ def test_rounding_of_stored_times_is_forgiven_up_to_a_slack() -> None:
                 encoder.angle_rad(0, np.array([beyond_s]))
 
 
-@pytest.mark.parametrize("step_deg", [1.0, 5.0, 60.0, -20.0])
-def test_poses_between_samples_stay_on_a_circular_orbit(step_deg) -> None:
-    """The body is rigid: linear interpolation of the twelve numbers would be 1 mm off at 5°."""
-    time_s = np.arange(7.0)
-    table = PoseTable(time_s, GEOMETRY.pose(np.deg2rad(step_deg) * time_s))
-    asked_s = np.linspace(0, 6, 61)
-    expected = GEOMETRY.pose(np.deg2rad(step_deg) * asked_s)
+@pytest.mark.parametrize(("step_deg", "tilts"), [(1.0, [0, 0, 0]), (60.0, [0, 0, 0]), (-20.0, [0.4, -0.7, 1.1])])
+def test_poses_between_samples_stay_on_a_circular_orbit(step_deg, tilts) -> None:
+    """Of a machine that stands any way. Linear interpolation of the twelve numbers would be 1 mm off at 5°."""
+    machine = Rotation.from_euler("xyz", tilts).as_matrix()
+
+    def orbit(time_s: np.ndarray) -> np.ndarray:
+        return (GEOMETRY.pose(np.deg2rad(step_deg) * time_s).reshape(-1, 4, 3) @ machine.T).reshape(-1, 12)
+
+    time_s, asked_s = np.arange(7.0), np.linspace(0, 6, 61)
+    table, expected = PoseTable(time_s, orbit(time_s)), orbit(asked_s)
     np.testing.assert_allclose(table.pose(0, asked_s), expected, rtol=0, atol=RIGID_TOLERANCE_MM)
     naive = np.stack([np.interp(asked_s, time_s, column) for column in table.table.T], -1)
     assert np.abs(naive - expected).max() > 1e-2
 
 
-def test_interpolation_commutes_with_moving_the_whole_machine() -> None:
-    """A tilted orbit of a tilted panel: rotate all poses, and the interpolated ones rotate along."""
-    time_s = np.arange(5.0)
-    circle = GEOMETRY.pose(0.3 * time_s)
-    circle[:, 6:12] = circle[:, 6:12] + 0.01  # panel no longer parallel to the axis
-    turn = Rotation.from_euler("xyz", [0.4, -0.7, 1.1]).as_matrix()
-
-    def turned(poses):
-        return (poses.reshape(-1, 4, 3) @ turn.T).reshape(-1, 12)
-
-    asked_s = np.array([0.25, 1.5, 3.9])
-    ours = PoseTable(time_s, turned(circle)).pose(0, asked_s)
-    expected = turned(PoseTable(time_s, circle).pose(0, asked_s))
-    np.testing.assert_allclose(ours, expected, atol=RIGID_TOLERANCE_MM)
-
-
 def test_an_encoder_table_goes_on_at_the_speed_of_its_ends() -> None:
     table = EncoderTable(np.array([0.0, 1.0, 3.0]), np.array([0.0, 0.1, 0.5]))
-    longer = continued(CircularOrbit(GEOMETRY, table), 2.0)
-    times_s = np.array([-2.0, 0.0, 0.5, 3.0, 5.0])
+    longer, times_s = continued(CircularOrbit(GEOMETRY, table), 2.0), np.array([-2.0, 0.0, 0.5, 3.0, 5.0])
     np.testing.assert_allclose(longer.angle_rad(0, times_s), [-0.2, 0.0, 0.05, 0.5, 0.9])
     steady = CircularOrbit(GEOMETRY, ConstantSpeed(0.0, 1.0))
     assert continued(steady, 2.0) is steady

@@ -6,15 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConeGeometry,
-    ConstantSpeed,
-    ParallelGeometry,
-    Scan,
-    Shutter,
-)
-from phyradgs_cl.api import ray_operator, simulate, splat_operator
+from phyradgs_cl.acquisition import ConeGeometry, ParallelGeometry, Scan, Shutter
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, ConstantSpeed
+from phyradgs_cl.api import ray_operator, splat_operator
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
 
@@ -39,13 +33,10 @@ def scan_of(trajectory: object, geometry: ConeGeometry | ParallelGeometry = CONE
     return Scan(np.ones((3, 5, 6), np.float32), geometry, trajectory, shutter, np.arange(3.0), grid)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    ("change", "found"),
-    [
-        (lambda poses: poses[0], r"shape \(12,\)"), (lambda poses: poses[..., :9], r"shape \(\d+, 9\)"),
-        (lambda poses: np.nan * poses, "NaN"), (lambda poses: poses.astype(str), "expected numbers"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("change", "found"), [
+    (lambda poses: poses[0], r"shape \(12,\)"), (lambda poses: poses[..., :9], r"shape \(\d+, 9\)"),
+    (lambda poses: np.nan * poses, "NaN"), (lambda poses: poses.astype(str), "expected numbers"),
+])  # fmt: skip
 def test_poses_of_no_use_are_refused_by_every_operator(rt, change, found) -> None:
     scan = scan_of(Own(change))
     for made in (lambda: ray_operator(scan, "static"), lambda: ray_operator(scan), lambda: splat_operator(scan)):
@@ -72,12 +63,6 @@ def test_angles_of_no_use_are_refused(angle) -> None:
 
     with pytest.raises(InputError, match="kinematics Kinematics"):
         scan_of(CircularOrbit(CONE, Kinematics())).trajectory.pose(0, np.zeros(2))
-
-
-@pytest.mark.parametrize("pulse", ["0.2,0.5", 0.5, (0.1, 0.2, 0.3)])
-def test_a_pulse_is_two_numbers(pulse) -> None:
-    with pytest.raises(InputError, match="pulse"):
-        simulate("spheres", size=8, detector=16, views=6, pulse=pulse)
 
 
 def test_a_grid_is_divided_by_whole_numbers_into_three_sides() -> None:

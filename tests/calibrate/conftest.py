@@ -1,21 +1,13 @@
 """Small noisy scans of a phantom, whose frames last as long as they are apart or less, turned one way and the other."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 
 import pytest
 
-from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, Protocol, Scan
+from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.simulation import SimulationOptions, phantom_scene, simulate
-
-
-class Backwards(Protocol):
-    def orbit(self, geometry, jitter_deg=0.0, rng=None):
-        path = super().orbit(geometry, jitter_deg, rng).kinematics
-        first, last = -path.angle_start_rad, -path.angle_end_rad
-        return CircularOrbit(geometry, replace(path, angle_start_rad=first, angle_end_rad=last))
 
 
 @pytest.fixture(scope="session")
@@ -26,7 +18,7 @@ def turned(rt) -> Callable[..., Scan]:
     def make(back: bool = False, model: str = "log", axis: str = "rows") -> Scan:
         geometry = ConeGeometry(5.0, 7.0, (32, 32), (0.125, 0.125))
         scene = phantom_scene(rt, "jaw", geometry, Grid.cube(24, 2.0), 24, axis, 0)
-        plan = (Backwards if back else Protocol)(views=15, exposure_deg=12.0, readout_ratio=0.5)
+        plan = Protocol(views=15, exposure_deg=12.0, readout_ratio=0.5, turns=-1.0 if back else 1.0)
         options = SimulationOptions(plan, axis, noise="tigre", dose=1e6, time_samples=8, detector_model=model)
         return simulate(scene.source, geometry, scene.grid, options)
 

@@ -52,8 +52,7 @@ def test_turns_leave_the_middle_of_the_panel_where_it_is(right) -> None:
 def test_views_move_by_themselves(right) -> None:
     views = Views(np.zeros(15), np.zeros((15, 2)))
     views.turn_rad[3], views.shift_mm[5] = 0.01, (0.2, 0.0)
-    after = perturb(right, GeometryCorrection(), views)
-    time_s = np.array([1.0])
+    after, time_s = perturb(right, GeometryCorrection(), views), np.array([1.0])
     is_off = [not np.allclose(after.trajectory.pose(f, time_s), right.trajectory.pose(f, time_s)) for f in range(15)]
     assert np.flatnonzero(is_off).tolist() == [3, 5]
     shift = (after.trajectory.pose(5, time_s) - right.trajectory.pose(5, time_s))[0]
@@ -81,15 +80,10 @@ def datasets(path) -> dict[str, object]:
     return found
 
 
-@pytest.mark.parametrize(
-    ("change", "touched"),
-    [
-        (NUMBERS, {"detector_offset", "detector/distance", "source/distance"}),
-        (TURNS, {"poses/pose", "poses/time_s"}),
-        (TIMES, TIMED),
-        (replace(TIMES, offset_u_mm=0.3), TIMED | {"detector_offset"}),
-    ],
-)
+@pytest.mark.parametrize(("change", "touched"), [
+    (NUMBERS, {"detector_offset", "detector/distance", "source/distance"}), (TURNS, {"poses/pose", "poses/time_s"}),
+    (TIMES, TIMED), (replace(TIMES, offset_u_mm=0.3), TIMED | {"detector_offset"}),
+])  # fmt: skip
 def test_a_copy_says_what_was_changed_and_nothing_else(right, tmp_path, change, touched) -> None:
     path, copy = tmp_path / "scan.h5", tmp_path / "copy.h5"
     counts = np.random.default_rng(0).integers(1, 60000, (17, 32, 32)).astype(np.uint16)
@@ -111,9 +105,7 @@ def test_encoder_standing_gantry_and_views_are_copied_too(right, tmp_path) -> No
     table = EncoderTable(np.array([-1.0, 50.0]), np.array([0.0, 7.0]))
     encoded = replace(right, trajectory=CircularOrbit(right.geometry, table))
     views = Views(0.01 * np.arange(15), 0.1 * np.arange(30).reshape(15, 2))
-    for scan, change, off in (
-        (encoded, TIMES, None), (replace(right, is_fly=False), TURNS, None), (right, TURNS, views)
-    ):  # fmt: skip
+    for scan, change, off in ((encoded, TIMES, None), (replace(right, is_fly=False), TURNS, None), (right, TURNS, views)):
         write_scan(path, scan)
         changed = perturb(load_scan(path), change, off)
         copy_with_motion(path, copy, changed)

@@ -1,15 +1,14 @@
 """Shifts and turns of single views, and a motion of the object: found where they show, left where they do not."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import ConeGeometry, Protocol
-from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, perturb
 from phyradgs_cl.api import simulate
-from phyradgs_cl.calibrate import AGREES, CORRECTED, Calibration, calibrate
+from phyradgs_cl.calibrate import AGREES, CORRECTED, calibrate
 from phyradgs_cl.calibrate.per_view import SPLINES, MotionParameters, WobbleParameters, estimate_views
 from phyradgs_cl.calibrate.problem import PassCounter, Stage
 from phyradgs_cl.fields import Grid
@@ -84,8 +83,7 @@ def test_a_wobble_does_not_pass_for_a_roll(rt, monkeypatch) -> None:
     """Asked together with what all views share, which is found beside it; found again, it is what is left, beside what had
     been found before."""
     how = {"size": 16, "detector": 24, "views": 24, "exposure_deg": 7.5, "noise": "tigre", "dose": 1e5}
-    scan = simulate("jaw", **how, device=rt)
-    course = np.cos(np.pi * np.linspace(0, 1, 24))
+    scan, course = simulate("jaw", **how, device=rt), np.cos(np.pi * np.linspace(0, 1, 24))
     parameters = WobbleParameters.of(scan)
     planted = parameters.without_gauges(np.stack([0 * course, 0.1 * course**2, 0.15 * course], -1))
     offset_mm = 0.2
@@ -110,22 +108,9 @@ def test_a_wobble_does_not_pass_for_a_roll(rt, monkeypatch) -> None:
     assert asked == [GeometryCorrection()]  # nothing that all views share was off: they are not solved for again
 
 
-def test_a_figure_has_a_curve_for_each_number_of_a_view(right) -> None:
-    images = np.zeros((15, 4, 5), np.float32)
-    alone = Calibration(right, [], [], (1.0, 0.5), images, images)
-    sway = Sway.none(right, 7)
-    moving = replace(alone, views=replace(sway, coefficients=np.ones((7, 6))))
-    shifted = replace(alone, views=Views(np.zeros(15), np.ones((15, 2))))
-    left = replace(alone, views=Views(np.zeros(15), np.zeros((15, 2))))
-    count = [len(found.plot().axes) for found in (alone, shifted, moving, left)]
-    assert alone.per_view() == {} and alone.facts()["views"] == {} and "residual 1, then 0.5" in repr(alone)
-    assert count[1] == count[0] + 1 and count[2] == count[0] + 2 and count[3] == count[0]  # a kind that is 0 was left alone
-
-
 def test_an_object_that_moves_is_followed_and_the_file_has_its_poses(cli, rt, right, tmp_path, capsys) -> None:
     """Frames that overlap in time are no hindrance: a motion is of time alone."""
-    parameters = MotionParameters.of(right)
-    course = np.zeros((SPLINES, 6))
+    parameters, course = MotionParameters.of(right), np.zeros((SPLINES, 6))
     course[:, 3:] = 0.15 * np.random.default_rng(2).normal(size=(SPLINES, 3))
     planted = parameters.without_gauges(course)
     path, out = tmp_path / "scan.h5", tmp_path / "out.h5"
@@ -145,17 +130,9 @@ def test_an_object_that_moves_is_followed_and_the_file_has_its_poses(cli, rt, ri
     assert np.std((found - truth)[:, :3]) < 0.25 * np.std((stated - truth)[:, :3])
 
 
-def test_a_still_object_stays_still(rt, right) -> None:
-    stages = [Stage(16, 30, 10), Stage(32, 30, 10)]
-    found = estimate_views(rt, right, MotionParameters.of(right), stages, GeometryCorrection(), SILENT)
-    shifts_mm = np.zeros(1) if found.views is None else found.views.coefficients[:, 3:]
-    assert np.abs(shifts_mm).max() < 0.02
-
-
 def test_gauges_are_what_an_object_elsewhere_or_a_larger_one_looks_like(right) -> None:
     """Of a motion, and of a wobble, in which the panel's offset shows."""
-    parameters = MotionParameters.of(right)
-    angle = np.deg2rad(24 * np.arange(15))
+    parameters, angle = MotionParameters.of(right), np.deg2rad(24 * np.arange(15))
     towards = np.linalg.lstsq(parameters.basis, np.stack([np.cos(angle), np.sin(angle)], -1), rcond=None)[0]
     gauges = np.tile(np.arange(6.0), (SPLINES, 1))
     gauges[:, 3:5] += towards

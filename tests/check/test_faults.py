@@ -25,8 +25,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_a_scan_at_rest_is_asked_less_and_progress_is_told(rt, clean) -> None:
-    seen = []
-    still = replace(clean, is_fly=False)
+    seen, still = [], replace(clean, is_fly=False)
     asked = verdicts(check(still, rt, report=lambda done, total, question: seen.append((done, total, question))))
     assert seen == [(n, 11, question) for n, question in enumerate([*asked, ""])]
     assert "sign of readout" not in asked and asked["exposure"] == CANNOT_TELL and len(asked) == 11
@@ -67,8 +66,7 @@ def test_a_beam_without_a_fan_leaves_sizes_and_offset_open() -> None:
 
 def test_the_deviation_of_an_offset_covers_its_error_in_half_a_turn(rt, scan_of) -> None:
     """Most rays are then measured once, and coarse volumes pull the offset to one side."""
-    pixels = 0.5
-    geometry = ConeGeometry(5.0, 7.0, (64, 64), (0.0625, 0.0625))
+    pixels, geometry = 0.5, ConeGeometry(5.0, 7.0, (64, 64), (0.0625, 0.0625))
     scan = scan_of(geometry, size=32, views=40, exposure_deg=9.0)
     found = check(stated(some_frames(scan, slice(24)), detector_offset_mm=(0.0, -pixels * 0.0625)), rt)
     assert abs(found.offset_mm - pixels * 0.0625) < 2 * found.offset_spread_mm < 0.05
@@ -143,14 +141,26 @@ def test_the_command_and_its_status(cli, clean, tmp_path, capsys) -> None:
     assert {"question", "verdict", "value", "threshold", "unit", "text", "advice"} <= set(facts["findings"][0])
 
 
-@pytest.mark.parametrize("kind", ["orbit", "poses"])
-def test_the_offset_goes_into_a_copy(cli, clean, tmp_path, capsys, kind) -> None:
-    pitch_mm = clean.geometry.pixel_size_mm[1]
+def test_raw_counts_stay_raw_in_the_corrected_copy_and_the_status_where_something_else_is_suspicious(
+    cli, clean, tmp_path
+) -> None:
+    pitch_mm, path, fixed = clean.geometry.pixel_size_mm[1], tmp_path / "scan.h5", tmp_path / "fixed.h5"
+    light = np.concatenate([np.zeros((1, 32, 32)), clean.projections - np.linspace(0, 0.05, 15)[:, None, None]])
+    data = (60000 * np.exp(-light)).astype(np.uint16)
+    wrong, key = stated(clean, detector_offset_mm=(0.0, 3 * pitch_mm)), np.r_[1, np.zeros(15, int)]
+    write_scan(path, wrong, data=data, image_key=key, quantity="counts")
+    assert cli.run(["check", str(path), "--fix-offset", "-o", str(fixed)]) == SUSPICIOUS_STATUS
+    held = []
+    read_scan(fixed, lambda frames, keys, quantity, at: held.append((frames, quantity)) or (clean.projections, None))
+    assert held[0][1] == "counts" and np.array_equal(held[0][0], data)
+    assert abs(load_scan(fixed).geometry.detector_offset_mm[1]) < 0.1 * pitch_mm
+
+
+def test_the_offset_goes_into_a_copy_of_poses_too(cli, clean, tmp_path, capsys) -> None:
+    pitch_mm, time_s = clean.geometry.pixel_size_mm[1], np.linspace(-1, 30, 400)
     wrong = stated(clean, detector_offset_mm=(0.25, 3 * pitch_mm))
     frames = replace(wrong, trajectory=clean.trajectory)
-    if kind == "poses":
-        time_s = np.linspace(-1, 30, 400)
-        wrong = replace(wrong, trajectory=PoseTable(time_s, wrong.geometry.pose(np.deg2rad(24 * time_s))))
+    wrong = replace(wrong, trajectory=PoseTable(time_s, wrong.geometry.pose(np.deg2rad(24 * time_s))))
     path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
     write_scan(path, wrong)
     before = path.read_bytes()
@@ -167,25 +177,6 @@ def test_the_offset_goes_into_a_copy(cli, clean, tmp_path, capsys, kind) -> None
         assert cli.run(["check", str(path), *options]) == 2 and path.read_bytes() == before
     pose = copy.trajectory.pose(3, copy.frame_start_s[3:4])
     np.testing.assert_allclose(pose[:, 3:5], expected[:, 3:5], atol=0.15 * pitch_mm)
-
-
-def test_an_offset_is_corrected_and_the_status_stays_where_something_else_is_suspicious(cli, clean, tmp_path) -> None:
-    gain = np.linspace(0, 0.05, clean.frames, dtype=np.float32)
-    wrong = stated(clean, detector_offset_mm=(0.0, 3 * clean.geometry.pixel_size_mm[1]))
-    path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
-    write_scan(path, replace(wrong, projections=clean.projections - gain[:, None, None]))
-    assert cli.run(["check", str(path), "--fix-offset", "-o", str(fixed)]) == SUSPICIOUS_STATUS and fixed.exists()
-
-
-def test_raw_counts_stay_raw_in_the_copy(cli, clean, tmp_path) -> None:
-    path, fixed = tmp_path / "scan.h5", tmp_path / "fixed.h5"
-    light = np.concatenate([np.zeros((1, 32, 32)), clean.projections])
-    data = (60000 * np.exp(-light)).astype(np.uint16)
-    write_scan(path, clean, data=data, image_key=np.r_[1, np.zeros(clean.frames, int)], quantity="counts")
-    cli.run(["check", str(path), "--fix-offset", "-o", str(fixed)])
-    held = []
-    read_scan(fixed, lambda frames, keys, quantity, at: held.append((frames, quantity)) or (clean.projections, None))
-    assert held[0][1] == "counts" and np.array_equal(held[0][0], data)
 
 
 def test_masked_pixels_and_pulsed_beams(rt, clean) -> None:

@@ -84,8 +84,7 @@ def test_a_planted_offset_is_found_and_repaired(rt, tmp_path, capsys) -> None:
     assert check_command(tmp_path / "scan.h5", fix_offset=True, output=tmp_path / "fixed.h5") == 0
     assert f"suspicious   {CENTRE}" in capsys.readouterr().out
     fixed = load_scan(tmp_path / "fixed.h5")
-    assert fixed.is_parallel
-    assert abs(fixed.geometry.detector_offset_mm[1] - 0.15) < 0.01
+    assert fixed.is_parallel and abs(fixed.geometry.detector_offset_mm[1] - 0.15) < 0.01
     again = opposite_shift(fixed)
     assert abs(again.pixels) < 0.1
 

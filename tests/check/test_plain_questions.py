@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 from check_kit import cropped, some_frames
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConeGeometry,
-    EncoderTable,
-    FrameSweeps,
-    PoseTable,
-    Saturation,
-    pixel_centres,
-)
+from phyradgs_cl.acquisition import ConeGeometry, Saturation, pixel_centres
 from phyradgs_cl.acquisition.altered.angles import exposure_arc_rad
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, EncoderTable, FrameSweeps, PoseTable
 from phyradgs_cl.api import static_scan
 from phyradgs_cl.check import OK, SUSPICIOUS, CountReader
 from phyradgs_cl.check.consistency import repeated_frames
@@ -78,8 +71,7 @@ def test_speed_within_frames_fits_the_steps_between_them_but_for_wandering(clean
     time_s = np.linspace(0, 30, 301)
     table = EncoderTable(time_s, np.deg2rad(24 * time_s) + 0.02 * np.sin(time_s))
     scan = replace(clean, trajectory=CircularOrbit(clean.geometry, table))
-    assert check_timing(scan).verdict == OK
-    assert np.rad2deg(exposure_arc_rad(clean)) == pytest.approx(24.0)
+    assert check_timing(scan).verdict == OK and np.rad2deg(exposure_arc_rad(clean)) == pytest.approx(24.0)
     assert exposure_arc_rad(replace(clean, is_fly=False)) == 0
     ends = replace(sweeps, angle_end_rad=sweeps.angle_start_rad - np.deg2rad(270))
     long = replace(clean, trajectory=CircularOrbit(clean.geometry, ends))
@@ -164,8 +156,7 @@ def test_saturated_areas_but_not_noise_that_is_cut_off(clean) -> None:
 def test_counts_at_the_ceiling_are_seen_on_reading_or_believed_of_an_import(clean) -> None:
     p = clean.projections
     bright, flat = np.minimum(7e4 * np.exp(-p), 65535), np.full((1, *p.shape[1:]), 65535.0)
-    data = np.concatenate([flat, bright]).astype(np.uint16)
-    key = np.r_[1, np.zeros(len(p), int)]
+    data, key = np.concatenate([flat, bright]).astype(np.uint16), np.r_[1, np.zeros(len(p), int)]
     counts = CountReader()
     counts(data, key, "counts")
     assert counts.ceiling == 65535 and counts.at_ceiling > 0.01
@@ -173,8 +164,7 @@ def test_counts_at_the_ceiling_are_seen_on_reading_or_believed_of_an_import(clea
     invalid = np.full_like(data[:1], 65535)
     counts(np.concatenate([np.minimum(data, 60_000), invalid]), np.r_[key, 3], "counts")
     assert counts.ceiling == 60_000 and counts.at_ceiling > 0.01
-    counts = CountReader()
-    noise = np.random.default_rng(0).poisson(data * 0.1)
+    counts, noise = CountReader(), np.random.default_rng(0).poisson(data * 0.1)
     counts(noise.astype(np.uint16), key, "counts")
     assert check_saturation(clean, counts).verdict == OK
     finding = check_saturation(replace(clean, saturation=Saturation(40_000.0, 0.25)))

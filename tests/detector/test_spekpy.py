@@ -10,8 +10,7 @@ from phyradgs_cl.prepare import water_polynomial
 
 def half_value_mm(spectrum: Spectrum) -> float:
     """Aluminium that leaves half of the recorded signal."""
-    depth_mm = np.linspace(0, 30, 3001)
-    per_mm = _at(spectrum.energy_kev, _ALUMINIUM) * _ALUMINIUM_G_PER_CM3 / 10
+    depth_mm, per_mm = np.linspace(0, 30, 3001), _at(spectrum.energy_kev, _ALUMINIUM) * _ALUMINIUM_G_PER_CM3 / 10
     light = np.exp(-np.outer(depth_mm, per_mm)) @ spectrum.weight
     return float(np.interp(-0.5, -light, depth_mm))
 

@@ -40,13 +40,8 @@ def nvidia(source: Path, options: Sequence[str], folder: Path) -> list[KernelCos
     """PTX by LLVM, machine code for Hopper by ptxas."""
     ptx = folder / "kernel.ptx"
     _clang(source, options, "nvptx64--nvidiacl", "sm_80", "nvptx64--nvidiacl.bc", ptx)
-    return ptxas_costs(_output(str(_ptxas()), "-v", "-arch=sm_90", "-o", os.devnull, str(ptx)))
-
-
-def ptxas_costs(text: str) -> list[KernelCost]:
-    """Returns the costs from the output of ``ptxas -v``."""
-    found = []
-    for block in text.split("Compiling entry function ")[1:]:
+    found, said = [], _output(str(_ptxas()), "-v", "-arch=sm_90", "-o", os.devnull, str(ptx))
+    for block in said.split("Compiling entry function ")[1:]:
         name, registers = _match(r"'(\w+)'", block), int(_match(r"Used (\d+) registers", block))
         # the frame holds spilled registers, and arrays whose index is not known when the kernel is built
         spilled = int(_match(r"(\d+) bytes stack frame", block))
@@ -57,15 +52,10 @@ def ptxas_costs(text: str) -> list[KernelCost]:
 
 
 def amd(source: Path, options: Sequence[str], folder: Path) -> list[KernelCost]:
-    """RDNA 2, whose figures LLVM writes into the assembly."""
-    assembly = folder / "kernel.s"
+    """RDNA 2, whose figures LLVM writes into the assembly; its waves are those of half a work-group processor."""
+    found, assembly = [], folder / "kernel.s"
     _clang(source, options, "amdgcn-amd-amdhsa", "gfx1030", "amdgcn--amdhsa.bc", assembly)
-    return amdgcn_costs(assembly.read_text(encoding="utf-8"))
-
-
-def amdgcn_costs(text: str) -> list[KernelCost]:
-    """Of LLVM's assembly for AMD; its waves are those of half a work-group processor."""
-    found = []
+    text = assembly.read_text(encoding="utf-8")
     for name, block in re.findall(r"\.amdhsa_kernel (\w+)\n(.*?)(?=\.amdhsa_kernel |\Z)", text, re.S):
         registers, scratch, local, waves = (
             int(_match(rf"; {key}: (\d+)", block)) for key in ("NumVgprs", "ScratchSize", "LDSByteSize", "Occupancy")
@@ -80,14 +70,10 @@ def intel(source: Path, options: Sequence[str], folder: Path) -> list[KernelCost
         str(BINARIES / "ocloc"), "compile", "-file", str(source), "-device", "dg2",
         "-options", " ".join(options), "-out_dir", str(folder),
     )  # fmt: skip
-    return ocloc_costs(said, re.findall(r"__kernel\s+void\s+(\w+)", source.read_text(encoding="utf-8")))
-
-
-def ocloc_costs(text: str, kernels: Sequence[str]) -> list[KernelCost]:
-    """Returns the costs from ocloc's output for a program with these kernels."""
-    if "Build succeeded" not in text:
-        raise Refused(text)
-    spills = dict(re.findall(r"kernel (\w+)\s.*spilled around (\d+)", text))
+    if "Build succeeded" not in said:
+        raise Refused(said)
+    kernels = re.findall(r"__kernel\s+void\s+(\w+)", source.read_text(encoding="utf-8"))
+    spills = dict(re.findall(r"kernel (\w+)\s.*spilled around (\d+)", said))
     return [KernelCost("Intel dg2", name, None, int(spills.get(name, 0)), None, None) for name in kernels]
 
 

@@ -19,8 +19,7 @@ def test_a_finer_truth_is_averaged_over_the_volumes_voxels(factors) -> None:
     fine = Grid(counts, tuple(d / f for d, f in zip(grid.voxel_size_mm, factors, strict=True)), grid.offset_mm)
     truth = _truth(fine.shape)
     means = truth.reshape(4, factors[0], 6, factors[1], 5, factors[2]).mean((1, 3, 5))
-    noise = np.random.default_rng(1).normal(0, 0.05, means.shape).astype(np.float32)
-    scores = []
+    noise, scores = np.random.default_rng(1).normal(0, 0.05, means.shape).astype(np.float32), []
     for part in (noise, noise / np.float32(np.sqrt(2))):  # 3.01 dB apart
         pair = aligned(means + part, grid, truth, fine)
         assert pair is not None and pair.grid == grid and pair.share == 1

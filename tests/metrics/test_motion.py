@@ -33,8 +33,7 @@ def test_errors_are_how_far_apart_two_descriptions_put_matter() -> None:
 
 def test_the_state_that_the_reference_shows_does_not_matter() -> None:
     """The same motion, of a reference that is stretched by 1.1: y + w' = 1.1 (y + w)."""
-    truth = stretch(0.1, [0.0, 1.0, 0.5])
-    other = stretch(0.1, [1.0, 2.1, 1.55])
+    truth, other = stretch(0.1, [0.0, 1.0, 0.5]), stretch(0.1, [1.0, 2.1, 1.55])
     assert motion_error_mm(other, truth, POINTS_MM, TIMES_S) == pytest.approx((0, 0), abs=1e-5)
     still = replace(truth, weights=np.zeros((3, 1)))
     assert motion_error_mm(still, truth, POINTS_MM, TIMES_S)[0] > 0.05

@@ -1,4 +1,4 @@
-"""PSNR against its definition, SSIM against scikit-image's with a margin of zeros, and both together."""
+"""PSNR by its definition, SSIM against scikit-image's with a margin of zeros, both together, and the figure of slices."""
 
 from importlib import import_module
 
@@ -6,25 +6,18 @@ import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from phyradgs_cl.metrics import METRICS, compare, printed, psnr, ssim, ssim_map
-
-
-def _pair() -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(0)
-    truth = rng.uniform(0, 0.8, (6, 7, 8)).astype(np.float32)
-    return truth + rng.normal(0, 0.05, truth.shape).astype(np.float32), truth
+from phyradgs_cl.errors import OutputError
+from phyradgs_cl.metrics import METRICS, compare, printed, psnr, slices_png, ssim, ssim_map
 
 
 def test_equals_scikit_image() -> None:
-    result, truth = _pair()
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(0, 0.8, (6, 7, 8)).astype(np.float32)
+    result = truth + rng.normal(0, 0.05, truth.shape).astype(np.float32)
     for data_range in (1.0, 0.3):
         expected = peak_signal_noise_ratio(truth.astype(float), result.astype(float), data_range=data_range)
         assert psnr(result, truth, data_range) == pytest.approx(expected, rel=1e-12)
-    assert psnr(result, truth) == psnr(result, truth, float(truth.max()))
-    assert psnr(np.full((3, 4, 5), 1.1), np.ones((3, 4, 5))) == pytest.approx(20.0)
-    result, truth = _pair()
-    assert psnr(result * 64, truth * 64) == pytest.approx(psnr(result, truth), rel=1e-9)
-    assert psnr(truth, truth) == np.inf
+    assert psnr(result, truth) == psnr(result, truth, float(truth.max())) and psnr(truth, truth) == np.inf
 
 
 def _two_stacks() -> tuple[np.ndarray, np.ndarray]:
@@ -37,48 +30,45 @@ def _two_stacks() -> tuple[np.ndarray, np.ndarray]:
 
 def _reference_map(image: np.ndarray, truth: np.ndarray, data_range: float) -> np.ndarray:
     margin = 12  # more than the window reaches, so that mirroring only ever mirrors zeros
-    window = {
-        "gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": data_range,
-    }
+    window = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": data_range}
     _, full = structural_similarity(np.pad(image, margin), np.pad(truth, margin), full=True, **window)
     return full[margin:-margin, margin:-margin]
 
 
-def test_map_equals_scikit_image_up_to_the_border() -> None:
+@pytest.mark.parametrize("data_range", [None, 1.0])
+def test_ssim_is_scikit_images_up_to_the_border_and_a_mean_over_slices_that_are_not_empty(data_range) -> None:
     result, truth = _two_stacks()
     expected = np.stack([_reference_map(a, b, 1.3) for a, b in zip(result, truth, strict=True)])
     assert np.allclose(ssim_map(result, truth, 1.3), expected, atol=1e-10)
-
-
-@pytest.mark.parametrize("data_range", [None, 1.0])
-def test_volume_equals_the_mean_over_slices_that_are_not_empty(data_range: float | None) -> None:
-    result, truth = _two_stacks()
-    peak = data_range or truth.max()
-    means = []
+    peak, means = data_range or truth.max(), []
     for axis in range(3):
         slices = zip(np.moveaxis(result, axis, 0), np.moveaxis(truth, axis, 0), strict=True)
         means.append(np.mean([_reference_map(a, b, peak).mean() for a, b in slices if b.any()]))
     assert ssim(result, truth, data_range) == pytest.approx(np.mean(means), abs=1e-10)
 
 
-def test_laws_and_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    result, truth = _two_stacks()
-    assert ssim(truth, truth) == pytest.approx(1.0, abs=1e-12)
-    full = np.abs(result) + 0.1, np.abs(truth) + 0.1  # no empty slices: then the order does not matter
-    assert ssim(*full, 1.0) == pytest.approx(ssim(full[1], full[0], 1.0), rel=1e-12)
-    assert ssim(result * 0.01, truth * 0.01) == pytest.approx(ssim(result, truth), rel=1e-9)
+def test_batches_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
     result, truth = _two_stacks()
     whole = ssim(result, truth)
-    module = import_module("phyradgs_cl.metrics.quality")
-    monkeypatch.setattr(module, "_VOXELS_PER_BATCH", 700)
+    monkeypatch.setattr(import_module("phyradgs_cl.metrics.quality"), "_VOXELS_PER_BATCH", 700)
     assert ssim(result, truth) == pytest.approx(whole, rel=1e-13)
 
 
 def test_compare_uses_the_references_maximum_and_metrics_are_printed_with_their_units() -> None:
     truth = np.random.default_rng(0).uniform(0, 3, (4, 12, 14))
-    found = compare(truth + 0.1, truth)
-    peak = truth.max()
+    found, peak = compare(truth + 0.1, truth), truth.max()
     assert found == {"psnr_db": psnr(truth + 0.1, truth, peak), "ssim": ssim(truth + 0.1, truth, peak), "data_range": peak}
     assert found.keys() == {*METRICS, "data_range"}
     assert list(printed({"psnr_db": 22.126, "ssim": 1.0})) == [("PSNR", "22.13 dB"), ("SSIM", "1.0000")]
     assert list(printed({"psnr_db": "x", "ssim": None})) == []
+
+
+def test_the_picture_has_three_columns_also_of_nothing_and_a_missing_folder_is_named(tmp_path) -> None:
+    volume, nothing = np.random.default_rng(0).uniform(size=(6, 8, 10)).astype(np.float32), np.zeros((3, 3, 3))
+    for result, truth, least in ((volume + 0.1, volume, 600), (nothing, nothing, 1)):
+        slices_png(tmp_path / "a.png", result, truth, "title")
+        head = (tmp_path / "a.png").read_bytes()[:24]
+        assert head.startswith(b"\x89PNG\r\n\x1a\n")
+        assert int.from_bytes(head[16:20], "big") >= least and int.from_bytes(head[20:24], "big") > 0
+    with pytest.raises(OutputError, match="missing"):
+        slices_png(tmp_path / "missing" / "a.png", nothing, nothing, "title")

@@ -28,8 +28,7 @@ def _marched(phantom: EllipsoidPhantom, source: np.ndarray, target: np.ndarray, 
     points, total = source + t[:, None] * (target - source), np.zeros(n)
     for e in phantom.ellipsoids:
         r = np.array(e.rotation)
-        form = r @ np.diag(1 / np.array(e.semi_axes_mm) ** 2) @ r.T
-        d = points - np.array(e.centre_mm)
+        form, d = r @ np.diag(1 / np.array(e.semi_axes_mm) ** 2) @ r.T, points - np.array(e.centre_mm)
         total += e.attenuation_per_mm * (np.sum((d @ form) * d, axis=1) < 1)
     return float(total.mean() * np.linalg.norm(target - source))
 
@@ -44,8 +43,7 @@ def test_line_integrals_equal_brute_force_sampling_also_from_inside() -> None:
 
 
 def test_wires_are_sampled_alike_from_any_side_and_cut_off_flat() -> None:
-    rng = np.random.default_rng(3)
-    wire = EllipsoidPhantom((Cylinder(((-3, 1, -8), (5, -2, 9)), 2.5, 0.3),), "wire")
+    rng, wire = np.random.default_rng(3), EllipsoidPhantom((Cylinder(((-3, 1, -8), (5, -2, 9)), 2.5, 0.3),), "wire")
     source, target = rng.uniform(-12, 12, (2, 40, 3))
     share = (np.arange(20000) + 0.5) / 20000
     for s, t in zip(source, target, strict=True):

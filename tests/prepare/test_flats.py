@@ -20,8 +20,7 @@ DARK = 100.0
 
 def counts(clean: Scan, components: int) -> tuple[np.ndarray, np.ndarray]:
     """Counts (F, v, u) and keys of a scan, a dark and three groups of flats, under light whose pattern drifts."""
-    rng = np.random.default_rng(5)
-    p = np.maximum(clean.projections, 0)
+    rng, p = np.random.default_rng(5), np.maximum(clean.projections, 0)
     patterns = [np.add.outer(np.zeros(p.shape[1]), np.sin(np.arange(p.shape[2]) / (2.0 + k))) for k in range(components)]
     third = len(p) // 2
     key = np.array([2, 1, 1, *[0] * third, 1, 1, *[0] * (len(p) - third), 1, 1])
@@ -95,6 +94,9 @@ def test_flats_are_taken_at_the_times_that_the_file_states(tmp_path, place, ligh
 
 
 def nxtomo(path: Path, frames: np.ndarray, place: str, times: object) -> Path:
+    mm = {"detector/x_pixel_size": 0.5, "detector/y_pixel_size": 0.5, "detector/distance": 50.0, "source/distance": 100.0}
+    with_units = {f"instrument/{name}": (value, "mm") for name, value in mm.items()}
+    with_units["sample/rotation_angle"] = 10.0 * np.arange(len(KEYS)), "deg"
     with h5py.File(path, "w") as file:
         file["entry/definition"] = "NXtomo"
         detector = file.create_group("entry/instrument/detector")
@@ -102,11 +104,7 @@ def nxtomo(path: Path, frames: np.ndarray, place: str, times: object) -> Path:
         detector["image_key"] = np.array(KEYS, np.int32)
         if times is not None:
             detector[place] = times
-        pixel_mm, angles = {"x_pixel_size": 0.5, "y_pixel_size": 0.5, "distance": 50.0}, 10.0 * np.arange(len(KEYS))
-        lengths = {**{f"instrument/detector/{k}": v for k, v in pixel_mm.items()}, "instrument/source/distance": 100.0}
-        for name, (value, unit) in {
-            **{name: (value, "mm") for name, value in lengths.items()}, "sample/rotation_angle": (angles, "deg")
-        }.items():
+        for name, (value, unit) in with_units.items():
             file[f"entry/{name}"] = value
             file[f"entry/{name}"].attrs["units"] = unit
     return path

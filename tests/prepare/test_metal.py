@@ -36,8 +36,7 @@ def beads(rt):
         energies, iron = np.log(np.array(IRON).T)
         water = _at(spectrum.energy_kev, _WATER) / 10
         steel = np.exp(np.interp(np.log(spectrum.energy_kev), energies, iron)) * 7.87 / 10
-        paths = [_paths(empty, bodies) for bodies in (BODY, STEEL)]
-        light = np.zeros(empty.projections.shape)
+        paths, light = [_paths(empty, bodies) for bodies in (BODY, STEEL)], np.zeros(empty.projections.shape)
         for weight, soft, dense in zip(spectrum.weight, water, steel, strict=True):
             light += weight * np.exp(-soft * (paths[0] - paths[1] * has_steel) - dense * paths[1] * has_steel)
         counts = np.random.default_rng(1).poisson(2e5 * light)

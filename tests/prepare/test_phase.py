@@ -89,9 +89,8 @@ def test_the_step_takes_a_cones_distances_from_its_geometry(material) -> None:
 
 
 def test_a_parallel_beam_needs_a_stated_distance() -> None:
-    seen = line_integrals(transported(CONTACT))
-    geometry, options = ParallelGeometry((PIXELS, PIXELS), PIXEL_MM), {"energy_kev": ENERGY_KEV, "delta_beta": DELTA_BETA}
-    scan = Scan.from_poses(seen, geometry.pose(np.zeros(1)), is_parallel=True)
+    seen, options = line_integrals(transported(CONTACT)), {"energy_kev": ENERGY_KEV, "delta_beta": DELTA_BETA}
+    scan = Scan.from_poses(seen, ParallelGeometry((PIXELS, PIXELS), PIXEL_MM).pose(np.zeros(1)), is_parallel=True)
     prepared = prepare(scan, "phase", phase={**options, "distance_mm": DISTANCE_MM})
     np.testing.assert_allclose(prepared.projections[0], MU_PER_MM * retrieved_mm(seen), atol=1e-5)
     with pytest.raises(InputError, match="phase.distance_mm"):

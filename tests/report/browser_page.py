@@ -66,11 +66,6 @@ def reading(page: Page) -> str:
     return page.locator("#reading").inner_text()
 
 
-def test_nothing_is_wider_than_the_window(page) -> None:
-    assert page.evaluate("document.documentElement.scrollWidth") == page.viewport_size["width"]
-    assert page.evaluate("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
-
-
 def test_a_slider_moves_by_keys(page) -> None:
     slider = page.locator("#slider-axial")
     before = picture(page, "axial")
@@ -149,8 +144,7 @@ def test_zoom_keeps_the_crossing_in_sight_and_the_bar_true(page) -> None:
     bar, box = page.locator("#plane-axial .bar"), page.locator("#plane-axial .picture")
     page.locator("#zoom").focus()
     page.keyboard.press("End")
-    length_mm = float(bar.inner_text().split()[0])
-    share = bar.bounding_box()["width"] / box.bounding_box()["width"]
+    length_mm, share = float(bar.inner_text().split()[0]), bar.bounding_box()["width"] / box.bounding_box()["width"]
     assert share == pytest.approx(8 * length_mm / 2.0, rel=0.02)
     page.locator("#slider-sagittal").focus()
     page.keyboard.press("Home")
@@ -158,7 +152,9 @@ def test_zoom_keeps_the_crossing_in_sight_and_the_bar_true(page) -> None:
     assert seen["x"] <= line["x"] <= seen["x"] + seen["width"]
 
 
-def test_tab_reaches_every_control(page) -> None:
+def test_nothing_is_wider_than_the_window_and_tab_reaches_every_control(page) -> None:
+    assert page.evaluate("document.documentElement.scrollWidth") == page.viewport_size["width"]
+    assert page.evaluate("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
     reached = []
     for _ in range(40):
         page.keyboard.press("Tab")

@@ -96,8 +96,7 @@ def test_a_projection_is_the_maximum_of_the_volume(page, ball, turn, tilt, axis)
     across, up = np.meshgrid(centres_mm(), centres_mm(), indexing="xy")
     inner = (abs(across) < 5) & (abs(up) < 5)  # the box's edges are drawn over the rest
     white = float(page.locator("#white-value").inner_text().strip("≤≥ ").split()[0])
-    expected = np.clip(ball.max(axis=axis) / white, 0, 1)
-    places = np.stack([across[inner], up[inner]], -1)
+    expected, places = np.clip(ball.max(axis=axis) / white, 0, 1), np.stack([across[inner], up[inner]], -1)
     assert sampled(image, places) == pytest.approx(expected[inner], abs=0.1)  # half a pixel of the steepest edge
 
 
@@ -107,11 +106,9 @@ def test_a_surface_stands_where_the_volume_crosses_the_threshold(page) -> None:
     for step in (140, 100):
         page.locator("#threshold").fill(str(step))
         value = float(page.locator("#threshold-value").inner_text().split()[0])
-        radius_mm = 2 * RADIUS_MM * (1 - value)
-        image = picture(page)
+        radius_mm, image = 2 * RADIUS_MM * (1 - value), picture(page)
         middle = image[:, image.shape[1] // 2].max(axis=1)
-        per_mm = image.shape[0] / 2 / (0.505 * np.sqrt(3) * SIDE_MM)
-        lit = np.flatnonzero(middle > 0.1)
+        per_mm, lit = image.shape[0] / 2 / (0.505 * np.sqrt(3) * SIDE_MM), np.flatnonzero(middle > 0.1)
         inside = [row for row in lit if abs(row - image.shape[0] / 2) < 5.5 * per_mm]
         assert (max(inside) - min(inside)) / per_mm / 2 == pytest.approx(radius_mm, abs=0.15)
 
@@ -122,8 +119,7 @@ def test_centres_lie_where_the_gaussians_are(page) -> None:
     page.locator("#centres").check()
     after = picture(page)
     changed = np.argwhere(np.abs(after - before).max(axis=2) > 0.2)
-    per_mm = before.shape[0] / 2 / (0.505 * np.sqrt(3) * SIDE_MM)
-    middle = np.array(before.shape[:2]) / 2
+    per_mm, middle = before.shape[0] / 2 / (0.505 * np.sqrt(3) * SIDE_MM), np.array(before.shape[:2]) / 2
     marks_mm = np.round((changed - middle) / (-per_mm, per_mm)).astype(int)  # up and to the right
     assert {tuple(mark) for mark in marks_mm} == {(-5, -5), (5, 5)}
 

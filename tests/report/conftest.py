@@ -61,8 +61,7 @@ def scan_maker(rt) -> Callable[..., Scan]:
     """A factory of 12³ voxels and 8 frames of 16 × 14 pixels; its changes are those of the simulation."""
 
     def make(**changes: object) -> Scan:
-        geometry = ConeGeometry(5.0, 7.0, (16, 14), (0.25, 0.25))
-        axis = str(changes.get("readout_axis", "rows"))
+        geometry, axis = ConeGeometry(5.0, 7.0, (16, 14), (0.25, 0.25)), str(changes.get("readout_axis", "rows"))
         scene = phantom_scene(rt, "jaw", geometry, Grid.cube(12, 2.0), 12, axis, 0)
         protocol = changes.pop("protocol", make_protocol("rapid", views=8, exposure_deg=20.0))
         options = SimulationOptions(protocol=protocol, **changes)

@@ -36,14 +36,12 @@ def kinds(scan_maker, small_scan) -> dict[str, object]:
     table = PoseTable(times_s, small_scan.trajectory.pose(0, times_s))
     pulsed = make_protocol("rapid", views=8, exposure_deg=20.0, pulse=(0.86, 0.14))
     return {
-        "fly": small_scan,
-        "still": scan_maker(protocol=make_protocol("static", views=8)),
+        "fly": small_scan, "still": scan_maker(protocol=make_protocol("static", views=8)),
         "columns backwards": scan_maker(readout_axis="columns", readout_direction=-1),
-        "pulsed": scan_maker(protocol=pulsed),
-        "wobbling": replace(small_scan, trajectory=table),
+        "pulsed": scan_maker(protocol=pulsed), "wobbling": replace(small_scan, trajectory=table),
         "instant": replace(small_scan, shutter=Shutter(0.0)),
         "one frame": replace(small_scan, projections=small_scan.projections[:1], frame_start_s=np.zeros(1)),
-    }
+    }  # fmt: skip
 
 
 def test_every_kind_of_scan_is_drawn_with_finite_numbers(kinds) -> None:
@@ -87,16 +85,12 @@ def test_the_orbit_is_that_of_the_scan_and_the_panel_ends_half_a_pixel_beyond_it
 
 def test_parallel_rays_come_from_their_direction_and_have_no_source() -> None:
     for scan in (parallel_scan(12, shutter=Shutter(0.1, 0.5)), laminography_scan(12)):
-        from_above, from_the_side = scan_charts.orbit_chart(scan), scan_charts.side_chart(scan)
-        for drawing in (from_above, from_the_side):
-            assert drawing.startswith("<svg") and "nan" not in drawing and "source" not in drawing
-        assert "12 directions of parallel rays" in from_above
+        drawings = scan_charts.orbit_chart(scan) + scan_charts.side_chart(scan)
+        assert "nan" not in drawings and "source" not in drawings and "12 directions of parallel rays" in drawings
         pose, drawn_pose = (poses[3] for poses in (middle_poses(scan), scan_charts.with_sources(scan, middle_poses(scan))))
         middle, reach_mm = scan_charts.panel_corners(drawn_pose, (SIDE, SIDE)).mean(0), np.linalg.norm(scan.grid.size_mm) / 2
         assert np.allclose(np.cross(middle - drawn_pose[:3], pose[:3]), 0)  # the middle ray
         assert drawn_pose[:3] @ pose[:3] < -reach_mm < reach_mm < middle @ pose[:3]  # the volume between both
-        axes = drawn(scan_charts._draw_rays, np.array([[0.0, 1.0], [0.0, -1.0]]), np.array([-5.0, 0.0]), True)
-        assert [line.get_xydata().tolist() for line in axes.lines] == [[[-5, 1], [0, 1]], [[-5, -1], [0, -1]]]
     first_deg = np.rad2deg(0.3) + 30
     title = parallel_scan(12, shutter=Shutter(0.0, 0.5)).plot(2).axes[1].get_title()
     assert title == f"gantry from {first_deg:.1f}° to {first_deg + 7.5:.1f}°"

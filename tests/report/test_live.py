@@ -33,10 +33,6 @@ def pair(frame: int) -> FramePair:
     return FramePair(frame, ones, 0.75 * ones, ones > 0)
 
 
-def decoded(source: str) -> np.ndarray:
-    return imread(BytesIO(base64.b64decode(source.partition(",")[2])))
-
-
 def report(iteration: int, loss: float = 0.5, **more: object) -> Progress:
     return Progress(iteration, 20, loss, 0, 1.0, "residual", volume=volume, **more)
 
@@ -54,8 +50,7 @@ def test_the_page_has_the_numbers_of_the_run(parse) -> None:
     assert not page.open and len(page.ids) == len(set(page.ids))
     tiles = dict(zip(page.texts["span"], [text for text in page.texts["b"] if text], strict=False))
     assert tiles == {
-        "iteration": "12 of 20", "residual": "0.2", "per minute": "120", "time left": "0:03",
-        "time so far": "0:15",
+        "iteration": "12 of 20", "residual": "0.2", "per minute": "120", "time left": "0:03", "time so far": "0:15",
     }  # fmt: skip
     assert "Residual: from 0.5 to 0.2 at iteration 12." in page.words and "relaxation" in page.words and "0.7" in page.words
     for link in page.all("a"):
@@ -77,12 +72,12 @@ def test_a_count_that_starts_again_is_another_curve() -> None:
 def test_pictures_are_those_of_the_volume_and_the_frames(parse) -> None:
     values, grid = volume(2.0)
     values[0, 0, 0] = 1.0
-    snapshot = Snapshot.of(8, values, grid, [pair(3)])
-    now = status(report(4), report(8))
+    snapshot, now = Snapshot.of(8, values, grid, [pair(3)]), status(report(4), report(8))
     page = parse(live_page(Status(**{**vars(now), "snapshot": snapshot}), 15.0))
     images = page.all("img")
     assert "after iteration 8" in page.words and "residual, RMS 0.25 (25 %)" in page.words
-    axial, coronal, sagittal = (decoded(image["src"]) for image in images[:3])
+    pngs = (base64.b64decode(image["src"].partition(",")[2]) for image in images[:3])
+    axial, coronal, sagittal = (imread(BytesIO(png)) for png in pngs)
     assert axial[6 - 1 - 2, 4] == 255 and axial.astype(int).sum() == 255
     assert coronal.max() == sagittal.max() == 0  # y = 3 and x = 3 hold nothing
 
@@ -101,8 +96,7 @@ def test_pictures_wait_until_they_cost_less_than_their_share(tmp_path) -> None:
         time.sleep(0.02)
         return volume()
 
-    live = LivePage(tmp_path / "p.html", "v.h5", SETTINGS, every_s=0.0)
-    started_s = time.monotonic()
+    live, started_s = LivePage(tmp_path / "p.html", "v.h5", SETTINGS, every_s=0.0), time.monotonic()
     while (used_s := time.monotonic() - started_s) < 0.3:
         live(Progress(1, 9, 0.5, 0, 1.0, volume=slow))
     assert len(taken) == 1 and live.spent_s >= 0.02

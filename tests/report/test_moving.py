@@ -1,4 +1,4 @@
-"""An object that moves on a page: what the page's script gets, its budget, and pages of runs that knew the motion."""
+"""What moves on a page: an object, and the first frame of a fly-scan; what the page's script gets, and its budget."""
 
 import base64
 import json
@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from skimage import io
 
+from phyradgs_cl.acquisition import Shutter, make_protocol
 from phyradgs_cl.fields import Deformation, Grid, deformed
 from phyradgs_cl.fields.deformation import control_points
 from phyradgs_cl.io import read_volume, sha256_of, write_deformation, write_volume
 from phyradgs_cl.report import load_run, report_page
 from phyradgs_cl.report.images import Window
-from phyradgs_cl.report.motion import MOST_VALUES, fitting, object_in_motion
+from phyradgs_cl.report.motion import MOST_VALUES, fitting, frame_in_motion, object_in_motion
 from phyradgs_cl.report.sections import motion_section
 
 pytestmark = pytest.mark.slow
@@ -62,8 +63,7 @@ def test_a_fine_field_and_many_times_stay_within_the_budget() -> None:
     grid = Grid.cube(40, 40.0)
     origin_mm, counts = control_points(grid, 1.0)
     z, y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in counts), indexing="ij")
-    control_mm = np.stack([np.sin(2 * z), x * y, np.cos(2 * x)], -1)[None]
-    times_s = np.arange(5000.0)
+    control_mm, times_s = np.stack([np.sin(2 * z), x * y, np.cos(2 * x)], -1)[None], np.arange(5000.0)
     fine = Deformation(control_mm, origin_mm, 1.0, times_s, np.sin(times_s / 500)[:, None])
     assert fine.control_mm.size > MOST_VALUES
     markup = object_in_motion(np.ones(grid.shape), grid, Window.of(0.0, 1.0, np.ones(1)), fine, (0.0, 4999.0))
@@ -93,7 +93,39 @@ def test_a_run_that_knew_the_motion_has_a_section_of_it(files, tmp_path, parse) 
     assert data["span_s"] == pytest.approx([times_s[0], times_s[-1] + run.scan.shutter.lit_span_s[1]])
     write_deformation(path, field)
     changed = load_run(tmp_path / "v.h5", files[0])
-    assert changed.deformation is None and "has changed since" in changed.notes[0]
-    assert motion_section(changed) is None
+    assert changed.deformation is None and "has changed since" in changed.notes[0] and motion_section(changed) is None
     write_volume(tmp_path / "found.h5", stored.values, stored.grid, stored.provenance, deformation=quiet)
     assert (load_run(tmp_path / "found.h5").deformation.control_mm == quiet.control_mm).all()
+
+
+def data_of(parse, scan) -> dict:
+    page = parse(frame_in_motion(scan))
+    assert not page.open and {"rows", "rows-play", "rows-time", "rows-reset"} <= set(page.ids)
+    return json.loads(page.texts["script"][0])
+
+
+@pytest.mark.parametrize("axis", ["rows", "columns"])
+def test_lines_and_poses_are_those_of_the_scan(scan_maker, parse, axis) -> None:
+    """To a fraction of a pixel between two poses too, where the script interpolates linearly."""
+    scan = scan_maker(readout_axis=axis, protocol=make_protocol("rapid", views=8, exposure_deg=20.0))
+    data = data_of(parse, scan)
+    assert data["axis"] == axis and data["lines"] == list(range(scan.lines)) and data["shape"] == [16, 14]
+    assert data["times_s"] == [0.0, pytest.approx(scan.shutter.span_s)]
+    times_s = scan.frame_start_s[0] + np.linspace(*data["times_s"], len(data["poses"]))
+    assert np.array(data["poses"]) == pytest.approx(scan.trajectory.pose(0, times_s), abs=1e-5)
+    angles_deg = np.rad2deg(scan.trajectory.angle_rad(0, times_s))
+    assert np.array(data["angles_deg"])[:, 0] == pytest.approx(angles_deg) and np.ptp(angles_deg) > 20
+    opens_s, closes_s = np.array(data["opens_s"]), np.array(data["closes_s"])
+    assert opens_s == pytest.approx(scan.shutter.delay_s(scan.lines))
+    assert closes_s - opens_s == pytest.approx(np.full(scan.lines, scan.shutter.exposure_s))
+    poses, times_s = np.array(data["poses"]), np.linspace(*times_s[[0, -1]], 2 * len(times_s) - 1)[1::2]
+    error_mm = np.abs((poses[1:] + poses[:-1]) / 2 - scan.trajectory.pose(0, times_s))[:, :6].max()
+    assert error_mm < 0.01 * min(scan.geometry.pixel_size_mm)
+
+
+def test_a_pulse_lights_a_part_of_the_window(scan_maker, parse) -> None:
+    scan = scan_maker()
+    pulsed = Shutter(scan.shutter.exposure_s, scan.shutter.readout_s, pulse_s=(0.5 * scan.shutter.exposure_s, 0.1))
+    data = data_of(parse, replace(scan, shutter=pulsed))
+    assert data["times_s"] == pytest.approx([0.5 * scan.shutter.exposure_s, 0.5 * scan.shutter.exposure_s + 0.1])
+    assert min(data["opens_s"]) >= data["times_s"][0] - 1e-9 and max(data["closes_s"]) <= data["times_s"][1] + 1e-9

@@ -19,8 +19,7 @@ MANIFEST = Path(phyradgs_cl.__file__).with_name("napari.yaml")
 @pytest.fixture
 def viewer() -> ViewerModel:
     """A viewer without a window, in which the plugin is installed."""
-    manifest = PluginManifest.from_file(MANIFEST)
-    manager = PluginManager.instance()
+    manifest, manager = PluginManifest.from_file(MANIFEST), PluginManager.instance()
     if manifest.name not in {known.name for known in manager.iter_manifests()}:
         manager.register(manifest)
     return ViewerModel()

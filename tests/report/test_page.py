@@ -82,17 +82,13 @@ def test_a_slice_says_why_there_is_no_picture_in_3d(tmp_path, parse) -> None:
 def test_metrics_and_convergence_are_those_of_the_file(page, files) -> None:
     stored = read_volume(files[1])
     residuals = [line["residual"] for line in stored.provenance["record"]]
-    for told in (
-        f"{stored.metrics['psnr_db']:.2f} dB",
-        f"{stored.metrics['ssim']:.4f}",
-        f"Residual: from {residuals[0]:.4g} to {residuals[-1]:.4g} at iteration 3",
-    ):
+    course = f"Residual: from {residuals[0]:.4g} to {residuals[-1]:.4g} at iteration 3"
+    for told in (f"{stored.metrics['psnr_db']:.2f} dB", f"{stored.metrics['ssim']:.4f}", course):
         assert told in page.words
 
 
 def test_pictures_decode_to_the_volume_slices(page, files, small_scan) -> None:
-    stored = read_volume(files[1])
-    data = json.loads(page.texts["script"][0])
+    stored, data = read_volume(files[1]), json.loads(page.texts["script"][0])
     layers = {"result": stored.values, "truth": small_scan.reference, "difference": stored.values - small_scan.reference}
     assert list(data["windows"]) == list(layers)
     for name, axis in (("axial", 0), ("coronal", 1), ("sagittal", 2)):
@@ -130,11 +126,9 @@ def test_the_shown_frames_are_close_to_the_measured_ones(rt, files, page) -> Non
     run = load_run(files[1])
     views = computed_views(run, rt, 3)
     assert [view.frame for view in views] == [0, 2, 5] == spread_frames(8, 3)
-    assert spread_frames(3, 16) == [0, 1, 2]
-    assert all(view.relative < 0.2 for view in views)
+    assert spread_frames(3, 16) == [0, 1, 2] and all(view.relative < 0.2 for view in views)
     images = [image for image in page.all("img") if image["alt"].startswith("frame ")]
-    assert len(images) == 9
-    assert decoded(images[0]["src"]).shape == (16, 14)
+    assert len(images) == 9 and decoded(images[0]["src"]).shape == (16, 14)
     assert f"residual, RMS {views[0].rms:.4g}" in page.words
 
 
@@ -250,8 +244,7 @@ def test_steps_before_the_method_are_shown(rt, small_scan, tmp_path, parse) -> N
     section = text.split('id="preparation"')[1].split("</section>")[0]
     assert "sparks: frame 1" in section and "rings: frame" in section and "0.98" in section
     assert section.count("sparks: sinogram of row 5") == 1 and section.count("middle slice by fdk</h3>") == 2
-    assert section.count("<img") == 18 and section.count("Histogram of line integrals") == 2
-    assert not parse(text).open
+    assert section.count("<img") == 18 and section.count("Histogram of line integrals") == 2 and not parse(text).open
 
 
 def test_what_a_calibration_says_of_itself_may_be_anything(rt, small_scan, tmp_path, parse) -> None:

@@ -26,8 +26,7 @@ GAP = 4
 def test_three_slices_stand_upright_in_their_proportions(any_volume, tmp_path) -> None:
     volume, grid = any_volume  # 1.5 × 1.2 × 0.8 mm (z, y, x), brighter upwards
     write_preview(volume, grid, tmp_path / "p.png")
-    picture = io.imread(tmp_path / "p.png")
-    per_mm = 128 / 1.5
+    picture, per_mm = io.imread(tmp_path / "p.png"), 128 / 1.5
     widths = [round(side * per_mm) for side in (0.8, 0.8, 1.2)]
     assert picture.shape == (128, sum(widths) + 2 * GAP)
     coronal = picture[:, widths[0] + GAP : widths[0] + GAP + widths[1]]

@@ -134,8 +134,7 @@ def test_the_truth_of_states_is_the_deformed_object(rt, of) -> None:
 
 def test_breathing_returns_and_does_not_go_back_the_way_it_came() -> None:
     motion = ObjectMotion("breathing", amplitude_mm=0.2, period_s=4.0, jitter=0.1)
-    field = motion.deformation(BOX, 0.0, 40.0)
-    height_mm = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
+    field, height_mm = motion.deformation(BOX, 0.0, 40.0), np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
     path_mm = np.stack([field.displacement_mm(height_mm, weights) for weights in field.weights_at(np.arange(0, 40, 0.05))])
     base, top = path_mm[:, 0], path_mm[:, 1]
     assert np.abs(top).max() == pytest.approx(0.2, rel=0.1) and np.abs(base).max() < 0.02

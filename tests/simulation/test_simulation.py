@@ -119,8 +119,7 @@ def test_a_pulse_freezes_what_it_lights() -> None:
     expected = integrals(np.deg2rad(120.0 + 0.8 * 12.0))
     np.testing.assert_allclose(scan.projections[1][lit], expected[lit], rtol=0, atol=1e-4)
     dark = np.setdiff1d(np.arange(SHAPE[0]), lit)
-    assert not scan.projections[:, dark].any()
-    assert scan.pixel_mask[dark].all() and not scan.pixel_mask[lit].any()
+    assert not scan.projections[:, dark].any() and scan.pixel_mask[dark].all() and not scan.pixel_mask[lit].any()
 
 
 @pytest.mark.parametrize("noise", ["tigre", "beer"])
@@ -147,8 +146,7 @@ def test_lag_leaves_a_ghost_of_the_frame_before(noise) -> None:
 
 @pytest.mark.parametrize("noise", ["tigre", "beer"])
 def test_noise_has_a_seed_and_a_dose(noise) -> None:
-    clean = run(SimulationOptions(FLY)).projections
-    noisy = SimulationOptions(FLY, noise=noise, dose=1e4)
+    clean, noisy = run(SimulationOptions(FLY)).projections, SimulationOptions(FLY, noise=noise, dose=1e4)
     one, same, other = (run(replace(noisy, seed=seed)).projections for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, same)
     assert np.any(one != other)
@@ -171,9 +169,7 @@ def test_a_box_that_a_procedural_phantom_does_not_fill_is_said(rt, caplog) -> No
     assert not caplog.records
     flat = Grid((4, 8, 8), (0.25, 0.25, 0.25), (0.1, 0.0, 0.0))
     scene = phantom_scene(rt, "jaw", geometry, flat, 8, "rows", 0)
-    assert "not used" in caplog.text
-    assert scene.grid == Grid.cube(8, 1.0)
-    assert cube.grid == Grid.cube(8, 2.0)
+    assert "not used" in caplog.text and scene.grid == Grid.cube(8, 1.0) and cube.grid == Grid.cube(8, 2.0)
 
 
 @pytest.mark.parametrize(("words", "overlaps"), [
