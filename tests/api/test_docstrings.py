@@ -45,9 +45,7 @@ def missing(name: str) -> list[str]:
         return ["a docstring"]
     taken = parameters(thing)
     lacks = [f"its parameter {p.name}" for p in taken if not re.search(rf"\b{p.name}\b", doc)]
-    annotations = " ".join(
-        [str(p.annotation) for p in taken] + [str(getattr(thing, "__annotations__", {}).get("return"))]
-    )
+    annotations = " ".join([str(p.annotation) for p in taken] + [str(getattr(thing, "__annotations__", {}).get("return"))])
     if any(word in annotations for word in ARRAYS) and not SHAPE.search(doc):
         lacks.append("the shape of its arrays")
     is_measure = "float" in annotations or any(word in annotations for word in ARRAYS)

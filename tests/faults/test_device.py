@@ -31,10 +31,10 @@ def test_a_device_that_fails_at_any_launch(run, scan, tmp_path, capfd, launches,
     launches.arm(None)
     assert run(*command(scan, whole, RUNS[name])) == 0
     kept = 0
-    for at in np.unique(np.linspace(1, launches.calls, MOST).astype(int)):
+    for at in np.unique(np.linspace(1, launches.calls, MOST).astype(int)).tolist():
         output.write_bytes(kit.OLD)
         capfd.readouterr()
-        launches.arm(int(at))
+        launches.arm(at)
         assert run(*command(scan, output, RUNS[name])) == 5
         line = capfd.readouterr().err.splitlines()[-1]
         assert all(words in line for words in ("phyradgs: device ", "a launch of", "INVALID_COMMAND_QUEUE"))
@@ -50,18 +50,34 @@ def test_a_device_that_fails_at_any_launch(run, scan, tmp_path, capfd, launches,
     assert kept > 0
 
 
-def test_failing_copies_and_memory_that_is_missed(run, scan, tmp_path, capfd, launches, copies) -> None:
+def test_failing_copies_and_memory_that_is_missed(run, scan, tmp_path, capfd, monkeypatch, launches, copies) -> None:
+    """At a launch, or where an allocator refuses above a limit, as a device's does that somebody else uses too."""
     command = ["reconstruct", scan, "-o", tmp_path / "v.h5", "--method"]
+    real, held = kit.cl.Buffer, []
+
+    def missed(method: str, words: str = "") -> None:
+        assert run(*command, method) == 6
+        line = capfd.readouterr().err.splitlines()[-1]
+        assert line.startswith("phyradgs: memory of ") and words in line and kit.names(tmp_path) == []
+
+    def small(context: object, flags: object, size: int) -> object:
+        if sum(held) + size > 3_000:
+            raise kit.cl_error(-4)
+        held.append(size)
+        return real(context, flags, size)
+
     for method in ("fdk", "sirt"):
         copies.arm(2)
-        assert run(*command, method) == 5
-        assert "failed (injected" in capfd.readouterr().err.splitlines()[-1]
+        assert run(*command, method) == 5 and "failed (injected" in capfd.readouterr().err.splitlines()[-1]
     copies.arm(None)
     for code in (-4, -5, -6):
         launches.arm(1, code)
-        assert run(*command, "sirt") == 6
-        assert capfd.readouterr().err.splitlines()[-1].startswith("phyradgs: memory of ")
-    assert kit.names(tmp_path) == []
+        missed("sirt")
+    launches.arm(None)
+    monkeypatch.setattr(context.cl, "Buffer", small)
+    for method in ("fdk", "sirt", "phyradgs"):
+        held.clear()
+        missed(method, "MEM_OBJECT_ALLOCATION_FAILURE")
 
 
 def test_memory_that_is_missed_late_leaves_the_checkpoint(run, scan, tmp_path, capfd, copies) -> None:
@@ -95,25 +111,6 @@ def test_a_driver_that_ended_a_kernel(run, scan, tmp_path, capfd, monkeypatch, c
         assert all(words in line for words in ("phyradgs: device ", "ended a kernel", "devices --check"))
         assert launches.calls == 1 and "smaller bricks" not in caplog.text
     assert kit.names(tmp_path) == []
-
-
-def test_a_memory_that_is_too_small(run, scan, tmp_path, capfd, monkeypatch) -> None:
-    """An allocator that refuses above a limit, as a device does that somebody else uses too."""
-    real, limit_bytes, held = kit.cl.Buffer, 3_000, []
-
-    def small(context: object, flags: object, size: int) -> object:
-        if sum(held) + size > limit_bytes:
-            raise kit.cl_error(-4)
-        held.append(size)
-        return real(context, flags, size)
-
-    monkeypatch.setattr(context.cl, "Buffer", small)
-    for method in ("fdk", "sirt", "phyradgs"):
-        held.clear()
-        assert run("reconstruct", scan, "-o", tmp_path / "v.h5", "--method", method) == 6
-        line = capfd.readouterr().err.splitlines()[-1]
-        assert line.startswith("phyradgs: memory of ") and "MEM_OBJECT_ALLOCATION_FAILURE" in line
-        assert kit.names(tmp_path) == []
 
 
 # In a process of its own that may map no more than so many MiB beyond what it has at the start.

@@ -27,8 +27,7 @@ def steps_deg(truth: Any) -> tuple[float, float]:
 
 
 def lab_pixels(
-    points: np.ndarray, gantry_rad: float, geometry: Any, axis_mm: float = 0.0, roll_rad: float = 0.0,
-    tilt_rad: float = 0.0,
+    points: np.ndarray, gantry_rad: float, geometry: Any, axis_mm: float = 0.0, roll_rad: float = 0.0, tilt_rad: float = 0.0
 ) -> np.ndarray:
     """Pixels (n, 2) (row from below, column from the left) where points (n, 3) of a sample on a stage fall, in the room.
 
@@ -125,8 +124,7 @@ def write_ole(path: Path, streams: dict[str, bytes]) -> None:
 
     def put(data: bytes) -> int:
         """The first sector of a chain with the data; END for none."""
-        count = -(-len(data) // SECTOR)
-        first = len(sectors)
+        count, first = -(-len(data) // SECTOR), len(sectors)
         sectors.extend(data[i * SECTOR : (i + 1) * SECTOR].ljust(SECTOR, b"\0") for i in range(count))
         fat.extend([*range(first + 1, first + count), END][:count])
         return first if count else END

@@ -30,8 +30,7 @@ def rewrite(path: Path, changes: dict[str, bytes]) -> None:
 
 
 def npy(array: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    np.lib.format.write_array(stream, array)
+    np.save(stream := io.BytesIO(), array)
     return stream.getvalue()
 
 

@@ -14,7 +14,7 @@ from phyradgs_cl.workflow.files import load_scan
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("fast_pictures")]
 ABSURD = {
     "half a surrogate pair": "x\udcff\ud800", "a control": "x\x1b[2J\0", "a list": ["x", 1], "a table": {"a": {"b": 1}},
-    "beyond floats": 1e308, "NaN": float("nan"), "nothing": None, "a truth value": True,
+    "beyond floats": 1e308, "NaN": float("nan"), "nothing": None,
 }  # fmt: skip
 FIELDS = ("method", "scan", "scan_sha256", "seconds", "gaussians", "record", "options", "input", "segments")
 FIELDS += ("program", "interrupted_at", "unheard_of")
