@@ -37,8 +37,7 @@ def test_a_script_stops_with_the_partial_volume(tmp_path) -> None:
     """One real SIGINT after the first report."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     child = subprocess.Popen([sys.executable, "-c", SCRIPT], cwd=tmp_path, **pipes)
-    watchdog = threading.Timer(100, child.kill)
-    watchdog.start()
+    (watchdog := threading.Timer(100, child.kill)).start()
     child.stdout.readline()
     child.send_signal(signal.SIGINT)
     said, errors = child.communicate()
@@ -73,8 +72,7 @@ def test_the_partial_result_goes_on_to_the_bits_of_the_whole(rt, scan, tmp_path)
     whole = reconstruct(scan, **options, report=False)
     api.save_volume(tmp_path / "partial.h5", partial)
     for so_far in (partial, api.load_volume(tmp_path / "partial.h5")):
-        went_on = reconstruct(scan, **options, resume=so_far, report=False)
-        np.testing.assert_array_equal(went_on.volume, whole.volume)
+        np.testing.assert_array_equal(reconstruct(scan, **options, resume=so_far, report=False).volume, whole.volume)
     with h5py.File(tmp_path / "partial.h5", "a") as file:
         del file["entry/state/iteration"]
         file.create_group("entry/state/iteration")
@@ -136,5 +134,4 @@ def test_a_line_tells_how_far_it_is(rt, scan, monkeypatch, kind, is_terminal, re
     said = screen.getvalue()
     assert ("iteration 5/5  residual" in said) == is_told
     if is_told:
-        assert said.endswith("\n") and said.count("\n") == 1 and "ETA" in said
-        assert ("\x1b[K" in said) == is_terminal
+        assert said.endswith("\n") and said.count("\n") == 1 and "ETA" in said and ("\x1b[K" in said) == is_terminal

@@ -18,8 +18,7 @@ STEPS = (1e-3, 1e-2, 1e-2)  # rad, mm, mm
 
 
 def weights(scan) -> np.ndarray:
-    noise = np.random.default_rng(5).normal(size=scan.projections.shape)
-    return gaussian_filter(noise, (0, 2, 2)).astype(np.float32)
+    return gaussian_filter(np.random.default_rng(5).normal(size=scan.projections.shape), (0, 2, 2)).astype(np.float32)
 
 
 def differences(scan, frames_of, by_frames) -> np.ndarray:
@@ -56,8 +55,7 @@ def test_a_clouds_gradient_is_that_of_moved_views(rt, request, cloud, axis, opti
 def test_a_volumes_gradient_is_that_of_moved_views(rt, scan) -> None:
     by_frames, volume = weights(scan), gaussian_filter(scan.reference, 1)
     found = pose_gradient(scan, volume, by_frames, "per-row", device=rt)
-    expected = differences(scan, lambda of: ray_operator(of, "per-row", device=rt)(volume), by_frames)
-    assert_close(found, expected, 0.1)
+    assert_close(found, differences(scan, lambda of: ray_operator(of, "per-row", device=rt)(volume), by_frames), 0.1)
 
 
 def test_gauges_are_left_out(scan) -> None:

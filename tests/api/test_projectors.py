@@ -94,12 +94,10 @@ def test_gaussians_and_their_voxels_make_the_same_frames(rt, cloud, which) -> No
     how = {"exposure_deg": 30.0, "readout_axis": which, "time_samples": 1, "device": rt}
     scan = api.simulate("jaw", size=8, detector=128, views=2, **how)
     motion, grid = api.OwnTimes(sub_intervals=4), Grid.cube(120, 2.4)
-    volume = voxelise(cloud, grid, cutoff_sigma=0.0, device=rt)
-    rays = ray_operator(scan, motion, grid=grid, device=rt)
+    volume, rays = voxelise(cloud, grid, cutoff_sigma=0.0, device=rt), ray_operator(scan, motion, grid=grid, device=rt)
     splats = splat_operator(scan, motion, cutoff_sigma=0.0, device=rt)
     for by_rays, by_splats in ((rays(volume), splats(cloud)), (rays.intensity(volume), splats.intensity(cloud))):
-        assert by_splats.shape == scan.projections.shape
-        assert np.abs(by_splats - by_rays).max() <= VOXELS * by_rays.max()
+        assert by_splats.shape == scan.projections.shape and np.abs(by_splats - by_rays).max() <= VOXELS * by_rays.max()
 
 
 def test_splats_are_the_twin_in_millimetres(rt, scan, cloud) -> None:
@@ -133,8 +131,7 @@ def test_linear_operators_keep_scipys_law(rt, scan, cloud, kind) -> None:
     assert forward.shape == (matrix.shape[0],) and back.shape == (matrix.shape[1],)
     assert forward.dtype == np.float32 and np.array_equal(back, matrix.H @ y)
     assert float(forward @ y) == pytest.approx(float(x @ back), rel=ADJOINT)
-    pair = np.stack([x, 2 * x], -1)
-    assert np.allclose(matrix @ pair, np.stack([forward, 2 * forward], -1), rtol=1e-5)
+    assert np.allclose(matrix @ np.stack([x, 2 * x], -1), np.stack([forward, 2 * forward], -1), rtol=1e-5)
     assert np.allclose((matrix.T @ matrix) @ x, matrix.T @ forward, rtol=1e-5)
 
 

@@ -36,7 +36,7 @@ def test_a_reconstruction_goes_to_a_file_of_each_suffix_and_back(rt, scan, tmp_p
     assert api.load_volume(tmp_path / "v.h5").gaussians is None
 
 
-def test_threads_have_the_bits_of_runs_alone(scan) -> None:
+def test_threads_have_the_bits_of_runs_alone_and_share_a_device(scan, monkeypatch) -> None:
     def run(weight: float) -> np.ndarray:
         return reconstruct(scan, "fista-tv", iterations=4, size=16, tv_weight=weight, report=False).volume
 
@@ -45,9 +45,6 @@ def test_threads_have_the_bits_of_runs_alone(scan) -> None:
     with ThreadPoolExecutor(2) as pool:
         for found, expected in zip(pool.map(run, 3 * weights), 3 * alone, strict=True):
             np.testing.assert_array_equal(found, expected)
-
-
-def test_threads_that_start_together_share_a_device(monkeypatch) -> None:
     monkeypatch.setattr(runs, "_runtime_by_name", lru_cache(lambda name: (time.sleep(0.05), object())[1]))
     with ThreadPoolExecutor(4) as pool:
         assert len(set(pool.map(runs.runtime_of, 4 * [None]))) == 1
@@ -61,8 +58,7 @@ def test_hounsfield_units_are_kept_by_files(rt, scan, tmp_path) -> None:
     scaled = result.hounsfield(edge, middle)
     for name in ("v.h5", "v.nii", "v.npy"):
         api.save_volume(tmp_path / name, scaled, hu=True)
-        again = api.load_volume(tmp_path / name)
-        np.testing.assert_allclose(again.volume, result.volume, atol=2e-7)
+        np.testing.assert_allclose((again := api.load_volume(tmp_path / name)).volume, result.volume, atol=2e-7)
         assert again.scale.water_per_mm == pytest.approx(scaled.scale.water_per_mm)
     for words, call in {
         "hu: found a result without a scale": lambda: api.save_volume(tmp_path / "v.h5", result, hu=True),
@@ -112,12 +108,8 @@ class Softened:
 def test_a_prior_may_be_a_function(rt, scan, tmp_path) -> None:
     """The facts have its name; a resumed run needs the same name and ends with the same bits."""
     usual = {"iterations": 4, "subvoxels": 1, "device": rt}
-    named = {
-        softened: f"{__name__}:softened",
-        Softened(): f"{__name__}:Softened",
-        partial(softened, share=0.9): "functools:partial",
-        lambda volume, noise: 0.9 * volume: f"{__name__}:test_a_prior_may_be_a_function.<locals>.<lambda>",
-    }
+    named = {softened: f"{__name__}:softened", Softened(): f"{__name__}:Softened"}
+    named[partial(softened, share=0.9)] = "functools:partial"
     whole = [api.reconstruct(scan, "fista", prior=prior, **usual) for prior in named]
     for result, name in zip(whole, named.values(), strict=True):
         assert json.loads(json.dumps(result.facts))["options"]["prior"] == name
@@ -161,8 +153,7 @@ def images(figure: Figure) -> list[np.ndarray]:
 def test_a_frame_has_its_picture_its_windows_and_its_arc(scan) -> None:
     mask = np.zeros(scan.geometry.detector_shape)
     mask[3, 4] = 1
-    pulsed = replace(scan, pixel_mask=mask, shutter=Shutter(1.0, 0.86, "rows", -1, (0.4, 0.6)))
-    figure = pulsed.plot(2)
+    figure = replace(scan, pixel_mask=mask, shutter=Shutter(1.0, 0.86, "rows", -1, (0.4, 0.6))).plot(2)
     assert titles(figure) == ["frame 2 of 6: line integrals", "gantry from 120.0° to 175.8°"]
     (picture,) = images(figure)
     known = np.isfinite(picture)
@@ -172,8 +163,7 @@ def test_a_frame_has_its_picture_its_windows_and_its_arc(scan) -> None:
     assert windows.get_xlabel() == "time after the frame's start (s)" and windows.get_ylabel() == "detector row"
     low, high = windows.dataLim.intervalx
     assert (low, high) == pytest.approx((0.0, 1.86))
-    still = replace(scan, is_fly=False).plot()
-    assert "the gantry stands still" in texts(still)
+    assert "the gantry stands still" in texts(replace(scan, is_fly=False).plot())
 
 
 def test_a_result_has_slices_convergence_and_a_residual(rt, scan) -> None:
@@ -187,8 +177,7 @@ def test_a_result_has_slices_convergence_and_a_residual(rt, scan) -> None:
     whole = result.plot(scan, frame=3, device=rt)
     assert len(images(whole)) == 3 * 3 + 2 and len(images(Reconstruction(result.volume, result.grid).plot())) == 3
     np.testing.assert_array_equal(images(whole)[-2], scan.projections[3])
-    residual = images(whole)[-1]
-    share = np.linalg.norm(residual) / np.linalg.norm(scan.projections[3])
+    share = np.linalg.norm(images(whole)[-1]) / np.linalg.norm(scan.projections[3])
     assert 0 < share < 1 and f"RMS {100 * share:.2g} %" in titles(whole)[-1]
 
 

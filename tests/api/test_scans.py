@@ -10,7 +10,6 @@ from phyradgs_cl.api import ConeGeometry, ParallelGeometry, fly_scan, reconstruc
 from phyradgs_cl.errors import InputError
 
 pytestmark = pytest.mark.slow
-
 LIGHT, DARK = 40_000.0, 200.0
 CONE = ConeGeometry(5.0, 7.0, (6, 8), (0.2, 0.2))
 
@@ -119,8 +118,7 @@ def test_counts_are_divided_and_bad_pixels_masked(tmp_path) -> None:
     applied = {"flats_applied": 3, "darks_applied": 2}
     assert scan.provenance == {**applied, "taken": "flats: the median of 3; darks: the median of 2"}
     api.save_scan(tmp_path / "s.h5", scan)
-    again = api.load_scan(tmp_path / "s.h5")
-    np.testing.assert_array_equal(again.pixel_mask != 0, bad)
+    np.testing.assert_array_equal((again := api.load_scan(tmp_path / "s.h5")).pixel_mask != 0, bad)
     np.testing.assert_allclose(poses(again), poses(scan), atol=1e-9)
     of_transmission = static_scan(np.exp(-wanted), cone, 90.0 * np.arange(4), quantity="transmission")
     np.testing.assert_allclose(of_transmission.projections, wanted, atol=1e-5)

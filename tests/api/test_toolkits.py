@@ -60,8 +60,7 @@ def test_points_fall_where_tigre_puts_them(rt, changes, caplog) -> None:
     assert "degrees" not in caplog.text
     Scan.from_tigre(geo, np.rad2deg(ANGLES), FRAMES)
     assert "4 frames over 234.9 rad: are they degrees?" in caplog.text
-    expected = np.stack([tigre_pixels(geo, i) for i in range(4)])
-    assert np.abs(drawn_pixels(scan, rt) - expected).max() < PIXEL
+    assert np.abs(drawn_pixels(scan, rt) - np.stack([tigre_pixels(geo, i) for i in range(4)])).max() < PIXEL
     assert isinstance(scan.trajectory, CircularOrbit if len(changes) == 0 else (PoseTable, CircularOrbit))
     assert scan.grid == Grid((8, 10, 12), (5.0, 4.5, 4.0), (1, -2, 3))
 
@@ -117,15 +116,13 @@ def test_points_fall_where_astra_puts_them_and_the_vectors_come_back(rt, tmp_pat
         vectors[:, :3] /= np.linalg.norm(vectors[:, :3], axis=1, keepdims=True)
     np.testing.assert_allclose(scan.astra_vectors(), vectors, atol=1e-9)
     api.save_scan(tmp_path / "s.h5", scan)
-    stored = api.load_scan(tmp_path / "s.h5")
-    np.testing.assert_allclose(stored.astra_vectors(), vectors, atol=1e-6)
+    np.testing.assert_allclose((stored := api.load_scan(tmp_path / "s.h5")).astra_vectors(), vectors, atol=1e-6)
     assert stored.is_parallel == is_parallel
 
 
 def test_tigre_s_parallel_mode_is_astra_s_parallel_geometry(rt, tmp_path) -> None:
     """On a circle, which files hold as angles; distances are not used, and COR moves the panel."""
-    geo = tigre(mode="parallel", DSO=None, DSD=None, COR=1.5)
-    scan = Scan.from_tigre(geo, ANGLES, FRAMES)
+    scan = Scan.from_tigre(tigre(mode="parallel", DSO=None, DSD=None, COR=1.5), ANGLES, FRAMES)
     assert isinstance(scan.trajectory, CircularOrbit) and scan.title == "parallel-beam scan"
     assert scan.geometry.detector_offset_mm == pytest.approx((5.0, -2.5))
     v = POINTS[:, 2] - 5.0

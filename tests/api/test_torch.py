@@ -57,14 +57,13 @@ def test_tensors_on_the_host_are_not_copied(rt, scan, monkeypatch) -> None:
 
 
 def test_what_does_not_fit_is_named_and_what_needs_no_gradient_has_none(rt, scan, cloud) -> None:
-    with pytest.raises(InputError, match="x: found Gaussians.*expected a tensor; of a cloud"):
-        as_torch(splat_operator(scan, device=rt))(cloud)
-    rays = ray_operator(scan, device=rt)
+    rays, still = ray_operator(scan, device=rt), torch.zeros(scan.grid.shape)
     project = as_torch(rays)
-    assert not project(torch.zeros(scan.grid.shape)).requires_grad
-    with pytest.raises(InputError, match="volume.*shape"):
-        project(torch.zeros(3))
-    with pytest.raises(InputError, match="frames"):
-        project(torch.zeros(scan.grid.shape), frames=[99])
-    with pytest.raises(InputError, match="detach"):
-        rays(torch.zeros(scan.grid.shape, requires_grad=True))
+    assert not project(still).requires_grad
+    for words, call in {
+        "x: found Gaussians.*expected a tensor; of a cloud": lambda: as_torch(splat_operator(scan, device=rt))(cloud),
+        "volume.*shape": lambda: project(torch.zeros(3)), "frames": lambda: project(still, frames=[99]),
+        "detach": lambda: rays(torch.zeros(scan.grid.shape, requires_grad=True)),
+    }.items():
+        with pytest.raises(InputError, match=words):
+            call()

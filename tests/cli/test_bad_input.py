@@ -64,8 +64,7 @@ OTHERS = {
 
 @pytest.mark.parametrize("command", ["reconstruct", "simulate", "others"])
 def test_wrong_options(kept, scan, tmp_path, command) -> None:
-    text = tmp_path / "text.h5"
-    text.write_text("this is [not a table")
+    (text := tmp_path / "text.h5").write_text("this is [not a table")
     start, table = {
         "reconstruct": (f"reconstruct {scan} --method phyradgs", RECONSTRUCT),
         "simulate": (f"simulate {SMALL}", SIMULATE), "others": ("", OTHERS),

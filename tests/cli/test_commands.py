@@ -141,8 +141,7 @@ def test_volume_files_are_simulated_at_their_own_resolution(cli, tmp_path, caplo
     assert cli.run([*command, "--size", "12", "-o", str(path)]) == 0
     with h5py.File(path) as file:
         reference = file["entry/phyradgs/reference/volume"][()]
-    block = (volume / 255).reshape(12, 2, 12, 2, 12, 2).mean((1, 3, 5))
-    np.testing.assert_allclose(reference, block, atol=1e-6)
+    np.testing.assert_allclose(reference, (volume / 255).reshape(12, 2, 12, 2, 12, 2).mean((1, 3, 5)), atol=1e-6)
     assert "inverse crime" not in caplog.text
     assert cli.run([*command, "--lag", "0.1", "-o", str(path)]) == 0
     assert "24×24×24 voxels are projected and a grid of 24×24×24 is to be reconstructed" in caplog.text

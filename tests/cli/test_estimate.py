@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
@@ -91,16 +92,11 @@ def test_the_command_says_time_and_memory(cli, scan, capsys) -> None:
 
 def test_the_words_of_reconstruct(cli, refused, scan, monkeypatch) -> None:
     """All that changes how long a run takes can be said to both."""
-    plans = []
-
-    def fake(scan, plan, rt, around):
-        plans.append(plan)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("phyradgs_cl.commands.reconstruct.estimate", fake)
+    monkeypatch.setattr("phyradgs_cl.commands.reconstruct.estimate", fake := Mock(side_effect=KeyboardInterrupt))
     before = ["--detector-model", "intensity", "--holdout", "3", "--set", "ignore_lag=true"]
     for words in (["--strips", "2", "--sub-intervals", "1"], ["--set", "segments=2", "--set", "time_error=0.01"]):
         cli.run(["estimate", str(scan), "--method", "phyradgs", *words, *before])
+    plans = [call.args[1] for call in fake.call_args_list]
     for plan in plans:
         assert plan.options.detector_model == "intensity"
         assert (plan.preprocessing.holdout, plan.preprocessing.ignore_lag) == (3, True)

@@ -57,8 +57,7 @@ def test_a_box_inside_of_what_is_seen_is_said_where_it_matters(cli, scan, tmp_pa
     assert not any("field of view" in record.getMessage() for record in caplog.records)
     assert cli.run([*command, "--roi", INSIDE]) == 0
     (line,) = [r.getMessage() for r in caplog.records if "field of view" in r.getMessage()]
-    assert "--method sirt puts the object beyond it into the grid" in line
-    assert "--margin-mm reconstructs a margin" in line
+    assert "--method sirt puts the object beyond it into the grid" in line and "--margin-mm reconstructs a margin" in line
     alone = read_volume(tmp_path / "v.h5")
     for margin_mm, expected in (("0.5,0,0", "widen --margin-mm"), ("0.5", "")):
         caplog.clear()

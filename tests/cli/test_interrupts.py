@@ -47,8 +47,7 @@ FINISHED = [
 
 @pytest.mark.parametrize(("command", "owner", "step"), STAGES)
 def test_before_the_output_there_is_nothing(cli, scan, tmp_path, capfd, monkeypatch, command, owner, step):
-    output = tmp_path / "existing.h5"
-    output.write_bytes(b"an older result")
+    (output := tmp_path / "existing.h5").write_bytes(b"an older result")
     monkeypatch.setattr(owner, step, interrupted_before(getattr(owner, step)))
     arguments = [a.format(scan=scan) for a in COMMANDS[command]]
     assert cli.run([*arguments, "-o", str(output)]) == 130 and capfd.readouterr().err.endswith(NOTHING)
@@ -122,8 +121,7 @@ def test_a_library_that_swallows_the_signal_delays_the_end(tmp_path) -> None:
             return make(*words, **options)
         """
     done = run_process([*COMMANDS["simulate"], "-o", str(tmp_path / "scan.h5")], at_a_kernel("kernel", before))
-    assert done.returncode == 130 and done.stderr.endswith(COMPLETE)
-    assert list(tmp_path.iterdir()) == [tmp_path / "scan.h5"]
+    assert done.returncode == 130 and done.stderr.endswith(COMPLETE) and list(tmp_path.iterdir()) == [tmp_path / "scan.h5"]
 
 
 # A signal at the second report of a loop: it comes again at once, as wrappers pass it on.
@@ -195,7 +193,7 @@ def test_ctrl_c_that_ends_the_compiler_of_a_kernel_is_no_failure_of_the_device(s
         assert done.returncode == status and said in done.stderr and done.stderr.count("\n") == 1
 
 
-def test_a_second_ctrl_c_does_not_wait_unless_it_is_the_same_press(monkeypatch):
+def test_a_second_ctrl_c_does_not_wait_unless_it_is_the_same_press_and_an_ignored_one_stays_ignored(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(signals.time, "monotonic", lambda: now[0])
     with pytest.raises(KeyboardInterrupt), stop_on_interrupt() as request:
@@ -205,14 +203,10 @@ def test_a_second_ctrl_c_does_not_wait_unless_it_is_the_same_press(monkeypatch):
         now[0] += 2
         signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def test_a_signal_that_is_ignored_stays_ignored():
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # until the test ends: tests/conftest.py
     with signals.answer_signals(), stop_on_interrupt() as request, finish_despite_interrupt():
         signal.raise_signal(signal.SIGINT)
     assert not request.is_set and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    signal.signal(signal.SIGINT, before)
 
 
 def run_process(arguments, body):
@@ -247,9 +241,7 @@ def test_a_reader_says_where_the_run_was_interrupted(cli, tmp_path, monkeypatch,
 
 def test_a_partial_volume_has_a_name_of_its_own_where_no_scan_lies(refused, tmp_path) -> None:
     for name in ("v.partial.h5", "volume", ".hidden", "a.b.h5"):
-        path = partial_path(tmp_path / name)
-        assert path.parent == tmp_path and path.name != name and ".partial" in path.name
-    scan = tmp_path / "volume.partial.h5"
-    scan.write_bytes(b"a scan")
+        assert (path := partial_path(tmp_path / name)).parent == tmp_path and path.name != name and ".partial" in path.name
+    (scan := tmp_path / "volume.partial.h5").write_bytes(b"a scan")
     refused(["reconstruct", scan, "-o", tmp_path / "volume.h5", "--method", "fdk"], "reads or writes")
     assert list(tmp_path.iterdir()) == [scan]

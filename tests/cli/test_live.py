@@ -62,8 +62,7 @@ def test_pages_and_pictures_do_not_replace_what_matters(refused, scan, tmp_path,
     output, before = tmp_path / f"volume.{suffix}", scan.read_bytes()
     for path in (scan, output, partial_path(output), tmp_path / other):
         refused(["reconstruct", scan, "-o", output, flag, path], flag)
-    elsewhere = tmp_path / "none" / f"now.{suffix}"
-    refused(["reconstruct", scan, "-o", output, flag, elsewhere], "none", status=4)
+    refused(["reconstruct", scan, "-o", output, flag, tmp_path / "none" / f"now.{suffix}"], "none", status=4)
     assert scan.read_bytes() == before and not list(tmp_path.iterdir())
 
 
@@ -117,6 +116,10 @@ def test_a_loss_comes_with_its_gaussians_and_rate_and_time_left_count_from_the_f
         for now[0], done, share in reports:
             ticker.show(done, 100, share=share)
         assert capsys.readouterr().err == said
+    ticker = Ticker("frame")  # a file gets a line every ten seconds, and the last
+    for now[0] in map(float, range(31)):
+        ticker.show(int(now[0]), 30)
+    assert [line.split()[1] for line in capsys.readouterr().err.splitlines()] == ["10/30", "20/30", "30/30"]
     assert [clock(seconds) for seconds in (0.2, 59.6, 125, 3600)] == ["0:00", "1:00", "2:05", "1:00:00"]
 
 
@@ -134,11 +137,3 @@ def test_on_a_terminal_there_is_a_line_before_there_is_a_count(capsys, monkeypat
     with Ticker("frame") as ticker:
         ticker.show(1, 1)
     assert not ticker.is_open  # nothing to close where nothing could be written
-
-
-def test_a_file_gets_a_line_every_ten_seconds_and_the_last(capsys, now) -> None:
-    ticker = Ticker("frame")
-    for second in range(31):
-        now[0] = float(second)
-        ticker.show(second, 30)
-    assert [line.split()[1] for line in capsys.readouterr().err.splitlines()] == ["10/30", "20/30", "30/30"]

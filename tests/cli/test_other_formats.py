@@ -14,7 +14,6 @@ from phyradgs_cl.exporters import export_volume
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.importers import load_volume
 from phyradgs_cl.io import write_scan, write_volume
-from phyradgs_cl.metrics import resampled
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("fast_pictures")]
 FORMATS = {"v.mha": "mha", "v.nii.gz": "nii", "v.nrrd": "nrrd", "v.npy": "npy", "v.tif": "tiff"}
@@ -83,8 +82,7 @@ def test_a_result_in_hounsfield_units_is_converted_once(told, refused, files, tm
     noted, bare = tmp_path / "noted.nii", tmp_path / "bare.nii"
     told("export", volume, "-o", noted, "--mu-water-per-mm", "0.002")
     image = sitk.ReadImage(str(noted))
-    without_note = sitk.GetImageFromArray(sitk.GetArrayFromImage(image))
-    without_note.SetSpacing(image.GetSpacing())
+    (without_note := sitk.GetImageFromArray(sitk.GetArrayFromImage(image))).SetSpacing(image.GetSpacing())
     without_note.SetOrigin(image.GetOrigin())
     sitk.WriteImage(without_note, str(bare))
     ways = ((volume,), (noted,), (bare, "--mu-water-per-mm", "0.002"))
@@ -129,11 +127,9 @@ def test_boxes_with_little_in_common_are_warned_of(told, files, tmp_path, caplog
         said = caplog.text.count(f"share {first} % of the first box and {second} % of the second")
         assert said == (min(first, second) < 50), (name, caplog.text)
     caplog.clear()
-    part, wide = grid.part((2, 3, 2), (5, 5, 5)), Grid.cube(11, 1.4 * grid.size_mm[0])
+    part = grid.part((2, 3, 2), (5, 5, 5))
     write_volume(tmp_path / "part.h5", np.full((5, 5, 5), 0.1, np.float32), part, {})  # a region of interest, and a bad one
-    write_volume(tmp_path / "wide.h5", resampled(values, grid, wide)[0], wide, {})  # the truth, in the whole field of view
-    for name in ("part", "wide"):
-        told("evaluate", tmp_path / f"{name}.h5", "--reference", scan)
+    told("evaluate", tmp_path / "part.h5", "--reference", scan)
     assert "of the first box" not in caplog.text
 
 

@@ -71,8 +71,7 @@ def test_a_configuration_file_says_the_same(cli, simulated, tmp_path, capsys) ->
 def test_bad_input_is_one_line_and_loses_nothing(refused, simulated, tmp_path) -> None:
     source, output = simulated(*SPOILT), tmp_path / "clean.h5"
     output.write_bytes(b"what was there before")
-    flooded = tmp_path / "flooded.h5"
-    flooded.write_bytes(Path(source).read_bytes())
+    (flooded := tmp_path / "flooded.h5").write_bytes(Path(source).read_bytes())
     on("entry/instrument/detector/data", changed(lambda data: data + 2))(flooded)
     for words, parts in (
         (["--steps", "ring"], ("--steps", "did you mean 'rings'")), (["--steps", ""], ("--steps", "found none")),

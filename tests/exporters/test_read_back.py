@@ -18,7 +18,6 @@ from phyradgs_cl.io import read_volume, write_volume
 from phyradgs_cl.io.attenuation import attenuation_of
 
 pytestmark = pytest.mark.slow
-
 NAMES = {"v.mha": "mha", "v.nii": "nii", "v.nii.gz": "nii", "v.nrrd": "nrrd", "v.npy": "npy", "v.tif": "tiff"}
 NAMES |= {"v.ome.zarr": "zarr"} if find_spec("ome_zarr") else {}
 
@@ -33,8 +32,7 @@ def exported(volume_file, tmp_path):
 
 
 def assert_same(path, stored, atol: float = 0) -> None:
-    loaded = load_volume(path)
-    np.testing.assert_allclose(loaded.values, stored.values, rtol=0, atol=atol)
+    np.testing.assert_allclose((loaded := load_volume(path)).values, stored.values, rtol=0, atol=atol)
     assert loaded.values.dtype == np.float32 and loaded.grid.is_close(stored.grid), loaded.grid
 
 
@@ -45,8 +43,7 @@ def test_an_export_comes_back_bit_for_bit_and_in_its_place(exported, stored, tmp
     assert_same(exported(name), stored)
     assert foreign_volume(f"{name.upper()}") and load_attenuation(exported(name)).grid is not None
     scale = Hounsfield(0.02, 0.001)
-    path = exported(name, scale_of=lambda _: scale)
-    assert_same(path, stored, atol=1e-8)
+    assert_same(path := exported(name, scale_of=lambda _: scale), stored, atol=1e-8)
     assert load_volume(path).scale == scale and load_volume(path, 0.03).scale == scale
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Hounsfield, "note", "values in HU")
@@ -161,8 +158,7 @@ WRONG = {
 def test_a_wrong_file_is_one_line(exported, name) -> None:
     """Counts, axes, directions, units and types that no reader may take; cut files: tests/importers/test_fuzz.py."""
     for number, damage in enumerate(WRONG[name]):
-        path = exported(name)
-        path.write_bytes(damage(path.read_bytes()))
+        (path := exported(name)).write_bytes(damage(path.read_bytes()))
         with pytest.raises(InputError) as caught:
             load_volume(path)
         assert name in str(caught.value) and "\n" not in str(caught.value), number

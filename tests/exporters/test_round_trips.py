@@ -19,7 +19,6 @@ from phyradgs_cl.exporters.writers import write_image
 from phyradgs_cl.io import write_volume
 
 pytestmark = pytest.mark.slow
-
 BRIGHT = (4, 1, 2)  # z, y, x
 
 
@@ -147,8 +146,7 @@ def test_wrong_wishes_are_one_line(volume_file, tmp_path, stored) -> None:
     ):  # fmt: skip
         with pytest.raises((InputError, OutputError)) as caught:
             export_volume(volume_file, to, output and tmp_path / output, water)
-        assert subject in str(caught.value) and "\n" not in str(caught.value)
-        assert sorted(tmp_path.iterdir()) == before
+        assert subject in str(caught.value) and "\n" not in str(caught.value) and sorted(tmp_path.iterdir()) == before
     write_volume(volume_file, stored.values, stored.grid, {})
     with pytest.raises(InputError, match="/entry/gaussians"):
         export_volume(volume_file, "ply")
@@ -175,8 +173,7 @@ def test_a_failure_leaves_nothing(volume_file, tmp_path, monkeypatch, to) -> Non
 
 
 def test_a_missing_package_is_named(volume_file, monkeypatch) -> None:
-    packages = {"nii": "SimpleITK", "tiff": "tifffile", "dicom": "pydicom", "zarr": "ome_zarr.writer"}
-    for to, package in packages.items():
+    for to, package in {"nii": "SimpleITK", "tiff": "tifffile", "dicom": "pydicom", "zarr": "ome_zarr.writer"}.items():
         monkeypatch.setitem(sys.modules, package, None)
         with pytest.raises(InputError, match=rf"{package}: .*{'zarr' if to == 'zarr' else 'formats'}\]"):
             export_volume(volume_file, to)

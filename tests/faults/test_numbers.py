@@ -69,8 +69,7 @@ def test_gaussians_at_the_source_behind_it_and_in_its_plane(rt, make_cloud, affi
 
 @pytest.mark.parametrize("distance", [1e-3, 0.5, 1.0])
 def test_a_source_inside_the_volume(rt, make_cloud, distance) -> None:
-    geometry = ConeGeometry(distance, distance + 3.0, SHAPE, (0.6, 0.6))
-    cells = one_cell(geometry)
+    cells = one_cell(ConeGeometry(distance, distance + 3.0, SHAPE, (0.6, 0.6)))
     operator = RayOperator(rt, GRID, SHAPE, [cells])
     assert np.isfinite(operator.forward(np.ones(GRID.shape, np.float32))).all()
     assert np.isfinite(operator.adjoint(np.ones(operator.frames_shape, np.float32))).all()

@@ -79,8 +79,7 @@ def truth(fly: bool = False, axis: str = "rows", direction: int = 1, geometry: G
     shutter = Shutter(exposure_s, 0.3, axis, direction) if fly else Shutter(0.0)
     sweeps = FrameSweeps(start_s, shutter.exposure_s, angle_rad, angle_rad + arc)
     orbit, reference = CircularOrbit(geometry, sweeps), BALLS.voxelise(GRID)
-    scan = Scan(frames, geometry, orbit, shutter, start_s, GRID, fly, reference=reference)
-    return Truth(scan, angle_rad)
+    return Truth(Scan(frames, geometry, orbit, shutter, start_s, GRID, fly, reference=reference), angle_rad)
 
 
 @pytest.fixture

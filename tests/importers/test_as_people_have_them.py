@@ -17,7 +17,6 @@ from phyradgs_cl.importers.angles import read_angles_rad
 from phyradgs_cl.importers.series import flat_places, series_of
 
 pytestmark = pytest.mark.slow
-
 CENTRED = ConeGeometry(512.0, 1024.0, (10, 14), (2.5, 2.5))
 COUNT = 24
 NAMES = {  # a name for each frame, in the order of the scan
@@ -39,8 +38,7 @@ NAMES = {  # a name for each frame, in the order of the scan
 def test_names_are_read_as_a_person_reads_them(kind) -> None:
     """The order is right whatever the order of the listing, and a frame that is missing is seen."""
     paths = [Path("/scan") / NAMES[kind](i) for i in range(COUNT)]
-    shuffled = [paths[i] for i in np.random.default_rng(1).permutation(COUNT)]
-    series = series_of(shuffled, "/scan", "complete it")
+    series = series_of([paths[i] for i in np.random.default_rng(1).permutation(COUNT)], "/scan", "complete it")
     assert series.paths == paths and f"{COUNT} files, {paths[0].name} to {paths[-1].name}" in series.said
     with pytest.raises(InputError, match="a hole in the numbering.*complete it"):
         series_of([path for i, path in enumerate(paths) if i != 13], "/scan", "complete it")
@@ -64,8 +62,7 @@ def test_strays_other_series_and_numbers_that_disagree(caplog) -> None:
 
 def test_flats_have_places_by_words_and_by_numbers() -> None:
     series = series_of([Path(f"p_{i:03d}.tif") for i in range(12, 32)], "", "")
-    flats = [Path(f"f_{i:03d}.tif") for i in (2, 3, 32, 33)]
-    darks = [Path(f"d_{i:03d}.tif") for i in (*range(4, 12),)]
+    flats, darks = [Path(f"f_{i:03d}.tif") for i in (2, 3, 32, 33)], [Path(f"d_{i:03d}.tif") for i in (*range(4, 12),)]
     np.testing.assert_array_equal(np.concatenate(flat_places(flats, darks, series)), [2, 3, 32, 33, *range(12, 32)])
     assert flat_places(flats, darks[1:], series) is None
     words = [Path("flat_before_0.tif"), Path("flat_after_0.tif")]
@@ -99,8 +96,7 @@ def test_what_flats_and_darks_name_is_no_projection_and_odd_files_do_not_matter(
     folder = toml_folder(tmp_path / "a", frames, PATTERNS, white=[shot(40000, i) for i in range(3)], dark=[shot(50)])
     for name in ("._p_000.tif", "p_000.tif.md5", "Thumbs.db"):
         (folder / name).write_bytes(b"\0\5")
-    elsewhere = (folder / "p_003.tif").rename(tmp_path / "raw_003.tif")
-    (folder / "p_003.tif").symlink_to(elsewhere)
+    (folder / "p_003.tif").symlink_to((folder / "p_003.tif").rename(tmp_path / "raw_003.tif"))
     (folder / "p_004.tif").rename(folder / "p_004.TIF")
     scan, truth = import_scan(folder), -np.log((np.stack(frames)[:, ::-1] - 50.0) / 39950)
     assert scan.frames == 8 and np.abs(scan.projections - truth).max() < 0.1
@@ -166,8 +162,7 @@ def test_flats_are_interpolated_in_time(tmp_path) -> None:
     )
     air = import_scan(folder)
     assert np.abs(air.projections.mean((1, 2))).max() < 0.02 and "10 of 2 times, interpolated" in air.provenance["taken"]
-    median = import_scan(folder, ImportOptions(flats="median"))
-    assert np.ptp(median.projections.mean((1, 2))) > 0.15
+    assert np.ptp(import_scan(folder, ImportOptions(flats="median")).projections.mean((1, 2))) > 0.15
     for i, path in enumerate(sorted(folder.glob("white_after*"), reverse=True) + sorted(folder.glob("white_before*"))):
         path.rename(folder / f"white_{9 - i}.tif")  # nothing says when they were taken
     assert "median of" in import_scan(folder).provenance["taken"]
@@ -280,8 +275,7 @@ def test_options_come_before_what_the_file_lacks_or_spells_wrongly(tmp_path, mak
 @pytest.mark.parametrize("code", ["utf-16", "cp1252"])
 def test_names_are_text_and_commas_are_decimal(tmp_path, make_truth, code) -> None:
     truth = make_truth(geometry=CENTRED)
-    plain = import_scan(lab.write_nikon(tmp_path / "plain", truth))
-    path = lab.write_nikon(tmp_path / "nikon", truth)
+    plain, path = import_scan(lab.write_nikon(tmp_path / "plain", truth)), lab.write_nikon(tmp_path / "nikon", truth)
     text = (path / "scan.xtekct").read_text().replace("Name=scan", "Name=3e2 Zähne").replace("2.5", "2,5")
     (path / "scan.xtekct").write_bytes(text.replace("[Xrays]", "Units=MM\r\n[Xrays]").replace(".0", ",0").encode(code))
     for file in path.glob("*.tif"):
@@ -317,8 +311,7 @@ def test_more_and_fewer_files_than_a_description_states(tmp_path, make_truth, ca
     for form, digits in (("nikon", 4), ("skyscan", 8)):
         path = written(form, tmp_path / form, make_truth(geometry=CENTRED))
         last = sorted(path.glob("scan_*0*.tif"))[-1]
-        beyond = path / f"scan_{int(last.stem[5:]) + 1:0{digits}d}.tif"
-        beyond.write_bytes(last.read_bytes())
+        (beyond := path / f"scan_{int(last.stem[5:]) + 1:0{digits}d}.tif").write_bytes(last.read_bytes())
         whole = import_scan(path)
         assert whole.frames == 6 and f"left out: {beyond.name}" in caplog.text
         other = {"nikon": -1, "skyscan": 1}[form]  # from another number on any file may be the surplus one

@@ -13,7 +13,6 @@ from phyradgs_cl.importers.formats.pickles import PlainUnpickler
 from phyradgs_cl.importers.frames import line_integrals
 
 pytestmark = pytest.mark.slow
-
 FRAMES = np.array([[[100.0, 50.0], [25.0, 10.0]]] * 3, np.float32)
 
 

@@ -17,7 +17,6 @@ from phyradgs_cl.importers import ImportOptions, import_scan, load_volume
 from phyradgs_cl.importers.options import option_name
 
 pytestmark = pytest.mark.slow
-
 KEY = np.repeat([2, 1, 0, 1], [1, 2, 6, 2])
 ANGLE_DEG = np.where(KEY == 0, np.cumsum(KEY == 0) * 20.0 - 20.0, np.nan)
 FRAMES = np.choose(KEY, [20000, 50000, 100])[:, None, None] * np.ones((1, 4, 5))
@@ -203,8 +202,7 @@ def test_data_exchange_of_beamlines(tmp_path, added, side_mm, caplog) -> None:
             if unit:
                 file[where].attrs["units"] = unit
     scan = import_scan(path, ImportOptions(quantity="counts"))
-    assert scan.geometry.pixel_size_mm == pytest.approx((side_mm, side_mm))
-    assert "no angles: 0° to 180°" in caplog.text
+    assert scan.geometry.pixel_size_mm == pytest.approx((side_mm, side_mm)) and "no angles: 0° to 180°" in caplog.text
     expected = np.log((np.array([50000 - 10000 / 12, 40000 + 10000 / 12]) - 100) / 19900)  # within the first and last
     np.testing.assert_allclose(scan.projections[[0, -1], 0, 0], expected, rtol=1e-3)
     stated = ImportOptions(quantity="counts", angles="0,30", at=("angles=/exchange/nothing",))
@@ -257,8 +255,7 @@ def test_exposures_and_the_monitor_of_the_beam_in_nxtomo(tmp_path, caplog, expos
     same(path := lit(tmp_path / "a.nxs", times, exposure, **added))
     assert "control/data: frames are divided by it (0." in caplog.text and "say at monitor=none to leave" in caplog.text
     assert ("times as long" in caplog.text) == (exposure != 1)
-    without = import_scan(path, ImportOptions(at=("monitor=none",)))
-    assert np.ptp(without.projections[:, 0, 0]) > 0.05
+    assert np.ptp(import_scan(path, ImportOptions(at=("monitor=none",))).projections[:, 0, 0]) > 0.05
 
 
 @pytest.mark.parametrize("monitor", [np.ones(3), np.logspace(0, 2, len(KEY)), np.where(KEY == 1, np.nan, 1.0)])
@@ -273,8 +270,7 @@ def test_the_source_of_a_beamline_is_so_far_that_its_beam_is_parallel(tmp_path, 
     scan = import_scan(path)
     assert scan.is_parallel and scan.geometry.pixel_size_mm == pytest.approx((0.009, 0.018))
     assert "a source 90 m away, whose fan moves rays by" in caplog.text and "a parallel beam" in caplog.text
-    given = ImportOptions(source_to_axis_mm=5e4, source_to_detector_mm=5.1e4)
-    assert import_scan(path, given).is_parallel
+    assert import_scan(path, ImportOptions(source_to_axis_mm=5e4, source_to_detector_mm=5.1e4)).is_parallel
     wide = {"data": np.ones((11, 1, 9000)) * FRAMES[:, :1, :1], "x_pixel_size": 9e-5, "y_pixel_size": 9e-5}
     with pytest.raises(InputError, match=r"source/distance: found a source 90 m away.*\[source\] beam = 'parallel'"):
         import_scan(nxtomo(tmp_path / "b.nxs", added=added, **wide))

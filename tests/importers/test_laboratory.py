@@ -16,7 +16,6 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
 
 pytestmark = pytest.mark.slow
-
 CENTRED = ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5))
 WRITERS: dict[str, tuple[Callable[..., Path], ConeGeometry]] = {
     "nikon": (lab.write_nikon, CENTRED),
@@ -33,8 +32,7 @@ def test_pixels_and_geometry_are_those_of_the_scan_that_was_written(tmp_path, ma
     truth = make_truth(geometry=geometry)
     path = writer(tmp_path / form, truth)
     assert recognise(path) == form
-    scan = import_scan(path)
-    assert_same(scan, truth, grid=False, pixels=1e-3)
+    assert_same(scan := import_scan(path), truth, grid=False, pixels=1e-3)
     assert isinstance(scan.trajectory, CircularOrbit)
     np.testing.assert_array_equal(scan.projections, lab.line_integrals_of(lab.counts16(truth)))
     fly = make_truth(fly=True, direction=-1, geometry=geometry)
@@ -100,8 +98,7 @@ def test_skyscan_s_pixels_are_not_square_and_its_sample_turns_either_way(tmp_pat
         assert text in caplog.text
     assert not any(text in caplog.text for text in ("STEP", "an exposure", "Random Movement"))
     other = {"Rotation Direction": "CC", "Type of Detector Motion": None, "Random Movement": "ON (10)"}
-    back = lab.write_skyscan(tmp_path / "b", truth, **other)
-    scan = import_scan(back)
+    scan = import_scan(lab.write_skyscan(tmp_path / "b", truth, **other))
     falls_where(scan, -truth.angle_rad, geometry)
     assert "an exposure of 0.4 s and no time from frame to frame" in caplog.text  # two frames of 200 ms
     assert "Random Movement is ON (10): the log states no shifts" in caplog.text
@@ -110,19 +107,20 @@ def test_skyscan_s_pixels_are_not_square_and_its_sample_turns_either_way(tmp_pat
     np.testing.assert_array_equal(fly.projections, lab.line_integrals_of(lab.counts16(truth)))
 
 
-@pytest.mark.parametrize(("lines", "words"), [
-    ({"Type of Detector Motion": "CONTINUOUS"}, r"0.4 s and a sample that never stopped \(CONTINUOUS\), .* at rest; say"),
-    ({"Camera Offset": "ON"}, "Camera Offset is ON: only the images of this log"),
-    ({"Number of connected scans": 3}, "Number of connected scans is 3: only"),
-    ({"Camera Pixel Size (um)": 4000.0}, "2.5 mm on the panel, where the camera's pixels are 4 mm: else say pixel_size_mm"),
-    ({"Suggested HU": "1\n[Reconstruction]\nPostalignment=-1.50"}, "not by Postalignment, -1.50, whose sign"),
-    ({"Camera Pixel Size (um)": 1250.0, "Camera binning": "2x2", "Number of connected scans": 1}, ""),
-])  # fmt: skip
-def test_what_a_skyscan_s_log_says_and_is_not_used_is_named(tmp_path, make_truth, caplog, lines, words) -> None:
-    geometry = ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5), (4.0, 0.0))
-    import_scan(lab.write_skyscan(tmp_path / "a", make_truth(geometry=geometry), **lines))
-    assert re.search(words, caplog.text)
-    assert words or not re.search("Camera|connected|Postalignment|never stopped", caplog.text)
+def test_what_a_skyscan_s_log_says_and_is_not_used_is_named(tmp_path, make_truth, caplog) -> None:
+    truth = make_truth(geometry=ConeGeometry(500.0, 800.0, (10, 14), (3.0, 2.5), (4.0, 0.0)))
+    fine = {"Camera Pixel Size (um)": 1250.0, "Camera binning": "2x2", "Number of connected scans": 1}
+    import_scan(lab.write_skyscan(tmp_path / "a", truth, **fine))
+    assert not re.search("Camera|connected|Postalignment|never stopped", caplog.text)
+    odd = {"Camera Offset": "ON", "Number of connected scans": 3, "Camera Pixel Size (um)": 4000.0}
+    odd |= {"Type of Detector Motion": "CONTINUOUS", "Suggested HU": "1\n[Reconstruction]\nPostalignment=-1.50"}
+    import_scan(lab.write_skyscan(tmp_path / "b", truth, **odd))
+    for words in (
+        r"0.4 s and a sample that never stopped \(CONTINUOUS\), .* at rest; say", "is ON: only the images of this log",
+        "Number of connected scans is 3: only", "where the camera's pixels are 4 mm: else say pixel_size_mm",
+        "not by Postalignment, -1.50, whose sign",
+    ):
+        assert re.search(words, caplog.text)
 
 
 def test_zeiss_s_reference_of_another_exposure_is_scaled(tmp_path, make_truth, caplog) -> None:

@@ -17,7 +17,6 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
 
 pytestmark = pytest.mark.slow
-
 # Written by RTK 2.7: three projections, the third tilted about all axes with every offset in use.
 DATA = Path(__file__).with_name("data")
 RTK_FILE, RTK_PARALLEL = DATA / "rtk_tilted.xml", DATA / "rtk_parallel.xml"
@@ -37,8 +36,7 @@ def rtk_folder(tmp_path) -> Path:
 
 def rtk_pixels(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Pixels (n, 2) (row, column) by RTK's own 3×4 matrix; its axes (X, Y, Z) are (y, z, x) here."""
-    theirs = np.concatenate([points[:, [1, 2, 0]], np.ones((len(points), 1))], 1)
-    u, v, w = matrix @ theirs.T
+    u, v, w = matrix @ np.concatenate([points[:, [1, 2, 0]], np.ones((len(points), 1))], 1).T
     return np.stack([(v / w - ORIGIN[1]) / SPACING[1], (u / w - ORIGIN[0]) / SPACING[0]], -1)
 
 
@@ -120,8 +118,7 @@ def test_circles_beside_the_axis(tmp_path, real_truth) -> None:
 
 def test_windows_that_overlap_are_moved_apart(tmp_path, real_truth) -> None:
     sweeps = real_truth.scan.trajectory.kinematics
-    wide = replace(sweeps, angle_end_rad=sweeps.angle_start_rad + np.deg2rad(24))
-    orbit = CircularOrbit(REAL_GEOMETRY, wide)
+    orbit = CircularOrbit(REAL_GEOMETRY, replace(sweeps, angle_end_rad=sweeps.angle_start_rad + np.deg2rad(24)))
     wide_truth = replace(real_truth, scan=replace(real_truth.scan, trajectory=orbit))
     scan = import_scan(write_phyradgs_real(tmp_path / "real", wide_truth), REAL)
     assert np.diff(scan.frame_start_s).min() > scan.shutter.span_s

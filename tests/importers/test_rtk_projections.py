@@ -1,7 +1,5 @@
-"""Raw projections of makers, read by the package itk-rtk, where that is installed (conftest.py).
-
-They are written here as Elekta, Varian and medPhoton write them, in the layouts that RTK's readers state. ``AIR`` are the
-counts that RTK takes for air."""
+"""Raw projections, read by the package itk-rtk, where it is installed (conftest.py), and written here as Elekta, Varian and
+medPhoton write them, in the layouts that RTK's readers state. ``AIR`` are the counts that RTK takes for air."""
 
 import struct
 from collections.abc import Callable
@@ -69,9 +67,8 @@ def differences(image: np.ndarray) -> tuple[bytes, bytes]:
 
 def obi_header(shape: tuple[int, int], pitch_mm: tuple[float, float], angle_deg: float) -> bytes:
     """The header of .hnd and .hnc: words and numbers in a fixed order, of which RTK reads size, pitch and angle."""
-    text = struct.pack(
-        "<32sI4sI8s8s16sI16sI16sI", b"VARIAN_VA_INTERNAL_HNC_1.0", 0, b"", 0, b"", b"", b"", 0, b"", 0, b"", 0
-    )
+    first = "<32sI4sI8s8s16sI16sI16sI", b"VARIAN_VA_INTERNAL_HNC_1.0"
+    text = struct.pack(*first, 0, b"", 0, b"", b"", b"", 0, b"", 0, b"", 0)
     text += struct.pack("<IId16sIII4s", shape[1], shape[0], 0.0, b"RTIMAGE", 0, 0, 0, b"")
     numbers = np.zeros(40)
     numbers[[23, 24]] = pitch_mm[::-1]  # dIDUResolutionX, -Y
@@ -106,8 +103,7 @@ def write_obi(folder: Path, truth: Any, suffix: str, fan: str = "HalfFan") -> Pa
 def write_probeam(folder: Path, truth: Any) -> Path:
     """Scan.xml, and .xim of packed differences in Acquisitions/NUMBER/, each with the panel's place in cm and the source's
     angle, which turns against the gantry's."""
-    images = folder / "Acquisitions" / "733061622"
-    images.mkdir(parents=True)
+    (images := folder / "Acquisitions" / "733061622").mkdir(parents=True)
     g = truth.scan.geometry
     distances = f"<SAD>{g.source_to_axis_mm}</SAD><SID>{g.source_to_detector_mm}</SID>"
     (folder / "Scan.xml").write_text(f"<?xml version='1.0'?><Scan><Acquisitions>{distances}</Acquisitions></Scan>")

@@ -13,7 +13,6 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
 
 pytestmark = pytest.mark.slow
-
 FLY = ImportOptions(0.4, 0.3, 1.25, readout_axis="columns", readout_direction=-1)
 MOVING = {"fly": True, "axis": "columns", "direction": -1}
 ALL = ImportOptions(part="all")
@@ -42,8 +41,6 @@ SAME = {
     "tiff, starts": ("tiff", {"timing": TIMED.format(STARTS), "angles": STEPS}, MOVING, None),
     "tiff, middles": ("tiff", {"timing": EVERY, "angles": MIDDLE}, MOVING, None),
 }  # fmt: skip
-
-
 SAID = ": a parallel beam"
 OFFSET = {"detector_offset_mm": (4.0, -6.0)}
 PARALLEL = {
@@ -105,8 +102,7 @@ def test_data_exchange(tmp_path, make_truth, assert_same) -> None:
     truth = make_truth()
     path = w.write_data_exchange(tmp_path / "scan.h5", truth, dead=(2, 11))
     assert recognise(path) == "data-exchange"
-    scan = import_scan(path, ImportOptions(**CONE))
-    assert_same(scan, truth, grid=False)
+    assert_same(scan := import_scan(path, ImportOptions(**CONE)), truth, grid=False)
     assert scan.pixel_mask.shape == truth.scan.geometry.detector_shape
     assert list(zip(*np.nonzero(scan.pixel_mask), strict=True)) == [(2, 11)]
     for name in ("data_white", "data_dark"):
@@ -120,8 +116,7 @@ def test_nxtomo(tmp_path, make_truth, assert_same, caplog, flips) -> None:
     truth = make_truth(geometry=replace(make_truth().scan.geometry, detector_offset_mm=(0.0, -6.0)))
     path = w.write_nxtomo(tmp_path / "theirs.nx", truth, flips)
     assert recognise(path) == "nxtomo"
-    scan = import_scan(path)
-    assert_same(scan, truth, grid=False, timing=False)
+    assert_same(scan := import_scan(path), truth, grid=False, timing=False)
     assert scan.shutter.exposure_s == pytest.approx(0.4) and scan.title == "theirs"
     assert "row 0 is taken as the lowest" in caplog.text and "say row_0 top" in caplog.text
     assert "an exposure of 0.4 s and no time from frame to frame: taken at rest; say frame_time_s or fps" in caplog.text

@@ -14,7 +14,6 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
 
 pytestmark = pytest.mark.slow
-
 SQUARE = replace(GEOMETRY, detector_offset_mm=(3.0, -5.0))  # whole and half pixels, which text keeps to the bit
 FLAT = ParallelGeometry((10, 14), (3.0, 2.5), (3.0, -5.0))
 
@@ -60,8 +59,7 @@ def test_leap_s_formula_sees_points_where_our_poses_do(tmp_path, make_truth, cap
 
 def test_leap_s_modular_beam_is_a_table_of_views(tmp_path, make_truth, assert_same) -> None:
     truth = make_truth()
-    poses = GEOMETRY.pose(truth.angle_rad).reshape(-1, 4, 3)
-    source, first, step_u, step_v = poses.swapaxes(0, 1)
+    source, first, step_u, step_v = GEOMETRY.pose(truth.angle_rad).reshape(-1, 4, 3).swapaxes(0, 1)
     centre = first + 6.5 * step_u + 4.5 * step_v
     vectors = {"sourcePositions": source, "moduleCenters": centre, "rowVectors": step_v / 3.0, "colVectors": step_u / 2.5}
     lines = {name: ", ".join(map(repr, table.ravel().tolist())) for name, table in vectors.items()}
@@ -79,10 +77,9 @@ RAW = {"_Frames.xml": "1.his", "ProjectionInfo.xml": "1.hnd", "Scan.xml": "1.xim
 def test_raw_projections_are_recognised_and_name_the_package_that_reads_them(tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "itk", None)
     for description, projection in RAW.items():
-        folder = tmp_path / projection
-        folder.mkdir()
+        (folder := tmp_path / projection).mkdir()
         for name in (description, projection):
-            (folder / name).write_bytes(b"")
+            (folder / name).touch()
         assert recognise(folder) == recognise(folder / description) == "rtk-projections"
         with pytest.raises(InputError, match=r"phyradgs-cl\[rtk\]"):
             import_scan(folder)

@@ -59,8 +59,7 @@ def write_phyradgs(folder: Path, truth: Any) -> Path:
     """A synthetic PhyRadGS folder: the same, with where first and last lines began and ended."""
     write_r2(folder, truth, test=0)
     shutter, sweeps = truth.scan.shutter, truth.scan.trajectory.kinematics
-    arc = sweeps.angle_end_rad - sweeps.angle_start_rad
-    meta = json.loads((folder / "meta_data.json").read_text())
+    arc, meta = sweeps.angle_end_rad - sweeps.angle_start_rad, json.loads((folder / "meta_data.json").read_text())
     meta["simulate_train"] = [
         {
             **entry, "first_line_start": entry["angle"], "first_line_end": entry["angle"] + a,
@@ -340,8 +339,6 @@ WRITERS = {
     "flexray": (lab.write_flexray, "flexray"), "zeiss": (lab.write_zeiss, "sample.txrm"),
     "leap": (write_leap, "leap"), "tigre": (write_tigre, "tigre.pickle"),
 }  # fmt: skip
-
-
 # of the panel, where a format cannot state all
 OFFSETS_MM = {"phyradgs-real": (4.0, 0.0), "nikon": (0.0, 0.0), "zeiss": (0.0, 0.0), "skyscan": (4.0, 0.0)}
 

@@ -58,8 +58,7 @@ def test_damage_is_named_in_one_line(path: Path, name: str, damage: Change, subj
 def a_moving_scan(make_scan: Callable[..., Scan]) -> Scan:
     states = np.random.default_rng(3).uniform(0, 1, (2, *make_scan().grid.shape)).astype(np.float32)
     field = Deformation(np.full((1, 2, 2, 2, 3), 0.1), (0.0, 0.0, 0.0), 4.0, np.array([0.0, 5.0]), np.array([[0.0], [1.0]]))
-    truth = MovingTruth(np.array([1.0, 2.5]), states, field)
-    return make_scan(reference=states[0], moving_truth=truth)
+    return make_scan(reference=states[0], moving_truth=MovingTruth(np.array([1.0, 2.5]), states, field))
 
 
 def test_a_scan_holds_states_and_how_they_came_about(tmp_path: Path, make_scan: Callable[..., Scan]) -> None:

@@ -12,7 +12,6 @@ from phyradgs_cl.io import only_run
 from phyradgs_cl.io.output import lock_path
 
 pytestmark = pytest.mark.slow
-
 HOLD = """
 import sys, time
 from phyradgs_cl.io import only_run

@@ -14,7 +14,6 @@ from phyradgs_cl.io.scan.motion import sampled
 from phyradgs_cl.reconstructors import RunPlan, method_options, reconstruct
 
 pytestmark = pytest.mark.slow
-
 GEOMETRY = ConeGeometry(500.0, 800.0, (9, 12), (6.0, 5.0))
 TURN = CircularOrbit(GEOMETRY, ConstantSpeed(0.0, 0.5))
 

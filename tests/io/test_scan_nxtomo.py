@@ -64,5 +64,4 @@ def test_we_read_a_file_of_nxtomo(nxtomo, tmp_path) -> None:
     found = scan.geometry.source_to_axis_mm, scan.geometry.source_to_detector_mm, *scan.geometry.pixel_size_mm
     assert found == pytest.approx((500, 750, 0.3, 0.2)) and scan.shutter.exposure_s == pytest.approx(0.1)
     np.testing.assert_array_equal(scan.projections, tomo.instrument.detector.data)
-    start_s = scan.frame_start_s[2:3]
-    assert np.rad2deg(scan.trajectory.angle_rad(2, start_s))[0] == pytest.approx(-72)
+    assert np.rad2deg(scan.trajectory.angle_rad(2, scan.frame_start_s[2:3]))[0] == pytest.approx(-72)

@@ -12,7 +12,6 @@ from phyradgs_cl.io import load_scanner, with_detector_count
 from phyradgs_cl.simulation import scanner_options
 
 pytestmark = pytest.mark.slow
-
 DATA = Path(__file__).parents[2] / "data"
 GOOD = """
 [source]

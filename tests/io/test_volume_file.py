@@ -19,8 +19,7 @@ PROVENANCE = {"method": "fdk", "seed": 7, "options": {"filter": "ram-lak", "M": 
 
 @pytest.fixture
 def stored(tmp_path):
-    volume = np.arange(24, dtype=np.float32).reshape(GRID.shape) / 1000
-    rows = np.arange(5 * 11.0).reshape(5, 11)
+    volume, rows = np.arange(24, dtype=np.float32).reshape(GRID.shape) / 1000, np.arange(5 * 11.0).reshape(5, 11)
     gaussians = Gaussians(rows[:, :3], rows[:, 3:6], rows[:, 6:10], rows[:, 10])
     parts = PROVENANCE, gaussians, {"psnr_db": np.float64(31.5)}
     write_volume(tmp_path / "volume.h5", volume, GRID, *parts)

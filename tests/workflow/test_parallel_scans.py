@@ -30,6 +30,5 @@ def test_laminography_is_reconstructed(rt, method: str) -> None:
     with pytest.raises(InputError, match="laminography"):
         reconstruct(laminography_scan(8), plan_run("fbp", {}), rt)
     scan, iterations = laminography_scan(), {"fista": 6, "phyradgs": 300}[method]
-    result = reconstruct(scan, plan_run(method, {"iterations": iterations}), rt)
-    truth = BODIES.voxelise(scan.grid, 2)
+    result, truth = reconstruct(scan, plan_run(method, {"iterations": iterations}), rt), BODIES.voxelise(scan.grid, 2)
     assert np.linalg.norm(result.volume - truth) < 0.4 * np.linalg.norm(truth)

@@ -20,7 +20,6 @@ from phyradgs_cl.workflow import load_scan, run_reconstruction
 from phyradgs_cl.workflow.slabs import Slabs, rows_of, surely_fits
 
 pytestmark = pytest.mark.slow
-
 ROWS, SIDE, VIEWS = 26, 24, 30
 GRID = Grid((24, SIDE, SIDE), (0.08, 0.08, 0.08), (0.02, 0.0, 0.0))
 

@@ -88,8 +88,7 @@ def test_a_sweep_goes_on_where_it_was_stopped(sweep) -> None:
     (sweep.folder / RESULTS).write_bytes(whole[:-30])  # killed while the last line was written
     told = []
     sweep.run(tell=lambda done, line: told.append(done))
-    assert told == list(range(5, RUNS + 1))
-    assert len(sweep.lines()) == RUNS == len({line["run"] for line in sweep.lines()})
+    assert told == list(range(5, RUNS + 1)) and len(sweep.lines()) == RUNS == len({line["run"] for line in sweep.lines()})
     sweep.run()
     assert len(sweep.lines()) == RUNS
 
@@ -106,8 +105,7 @@ def test_failures_are_noted_and_tried_again(cli, sweep, monkeypatch, capsys) -> 
 
     monkeypatch.setattr(sweep_run, "resume_or_restart", failing)
     monkeypatch.setattr(sweep_run, "_BUSY_S", 0.0)
-    assert cli.run(["sweep", str(sweep.grid), "-o", str(sweep.folder)]) == 2
-    assert "4 runs failed" in capsys.readouterr().err
+    assert cli.run(["sweep", str(sweep.grid), "-o", str(sweep.folder)]) == 2 and "4 runs failed" in capsys.readouterr().err
     noted = sorted(line["error"] for line in sweep.lines() if "error" in line)
     assert noted[:2] == ["ZeroDivisionError: a defect", "device: found lost"]
     assert noted[2:] == ["scan: found no good | at all", "volume: found busy"]
@@ -183,8 +181,7 @@ def test_a_checkpoint_that_does_not_fit_is_set_aside(again, tmp_path, what) -> N
     again(stop_at=3)
     content = checkpoint.read_bytes()
     if what == "damaged":
-        content = content[: len(content) // 2]
-        checkpoint.write_bytes(content)
+        checkpoint.write_bytes(content := content[: len(content) // 2])
     result, seen = again(plan=PLAN if what == "damaged" else replace(PLAN, seed=1))
     assert not result.interrupted_at and min(seen) <= 3 and Path(f"{checkpoint}.bak").read_bytes() == content
 
@@ -214,8 +211,7 @@ def test_lists_are_multiplied_and_runs_taken_as_they_are(plan) -> None:
         method = "FDK"
         size = [4, 5, 6]
     """)  # fmt: skip
-    settings = 8 + 2 + 1
-    assert len(runs) == 2 * settings * 2 and [run.scan.name for run in runs[:: len(runs) // 2]] == ["a.h5", "b.h5"]
+    assert len(runs) == 2 * (8 + 2 + 1) * 2 and [run.scan.name for run in runs[:: len(runs) // 2]] == ["a.h5", "b.h5"]
     assert [run.plan.seed for run in runs[:4]] == [0, 3, 0, 3]
     first, splats, fdk = runs[0], runs[16], runs[20]
     assert first.facts["label"] == "sirt holdout=3 motion=static iterations=5"
