@@ -40,7 +40,7 @@ def reconstructed(cli, tmp_path):
     return reconstruct
 
 
-def test_info_tells_tables_in_words_and_long_ones_in_few_lines(cli, tmp_path, capsys):
+def test_info_tells_tables_in_words_and_long_ones_in_few_lines(told, tmp_path):
     step = {"step": "sparks", "pixels": 3, "options": {"least": 0.1}}
     facts = {
         "prepared": [step] * 40, "doubt": {"runs": 3, "mean_per_mm": 0.0123456789, "held_out": None},
@@ -48,15 +48,13 @@ def test_info_tells_tables_in_words_and_long_ones_in_few_lines(cli, tmp_path, ca
     }  # fmt: skip
     grid = Grid.cube(2, 2.0)
     write_volume(tmp_path / "v.h5", np.ones(grid.shape, np.float32), grid, facts)
-    assert cli.run(["info", str(tmp_path / "v.h5")]) == 0
-    told = capsys.readouterr().out
-    lines = told.splitlines()
+    lines = (text := told("info", tmp_path / "v.h5")).splitlines()
     said = {"doubt": "runs 3, mean 0.0123457 1/mm", "times": "500 values from 0 to 49.9", "scan": facts["scan"]}
-    assert {f"{key:24s} {text}" for key, text in said.items()} <= {*lines}
+    assert {f"{key:24s} {value}" for key, value in said.items()} <= {*lines}
     (first,) = [line for line in lines if line.startswith("prepared")]
     assert first[25:].startswith("step sparks, pixels 3, options (least 0.1); step sparks, pixels 3")
-    assert sum(line.startswith(" ") for line in lines) == 5 and "… (--json)" in told
-    assert "interrupted" not in told and "{" not in told
+    assert sum(line.startswith(" ") for line in lines) == 5 and "… (--json)" in text
+    assert "interrupted" not in text and "{" not in text
 
 
 def test_the_error_on_held_out_pixels_is_said_and_kept(scan, reconstructed, capsys):

@@ -78,9 +78,8 @@ def test_what_is_around_the_method_counts_and_fdk_is_run(rt, scan, clock, estima
     assert (found.seconds, found.iterations) == (2.25, 0) and "iterations" not in found.text()
 
 
-def test_the_command_says_time_and_memory(cli, scan, capsys) -> None:
-    assert cli.run(["estimate", str(scan), "--method", "fista-tv"]) == 0
-    text = capsys.readouterr().out
+def test_the_command_says_time_and_memory(told, scan) -> None:
+    text = told("estimate", scan, "--method fista-tv")
     assert text.startswith("fista-tv on ")
     assert re.search(r"^time +\S+ (s|min)", text, re.M) and int(re.search(r"^memory +(\d+) MiB", text, re.M)[1]) > 10
     whole, count, each, *others = re.findall(r"([\d.]+(?:e[+-]\d+)?) (?:s|ms|iterations)", text.splitlines()[1])
@@ -106,10 +105,8 @@ def test_the_words_of_reconstruct(cli, refused, scan, monkeypatch) -> None:
     refused(["estimate", scan, "--method", "phyradgs", "--motion", "per-row"], "--motion")
 
 
-def test_profile_says_where_the_time_went(cli, scan, tmp_path, capsys) -> None:
-    command = ["reconstruct", str(scan), "-o", str(tmp_path / "v"), "--method", "phyradgs", "--motion", "static"]
-    command += ["--iterations", "5"]
-    assert cli.run([*command, "--profile"]) == 0
-    text = capsys.readouterr().out
+def test_profile_says_where_the_time_went(told, scan, tmp_path) -> None:
+    line = f"reconstruct {scan} -o {tmp_path}/v --method phyradgs --motion static --iterations 5"
+    text = told(line, "--profile")
     assert all(re.search(rf"^splat_{way}_(rows|pixels|group) +5 ", text, re.M) for way in ("forward", "backward"))
-    assert cli.run(command) == 0 and "splat_forward" not in capsys.readouterr().out
+    assert "splat_forward" not in told(line)

@@ -14,23 +14,21 @@ INSIDE = "-0.5,0.5,-0.5,0.75,-0.75,0.5"  # of a box of ±1 mm in voxels of 0.25 
 SIRT = ["--method", "sirt", "--iterations", "2"]
 
 
-def test_what_is_chosen_is_in_the_result_and_told(cli, scan, tmp_path, capsys, caplog) -> None:
+def test_what_is_chosen_is_in_the_result_and_told(told, scan, tmp_path, caplog) -> None:
     output = tmp_path / "v.h5"
-    assert cli.run(["reconstruct", str(scan), "-o", str(output), "--method", "FDK", "--size", "10,11,12"]) == 0
+    line = told(f"reconstruct {scan} -o {output} --method FDK --size 10,11,12")
     stored = read_volume(output)
     assert stored.grid == Grid((10, 11, 12), (0.2, 2 / 11, 2 / 12))
     assert stored.provenance["input"]["size"] == [10, 11, 12] and stored.provenance["method"] == "fdk"
     with h5py.File(output) as file:
         assert file["entry/reconstruction/x"][()] == pytest.approx(stored.grid.axes_mm()[2])
-    assert not caplog.records
-    line = capsys.readouterr().out
+    assert not caplog.records and " size (10, 11, 12), " in told("info", output)
     assert f"PSNR {stored.metrics['psnr_db']:.2f} dB" in line and "resampled (linear) from 12×11×10 voxels" in line
-    assert cli.run(["info", str(output)]) == 0 and " size (10, 11, 12), " in capsys.readouterr().out
     run = load_run(output, scan)
     assert run.reference is None and "its slices are not shown" in run.notes[-1]
     assert run.metrics == stored.metrics and "resampled" in run.compared
-    assert cli.run(["reconstruct", str(scan), "-o", str(output), "--method", "fdk", "--size", "4"]) == 0
-    assert "with means of the reference over 2×2×2 voxels" in capsys.readouterr().out
+    line = told(f"reconstruct {scan} -o {output} --method fdk --size 4")
+    assert "with means of the reference over 2×2×2 voxels" in line
     stored, run = read_volume(output), load_run(output, scan)
     assert run.compared == stored.provenance["compared"] and run.reference.shape == (4, 4, 4)
     write_volume(output, stored.values, stored.grid, stored.provenance)  # as written before there was a score

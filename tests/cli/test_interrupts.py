@@ -1,6 +1,5 @@
 """Ctrl-C at every stage: one line, status 130, outputs whole or as they were; volumes of which all readers say so."""
 
-import json
 import signal
 import subprocess
 import sys
@@ -136,7 +135,7 @@ AT_A_REPORT = """
 """
 
 
-def test_a_loop_is_saved_beside_the_output_and_goes_on(cli, scan, tmp_path, capsys):
+def test_a_loop_is_saved_beside_the_output_and_goes_on(cli, told, scan, tmp_path):
     """Splats, which report every 50 iterations, in a process of Python: api/test_interrupts.py."""
     output, whole = tmp_path / "volume.h5", tmp_path / "whole.h5"
     output.write_bytes(b"an older result")
@@ -148,8 +147,7 @@ def test_a_loop_is_saved_beside_the_output_and_goes_on(cli, scan, tmp_path, caps
     assert done.stdout.startswith(f"{partial}: sart") and output.read_bytes() == b"an older result"
     left = {"volume.h5", "volume.h5.checkpoint.npz", "volume.partial.h5"}
     assert {path.name for path in tmp_path.iterdir()} - {"now.partial.png"} == left
-    assert cli.run(["evaluate", str(partial), "--reference", str(scan), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    facts = told("evaluate", partial, "--reference", scan, "--json")
     assert (facts["interrupted_at"], facts["iterations_asked"]) == (2, 8)
     (tmp_path / "volume.partial.evaluated.png").unlink()
     assert cli.run([*command, str(output), "--resume", "--preview", str(tmp_path / "now.png")]) == 0
@@ -229,14 +227,13 @@ READERS = (
 
 
 @pytest.mark.parametrize("line", READERS)
-def test_a_reader_says_where_the_run_was_interrupted(cli, tmp_path, monkeypatch, caplog, capsys, line) -> None:
+def test_a_reader_says_where_the_run_was_interrupted(told, tmp_path, monkeypatch, caplog, line) -> None:
     monkeypatch.chdir(tmp_path)
     grid, history = Grid.cube(6, 2.0), {"method": "sirt", "interrupted_at": 812, "options": {"iterations": 3000}}
     write_volume("v.h5", np.linspace(0, 1, 216, dtype=np.float32).reshape(grid.shape), grid, history)
-    assert cli.run(line.split()) == 0 and caplog.text.count(SAID) == 1 and f"v.h5: {SAID}" in caplog.text
-    if "--json" in line:
-        facts = json.loads(capsys.readouterr().out)
-        assert (facts["interrupted_at"], facts["iterations_asked"]) == (812, 3000)
+    facts = told(line)
+    assert caplog.text.count(SAID) == 1 and f"v.h5: {SAID}" in caplog.text
+    assert "--json" not in line or (facts["interrupted_at"], facts["iterations_asked"]) == (812, 3000)
 
 
 def test_a_partial_volume_has_a_name_of_its_own_where_no_scan_lies(refused, tmp_path) -> None:

@@ -1,6 +1,5 @@
 """An object that moves or changes from its simulation to its states: evaluate, export, info and report."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,19 +29,6 @@ def folder(cli, tmp_path_factory) -> Path:
     write_volume(path / "volume.h5", scan.reference, scan.grid, {"method": "made up"})
     write_deformation(path / "field.h5", scan.moving_truth.deformation)
     return path
-
-
-@pytest.fixture
-def told(cli, capfd):
-    """A command's line → what it prints, as facts where that is JSON."""
-
-    def tell(line: str):
-        capfd.readouterr()
-        assert cli.run(line.split()) == 0
-        said = capfd.readouterr().out
-        return json.loads(said) if "--json" in line else said
-
-    return tell
 
 
 def test_a_volume_is_compared_with_every_state(told, refused, folder) -> None:

@@ -1,6 +1,5 @@
 """Volumes and scans in other programs' formats at the commands that read them."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,19 +16,6 @@ from phyradgs_cl.io import write_scan, write_volume
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("fast_pictures")]
 FORMATS = {"v.mha": "mha", "v.nii.gz": "nii", "v.nrrd": "nrrd", "v.npy": "npy", "v.tif": "tiff"}
-
-
-@pytest.fixture
-def told(cli, capfd):
-    """(words...) → what the command prints, as facts where that is JSON."""
-
-    def tell(*words: object):
-        capfd.readouterr()
-        assert cli.run([str(word) for word in words]) == 0
-        said = capfd.readouterr().out
-        return json.loads(said) if "--json" in words else said
-
-    return tell
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """A parallel beam through the commands: from a simulated scan to its quality, and what is refused in one line."""
 
-import json
 import shutil
 from pathlib import Path
 
@@ -17,16 +16,13 @@ def parallel(simulated) -> Path:
     return simulated(*FLY.split())
 
 
-def test_from_a_simulated_scan_to_its_quality(cli, parallel, tmp_path, fast_pictures, capsys) -> None:
+def test_from_a_simulated_scan_to_its_quality(told, parallel, tmp_path, fast_pictures) -> None:
     """Lines' own times help."""
-    assert cli.run(["info", str(parallel)]) == 0
-    facts, volume, psnr_db = capsys.readouterr().out, str(tmp_path / "volume.h5"), []
+    facts, volume, psnr_db = told("info", parallel), tmp_path / "volume.h5", []
     assert "parallel beam" in facts and "source to" not in facts and "(0.106667, 0.106667)" in facts
-    for words in ([], ["--motion", "static"]):
-        assert cli.run(["reconstruct", str(parallel), "--method", "fbp", *words, "-o", volume]) == 0
-        capsys.readouterr()
-        assert cli.run(["evaluate", volume, "--reference", str(parallel), "--json"]) == 0
-        psnr_db.append(json.loads(capsys.readouterr().out)["psnr_db"])
+    for words in ("", "--motion static"):
+        told(f"reconstruct {parallel} --method fbp {words} -o {volume}")
+        psnr_db.append(told(f"evaluate {volume} --reference {parallel} --json")["psnr_db"])
     assert psnr_db[0] > psnr_db[1] > 26
 
 
