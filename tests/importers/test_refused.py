@@ -351,9 +351,9 @@ def test_images_with_too_few_voxels_are_refused(tmp_path, name) -> None:
     else:
         sitk.WriteImage(sitk.GetImageFromArray(values), str(path), useCompression="packed" in name)
     np.testing.assert_array_equal(load_volume(path).values, values)
-    content = path.read_bytes()
+    content, end = path.read_bytes(), -300 if name == "v.tif" else -8
     spoilt = [content[:-200] + bytes(4) + content[-196:]] if name in ("v.nii.gz", "packed.mha") else []
-    for damaged in (content[: len(content) // 2], content[:-8], *spoilt):
+    for damaged in (content[: len(content) // 2], content[:end], *spoilt):
         path.write_bytes(damaged)
-        with pytest.raises(InputError, match="bytes of data|a damaged file|pages behind the end"):
+        with pytest.raises(InputError, match="bytes of data|a damaged file|pages behind|cannot be read"):
             load_volume(path)

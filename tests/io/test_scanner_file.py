@@ -90,6 +90,7 @@ WRONG = {  # by the place that a message names: what is there in a good file, an
     "[source] to_detector_mm": [("to_detector_mm = 1000.0", "to_detector_mm = 400")],
     "[detector] colums": [("rows = 40", "rows = 40\ncolums = 60")], "[detector] lag": [("lag = 0.03", "lag = 1.0")],
     "[detector] rows": [("rows = 40", f"rows = {rows}") for rows in (10**400, 40.5, "true")],
+    "[volume] size_mm": [("[10.0, 20.0, 80.0]", "[10.0, 0, 80.0]")],
     "[volume] shape": [("shape = [10, 20, 40]", f"shape = {shape}") for shape in ([10, 20], 10, [10, 0, 40])],
     "[readout] axis": [('axis = "columns"', 'axis = "cols"')], "[readout] direction": [("direction = -1", "direction = 0")],
     "[readout] first": [("direction = -1", 'first = "top"')],
