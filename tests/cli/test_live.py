@@ -116,6 +116,7 @@ def test_a_loss_comes_with_its_gaussians_and_rate_and_time_left_count_from_the_f
         for now[0], done, share in reports:
             ticker.show(done, 100, share=share)
         assert capsys.readouterr().err == said
+    now[0] = 0.0
     ticker = Ticker("frame")  # a file gets a line every ten seconds, and the last
     for now[0] in map(float, range(31)):
         ticker.show(int(now[0]), 30)

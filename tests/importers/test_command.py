@@ -173,7 +173,8 @@ def test_nothing_that_is_read_is_overwritten(run, tmp_path, make_truth) -> None:
 
 
 def test_frames_without_a_pixel_are_named_and_do_not_count(run, tmp_path) -> None:
-    counts = np.array([500.0, 0.0, 700.0])[:, None, None] * np.ones((1, 4, 5))
+    counts = np.random.default_rng(0).uniform(500.0, 900.0, (3, 4, 5))
+    counts[0, 0, 0], counts[1] = 500.0, 0.0
     with h5py.File(tmp_path / "dx.h5", "w") as file:
         file["exchange/data"], file["exchange/theta"] = counts, np.array([0.0, 120.0, 240.0])
         file["exchange/data_white"], file["exchange/data_dark"] = np.full((2, 4, 5), 1000.0), np.zeros((1, 4, 5))

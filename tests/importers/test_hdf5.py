@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
-from damage import attribute, on, put
+from damage import attribute, on, put, value
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, load_volume
@@ -242,7 +242,8 @@ def test_flats_of_another_exposure_are_scaled_where_data_exchange_says_so(tmp_pa
 def lit(path: Path, times: np.ndarray, flat_exposure: float = 1.0, **added: object) -> Path:
     """The scan of ``nxtomo`` in light that varies by ``times`` (F,), its flats exposed ``flat_exposure`` times as long."""
     light = times * np.where(KEY == 1, flat_exposure, 1.0)
-    return nxtomo(path, added=added, data=100 + (FRAMES - 100) * light[:, None, None])
+    on("entry/instrument/detector/data", value(100 + (FRAMES - 100) * light[:, None, None]))(nxtomo(path, added=added))
+    return path
 
 
 @pytest.mark.parametrize(("exposure", "is_rate"), [(1.0, True), (2.0, True), (0.25, True), (4.0, False), (1.0, False)])
