@@ -208,8 +208,8 @@ def test_the_counts_of_air_replace_those_that_rtk_takes(suffix, make_files, capl
     path, truth = make_files({"his": "elekta", "hnd": "obi", "hnc": "obi-16-bits", "xim": "probeam"}[suffix])
     brighter = import_scan(path, ImportOptions(flat_value=2.0 * AIR[suffix]))
     np.testing.assert_allclose(brighter.projections - truth.scan.projections, np.log(2), atol=1e-3)
-    assert "air" not in caplog.text
     if suffix == "hnc":  # which states none
+        assert "air" not in caplog.text
         import_scan(path)
         assert "air is taken for 65535 counts, as RTK does; say flat_value" in caplog.text
 
