@@ -8,7 +8,7 @@ from unittest.mock import Mock
 import pytest
 
 from phyradgs_cl import estimate as room
-from phyradgs_cl.estimate import estimate
+from phyradgs_cl.estimate import duration, estimate
 from phyradgs_cl.reconstructors import RunPlan, method_options, plan_run
 from phyradgs_cl.reconstructors.splats.options import SplatOptions
 from phyradgs_cl.workflow import load_scan
@@ -110,3 +110,8 @@ def test_profile_says_where_the_time_went(told, scan, tmp_path) -> None:
     text = told(line, "--profile")
     assert all(re.search(rf"^splat_{way}_(rows|pixels|group) +5 ", text, re.M) for way in ("forward", "backward"))
     assert "splat_forward" not in told(line)
+
+
+def test_durations_for_people() -> None:
+    for seconds, text in ((8.26, "8.26 s"), (260.0, "4 min 20 s"), (11100.0, "3 h 05 min")):
+        assert duration(seconds) == text

@@ -9,6 +9,7 @@ import pytest
 from phyradgs_cl.io import read_volume
 from phyradgs_cl.reconstructors import run as room
 from phyradgs_cl.runtime import MEMORY_VARIABLE, context
+from phyradgs_cl.workflow import load_scan
 
 pytestmark = pytest.mark.slow
 VOLUME = ["--phantom", "jaw", "--size", "24", "--detector", "20", "--views", "4", "--time-samples", "2"]
@@ -55,3 +56,11 @@ def test_too_little_and_a_wrong_size_are_named_where_they_stand(refused, scan, t
     monkeypatch.setenv(MEMORY_VARIABLE, "much")
     refused(run, f"{MEMORY_VARIABLE}: found 'much'")
     assert not output.exists()
+
+
+def test_simulation_in_bricks(cli, scan, tmp_path) -> None:
+    """The phantom has twice as many voxels per side: 50·50·64 padded floats, 625 KiB."""
+    found = tmp_path / "bricks.h5"
+    assert cli.run(["simulate", *VOLUME, "--memory", "350KiB", "-o", str(found)]) == 0
+    expected = load_scan(scan).projections
+    np.testing.assert_allclose(load_scan(found).projections, expected, rtol=0, atol=3e-6 * expected.max())

@@ -15,6 +15,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan
 from phyradgs_cl.importers.angles import read_angles_rad
 from phyradgs_cl.importers.series import flat_places, series_of
+from phyradgs_cl.importers.text import number_at_start
 
 pytestmark = pytest.mark.slow
 CENTRED = ConeGeometry(512.0, 1024.0, (10, 14), (2.5, 2.5))
@@ -371,3 +372,11 @@ def test_packed_tiffs_are_read(tmp_path, way) -> None:
         path = folder / f"p_{i:03d}.tif"
         packed_12_bit(path, image) if way == "12 bits" else Image.fromarray(image).save(path, compression=way)
     np.testing.assert_allclose(np.exp(-import_scan(folder).projections) * 4000, frames[:, ::-1], rtol=1e-5)
+
+
+def test_numbers_in_texts() -> None:
+    read = {"0,25 mm": (0.25, "mm"), "1.234,5": (1234.5, ""), "2,500.5um": (2500.5, "um"), "12 week": (12.0, "week")}
+    read["-3E-2"] = (-0.03, "")
+    assert {text: number_at_start(text) for text in read} == read
+    assert all(number_at_start(text) is None for text in ("1,500", "week 12", "1.2.3", ""))
+    assert number_at_start("1,500", comma_is_decimal=True) == (1.5, "")

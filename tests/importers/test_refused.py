@@ -75,6 +75,7 @@ MISTAKES: dict[str, dict[str, Damage]] = {  # by format: the field, or what a me
         "DSD": meta(lambda m: m["scanner"].update(DSD=400)),
         "mode": meta(lambda m: m["scanner"].update(mode="fan")),
         "proj_train[1].angle": meta(lambda m: m["proj_train"][1].pop("angle")),
+        "grid shape": meta(lambda m: m["scanner"].update(nVoxel=[10**6] * 3)),
         "again": meta(lambda m: m["proj_train"].append(m["proj_train"][0])),
         "3 of 4 views at one angle": meta(lambda m: [one.update(angle=0.5) for one in m["proj_train"][:3]]),
         "0000.npy": lambda path: (path / "proj_train/0000.npy").unlink(),
@@ -96,6 +97,7 @@ MISTAKES: dict[str, dict[str, Damage]] = {  # by format: the field, or what a me
         "image": pickled(lambda d: d.update(image=np.zeros((2, 2, 2)))),
     },
     "rtk": {
+        "SourceToIsocenterDistance": text(XML, "Distance>500.0<", "Distance>0<"),
         "SourceToDetectorDistance": text(XML, "Distance>800.0<", "Distance>80<"),
         "GantryAngle": text(XML, "<GantryAngle>", "<GantryAngle>ten "),
         "RadiusCylindricalDetector": text(XML, "<Projection>", f"{CURVED}<Projection>"),

@@ -83,3 +83,16 @@ def test_raw_projections_are_recognised_and_name_the_package_that_reads_them(tmp
         assert recognise(folder) == recognise(folder / description) == "rtk-projections"
         with pytest.raises(InputError, match=r"phyradgs-cl\[rtk\]"):
             import_scan(folder)
+
+
+def test_tigre_s_centre_of_rotation_and_values_per_frame(tmp_path, make_truth) -> None:
+    truth = make_truth(geometry=SQUARE)
+    offsets = np.tile([3.0, -5.0], (6, 1)) + np.arange(6)[:, None] * [0.5, 0.25]
+    scan = import_scan(w.write_tigre(tmp_path / "a.pkl", truth, COR=1.5, offDetector=offsets))
+    assert isinstance(scan.trajectory, PoseTable)
+    for frame in range(6):
+        geometry = replace(SQUARE, detector_offset_mm=tuple(offsets[frame].tolist()))
+        pose = geometry.pose(truth.angle_rad[frame])
+        pose[:6] += np.tile(1.5 * pose[6:9] / 2.5, 2)
+        expected = projected(pose, WORLD_POINTS)
+        np.testing.assert_allclose(projected(pose_at(scan, frame, 0.5), WORLD_POINTS), expected, atol=1e-6)
