@@ -10,8 +10,8 @@ import pytest
 from phyradgs_cl import api
 
 pytestmark = pytest.mark.slow
-TEXT = (Path(__file__).resolve().parents[2] / "docs" / "api.md").read_text(encoding="utf-8")
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+ROOT = Path(__file__).resolve().parents[2]
+TEXT = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, re.S)
 
 
@@ -28,7 +28,7 @@ def test_the_blocks_of_the_page_run_in_order(tmp_path, monkeypatch, capsys) -> N
 
 
 def test_the_readme_s_lines_run_on_raw_counts(scan) -> None:
-    (block,) = re.findall(r"```python\n(.*?)```", (EXAMPLES.parent / "README.md").read_text(encoding="utf-8"), re.S)
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.S)
     counts = np.round(200 + 40_000 * np.exp(-scan.projections)).astype(np.uint16)
     flats, darks = (np.full((2, *counts.shape[1:]), level, np.uint16) for level in (40_200, 200))
     names = {"frames": counts, "angles_deg": 60.0 * np.arange(6), "flats": flats, "darks": darks}
@@ -38,7 +38,6 @@ def test_the_readme_s_lines_run_on_raw_counts(scan) -> None:
 
 def test_the_page_names_everything_and_nothing_else() -> None:
     table = TEXT.split("## A scan")[0]
-    missing = [name for name in api.__all__ if f"`{name}" not in table]
-    assert not missing
+    assert not [name for name in api.__all__ if f"`{name}" not in table]
     for name in re.findall(r"from phyradgs_cl\.api import (.*)", TEXT):
         assert set(re.split(r",\s*", name)) <= set(api.__all__)

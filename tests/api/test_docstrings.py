@@ -45,13 +45,10 @@ def missing(name: str) -> list[str]:
         return ["a docstring"]
     taken = parameters(thing)
     lacks = [f"its parameter {p.name}" for p in taken if not re.search(rf"\b{p.name}\b", doc)]
-    annotations = " ".join(
-        [str(p.annotation) for p in taken] + [str(getattr(thing, "__annotations__", {}).get("return"))]
-    )
+    annotations = " ".join([str(p.annotation) for p in taken] + [str(getattr(thing, "__annotations__", {}).get("return"))])
     if any(word in annotations for word in ARRAYS) and not SHAPE.search(doc):
         lacks.append("the shape of its arrays")
-    is_measure = "float" in annotations or any(word in annotations for word in ARRAYS)
-    if is_measure and not UNIT.search(doc):
+    if any(word in annotations for word in ("float", *ARRAYS)) and not UNIT.search(doc):
         lacks.append("its units")
     if taken and not ERROR.search(doc):
         lacks.append("the error that it raises")

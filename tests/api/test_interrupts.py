@@ -37,8 +37,7 @@ def test_a_script_stops_with_the_partial_volume(tmp_path) -> None:
     """One real SIGINT after the first report."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     child = subprocess.Popen([sys.executable, "-c", SCRIPT], cwd=tmp_path, **pipes)
-    watchdog = threading.Timer(100, child.kill)
-    watchdog.start()
+    (watchdog := threading.Timer(100, child.kill)).start()
     child.stdout.readline()
     child.send_signal(signal.SIGINT)
     said, errors = child.communicate()
@@ -73,8 +72,7 @@ def test_the_partial_result_goes_on_to_the_bits_of_the_whole(rt, scan, tmp_path)
     whole = reconstruct(scan, **options, report=False)
     api.save_volume(tmp_path / "partial.h5", partial)
     for so_far in (partial, api.load_volume(tmp_path / "partial.h5")):
-        went_on = reconstruct(scan, **options, resume=so_far, report=False)
-        np.testing.assert_array_equal(went_on.volume, whole.volume)
+        np.testing.assert_array_equal(reconstruct(scan, **options, resume=so_far, report=False).volume, whole.volume)
     with h5py.File(tmp_path / "partial.h5", "a") as file:
         del file["entry/state/iteration"]
         file.create_group("entry/state/iteration")
@@ -86,8 +84,7 @@ def test_the_partial_result_goes_on_to_the_bits_of_the_whole(rt, scan, tmp_path)
 def test_another_run_is_not_gone_on_with(rt, scan) -> None:
     options = {"method": "sirt", "iterations": 4, "device": rt}
     partial = reconstruct(scan, **options, report=pressing_at(2), on_interrupt="return")
-    wider = replace(scan.grid, voxel_size_mm=(0.5, 0.5, 0.5))
-    mask = np.zeros(scan.projections.shape[1:], bool)
+    wider, mask = replace(scan.grid, voxel_size_mm=(0.5, 0.5, 0.5)), np.zeros(scan.projections.shape[1:], bool)
     mask[3] = True
     for given, changes, words in [
         (replace(scan, projections=scan.projections[::-1]), {}, "scan"), (replace(scan, pixel_mask=mask), {}, "scan"),
@@ -119,10 +116,6 @@ def test_ctrl_c_is_never_lost(rt, scan) -> None:
 class Screen(io.StringIO):
     """A stream that is a terminal or not."""
 
-    def __init__(self, is_terminal: bool) -> None:
-        super().__init__()
-        self.isatty = lambda: is_terminal
-
 
 class NotebookScreen(Screen):
     """The stream of a notebook's kernel."""
@@ -130,16 +123,15 @@ class NotebookScreen(Screen):
     __module__ = "ipykernel.iostream"
 
 
-@pytest.mark.parametrize(("screen", "report", "is_told"), {
-    "terminal": (Screen(True), True, True), "notebook": (NotebookScreen(False), True, True),
-    "a file": (Screen(False), True, False), "asked not to": (Screen(True), False, False),
-    "a function": (Screen(True), lambda progress: None, False),
+@pytest.mark.parametrize(("kind", "is_terminal", "report", "is_told"), {
+    "terminal": (Screen, True, True, True), "notebook": (NotebookScreen, False, True, True),
+    "a file": (Screen, False, True, False), "a function": (Screen, True, lambda progress: None, False),
 }.values())  # fmt: skip
-def test_a_line_tells_how_far_it_is(rt, scan, monkeypatch, screen, report, is_told) -> None:
-    monkeypatch.setattr(sys, "stderr", screen)
+def test_a_line_tells_how_far_it_is(rt, scan, monkeypatch, kind, is_terminal, report, is_told) -> None:
+    monkeypatch.setattr(sys, "stderr", screen := kind())
+    screen.isatty = lambda: is_terminal
     reconstruct(scan, "sirt", iterations=5, device=rt, report=report)
     said = screen.getvalue()
     assert ("iteration 5/5  residual" in said) == is_told
     if is_told:
-        assert said.endswith("\n") and said.count("\n") == 1 and "ETA" in said
-        assert ("\x1b[K" in said) == screen.isatty()
+        assert said.endswith("\n") and said.count("\n") == 1 and "ETA" in said and ("\x1b[K" in said) == is_terminal

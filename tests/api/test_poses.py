@@ -9,7 +9,6 @@ from scipy.ndimage import gaussian_filter
 
 from phyradgs_cl import api
 from phyradgs_cl.api import Exact, MicroViews, move_views, pose_gradient, ray_operator, splat_operator
-from phyradgs_cl.fields import GridChoice
 from phyradgs_cl.io.scan.motion import overlaps
 from phyradgs_cl.io.scan.writer import copy_with_motion
 
@@ -19,8 +18,7 @@ STEPS = (1e-3, 1e-2, 1e-2)  # rad, mm, mm
 
 
 def weights(scan) -> np.ndarray:
-    noise = np.random.default_rng(5).normal(size=scan.projections.shape)
-    return gaussian_filter(noise, (0, 2, 2)).astype(np.float32)
+    return gaussian_filter(np.random.default_rng(5).normal(size=scan.projections.shape), (0, 2, 2)).astype(np.float32)
 
 
 def differences(scan, frames_of, by_frames) -> np.ndarray:
@@ -40,9 +38,7 @@ def assert_close(found, expected, share) -> None:
 
 
 @pytest.mark.parametrize("axis", ["rows", "columns"])
-@pytest.mark.parametrize(
-    "options", [{"motion": FINE}, {"motion": MicroViews(4, 3)}, {"motion": "static", "affine": True}]
-)
+@pytest.mark.parametrize("options", [{"motion": FINE}, {"motion": MicroViews(4, 3)}, {"motion": "static", "affine": True}])
 def test_a_clouds_gradient_is_that_of_moved_views(rt, request, cloud, axis, options) -> None:
     scan = request.getfixturevalue("scan" if axis == "rows" else "columns_scan")
     by_frames, pitch_mm = weights(scan), scan.geometry.pixel_size_mm
@@ -56,47 +52,34 @@ def test_a_clouds_gradient_is_that_of_moved_views(rt, request, cloud, axis, opti
     assert np.allclose(some, found[[4, 1]], rtol=1e-6)
 
 
-def test_volumes_and_clouds_meet(rt, scan, cloud) -> None:
-    """A cloud and its voxels, on a grid that is finer than it: the same object by two ways."""
-    by_frames, fine = weights(scan), scan.with_grid(GridChoice(size=30))
-    of_cloud = pose_gradient(fine, cloud, by_frames, device=rt)
-    of_voxels = pose_gradient(fine, api.voxelise(cloud, fine.grid, device=rt), by_frames, device=rt)
-    assert_close(of_voxels, of_cloud, 0.05)
-
-
 def test_a_volumes_gradient_is_that_of_moved_views(rt, scan) -> None:
     by_frames, volume = weights(scan), gaussian_filter(scan.reference, 1)
     found = pose_gradient(scan, volume, by_frames, "per-row", device=rt)
-    expected = differences(scan, lambda of: ray_operator(of, "per-row", device=rt)(volume), by_frames)
-    assert_close(found, expected, 0.1)
+    assert_close(found, differences(scan, lambda of: ray_operator(of, "per-row", device=rt)(volume), by_frames), 0.1)
 
 
 def test_gauges_are_left_out(scan) -> None:
     views = np.zeros((scan.frames, 3))
     views[:, 0] = 0.1
-    moved, kept, same = (s.trajectory.pose(0, np.zeros(1)) for s in (
-        move_views(scan, views), move_views(scan, views, without_gauges=True), scan,
-    ))  # fmt: skip
+    scans = move_views(scan, views), move_views(scan, views, without_gauges=True), scan
+    moved, kept, same = (one.trajectory.pose(0, np.zeros(1)) for one in scans)
     assert not np.allclose(moved, same) and np.allclose(kept, same)
 
 
 @pytest.mark.parametrize(("first_s", "step_s", "readout_ratio", "is_fly"), [
-    (0.0, 1.0, 0.0, True), (1e5, 0.1, 0.0, True), (0.0, 0.1, 0.5, True), (1.7e9, 0.3, 0.0, True), (0.0, 1.0, 0.0, False),
+    (0.0, 1.0, 0.0, True), (0.0, 0.1, 0.5, True), (1.7e9, 0.3, 0.0, True), (0.0, 1.0, 0.0, False),
 ])
 def test_moved_frames_that_touch_in_time_are_saved(rt, tmp_path, first_s, step_s, readout_ratio, is_fly) -> None:
     """Poses jump from one frame to the next, and the file keeps a pose for every time."""
     cone, reference = api.ConeGeometry(5.0, 7.0, (12, 12), 0.3), np.random.default_rng(4).uniform(size=(6, 6, 6))
     frames, exposure_s = np.zeros((8, 12, 12)), step_s / (1 + readout_ratio)
     arc_deg = 45.0 * exposure_s / step_s
-    touching = api.fly_scan(
-        frames, cone, 45.0 * np.arange(8), exposure_deg=arc_deg, exposure_s=exposure_s, readout_ratio=readout_ratio,
-        grid=api.Grid.cube(6, 2.0),
-    )
+    how = {"exposure_deg": arc_deg, "exposure_s": exposure_s, "readout_ratio": readout_ratio, "grid": api.Grid.cube(6, 2.0)}
+    touching = api.fly_scan(frames, cone, 45.0 * np.arange(8), **how)
     start_s = first_s + touching.frame_start_s
     speed = api.ConstantSpeed(-first_s * np.deg2rad(45.0) / step_s, np.deg2rad(45.0) / step_s)
-    path = api.CircularOrbit(cone, speed)
-    gating = api.Gating(start_s + touching.shutter.middle_s, np.arange(8.0))
-    scan = replace(touching, frame_start_s=start_s, trajectory=path, is_fly=is_fly, gating=gating)
+    gating, orbit = api.Gating(start_s + touching.shutter.middle_s, np.arange(8.0)), api.CircularOrbit(cone, speed)
+    scan = replace(touching, frame_start_s=start_s, trajectory=orbit, is_fly=is_fly, gating=gating)
     moved = move_views(scan, np.random.default_rng(0).normal(size=(8, 3)) * [0.02, 0.3, 0.3])
     assert not overlaps(moved)
     gaussian = api.Gaussians(np.array([[0.3, 0.1, 0.2]]), np.full((1, 3), 0.3), np.eye(1, 4), np.ones(1))

@@ -36,7 +36,7 @@ def test_a_reconstruction_goes_to_a_file_of_each_suffix_and_back(rt, scan, tmp_p
     assert api.load_volume(tmp_path / "v.h5").gaussians is None
 
 
-def test_threads_have_the_bits_of_runs_alone(scan) -> None:
+def test_threads_have_the_bits_of_runs_alone_and_share_a_device(scan, monkeypatch) -> None:
     def run(weight: float) -> np.ndarray:
         return reconstruct(scan, "fista-tv", iterations=4, size=16, tv_weight=weight, report=False).volume
 
@@ -45,32 +45,29 @@ def test_threads_have_the_bits_of_runs_alone(scan) -> None:
     with ThreadPoolExecutor(2) as pool:
         for found, expected in zip(pool.map(run, 3 * weights), 3 * alone, strict=True):
             np.testing.assert_array_equal(found, expected)
-
-
-def test_threads_that_start_together_share_a_device(monkeypatch) -> None:
     monkeypatch.setattr(runs, "_runtime_by_name", lru_cache(lambda name: (time.sleep(0.05), object())[1]))
     with ThreadPoolExecutor(4) as pool:
         assert len(set(pool.map(runs.runtime_of, 4 * [None]))) == 1
 
 
 def test_hounsfield_units_are_kept_by_files(rt, scan, tmp_path) -> None:
-    result = api.reconstruct(scan, "fdk", device=rt)
+    result = api.reconstruct(scan, "FDK", size=[10, 11, 12], voxel_mm=0.15, device=rt)
+    assert result.grid == api.Grid((10, 11, 12), (0.15, 0.15, 0.15))
     (z0, z1), (y0, y1), (x0, x1) = result.grid.box_mm
     edge, middle = (z0, z1, y0, y1, x0, x0 + (x1 - x0) / 9), (z0 / 2, z1 / 2, y0 / 2, y1 / 2, x0 / 2, x1 / 2)
     scaled = result.hounsfield(edge, middle)
     for name in ("v.h5", "v.nii", "v.npy"):
         api.save_volume(tmp_path / name, scaled, hu=True)
-        again = api.load_volume(tmp_path / name)
-        np.testing.assert_allclose(again.volume, result.volume, atol=2e-7)
+        np.testing.assert_allclose((again := api.load_volume(tmp_path / name)).volume, result.volume, atol=2e-7)
         assert again.scale.water_per_mm == pytest.approx(scaled.scale.water_per_mm)
-    with pytest.raises(InputError, match="hu: found a result without a scale"):
-        api.save_volume(tmp_path / "v.h5", result, hu=True)
-    with pytest.raises(InputError, match="hu: given for v.ply"):
-        api.save_volume(tmp_path / "v.ply", scaled, hu=True)
-    with pytest.raises(InputError, match="^air: found shape"):
-        result.hounsfield((1.0, 2.0))
-    with pytest.raises(InputError, match="mu_water_per_mm: given for .*v.h5, which is in 1/mm"):
-        api.load_volume(tmp_path / "v.h5", mu_water_per_mm=0.02)
+    for words, call in {
+        "hu: found a result without a scale": lambda: api.save_volume(tmp_path / "v.h5", result, hu=True),
+        "hu: given for v.ply": lambda: api.save_volume(tmp_path / "v.ply", scaled, hu=True),
+        "^air: found shape": lambda: result.hounsfield((1.0, 2.0)),
+        "mu_water_per_mm: given for .*v.h5, which is": lambda: api.load_volume(tmp_path / "v.h5", mu_water_per_mm=0.02),
+    }.items():
+        with pytest.raises(InputError, match=words):
+            call()
 
 
 def test_xarray_has_the_places_of_voxels_in_mm(monkeypatch) -> None:
@@ -86,10 +83,9 @@ def test_xarray_has_the_places_of_voxels_in_mm(monkeypatch) -> None:
     in_hu = result.to_xarray(hu=True, states=True)
     assert in_hu.dims == ("time", "z", "y", "x") and in_hu.attrs["units"] == "HU" and in_hu["time"].values.tolist() == [1, 4]
     np.testing.assert_allclose(in_hu.sel(time=1.0), 1000 * (values / 0.02 - 1), atol=1e-3)
-    with pytest.raises(InputError, match="hu: found a result without a scale"):
-        api.Reconstruction(values, grid).to_xarray(hu=True)
-    with pytest.raises(InputError, match="states: found a result without states"):
-        api.Reconstruction(values, grid).to_xarray(states=True)
+    for name, words in {"hu": "a scale", "states": "states"}.items():
+        with pytest.raises(InputError, match=f"{name}: found a result without {words}"):
+            api.Reconstruction(values, grid).to_xarray(**{name: True})
     monkeypatch.setitem(sys.modules, "xarray", None)
     with pytest.raises(InputError, match="xarray: not installed; .*pip install 'xarray'"):
         result.to_xarray()
@@ -112,12 +108,8 @@ class Softened:
 def test_a_prior_may_be_a_function(rt, scan, tmp_path) -> None:
     """The facts have its name; a resumed run needs the same name and ends with the same bits."""
     usual = {"iterations": 4, "subvoxels": 1, "device": rt}
-    named = {
-        softened: f"{__name__}:softened",
-        Softened(): f"{__name__}:Softened",
-        partial(softened, share=0.9): "functools:partial",
-        lambda volume, noise: 0.9 * volume: f"{__name__}:test_a_prior_may_be_a_function.<locals>.<lambda>",
-    }
+    named = {softened: f"{__name__}:softened", Softened(): f"{__name__}:Softened"}
+    named[partial(softened, share=0.9)] = "functools:partial"
     whole = [api.reconstruct(scan, "fista", prior=prior, **usual) for prior in named]
     for result, name in zip(whole, named.values(), strict=True):
         assert json.loads(json.dumps(result.facts))["options"]["prior"] == name
@@ -136,21 +128,11 @@ def test_a_prior_may_be_a_function(rt, scan, tmp_path) -> None:
         api.reconstruct(scan, "fista", prior=Softened(), resume=part, **usual)
 
 
-def test_a_grid_is_given_or_described(rt, scan) -> None:
-    grid = api.Grid((4, 6, 8), (0.1, 0.1, 0.1), (0.0, 0.1, 0.2))
-    given = api.reconstruct(scan, "FDK", grid=grid, device=rt)
-    assert given.grid == grid and given.volume.shape == grid.shape
-    described = api.reconstruct(scan, "fdk", size=[4, 6, 8], voxel_mm=0.1, device=rt)
-    assert described.grid == api.Grid(grid.shape, grid.voxel_size_mm)
-
-
 def test_the_command_and_python_make_the_same_scan(rt, tmp_path) -> None:
-    options = ["--phantom", "jaw", "--size", "8", "--detector", "10", "--views", "2", "--noise", "beer", "--seed", "4"]
-    options += ["--first", "left", "--truncation", "0.4", "-o", str(tmp_path / "scan.h5")]
-    assert load_cli().run(["simulate", *options]) == 0
+    options = "--phantom jaw --size 8 --detector 10 --views 2 --noise beer --seed 4 --first left --truncation 0.4"
+    assert load_cli().run(["simulate", *options.split(), "-o", str(tmp_path / "scan.h5")]) == 0
     usual = {"size": 8, "detector": 10, "views": 2, "noise": "beer", "seed": 4, "readout_axis": "columns", "device": rt}
-    ours = api.simulate("jaw", truncation=0.4, **usual)
-    theirs = api.load_scan(tmp_path / "scan.h5")
+    ours, theirs = api.simulate("jaw", truncation=0.4, **usual), api.load_scan(tmp_path / "scan.h5")
     assert ours.projections.shape == (2, 10, 6)
     assert np.array_equal(ours.projections, theirs.projections) and ours.shutter == theirs.shutter
     assert ours.provenance == theirs.provenance and ours.provenance["simulated"] == "phantom jaw"
@@ -160,6 +142,10 @@ def titles(figure: Figure) -> list[str]:
     return [axes.get_title() for axes in figure.axes if axes.get_title()]
 
 
+def texts(figure: Figure) -> set[str]:
+    return {text.get_text() for axes in figure.axes for text in axes.texts}
+
+
 def images(figure: Figure) -> list[np.ndarray]:
     return [np.asarray(image.get_array()) for axes in figure.axes for image in axes.get_images()]
 
@@ -167,21 +153,17 @@ def images(figure: Figure) -> list[np.ndarray]:
 def test_a_frame_has_its_picture_its_windows_and_its_arc(scan) -> None:
     mask = np.zeros(scan.geometry.detector_shape)
     mask[3, 4] = 1
-    pulsed = replace(scan, pixel_mask=mask, shutter=Shutter(1.0, 0.86, "rows", -1, (0.4, 0.6)))
-    figure = pulsed.plot(2)
+    figure = replace(scan, pixel_mask=mask, shutter=Shutter(1.0, 0.86, "rows", -1, (0.4, 0.6))).plot(2)
     assert titles(figure) == ["frame 2 of 6: line integrals", "gantry from 120.0° to 175.8°"]
     (picture,) = images(figure)
     known = np.isfinite(picture)
     np.testing.assert_array_equal(picture[known], scan.projections[2][known])
-    assert not known[3, 4]
-    said = {text.get_text() for axes in figure.axes for text in axes.texts}
-    assert "1 mm" in said  # the bar of a panel of 4 mm
+    assert not known[3, 4] and "1 mm" in texts(figure)  # the bar of a panel of 4 mm
     windows = figure.axes[1]
     assert windows.get_xlabel() == "time after the frame's start (s)" and windows.get_ylabel() == "detector row"
     low, high = windows.dataLim.intervalx
     assert (low, high) == pytest.approx((0.0, 1.86))
-    still = replace(scan, is_fly=False).plot()
-    assert "the gantry stands still" in {text.get_text() for axes in still.axes for text in axes.texts}
+    assert "the gantry stands still" in texts(replace(scan, is_fly=False).plot())
 
 
 def test_a_result_has_slices_convergence_and_a_residual(rt, scan) -> None:
@@ -191,21 +173,18 @@ def test_a_result_has_slices_convergence_and_a_residual(rt, scan) -> None:
     np.testing.assert_array_equal(images(alone)[1], result.volume[:, 6])
     curve = next(axes for axes in alone.axes if axes.get_title() == "convergence")
     np.testing.assert_array_equal(curve.lines[0].get_ydata(), [line["residual"] for line in result.record])
-    assert curve.get_ylabel() == "residual" and curve.get_xlabel() == "iteration"
-    assert "0.5 mm" in {text.get_text() for axes in alone.axes for text in axes.texts}
+    assert curve.get_ylabel() == "residual" and curve.get_xlabel() == "iteration" and "0.5 mm" in texts(alone)
     whole = result.plot(scan, frame=3, device=rt)
     assert len(images(whole)) == 3 * 3 + 2 and len(images(Reconstruction(result.volume, result.grid).plot())) == 3
     np.testing.assert_array_equal(images(whole)[-2], scan.projections[3])
-    residual = images(whole)[-1]
-    share = np.linalg.norm(residual) / np.linalg.norm(scan.projections[3])
+    share = np.linalg.norm(images(whole)[-1]) / np.linalg.norm(scan.projections[3])
     assert 0 < share < 1 and f"RMS {100 * share:.2g} %" in titles(whole)[-1]
 
 
 def test_pyplot_shows_it_where_somebody_has_imported_that(scan, monkeypatch) -> None:
     import matplotlib.pyplot as plt
 
-    figure = scan.plot()
-    assert plt.fignum_exists(figure.number)
+    assert plt.fignum_exists((figure := scan.plot()).number)
     plt.close(figure)
     monkeypatch.delitem(sys.modules, "matplotlib.pyplot")
     assert not hasattr(scan.plot(), "number")

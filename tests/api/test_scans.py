@@ -10,8 +10,8 @@ from phyradgs_cl.api import ConeGeometry, ParallelGeometry, fly_scan, reconstruc
 from phyradgs_cl.errors import InputError
 
 pytestmark = pytest.mark.slow
-
 LIGHT, DARK = 40_000.0, 200.0
+CONE = ConeGeometry(5.0, 7.0, (6, 8), (0.2, 0.2))
 
 
 def poses(scan) -> np.ndarray:
@@ -49,13 +49,11 @@ def test_scans_of_a_parallel_beam_from_arrays_are_the_simulated_ones(rt) -> None
 
 
 def test_a_gantry_that_turns_clockwise_has_a_negative_exposure() -> None:
-    cone = ConeGeometry(5.0, 7.0, (6, 8), (0.2, 0.2))
-    frames = np.zeros((5, 6, 8), np.float32)
-    scan = fly_scan(frames, cone, -10.0 * np.arange(5), exposure_deg=-10.0)
+    scan = fly_scan(np.zeros((5, 6, 8)), CONE, -10.0 * np.arange(5), exposure_deg=-10.0)
     assert np.allclose(np.diff(scan.frame_start_s), 1.0)
     first, last = (scan.trajectory.angle_rad(2, scan.frame_start_s[2] + t) for t in (0.0, 1.0))
     assert np.rad2deg(first) == pytest.approx(-20.0) and np.rad2deg(last) == pytest.approx(-30.0)
-    shuffled = fly_scan(frames, cone, [0, 200, 40, 240, 80], exposure_deg=5.0, readout_ratio=0.5)
+    shuffled = fly_scan(np.zeros((5, 6, 8)), CONE, [0, 200, 40, 240, 80], exposure_deg=5.0, readout_ratio=0.5)
     assert np.all(np.diff(shuffled.frame_start_s) > 0)
 
 
@@ -70,14 +68,12 @@ def test_small_numbers_of_numpy_neither_overflow_nor_lose_digits(kind) -> None:
 
 
 def test_what_looks_like_radians_transmissions_or_percent_is_said(caplog) -> None:
-    cone = ConeGeometry(5.0, 7.0, (6, 8), (0.2, 0.2))
-    frames, turn_deg = np.zeros((20, 6, 8), np.float32), 18.0 * np.arange(20)
+    cone, frames, turn_deg = CONE, np.zeros((20, 6, 8), np.float32), 18.0 * np.arange(20)
     transmission = np.ones_like(frames)
     transmission[..., 2:6] = 0.3
     cases = [
         (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=18.0), ""),
         (lambda: fly_scan(frames, cone, np.deg2rad(turn_deg), exposure_deg=18.0), "20 frames within 5.969°: .* radians"),
-        (lambda: fly_scan(frames, cone, -np.deg2rad(turn_deg), exposure_deg=-0.3), "radians"),
         (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=np.deg2rad(18.0)), "exposure_deg: 1/57.3 .* radians"),
         (lambda: static_scan(frames[:9], cone, np.deg2rad(turn_deg[:9])), ""),
         (lambda: fly_scan(frames, cone, turn_deg, exposure_deg=9.0, readout_ratio=2.0), ""),
@@ -116,9 +112,7 @@ def test_numpy_numbers_are_numbers(rt, tmp_path) -> None:
 
 
 def test_counts_are_divided_and_bad_pixels_masked(tmp_path) -> None:
-    cone = ConeGeometry(5.0, 7.0, (6, 8), (0.2, 0.2))
-    rng = np.random.default_rng(0)
-    wanted = rng.uniform(0, 2, (4, 6, 8))
+    cone, wanted = CONE, np.random.default_rng(0).uniform(0, 2, (4, 6, 8))
     counts = DARK + LIGHT * np.exp(-wanted)
     flats, darks = np.full((3, 6, 8), DARK + LIGHT), np.full((2, 6, 8), DARK)
     counts[:, 1, 2] = DARK - 5  # a dead pixel
@@ -134,19 +128,7 @@ def test_counts_are_divided_and_bad_pixels_masked(tmp_path) -> None:
     applied = {"flats_applied": 3, "darks_applied": 2}
     assert scan.provenance == {**applied, "taken": "flats: the median of 3; darks: the median of 2"}
     api.save_scan(tmp_path / "s.h5", scan)
-    again = api.load_scan(tmp_path / "s.h5")
-    np.testing.assert_array_equal(again.pixel_mask != 0, bad)
+    np.testing.assert_array_equal((again := api.load_scan(tmp_path / "s.h5")).pixel_mask != 0, bad)
     np.testing.assert_allclose(poses(again), poses(scan), atol=1e-9)
     of_transmission = static_scan(np.exp(-wanted), cone, 90.0 * np.arange(4), quantity="transmission")
     np.testing.assert_allclose(of_transmission.projections, wanted, atol=1e-5)
-
-
-def test_nobody_has_to_say_a_grid(rt) -> None:
-    """The cube that a full turn sees holds the object where it is."""
-    made = simulate("spheres", size=24, detector=32, views=12, protocol="static", device=rt)
-    angles = np.rad2deg(made.trajectory.kinematics.angle_start_rad)
-    scan = static_scan(made.projections, made.geometry, angles)
-    assert scan.grid.offset_mm == (0, 0, 0) and max(scan.grid.shape) == min(scan.grid.shape) == 31
-    volumes = [reconstruct(s, "fdk", device=rt) for s in (scan, made)]
-    mass = [v.volume.sum() * np.prod(v.grid.voxel_size_mm) for v in volumes]
-    assert mass[0] == pytest.approx(mass[1], rel=0.1)

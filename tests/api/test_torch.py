@@ -13,24 +13,9 @@ def numbers(tensor: torch.Tensor) -> np.ndarray:
     return np.from_dlpack(tensor.detach())
 
 
-def test_a_linear_operator_has_its_transpose_as_gradient(rt, scan) -> None:
-    operator = ray_operator(scan, device=rt)
-    project = as_torch(operator)
-    rng = np.random.default_rng(0)
-    volume = torch.tensor(rng.random(operator.domain_shape).tolist(), dtype=torch.float64, requires_grad=True)
-    weights = rng.random(operator.range_shape)
-    frames = project(volume)
-    assert frames.dtype == torch.float64 and frames.shape == operator.range_shape
-    expected = operator(numbers(volume))
-    assert np.allclose(numbers(frames), expected, rtol=FLOAT32, atol=FLOAT32)
-    (frames * torch.from_dlpack(weights)).sum().backward()
-    assert np.allclose(numbers(volume.grad), operator.T(weights), rtol=FLOAT32, atol=FLOAT32)
-
-
 def test_a_linear_operator_can_be_differentiated_twice(rt, scan) -> None:
     operator = ray_operator(scan, device=rt)
-    project = as_torch(operator)
-    volume = torch.rand(operator.domain_shape, requires_grad=True)
+    project, volume = as_torch(operator), torch.rand(operator.domain_shape, requires_grad=True)
     (gradient,) = torch.autograd.grad(0.5 * (project(volume) ** 2).sum(), volume, create_graph=True)
     direction = torch.rand(operator.domain_shape)
     (curved,) = torch.autograd.grad((gradient * direction).sum(), volume)
@@ -38,22 +23,22 @@ def test_a_linear_operator_can_be_differentiated_twice(rt, scan) -> None:
     assert np.allclose(numbers(curved), expected, rtol=1e-4, atol=1e-4 * expected.max())
 
 
-@pytest.mark.parametrize("which", ["splats", "splat intensity", "ray intensity", "voxels"])
+@pytest.mark.parametrize("which", ["splats", "splat intensity", "rays", "ray intensity", "voxels"])
 def test_each_call_has_its_own_gradient(rt, scan, cloud, which) -> None:
     splats, rays = splat_operator(scan, device=rt), ray_operator(scan, device=rt)
-    kinds = {"splats": splats, "splat intensity": splats.intensity, "ray intensity": rays.intensity}
+    kinds = {"splats": splats, "splat intensity": splats.intensity, "rays": rays, "ray intensity": rays.intensity}
     operator = kinds[which] if which in kinds else voxel_operator(scan.grid, device=rt)
-    like = scan.reference if which == "ray intensity" else cloud.rows()
-    x = torch.tensor(np.float32(like).tolist(), requires_grad=True)
-    function = as_torch(operator)
+    like, dtype = scan.reference if "ray" in which else cloud.rows(), torch.float64 if which == "rays" else torch.float32
+    x, function = torch.tensor(np.float32(like).tolist(), dtype=dtype, requires_grad=True), as_torch(operator)
     options = [{}] if which == "voxels" else [{"frames": [3]}, {"frames": [1, 4]}]
     values = [function(x, **chosen) for chosen in options]  # all before any goes back
     sum((value**2).sum() / 2 for value in values).backward()
     expected = np.zeros(x.shape, np.float32)
-    for chosen in options:
+    for chosen, value in zip(options, values, strict=True):
         part = operator.frames(chosen["frames"]) if chosen else operator
         y, back = part.vjp(numbers(x))
         expected += back(y)
+        assert value.dtype == dtype and np.allclose(numbers(value), y, rtol=FLOAT32, atol=FLOAT32 * y.max())
     assert np.allclose(numbers(x.grad), expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
 
@@ -72,14 +57,13 @@ def test_tensors_on_the_host_are_not_copied(rt, scan, monkeypatch) -> None:
 
 
 def test_what_does_not_fit_is_named_and_what_needs_no_gradient_has_none(rt, scan, cloud) -> None:
-    with pytest.raises(InputError, match="x: found Gaussians.*expected a tensor; of a cloud"):
-        as_torch(splat_operator(scan, device=rt))(cloud)
-    rays = ray_operator(scan, device=rt)
+    rays, still = ray_operator(scan, device=rt), torch.zeros(scan.grid.shape)
     project = as_torch(rays)
-    assert not project(torch.zeros(scan.grid.shape)).requires_grad
-    with pytest.raises(InputError, match="volume.*shape"):
-        project(torch.zeros(3))
-    with pytest.raises(InputError, match="frames"):
-        project(torch.zeros(scan.grid.shape), frames=[99])
-    with pytest.raises(InputError, match="detach"):
-        rays(torch.zeros(scan.grid.shape, requires_grad=True))
+    assert not project(still).requires_grad
+    for words, call in {
+        "x: found Gaussians.*expected a tensor; of a cloud": lambda: as_torch(splat_operator(scan, device=rt))(cloud),
+        "volume.*shape": lambda: project(torch.zeros(3)), "frames": lambda: project(still, frames=[99]),
+        "detach": lambda: rays(torch.zeros(scan.grid.shape, requires_grad=True)),
+    }.items():
+        with pytest.raises(InputError, match=words):
+            call()

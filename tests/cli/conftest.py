@@ -1,6 +1,9 @@
-"""A scan of some voxels that the commands are tried on."""
+"""A scan of some voxels that the commands are tried on, and what they say."""
 
+import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,3 +19,17 @@ def tiny() -> list[str]:
 @pytest.fixture(scope="session")
 def scan(simulated, tiny) -> Path:
     return simulated(*tiny)
+
+
+@pytest.fixture
+def told(cli, capfd) -> Callable[..., Any]:
+    """(words, or lines of them...) → what the command prints, as facts where that is JSON."""
+
+    def tell(*lines: object) -> Any:
+        words = [word for line in lines for word in str(line).split()]
+        capfd.readouterr()
+        assert cli.run(words) == 0, words
+        said = capfd.readouterr().out
+        return json.loads(said) if "--json" in words else said
+
+    return tell

@@ -1,44 +1,31 @@
 """Error bars on the command line: reconstruct, info, evaluate, export, report."""
 
-import json
-
 import h5py
 import numpy as np
 import pytest
 
-WORDS = ["--method", "sirt", "--iterations", "3", "--doubt"]
-
 
 @pytest.mark.slow
-def test_error_bars_go_with_their_volume_through_every_command(cli, scan, tmp_path, capsys, fast_pictures) -> None:
-    volume, bars, page = (str(tmp_path / name) for name in ("volume.h5", "bars.npy", "page.html"))
-    assert cli.run(["reconstruct", str(scan), "-o", volume, *WORDS]) == 0
-    assert "the 95 % bar is" in capsys.readouterr().out
+def test_error_bars_go_with_their_volume_through_every_command(told, refused, scan, tmp_path, fast_pictures) -> None:
+    volume, bars, page = (tmp_path / name for name in ("volume.h5", "bars.npy", "page.html"))
+    line = f"reconstruct {scan} -o {volume}"
+    assert "the 95 % bar is" in told(f"{line} --method sirt --iterations 3 --doubt")
     with h5py.File(volume) as file:
         sigma = file["/entry/reconstruction/doubt"]
         assert sigma.attrs["units"] == "1/mm" and sigma.shape == file["/entry/reconstruction/volume"].shape
         sigma = sigma[...]
-    assert cli.run(["info", volume, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["doubt"]["multiple_95"] > 1
-    assert cli.run(["evaluate", volume, "--reference", str(scan), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    assert told(f"info {volume} --json")["doubt"]["multiple_95"] > 1
+    facts = told(f"evaluate {volume} --reference {scan} --json")
     assert 0 < facts["within_doubt"] <= facts["within_doubt_95"] <= 1 and facts["doubt_over_error"] > 0
     assert (tmp_path / "volume.evaluated.doubt.png").is_file()
-    assert cli.run(["export", volume, "-o", bars, "--doubt"]) == 0
-    np.testing.assert_array_equal(np.load(bars), sigma)
+    for words in (f"-o {bars} --doubt", "--to npy", "--to npy --doubt"):
+        told(f"export {volume} {words}")
+    for name, is_doubt in {"bars": True, "volume.doubt": True, "volume": False}.items():
+        assert np.array_equal(np.load(tmp_path / f"{name}.npy"), sigma) == is_doubt, name
     assert "error bars" in (tmp_path / "bars.json").read_text(encoding="utf-8")
-    assert cli.run(["export", volume, "--to", "npy"]) == cli.run(["export", volume, "--to", "npy", "--doubt"]) == 0
-    np.testing.assert_array_equal(np.load(tmp_path / "volume.doubt.npy"), sigma)
-    assert not np.array_equal(np.load(tmp_path / "volume.npy"), sigma)
-    assert cli.run(["report", volume, "-o", page, "--views", "0"]) == 0
-    text = (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert "Error bars" in text and 'value="doubt"' in text
-    assert cli.run(["export", volume, "-o", str(tmp_path / "scaled.h5"), "--hu", "--doubt"]) == 2
-
-
-def test_a_volume_without_error_bars_has_none_to_export(cli, scan, tmp_path, capsys) -> None:
-    volume = str(tmp_path / "volume.h5")
-    assert cli.run(["reconstruct", str(scan), "-o", volume, "--method", "fdk"]) == 0
-    assert cli.run(["export", volume, "-o", str(tmp_path / "bars.npy"), "--doubt"]) == 2
-    assert "no error bars" in capsys.readouterr().err
-    assert cli.run(["reconstruct", str(scan), "-o", volume, *WORDS, "--rows", "0:4"]) == 2
+    told(f"report {volume} -o {page} --views 0")
+    assert "Error bars" in (text := page.read_text(encoding="utf-8")) and 'value="doubt"' in text
+    refused(f"export {volume} -o {tmp_path}/scaled.h5 --hu --doubt".split())
+    refused(f"{line} --method sirt --iterations 3 --doubt --rows 0:4".split())
+    told(f"{line} --method fdk")
+    refused(f"export {volume} -o {bars} --doubt".split(), "no error bars")

@@ -5,9 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
+from damage import changed, on
 
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.runtime import device, pocl
@@ -39,27 +39,8 @@ def test_doubtful_frames_are_said(cli, warned, scan, tiny, tmp_path) -> None:
     assert cli.run(["simulate", *tiny, "--views", "1", "-o", str(one)]) == 0
     assert "all views are from one angle" in warned("--method", "fdk", scan=one)
     swapped.write_bytes(scan.read_bytes())
-    with h5py.File(swapped, "r+") as file:
-        times = file["entry/instrument/detector/frame_start_time"]
-        times[...] = np.sort(times[()])[[0, 2, 1, 3]]
+    on("entry/instrument/detector/frame_start_time", changed(lambda times: np.sort(times)[[0, 2, 1, 3]]))(swapped)
     assert "frame 2 starts no later than frame 1" in warned("--method", "fdk", scan=swapped)
-
-
-def test_files_of_another_kind_are_called_by_their_kind(cli, refused, scan, tmp_path) -> None:
-    volume, bare, output = tmp_path / "volume.h5", tmp_path / "bare.h5", ["-o", tmp_path / "out.h5"]
-    assert cli.run(["reconstruct", str(scan), "-o", str(volume), "--method", "fdk"]) == 0
-    with h5py.File(bare, "w") as file:
-        file["volume"] = np.ones((4, 4, 4), np.uint8)
-    damaged = Path(f"{output[1]}.checkpoint.npz")
-    damaged.write_text("no archive")
-    for words, expected in (
-        (["reconstruct", volume, *output], f"{volume}: found a volume of phyradgs-cl; expected a scan"),
-        (["reconstruct", bare, *output], f"{bare}: found a bare volume (dataset /volume); expected a scan"),
-        (["evaluate", scan, "--reference", scan], f"{scan}: found a scan; expected a volume"),
-        (["simulate", "--volume", scan, *output], f"{scan}: found a scan; expected a bare volume"),
-        (["reconstruct", scan, *output, "--resume"], "found a damaged checkpoint; expected a complete one"),
-    ):
-        refused(words, expected)
 
 
 def test_no_device_for_want_of_a_cache_is_said(refused, monkeypatch) -> None:
@@ -68,22 +49,12 @@ def test_no_device_for_want_of_a_cache_is_said(refused, monkeypatch) -> None:
     refused(["devices"], "/full/cache cannot be written", "set POCL_CACHE_DIR to a folder that can", status=5)
 
 
-def test_a_reader_that_goes_away_is_no_error(scan) -> None:
-    for words in (["info", str(scan)], ["--help"]):
-        command = [sys.executable, "-m", "phyradgs_cl", *words]
-        started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        started.stdout.close()
-        assert started.stderr.read() == "" and started.wait(60) == 0
-
-
-# --- homes that cannot be written, variables of drivers, a standard error that is closed ---------------------------------
-
-COMMAND = [sys.executable, "-m", "phyradgs_cl"]
 POSIX = pytest.mark.skipif(os.name != "posix", reason="a shell and devices of POSIX")
 
 
 def run(*words: str, **environment: str) -> subprocess.CompletedProcess:
-    return subprocess.run([*COMMAND, *words], env=environment, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", "phyradgs_cl", *words]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
 @POSIX
@@ -91,10 +62,8 @@ def test_a_cache_that_cannot_be_written_costs_a_warning(tiny, tmp_path: Path) ->
     """PoCL's users are told of its cache."""
     usual = {name: os.environ[name] for name in os.environ.keys() - {"POCL_CACHE_DIR", "XDG_CACHE_HOME"}}
     output = tmp_path / "scan.h5"
-    for where, words in (
-        ({"HOME": "/dev/null"}, ["devices"]),
-        ({"POCL_CACHE_DIR": "/dev/null/cache"}, ["simulate", *tiny, "-o", str(output)]),
-    ):
+    simulate = ["simulate", *tiny, "-o", str(output)]
+    for where, words in (({"HOME": "/dev/null"}, ["devices"]), ({"POCL_CACHE_DIR": "/dev/null/cache"}, simulate)):
         done = run(*words, **usual | {"TMPDIR": str(tmp_path)} | where)
         told = [line for line in done.stderr.splitlines() if not line.startswith("frame ")]
         assert done.returncode == 0 and len(told) <= 1 and output.exists() == ("simulate" in words), (where, done.stderr)
@@ -104,7 +73,7 @@ def test_a_cache_that_cannot_be_written_costs_a_warning(tiny, tmp_path: Path) ->
 
 def test_a_number_of_threads_that_pocl_would_crash_on_is_refused(monkeypatch) -> None:
     monkeypatch.setenv(pocl.CACHE_VARIABLE, os.environ.get(pocl.CACHE_VARIABLE, ""))
-    for wish in ("0", "abc", "1.5", "1025"):
+    for wish in ("0", "abc", "1025"):
         monkeypatch.setenv(pocl.THREADS_VARIABLE, wish)
         with pytest.raises(InputError, match=f"POCL_MAX_PTHREAD_COUNT: found '{wish}'; expected a whole"):
             pocl.prepare_environment()
@@ -118,8 +87,12 @@ def test_a_number_of_threads_that_pocl_would_crash_on_is_refused(monkeypatch) ->
 
 
 @POSIX
-def test_without_standard_error_the_status_is_right() -> None:
-    for words in ("info none.h5", "nonsense"):
-        shell = ["sh", "-c", f'"$0" -m phyradgs_cl {words} 2>&-', sys.executable]
-        done = subprocess.run(shell, capture_output=True, check=False)
-        assert (done.returncode, done.stdout, done.stderr) == (2, b"", b""), words
+def test_a_reader_that_goes_away_is_no_error_and_without_standard_error_the_status_is_right(scan) -> None:
+    for words in (["info", str(scan)], ["--help"]):
+        command = [sys.executable, "-m", "phyradgs_cl", *words]
+        started = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        started.stdout.close()
+        assert started.stderr.read() == "" and started.wait(60) == 0
+    shell = ["sh", "-c", '"$0" -m phyradgs_cl info none.h5 2>&-', sys.executable]
+    done = subprocess.run(shell, capture_output=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (2, b"", b"")

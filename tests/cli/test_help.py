@@ -29,8 +29,7 @@ def told(cli, capsys):
 def test_help_is_whole_everywhere(cli, told, monkeypatch) -> None:
     """No sentence is cut, and arguments are named as the documentation names them."""
     monkeypatch.setenv("COLUMNS", "80")
-    commands = typer.main.get_command(cli.app).commands
-    whole = told("--help")
+    commands, whole = typer.main.get_command(cli.app).commands, told("--help")
     lines = whole.split("Commands:\n")[1].splitlines()
     assert [line.split()[0] for line in lines] == list(commands)
     assert all(line.endswith(".") and "..." not in line for line in lines)
@@ -48,8 +47,7 @@ def test_help_is_whole_everywhere(cli, told, monkeypatch) -> None:
 
 
 def test_the_defaults_are_those_of_the_default_method(told) -> None:
-    options = method_options(DEFAULT_METHOD, None, {})
-    text = " ".join(told("reconstruct", "-h").split())
+    options, text = method_options(DEFAULT_METHOD, None, {}), " ".join(told("reconstruct", "-h").split())
     assert f"Defaults are those of {DEFAULT_METHOD}." in text
     shown = {"motion": options.motion.name, "iterations": options.iterations, "prior": options.prior}
     for name, value in {"method": DEFAULT_METHOD, **shown}.items():

@@ -1,11 +1,9 @@
 """Ctrl-C at every stage: one line, status 130, outputs whole or as they were; volumes of which all readers say so."""
 
-import json
 import signal
 import subprocess
 import sys
 import textwrap
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -17,7 +15,6 @@ from phyradgs_cl.io import partial_path, read_volume, write_volume
 from phyradgs_cl.progress import Ticker
 from phyradgs_cl.runtime import Runtime
 from phyradgs_cl.signals import finish_despite_interrupt, stop_on_interrupt
-from phyradgs_cl.simulation import run as simulation_run
 from phyradgs_cl.workflow import reconstruct, scans, volumes
 
 pytestmark = pytest.mark.slow
@@ -41,43 +38,33 @@ COMMANDS = {
     "fdk": ["reconstruct", "{scan}", "--method", "fdk"],
     "evaluate": ["evaluate", "{volume}", "--reference", "{scan}"],
 }
-STAGES = [
-    ("simulate", simulation_run, "load_scanner"), ("simulate", scans, "simulated_scan"),
-    ("reconstruct", reconstruct, "hashing"), ("fdk", Runtime, "launch"),
-]  # fmt: skip
+STAGES = [("simulate", scans, "simulated_scan"), ("reconstruct", reconstruct, "hashing"), ("fdk", Runtime, "launch")]
 FINISHED = [
-    ("simulate", scans, "write_scan"), ("reconstruct", reconstruct, "write_volume"),
-    ("evaluate", volumes, "slices_png"),
+    ("simulate", scans, "write_scan"), ("reconstruct", reconstruct, "write_volume"), ("evaluate", volumes, "slices_png"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("command", "owner", "step"), STAGES)
 def test_before_the_output_there_is_nothing(cli, scan, tmp_path, capfd, monkeypatch, command, owner, step):
-    output = tmp_path / "existing.h5"
-    output.write_bytes(b"an older result")
+    (output := tmp_path / "existing.h5").write_bytes(b"an older result")
     monkeypatch.setattr(owner, step, interrupted_before(getattr(owner, step)))
     arguments = [a.format(scan=scan) for a in COMMANDS[command]]
-    assert cli.run([*arguments, "-o", str(output)]) == 130
-    assert capfd.readouterr().err.endswith(NOTHING)
-    assert output.read_bytes() == b"an older result"
-    assert list(tmp_path.iterdir()) == [output]
+    assert cli.run([*arguments, "-o", str(output)]) == 130 and capfd.readouterr().err.endswith(NOTHING)
+    assert output.read_bytes() == b"an older result" and list(tmp_path.iterdir()) == [output]
 
 
 @pytest.mark.parametrize(("command", "owner", "step"), FINISHED)
 def test_what_is_being_written_is_finished(cli, scan, tmp_path, capfd, monkeypatch, command, owner, step):
     volume = tmp_path / "volume.h5"
-    output = volume.with_suffix(".evaluated.png") if command == "evaluate" else tmp_path / "output.h5"
-    if command == "evaluate":
-        assert cli.run(["reconstruct", str(scan), "--method", "fdk", "-o", str(volume)]) == 0
+    assert cli.run(["reconstruct", str(scan), "--method", "fdk", "-o", str(volume)]) == 0
+    output, option = (tmp_path / "out.png", "--picture") if command == "evaluate" else (tmp_path / "output.h5", "-o")
     monkeypatch.setattr(owner, step, interrupted_before(interrupted_before(getattr(owner, step))))
     words = [word.format(scan=scan, volume=volume) for word in COMMANDS[command]]
-    assert cli.run([*words, "--picture" if command == "evaluate" else "-o", str(output)]) == 130
+    assert cli.run([*words, option, str(output)]) == 130
     said = capfd.readouterr().err
-    assert said.splitlines()[-1] == COMPLETE.strip()
-    assert "nothing written" not in said and "Traceback" not in said
-    assert output.stat().st_size > 1000 and set(tmp_path.iterdir()) - {volume} == {output}
-    if output.suffix == ".h5":
-        assert "entry" in h5py.File(output)
+    assert said.splitlines()[-1] == COMPLETE.strip() and "nothing written" not in said and "Traceback" not in said
+    assert output.stat().st_size > 1000 and set(tmp_path.iterdir()) == {volume, output}
+    assert output.suffix == ".png" or "entry" in h5py.File(output)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
@@ -124,20 +111,16 @@ def test_a_process_ends_with_one_line_and_130(tmp_path, monkeypatch, stage):
 
 def test_a_library_that_swallows_the_signal_delays_the_end(tmp_path) -> None:
     """The command ends after the output is written: a loop, or a block that writes, sees that a signal has come."""
-    body = at_a_kernel(
-        "kernel",
-        """
+    before = """
         import phyradgs_cl.runtime as r
         make = r.Runtime.kernel
         def kernel(*words, **options):
             with contextlib.suppress(BaseException):
                 press()
             return make(*words, **options)
-        """,
-    )
-    done = run_process([*COMMANDS["simulate"], "-o", str(tmp_path / "scan.h5")], body)
-    assert done.returncode == 130 and done.stderr.endswith(COMPLETE)
-    assert list(tmp_path.iterdir()) == [tmp_path / "scan.h5"]
+        """
+    done = run_process([*COMMANDS["simulate"], "-o", str(tmp_path / "scan.h5")], at_a_kernel("kernel", before))
+    assert done.returncode == 130 and done.stderr.endswith(COMPLETE) and list(tmp_path.iterdir()) == [tmp_path / "scan.h5"]
 
 
 # A signal at the second report of a loop: it comes again at once, as wrappers pass it on.
@@ -152,7 +135,7 @@ AT_A_REPORT = """
 """
 
 
-def test_a_loop_is_saved_beside_the_output_and_goes_on(cli, scan, tmp_path, capsys):
+def test_a_loop_is_saved_beside_the_output_and_goes_on(cli, told, scan, tmp_path):
     """Splats, which report every 50 iterations, in a process of Python: api/test_interrupts.py."""
     output, whole = tmp_path / "volume.h5", tmp_path / "whole.h5"
     output.write_bytes(b"an older result")
@@ -164,8 +147,7 @@ def test_a_loop_is_saved_beside_the_output_and_goes_on(cli, scan, tmp_path, caps
     assert done.stdout.startswith(f"{partial}: sart") and output.read_bytes() == b"an older result"
     left = {"volume.h5", "volume.h5.checkpoint.npz", "volume.partial.h5"}
     assert {path.name for path in tmp_path.iterdir()} - {"now.partial.png"} == left
-    assert cli.run(["evaluate", str(partial), "--reference", str(scan), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    facts = told("evaluate", partial, "--reference", scan, "--json")
     assert (facts["interrupted_at"], facts["iterations_asked"]) == (2, 8)
     (tmp_path / "volume.partial.evaluated.png").unlink()
     assert cli.run([*command, str(output), "--resume", "--preview", str(tmp_path / "now.png")]) == 0
@@ -192,6 +174,9 @@ def test_a_run_that_is_interrupted_in_its_last_iteration_is_told_in_full(cli, sc
 
 
 def test_ctrl_c_that_ends_the_compiler_of_a_kernel_is_no_failure_of_the_device(scan, tmp_path):
+    """And a signal after the last line changes nothing."""
+    done = run_process(["info", str(scan)], "import atexit\natexit.register(signal.raise_signal, signal.SIGINT)")
+    assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("kind")
     command = ["reconstruct", str(scan), "--method", "sirt", "-o", str(tmp_path / "volume.h5")]
     for first, status, said in (("press()", 130, NOTHING), ("pass", 5, "linker command failed")):
         body = f"""
@@ -206,12 +191,7 @@ def test_ctrl_c_that_ends_the_compiler_of_a_kernel_is_no_failure_of_the_device(s
         assert done.returncode == status and said in done.stderr and done.stderr.count("\n") == 1
 
 
-def test_a_signal_after_the_last_line_changes_nothing(scan):
-    done = run_process(["info", str(scan)], "import atexit\natexit.register(signal.raise_signal, signal.SIGINT)")
-    assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith("kind")
-
-
-def test_a_second_ctrl_c_does_not_wait_unless_it_is_the_same_press(monkeypatch):
+def test_a_second_ctrl_c_does_not_wait_unless_it_is_the_same_press_and_an_ignored_one_stays_ignored(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(signals.time, "monotonic", lambda: now[0])
     with pytest.raises(KeyboardInterrupt), stop_on_interrupt() as request:
@@ -221,14 +201,10 @@ def test_a_second_ctrl_c_does_not_wait_unless_it_is_the_same_press(monkeypatch):
         now[0] += 2
         signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def test_a_signal_that_is_ignored_stays_ignored():
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # until the test ends: tests/conftest.py
     with signals.answer_signals(), stop_on_interrupt() as request, finish_despite_interrupt():
         signal.raise_signal(signal.SIGINT)
     assert not request.is_set and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-    signal.signal(signal.SIGINT, before)
 
 
 def run_process(arguments, body):
@@ -244,37 +220,25 @@ def run_process(arguments, body):
 
 
 SAID = "interrupted at iteration 812 of 3000"
-READERS = {
-    "evaluate": ["evaluate", "{volume}", "--reference", "{volume}", "--json"], "info": ["info", "{volume}", "--json"],
-    "report": ["report", "{volume}", "-o", "{folder}/page.html"], "export": ["export", "{volume}", "--to", "npy"],
-    "simulate": ["simulate", "--volume", "{volume}", "--detector", "8", "--views", "2", "-o", "{folder}/scan.h5"],
-}  # fmt: skip
+READERS = (
+    "evaluate v.h5 --reference v.h5 --json", "info v.h5 --json", "report v.h5 -o page.html", "export v.h5 --to npy",
+    "simulate --volume v.h5 --detector 8 --views 2 -o scan.h5",
+)  # fmt: skip
 
 
-@pytest.fixture
-def stored(tmp_path: Path) -> Path:
-    grid = Grid.cube(6, 2.0)
-    history = {"method": "sirt", "interrupted_at": 812, "options": {"iterations": 3000}}
-    write_volume(tmp_path / "v.h5", np.linspace(0, 1, 216, dtype=np.float32).reshape(grid.shape), grid, history)
-    return tmp_path / "v.h5"
-
-
-@pytest.mark.parametrize("name", READERS)
-def test_a_reader_says_where_the_run_was_interrupted(cli, stored, caplog, capsys, name) -> None:
-    words = [word.format(volume=stored, folder=stored.parent) for word in READERS[name]]
-    assert cli.run(words) == 0
-    assert caplog.text.count(SAID) == 1 and f"{stored}: {SAID}" in caplog.text
-    if "--json" in words:
-        facts = json.loads(capsys.readouterr().out)
-        assert (facts["interrupted_at"], facts["iterations_asked"]) == (812, 3000)
+@pytest.mark.parametrize("line", READERS)
+def test_a_reader_says_where_the_run_was_interrupted(told, tmp_path, monkeypatch, caplog, line) -> None:
+    monkeypatch.chdir(tmp_path)
+    grid, history = Grid.cube(6, 2.0), {"method": "sirt", "interrupted_at": 812, "options": {"iterations": 3000}}
+    write_volume("v.h5", np.linspace(0, 1, 216, dtype=np.float32).reshape(grid.shape), grid, history)
+    facts = told(line.replace("v.h5", str(tmp_path / "v.h5")))
+    assert caplog.text.count(SAID) == 1 and f"{tmp_path}/v.h5: {SAID}" in caplog.text
+    assert "--json" not in line or (facts["interrupted_at"], facts["iterations_asked"]) == (812, 3000)
 
 
 def test_a_partial_volume_has_a_name_of_its_own_where_no_scan_lies(refused, tmp_path) -> None:
     for name in ("v.partial.h5", "volume", ".hidden", "a.b.h5"):
-        path = partial_path(tmp_path / name)
-        assert path.parent == tmp_path and path.name != name and ".partial" in path.name
-        assert path.suffix in ("", Path(name).suffix) or not Path(name).suffix
-    scan = tmp_path / "volume.partial.h5"
-    scan.write_bytes(b"a scan")
+        assert (path := partial_path(tmp_path / name)).parent == tmp_path and path.name != name and ".partial" in path.name
+    (scan := tmp_path / "volume.partial.h5").write_bytes(b"a scan")
     refused(["reconstruct", scan, "-o", tmp_path / "volume.h5", "--method", "fdk"], "reads or writes")
     assert list(tmp_path.iterdir()) == [scan]

@@ -1,5 +1,7 @@
 """What is said on the way, and changes no run: lines of progress, --live, a page, and --preview, a picture."""
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 from skimage.io import imread
@@ -55,15 +57,12 @@ def test_an_interrupted_run_says_how_to_go_on(cli, scan, tmp_path, monkeypatch) 
     assert cli.run([*command, "--resume"]) == 0 and 'id="provenance"' in page.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(
-    ("flag", "suffix", "other"), [("--live", "html", "page.txt"), ("--preview", "png", "now.jpg")]
-)
+@pytest.mark.parametrize(("flag", "suffix", "other"), [("--live", "html", "a.txt"), ("--preview", "png", "a.jpg")])
 def test_pages_and_pictures_do_not_replace_what_matters(refused, scan, tmp_path, flag, suffix, other) -> None:
     output, before = tmp_path / f"volume.{suffix}", scan.read_bytes()
     for path in (scan, output, partial_path(output), tmp_path / other):
         refused(["reconstruct", scan, "-o", output, flag, path], flag)
-    elsewhere = tmp_path / "none" / f"now.{suffix}"
-    refused(["reconstruct", scan, "-o", output, flag, elsewhere], "none", status=4)
+    refused(["reconstruct", scan, "-o", output, flag, tmp_path / "none" / f"now.{suffix}"], "none", status=4)
     assert scan.read_bytes() == before and not list(tmp_path.iterdir())
 
 
@@ -71,8 +70,7 @@ GRID = Grid.cube(4, 2.0)
 
 
 def test_the_picture_is_of_the_present_volume(tmp_path) -> None:
-    pictures = []
-    preview = Preview(tmp_path / "now.png", every_s=0.0)
+    pictures, preview = [], Preview(tmp_path / "now.png", every_s=0.0)
     for value in (0.0, 1.0):
         volume = np.zeros(GRID.shape, np.float32)
         volume[2, 2, 2] = value
@@ -84,42 +82,33 @@ def test_the_picture_is_of_the_present_volume(tmp_path) -> None:
 
 
 def test_pictures_are_no_more_often_than_asked_and_cost_one_warning(tmp_path, monkeypatch, caplog) -> None:
-    def full(*arguments: object) -> None:
-        raise OutputError("now.png", "no room left")
-
-    def volume() -> tuple[np.ndarray, Grid]:
-        made.append(1)
-        return np.ones(GRID.shape, np.float32), GRID
-
+    made = []
+    progress = Progress(1, 9, 0.5, 0, 1.0, volume=lambda: made.append(1) or (np.ones(GRID.shape, np.float32), GRID))
     for every_s, times in ((1000.0, 1), (0.0, 5)):
-        made: list[int] = []
+        made.clear()
         preview = Preview(tmp_path / "now.png", every_s)
-        for iteration in range(5):
-            preview(Progress(iteration, 9, 0.5, 0, 1.0, volume=volume))
+        for _ in range(5):
+            preview(progress)
         assert len(made) == times and caplog.text == ""
-    monkeypatch.setattr("phyradgs_cl.report.preview.write_preview", full)
-    for iteration in range(3):
-        preview(Progress(iteration, 9, 0.5, 0, 1.0, volume=volume))
+    full = OutputError("now.png", "no room left")
+    monkeypatch.setattr("phyradgs_cl.report.preview.write_preview", Mock(side_effect=full))
+    for _ in range(3):
+        preview(progress)
     assert caplog.text.count("no preview") == 1
 
 
 @pytest.fixture
 def now(monkeypatch):
     """A clock in the test's hands: now[0] seconds."""
-    seconds = [0.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: seconds[0])
-    return seconds
+    return (seconds := [0.0])
 
 
-def test_a_loss_comes_with_its_gaussians_and_a_residual_without(capsys) -> None:
-    Ticker("iteration").progress(Progress(50, 50, 0.125, 300, 1.0))
-    assert capsys.readouterr().err == "iteration 50/50  loss 0.12500  300 Gaussians\n"
-    Ticker("iteration").progress(Progress(3, 3, 0.5, 0, 1.0, quantity="residual"))
-    assert capsys.readouterr().err == "iteration 3/3  residual 0.50000\n"
-
-
-def test_rate_and_time_left_count_from_the_first_report(capsys, now) -> None:
+def test_a_loss_comes_with_its_gaussians_and_rate_and_time_left_count_from_the_first_report(capsys, now) -> None:
     """By the share of the work that is done, where later passes take longer."""
+    Ticker("iteration").progress(Progress(50, 50, 0.125, 300, 1.0))
+    Ticker("iteration").progress(Progress(3, 3, 0.5, 0, 1.0, quantity="residual"))
+    assert capsys.readouterr().err == "iteration 50/50  loss 0.12500  300 Gaussians\niteration 3/3  residual 0.50000\n"
     for ticker, reports, said in (
         (Ticker("frame"), ((20.0, 10, None), (40.0, 30, None)), "frame 10/100\nframe 30/100  1.0/s  ETA 1:10\n"),
         (Ticker("pass"), ((0.0, 0, 0.0), (20.0, 80, 0.25)), "pass 80/100  4.0/s  ETA 1:00\n"),
@@ -127,8 +116,12 @@ def test_rate_and_time_left_count_from_the_first_report(capsys, now) -> None:
         for now[0], done, share in reports:
             ticker.show(done, 100, share=share)
         assert capsys.readouterr().err == said
-    times = {0.2: "0:00", 59.6: "1:00", 125: "2:05", 3600: "1:00:00"}
-    assert {seconds: clock(seconds) for seconds in times} == times
+    now[0] = 0.0
+    ticker = Ticker("frame")  # a file gets a line every ten seconds, and the last
+    for now[0] in map(float, range(31)):
+        ticker.show(int(now[0]), 30)
+    assert [line.split()[1] for line in capsys.readouterr().err.splitlines()] == ["10/30", "20/30", "30/30"]
+    assert [clock(seconds) for seconds in (0.2, 59.6, 125, 3600)] == ["0:00", "1:00", "2:05", "1:00:00"]
 
 
 def test_on_a_terminal_there_is_a_line_before_there_is_a_count(capsys, monkeypatch) -> None:
@@ -145,11 +138,3 @@ def test_on_a_terminal_there_is_a_line_before_there_is_a_count(capsys, monkeypat
     with Ticker("frame") as ticker:
         ticker.show(1, 1)
     assert not ticker.is_open  # nothing to close where nothing could be written
-
-
-def test_a_file_gets_a_line_every_ten_seconds_and_the_last(capsys, now) -> None:
-    ticker = Ticker("frame")
-    for second in range(31):
-        now[0] = float(second)
-        ticker.show(second, 30)
-    assert [line.split()[1] for line in capsys.readouterr().err.splitlines()] == ["10/30", "20/30", "30/30"]

@@ -20,24 +20,11 @@ def scan(simulated) -> Path:
     return simulated(*VOLUME)
 
 
-def test_simulation_in_bricks(cli, scan, tmp_path) -> None:
-    """The phantom has twice as many voxels per side: 50·50·64 padded floats, 625 KiB."""
-    found = tmp_path / "bricks.h5"
-    assert cli.run(["simulate", *VOLUME, "--memory", "350KiB", "-o", str(found)]) == 0
-    expected = load_scan(scan).projections
-    np.testing.assert_allclose(load_scan(found).projections, expected, rtol=0, atol=3e-6 * expected.max())
-
-
 @pytest.mark.parametrize("method", ["sirt --iterations 2", "fdk"])
 def test_reconstruction_in_bricks(cli, scan, tmp_path, method, monkeypatch) -> None:
     """24³ voxels are 26·26·48 padded floats, 127 KiB, or 108 KiB for FDK."""
     ledgers, made, volumes = [], context.MemoryLedger, []
-
-    def ledger(*arguments):
-        ledgers.append(made(*arguments))
-        return ledgers[-1]
-
-    monkeypatch.setattr(context, "MemoryLedger", ledger)
+    monkeypatch.setattr(context, "MemoryLedger", lambda *given: ledgers.append(made(*given)) or ledgers[-1])
     for more in ([], ["--memory", "100KiB"]):
         output = tmp_path / f"{len(more)}.h5"
         assert cli.run(["reconstruct", str(scan), "-o", str(output), "--method", *method.split(), *more]) == 0
@@ -47,22 +34,16 @@ def test_reconstruction_in_bricks(cli, scan, tmp_path, method, monkeypatch) -> N
     assert cli.run(["estimate", str(scan), "--method", *method.split(), "--memory", "100KiB"]) == 0
 
 
-def test_a_size_that_does_not_fit_is_refused_with_one_that_does(cli, refused, scan, tmp_path) -> None:
-    run = ["reconstruct", scan, "-o", tmp_path / "v.h5", "--method", "fista", "--iterations", "1", "--memory", "3MiB"]
-    line = refused([*run, "--size", "200"], "fits", status=6)
-    size = int(re.search(r"--size (\d+) fits", line)[1])
-    assert 12 <= size < 200
-    assert cli.run([str(word) for word in [*run, "--size", size]]) == 0
-
-
-def test_a_volume_larger_than_the_machine_is_refused_before_the_run(cli, refused, scan, tmp_path, monkeypatch) -> None:
-    """Not after it, when the volume is made; of a machine with 8 MiB."""
-    for name in ("host_bytes", "free_bytes"):
+@pytest.mark.parametrize("method", ["fista --iterations 1 --memory 3MiB", "fdk"])
+def test_a_size_that_does_not_fit_is_refused_with_one_that_does(cli, refused, scan, tmp_path, monkeypatch, method) -> None:
+    """On the device, and in a machine with 8 MiB: before the run, not after it, when the volume is made."""
+    for name in ("host_bytes", "free_bytes") if method == "fdk" else ():
         monkeypatch.setattr(room, name, lambda: 8 * 2.0**20)
-    run = ["reconstruct", scan, "-o", tmp_path / "v.h5", "--method", "fdk"]
-    line = refused([*run, "--size", "200"], "200×200×200 voxels", "in one volume", status=6)
-    size = int(re.search(r"--size (\d+) fits", line)[1])
-    assert 48 <= size <= 80 and cli.run([str(word) for word in [*run, "--size", size]]) == 0
+    run = ["reconstruct", scan, "-o", tmp_path / "v.h5", "--method", *method.split(), "--size"]
+    words = ("200×200×200 voxels", "in one volume") if method == "fdk" else ("fits",)
+    size = int(re.search(r"--size (\d+) fits", refused([*run, "200"], *words, status=6))[1])
+    assert (48 <= size <= 80 if method == "fdk" else 12 <= size < 200)
+    assert cli.run([str(word) for word in [*run, size]]) == 0
 
 
 def test_too_little_and_a_wrong_size_are_named_where_they_stand(refused, scan, tmp_path, monkeypatch) -> None:
@@ -75,3 +56,11 @@ def test_too_little_and_a_wrong_size_are_named_where_they_stand(refused, scan, t
     monkeypatch.setenv(MEMORY_VARIABLE, "much")
     refused(run, f"{MEMORY_VARIABLE}: found 'much'")
     assert not output.exists()
+
+
+def test_simulation_in_bricks(cli, scan, tmp_path) -> None:
+    """The phantom has twice as many voxels per side: 50·50·64 padded floats, 625 KiB."""
+    found = tmp_path / "bricks.h5"
+    assert cli.run(["simulate", *VOLUME, "--memory", "350KiB", "-o", str(found)]) == 0
+    expected = load_scan(scan).projections
+    np.testing.assert_allclose(load_scan(found).projections, expected, rtol=0, atol=3e-6 * expected.max())

@@ -3,9 +3,9 @@
 import json
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
+from damage import changed, on
 
 from phyradgs_cl.io import read_volume
 from phyradgs_cl.workflow import load_scan
@@ -27,10 +27,9 @@ def test_a_clean_file_says_what_was_done_to_it(cli, simulated, tmp_path, capsys)
     assert after.provenance["prepared"] == told and after.provenance["prepared_from"] == str(source)
     assert (~after.valid).sum() == told[0]["pixels"] + told[1]["pixels"] * after.frames
     assert np.abs(after.projections - before.projections).max() > 0.1
-    np.testing.assert_array_equal(after.reference, before.reference)
-    np.testing.assert_array_equal(after.frame_start_s, before.frame_start_s)
-    volume = tmp_path / "v.h5"
-    steps = ["--steps", "sparks,dead,rings", "--set", "rings.window=5"]
+    for name in ("reference", "frame_start_s"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+    volume, steps = tmp_path / "v.h5", ["--steps", "sparks,dead,rings", "--set", "rings.window=5"]
     assert cli.run(["reconstruct", str(source), "-o", str(volume), "--method", "fdk", *steps]) == 0
     direct = read_volume(volume)
     assert cli.run(["reconstruct", str(output), "-o", str(volume), "--method", "fdk"]) == 0
@@ -54,31 +53,26 @@ def test_a_step_that_finds_nothing_says_so_and_may_be_asked_again(cli, simulated
         assert cli.run(list(map(str, stated))) == 2
         assert "scatter.to_primary=0.2: found 0.2; expected a ratio that the kernel gives" in capsys.readouterr().err
     else:
-        assert cli.run(list(map(str, stated))) == 0
-        assert "to primary 0.2" in capsys.readouterr().out
+        assert cli.run(list(map(str, stated))) == 0 and "to primary 0.2" in capsys.readouterr().out
 
 
 def test_a_configuration_file_says_the_same(cli, simulated, tmp_path, capsys) -> None:
-    config = tmp_path / "steps.toml"
-    config.write_text('steps = "rings"\n[rings]\nwindow = 5\n')
-    command = ["prepare", str(simulated(*SPOILT)), "-o", str(tmp_path / "clean.h5"), "--config", str(config), "--json"]
-    assert cli.run(command) == 0
+    config, clean, cleaner = (str(tmp_path / name) for name in ("steps.toml", "clean.h5", "cleaner.h5"))
+    Path(config).write_text('steps = "rings"\n[rings]\nwindow = 5\n')
+    assert cli.run(["prepare", str(simulated(*SPOILT)), "-o", clean, "--config", config, "--json"]) == 0
     (step,) = json.loads(capsys.readouterr().out.splitlines()[-1])["steps"]
     assert step["options"] == {"window": 5}
-    again = ["prepare", str(tmp_path / "clean.h5"), "-o", str(tmp_path / "cleaner.h5"), "--steps", "dead"]
-    assert cli.run(again) == 0
+    assert cli.run(["prepare", clean, "-o", cleaner, "--steps", "dead"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split("  ")[0] for line in lines] == ["done before", "dead", str(tmp_path / "cleaner.h5")]
+    assert [line.split("  ")[0] for line in lines] == ["done before", "dead", cleaner]
     assert lines[0].split()[2:] == ["rings"]
 
 
 def test_bad_input_is_one_line_and_loses_nothing(refused, simulated, tmp_path) -> None:
     source, output = simulated(*SPOILT), tmp_path / "clean.h5"
     output.write_bytes(b"what was there before")
-    flooded = tmp_path / "flooded.h5"
-    flooded.write_bytes(Path(source).read_bytes())
-    with h5py.File(flooded, "r+") as file:
-        file["entry/instrument/detector/data"][...] += 2
+    (flooded := tmp_path / "flooded.h5").write_bytes(Path(source).read_bytes())
+    on("entry/instrument/detector/data", changed(lambda data: data + 2))(flooded)
     for words, parts in (
         (["--steps", "ring"], ("--steps", "did you mean 'rings'")), (["--steps", ""], ("--steps", "found none")),
         (["--set", "scatter.reach=0.1"], ("--set scatter.reach=0.1", "scatter among the steps")),

@@ -48,12 +48,10 @@ def test_a_named_option_wins_over_set_and_set_over_the_file(config: Path) -> Non
 @pytest.mark.parametrize(
     ("text", "error"),
     [
-        *((f"iterations = {value}", "iterations: ") for value in ("'many'", "nan", f"0x{'f' * 5000}")),
+        *((f"iterations = {value}", "iterations: ") for value in ("'many'", f"0x{'f' * 5000}")),
         ("strips = true", "strips: "), ("motion = 'wobble'", "motion: "), ("method = ['fdk']", "method: "),
-        *((f"seed = {value}", "seed: ") for value in ("1e300", "2024-01-01")), ("device = [0]", "device: "),
-        ("voxel_mm = [1, 2]", "voxel_mm: "), ("preset = ['default']", "preset: "), ("size = '4,4,4'", "size: "),
-        ("roi_mm = [-inf, inf, 0, 1, 0, 1]", "roi_mm: "), ("holdout = 60", "holdout: "),
-        ("method = 'phyradgs'\nrates = 3", "rates: "),
+        ("seed = 2024-01-01", "seed: "), ("device = [0]", "device: "), ("voxel_mm = [1, 2]", "voxel_mm: "),
+        ("preset = ['default']", "preset: "), ("size = '4,4,4'", "size: "), ("method = 'phyradgs'\nrates = 3", "rates: "),
         ("method = 'phyradgs'\n[rates]\nposition = [nan, 1e-4]", "rates.position: "),
         ("method = 'phyradgs'\n[control]\nthreshold = -1", "control.threshold: "),
         ("method = 'phyradgs'\n[control]\nevry = 3", "control.evry: found no such option of --method phyradgs"),
@@ -67,17 +65,14 @@ def test_a_wrong_value_of_a_file_is_named_by_its_line(config: Path, text: str, e
         plan_of(config, {})
 
 
-def test_a_wrong_option_of_the_command_line_is_not_the_files(config: Path) -> None:
+def test_a_wrong_option_is_named_where_it_stands_and_who_has_it(config: Path) -> None:
     config.write_text("method = 'fdk'\niterations = 3\n")
-    with pytest.raises(InputError, match="^--iterations: found no such option of --method fdk"):
-        plan_of(config, {"iterations": 5})
-    with pytest.raises(InputError, match="^--set iterations=5: found no such option of --method fdk"):
-        plan_of(None, {"method": "fdk"}, ["iterations=5"])
-
-
-def test_a_prior_is_for_methods_that_have_one() -> None:
     assert plan_of(None, {"prior": "tv"}, ["prior=dct"]).options.prior == "tv"
-    with pytest.raises(InputError, match="^--prior: found no such option of --method sirt.*fista or moving has it$"):
-        plan_of(None, {"prior": "tv", "method": "sirt"})
-    with pytest.raises(InputError, match="noise_stop=1.1: .*; --method sart or os-sart or cgls or asd-pocs has it$"):
-        plan_of(None, {"method": "sirt"}, ["noise_stop=1.1"])
+    for given, assignments, words in (
+        ((config, {"iterations": 5}), [], "^--iterations: found no such option of --method fdk"),
+        ((None, {"method": "fdk"}), ["iterations=5"], "^--set iterations=5: found no such option of --method fdk"),
+        ((None, {"prior": "tv", "method": "sirt"}), [], "^--prior: .* of --method sirt.*fista or moving has it$"),
+        ((None, {"method": "sirt"}), ["noise_stop=1.1"], "1.1: .*; --method sart or os-sart or cgls or asd-pocs has it$"),
+    ):
+        with pytest.raises(InputError, match=words):
+            plan_of(*given, assignments)

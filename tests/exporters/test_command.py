@@ -21,8 +21,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def run():
-    app = typer.Typer(rich_markup_mode=None)
-    app.command("export", epilog=EXAMPLES["export"])(export_command)
+    (app := typer.Typer(rich_markup_mode=None)).command("export", epilog=EXAMPLES["export"])(export_command)
     return lambda *arguments: CliRunner().invoke(app, [str(a) for a in arguments])
 
 
@@ -33,8 +32,7 @@ def test_the_output_s_suffix_says_the_format(run, volume_file, tmp_path) -> None
         assert done.exit_code == 0 and (tmp_path / name).exists(), done.exception
     for output in (("-o", "a.stl"), ("-o", "folder"), ()):
         error = run(volume_file, *output).exception
-        assert isinstance(error, InputError)
-        assert ".nii, .nii.gz, .mha, .nrrd, .tif, .tiff, .npy, .ply, .npz" in str(error)
+        assert isinstance(error, InputError) and ".nii, .nii.gz, .mha, .nrrd, .tif, .tiff, .npy, .ply, .npz" in str(error)
     done = run(volume_file, "--to", "nii", "-o", tmp_path / "hu.nii.gz", "--mu-water-per-mm", "0.02")
     assert done.exit_code == 0 and "HU" in done.output and (tmp_path / "hu.nii.gz").exists()
 
@@ -73,5 +71,4 @@ def test_the_documentation_s_examples_run(run, volume_file, monkeypatch) -> None
         exec(compile(block, str(DOCS), "exec"), {})
     for line in re.findall(r"^phyradgs export (.*)$", text, re.M):
         assert run(*shlex.split(line)).exit_code == 0
-    found = {path.name for path in volume_file.parent.iterdir()}
-    assert {"volume.nii", "volume.nii.gz", "volume.ply"} <= found
+    assert {"volume.nii", "volume.nii.gz", "volume.ply"} <= {path.name for path in volume_file.parent.iterdir()}

@@ -44,16 +44,13 @@ def test_every_level_has_the_means_and_places_of_the_one_before(tmp_path) -> Non
     for n, level in enumerate(levels):
         scale, translation = level.coordinateTransformations
         assert scale.scale == pytest.approx(np.array((2.0, 1.5, 0.25)) * 2**n)
-        corner_mm = np.array(translation.translation) - np.array(scale.scale) / 2
-        assert corner_mm == pytest.approx(grid.box_mm[:, 0])
-    again = load_volume(tmp_path / "v.ome.zarr")
-    np.testing.assert_array_equal(again.values, large.values)
+        assert (np.array(translation.translation) - np.array(scale.scale) / 2) == pytest.approx(grid.box_mm[:, 0])
+    np.testing.assert_array_equal((again := load_volume(tmp_path / "v.ome.zarr")).values, large.values)
     assert again.grid.is_close(grid)
 
 
-@pytest.mark.parametrize("scale", [None, Hounsfield(0.02, 0.001)])
-def test_no_second_copy_of_the_volume_is_made(tmp_path, scale) -> None:
-    values = np.zeros((2048, 48, 48), np.float32)
+def test_no_second_copy_of_the_volume_is_made(tmp_path) -> None:
+    scale, values = Hounsfield(0.02, 0.001), np.zeros((2048, 48, 48), np.float32)
     write_zarr(tmp_path / "warm.zarr", Volume(values[:64], Grid((64, 48, 48), (1.0, 1.0, 1.0))), scale)
     tracemalloc.start()
     write_zarr(tmp_path / "v.zarr", Volume(values, Grid(values.shape, (1.0, 1.0, 1.0))), scale)
@@ -67,8 +64,7 @@ def test_other_programs_versions_units_axes_and_types(tmp_path, caplog) -> None:
     from ome_zarr.format import FormatV04
 
     counts = np.random.default_rng(1).integers(-1000, 3000, (1, 1, 6, 5, 4)).astype(np.int16)
-    sides = {"t": 1.0, "c": 1.0, "z": 500.0, "y": 250.0, "x": 125.0}
-    units = {axis: "micrometer" for axis in "zyx"}
+    sides, units = {"t": 1.0, "c": 1.0, "z": 500.0, "y": 250.0, "x": 125.0}, {axis: "micrometer" for axis in "zyx"}
     write_image(counts, str(tmp_path / "v4.zarr"), axes="tczyx", scale=sides, axes_units=units, fmt=FormatV04())
     with pytest.raises(InputError, match="as of Hounsfield"):
         attenuation_of("v4", load_volume(tmp_path / "v4.zarr"))
@@ -93,8 +89,7 @@ def test_what_is_lost_or_no_volume_is_said(volume_file, stored, tmp_path, caplog
     (lost / "s0" / "c" / "0" / "0" / "0").unlink()
     assert sha256_of(lost) != sha256_of(path)
     assert not load_volume(lost).values.any() and "1 chunks are missing" in caplog.text
-    damaged = shutil.copytree(path, tmp_path / "damaged.zarr")
-    (damaged / "s0" / "c" / "0" / "0" / "0").write_bytes(b"nothing")
+    (shutil.copytree(path, tmp_path / "damaged.zarr") / "s0" / "c" / "0" / "0" / "0").write_bytes(b"nothing")
     (tmp_path / "empty.zarr").mkdir()
     write_image(np.ones((2, 4, 5, 6), np.float32), str(tmp_path / "times.zarr"), axes="tzyx")
     write_image(np.ones((4, 5), np.float32), str(tmp_path / "flat.zarr"), axes="yx")

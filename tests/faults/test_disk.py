@@ -2,8 +2,6 @@
 
 import errno
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -57,8 +55,7 @@ WRITERS: dict[str, Callable[[Path, int], None]] = {
 
 @pytest.mark.parametrize("kind", WRITERS)
 def test_no_room_at_any_call_leaves_the_old_file_or_the_new_one(tmp_path, monkeypatch, kind) -> None:
-    target = tmp_path / kind
-    full = FullAt(monkeypatch)
+    target, full = tmp_path / kind, FullAt(monkeypatch)
     WRITERS[kind](target, 1)
     calls, old = full.made, target.read_bytes()
     assert calls >= 4
@@ -79,8 +76,7 @@ def test_no_room_at_any_call_leaves_the_old_file_or_the_new_one(tmp_path, monkey
 
 @pytest.mark.slow
 def test_results_keep_their_lines_when_there_is_no_room(tmp_path, monkeypatch) -> None:
-    results = tmp_path / "results.jsonl"
-    full = FullAt(monkeypatch)
+    results, full = tmp_path / "results.jsonl", FullAt(monkeypatch)
     append_line(results, {"run": "one"})
     for at in range(1, full.made + 1):
         full.arm(at)
@@ -88,47 +84,3 @@ def test_results_keep_their_lines_when_there_is_no_room(tmp_path, monkeypatch) -
             append_line(results, {"run": "two"})
         full.arm(None)
         assert read_lines(results)[0] == {"run": "one"}
-
-
-def can_mount() -> bool:
-    """Whether a process may have a mount of its own."""
-    script = ["unshare", "--mount", "mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", "/mnt"]
-    try:
-        return subprocess.run(script, capture_output=True, check=False).returncode == 0
-    except OSError:
-        return False
-
-
-# A real small disk, mounted where only this process sees it.
-ON_A_DISK = """
-mount -t tmpfs -o size=$1 tmpfs "$2" || exit 99
-printf 'an older result' > "$2/v.h5"
-shift; folder=$1; shift
-"$@"; status=$?
-content=new; grep -q 'an older result' "$folder/v.h5" && content=old
-printf '%s|%s|%s\\n' "$status" "$(ls -A "$folder" | tr '\\n' ' ')" "$content"
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not can_mount(), reason="a mount needs the superuser")
-@pytest.mark.parametrize("size_kib", [8, 1024])
-def test_a_disk_that_is_full(scan, tmp_path, size_kib) -> None:
-    """The real thing: HDF5 and the checkpoints run into it by themselves."""
-    script = tmp_path / "on_a_disk.sh"
-    script.write_text(ON_A_DISK)
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    words = ["reconstruct", str(scan), "-o", str(disk / "v.h5"), "--method", "sirt", "--iterations", "3"]
-    command = ["unshare", "--mount", "sh", str(script), f"{size_kib}k", str(disk)]
-    command += [sys.executable, "-m", "phyradgs_cl", *words, "--checkpoint-every", "1e-6"]
-    done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False, timeout=300)
-    status, left, content = done.stdout.splitlines()[-1].split("|")
-    complaints = [line for line in done.stderr.splitlines() if line.startswith("phyradgs:")]
-    assert "Traceback" not in done.stderr
-    if size_kib == 1024:
-        assert (status, left.split(), content) == ("0", ["v.h5"], "new"), done.stderr
-        return
-    assert (status, content, len(complaints)) == ("4", "old", 1), done.stderr
-    assert "no room left" in complaints[0]
-    assert set(left.split()) <= {"v.h5", "v.h5.checkpoint.npz"}

@@ -35,39 +35,30 @@ def expect_finite(rt, rows: np.ndarray, cells: TimeCells, **options: object) -> 
     on_device, gaussians = DeviceCells.upload(rt, cells), DeviceGaussians.upload(rt, rows)
     frame = projector.project(rows, on_device)
     projector.forward(gaussians, on_device)
-    gradients = rt.zeros((13, gaussians.stride))
-    ones = rt.upload(pad_rows(np.ones(SHAPE, np.float32)))
+    gradients, ones = rt.zeros((13, gaussians.stride)), rt.upload(pad_rows(np.ones(SHAPE, np.float32)))
     projector.backward(gaussians, on_device, ones, gradients)
     assert np.isfinite(frame).all() and np.isfinite(rt.download(gradients)[:, : gaussians.count]).all()
 
 
 @pytest.mark.parametrize("affine", [False, True], ids=["exact", "affine"])
 def test_gaussians_at_the_bounds_of_their_parameters(rt, make_cloud, affine) -> None:
-    """Raw parameters as large as float32 lets an optimiser drive them: the activation keeps everything in bounds."""
-    activation = SplatOptions().activation(GRID)
+    """Raw parameters as large as float32 lets an optimiser drive them: the activation, on the device too, keeps bounds."""
+    activation, on_device = SplatOptions().activation(GRID), rt.zeros((11, 64))
     raw = np.random.default_rng(0).choice([-1e4, -50.0, 0.0, 50.0, 1e4], (11, 64)).astype(np.float32)
     raw[MEAN] = np.random.default_rng(1).uniform(-1, 1, (3, 64))
     rows = activation.apply(raw.astype(np.float64))
-    assert np.isfinite(rows).all() and rows[SCALE].min() > 0
+    DeviceAdam(rt, activation).activate(rt.upload(raw), on_device, 64, 64)
+    for found in (rows, rt.download(on_device)):
+        assert np.isfinite(found).all() and found[SCALE].min() > 0 and found[DENSITY].min() >= 0
     expect_finite(rt, rows, one_cell(GEOMETRY), affine=affine)
     assert np.isfinite(voxelise(rt, rows, GRID)).all()
-
-
-def test_the_activation_on_the_device_stays_finite_too(rt) -> None:
-    activation, count = SplatOptions().activation(GRID), 64
-    raw = np.random.default_rng(2).choice([-1e4, -60.0, -1.0, 60.0, 1e4], (11, count)).astype(np.float32)
-    rows = rt.zeros((11, count))
-    DeviceAdam(rt, activation).activate(rt.upload(raw), rows, count, count)
-    found = rt.download(rows)
-    assert np.isfinite(found).all() and found[SCALE].min() > 0 and found[DENSITY].min() >= 0
 
 
 @pytest.mark.parametrize("affine", [False, True], ids=["exact", "affine"])
 def test_gaussians_at_the_source_behind_it_and_in_its_plane(rt, make_cloud, affine) -> None:
     cells = one_cell(GEOMETRY)
     source, to_detector = cells.pose[0, :3], -cells.pose[0, :3] / np.linalg.norm(cells.pose[0, :3])
-    across = np.cross(to_detector, [0.0, 0.0, 1.0])
-    rows = make_cloud(12, 5)
+    across, rows = np.cross(to_detector, [0.0, 0.0, 1.0]), make_cloud(12, 5)
     for index, place in enumerate((0.0, 1e-7, -1e-7, 1e-3, -1e-3, -0.5, 0.05)):
         rows[MEAN, index] = source + place * to_detector
     for index, place in enumerate((1e-3, 0.1, 1.0, -3.0, 100.0), start=7):
@@ -78,15 +69,14 @@ def test_gaussians_at_the_source_behind_it_and_in_its_plane(rt, make_cloud, affi
 
 @pytest.mark.parametrize("distance", [1e-3, 0.5, 1.0])
 def test_a_source_inside_the_volume(rt, make_cloud, distance) -> None:
-    geometry = ConeGeometry(distance, distance + 3.0, SHAPE, (0.6, 0.6))
-    cells = one_cell(geometry)
+    cells = one_cell(ConeGeometry(distance, distance + 3.0, SHAPE, (0.6, 0.6)))
     operator = RayOperator(rt, GRID, SHAPE, [cells])
     assert np.isfinite(operator.forward(np.ones(GRID.shape, np.float32))).all()
     assert np.isfinite(operator.adjoint(np.ones(operator.frames_shape, np.float32))).all()
     expect_finite(rt, make_cloud(20, 6), cells)
 
 
-@pytest.mark.parametrize("turn", [0.0, np.pi / 4, np.pi / 2])
+@pytest.mark.parametrize("turn", [0.0, np.pi / 4])
 @pytest.mark.parametrize("shape", [(1, 1), (5, 5), (4, 4)])
 def test_rays_through_vertices_and_along_faces(rt, turn, shape) -> None:
     """The central ray of odd detectors runs in planes of voxels' faces or through corners; a voxel counts once."""

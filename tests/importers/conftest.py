@@ -9,16 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from phyradgs_cl.acquisition import (
-    CircularOrbit,
-    ConeGeometry,
-    FrameSweeps,
-    ParallelGeometry,
-    Scan,
-    Shutter,
-    pixel_centres,
-)
+from phyradgs_cl.acquisition import pixel_centres
 from phyradgs_cl.acquisition.geometry import Geometry
+from phyradgs_cl.api import CircularOrbit, ConeGeometry, FrameSweeps, ParallelGeometry, Scan, Shutter
 from phyradgs_cl.detector import counts_to_attenuation
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.io import read_scan, write_scan
@@ -55,11 +48,9 @@ def projected(pose: np.ndarray, points: np.ndarray, is_parallel: bool = False) -
     """Pixels (n, 2) as (row, column) where world points (n, 3) fall for a pose (12,): plain linear algebra."""
     source, first, step_u, step_v = pose.reshape(4, 3)
     found = []
-    for point in points:
-        # start + s ray = first + c step_u + r step_v
+    for point in points:  # start + s ray = first + c step_u + r step_v
         start, ray = (point, source) if is_parallel else (source, point - source)
-        _, column, row = np.linalg.solve(np.stack([ray, -step_u, -step_v], 1), first - start)
-        found.append((row, column))
+        found.append(np.linalg.solve(np.stack([ray, -step_u, -step_v], 1), first - start)[:0:-1])
     return np.array(found)
 
 
@@ -87,10 +78,8 @@ def truth(fly: bool = False, axis: str = "rows", direction: int = 1, geometry: G
     arc = np.deg2rad(25.0) * exposure_s / frame_time_s if fly else 0.0
     shutter = Shutter(exposure_s, 0.3, axis, direction) if fly else Shutter(0.0)
     sweeps = FrameSweeps(start_s, shutter.exposure_s, angle_rad, angle_rad + arc)
-    orbit = CircularOrbit(geometry, sweeps)
-    reference = BALLS.voxelise(GRID)
-    scan = Scan(frames, geometry, orbit, shutter, start_s, GRID, fly, reference=reference)
-    return Truth(scan, angle_rad)
+    orbit, reference = CircularOrbit(geometry, sweeps), BALLS.voxelise(GRID)
+    return Truth(Scan(frames, geometry, orbit, shutter, start_s, GRID, fly, reference=reference), angle_rad)
 
 
 @pytest.fixture
@@ -108,8 +97,7 @@ def assert_same(tmp_path) -> Callable[..., None]:
         if ours.pixel_mask is not None:
             valid &= ~np.broadcast_to(ours.pixel_mask, valid.shape)
         worst = np.abs(ours.projections - native.projections)[valid].max()
-        assert worst <= pixels * native.projections.max()
-        assert ours.is_fly == native.is_fly
+        assert worst <= pixels * native.projections.max() and ours.is_fly == native.is_fly
         if timing:
             compare_timing(ours, native)
         compare_poses(ours, native)

@@ -27,11 +27,9 @@ def steps_deg(truth: Any) -> tuple[float, float]:
 
 
 def lab_pixels(
-    points: np.ndarray, gantry_rad: float, geometry: Any, axis_mm: float = 0.0, roll_rad: float = 0.0,
-    tilt_rad: float = 0.0,
+    points: np.ndarray, gantry_rad: float, geometry: Any, axis_mm: float = 0.0, roll_rad: float = 0.0, tilt_rad: float = 0.0
 ) -> np.ndarray:
     """Pixels (n, 2) (row from below, column from the left) where points (n, 3) of a sample on a stage fall, in the room.
-
     The room has its origin in the source: x to the right seen from there, y to the panel, z up. The stage turns the sample
     clockwise seen from above, about an axis ``axis_mm`` to the right. The top of the axis leans to the right by ``roll_rad``
     and towards the panel by ``tilt_rad``. At angle 0 the sample's x points to the source, its y to the right."""
@@ -46,8 +44,7 @@ def lab_pixels(
     room += np.array([[axis_mm], [geometry.source_to_axis_mm], [0.0]])
     on_panel = geometry.source_to_detector_mm * room[[2, 0]] / room[1]  # v, u
     offset, pitch = (np.array(pair)[:, None] for pair in (geometry.detector_offset_mm, geometry.pixel_size_mm))
-    middle = (np.array(geometry.detector_shape)[:, None] - 1) / 2
-    return ((on_panel - offset) / pitch + middle).T
+    return ((on_panel - offset) / pitch + ((np.array(geometry.detector_shape)[:, None] - 1) / 2)).T
 
 
 def write_nikon(folder: Path, truth: Any, **lines: object) -> Path:
@@ -70,8 +67,7 @@ def write_nikon(folder: Path, truth: Any, **lines: object) -> Path:
 
 
 def write_skyscan(folder: Path, truth: Any, **lines: object) -> Path:
-    """A SkyScan's scan_.log with its TIFFs and a preview: rows from the top, the right column first. Lines are counted from
-    the bottom line's lower edge."""
+    """A SkyScan's scan_.log with TIFFs and a preview: rows from the top, right column first, lines counted from below."""
     folder.mkdir()
     g, (first_deg, step_deg) = truth.scan.geometry, steps_deg(truth)
     values: dict[str, object] = {
@@ -125,8 +121,7 @@ def write_ole(path: Path, streams: dict[str, bytes]) -> None:
 
     def put(data: bytes) -> int:
         """The first sector of a chain with the data; END for none."""
-        count = -(-len(data) // SECTOR)
-        first = len(sectors)
+        count, first = -(-len(data) // SECTOR), len(sectors)
         sectors.extend(data[i * SECTOR : (i + 1) * SECTOR].ljust(SECTOR, b"\0") for i in range(count))
         fat.extend([*range(first + 1, first + count), END][:count])
         return first if count else END

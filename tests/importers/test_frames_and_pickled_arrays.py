@@ -1,7 +1,6 @@
 """Frames to line integrals, and arrays out of pickles: what is refused, and what it says."""
 
 import io
-import pickle
 
 import numpy as np
 import pytest
@@ -10,11 +9,10 @@ from tolerances import FLOAT32
 from phyradgs_cl.acquisition import Saturation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions
-from phyradgs_cl.importers.formats.pickles import PlainUnpickler, read_pickle
+from phyradgs_cl.importers.formats.pickles import PlainUnpickler
 from phyradgs_cl.importers.frames import line_integrals
 
 pytestmark = pytest.mark.slow
-
 FRAMES = np.array([[[100.0, 50.0], [25.0, 10.0]]] * 3, np.float32)
 
 
@@ -55,29 +53,9 @@ def test_clipped_counts_are_masked_in_their_own_frames(caplog) -> None:
     same = line_integrals("f", frames, ImportOptions(flat_value=40000.0), darks=darks)
     assert same.mask is None and same.saturation == found.saturation and (same.values[frames == 40000] == 0).all()
     text = f"f: {100 * share:.3g} % of the projections' pixels are clipped at 40000 counts: "
-    assert caplog.messages == [
-        text + "masked, each in its own frame", text + "taken as air, for flat_value is no brighter",
-    ]
+    assert caplog.messages == [text + "masked, each in its own frame", text + "taken as air, for flat_value is no brighter"]
     line_integrals("f", frames, ImportOptions(), flats=np.full((2, 40, 40), 40000.0), darks=darks)
     assert caplog.messages[-1] == text + "taken as air, for the flats are clipped too"
-
-
-CONTENT = {
-    "rows": np.arange(6.0).reshape(2, 3),
-    "columns": np.asfortranarray(np.arange(6, dtype=">i4").reshape(2, 3)),
-    "large": np.arange(300, dtype=np.float32), "scalars": [np.float32(2.5), np.int64(3), np.array(1.5)],
-    "plain": [1, 2.5, "é", b"x", None, True, (4, -5)], 7: {},
-}
-
-
-def test_plain_containers_and_arrays_come_out_of_pickles(tmp_path) -> None:
-    for protocol in range(6):
-        (tmp_path / "a.pickle").write_bytes(pickle.dumps(CONTENT, protocol))
-        found = read_pickle(tmp_path / "a.pickle")
-        assert list(found) == list(CONTENT), protocol
-        assert found["plain"] == CONTENT["plain"] and found["scalars"] == [2.5, 3, 1.5]
-        for name in ("rows", "columns", "large"):
-            np.testing.assert_array_equal(found[name], CONTENT[name])
 
 
 RAW = np.arange(6, dtype="<i2").tobytes()

@@ -17,7 +17,6 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
 
 pytestmark = pytest.mark.slow
-
 # Written by RTK 2.7: three projections, the third tilted about all axes with every offset in use.
 DATA = Path(__file__).with_name("data")
 RTK_FILE, RTK_PARALLEL = DATA / "rtk_tilted.xml", DATA / "rtk_parallel.xml"
@@ -37,8 +36,7 @@ def rtk_folder(tmp_path) -> Path:
 
 def rtk_pixels(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Pixels (n, 2) (row, column) by RTK's own 3×4 matrix; its axes (X, Y, Z) are (y, z, x) here."""
-    theirs = np.concatenate([points[:, [1, 2, 0]], np.ones((len(points), 1))], 1)
-    u, v, w = matrix @ theirs.T
+    u, v, w = matrix @ np.concatenate([points[:, [1, 2, 0]], np.ones((len(points), 1))], 1).T
     return np.stack([(v / w - ORIGIN[1]) / SPACING[1], (u / w - ORIGIN[0]) / SPACING[0]], -1)
 
 
@@ -52,24 +50,19 @@ def test_rtk_s_own_matrices_see_points_where_our_poses_do(rtk_folder, file) -> N
         matrix = np.array(text.split(), float).reshape(3, 4)
         for share in (0.0, 0.5, 1.0):
             at = scan.frame_start_s[frame] + share * scan.shutter.middle_s
-            pose = scan.trajectory.pose(frame, np.array([at]))[0]
-            expected = rtk_pixels(matrix, WORLD_POINTS)
+            pose, expected = scan.trajectory.pose(frame, np.array([at]))[0], rtk_pixels(matrix, WORLD_POINTS)
             np.testing.assert_allclose(projected(pose, WORLD_POINTS, scan.is_parallel), expected, atol=1e-6)
     np.testing.assert_array_equal(scan.projections[1, 2, :3], (140 + 28 + np.arange(3)) / 64)
-
-
-def test_of_two_stacks_the_named_one_is_read(rtk_folder) -> None:
-    stack = next(rtk_folder.glob("*.mha"))
-    scan = import_scan(rtk_folder)
-    shutil.copy(stack, rtk_folder / "truth.mha")
-    with pytest.raises(InputError, match="name the file itself"):
-        import_scan(rtk_folder)
-    np.testing.assert_array_equal(import_scan(stack).projections, scan.projections)
 
 
 def test_rtk_s_poses_move_through_the_frames(rtk_folder) -> None:
     """With times the poses of the file are met as each exposure starts, or in its middle; every window is covered."""
     still = import_scan(rtk_folder)
+    shutil.copy(rtk_folder / "stack.mha", rtk_folder / "truth.mha")
+    with pytest.raises(InputError, match="name the file itself"):
+        import_scan(rtk_folder)
+    np.testing.assert_array_equal(import_scan(rtk_folder / "stack.mha").projections, still.projections)
+    (rtk_folder / "truth.mha").unlink()
     for options, after_s in ((FLY, 0.0), (replace(FLY, angle_at="middle"), 0.25)):
         fly = import_scan(rtk_folder, options)
         assert fly.is_fly
@@ -125,12 +118,10 @@ def test_circles_beside_the_axis(tmp_path, real_truth) -> None:
 
 def test_windows_that_overlap_are_moved_apart(tmp_path, real_truth) -> None:
     sweeps = real_truth.scan.trajectory.kinematics
-    wide = replace(sweeps, angle_end_rad=sweeps.angle_start_rad + np.deg2rad(24))
-    orbit = CircularOrbit(REAL_GEOMETRY, wide)
+    orbit = CircularOrbit(REAL_GEOMETRY, replace(sweeps, angle_end_rad=sweeps.angle_start_rad + np.deg2rad(24)))
     wide_truth = replace(real_truth, scan=replace(real_truth.scan, trajectory=orbit))
     scan = import_scan(write_phyradgs_real(tmp_path / "real", wide_truth), REAL)
     assert np.diff(scan.frame_start_s).min() > scan.shutter.span_s
-    pose = pose_at(scan, 3, 1.0)
-    end_rad = sweeps.angle_start_rad[3] + np.deg2rad(24) * (1 + 0.3 / 0.4)
+    pose, end_rad = pose_at(scan, 3, 1.0), sweeps.angle_start_rad[3] + np.deg2rad(24) * (1 + 0.3 / 0.4)
     native = REAL_GEOMETRY.pose(end_rad)
     np.testing.assert_allclose(projected(pose, WORLD_POINTS), projected(native, WORLD_POINTS), atol=1e-5)

@@ -1,7 +1,5 @@
-"""Raw projections of makers, read by the package itk-rtk, where that is installed (conftest.py).
-
-They are written here as Elekta, Varian and medPhoton write them, in the layouts that RTK's readers state. ``AIR`` are the
-counts that RTK takes for air."""
+"""Raw projections, read by the package itk-rtk, where it is installed (conftest.py), and written here as Elekta, Varian and
+medPhoton write them, in the layouts that RTK's readers state. ``AIR`` are the counts that RTK takes for air."""
 
 import struct
 from collections.abc import Callable
@@ -69,9 +67,8 @@ def differences(image: np.ndarray) -> tuple[bytes, bytes]:
 
 def obi_header(shape: tuple[int, int], pitch_mm: tuple[float, float], angle_deg: float) -> bytes:
     """The header of .hnd and .hnc: words and numbers in a fixed order, of which RTK reads size, pitch and angle."""
-    text = struct.pack(
-        "<32sI4sI8s8s16sI16sI16sI", b"VARIAN_VA_INTERNAL_HNC_1.0", 0, b"", 0, b"", b"", b"", 0, b"", 0, b"", 0
-    )
+    first = "<32sI4sI8s8s16sI16sI16sI", b"VARIAN_VA_INTERNAL_HNC_1.0"
+    text = struct.pack(*first, 0, b"", 0, b"", b"", b"", 0, b"", 0, b"", 0)
     text += struct.pack("<IId16sIII4s", shape[1], shape[0], 0.0, b"RTIMAGE", 0, 0, 0, b"")
     numbers = np.zeros(40)
     numbers[[23, 24]] = pitch_mm[::-1]  # dIDUResolutionX, -Y
@@ -106,8 +103,7 @@ def write_obi(folder: Path, truth: Any, suffix: str, fan: str = "HalfFan") -> Pa
 def write_probeam(folder: Path, truth: Any) -> Path:
     """Scan.xml, and .xim of packed differences in Acquisitions/NUMBER/, each with the panel's place in cm and the source's
     angle, which turns against the gantry's."""
-    images = folder / "Acquisitions" / "733061622"
-    images.mkdir(parents=True)
+    (images := folder / "Acquisitions" / "733061622").mkdir(parents=True)
     g = truth.scan.geometry
     distances = f"<SAD>{g.source_to_axis_mm}</SAD><SID>{g.source_to_detector_mm}</SID>"
     (folder / "Scan.xml").write_text(f"<?xml version='1.0'?><Scan><Acquisitions>{distances}</Acquisitions></Scan>")
@@ -139,8 +135,7 @@ def write_ora(folder: Path, truth: Any) -> Path:
         angle_rad = np.deg2rad(angle_deg)
         right = np.array([np.cos(angle_rad), 0, -np.sin(angle_rad)])
         up, back = np.array([0.0, 1, 0]), np.array([np.sin(angle_rad), 0, np.cos(angle_rad)])
-        shift = np.array([0, 10 * ALONG_CM, 10 * TABLE_CM])
-        source = back * g.source_to_axis_mm
+        shift, source = np.array([0, 10 * ALONG_CM, 10 * TABLE_CM]), back * g.source_to_axis_mm
         panel = source - back * g.source_to_detector_mm + right * off_u + up * off_v
         values = {
             "SourcePosition": " ".join(map(repr, (source + shift).tolist())),
@@ -197,43 +192,39 @@ def test_projections_of_a_maker_with_their_geometry(maker, make_files, assert_sa
     assert_same(scan, truth, grid=False, pixels=1e-3 if maker == "elekta" else 1e-4)  # whole counts
 
 
-def test_a_rate_and_an_exposure_make_a_fly_scan_on_a_circle(make_files) -> None:
-    scan = import_scan(make_files("elekta")[0], ImportOptions(exposure_s=0.4, fps=0.8))
-    assert isinstance(scan.trajectory, CircularOrbit)
-    assert scan.is_fly and scan.shutter.exposure_s == 0.4
-
-
-@pytest.mark.parametrize(
-    ("maker", "suffix"), [("elekta", "his"), ("obi", "hnd"), ("obi-16-bits", "hnc"), ("probeam", "xim")]
-)
-def test_the_counts_of_air_replace_those_that_rtk_takes(maker, suffix, make_files) -> None:
-    path, truth = make_files(maker)
-    brighter = import_scan(path, ImportOptions(flat_value=2.0 * AIR[suffix]))
-    difference = brighter.projections - truth.scan.projections
-    np.testing.assert_allclose(difference, np.log(2), atol=1e-3)
-
-
-def test_the_counts_of_air_that_nothing_states_are_said(make_files, caplog) -> None:
-    path, _ = make_files("obi-16-bits")
+def test_times_of_frames_are_named_and_a_rate_and_an_exposure_make_a_fly_scan_on_a_circle(make_files, caplog) -> None:
+    path, _ = make_files("elekta")
+    text = (path / "_Frames.xml").read_text()
+    (path / "_Frames.xml").write_text(text.replace("<Seq>1</Seq>", "<Seq>1</Seq><DeltaMs>182</DeltaMs>"))
     import_scan(path)
-    assert "air is taken for 65535 counts, as RTK does; say flat_value" in caplog.text
-    caplog.clear()
-    import_scan(path, ImportOptions(flat_value=60000.0))
-    assert "air" not in caplog.text
+    said = "no exposure and frames' times (DeltaMs): taken at rest; say frame_time_s or fps if the gantry did not stop"
+    assert said in caplog.text
+    scan = import_scan(path, ImportOptions(exposure_s=0.4, fps=0.8))
+    assert isinstance(scan.trajectory, CircularOrbit) and scan.is_fly and scan.shutter.exposure_s == 0.4
 
 
-@pytest.mark.parametrize(("maker", "value"), [("obi", 0), ("obi-16-bits", 0), ("probeam", 0)])
-def test_pixels_without_counts_are_masked(maker, value, tmp_path, make_truth, monkeypatch) -> None:
+@pytest.mark.parametrize("suffix", AIR)
+def test_the_counts_of_air_replace_those_that_rtk_takes(suffix, make_files, caplog) -> None:
+    path, truth = make_files({"his": "elekta", "hnd": "obi", "hnc": "obi-16-bits", "xim": "probeam"}[suffix])
+    brighter = import_scan(path, ImportOptions(flat_value=2.0 * AIR[suffix]))
+    np.testing.assert_allclose(brighter.projections - truth.scan.projections, np.log(2), atol=1e-3)
+    if suffix == "hnc":  # which states none
+        assert "air" not in caplog.text
+        import_scan(path)
+        assert "air is taken for 65535 counts, as RTK does; say flat_value" in caplog.text
+
+
+@pytest.mark.parametrize("maker", ["obi", "obi-16-bits", "probeam"])
+def test_pixels_without_counts_are_masked(maker, make_files, monkeypatch) -> None:
     """RTK's own line integral of them is 0, as of air."""
 
     def spoilt(integrals: np.ndarray, air: float, whole: Callable[..., np.ndarray] = counts) -> np.ndarray:
         image = whole(integrals, air)
-        image[2, 5] = value
+        image[2, 5] = 0
         return image
 
     monkeypatch.setitem(globals(), "counts", spoilt)
-    truth = make_truth(geometry=GEOMETRIES[maker]) if maker in GEOMETRIES else make_truth()
-    scan = import_scan(MAKERS[maker][0](tmp_path / maker, truth))
+    scan = import_scan(make_files(maker)[0])
     assert np.argwhere(np.atleast_3d(scan.pixel_mask)[..., 0] != 0).tolist() in ([[2, 5]], [[7, 5]])
 
 
@@ -249,42 +240,22 @@ def test_the_dose_of_a_truebeam_s_frames(tmp_path, make_truth, caplog, dose, wor
         count = data.rindex(struct.pack("<I11s", 11, b"KVSourceRtn")) - 4
         more = struct.pack("<I13sIi", len(name), name, 0, one)
         file.write_bytes(data[:count] + struct.pack("<I", 6) + data[count + 4 :] + more)
-    scan = import_scan(path)
-    light = np.log(times if "divided" in words else np.ones(6))[:, None, None]
+    scan, light = import_scan(path), np.log(times if "divided" in words else np.ones(6))[:, None, None]
     np.testing.assert_allclose(scan.projections - light, truth.scan.projections, atol=1e-4)
     assert words in caplog.text and (words or "KVNormChamber" not in caplog.text)
 
 
-@pytest.mark.parametrize(("maker", "old", "new"), [
-    ("elekta", ("_Frames.xml", b"<Seq>1</Seq>"), b"<Seq>1</Seq><DeltaMs>182</DeltaMs>"), ("obi", None, b""),
-])  # fmt: skip
-def test_times_of_frames_are_named(make_files, caplog, maker, old, new) -> None:
-    path, _ = make_files(maker)
-    if old:
-        file = path / old[0]
-        file.write_bytes(file.read_bytes().replace(old[1], new))
-    import_scan(path)
-    said = "no exposure and frames' times (DeltaMs): taken at rest; say frame_time_s or fps if the gantry did not stop"
-    assert (said in caplog.text) == bool(old) and "DeltaMs" in caplog.text or not old
-
-
-def test_options_that_mean_nothing_are_refused(make_files) -> None:
+def test_what_rtk_does_not_read_or_is_no_scan_is_one_error_of_one_line(make_files) -> None:
+    """Nor are options of no meaning taken, nor two acquisitions of a TrueBeam."""
     path, _ = make_files("ora")
     for options in (ImportOptions(flat_value=5e4), ImportOptions(quantity="counts")):
         with pytest.raises(InputError, match="with format rtk-projections"):
             import_scan(path, options)
-
-
-def test_two_acquisitions_of_a_truebeam_are_not_one_scan(make_files) -> None:
     path, _ = make_files("probeam")
-    other = path / "Acquisitions" / "2"
-    other.mkdir()
-    (other / "Proj_00000.xim").write_bytes(b"VMS.XI")
+    (path / "Acquisitions/2").mkdir()
+    (path / "Acquisitions/2/Proj_00000.xim").write_bytes(b"VMS.XI")
     with pytest.raises(InputError, match="found projections of several acquisitions"):
         import_scan(path)
-
-
-def test_what_rtk_does_not_read_is_one_error_of_one_line(make_files) -> None:
     path, _ = make_files("elekta")
     (path / "00003.his").write_bytes(b"none")
     with pytest.raises(InputError, match="elekta: found files that RTK does not read") as caught:

@@ -14,7 +14,6 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import ImportOptions, import_scan, recognise
 
 pytestmark = pytest.mark.slow
-
 SQUARE = replace(GEOMETRY, detector_offset_mm=(3.0, -5.0))  # whole and half pixels, which text keeps to the bit
 FLAT = ParallelGeometry((10, 14), (3.0, 2.5), (3.0, -5.0))
 
@@ -46,24 +45,21 @@ def test_leap_s_formula_sees_points_where_our_poses_do(tmp_path, make_truth, cap
     """τ above 0 moves source and panel against the columns; equal steps begin at 0°; frames may be TIFFs."""
     truth = make_truth()
     path = w.write_leap(tmp_path / "a", truth, tau=2.5, phis=None, angularRange=-300.0)
-    values = {**w.leap_values(truth), "tau": 2.5}
-    scan = import_scan(path / "params.txt")
+    values, scan = {**w.leap_values(truth), "tau": 2.5}, import_scan(path / "params.txt")
     for frame in range(6):
         expected = leap_pixels(WORLD_POINTS, -50.0 * frame, values)
         np.testing.assert_allclose(projected(pose_at(scan, frame, 0.5), WORLD_POINTS), expected, atol=1e-6)
     assert "no phis (angularRange in equal steps from 0°)" in caplog.text
-    w.write_leap(tmp_path / "b", truth)
-    (tmp_path / "b" / "g.npy").unlink()
+    (path / "g.npy").unlink()
     for i, image in enumerate(truth.scan.projections):
-        tifffile.imwrite(tmp_path / "b" / f"g_{i}.tif", image)
-    assert recognise(tmp_path / "b") == "leap"
-    np.testing.assert_array_equal(import_scan(tmp_path / "b").projections, truth.scan.projections)
+        tifffile.imwrite(path / f"g_{i}.tif", image)
+    assert recognise(path) == "leap"
+    np.testing.assert_array_equal(import_scan(path).projections, truth.scan.projections)
 
 
 def test_leap_s_modular_beam_is_a_table_of_views(tmp_path, make_truth, assert_same) -> None:
     truth = make_truth()
-    poses = GEOMETRY.pose(truth.angle_rad).reshape(-1, 4, 3)
-    source, first, step_u, step_v = poses.swapaxes(0, 1)
+    source, first, step_u, step_v = GEOMETRY.pose(truth.angle_rad).reshape(-1, 4, 3).swapaxes(0, 1)
     centre = first + 6.5 * step_u + 4.5 * step_v
     vectors = {"sourcePositions": source, "moduleCenters": centre, "rowVectors": step_v / 3.0, "colVectors": step_u / 2.5}
     lines = {name: ", ".join(map(repr, table.ravel().tolist())) for name, table in vectors.items()}
@@ -73,6 +69,20 @@ def test_leap_s_modular_beam_is_a_table_of_views(tmp_path, make_truth, assert_sa
     assert_same(scan, truth, grid=False)
     with pytest.raises(InputError, match="rotates with format leap, which states every view"):
         import_scan(path, ImportOptions(rotates="sample"))
+
+
+RAW = {"_Frames.xml": "1.his", "ProjectionInfo.xml": "1.hnd", "Scan.xml": "1.xim", "a.ora.xml": "b.ora.xml"}
+
+
+def test_raw_projections_are_recognised_and_name_the_package_that_reads_them(tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "itk", None)
+    for description, projection in RAW.items():
+        (folder := tmp_path / projection).mkdir()
+        for name in (description, projection):
+            (folder / name).touch()
+        assert recognise(folder) == recognise(folder / description) == "rtk-projections"
+        with pytest.raises(InputError, match=r"phyradgs-cl\[rtk\]"):
+            import_scan(folder)
 
 
 def test_tigre_s_centre_of_rotation_and_values_per_frame(tmp_path, make_truth) -> None:
@@ -86,18 +96,3 @@ def test_tigre_s_centre_of_rotation_and_values_per_frame(tmp_path, make_truth) -
         pose[:6] += np.tile(1.5 * pose[6:9] / 2.5, 2)
         expected = projected(pose, WORLD_POINTS)
         np.testing.assert_allclose(projected(pose_at(scan, frame, 0.5), WORLD_POINTS), expected, atol=1e-6)
-
-
-RAW = {"_Frames.xml": "1.his", "ProjectionInfo.xml": "1.hnd", "Scan.xml": "1.xim", "a.ora.xml": "b.ora.xml"}
-
-
-def test_raw_projections_are_recognised_and_name_the_package_that_reads_them(tmp_path, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "itk", None)
-    for description, projection in RAW.items():
-        folder = tmp_path / projection
-        folder.mkdir()
-        for name in (description, projection):
-            (folder / name).write_bytes(b"")
-        assert recognise(folder) == recognise(folder / description) == "rtk-projections"
-        with pytest.raises(InputError, match=r"phyradgs-cl\[rtk\]"):
-            import_scan(folder)

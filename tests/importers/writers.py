@@ -41,9 +41,7 @@ def scanner_table(truth: Any, unit_mm: float) -> dict[str, object]:
 def write_r2(folder: Path, truth: Any, unit_mm: float = 1.0, test: int = 2) -> Path:
     """An R2-Gaussian folder: the last ``test`` frames are held out."""
     folder.mkdir()
-    meta: dict[str, Any] = {
-        "scanner": scanner_table(truth, unit_mm), "vol": "vol_gt.npy", "bbox": [[-1] * 3, [1] * 3],
-    }
+    meta: dict[str, Any] = {"scanner": scanner_table(truth, unit_mm), "vol": "vol_gt.npy", "bbox": [[-1] * 3, [1] * 3]}
     np.save(folder / "vol_gt.npy", np.transpose(truth.scan.reference, (2, 1, 0)) * unit_mm)
     count = truth.scan.frames - test
     for part, frames in (("train", range(count)), ("test", range(count, truth.scan.frames))):
@@ -61,8 +59,7 @@ def write_phyradgs(folder: Path, truth: Any) -> Path:
     """A synthetic PhyRadGS folder: the same, with where first and last lines began and ended."""
     write_r2(folder, truth, test=0)
     shutter, sweeps = truth.scan.shutter, truth.scan.trajectory.kinematics
-    arc = sweeps.angle_end_rad - sweeps.angle_start_rad
-    meta = json.loads((folder / "meta_data.json").read_text())
+    arc, meta = sweeps.angle_end_rad - sweeps.angle_start_rad, json.loads((folder / "meta_data.json").read_text())
     meta["simulate_train"] = [
         {
             **entry, "first_line_start": entry["angle"], "first_line_end": entry["angle"] + a,
@@ -103,10 +100,8 @@ def write_naf(path: Path, truth: Any, protocol: int = 4, dtype: type = np.float3
 
 
 def write_phyradgs_real(folder: Path, truth: Any, centre_mm: tuple[float, float] = (0.0, 0.0)) -> Path:
-    """Views with 4×4 detector matrices (image x, image y downwards, away from the source) and 16-bit counts.
-
-    The circles may be centred off the axis; matrices are given where the panel stands in the middle of the exposure.
-    """
+    """Views with 4×4 detector matrices (image x, image y downwards, away from the source) and 16-bit counts. The circles may
+    be centred off the axis; matrices are given where the panel stands in the middle of the exposure."""
     scan, g = truth.scan, truth.scan.geometry
     sweeps, ratio = scan.trajectory.kinematics, scan.shutter.readout_s / scan.shutter.exposure_s
     (folder / "projections").mkdir(parents=True)
@@ -118,9 +113,8 @@ def write_phyradgs_real(folder: Path, truth: Any, centre_mm: tuple[float, float]
         a, b = sweeps.angle_start_rad[i], sweeps.angle_end_rad[i]
         marks = np.rad2deg([a, b, a + ratio * (b - a), b + ratio * (b - a)])
         names = ("first_row_start_angle", "first_row_end_angle", "last_row_start_angle", "last_row_end_angle")
-        half = (a + b) / 2
-        radial = np.array([np.cos(half), np.sin(half), 0])
-        x, y = np.array([-np.sin(half), np.cos(half), 0]), np.array([0, 0, -1.0])
+        radial = np.array([np.cos((a + b) / 2), np.sin((a + b) / 2), 0])
+        x, y = np.array([-radial[1], radial[0], 0]), np.array([0, 0, -1.0])
         matrix = np.eye(4)
         matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = x, y, np.cross(x, y)
         matrix[:3, 3] = centre - (g.source_to_detector_mm - g.source_to_axis_mm) * radial + [0, 0, off_v]
@@ -139,8 +133,7 @@ def write_phyradgs_real(folder: Path, truth: Any, centre_mm: tuple[float, float]
         "detector": {"center": [*centre_mm, off_v], "radius": behind},
         "source": {"center": [*centre_mm, 0.0], "radius": g.source_to_axis_mm},
     }
-    text = json.dumps({"views": views, "rolling_shutter_geometry": circles})
-    (folder / "geometric_motion_rs.json").write_text(text)
+    (folder / "geometric_motion_rs.json").write_text(json.dumps({"views": views, "rolling_shutter_geometry": circles}))
     return folder
 
 
@@ -152,10 +145,8 @@ def write_rtk(
     folder.mkdir()
     g = truth.scan.geometry
     (nv, nu), (dv, du), (off_v, off_u) = g.detector_shape, g.pixel_size_mm, g.detector_offset_mm
-    angles = "".join(
-        f"  <Projection>\n    <GantryAngle>{np.rad2deg(a):.15g}</GantryAngle>\n  </Projection>\n"
-        for a in truth.angle_rad
-    )
+    frame = "  <Projection>\n    <GantryAngle>{:.15g}</GantryAngle>\n  </Projection>\n"
+    angles = "".join(map(frame.format, np.rad2deg(truth.angle_rad)))
     distances = "" if truth.scan.is_parallel else (
         f"  <SourceToIsocenterDistance>{g.source_to_axis_mm}</SourceToIsocenterDistance>\n"
         f"  <SourceToDetectorDistance>{g.source_to_detector_mm}</SourceToDetectorDistance>\n"
@@ -213,11 +204,7 @@ def write_nxtomo(path: Path, truth: Any, flips: tuple[bool, bool] = (False, Fals
     units, g = pint.get_application_registry(), truth.scan.geometry
     frames, flats, darks = counts(truth)
     stack = np.concatenate([darks[:1], flats[:1], frames, flats[1:]])
-    if flips[0]:
-        stack = stack[:, ::-1]
-    if flips[1]:
-        stack = stack[:, :, ::-1]
-    tomo = nxtomo.NXtomo()
+    stack, tomo = stack[:, :: -1 if flips[0] else 1, :: -1 if flips[1] else 1], nxtomo.NXtomo()
     tomo.title = "theirs"
     detector = tomo.instrument.detector
     detector.data = np.ascontiguousarray(stack.astype(np.float32))
@@ -260,8 +247,7 @@ def write_tiff(folder: Path, truth: Any, timing: str = "", angles: str | None = 
     frames, flats, darks = counts(truth, **dead)
     for name, stack in (("proj", frames), ("flat", flats), ("dark", darks)):
         for i, image in enumerate(stack):
-            file = folder / f"{name}_{i}.tif"
-            tifffile.imwrite(file, image[::-1].astype(np.float64))
+            tifffile.imwrite(folder / f"{name}_{i}.tif", image[::-1].astype(np.float64))
     g, grid = truth.scan.geometry, truth.scan.grid
     distances = f"to_axis_mm = {g.source_to_axis_mm}\nto_detector_mm = {g.source_to_detector_mm}" if is_cone(truth) else ""
     angles = angles or f"values_deg = {np.rad2deg(truth.angle_rad).tolist()}"
@@ -319,12 +305,10 @@ def write_leap(folder: Path, truth: Any, **values: object) -> Path:
 
 def tigre_geometry(truth: Any, **attributes: object) -> Any:
     """An object of a class by the name of TIGRE's, which is not installed."""
-    names = ("tigre", "tigre.utilities", "tigre.utilities.geometry")
-    for name in names:
-        sys.modules.setdefault(name, types.ModuleType(name))
-    module = sys.modules[names[-1]]
+    for name in ("tigre", "tigre.utilities", "tigre.utilities.geometry"):
+        module = sys.modules.setdefault(name, types.ModuleType(name))
     if not hasattr(module, "Geometry"):
-        module.Geometry = type("Geometry", (), {"__module__": names[-1]})
+        module.Geometry = type("Geometry", (), {"__module__": name})
     geo, g, grid = module.Geometry(), truth.scan.geometry, truth.scan.grid
     values = {
         "mode": "cone" if is_cone(truth) else "parallel", "accuracy": 0.5, "filter": None,
@@ -340,8 +324,7 @@ def tigre_geometry(truth: Any, **attributes: object) -> Any:
 
 def write_tigre(path: Path, truth: Any, **attributes: object) -> Path:
     """A pickle of what TIGRE's loaders return."""
-    content = (truth.scan.projections, tigre_geometry(truth, **attributes), truth.angle_rad)
-    path.write_bytes(pickle.dumps(content))
+    path.write_bytes(pickle.dumps((truth.scan.projections, tigre_geometry(truth, **attributes), truth.angle_rad)))
     return path
 
 
@@ -356,8 +339,6 @@ WRITERS = {
     "flexray": (lab.write_flexray, "flexray"), "zeiss": (lab.write_zeiss, "sample.txrm"),
     "leap": (write_leap, "leap"), "tigre": (write_tigre, "tigre.pickle"),
 }  # fmt: skip
-
-
 # of the panel, where a format cannot state all
 OFFSETS_MM = {"phyradgs-real": (4.0, 0.0), "nikon": (0.0, 0.0), "zeiss": (0.0, 0.0), "skyscan": (4.0, 0.0)}
 

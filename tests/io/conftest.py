@@ -18,8 +18,7 @@ def make_scan() -> Callable[..., Scan]:
     """A factory of a 4-frame fly-scan (3 × 5 pixels); keywords replace fields of the Scan."""
 
     def make(**changes: object) -> Scan:
-        rng = np.random.default_rng(7)
-        start_s = np.array([0.5, 1.75, 3.0, 4.5])
+        rng, start_s = np.random.default_rng(7), np.array([0.5, 1.75, 3.0, 4.5])
         first_rad = np.deg2rad([10.0, 25.0, 40.0, 58.0])
         sweeps = FrameSweeps(start_s, 0.8, first_rad, first_rad + np.deg2rad([3.0, 4.0, 5.0, 6.0]))
         fields: dict[str, object] = {

@@ -5,6 +5,7 @@ import os
 import pickle
 import zipfile
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -30,8 +31,7 @@ def rewrite(path: Path, changes: dict[str, bytes]) -> None:
 
 
 def npy(array: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    np.lib.format.write_array(stream, array)
+    np.save(stream := io.BytesIO(), array)
     return stream.getvalue()
 
 
@@ -52,13 +52,10 @@ def test_what_was_written_is_read(path) -> None:
 
 
 def test_none_another_versions_or_one_that_cannot_be_opened(path, monkeypatch) -> None:
-    def closed(*_: object, **__: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
     refused(path.with_name("none.npz"), "no checkpoint")
     rewrite(path, {"format.npy": npy(np.array(1))})
     refused(path, "a checkpoint of another version")
-    monkeypatch.setattr(zipfile, "ZipFile", closed)
+    monkeypatch.setattr(zipfile, "ZipFile", Mock(side_effect=PermissionError(13, "Permission denied")))
     refused(path, r"a damaged checkpoint \(Permission denied\)")
 
 

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import time
 from pathlib import Path
 from subprocess import DEVNULL, PIPE
 
@@ -13,7 +12,6 @@ from phyradgs_cl.io import only_run
 from phyradgs_cl.io.output import lock_path
 
 pytestmark = pytest.mark.slow
-
 HOLD = """
 import sys, time
 from phyradgs_cl.io import only_run
@@ -21,10 +19,6 @@ with only_run(sys.argv[1]):
     print("held", flush=True)
     time.sleep(60)
 """
-
-
-def start(output: Path) -> subprocess.Popen[str]:
-    return subprocess.Popen([sys.executable, "-c", HOLD, str(output)], stdout=PIPE, stderr=DEVNULL, text=True)
 
 
 def refused(path: Path, words: str = "another run") -> None:
@@ -35,19 +29,26 @@ def refused(path: Path, words: str = "another run") -> None:
 @pytest.fixture
 def holder(tmp_path):
     """Another process that is at work on volume.h5."""
-    process = start(tmp_path / "volume.h5")
+    words = [sys.executable, "-c", HOLD, str(tmp_path / "volume.h5")]
+    process = subprocess.Popen(words, stdout=PIPE, stderr=DEVNULL, text=True)
     assert process.stdout.readline() == "held\n"
     yield process
     process.kill()
     process.wait()
 
 
-def test_a_second_run_is_refused_by_any_name_of_the_output(tmp_path, holder) -> None:
+def test_a_second_run_is_refused_by_any_name_of_the_output_until_the_first_is_dead(tmp_path, holder) -> None:
     (tmp_path / "link.h5").symlink_to(tmp_path / "volume.h5")
     for name in ("volume.h5", "link.h5"):
         refused(tmp_path / name)
     with only_run(tmp_path / "other.h5"):
         assert holder.poll() is None
+    holder.kill()
+    holder.wait()
+    assert lock_path(tmp_path / "volume.h5").exists()
+    with only_run(tmp_path / "volume.h5"):
+        assert lock_path(tmp_path / "volume.h5").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["link.h5"]
 
 
 def test_a_run_beside_it_in_the_same_process_is_refused(tmp_path) -> None:
@@ -61,31 +62,9 @@ def test_a_run_beside_it_in_the_same_process_is_refused(tmp_path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_dead_runs_lock_is_taken_over(tmp_path, holder) -> None:
-    holder.kill()
-    holder.wait()
-    assert lock_path(tmp_path / "volume.h5").exists()
-    with only_run(tmp_path / "volume.h5"):
-        assert lock_path(tmp_path / "volume.h5").exists()
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_lock_that_is_a_link_is_not_followed(tmp_path) -> None:
     victim = tmp_path / "victim"
     victim.write_text("precious")
     lock_path(tmp_path / "volume.h5").symlink_to(victim)
     refused(tmp_path / "volume.h5", "lock")
     assert victim.read_text() == "precious"
-
-
-def test_of_many_runs_at_once_one_wins(tmp_path) -> None:
-    count = 3
-    processes = [start(tmp_path / "volume.h5") for _ in range(count)]
-    deadline = time.monotonic() + 60
-    while sum(p.poll() is not None for p in processes) < count - 1 and time.monotonic() < deadline:
-        time.sleep(0.05)
-    alive = [p for p in processes if p.poll() is None]
-    for process in alive:
-        process.kill()
-        process.wait()
-    assert len(alive) == 1

@@ -28,12 +28,11 @@ def of_photons(scan: Scan, photons: float) -> Scan:
     return replace(scan, projections=np.log(photons / np.maximum(counts, 0.5)).astype(np.float32))
 
 
-def stated(scan: Scan, frames: np.ndarray | None = None, turns: float = 1.0, **geometry: object) -> Scan:
-    """The same frames, or others, with another geometry, and angles ``turns`` times as large."""
-    panel, sweeps = replace(scan.geometry, **geometry), scan.trajectory.kinematics
-    angles = {name: turns * getattr(sweeps, name) for name in ("angle_start_rad", "angle_end_rad")}
+def stated(scan: Scan, frames: np.ndarray | None = None, **geometry: object) -> Scan:
+    """The same frames, or others, with another geometry."""
+    panel = replace(scan.geometry, **geometry)
     frames = scan.projections if frames is None else np.ascontiguousarray(frames, np.float32)
-    return replace(scan, projections=frames, geometry=panel, trajectory=CircularOrbit(panel, replace(sweeps, **angles)))
+    return replace(scan, projections=frames, geometry=panel, trajectory=CircularOrbit(panel, scan.trajectory.kinematics))
 
 
 RIGHT = {
@@ -43,7 +42,6 @@ RIGHT = {
 WRONG = {
     "axis off by 10 pixels": lambda scan: stated(scan, detector_offset_mm=(0.0, 10 * 4 / 48)),
     "no flats": lambda scan: stated(scan, scan.projections - np.log(2e4)),
-    "angles reversed": lambda scan: stated(scan, turns=-1.0),
 }
 
 

@@ -14,7 +14,7 @@ from phyradgs_cl.workflow.files import load_scan
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("fast_pictures")]
 ABSURD = {
     "half a surrogate pair": "x\udcff\ud800", "a control": "x\x1b[2J\0", "a list": ["x", 1], "a table": {"a": {"b": 1}},
-    "beyond floats": 1e308, "NaN": float("nan"), "nothing": None, "a truth value": True,
+    "beyond floats": 1e308, "NaN": float("nan"), "nothing": None,
 }  # fmt: skip
 FIELDS = ("method", "scan", "scan_sha256", "seconds", "gaussians", "record", "options", "input", "segments")
 FIELDS += ("program", "interrupted_at", "unheard_of")
@@ -33,8 +33,7 @@ def written(path: Path, target: Path, provenance: str, metrics: str = "{}") -> P
     shutil.copy(path, target)
     with h5py.File(target, "r+") as file:
         for name, text in (("provenance", provenance), ("metrics", metrics)):
-            group = file.require_group(f"entry/{name}")
-            group.pop("json", None)
+            (group := file.require_group(f"entry/{name}")).pop("json", None)
             group["json"] = text
     return target
 
@@ -45,8 +44,7 @@ def test_every_field_may_be_absurd(files, tmp_path, cli, case, capsys, caplog) -
     scan, volume = files
     facts = dict.fromkeys(FIELDS, ABSURD[case])
     facts["options"] = {"motion": {"name": ABSURD[case], "strips": ABSURD[case]}}
-    text = json.dumps(facts)
-    bad = written(volume, tmp_path / "v.h5", text, json.dumps({"psnr_db": ABSURD[case], "ssim": 1.0}))
+    bad = written(volume, tmp_path / "v.h5", json.dumps(facts), json.dumps({"psnr_db": ABSURD[case], "ssim": 1.0}))
     for command in (
         ["info", str(bad)],
         ["report", str(bad), "-o", str(tmp_path / "page.html"), "--views", "0", "--scan", str(scan)],

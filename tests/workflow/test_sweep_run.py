@@ -6,6 +6,7 @@ import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from phyradgs_cl.io.output import BusyError
 from phyradgs_cl.reconstructors import Progress, plan_run
 from phyradgs_cl.workflow import sweep as sweep_run
 from phyradgs_cl.workflow.reconstruct import resume_or_restart
-from phyradgs_cl.workflow.sweep import RESULTS, SweepRun, markdown, plan_sweep, read_lines, run_sweep
+from phyradgs_cl.workflow.sweep import RESULTS, markdown, plan_sweep, read_lines, run_sweep
 
 pytestmark = pytest.mark.slow
 TEXT = """
@@ -65,19 +66,14 @@ def test_every_run_is_in_the_file_once_with_what_it_depends_on(sweep) -> None:
     text = (sweep.folder / "results.md").read_text()
     (row,) = [line for line in text.splitlines() if line.startswith("| sirt iterations=4 |")]
     scores = [line["metrics"]["psnr_db"] for line in lines if line["label"] == "sirt iterations=4"]
-    assert row.split("|")[2].strip() == "4" and f"{sum(scores) / 4:.2f} ±" in row
+    assert row.split("|")[2].strip() == "4" and f"{sum(scores) / 4:.2f} ±" in row and "held-out" not in text
+    held_out = {"label": "one", "seconds": 1.0, "metrics": {"holdout_rms": 0.01234, "holdout_noise_rms": 0.0111}}
+    title, _, row = markdown([held_out], 1).splitlines()[2:]
+    assert "| held-out RMS | noise RMS |" in title and "| 0.01234 | 0.0111 |" in row
     os.utime(lines[0]["scan"], ns=(1, 1))
     sweep.run()
     again = sweep.lines()[RUNS:]
     assert len(again) == RUNS // 2 and {line["scan"] for line in again} == {lines[0]["scan"]}
-
-
-def test_the_table_has_held_out_errors_where_they_were_asked_for() -> None:
-    line = {"label": "one", "seconds": 1.0, "metrics": {}}
-    held_out = {**line, "metrics": {"holdout_rms": 0.01234, "holdout_noise_rms": 0.0111}}
-    assert "held-out" not in markdown([line], 1)
-    title, _, row = markdown([held_out], 1).splitlines()[2:]
-    assert "| held-out RMS | noise RMS |" in title and "| 0.01234 | 0.0111 |" in row
 
 
 def test_a_sweep_goes_on_where_it_was_stopped(sweep) -> None:
@@ -92,8 +88,7 @@ def test_a_sweep_goes_on_where_it_was_stopped(sweep) -> None:
     (sweep.folder / RESULTS).write_bytes(whole[:-30])  # killed while the last line was written
     told = []
     sweep.run(tell=lambda done, line: told.append(done))
-    assert told == list(range(5, RUNS + 1))
-    assert len(sweep.lines()) == RUNS == len({line["run"] for line in sweep.lines()})
+    assert told == list(range(5, RUNS + 1)) and len(sweep.lines()) == RUNS == len({line["run"] for line in sweep.lines()})
     sweep.run()
     assert len(sweep.lines()) == RUNS
 
@@ -110,8 +105,7 @@ def test_failures_are_noted_and_tried_again(cli, sweep, monkeypatch, capsys) -> 
 
     monkeypatch.setattr(sweep_run, "resume_or_restart", failing)
     monkeypatch.setattr(sweep_run, "_BUSY_S", 0.0)
-    assert cli.run(["sweep", str(sweep.grid), "-o", str(sweep.folder)]) == 2
-    assert "4 runs failed" in capsys.readouterr().err
+    assert cli.run(["sweep", str(sweep.grid), "-o", str(sweep.folder)]) == 2 and "4 runs failed" in capsys.readouterr().err
     noted = sorted(line["error"] for line in sweep.lines() if "error" in line)
     assert noted[:2] == ["ZeroDivisionError: a defect", "device: found lost"]
     assert noted[2:] == ["scan: found no good | at all", "volume: found busy"]
@@ -122,21 +116,22 @@ def test_failures_are_noted_and_tried_again(cli, sweep, monkeypatch, capsys) -> 
     assert "failed run" not in (sweep.folder / "results.md").read_text()
 
 
-def test_a_full_disk_ends_the_sweep(sweep, monkeypatch) -> None:
-    def full(*_: object) -> None:
-        raise OutputError("volume", "no room")
-
-    monkeypatch.setattr(sweep_run, "resume_or_restart", full)
+def test_a_full_disk_ends_the_sweep_and_lines_are_json_without_nan(sweep, monkeypatch) -> None:
+    original = sweep_run.resume_or_restart
+    monkeypatch.setattr(sweep_run, "resume_or_restart", Mock(side_effect=OutputError("volume", "no room")))
     with pytest.raises(OutputError, match="no room"):
         sweep.run()
     assert sweep.lines() == []
+    monkeypatch.setattr(sweep_run, "resume_or_restart", lambda *given: (original(*given)[0], {"psnr_db": float("inf")}))
+    sweep.run()
+    rows = (sweep.folder / RESULTS).read_text().splitlines()
+    assert [json.loads(row, parse_constant=pytest.fail)["metrics"]["psnr_db"] for row in rows] == RUNS * [None]
 
 
 def test_the_command_needs_no_dask_for_one_run_after_the_other(cli, sweep, monkeypatch, refused, capfd) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     command = ["sweep", str(sweep.grid), "-o", str(sweep.folder)]
-    assert cli.run(command) == 0
-    assert f"{RUNS}/{RUNS} " in capfd.readouterr().out
+    assert cli.run(command) == 0 and f"{RUNS}/{RUNS} " in capfd.readouterr().out
     with only_run(sweep.folder / RESULTS), pytest.raises(BusyError, match="another run"):
         sweep.run()
     (sweep.folder / RESULTS).unlink()
@@ -147,26 +142,7 @@ def test_the_command_needs_no_dask_for_one_run_after_the_other(cli, sweep, monke
     refused(command)
 
 
-def test_lines_are_json_without_nan(sweep, monkeypatch) -> None:
-    original = sweep_run.resume_or_restart
-
-    def perfect(*arguments):
-        result, metrics = original(*arguments)
-        return result, {**metrics, "psnr_db": float("inf")}
-
-    monkeypatch.setattr(sweep_run, "resume_or_restart", perfect)
-    sweep.run()
-    rows = (sweep.folder / RESULTS).read_text().splitlines()
-    lines = [json.loads(row, parse_constant=pytest.fail) for row in rows]
-    assert {line["metrics"]["psnr_db"] for line in lines} == {None}
-
-
 PLAN = plan_run("sirt", {"iterations": 6})
-
-
-@pytest.fixture
-def checkpoint(tmp_path) -> Path:
-    return checkpoint_path(tmp_path / "volume.h5")
 
 
 @pytest.fixture
@@ -186,30 +162,28 @@ def again(rt, tiny_scan, tmp_path):
     return go
 
 
-def test_a_stopped_run_goes_on_to_the_same_bits(again, checkpoint) -> None:
+def test_a_stopped_run_goes_on_to_the_same_bits_and_no_other_method_takes_its_checkpoint(again, tmp_path) -> None:
+    checkpoint = checkpoint_path(tmp_path / "volume.h5")
     assert again(stop_at=3)[0].interrupted_at
+    with pytest.raises(InputError, match="none.h5"):
+        again(scan=tmp_path / "none.h5")
+    assert checkpoint.exists()
     result, seen = again()
     assert not result.interrupted_at and min(seen) > 3 and not checkpoint.exists()
     np.testing.assert_array_equal(result.volume, again(name="alone.h5")[0].volume)
+    again(stop_at=3)
+    assert checkpoint.exists() and not again(plan=plan_run("fdk"))[0].interrupted_at
 
 
 @pytest.mark.parametrize("what", ["damaged", "of another seed"])
-def test_a_checkpoint_that_does_not_fit_is_set_aside(again, checkpoint, what) -> None:
+def test_a_checkpoint_that_does_not_fit_is_set_aside(again, tmp_path, what) -> None:
+    checkpoint = checkpoint_path(tmp_path / "volume.h5")
     again(stop_at=3)
     content = checkpoint.read_bytes()
     if what == "damaged":
-        content = content[: len(content) // 2]
-        checkpoint.write_bytes(content)
+        checkpoint.write_bytes(content := content[: len(content) // 2])
     result, seen = again(plan=PLAN if what == "damaged" else replace(PLAN, seed=1))
-    assert not result.interrupted_at and min(seen) <= 3
-    assert Path(f"{checkpoint}.bak").read_bytes() == content
-
-
-def test_a_checkpoint_outlives_a_missing_scan_and_no_other_method_takes_it(again, checkpoint) -> None:
-    again(stop_at=3)
-    with pytest.raises(InputError, match="none.h5"):
-        again(scan=checkpoint.with_name("none.h5"))
-    assert checkpoint.exists() and not again(plan=plan_run("fdk"))[0].interrupted_at
+    assert not result.interrupted_at and min(seen) <= 3 and Path(f"{checkpoint}.bak").read_bytes() == content
 
 
 SCANS = 'scans = ["*.h5"]\n'
@@ -218,12 +192,7 @@ SCANS = 'scans = ["*.h5"]\n'
 @pytest.fixture
 def plan(sweep):
     """A function that writes grid.toml next to two scans and plans its runs."""
-
-    def planned(text: str) -> list[SweepRun]:
-        sweep.grid.write_text(text)
-        return plan_sweep(sweep.grid, sweep.folder)
-
-    return planned
+    return lambda text: (sweep.grid.write_text(text), plan_sweep(sweep.grid, sweep.folder))[1]
 
 
 def test_lists_are_multiplied_and_runs_taken_as_they_are(plan) -> None:
@@ -242,8 +211,7 @@ def test_lists_are_multiplied_and_runs_taken_as_they_are(plan) -> None:
         method = "FDK"
         size = [4, 5, 6]
     """)  # fmt: skip
-    settings = 8 + 2 + 1
-    assert len(runs) == 2 * settings * 2 and [run.scan.name for run in runs[:: len(runs) // 2]] == ["a.h5", "b.h5"]
+    assert len(runs) == 2 * (8 + 2 + 1) * 2 and [run.scan.name for run in runs[:: len(runs) // 2]] == ["a.h5", "b.h5"]
     assert [run.plan.seed for run in runs[:4]] == [0, 3, 0, 3]
     first, splats, fdk = runs[0], runs[16], runs[20]
     assert first.facts["label"] == "sirt holdout=3 motion=static iterations=5"
@@ -265,10 +233,9 @@ def test_what_is_asked_for_twice_is_run_once_and_names_differ(plan, tmp_path) ->
 def test_what_is_wrong_is_named_at_once(plan) -> None:
     for text, message in (
         ('scnas = ["*.h5"]\n', "scnas: found a key that is not known.*did you mean 'scans'"),
-        ("[[runs]]\n", "scans: found None; expected a list"),
-        (SCANS, r"neither \[\[grid\]\] nor \[\[runs\]\]"), (SCANS + "grid = 3\n", "grid: found 3"),
+        ("[[runs]]\n", "scans: found None; expected a list"), (SCANS + "grid = 3\n", "grid: found 3"),
+        (SCANS, r"neither \[\[grid\]\] nor \[\[runs\]\]"), (SCANS + "seeds = [true]\n[[runs]]\n", "seeds: "),
         (SCANS + "options = 3\n[[runs]]\n", r"options: found \[3\]"), (SCANS + "seeds = [-1]\n[[runs]]\n", "--seed: "),
-        (SCANS + "seeds = [true]\n[[runs]]\n", "seeds: "), ('scans = ["none/*.h5"]\n[[runs]]\n', "no file for 'none/"),
         ('scans = ["grid.toml"]\n[[runs]]\n', "grid.toml: found a file that is not HDF5"),
         (SCANS + '[[grid]]\nmethod = ["sirt", "sitr"]\n', r"grid.toml \(method='sitr'\): --method"),
         (SCANS + "[[grid]]\niterations = []\n", "found an empty list"),
