@@ -99,9 +99,8 @@ def test_halves_are_of_angles_and_not_of_time(rt) -> None:
     assert [half.tolist() for half in halves(helix)] == [[*range(0, 30, 2)], [*range(1, 30, 2)]]
 
 
-def test_bars_follow_slopes_density_shape_noise_and_views() -> None:
-    """What both runs do is shape, what they do oppositely is noise; dense matter has wider bars in proportion. They stay
-    from 25 views of 64 voxels on, the longer side of a slice. Fewer than 0.1 a voxel count as so many."""
+def test_bars_follow_slopes_density_shape_and_noise() -> None:
+    """What both runs do is shape, what they do oppositely is noise; dense matter has wider bars in proportion."""
     volume = np.repeat(np.array([0.0, 1.0, 2.0]), 10)[:, None, None] * np.ones((30, 24, 24))
     bars = spread(*[volume[:20]] * 3, replace(LAW, slope=1.0))
     assert bars[9, 3, 2] == bars[10, 3, 2] == bars.max() and bars[3, 3, 2] < 0.05 * bars.max()
