@@ -125,7 +125,7 @@ def test_single_lines_of_pixels(two_rt, make_geometry: Geometries) -> None:
 
 @pytest.mark.parametrize("shape", [(1, 9), (9, 1), (1, 1), (5, 9)])
 def test_rounding_moves_no_voxel_off_the_panel(two_rt, make_geometry: Geometries, shape) -> None:
-    """The voxel lies on the first row, or the middle column, but for 0.0004 pixels; by upright, leaning and lines' kernels."""
+    """The voxel lies on the first row, or the middle column, but for 0.0004 pixels; by every kernel."""
     frames, weight = random_frames(shape)
     pose = make_geometry(*shape).pose(np.zeros(4))
     pose[:, 3:6] += (shape[0] - 1) / 2 * pose[:, 9:12]
