@@ -83,6 +83,13 @@ def frames_to_attenuation(
     return result, unusable
 
 
+def flats_by_time(flats_at: NDArray[np.generic], at: NDArray[np.generic]) -> list[NDArray[np.intp]]:
+    """Returns the indices of flats, those of one time together: flats without a projection between them. flats_at (n,), at
+    (P,): when flats and projections were taken, in one unit."""
+    before = np.searchsorted(np.sort(at), flats_at)
+    return [np.flatnonzero(before == count) for count in np.unique(before)]
+
+
 def mean_dark(darks: NDArray[np.generic] | None, panel: tuple[int, ...]) -> NDArray[np.float64]:
     """Returns the mean (v, u) of dark frames (n, v, u), or zeros without any. A NaN spoils only its own pixel."""
     if darks is None or len(darks) == 0:
