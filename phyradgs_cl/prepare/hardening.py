@@ -183,17 +183,13 @@ def find_bone(
 
 
 def _with_bone(bone: np.ndarray, frames: np.ndarray, spectrum: Spectrum, model: Model) -> np.ndarray:
+    """Returns line integrals (F, v, u) of bone (z, y, x) and of the soft tissue that, with it, gives ``frames``."""
     dense = np.maximum(model.frames(bone.astype(np.float32)), 0)
-    return (_soft_beside(dense, frames, spectrum) + dense).astype(np.float32)
-
-
-def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> np.ndarray:
-    """Returns the soft tissue's line integrals that, with those of bone (``dense``), give the measured ``frames``."""
     soft, small = np.asarray(frames - dense, np.float64), 1e-3
     for _ in range(_NEWTON):
         now = spectrum.hardened(soft, dense)
         soft = soft - small * (now - frames) / (spectrum.hardened(soft + small, dense) - now)
-    return soft
+    return (soft + dense).astype(np.float32)
 
 
 def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:

@@ -189,18 +189,16 @@ def _blur_and_limit(frames: np.ndarray, below: float) -> tuple[float, float]:
     some = frames[np.unique(np.linspace(0, len(frames) - 1, _SOME_FRAMES).round().astype(int))]
     low, high = np.percentile(scipy.ndimage.gaussian_filter(some, (0, _MARGIN, _MARGIN)), (1, 99.9))
     limit = below * float(high - low)
-    noise = float(np.median([_noise_of_brighter_half(frame) for frame in some]))
+    noises = []  # of each frame's brighter half
+    for frame in some:
+        second = frame[:, 1:-1] - 0.5 * (frame[:, :-2] + frame[:, 2:])
+        mean = scipy.ndimage.uniform_filter(frame, 5)[:, 1:-1]
+        noises.append(robust_deviation(second[mean <= np.median(mean)]) / _FILTER_NORM)
+    noise = float(np.median(noises))
     blur = min(_DEVIATIONS * noise / max(_FLAT_BLUR * limit, 1e-12), _WIDEST_BLUR * max(frames.shape[1:]))
     if blur < _LEAST_BLUR:
         return 0.0, limit
     return blur, max(limit, _DEVIATIONS * noise / (_FLAT_BLUR * blur))
-
-
-def _noise_of_brighter_half(frame: np.ndarray) -> float:
-    middle = frame[:, 1:-1]
-    second = middle - 0.5 * (frame[:, :-2] + frame[:, 2:])
-    mean = scipy.ndimage.uniform_filter(frame, 5)[:, 1:-1]
-    return robust_deviation(second[mean <= np.median(mean)]) / _FILTER_NORM
 
 
 def _from_sides(low: np.ndarray) -> np.ndarray:

@@ -18,7 +18,6 @@ from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.acquisition.plausible import question_unit
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble, brightness, hdf5
-from phyradgs_cl.importers.brightness import Reading
 from phyradgs_cl.importers.frames import gantry_sign
 from phyradgs_cl.importers.options import OF_HDF5, ImportOptions
 from phyradgs_cl.io import scan as schema
@@ -90,26 +89,17 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         if "projections" not in places.stated:
             quantity = h5.read_attribute(source, f"{detector}/data", "quantity")
         _refuse_moves(source, entry, stacks.used)
-        stacks, light = _evened(places, entry, keys, stacks, options, quantity)
+        if (options.quantity or quantity or "counts") == "counts":
+            addresses = (("exposures", f"{detector}/count_time"), ("monitor", f"{entry}/control/data"))
+            found = (places.per_frame(name, address, keys, len(stacks.used)) for name, address in addresses)
+            stacks = brightness.evened(stacks, *found, f"say {options.named('at')} monitor=none")
         title = h5.read_title(source, f"{entry}/title", path.stem)
     if options.row_0 is None:
         text = "%s: row 0 is taken as the lowest, after flips that the file declares; say %s top if the volume is mirrored"
         _log.warning(text, path, options.named("row_0"))
     integrals = stacks.line_integrals(f"{path}:{detector}/data", options, "bottom", quantity, turn)
-    parts = brightness.with_light(integrals, light), trajectory, geometry, timing, options
+    parts = integrals, trajectory, geometry, timing, options
     return assemble.assemble_scan(*parts, title=title, source=str(path))
-
-
-def _evened(
-    places: hdf5.Places, entry: str, keys: list[str], stacks: hdf5.Stacks, options: ImportOptions, quantity: str | None
-) -> tuple[hdf5.Stacks, np.ndarray]:
-    """Returns what ``brightness.evened`` does, by the exposures and the monitor of the beam in the file."""
-    if (options.quantity or quantity or "counts") != "counts":
-        return stacks, np.zeros(len(stacks.projections))
-    addresses = (("exposures", f"{entry}/{schema.DETECTOR}/count_time"), ("monitor", f"{entry}/control/data"))
-    found = (places.per_frame(name, address, keys, len(stacks.used)) for name, address in addresses)
-    exposure, monitor = (Reading(*one) if one else None for one in found)
-    return brightness.evened(stacks, exposure, monitor, f"say {options.named('at')} monitor=none")
 
 
 def _entry(source: Hdf5Source, options: ImportOptions) -> str:
@@ -259,7 +249,7 @@ def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
             clock=_clock(source, stacks.used, f"{_DETECTOR}/acquire_period", f"{_DETECTOR}/frame_rate"),
         )
         if (options.quantity or "counts") == "counts" and options.flat_value is None:
-            stacks, _ = brightness.evened(stacks, _flat_exposure(source, stacks), None)
+            stacks = brightness.evened(stacks, _flat_exposure(source, stacks), None)
         title = h5.read_title(source, f"{_EXCHANGE}/title", path.stem)
     timing = assemble.make_timing(str(path), len(theta_rad), options, stored)
     integrals = stacks.line_integrals(f"{path}:{data}", options, "top")
@@ -267,7 +257,7 @@ def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
     return assemble.assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
 
 
-def _flat_exposure(source: Hdf5Source, stacks: hdf5.Stacks) -> Reading | None:
+def _flat_exposure(source: Hdf5Source, stacks: hdf5.Stacks) -> hdf5.Reading | None:
     """Returns the exposures of flats and projections where the file says that they differ. Raises InputError where it says
     so, and states none of the flats."""
     said = next((address for address in _FLATS_DIFFER if source.find(address) is not None), None)
@@ -281,4 +271,4 @@ def _flat_exposure(source: Hdf5Source, stacks: hdf5.Stacks) -> Reading | None:
         return None
     at = next((address for address in _FLAT_EXPOSURES if source.find(address) is not None), _FLAT_EXPOSURES[1])
     flat_s, frame_s = (h5.read_length(source, address, TIME) for address in (at, f"{_DETECTOR}/exposure_time"))
-    return Reading(source.name(at), np.full(len(stacks.flats), flat_s), np.full(len(stacks.projections), frame_s))
+    return hdf5.Reading(source.name(at), np.full(len(stacks.flats), flat_s), np.full(len(stacks.projections), frame_s))
