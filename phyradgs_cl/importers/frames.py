@@ -268,9 +268,3 @@ def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: st
     if (options.column_0 or column_0) == "right":
         array = array[..., ::-1]
     return array
-
-
-def gantry_sign(options: ImportOptions, convention: str) -> float:
-    """Returns the factor that turns stored angles into the gantry's: +1 for the gantry's angles, −1 for the sample's.
-    convention: the format's, "gantry" or "sample"; the options' comes first."""
-    return 1.0 if (options.rotates or convention) == "gantry" else -1.0

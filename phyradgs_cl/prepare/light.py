@@ -32,7 +32,7 @@ from phyradgs_cl.detector.attenuation import (
 from phyradgs_cl.detector.noise_level import robust_deviation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import ToAttenuation, read_scan
-from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
+from phyradgs_cl.prepare.step import Facts, MakeModel, StepOptions, unmasked_frames
 
 WAYS = ("mean", "time", "pca")
 _MOST_COMPONENTS, _CLEAR = 4, 4.0  # most components used; a component with less than 4 times the median variance is noise
@@ -134,12 +134,10 @@ def _least_variation(frame: np.ndarray, components: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class AirOptions(checks.Checked):
+class AirOptions(StepOptions, step="air"):
     """Options of the step ``air``. below: pixels are air if they exceed the air of their frame by less than this fraction of
     the scan's range of line integrals, and connect to the panel's left or right side. least: least fraction of air in every
     frame."""
-
-    PREFIX = "air."
 
     below: float = checks.ranged(0.05, 1e-4, 0.2)
     least: float = checks.ranged(0.01, 0, 1)

@@ -23,7 +23,7 @@ from phyradgs_cl.detector import robust_deviation
 from phyradgs_cl.detector.noise_level import NORMAL_MAD
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.bad_pixels import axis_column
-from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
+from phyradgs_cl.prepare.step import Facts, MakeModel, StepOptions, unmasked_frames
 
 _LEAST_FRAMES = 8  # fewer views do not average the object enough to show rings: such scans stay unchanged
 _LEAST_PAIRS = 0.25  # columns are compared with their mirror images if at least this fraction of them has one on the panel
@@ -43,10 +43,8 @@ _EQUALLY_FAR = 1.15  # in a full turn, (largest distance / smallest distance) of
 
 
 @dataclass(frozen=True)
-class RingOptions(checks.Checked):
+class RingOptions(StepOptions, step="rings"):
     """Options of the step ``rings``. window: side in pixels of the blocks of cosines. Patterns wider than a block stay."""
-
-    PREFIX = "rings."
 
     window: int = checks.ranged(10, 3, 999)
 
@@ -91,21 +89,20 @@ def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tup
     full_turn = bool(distance.max() < _EQUALLY_FAR * distance.min())  # the sources lie on a full circle around their mean
     means, mirrored = _means(frames, full_turn), mirror_columns(frames.shape[2], column)
     usable = np.full(frames.shape[1:], scan.frames >= _LEAST_FRAMES) & (scan.valid.mean(axis=0) > 0.5)
-    single = find_single_gains(means, mirrored, usable, full_turn)
+    offset, words = find_single_gains(means, mirrored, usable, full_turn)
     facts: Facts = {"result": "nothing to do"}
-    if single.any:
-        frames, means = frames - single.offset, means - single.offset
-        scan = replace(scan, projections=scan.projections - single.offset)
-        facts = {"result": "removed", "single": single.words}
+    if words:
+        frames, means = frames - offset, means - offset
+        scan = replace(scan, projections=scan.projections - offset)
+        facts = {"result": "removed", "single": words}
     strength = _strength(means, column)
     facts |= {"spread": float(np.sqrt(max(strength.pattern, 0))), "noise_of_mean": float(np.sqrt(strength.noise))}
     if scan.frames < _LEAST_FRAMES or strength.pattern <= strength.least:
         return scan, facts
     pattern = _pattern(frames, strength, options.window, column if full_turn else np.inf)
     facts |= {"result": "removed", "rms_change": float(np.sqrt(np.mean(pattern.astype(np.float64) ** 2)))}
-    remaining = find_single_gains(means - pattern, mirrored, usable, full_turn)
-    if remaining.any:
-        facts["left"] = remaining.words
+    if left := find_single_gains(means - pattern, mirrored, usable, full_turn)[1]:
+        facts["left"] = left
     return replace(scan, projections=frames - pattern), facts
 
 
@@ -194,36 +191,18 @@ def _covariance(one: np.ndarray, other: np.ndarray) -> float:
     return (robust_deviation(one + other) ** 2 - robust_deviation(one - other) ** 2) / 4
 
 
-@dataclass(frozen=True)
-class SingleGains:
-    """Wrong gains of whole columns and single pixels. offset: the error (v, u) float32 that they add to line integrals, 0
-    elsewhere. columns, pixels: how many columns and single pixels have a wrong gain."""
-
-    offset: np.ndarray
-    columns: int = 0
-    pixels: int = 0
-
-    @property
-    def any(self) -> bool:
-        return bool(self.columns or self.pixels)
-
-    @property
-    def words(self) -> str:
-        """The numbers in words, as in "1 column, gain off by 3.0 %"."""
-        counted = [(self.columns, "column"), (self.pixels, "pixel")]
-        names = " and ".join(f"{n} {name}{'s' if n > 1 else ''}" for n, name in counted if n)
-        return f"{names}, gain off by {100 * float(np.abs(np.expm1(-self.offset)).max()):.1f} %"
-
-
 def find_single_gains(
     means: np.ndarray, mirrored: np.ndarray, usable: np.ndarray, full_turn: bool
-) -> SingleGains:
-    """Finds single wrong gains in the means (2, v, u) of two sets of views. mirrored: the columns' mirror images, from
-    ``mirror_columns``; columns without a mirror image are left alone. usable: bool (v, u), False for masked pixels.
-    full_turn: finds wrong pixels too, not only columns; on an arc an edge of the object looks like a wrong pixel."""
+) -> tuple[np.ndarray, str]:
+    """Finds wrong gains of single columns and pixels in the means (2, v, u) of two sets of views. Returns the error (v, u)
+    float32 that they add to line integrals, 0 elsewhere, and words, as "1 column, gain off by 3.0 %"; "" without any.
+
+    mirrored: the columns' mirror images, from ``mirror_columns``; columns without a mirror image are left alone. usable:
+    bool (v, u), False for masked pixels. full_turn: finds wrong pixels too; on an arc an edge of the object looks like
+    one."""
     offset = np.zeros(usable.shape, np.float32)
     if len(mirrored) < _NEAR:
-        return SingleGains(offset)
+        return offset, ""
     paired = np.s_[:, mirrored[::-1]]
     usable = usable[paired] & usable[:, mirrored]
     means = means[..., mirrored[::-1]]
@@ -236,7 +215,9 @@ def find_single_gains(
         deviation = np.where(np.abs(along) < np.abs(across), along, across)
         pixels = _outliers(deviation, _deviation(means - means[..., ::-1]), usable)
     offset[paired] = lines + pixels
-    return SingleGains(offset, int(np.count_nonzero(lines)), int(np.count_nonzero(pixels)))
+    counted = (np.count_nonzero(lines), "column"), (np.count_nonzero(pixels), "pixel")
+    names = " and ".join(f"{n} {name}{'s' if n > 1 else ''}" for n, name in counted if n)
+    return offset, names and f"{names}, gain off by {100 * float(np.abs(np.expm1(-offset)).max()):.1f} %"
 
 
 def _deviation(means: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import scipy
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.fields import GridChoice
 
@@ -17,6 +18,13 @@ _INSIDE = 0.1  # voxels above this fraction of the densest voxel belong to the o
 # Standard deviation of a blur, as a fraction of the panel's longer side: the blur keeps the smooth errors of hardening and
 # scatter, and removes the finer errors of the grid.
 _SMOOTH = 1 / 24
+
+
+class StepOptions(checks.Checked):
+    """Base of the options of the step that ``step`` names. Messages call an option STEP.NAME."""
+
+    def __init_subclass__(cls, step: str) -> None:
+        cls.PREFIX = f"{step}."
 
 
 @dataclass(frozen=True)

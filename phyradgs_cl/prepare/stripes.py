@@ -19,7 +19,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.bad_pixels import axis_column
 from phyradgs_cl.prepare.rings import mirror_columns
-from phyradgs_cl.prepare.step import Facts, MakeModel, fill_lines, unmasked_frames
+from phyradgs_cl.prepare.step import Facts, MakeModel, StepOptions, fill_lines, unmasked_frames
 
 _LEAST_VIEWS = 60  # fewest views: the method assumes that neighbouring columns record the same values, which takes this many
 _LEAST = 2e-3  # a stripe whose line integrals deviate by less is left alone: its gain is off by less than 0.2 %
@@ -31,11 +31,9 @@ _SMALLEST = 1e-6  # least spread of a column, in line integrals, as a divisor: t
 
 
 @dataclass(frozen=True)
-class StripeOptions(checks.Checked):
+class StripeOptions(StepOptions, step="stripes"):
     """Options of the step ``stripes``. width: columns over which the median is taken; stripes are narrower than half of it.
     ratio: a stripe deviates at least this many times as much as the columns at both sides; 0 replaces all columns."""
-
-    PREFIX = "stripes."
 
     width: int = checks.ranged(5, 3, 999)
     ratio: float = checks.ranged(3.0, 0, 100)

@@ -18,8 +18,7 @@ from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.acquisition.plausible import question_unit
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble, brightness, hdf5
-from phyradgs_cl.importers.frames import gantry_sign
-from phyradgs_cl.importers.options import OF_HDF5, ImportOptions
+from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5 import datasets as h5
@@ -71,7 +70,6 @@ def recognises(path: Path) -> bool:
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports projections, flats and darks from the file's NXtomo entry, or from the addresses that the options give."""
-    options.refuse_unused("nxtomo", OF_HDF5)
     with open_hdf5(path, options.linked_folder) as source:
         places = hdf5.places_of(options, source)
         entry = _entry(source, options) if "projections" not in places.stated or options.entry else _NOWHERE
@@ -91,15 +89,15 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         _refuse_moves(source, entry, stacks.used)
         if (options.quantity or quantity or "counts") == "counts":
             addresses = (("exposures", f"{detector}/count_time"), ("monitor", f"{entry}/control/data"))
-            found = (places.per_frame(name, address, keys, len(stacks.used)) for name, address in addresses)
-            stacks = brightness.evened(stacks, *found, f"say {options.named('at')} monitor=none")
+            readings = (places.per_frame(name, address, keys, len(stacks.used)) for name, address in addresses)
+            exposure, monitor = readings
+            stacks = brightness.evened(stacks, exposure, monitor, f"say {options.named('at')} monitor=none")
         title = h5.read_title(source, f"{entry}/title", path.stem)
     if options.row_0 is None:
         text = "%s: row 0 is taken as the lowest, after flips that the file declares; say %s top if the volume is mirrored"
         _log.warning(text, path, options.named("row_0"))
     integrals = stacks.line_integrals(f"{path}:{detector}/data", options, "bottom", quantity, turn)
-    parts = integrals, trajectory, geometry, timing, options
-    return assemble.assemble_scan(*parts, title=title, source=str(path))
+    return assemble.assemble_scan(integrals, trajectory, geometry, timing, options, path, title=title)
 
 
 def _entry(source: Hdf5Source, options: ImportOptions) -> str:
@@ -165,7 +163,7 @@ def _motion(
     of each exposure. Without it, or with angles or a frame time from options, neighbouring frames' angles give the speed."""
     assert places.source is not None
     source, detector, angles = places.source, f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SAMPLE}/rotation_angle"
-    sign = gantry_sign(options, h5.read_attribute(source, angles, "rotates") or "sample")
+    sign = options.gantry_sign(h5.read_attribute(source, angles, "rotates") or "sample")
     angle = sign * places.angles_rad(used, options, angles)
     question_unit(angle, options.called("angles", {"angles": source.name(angles)}), "deg")
     sweeps = source.find(f"{angles}_end") is not None and options.frame_time_s is None and options.angles is None
@@ -220,7 +218,6 @@ def recognises_exchange(path: Path) -> bool:
 
 def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
     """Imports the projections of /exchange, with the flats and darks taken before and after them."""
-    options.refuse_unused("data-exchange", OF_HDF5)
     with open_hdf5(path, options.linked_folder) as source:
         places, data, theta = hdf5.places_of(options, source), f"{_EXCHANGE}/data", f"{_EXCHANGE}/theta"
         if "monitor" in places.stated:
@@ -253,8 +250,8 @@ def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
         title = h5.read_title(source, f"{_EXCHANGE}/title", path.stem)
     timing = assemble.make_timing(str(path), len(theta_rad), options, stored)
     integrals = stacks.line_integrals(f"{path}:{data}", options, "top")
-    trajectory = assemble.turning(geometry, gantry_sign(options, "sample") * theta_rad, timing)
-    return assemble.assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
+    trajectory = assemble.turning(geometry, options.gantry_sign("sample") * theta_rad, timing)
+    return assemble.assemble_scan(integrals, trajectory, geometry, timing, options, path, title=title)
 
 
 def _flat_exposure(source: Hdf5Source, stacks: hdf5.Stacks) -> hdf5.Reading | None:
