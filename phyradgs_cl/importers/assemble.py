@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_direction")
 Length = Any  # a number, or a function that reads it
 Pitch = Any  # a pair of numbers (v, u), or a function that reads it
-_DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
+DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
 _VIEW_DIGITS = 5  # two views are equal if their poses, as fractions of the largest, agree to so many decimals
 _SLACK = 1e-6  # pose tables extend by this fraction of a frame's duration beyond the frames, for times that are rounded
 
@@ -233,7 +233,7 @@ def parallel(
 ) -> ParallelGeometry:
     """Returns the geometry of a parallel beam. Options replace the file's pitch and offset, both (v, u) in mm. Raises
     InputError if an option gives a distance of the source."""
-    for name in options.given(_DISTANCES):
+    for name in options.given(DISTANCES):
         expected, remedy = "no distance: this file has a parallel beam", "leave it out"
         raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
     return ParallelGeometry(panel, options.taken("pixel_size_mm", pitch_mm), options.detector_offset_mm or offset_mm)
@@ -246,12 +246,12 @@ def cone(
     """Returns the geometry of a cone beam. Options replace the file's values, which are the other arguments. A length or
     pitch may be a function that reads it. The function is called only if no option replaces its value. names: what the file
     calls its values, for messages. Raises InputError unless the distance to the detector exceeds that to the axis."""
-    axis_mm, detector_mm = map(options.taken, _DISTANCES, (to_axis_mm, to_detector_mm))
+    axis_mm, detector_mm = map(options.taken, DISTANCES, (to_axis_mm, to_detector_mm))
     if detector_mm <= axis_mm:
-        axis, detector = (options.called(name, names) for name in _DISTANCES)
+        axis, detector = (options.called(name, names) for name in DISTANCES)
         remedy = "are the two exchanged?"
-        if names and not names.keys().isdisjoint(_DISTANCES):
-            remedy += f" Correct the file, or say {' and '.join(map(options.named, _DISTANCES))}"
+        if names and not names.keys().isdisjoint(DISTANCES):
+            remedy += f" Correct the file, or say {' and '.join(map(options.named, DISTANCES))}"
         raise InputError(detector, f"{detector_mm:g}", f"more than {axis} ({axis_mm:g})", remedy)
     pitch = options.taken("pixel_size_mm", pitch_mm)
     return ConeGeometry(axis_mm, detector_mm, panel, pitch, options.detector_offset_mm or offset_mm)

@@ -14,7 +14,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.assemble import Turned, cone, parallel
+from phyradgs_cl.importers.assemble import DISTANCES, Turned, cone, parallel
 from phyradgs_cl.importers.files import SafeFolder
 from phyradgs_cl.importers.frames import LineIntegrals, Moments, line_integrals, oriented
 from phyradgs_cl.importers.options import ImportOptions
@@ -29,7 +29,6 @@ _log = logging.getLogger(__name__)
 STACKS = ("projections", "flats", "darks", "mask")
 NAMES = (*STACKS, "image_key", "angles", "monitor", "axes")
 AXES = ["frame", "v", "u"]
-_DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
 _LIKE = 0.1  # a larger relative difference between pixels on the panel and pixels at the sample × magnification is a warning
 _LEAST_MM = 1e-4  # no pixel is smaller than this: a smaller number without a unit must be in m
 _MAGNIFICATION = re.compile(r"(\d+(?:\.\d+)?)\s*[x×]|^(\d+(?:\.\d+)?)$", re.I)  # 10, 10x, 7.5 X/0.2
@@ -315,7 +314,7 @@ def beam(
         return widened
 
     to_axis_mm = to_detector_mm = 1.0
-    if not options.given(_DISTANCES) and source.find(lengths.source) is None:
+    if not options.given(DISTANCES) and source.find(lengths.source) is None:
         _log.warning("%s: no source distance: a parallel beam", source.name(lengths.source))
         sides = options.taken("pixel_size_mm", pitch_mm)
         return parallel(options, panel, sides, (0.0, axis_columns * sides[1]))

@@ -171,8 +171,7 @@ def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Volum
     units without ``mu_water_per_mm``, and values that are not finite."""
     if (reader := _reader(path)) is None:
         refuse_unread(Path(path), "a volume of a format of docs/formats.md")
-        return in_per_mm(str(path), read_volume(path), mu_water_per_mm)
-    return in_per_mm(str(path), reader[1](Path(path)), mu_water_per_mm)
+    return in_per_mm(str(path), (reader[1] if reader else read_volume)(Path(path)), mu_water_per_mm)
 
 
 def load_states(path: str | Path) -> Iterator[tuple[float, Volume]]:
