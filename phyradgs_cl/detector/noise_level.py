@@ -109,9 +109,10 @@ def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) 
     return noise_rms(frames, behind, behind)
 
 
-def _threes(frames: NDArray[Any], axis: int) -> NDArray[Any]:
-    """Returns views (3, ...) of the pixels before, at and behind each inner pixel along an axis."""
-    return np.moveaxis(np.lib.stride_tricks.sliding_window_view(frames, 3, axis), -1, 0)
+def _threes(frames: NDArray[Any], axis: int) -> tuple[NDArray[Any], ...]:
+    """Returns views of the pixels before, at and behind each inner pixel along an axis."""
+    lines = np.moveaxis(frames, axis, 0)
+    return tuple(np.moveaxis(part, 0, axis) for part in (lines[:-2], lines[1:-1], lines[2:]))
 
 
 def transmission_weights(
