@@ -83,7 +83,7 @@ def import_command(
     say("\n".join(filter(None, lines)))
 
 
-import_command.__doc__ = f"Import a scan: {', '.join(dict.fromkeys(whose for _, whose in FORMATS.values()))}."
+import_command.__doc__ = f"Import a scan: {', '.join(dict.fromkeys(whose for _, whose, _ in FORMATS.values()))}."
 
 
 def _applied_in_words(scan: Scan) -> list[str]:

@@ -83,6 +83,13 @@ def frames_to_attenuation(
     return result, unusable
 
 
+def flats_by_time(flats_at: NDArray[np.generic], at: NDArray[np.generic]) -> list[NDArray[np.intp]]:
+    """Returns the indices of flats, those of one time together: flats without a projection between them. flats_at (n,), at
+    (P,): when flats and projections were taken, in one unit."""
+    before = np.searchsorted(np.sort(at), flats_at)
+    return [np.flatnonzero(before == count) for count in np.unique(before)]
+
+
 def mean_dark(darks: NDArray[np.generic] | None, panel: tuple[int, ...]) -> NDArray[np.float64]:
     """Returns the mean (v, u) of dark frames (n, v, u), or zeros without any. A NaN spoils only its own pixel."""
     if darks is None or len(darks) == 0:
@@ -149,23 +156,17 @@ def tube_spectrum(kvp: float, filter_mm: float = FILTER_MM, anode_deg: float = 0
 
     The spectrum is SpekPy's for a tungsten anode at the angle ``anode_deg``; for 0 it follows Kramers' law. Raises
     InputError for an ``anode_deg`` other than 0 if the package spekpy is missing."""
-    energy_kev, photons = _tungsten(kvp, anode_deg) if anode_deg else _kramers(kvp)
+    if anode_deg:
+        spekpy = checks.package("spekpy", "the package that hardening.anode_deg asks", "phyradgs-cl[spectrum]")
+        energy_kev, photons = spekpy.Spek(kvp=kvp, th=anode_deg, dk=_STEP_KEV).get_spectrum(diff=False)
+        energy_kev, photons = (values[energy_kev >= _ENERGY_KEV[0]] for values in (energy_kev, photons))
+    else:
+        energy_kev = np.linspace(_ENERGY_KEV[0], kvp, 40, endpoint=False)
+        photons = (kvp - energy_kev) / energy_kev
     light = photons * energy_kev * np.exp(-_at(energy_kev, _ALUMINIUM) * _ALUMINIUM_G_PER_CM3 * filter_mm / 10)
     weight = light / light.sum()
     soft, bone = _at(energy_kev, _WATER), _at(energy_kev, _BONE)
     return Spectrum(energy_kev, weight, soft / (weight @ soft), bone / (weight @ bone))
-
-
-def _kramers(kvp: float) -> tuple[Array, Array]:
-    energy_kev = np.linspace(_ENERGY_KEV[0], kvp, 40, endpoint=False)
-    return energy_kev, (kvp - energy_kev) / energy_kev
-
-
-def _tungsten(kvp: float, anode_deg: float) -> tuple[Array, Array]:
-    spekpy = checks.package("spekpy", "the package that hardening.anode_deg asks", "phyradgs-cl[spectrum]")
-    energy_kev, photons = spekpy.Spek(kvp=kvp, th=anode_deg, dk=_STEP_KEV).get_spectrum(diff=False)
-    tabulated = energy_kev >= _ENERGY_KEV[0]
-    return energy_kev[tabulated], photons[tabulated]
 
 
 def _at(energy_kev: Array, table: Array) -> Array:

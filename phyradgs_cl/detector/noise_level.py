@@ -45,10 +45,10 @@ def noise_level(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_] | 
     fine as a pixel raises the estimate; noise correlated along rows lowers it. valid (F, v, u): pixels to use; None: all."""
     if line_integrals.shape[-1] < 3:
         return 0.0
-    left, middle, right = _along_rows(line_integrals)
+    left, middle, right = _threes(line_integrals, -1)
     usable = middle > 0
     if valid is not None:
-        usable = np.logical_and.reduce([usable, *_along_rows(valid)])
+        usable = np.logical_and.reduce([usable, *_threes(valid, -1)])
     pixels = np.flatnonzero(usable)
     pixels = pixels[:: max(1, pixels.size // _LARGEST_SAMPLE)]
     if pixels.size == 0:
@@ -67,12 +67,12 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
     are along rows alone."""
     usable, differences = valid, line_integrals
     means = line_integrals
-    cuts = (_along_rows, _along_columns) if line_integrals.shape[-2] >= 3 else (_along_rows,)
-    for cut in cuts:
-        left, middle, right = cut(differences)
+    axes = (-1, -2) if line_integrals.shape[-2] >= 3 else (-1,)
+    for axis in axes:
+        left, middle, right = _threes(differences, axis)
         differences = middle - 0.5 * (left + right)
-        means = np.mean(cut(means), axis=0, dtype=np.float32)
-        usable = np.logical_and.reduce(cut(usable))
+        means = np.mean(_threes(means, axis), axis=0, dtype=np.float32)
+        usable = np.logical_and.reduce(_threes(usable, axis))
     mean, size = means[usable], np.abs(differences[usable])
     if mean.size == 0 or not chosen.any():
         return 0.0
@@ -80,7 +80,7 @@ def noise_rms(line_integrals: NDArray[np.float32], chosen: NDArray[np.bool_], va
     tenth = np.digitize(mean, edges)
     levels = np.array([np.median(size[tenth == k]) if (tenth == k).any() else 0.0 for k in range(_TENTHS)])
     share = np.bincount(np.digitize(line_integrals[chosen], edges), minlength=_TENTHS) / chosen.sum()
-    return float(np.sqrt(share @ levels**2)) / (_MEDIAN_OF_NORMAL * _FILTER_NORM ** len(cuts))
+    return float(np.sqrt(share @ levels**2)) / (_MEDIAN_OF_NORMAL * _FILTER_NORM ** len(axes))
 
 
 def noise_map(residual: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -109,12 +109,10 @@ def noise_behind(line_integrals: NDArray[np.float32], valid: NDArray[np.bool_]) 
     return noise_rms(frames, behind, behind)
 
 
-def _along_rows(frames: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    return frames[..., :-2], frames[..., 1:-1], frames[..., 2:]
-
-
-def _along_columns(frames: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    return frames[..., :-2, :], frames[..., 1:-1, :], frames[..., 2:, :]
+def _threes(frames: NDArray[Any], axis: int) -> tuple[NDArray[Any], ...]:
+    """Returns views of the pixels before, at and behind each inner pixel along an axis."""
+    lines = np.moveaxis(frames, axis, 0)
+    return tuple(np.moveaxis(part, 0, axis) for part in (lines[:-2], lines[1:-1], lines[2:]))
 
 
 def transmission_weights(
@@ -151,12 +149,9 @@ def clustered_share(extreme: Iterable[NDArray[np.bool_]]) -> float:
     pixels = count = inner = touching = 0
     for at in extreme:
         pixels, count = pixels + at.size, count + int(np.count_nonzero(at))
-        if min(at.shape) < 3 or not at.any():
-            continue
-        middle = at[1:-1, 1:-1]
-        inner += int(np.count_nonzero(middle))
-        sides = at[:-2, 1:-1] & at[2:, 1:-1] & at[1:-1, :-2] & at[1:-1, 2:]
-        touching += int(np.count_nonzero(middle & sides))
+        if at.any():
+            inner += int(np.count_nonzero(at[1:-1, 1:-1]))
+            touching += int(np.count_nonzero(scipy.ndimage.binary_erosion(at)))  # beyond the panel there are no neighbours
     return count / pixels if inner and touching / inner > _TOUCHING else 0.0
 
 

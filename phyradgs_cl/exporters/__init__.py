@@ -22,7 +22,10 @@ EXPORTS = (*VOXELS, "dicom", *CLOUDS, "zarr")
 OWN = "h5"
 """This package's volume files. Their values stay in 1/mm; a scale of Hounsfield units is stored next to them."""
 ScaleOf = Callable[[Volume], Hounsfield | None]
-_SUFFIXES = {"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": (), "zarr": (".ome.zarr", ".zarr")}
+_SUFFIXES: dict[str, tuple[str, ...]] = {
+    **{to: (f".{to}",) for to in (*EXPORTS, OWN)},
+    **{"nii": (".nii", ".nii.gz"), "tiff": (".tif", ".tiff"), "dicom": (), "zarr": (".ome.zarr", ".zarr")},
+}
 # Suffixes of formats that are not written: an HDF5 file with such a name would be read as something else.
 _NOT_WRITTEN = (".mhd", ".dcm", ".png", ".jpg", ".raw", ".vol", ".bin", ".img", ".mat", ".vtk", ".vti", ".csv", ".json")
 _PLAIN = "values in 1/mm"  # a note for files of other programs, which have no field for this unit
@@ -81,7 +84,7 @@ def _checked(
         scale_of = lambda _: stated  # noqa: E731
     if to == OWN and scale_of is None:
         raise InputError("--hu", f"not given for {output}", "another format, or a scale to store", "add --hu")
-    suffixes = _suffixes(to)  # programs recognise the format by the suffix; the folder of DICOM has none
+    suffixes = _SUFFIXES[to]  # programs recognise the format by the suffix; the folder of DICOM has none
     target = Path(output or (path.with_suffix(suffixes[0]) if suffixes else path.with_name(f"{path.stem}_dicom")))
     if suffixes and not target.name.lower().endswith(suffixes):
         raise InputError(f"output of --to {to}", str(target), f"a name that ends in {' or '.join(suffixes)}")
@@ -143,7 +146,7 @@ def export_states(
         stack, notes = zip(*(_in_unit(state, scale) for state in states), strict=True)
         writers.write_image(target, stack[0], notes[0], times_s, stack)
         return [target]
-    suffix = next((s for s in _suffixes(to) if target.name.lower().endswith(s)), "")
+    suffix = next((s for s in _SUFFIXES[to] if target.name.lower().endswith(s)), "")
     stem, digits = target.name[: len(target.name) - len(suffix)], max(2, len(str(len(states))))
     targets = [target.with_name(f"{stem}_{k:0{digits}d}{target.name[len(stem) :]}") for k in range(1, len(states) + 1)]
     for state, one in zip(states, targets, strict=True):
@@ -180,20 +183,16 @@ def export_stored(
 
 def foreign_suffix(output: str | Path) -> str | None:
     """Returns the path's suffix if it belongs to another program's format, so that no HDF5 may have it; else None."""
-    suffixes = *(suffix for to in EXPORTS for suffix in _suffixes(to)), *_NOT_WRITTEN
+    suffixes = *(suffix for to in EXPORTS for suffix in _SUFFIXES[to]), *_NOT_WRITTEN
     return next((suffix for suffix in suffixes if Path(output).name.lower().endswith(suffix)), None)
 
 
 def format_of(output: str | Path | None, subject: str = "--to") -> str:
     """Returns the format, in ``EXPORTS`` or ``OWN``, that a suffix names. Raises InputError for other suffixes and None."""
     for to in (*EXPORTS, OWN):
-        if output is not None and _suffixes(to) and Path(output).name.lower().endswith(_suffixes(to)):
+        if output is not None and _SUFFIXES[to] and Path(output).name.lower().endswith(_SUFFIXES[to]):
             return to
-    suffixes = ", ".join(suffix for to in EXPORTS for suffix in _suffixes(to))
+    suffixes = ", ".join(suffix for to in EXPORTS for suffix in _SUFFIXES[to])
     found = "neither a format nor an output" if output is None else f"output {output}"
     remedy = "use such a suffix, or give --to dicom" if subject == "--to" else "or .h5, which holds everything"
     raise InputError(subject, found, f"a suffix of {suffixes}", remedy)
-
-
-def _suffixes(to: str) -> tuple[str, ...]:
-    return _SUFFIXES.get(to, (f".{to}",))

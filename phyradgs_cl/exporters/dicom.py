@@ -72,7 +72,9 @@ def write_dicom(path: Path, volume: Volume, note: str, labels: DicomLabels) -> N
     with their scale. Raises OutputError for a folder that has files or cannot be written."""
     pydicom = checks.package("pydicom", "the package that this export needs", "phyradgs-cl[formats]")
     unit = "HU" if of_note(note)[0] else "1/mm"
-    slope, grid = _rescale_slope(volume.values, unit), volume.required_grid
+    peak, slope, grid = float(np.abs(volume.values).max()), "1", volume.required_grid
+    if unit != "HU" or peak > _LARGEST:  # the smallest step of stored integers that 16 bits allow; 1e-8 more, for rounding
+        slope = f"{max(peak, 1e-30) / _LARGEST * (1 + 1e-8):.9e}"
     content = volume.values.tobytes() + repr((grid.voxel_size_mm[::-1], grid.first_centre_mm[::-1])).encode()
     content += repr(labels.given).encode() if labels.given else b""  # other labels make another study, with other UIDs
     seed, generate = hashlib.sha256(content).hexdigest(), pydicom.uid.generate_uid
@@ -87,14 +89,6 @@ def write_dicom(path: Path, volume: Volume, note: str, labels: DicomLabels) -> N
             _place(image, grid, index)
             image.PixelData = np.rint(plane / float(slope)).astype("<i2").tobytes()
             image.save_as(folder / f"{index + 1:04d}.dcm", enforce_file_format=True)
-
-
-def _rescale_slope(values: np.ndarray, unit: str) -> str:
-    """Returns, as text, the value of one step of the stored integers: 1 HU, or the smallest that 16 bits allow."""
-    peak = float(np.abs(values).max())
-    if unit == "HU" and peak <= _LARGEST:
-        return "1"
-    return f"{max(peak, 1e-30) / _LARGEST * (1 + 1e-8):.9e}"  # 1e-8 more, so that rounding never makes the step too small
 
 
 def _common(pydicom: Any, shape: tuple[int, ...], unit: str, slope: str, uid: dict[str, str]) -> Any:

@@ -15,9 +15,10 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.exporters.dicom import folder_written_beside
-from phyradgs_cl.fields import Grid, Hounsfield
+from phyradgs_cl.fields import Grid, Hounsfield, triple
 from phyradgs_cl.io.output import written_beside
 from phyradgs_cl.io.volume import Volume
+from phyradgs_cl.metrics.align import block_means
 
 _WRITERS = {".mha": "MetaImageIO", ".nii": "NiftiImageIO", ".nii.gz": "NiftiImageIO", ".nrrd": "NrrdImageIO"}
 _MOST_NIFTI_VOXELS = 32_767  # NIfTI allows at most this many voxels along an axis
@@ -105,21 +106,16 @@ def write_zarr(path: Path, volume: Volume, scale: Hounsfield | None, unit: str =
             for start in range(0, shape[0], _CHUNK):
                 stop = min(start + _CHUNK, shape[0])
                 slab = before[start * step[0] : stop * step[0]]
-                slab = _means(slab, step) if levels else slab if scale is None else scale.of(slab)
-                level[start:stop] = slab
+                if levels:  # voxels left over at the end are dropped
+                    nz, ny, nx = np.array(slab.shape) // step * step
+                    slab = block_means(slab[:nz, :ny, :nx], triple(step.tolist()))
+                level[start:stop] = slab if levels or scale is None else scale.of(slab)
             levels.append({"path": name, "coordinateTransformations": _places(grid, factors)})
             step = np.where(np.array(shape) > 1, 2, 1)
             factors, before = factors * step, level
         axes = [{"name": axis, "type": "space", "unit": "millimeter"} for axis in "zyx"]
         note = {"values": unit if scale is None else scale.note}
         writer.write_multiscales_metadata(group, levels, axes=axes, name=path.name, metadata=note)
-
-
-def _means(slab: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Returns means of slices (z, y, x) over blocks of ``step`` (3,) voxels. Voxels left over at the end are dropped."""
-    (nz, ny, nx), (z, y, x) = np.array(slab.shape) // step, step
-    cut = slab[: nz * z, : ny * y, : nx * x]
-    return cut.reshape(nz, z, ny, y, nx, x).mean((1, 3, 5), dtype=np.float32)
 
 
 def _places(grid: Grid, factors: np.ndarray) -> list[dict[str, object]]:

@@ -5,7 +5,6 @@
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, ConeGeometry, FrameSweeps, PoseTable, Scan, Shutter
+from phyradgs_cl.acquisition.altered.angles import middle_poses
 from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry, plain_geometry
 from phyradgs_cl.acquisition.plausible import check_plausible, question_unit
 from phyradgs_cl.acquisition.trajectory import grid_of_scan, resting_poses, unwrapped
@@ -24,10 +24,10 @@ from phyradgs_cl.importers.options import ImportOptions
 
 _log = logging.getLogger(__name__)
 _OF_A_TURN = ("exposure_s", "readout_s", "angle_at", "readout_axis", "readout_direction")
-Length = float | Callable[[], float]
-Pitch = tuple[float, float] | Callable[[], tuple[float, float]]
-_DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
-_VIEW_DIGITS = 5  # two views are equal if their angles' cosine and sine, or their scaled poses, agree to so many decimals
+Length = Any  # a number, or a function that reads it
+Pitch = Any  # a pair of numbers (v, u), or a function that reads it
+DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
+_VIEW_DIGITS = 5  # two views are equal if their poses, as fractions of the largest, agree to so many decimals
 _SLACK = 1e-6  # pose tables extend by this fraction of a frame's duration beyond the frames, for times that are rounded
 
 
@@ -165,26 +165,29 @@ def turn_of(pose: np.ndarray) -> Turned:
 
 
 def table_over_time(
-    pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, subject: str, is_parallel: bool = False
-) -> PoseTable:
-    """Returns a pose table from the first frame's opening to the last line's closing of the last frame. pose_at: returns
-    poses (T, 12) at frame positions (T,), where 2.5 is halfway from frame 2 to 3. At rest, every frame has one pose."""
+    pose_at: Callable[[np.ndarray], np.ndarray], timing: Timing, subject: str, panel: tuple[int, int],
+    is_parallel: bool = False,
+) -> tuple[PoseTable, Geometry]:
+    """Returns a pose table from the first frame's opening to the last line's closing of the last frame, and the nearest
+    circular geometry. pose_at: returns poses (T, 12) at frame positions (T,), where 2.5 is halfway from frame 2 to 3. At
+    rest, every frame has one pose. panel: the image's (rows, columns)."""
+    poses = pose_at(np.arange(len(timing.start_s), dtype=np.float64))
+    geometry = plain_geometry(poses, panel, is_parallel)
     if not timing.is_fly:
         at_s = np.asarray(timing.start_s) + timing.shutter.middle_s
-        poses = pose_at(np.arange(len(at_s), dtype=np.float64))
-        return resting_poses(poses, at_s, timing.shutter.span_s, f"{subject} poses", is_parallel)
+        return resting_poses(poses, at_s, timing.shutter.span_s, f"{subject} poses", is_parallel), geometry
     at_s, span_s = timing.angle_time_s, timing.shutter.span_s
     before_s = max(at_s[0] - timing.start_s[0] + _SLACK * span_s, 0.0)
     after_s = max(timing.start_s[-1] + span_s - at_s[-1], 0.0) + _SLACK * span_s
     time_s = np.concatenate([[at_s[0] - before_s], at_s, [at_s[-1] + after_s]])
     first, last = -before_s / (at_s[1] - at_s[0]), len(at_s) - 1 + after_s / (at_s[-1] - at_s[-2])
     position = np.concatenate([[first], np.arange(len(at_s)), [last]])
-    return PoseTable(time_s, pose_at(position), f"{subject} poses", is_parallel)
+    return PoseTable(time_s, pose_at(position), f"{subject} poses", is_parallel), geometry
 
 
 def assemble_scan(
     integrals: LineIntegrals, trajectory: CircularOrbit | PoseTable, geometry: Geometry, timing: Timing,
-    options: ImportOptions, *, title: str, source: str, grid: Grid | None = None,
+    options: ImportOptions, path: Path, *, title: str = "", grid: Grid | None = None,
     reference: np.ndarray | None = None, lag: float = 0.0, names: Mapping[str, str] | None = None, said: str = "",
 ) -> Scan:
     """Returns a scan of line integrals whose row 0 is the lowest. grid: None takes ``grid_of_scan``. reference, lag: see
@@ -196,30 +199,24 @@ def assemble_scan(
         frame_start_s=np.asarray(timing.start_s, np.float64),
         grid=grid or grid_of_scan(geometry, trajectory, timing.start_s),
         is_fly=timing.is_fly, detector_model=options.detector_model or "log", pixel_mask=integrals.mask,
-        reference=reference, title=title,
+        reference=reference, title=title or path.stem,
         provenance={
-            "imported_from": source, **integrals.applied, **({"assumed": assumed} if assumed else {}),
+            "imported_from": str(path), **integrals.applied, **({"assumed": assumed} if assumed else {}),
             TAKEN: "; ".join(str(part) for part in (said, integrals.applied.get(TAKEN)) if part),
         },
         lag=lag, saturation=integrals.saturation,
     )
-    subjects = {"grid": f"{source} grid", "angles": f"{source} angles", **(names or {})}
-    _check_turn(trajectory, scan.frame_start_s + timing.shutter.middle_s, options.called("angles", subjects))
+    subjects = {"grid": f"{path} grid", "angles": f"{path} angles", **(names or {})}
+    _check_turn(middle_poses(scan), options.called("angles", subjects))
     is_timed = "exposure" not in assumed  # an assumed exposure of 1 s gives no frame rate that can be checked
     check_plausible(scan, lambda name: options.called(name, subjects), is_timed)
     scan.warn_of_near_panel()
     return scan
 
 
-def _check_turn(trajectory: CircularOrbit | PoseTable, middle_s: np.ndarray, subject: str) -> None:
-    """Raises InputError if more than half of the views, at times ``middle_s`` (F,) in s, have the same angle or pose."""
-    if isinstance(trajectory, PoseTable):
-        views = trajectory.pose(0, middle_s)
-        views = views / np.abs(views).max(axis=0, initial=1e-9)
-    else:
-        angle_rad = np.array([float(trajectory.angle_rad(i, at_s)) for i, at_s in enumerate(middle_s)])
-        views = np.stack([np.cos(angle_rad), np.sin(angle_rad)], -1)
-    count = len(views)
+def _check_turn(poses: np.ndarray, subject: str) -> None:
+    """Raises InputError if more than half of the views have the same pose. poses (F, 12): in the middle of each frame."""
+    views, count = poses / np.abs(poses).max(axis=0, initial=1e-9), len(poses)
     most = int(np.unique(np.round(views, _VIEW_DIGITS) + 0.0, axis=0, return_counts=True)[1].max())
     if count > 1 and 2 * most > count:
         found = f"{most}{'' if most == count else f' of {count}'} views at one angle"
@@ -236,10 +233,10 @@ def parallel(
 ) -> ParallelGeometry:
     """Returns the geometry of a parallel beam. Options replace the file's pitch and offset, both (v, u) in mm. Raises
     InputError if an option gives a distance of the source."""
-    for name in options.given(_DISTANCES):
+    for name in options.given(DISTANCES):
         expected, remedy = "no distance: this file has a parallel beam", "leave it out"
         raise InputError(options.named(name), f"{getattr(options, name):g}", expected, remedy)
-    return ParallelGeometry(panel, _taken(options, "pixel_size_mm", pitch_mm), options.detector_offset_mm or offset_mm)
+    return ParallelGeometry(panel, options.taken("pixel_size_mm", pitch_mm), options.detector_offset_mm or offset_mm)
 
 
 def cone(
@@ -249,20 +246,15 @@ def cone(
     """Returns the geometry of a cone beam. Options replace the file's values, which are the other arguments. A length or
     pitch may be a function that reads it. The function is called only if no option replaces its value. names: what the file
     calls its values, for messages. Raises InputError unless the distance to the detector exceeds that to the axis."""
-    axis_mm, detector_mm = map(partial(_taken, options), _DISTANCES, (to_axis_mm, to_detector_mm))
+    axis_mm, detector_mm = map(options.taken, DISTANCES, (to_axis_mm, to_detector_mm))
     if detector_mm <= axis_mm:
-        axis, detector = (options.called(name, names) for name in _DISTANCES)
+        axis, detector = (options.called(name, names) for name in DISTANCES)
         remedy = "are the two exchanged?"
-        if names and not names.keys().isdisjoint(_DISTANCES):
-            remedy += f" Correct the file, or say {' and '.join(map(options.named, _DISTANCES))}"
+        if names and not names.keys().isdisjoint(DISTANCES):
+            remedy += f" Correct the file, or say {' and '.join(map(options.named, DISTANCES))}"
         raise InputError(detector, f"{detector_mm:g}", f"more than {axis} ({axis_mm:g})", remedy)
-    pitch = _taken(options, "pixel_size_mm", pitch_mm)
+    pitch = options.taken("pixel_size_mm", pitch_mm)
     return ConeGeometry(axis_mm, detector_mm, panel, pitch, options.detector_offset_mm or offset_mm)
-
-
-def _taken(options: ImportOptions, name: str, stored: Any) -> Any:
-    """Returns the option ``name`` if given, else ``stored``: a value, or a function that reads it."""
-    return options.taken(name, stored if callable(stored) else lambda: stored)
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,9 +297,7 @@ class RotaryStage:
             return self.poses(along(turned_rad, position), along(shift_mm, position))
 
         is_parallel = isinstance(self.geometry, ParallelGeometry)
-        at_frames = poses(np.arange(len(turned_rad), dtype=np.float64))
-        geometry = plain_geometry(at_frames, self.geometry.detector_shape, is_parallel)
-        return table_over_time(poses, timing, subject, is_parallel), geometry
+        return table_over_time(poses, timing, subject, self.geometry.detector_shape, is_parallel)
 
 
 def scan_on_stage(
@@ -329,8 +319,8 @@ def scan_on_stage(
     integrals = line_integrals(
         str(path), frames, with_air, flats=flats, darks=darks, convention="counts", is_corrected=darks is None
     )
-    parts = integrals, trajectory, geometry, timing, options
-    return assemble_scan(*parts, title=title, source=str(path), names=names, said=said)
+    parts = integrals, trajectory, geometry, timing, options, path
+    return assemble_scan(*parts, title=title, names=names, said=said)
 
 
 def along(values: np.ndarray, position: np.ndarray) -> np.ndarray:

@@ -1,44 +1,27 @@
 """Makes frames comparable that got more light than others, in HDF5: flats of another exposure, and a monitor of the beam."""
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from phyradgs_cl.importers.frames import LineIntegrals, median
-from phyradgs_cl.importers.hdf5 import Stacks
+from phyradgs_cl.importers.frames import median
+from phyradgs_cl.importers.hdf5 import Reading, Stacks
 
 _log = logging.getLogger(__name__)
 _LIKE = 0.01  # exposures whose relative difference is smaller are measured ones of one setting
 _LARGEST = 10.0  # a monitor whose largest reading exceeds its smallest by this factor measures something else
 
 
-@dataclass(frozen=True, eq=False)
-class Reading:
-    """A number for each flat (n,) and each projection (P,), such as their exposures; empty arrays where the file has none.
-    name: what messages call it."""
-
-    name: str
-    flats: np.ndarray
-    projections: np.ndarray
-
-
-def evened(
-    stacks: Stacks, exposure: Reading | None, monitor: Reading | None, remedy: str = ""
-) -> tuple[Stacks, np.ndarray]:
-    """Returns stacks whose flats have the light of one beam in the projections' exposure, and the logarithm (P,) of each
-    projection's light over that, for ``with_light``. monitor: readings of the beam. remedy: how to leave it out."""
+def evened(stacks: Stacks, exposure: Reading | None, monitor: Reading | None, remedy: str = "") -> Stacks:
+    """Returns stacks whose flats have the light of one beam in the projections' exposure, and whose projections' light is
+    stated relative to that. monitor: readings of the beam. remedy: how to leave it out."""
     longer = _longer(stacks, exposure)
     flats, frames = _monitored(stacks, monitor, longer, remedy)
     if np.any(flats != 1):
         dark = median(stacks.darks) if len(stacks.darks) else 0.0
         stacks = replace(stacks, flats=np.float32(dark + (stacks.flats - dark) / flats[:, None, None]))
-    return stacks, np.log(frames)
-
-
-def with_light(integrals: LineIntegrals, light: np.ndarray) -> LineIntegrals:
-    """Returns the line integrals that projections would have in the flats' light. light (P,): see ``evened``."""
-    return replace(integrals, values=integrals.values + np.float32(light)[:, None, None]) if light.any() else integrals
+    return replace(stacks, light=frames)
 
 
 def _longer(stacks: Stacks, exposure: Reading | None) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Saturation
 from phyradgs_cl.acquisition.plausible import FEW
 from phyradgs_cl.acquisition.scan import applied_facts
-from phyradgs_cl.detector.attenuation import frames_to_attenuation
+from phyradgs_cl.detector.attenuation import flats_by_time, frames_to_attenuation
 from phyradgs_cl.detector.noise_level import find_saturation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers.options import ImportOptions
@@ -64,10 +64,10 @@ def light_of(
     flats of one time."""
     flats_at, when, assumed = _times(subject, len(flats), count, options, at)
     light = max(float(np.median(_levels(flats)[1])), 1e-30)
-    group_of = _group_of(flats_at, when)
-    times = [np.flatnonzero(group_of == group) for group in np.unique(group_of)]
     said_by = (subject, light, names or {})
-    times = [group[_fitting("flats", flats, group, _TOGETHER, *said_by)] for group in times]
+    times = [
+        group[_fitting("flats", flats, group, _TOGETHER, *said_by)] for group in flats_by_time(flats_at, when)
+    ]
     used = np.concatenate(times)
     if len(times) > 1:
         used = used[_fitting("flats", flats, used, _APART, *said_by)]
@@ -89,11 +89,6 @@ def median(stack: np.ndarray) -> np.ndarray:
     return np.concatenate([np.median(stack[:, start : start + rows].astype(np.float64), axis=0) for start in starts])
 
 
-def _group_of(flats_at: np.ndarray, when: np.ndarray) -> np.ndarray:
-    """Returns how many projections were taken before each flat, (n,)."""
-    return np.searchsorted(np.sort(when), flats_at)
-
-
 def _times(
     subject: str, flats: int, count: int, options: ImportOptions, at: Moments | None
 ) -> tuple[np.ndarray, np.ndarray, str]:
@@ -101,7 +96,7 @@ def _times(
     numbers = np.arange(count)
     if options.flats != "time":
         return (np.full(flats, -0.5), numbers, "") if at is None or options.flats else (*at, "")
-    if flats < 2 or (at is not None and np.ptp(_group_of(*at)) == 0):
+    if flats < 2 or (at is not None and len(flats_by_time(*at)) == 1):
         found = f"{flats} of one time in {subject}"
         raise InputError(options.named("flats"), found, "flats of several times", "take their median: leave it out")
     before, said = (flats + 1) // 2, " (assumed: the first {} before the scan, the others after it)"
@@ -273,9 +268,3 @@ def oriented(array: np.ndarray, options: ImportOptions, row_0: str, column_0: st
     if (options.column_0 or column_0) == "right":
         array = array[..., ::-1]
     return array
-
-
-def gantry_sign(options: ImportOptions, convention: str) -> float:
-    """Returns the factor that turns stored angles into the gantry's: +1 for the gantry's angles, −1 for the sample's.
-    convention: the format's, "gantry" or "sample"; the options' comes first."""
-    return 1.0 if (options.rotates or convention) == "gantry" else -1.0

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import h5py
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.assemble import Turned, cone, parallel
+from phyradgs_cl.importers.assemble import DISTANCES, Turned, cone, parallel
 from phyradgs_cl.importers.files import SafeFolder
 from phyradgs_cl.importers.frames import LineIntegrals, Moments, line_integrals, oriented
 from phyradgs_cl.importers.options import ImportOptions
@@ -28,7 +29,6 @@ _log = logging.getLogger(__name__)
 STACKS = ("projections", "flats", "darks", "mask")
 NAMES = (*STACKS, "image_key", "angles", "monitor", "axes")
 AXES = ["frame", "v", "u"]
-_DISTANCES = ("source_to_axis_mm", "source_to_detector_mm")
 _LIKE = 0.1  # a larger relative difference between pixels on the panel and pixels at the sample × magnification is a warning
 _LEAST_MM = 1e-4  # no pixel is smaller than this: a smaller number without a unit must be in m
 _MAGNIFICATION = re.compile(r"(\d+(?:\.\d+)?)\s*[x×]|^(\d+(?:\.\d+)?)$", re.I)  # 10, 10x, 7.5 X/0.2
@@ -183,12 +183,10 @@ class Places:
 
         return options.angle_rad(int(used.sum()), stored_rad)
 
-    def per_frame(
-        self, name: str, usual: str, key: Sequence[str], frames: int
-    ) -> tuple[str, np.ndarray, np.ndarray] | None:
-        """Reads a number for each of the stored ``frames``: the address, and those of flats (n,) and of projections (P,).
-        Both are empty without one for each, flats' also with flats of other addresses. Returns None where no address of the
-        array ``name`` is stated, or none is the word, and the format's address (``usual``) is empty. key: see ``stacks``."""
+    def per_frame(self, name: str, usual: str, key: Sequence[str], frames: int) -> "Reading | None":
+        """Reads a number for each of the stored ``frames``: none without one for each, and none of flats that have other
+        addresses. Returns None where no address of the array ``name`` is stated, or none is the word, and the format's
+        address (``usual``) is empty. key: see ``stacks``."""
         for text in self._at(name, [usual])[:1]:
             if text == "none":
                 return None
@@ -199,14 +197,24 @@ class Places:
                     values = h5.read_values(source, address, dataset).astype(np.float64)
                 kinds = self._key(key, frames)
                 flats = values[(kinds == schema.FLAT) & fits & ("flats" not in self.stated)]
-                return source.name(address), flats, values[(kinds == schema.PROJECTION) & fits]
+                return Reading(source.name(address), flats, values[(kinds == schema.PROJECTION) & fits])
         return None
+
+
+class Reading(NamedTuple):
+    """A number for each flat (n,) and each projection (P,), such as their exposures; empty arrays where the file has none.
+    name: what messages call it."""
+
+    name: str
+    flats: np.ndarray
+    projections: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Stacks:
     """Projections (P, v, u), flats and darks (n, v, u), and a mask (v, u) or (P, v, u) that is non-zero at unusable pixels
-    (None: use all). used, bool (F,): which stored frames are projections. flats_at: see ``at`` of ``frames.light_of``."""
+    (None: use all). used, bool (F,): which stored frames are projections. flats_at: see ``at`` of ``frames.light_of``.
+    light (P,): that of the projections' beam over that of the flats'; None: as bright."""
 
     projections: np.ndarray
     flats: np.ndarray
@@ -214,6 +222,7 @@ class Stacks:
     mask: np.ndarray | None
     used: np.ndarray
     flats_at: Moments | None
+    light: np.ndarray | None = None
 
     @property
     def panel(self) -> tuple[int, int]:
@@ -232,6 +241,8 @@ class Stacks:
         integrals = line_integrals(
             subject, frames, options, flats=flats, darks=darks, convention=convention, flats_at=self.flats_at
         )
+        if self.light is not None and (brighter := np.log(self.light)).any():
+            integrals = replace(integrals, values=integrals.values + np.float32(brighter)[:, None, None])
         return integrals if bad is None else replace(integrals, mask=united(bad != 0, integrals.mask))
 
 
@@ -303,7 +314,7 @@ def beam(
         return widened
 
     to_axis_mm = to_detector_mm = 1.0
-    if not options.given(_DISTANCES) and source.find(lengths.source) is None:
+    if not options.given(DISTANCES) and source.find(lengths.source) is None:
         _log.warning("%s: no source distance: a parallel beam", source.name(lengths.source))
         sides = options.taken("pixel_size_mm", pitch_mm)
         return parallel(options, panel, sides, (0.0, axis_columns * sides[1]))

@@ -194,7 +194,12 @@ def read_zarr(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | N
         array = group[facts["datasets"][0]["path"]]
         units = {axis["name"]: LENGTH.factor(str(axis.get("unit"))) for axis in facts["axes"]}
         order = [list(units).index(name) for name in "zyx"]
-        sizes, first = _sizes_and_first(facts, array.ndim)
+        sizes, first = np.ones(array.ndim), np.zeros(array.ndim)  # a voxel's, and the first one's centre, in the axes' units
+        for change in (*facts["datasets"][0]["coordinateTransformations"], *facts.get("coordinateTransformations", ())):
+            if change["type"] not in ("scale", "translation"):
+                raise ValueError(f"transformation {change['type']}")
+            by = np.asarray(change[change["type"]], np.float64)
+            sizes, first = (sizes * by, first * by) if change["type"] == "scale" else (sizes, first + by)
         shape = [array.shape[axis] for axis in order]
         if array.dtype.kind not in "iuf" or len(units) != array.ndim or not 0 < math.prod(shape) == array.size:
             raise ValueError(f"axes {', '.join(units)} of {array.shape} voxels, {array.dtype}")
@@ -214,14 +219,3 @@ def read_zarr(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | N
         _log.warning("%s: its axes have no sizes in a unit of length: the scale is left out", path)
         return values, None, None, note
     return values, size_mm, first_mm, note
-
-
-def _sizes_and_first(facts: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a voxel's sizes and the first voxel's centre, each (count,), in the axes' units, at full resolution."""
-    sizes, first = np.ones(count), np.zeros(count)
-    for change in (*facts["datasets"][0]["coordinateTransformations"], *facts.get("coordinateTransformations", ())):
-        if change["type"] not in ("scale", "translation"):
-            raise ValueError(f"transformation {change['type']}")
-        by = np.asarray(change[change["type"]], np.float64)
-        sizes, first = (sizes * by, first * by) if change["type"] == "scale" else (sizes, first + by)
-    return sizes, first

@@ -17,7 +17,7 @@ from phyradgs_cl.fields.hounsfield import of_note
 from phyradgs_cl.importers import tiff
 from phyradgs_cl.importers.files import SafeFolder, read_json, read_npy
 from phyradgs_cl.importers.images import image_times_s, read_image_volume, read_zarr
-from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.options import OF_BARE_FRAMES, OF_FOLDERS, OF_HDF5, TIMING, ImportOptions
 from phyradgs_cl.io.attenuation import PER_MM, VALUES, check_attenuation, in_per_mm
 from phyradgs_cl.io.tables import Fields, read_toml, refuse_unknown
 from phyradgs_cl.io.volume import Volume, finite_float32, read_volume, shares_of_maximum
@@ -74,25 +74,28 @@ def _is_dicom(path: Path) -> bool:
         return file.read(132)[128:] == b"DICM"
 
 
-# For each format: its module in formats/, loaded when it is needed, and the program whose scans it reads, for the help.
-# A module has recognises(path) -> bool and import_scan(path, options) -> Scan, for a file or a folder.
+_OF_READOUT = "exposure_s", "readout_axis", "readout_direction", "detector_model"
+_OF_INTEGRALS = *TIMING, "quantity", "flat_value", "detector_model"
+# For each format: its module in formats/, loaded when it is needed, the program whose scans it reads, for the help, and the
+# options that it reads; None where the module itself refuses others.
+# A module has recognises(path) and import_scan(path, options) -> Scan, for a file or a folder.
 # For MODULE:END the module's functions are recognises_END and import_scan_END.
-FORMATS = {
-    "r2": ("r2_gaussian", "R2-Gaussian"),
-    "phyradgs": ("r2_gaussian:with_times", "PhyRadGS"),
-    "phyradgs-real": ("phyradgs_real", "PhyRadGS"),
-    "naf": ("pickles", "NAF"),
-    "rtk": ("rtk", "RTK"),
-    "data-exchange": ("beamlines:exchange", "Data Exchange"),
-    "nxtomo": ("beamlines", "NXtomo"),
-    "tiff": ("tiff_folder", "TIFF"),
-    "nikon": ("nikon", "Nikon"),
-    "skyscan": ("skyscan", "SkyScan"),
-    "zeiss": ("zeiss", "Zeiss"),
-    "flexray": ("flexray", "FleX-ray"),
-    "rtk-projections": ("rtk_projections", "Elekta, Varian, ORA"),
-    "leap": ("leap", "LEAP"),
-    "tigre": ("pickles:tigre", "TIGRE"),
+FORMATS: dict[str, tuple[str, str, tuple[str, ...] | None]] = {
+    "r2": ("r2_gaussian", "R2-Gaussian", (*TIMING, "unit_mm", "detector_model", "part")),
+    "phyradgs": ("r2_gaussian:with_times", "PhyRadGS", (*_OF_READOUT, "unit_mm", "part")),
+    "phyradgs-real": ("phyradgs_real", "PhyRadGS", (*_OF_READOUT, "pixel_size_mm", "quantity", "flat_value", "first_view")),
+    "naf": ("pickles", "NAF", (*TIMING, "detector_model", "part")),
+    "rtk": ("rtk", "RTK", _OF_INTEGRALS),
+    "data-exchange": ("beamlines:exchange", "Data Exchange", OF_HDF5),
+    "nxtomo": ("beamlines", "NXtomo", OF_HDF5),
+    "tiff": ("tiff_folder", "TIFF", (*OF_BARE_FRAMES, "linked_folder")),
+    "nikon": ("nikon", "Nikon", OF_FOLDERS),
+    "skyscan": ("skyscan", "SkyScan", OF_FOLDERS),
+    "zeiss": ("zeiss", "Zeiss", OF_FOLDERS),
+    "flexray": ("flexray", "FleX-ray", OF_BARE_FRAMES),
+    "rtk-projections": ("rtk_projections", "Elekta, Varian, ORA", None),
+    "leap": ("leap", "LEAP", OF_BARE_FRAMES),
+    "tigre": ("pickles:tigre", "TIGRE", (*_OF_INTEGRALS, "row_0", "column_0")),
 }
 _MOST_BODIES = 1000  # no calibration phantom has more beads and wires
 _LARGEST_MM, _LARGEST_PER_MM = 1e5, 1e5  # larger coordinates and attenuations must be in wrong units
@@ -109,8 +112,11 @@ def import_scan(path: str | Path, options: ImportOptions | None = None, form: st
     _check_there(path)
     form = form or recognise(path)
     checks.one_of("format", form, FORMATS)
+    options = options or ImportOptions()
+    if (used := FORMATS[form][2]) is not None:
+        options.refuse_unused(form, used)
     try:
-        scan: Scan = _function("import_scan", form)(path, options or ImportOptions())
+        scan: Scan = _function("import_scan", form)(path, options)
     except InputError as error:
         if not error.subject.startswith("grid "):
             raise
@@ -165,8 +171,7 @@ def load_volume(path: str | Path, mu_water_per_mm: float | None = None) -> Volum
     units without ``mu_water_per_mm``, and values that are not finite."""
     if (reader := _reader(path)) is None:
         refuse_unread(Path(path), "a volume of a format of docs/formats.md")
-        return in_per_mm(str(path), read_volume(path), mu_water_per_mm)
-    return in_per_mm(str(path), reader[1](Path(path)), mu_water_per_mm)
+    return in_per_mm(str(path), (reader[1] if reader else read_volume)(Path(path)), mu_water_per_mm)
 
 
 def load_states(path: str | Path) -> Iterator[tuple[float, Volume]]:

@@ -94,13 +94,13 @@ class ImportOptions:
         return [name for name in among if getattr(self, name) != _DEFAULTS[name]]
 
     def taken(self, name: str, stored: Callable[[], T]) -> T:
-        """Returns the option ``name`` if given, else what ``stored`` reads from the file. If reading raises InputError, the
-        error's remedy names the option."""
+        """Returns the option ``name`` if given, else what ``stored`` reads from the file, or ``stored`` itself if it is no
+        function. If reading raises InputError, the error's remedy names the option."""
         value: T | None = getattr(self, name)
         if value is not None:
             return value
         try:
-            return stored()
+            return stored() if callable(stored) else stored
         except InputError as error:
             remedy = f"{error.remedy}, or say {self.named(name)}" if error.remedy else f"say {self.named(name)}"
             raise InputError(error.subject, error.found, error.expected, remedy) from error
@@ -114,6 +114,11 @@ class ImportOptions:
             return read_angles_rad(path, count)
         first, last = float(steps[1]), float(steps[3])
         return np.deg2rad(first + last * np.arange(count) if steps[2] == "," else np.linspace(first, last, count))
+
+    def gantry_sign(self, convention: str) -> float:
+        """Returns the factor that turns stored angles into the gantry's: +1 for the gantry's angles, −1 for the sample's.
+        convention: the format's, "gantry" or "sample"; the options' comes first."""
+        return 1.0 if (self.rotates or convention) == "gantry" else -1.0
 
     def called(self, name: str, in_file: Mapping[str, str] | None = None) -> str:
         """Returns what messages call a field: the file's name for it (``in_file``) if the user gave no option, else the

@@ -2,13 +2,13 @@
 
 import logging
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.importers.files import read_text
+from phyradgs_cl.importers.files import SafeFolder, read_text
 from phyradgs_cl.io.files import decoded
 from phyradgs_cl.io.hdf5.datasets import Quantity
 from phyradgs_cl.io.tables import LARGEST, Fields
@@ -108,6 +108,17 @@ def head_has(path: Path, *marks: bytes) -> bool:
     with open(path, "rb") as file:
         head = decoded(file.read(_HEAD_BYTES)).lower()
     return all(mark.decode().lower() in head for mark in marks)
+
+
+def found_by(suffixes: tuple[str, ...], *marks: bytes) -> Callable[[Path], list[Path]]:
+    """Returns a function that finds the files with one of the suffixes and with all ``marks`` in their heads: the path that
+    it takes, or those in this folder."""
+
+    def found(path: Path) -> list[Path]:
+        files = SafeFolder(path).matching(*suffixes) if path.is_dir() else [path]
+        return [file for file in files if file.suffix.lower() in suffixes and head_has(file, *marks)]
+
+    return found
 
 
 def say_missing(fields: Fields, meanings: Mapping[str, str]) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation, Grid, MovingTruth, triple
@@ -94,9 +93,9 @@ def write_truth(extra: h5py.Group, scan: Scan) -> None:
         return
     group = h5.new_group(extra, "reference", "NXcollection")
     if scan.reference is not None:
-        _write_volumes(group, "volume", scan.reference)
+        write_packed(group, "volume", scan.reference)
     if moving is not None:
-        _write_volumes(group, "states", moving.volumes)
+        write_packed(group, "states", moving.volumes)
         h5.write_number(group, "state_times", moving.times_s, "s")
         if moving.deformation is not None:
             write_deformation_group(group, moving.deformation)
@@ -107,16 +106,17 @@ def check_truth(source: Hdf5Source, entry: str, grid: Grid) -> tuple[bool, int]:
     InputError for shapes that do not fit the grid."""
     if source.optional_group(f"{entry}/{schema.REFERENCE}") is None:
         return False, 0
-    states, times = (source.optional(f"{entry}/{name}") for name in (schema.STATES, schema.STATE_TIMES))
-    if states is None and times is None:
-        _check_shape(source, f"{entry}/{schema.TRUTH}", source.dataset(f"{entry}/{schema.TRUTH}").shape, grid.shape)
-        return True, 0
-    states, times = (source.dataset(f"{entry}/{name}") for name in (schema.STATES, schema.STATE_TIMES))
-    _check_shape(source, f"{entry}/{schema.STATES}", states.shape, (times.size, *grid.shape))
-    volume = source.optional(f"{entry}/{schema.TRUTH}")
-    if volume is not None:
-        _check_shape(source, f"{entry}/{schema.TRUTH}", volume.shape, grid.shape)
-    return volume is not None, int(times.size)
+    volume, states, times = (f"{entry}/{name}" for name in (schema.TRUTH, schema.STATES, schema.STATE_TIMES))
+    moves = source.optional(states) is not None or source.optional(times) is not None
+    count = int(source.dataset(times).size) if moves else 0
+    shapes: dict[str, tuple[int, ...]] = {states: (count, *grid.shape)} if moves else {}
+    if not moves or source.optional(volume) is not None:
+        shapes[volume] = grid.shape
+    for address, expected in shapes.items():
+        if (shape := source.dataset(address).shape) != expected:
+            remedy = f"store the reference's own grid in {entry}/{schema.GRID}"
+            raise source.error(address, f"shape {shape}", f"the grid's {expected}", remedy)
+    return volume in shapes, count
 
 
 def read_reference(source: Hdf5Source, entry: str) -> np.ndarray:
@@ -134,21 +134,15 @@ def read_moving_truth(source: Hdf5Source, entry: str) -> MovingTruth:
     return MovingTruth(times_s, volumes, read_deformation_group(source, address) if moves else None)
 
 
-def _check_shape(source: Hdf5Source, address: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> None:
-    if shape != expected:
-        remedy = f"store the reference's own grid in {address.split('/reference/')[0]}/grid"
-        raise source.error(address, f"shape {shape}", f"the grid's {expected}", remedy)
-
-
-def _write_volumes(group: h5py.Group, name: str, volumes: np.ndarray) -> None:
+def write_packed(group: h5py.Group, name: str, volumes: np.ndarray) -> None:
+    """Writes volumes (..., z, y, x) in 1/mm as compressed float32."""
     dataset = group.create_dataset(name, data=np.asarray(volumes, np.float32), compression="gzip", shuffle=True)
     dataset.attrs["units"] = "1/mm"
 
 
 def _read_volumes(source: Hdf5Source, address: str) -> np.ndarray:
-    values = h5.read_values(source, address, source.dataset(address))
-    checks.finite(source.name(address), values)
+    values = h5.read_attenuation(source, address, source.dataset(address))
     if values.max() <= 0:
         found = f"no voxel above 0 (the largest is {values.max() + 0.0:g})"
         raise source.error(address, found, "a truth to compare with", "take the reference out of the file")
-    return h5.in_unit(source, address, values, h5.ATTENUATION).astype(np.float32)
+    return values

@@ -150,7 +150,9 @@ def temporary_name(target: Path, suffix: str = "") -> Path:
     for path in target.parent.glob(f".{glob.escape(target.stem[:_LONGEST])}*.part*"):
         writer = _WRITER.search(path.name)
         if writer and writer[1] == _machine() and _is_dead(int(writer[2])):
-            _discard(path)
+            with suppress(OSError):  # ``path`` is a folder, or another process has removed it
+                path.unlink()
+            shutil.rmtree(path, ignore_errors=True)
     writer_now = f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
     return target.with_name(f".{target.name[:_LONGEST]}.{writer_now}.part{suffix}")
 
@@ -172,13 +174,6 @@ def _is_dead(process: int) -> bool:
     except OSError as error:
         return isinstance(error, ProcessLookupError)  # another error: the process lives, but is another user's
     return False
-
-
-def _discard(path: Path) -> None:
-    try:
-        path.unlink()
-    except OSError:  # ``path`` is a folder, or another process has removed it
-        shutil.rmtree(path, ignore_errors=True)
 
 
 def _flush_folder(folder: Path) -> None:

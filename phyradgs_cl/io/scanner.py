@@ -89,7 +89,7 @@ def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
     refuse_unknown(str(path), content, (*TABLES, *_WORDS), "a table")
     tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in TABLES.items()}
     geometry = _geometry(tables["source"], tables["detector"])
-    readout = tables["readout"]
+    readout, beam = tables["readout"], tables["beam"]
     axis, direction = _order(readout)
     fps = readout.length("fps") if readout.has("fps") else None
     readout_ms = readout.number("readout_ms", lowest=0.0) if readout.has("readout_ms") else None
@@ -99,7 +99,7 @@ def scanner_from(path: Path, content: dict[str, object]) -> Scanner:
         path.stem, geometry, _grid(tables["volume"]) if "volume" in content else default_grid(geometry), axis,
         direction,
         readout.number("ratio", lowest=0.0, highest=LARGEST_LENGTH) if readout.has("ratio") else None,
-        _pulse(tables["beam"]) if "beam" in content else None,
+        (beam.number("pulse_start", highest=LARGEST_LENGTH), beam.length("pulse_length")) if "beam" in content else None,
         tables["detector"].number("lag", 0.0, 0.0, LARGEST_LAG), fps, readout_ms,
     )
 
@@ -124,36 +124,27 @@ def _order(readout: Fields) -> tuple[str, int]:
 
 
 def _geometry(source: Fields, detector: Fields) -> Geometry:
-    if source.word("beam", BEAMS, default="cone") == "parallel":
-        for key in filter(source.has, ("to_axis_mm", "to_detector_mm")):
+    distances_mm = ("to_axis_mm", "to_detector_mm")
+    if is_parallel := source.word("beam", BEAMS, default="cone") == "parallel":
+        for key in filter(source.has, distances_mm):
             found, remedy = described(source.get(key)), "leave one of the two out"
             raise source.error(key, found, "no distance: beam is 'parallel'", remedy)
-        return ParallelGeometry(*_panel(detector))
-    to_axis_mm, to_detector_mm = source.length("to_axis_mm"), source.length("to_detector_mm")
+    to_axis_mm, to_detector_mm = (0.0, 1.0) if is_parallel else map(source.length, distances_mm)
     if to_detector_mm <= to_axis_mm:
         raise source.error("to_detector_mm", f"{to_detector_mm:g}", f"more than to_axis_mm ({to_axis_mm:g})")
-    return ConeGeometry(to_axis_mm, to_detector_mm, *_panel(detector))
-
-
-def _panel(detector: Fields) -> tuple[tuple[int, int], tuple[float, float], tuple[float, float]]:
-    """Returns a panel's numbers of pixels, pixel sizes in mm and offset in mm, each (v, u)."""
-    return (
+    panel = (  # each (v, u)
         (detector.count("rows", MOST_LINES), detector.count("columns", MOST_LINES)),
         (detector.length("pixel_size_v_mm"), detector.length("pixel_size_u_mm")),
         (detector.position("offset_v_mm"), detector.position("offset_u_mm")),
     )
-
-
-def _pulse(beam: Fields) -> tuple[float, float]:
-    start, length = (beam.number(key, highest=LARGEST_LENGTH) for key in ("pulse_start", "pulse_length"))
-    if length <= 0:
-        raise beam.error("pulse_length", f"{length:g}", "a share of the exposure above 0")
-    return start, length
+    return ParallelGeometry(*panel) if is_parallel else ConeGeometry(to_axis_mm, to_detector_mm, *panel)
 
 
 def _grid(volume: Fields) -> Grid:
-    shape, size_mm = _triple(volume, "shape"), _triple(volume, "size_mm")
-    offset_mm = _triple(volume, "offset_mm") if volume.has("offset_mm") else (0.0, 0.0, 0.0)
+    shape, size_mm, offset_mm = (
+        triple(volume.numbers(key, 3, LARGEST_LENGTH).tolist()) if volume.has(key) or key != "offset_mm" else (0.0,) * 3
+        for key in ("shape", "size_mm", "offset_mm")
+    )
     if any(n < 1 or n != int(n) for n in shape):
         raise volume.error("shape", str(list(shape)), "three counts of at least 1 (z, y, x)")
     if math.prod(shape) > MOST_VOXELS:
@@ -162,8 +153,3 @@ def _grid(volume: Fields) -> Grid:
         raise volume.error("size_mm", str(list(size_mm)), "three lengths above 0 (z, y, x)")
     voxel_mm = triple(side / n for side, n in zip(size_mm, shape, strict=True))
     return Grid(triple(int(n) for n in shape), voxel_mm, offset_mm)
-
-
-def _triple(volume: Fields, key: str) -> tuple[float, float, float]:
-    z, y, x = volume.numbers(key, 3, LARGEST_LENGTH).tolist()
-    return z, y, x

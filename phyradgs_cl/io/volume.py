@@ -98,7 +98,7 @@ def write_volume(
     with h5.new_hdf5(path, sum(values.nbytes for values in arrays)) as file:
         entry = h5.new_group(file, "entry", "NXentry")
         entry.attrs["default"] = "reconstruction"
-        _write_data(entry, np.asarray(volume, np.float32), grid)
+        _write_data(entry, "reconstruction", "attenuation (1/mm)", volume, grid)
         if doubt is not None:
             _write_attenuation(entry["reconstruction"], "doubt", doubt, "σ of the attenuation (1/mm)")
             entry["reconstruction"].attrs["auxiliary_signals"] = ["doubt"]
@@ -113,7 +113,9 @@ def write_volume(
         if deformation is not None:
             write_deformation_group(entry, deformation)
         if states is not None:
-            _write_states(entry, states, grid)
+            title = "attenuation (1/mm) at some times"
+            group = _write_data(entry, "time_series", title, states.volumes, grid, ("time_s",), chunks=(1, *grid.shape))
+            h5.write_number(group, "time_s", states.times_s, "s", long_name="time (s)")
         if state is not None:
             group = h5.new_group(entry, "state", "NXcollection")
             for name, values in state.items():
@@ -134,13 +136,13 @@ def read_volume(path: str | Path) -> Volume:
             found = "root members " + (", ".join(sorted(source.file)[:10]) or "none")
             raise InputError(str(path), found, f"a 3D dataset {_BARE} or {_VOLUME}")
         dataset, grid = _dataset_and_grid(source)
-        values = _read_attenuation(source, _VOLUME, dataset)
+        values = h5.read_attenuation(source, _VOLUME, dataset)
         provenance, gaussians, metrics = _read_provenance(source), _read_gaussians(source), _read_metrics(source)
         deformation = None if source.find(DEFORMATION) is None else read_deformation_group(source, DEFORMATION)
         states = _read_states(source, grid.shape)
         if (sigma := source.optional(_DOUBT)) is not None:
             checks.shape(source.name(_DOUBT), sigma, grid.shape)
-        doubt = None if sigma is None else _read_attenuation(source, _DOUBT, sigma)
+        doubt = None if sigma is None else h5.read_attenuation(source, _DOUBT, sigma)
         return Volume(values, grid, provenance, gaussians, metrics, deformation, states, doubt)
 
 
@@ -161,11 +163,13 @@ def volume_summary(path: str | Path) -> dict[str, Any]:
     with open_hdf5(path) as source:
         _, grid = _dataset_and_grid(source)
         means = source.optional(f"{_GAUSSIANS}/mean") if source.optional_group(_GAUSSIANS) else None
+        times_s = None if (stored := _states_datasets(source, grid.shape)) is None else stored[0]
+        states = None if times_s is None else (len(times_s), float(times_s[0]), float(times_s[-1]))
         return {
             "shape": grid.shape, "voxel_size_mm": grid.voxel_size_mm, "offset_mm": grid.offset_mm,
             "provenance": _read_provenance(source), "metrics": _read_metrics(source),
             "gaussians": means.shape[0] if means is not None and means.ndim else 0,
-            **_states_summary(source, grid.shape),
+            **dict(zip(("states", "states_from_s", "states_to_s"), states or (), strict=False)),
             "sha256": sha256_of(path),
         }
 
@@ -174,13 +178,6 @@ def read_states(path: str | Path) -> States | None:
     """Reads the object at several times from a volume file; None if the file has a single volume."""
     with open_hdf5(path) as source:
         return _read_states(source, _dataset_and_grid(source)[1].shape)
-
-
-def _states_summary(source: Hdf5Source, shape: tuple[int, ...]) -> dict[str, object]:
-    if source.optional_group(_STATES) is None:
-        return {}
-    times_s, _ = _states_datasets(source, shape)
-    return {"states": len(times_s), "states_from_s": float(times_s[0]), "states_to_s": float(times_s[-1])}
 
 
 def file_kind(path: str | Path) -> str:
@@ -232,31 +229,22 @@ def _warn_once(path: Path, text: str) -> None:
     log.warning("%s: %s", path, text)
 
 
-def _write_data(entry: h5py.Group, volume: np.ndarray, grid: Grid) -> None:
-    group = h5.new_group(entry, "reconstruction", "NXdata")
-    group.attrs["signal"], group.attrs["axes"] = "volume", list(_AXES)
-    group["title"] = "attenuation (1/mm)"
-    _write_attenuation(group, "volume", volume, "attenuation (1/mm)")
-    _write_axes(group, grid)
+def _write_data(
+    entry: h5py.Group, name: str, title: str, values: np.ndarray, grid: Grid, before: tuple[str, ...] = (), **how: Any
+) -> h5py.Group:
+    """Writes values (..., z, y, x) with their axes as NXdata, and returns its group. before: names of the first axes."""
+    group = h5.new_group(entry, name, "NXdata")
+    group.attrs["signal"], group.attrs["axes"] = "volume", [*before, *_AXES]
+    group["title"] = title
+    _write_attenuation(group, "volume", values, "attenuation (1/mm)", **how)
+    for axis, centres_mm in zip(_AXES, grid.axes_mm(), strict=True):
+        h5.write_number(group, axis, centres_mm, "mm", long_name=f"{axis} (mm)")
+    return group
 
 
 def _write_attenuation(group: h5py.Group, name: str, values: np.ndarray, words: str, **how: Any) -> None:
     dataset = group.create_dataset(name, data=np.asarray(values, np.float32), **how)
     dataset.attrs.update(units="1/mm", long_name=words, interpretation="image")
-
-
-def _write_axes(group: h5py.Group, grid: Grid) -> None:
-    for name, centres_mm in zip(_AXES, grid.axes_mm(), strict=True):
-        h5.write_number(group, name, centres_mm, "mm", long_name=f"{name} (mm)")
-
-
-def _write_states(entry: h5py.Group, states: States, grid: Grid) -> None:
-    group = h5.new_group(entry, "time_series", "NXdata")
-    group.attrs["signal"], group.attrs["axes"] = "volume", ["time_s", *_AXES]
-    group["title"] = "attenuation (1/mm) at some times"
-    _write_attenuation(group, "volume", states.volumes, "attenuation (1/mm)", chunks=(1, *grid.shape))
-    h5.write_number(group, "time_s", states.times_s, "s", long_name="time (s)")
-    _write_axes(group, grid)
 
 
 def _write_facts(entry: h5py.Group, name: str, facts: Mapping[str, object]) -> None:
@@ -302,27 +290,21 @@ def _grid_of_axes(source: Hdf5Source, shape: tuple[int, ...]) -> Grid:
 
 
 def _read_states(source: Hdf5Source, shape: tuple[int, ...]) -> States | None:
+    stored = _states_datasets(source, shape)
+    return stored and States(stored[0], h5.read_attenuation(source, f"{_STATES}/volume", stored[1]))
+
+
+def _states_datasets(source: Hdf5Source, shape: tuple[int, ...]) -> tuple[np.ndarray, h5py.Dataset] | None:
+    """Returns times (K,) in s and the dataset (K, nz, ny, nx) of the object at these times; None for a single volume.
+    Raises InputError for times that do not rise, and for other shapes."""
     if source.optional_group(_STATES) is None:
         return None
-    times_s, dataset = _states_datasets(source, shape)
-    return States(times_s, _read_attenuation(source, f"{_STATES}/volume", dataset))
-
-
-def _states_datasets(source: Hdf5Source, shape: tuple[int, ...]) -> tuple[np.ndarray, h5py.Dataset]:
-    """Returns times (K,) in s and the dataset (K, nz, ny, nx) of the object at these times. Raises InputError for times
-    that do not rise, and for other shapes."""
     times_s = h5.read_array(source, f"{_STATES}/time_s", (None,), h5.TIME)
     if len(times_s) == 0 or (np.diff(times_s) <= 0).any():
         raise source.error(f"{_STATES}/time_s", checks.short_repr(times_s.tolist()), "at least one time, rising")
     dataset = source.dataset(f"{_STATES}/volume")
     checks.shape(source.name(f"{_STATES}/volume"), dataset, (len(times_s), *shape))
     return times_s, dataset
-
-
-def _read_attenuation(source: Hdf5Source, address: str, dataset: h5py.Dataset) -> np.ndarray:
-    values = h5.read_values(source, address, dataset)
-    checks.finite(source.name(address), values)
-    return h5.in_unit(source, address, values, h5.ATTENUATION).astype(np.float32)
 
 
 def shares_of_maximum(values: np.ndarray) -> np.ndarray:

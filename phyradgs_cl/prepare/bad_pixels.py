@@ -13,7 +13,7 @@ import scipy
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector.noise_level import NORMAL_MAD, robust_deviation
-from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames, with_masked
+from phyradgs_cl.prepare.step import Facts, MakeModel, StepOptions, unmasked_frames, with_masked
 
 _AROUND = np.ones((3, 3), bool)
 _NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], bool)
@@ -33,11 +33,9 @@ _LINE = 0.9  # a row or column with more than this fraction of dead pixels is de
 
 
 @dataclass(frozen=True)
-class SparkOptions(checks.Checked):
+class SparkOptions(StepOptions, step="sparks"):
     """Options of the step ``sparks``. threshold: least height of a spark in local standard deviations (``find_sparks``).
     least: least height in line integrals, dimensionless. pixels: most touching pixels that count as one spark."""
-
-    PREFIX = "sparks."
 
     threshold: float = checks.ranged(5.0, 1, 1e3)
     least: float = checks.ranged(0.1, 0, 10)
@@ -45,11 +43,9 @@ class SparkOptions(checks.Checked):
 
 
 @dataclass(frozen=True)
-class DeadOptions(checks.Checked):
+class DeadOptions(StepOptions, step="dead"):
     """Options of the step ``dead``. deviations: least difference of a dead pixel from its neighbours, in robust standard
     deviations of this difference over the panel."""
-
-    PREFIX = "dead."
 
     deviations: float = checks.ranged(_DEVIATIONS, 1, 1e3)
 

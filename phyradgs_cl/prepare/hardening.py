@@ -22,7 +22,7 @@ from phyradgs_cl.detector import Spectrum, tube_spectrum
 from phyradgs_cl.detector.attenuation import FILTER_MM, HIGHEST_KVP, LOWEST_KVP
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare import step
-from phyradgs_cl.prepare.step import Facts, MakeModel, Model
+from phyradgs_cl.prepare.step import Facts, MakeModel, Model, StepOptions
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ _NONE: Polynomial = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class HardeningOptions(checks.Checked):
+class HardeningOptions(StepOptions, step="hardening"):
     """Options of the step ``hardening``: a polynomial, or a tube voltage. With neither, a polynomial is fitted for one
     material.
 
@@ -58,8 +58,6 @@ class HardeningOptions(checks.Checked):
     - filter_mm: thickness of aluminium. anode_deg: angle of a tungsten anode, for SpekPy's spectrum; 0: Kramers' law.
 
     Raises InputError for values out of range or in contradiction."""
-
-    PREFIX = "hardening."
 
     polynomial: Polynomial = checks.ranged(_NONE, -_LARGEST, _LARGEST)
     kvp: float = 0.0
@@ -101,18 +99,13 @@ def correct_hardening(scan: Scan, options: HardeningOptions, make_model: MakeMod
         return _by_voltage(scan, options, make_model)
     frames, fitted = step.unmasked_frames(scan), not any(options.polynomial)
     polynomial = fit_polynomial(frames, make_model(scan)) if fitted else options.polynomial
-    _check_rising(polynomial, float(frames.max()))
-    facts = {"polynomial": list(polynomial), "fitted": fitted}
-    return replace(scan, projections=straighten(frames, polynomial)), facts
-
-
-def _check_rising(polynomial: Polynomial, largest: float) -> None:
-    """Raises InputError for a polynomial that falls anywhere up to the ``largest`` line integral."""
+    largest = float(frames.max())
     p = np.linspace(0, max(largest, 1e-6), 100)
-    falls = np.diff(straighten(p, polynomial)) <= 0
-    if falls.any():
+    if (falls := np.diff(straighten(p, polynomial)) <= 0).any():
         found = f"{list(polynomial)}, which falls from line integrals of {p[np.argmax(falls)]:.3g} on"
         raise InputError("hardening.polynomial", found, f"one that rises up to the largest, {largest:.3g}")
+    facts = {"polynomial": list(polynomial), "fitted": fitted}
+    return replace(scan, projections=straighten(frames, polynomial)), facts
 
 
 def _by_voltage(scan: Scan, options: HardeningOptions, make_model: MakeModel) -> tuple[Scan, Facts]:
@@ -183,17 +176,13 @@ def find_bone(
 
 
 def _with_bone(bone: np.ndarray, frames: np.ndarray, spectrum: Spectrum, model: Model) -> np.ndarray:
+    """Returns line integrals (F, v, u) of bone (z, y, x) and of the soft tissue that, with it, gives ``frames``."""
     dense = np.maximum(model.frames(bone.astype(np.float32)), 0)
-    return (_soft_beside(dense, frames, spectrum) + dense).astype(np.float32)
-
-
-def _soft_beside(dense: np.ndarray, frames: np.ndarray, spectrum: Spectrum) -> np.ndarray:
-    """Returns the soft tissue's line integrals that, with those of bone (``dense``), give the measured ``frames``."""
     soft, small = np.asarray(frames - dense, np.float64), 1e-3
     for _ in range(_NEWTON):
         now = spectrum.hardened(soft, dense)
         soft = soft - small * (now - frames) / (spectrum.hardened(soft + small, dense) - now)
-    return soft
+    return (soft + dense).astype(np.float32)
 
 
 def fit_polynomial(frames: np.ndarray, model: Model) -> Polynomial:

@@ -19,11 +19,20 @@ import scipy
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.detector import counts_to_attenuation
-from phyradgs_cl.detector.attenuation import DARK, FLAT, PROJECTION, TRANSMISSION_FLOOR, mean_dark, minus_log
+from phyradgs_cl.detector.attenuation import (
+    DARK,
+    FLAT,
+    PROJECTION,
+    TRANSMISSION_FLOOR,
+    flats_by_time,
+    frames_to_attenuation,
+    mean_dark,
+    minus_log,
+)  # fmt: skip
 from phyradgs_cl.detector.noise_level import robust_deviation
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import ToAttenuation, read_scan
-from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
+from phyradgs_cl.prepare.step import Facts, MakeModel, StepOptions, unmasked_frames
 
 WAYS = ("mean", "time", "pca")
 _MOST_COMPONENTS, _CLEAR = 4, 4.0  # most components used; a component with less than 4 times the median variance is noise
@@ -71,29 +80,21 @@ def _with_changing_flats(
     if quantity != "counts" or len(flats) < needed:
         found, remedy = f"{quantity} with {len(flats)} flats", "take the mean of the flats (flats=mean)"
         raise InputError(f"flats={way}", found, f"counts with at least {needed} flats", remedy)
-    dark = mean_dark(data[image_key == DARK], data.shape[1:])
+    numbers, darks = np.flatnonzero(image_key == PROJECTION), data[image_key == DARK]
+    if way == "time":
+        at = np.arange(len(data)) if at is None else at
+        times = [flats[group] for group in flats_by_time(at[flats], at[numbers])]
+        means = np.stack([data[group].mean(axis=0, dtype=np.float64) for group in times])
+        place = np.interp(at[numbers], [at[group].mean() for group in times], np.arange(len(times)))
+        return frames_to_attenuation(data, quantity, means, darks, place=place, numbers=numbers)
+    dark = mean_dark(darks, data.shape[1:])
     signal = np.maximum(data[flats].astype(np.float64) - dark, 0)
-    numbers = np.flatnonzero(image_key == PROJECTION)
-    counts = (data[frame] - dark for frame in numbers)
-    at = np.arange(len(data)) if at is None else at
-    lights = _in_time(signal, at[flats], at[numbers]) if way == "time" else _of_components(signal, counts)
+    lights = _of_components(signal, (data[frame] - dark for frame in numbers))
     result = np.empty((len(numbers), *data.shape[1:]), np.float32)
     bad = np.empty(result.shape, bool)
     for i, (frame, light) in enumerate(zip(numbers, lights, strict=True)):
         result[i], bad[i] = minus_log(data[frame] - dark, light)
     return result, bad
-
-
-def _in_time(signal: np.ndarray, flats_at: np.ndarray, at: np.ndarray) -> Iterator[np.ndarray]:
-    """Yields each projection's flat (v, u): the means of flats without a projection between them, interpolated linearly.
-    flats_at (n,), at (P,): when flats and projections were taken."""
-    place = np.searchsorted(np.sort(at), flats_at)
-    groups = [place == one for one in np.unique(place)]
-    time = np.array([flats_at[group].mean() for group in groups])
-    means = np.stack([signal[group].mean(axis=0) for group in groups])
-    for moment in at:
-        share = np.array([np.interp(moment, time, unit) for unit in np.eye(len(time))])
-        yield np.tensordot(share, means, axes=1)
 
 
 def _of_components(signal: np.ndarray, counts: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
@@ -133,12 +134,10 @@ def _least_variation(frame: np.ndarray, components: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class AirOptions(checks.Checked):
+class AirOptions(StepOptions, step="air"):
     """Options of the step ``air``. below: pixels are air if they exceed the air of their frame by less than this fraction of
     the scan's range of line integrals, and connect to the panel's left or right side. least: least fraction of air in every
     frame."""
-
-    PREFIX = "air."
 
     below: float = checks.ranged(0.05, 1e-4, 0.2)
     least: float = checks.ranged(0.01, 0, 1)
@@ -188,18 +187,16 @@ def _blur_and_limit(frames: np.ndarray, below: float) -> tuple[float, float]:
     some = frames[np.unique(np.linspace(0, len(frames) - 1, _SOME_FRAMES).round().astype(int))]
     low, high = np.percentile(scipy.ndimage.gaussian_filter(some, (0, _MARGIN, _MARGIN)), (1, 99.9))
     limit = below * float(high - low)
-    noise = float(np.median([_noise_of_brighter_half(frame) for frame in some]))
+    noises = []  # of each frame's brighter half
+    for frame in some:
+        second = frame[:, 1:-1] - 0.5 * (frame[:, :-2] + frame[:, 2:])
+        mean = scipy.ndimage.uniform_filter(frame, 5)[:, 1:-1]
+        noises.append(robust_deviation(second[mean <= np.median(mean)]) / _FILTER_NORM)
+    noise = float(np.median(noises))
     blur = min(_DEVIATIONS * noise / max(_FLAT_BLUR * limit, 1e-12), _WIDEST_BLUR * max(frames.shape[1:]))
     if blur < _LEAST_BLUR:
         return 0.0, limit
     return blur, max(limit, _DEVIATIONS * noise / (_FLAT_BLUR * blur))
-
-
-def _noise_of_brighter_half(frame: np.ndarray) -> float:
-    middle = frame[:, 1:-1]
-    second = middle - 0.5 * (frame[:, :-2] + frame[:, 2:])
-    mean = scipy.ndimage.uniform_filter(frame, 5)[:, 1:-1]
-    return robust_deviation(second[mean <= np.median(mean)]) / _FILTER_NORM
 
 
 def _from_sides(low: np.ndarray) -> np.ndarray:

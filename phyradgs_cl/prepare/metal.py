@@ -11,7 +11,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Metal
 from phyradgs_cl.prepare import step
-from phyradgs_cl.prepare.step import Facts, MakeModel
+from phyradgs_cl.prepare.step import Facts, MakeModel, StepOptions
 
 _DENSER = 6.0  # metal has at least 6 times the main material's attenuation; bone has up to 5 times water's, titanium 7
 _FEWEST = 4  # fewer touching voxels than this are noise, not metal
@@ -21,11 +21,9 @@ _MOST, _OBJECT = 0.5, 0.02  # the shadow may cover at most half of the pixels th
 
 
 @dataclass(frozen=True)
-class MetalOptions(checks.Checked):
+class MetalOptions(StepOptions, step="metal"):
     """Options of the step ``metal``. above_per_mm: attenuation in 1/mm from which voxels of a first volume are metal; 0: six
     times that of the main material."""
-
-    PREFIX = "metal."
 
     above_per_mm: float = checks.ranged(0.0, 0, 1e3)
 

@@ -17,19 +17,17 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ParallelGeometry, Scan
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
+from phyradgs_cl.prepare.step import Facts, MakeModel, StepOptions, unmasked_frames
 
 WAVELENGTH_MM_KEV = 1.239841984e-6  # wavelength in mm times energy in keV: Planck's constant times the speed of light
 _REACHES = 8  # frames are padded by this many decay lengths of the filter: only exp(−8) of an edge wraps around
 
 
 @dataclass(frozen=True)
-class PhaseOptions(checks.Checked):
+class PhaseOptions(StepOptions, step="phase"):
     """Options of the step ``phase``. energy_kev: the beam's energy. distance_mm: the distance from object to panel; None
     takes the distance from axis to panel, for a cone beam only. delta_beta: δ/β of the object's material. delta, beta: δ and
     β themselves, in place of their ratio. Raises InputError for values out of range or in contradiction."""
-
-    PREFIX = "phase."
 
     energy_kev: float | None = checks.ranged(None, 1, 1000)
     distance_mm: float | None = checks.ranged(None, 0, 1e6)

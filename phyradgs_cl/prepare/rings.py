@@ -11,6 +11,7 @@ and both sets of views show it. (On an arc the mean is symmetric for a round obj
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -22,7 +23,7 @@ from phyradgs_cl.detector import robust_deviation
 from phyradgs_cl.detector.noise_level import NORMAL_MAD
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.bad_pixels import axis_column
-from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
+from phyradgs_cl.prepare.step import Facts, MakeModel, StepOptions, unmasked_frames
 
 _LEAST_FRAMES = 8  # fewer views do not average the object enough to show rings: such scans stay unchanged
 _LEAST_PAIRS = 0.25  # columns are compared with their mirror images if at least this fraction of them has one on the panel
@@ -42,16 +43,13 @@ _EQUALLY_FAR = 1.15  # in a full turn, (largest distance / smallest distance) of
 
 
 @dataclass(frozen=True)
-class RingOptions(checks.Checked):
+class RingOptions(StepOptions, step="rings"):
     """Options of the step ``rings``. window: side in pixels of the blocks of cosines. Patterns wider than a block stay."""
-
-    PREFIX = "rings."
 
     window: int = checks.ranged(10, 3, 999)
 
 
-@dataclass(frozen=True)
-class Strength:
+class Strength(NamedTuple):
     """Three variances, in line integrals squared: of the pattern, of its part that whole columns share, and of the noise in
     the mean of all views. least: the variance above which a pattern is certain."""
 
@@ -60,17 +58,17 @@ class Strength:
     noise: float
     least: float
 
-    @property
-    def is_certain(self) -> bool:
-        return self.pattern > self.least
-
 
 def _strength(means: np.ndarray, axis_column: float) -> Strength:
     """Measures the pattern that all views share and no object can cause, from the means (2, v, u) of two sets of views.
 
-    Subtracting its mirror image from each column cancels the object, and second differences along rows remove the rest of
-    it. The covariance of both sets is the pattern's variance."""
-    one, other = (_rough(_antisymmetric(mean, axis_column)) for mean in means)
+    Subtracting its mirror image from each column cancels the object, if at least a quarter of the columns have one. Second
+    differences along rows remove the rest of it. The covariance of both sets is the pattern's variance. The factors √2 and
+    √6 keep the variance of white noise."""
+    mirrored = mirror_columns(means.shape[2], axis_column)
+    if len(mirrored) >= _LEAST_PAIRS * means.shape[2]:
+        means = (means[..., mirrored[::-1]] - means[..., mirrored]) / np.sqrt(2)
+    one, other = (2 * means[..., 1:-1] - means[..., :-2] - means[..., 2:]) / np.sqrt(6)
     # a mean over half the views has twice the noise variance of that over all, and the difference of two such means four
     # times
     noise, rows = robust_deviation(one - other) ** 2 / 4, len(one) // 2
@@ -86,32 +84,26 @@ def remove_rings(scan: Scan, options: RingOptions, make_model: MakeModel) -> tup
     if options.window > frames.shape[2]:
         expected = f"no more than the panel's {frames.shape[2]} columns"
         raise InputError("rings.window", str(options.window), expected, "state fewer pixels")
-    column, full_turn = axis_column(scan), surround_evenly(scan)
+    column, sources = axis_column(scan), middle_poses(scan)[:, :3]
+    distance = np.linalg.norm(sources - sources.mean(axis=0), axis=1)
+    full_turn = bool(distance.max() < _EQUALLY_FAR * distance.min())  # the sources lie on a full circle around their mean
     means, mirrored = _means(frames, full_turn), mirror_columns(frames.shape[2], column)
     usable = np.full(frames.shape[1:], scan.frames >= _LEAST_FRAMES) & (scan.valid.mean(axis=0) > 0.5)
-    single = find_single_gains(means, mirrored, usable, full_turn)
+    offset, words = find_single_gains(means, mirrored, usable, full_turn)
     facts: Facts = {"result": "nothing to do"}
-    if single.any:
-        frames, means = frames - single.offset, means - single.offset
-        scan = replace(scan, projections=scan.projections - single.offset)
-        facts = {"result": "removed", "single": single.words}
+    if words:
+        frames, means = frames - offset, means - offset
+        scan = replace(scan, projections=scan.projections - offset)
+        facts = {"result": "removed", "single": words}
     strength = _strength(means, column)
     facts |= {"spread": float(np.sqrt(max(strength.pattern, 0))), "noise_of_mean": float(np.sqrt(strength.noise))}
-    if scan.frames < _LEAST_FRAMES or not strength.is_certain:
+    if scan.frames < _LEAST_FRAMES or strength.pattern <= strength.least:
         return scan, facts
     pattern = _pattern(frames, strength, options.window, column if full_turn else np.inf)
     facts |= {"result": "removed", "rms_change": float(np.sqrt(np.mean(pattern.astype(np.float64) ** 2)))}
-    remaining = find_single_gains(means - pattern, mirrored, usable, full_turn)
-    if remaining.any:
-        facts["left"] = remaining.words
+    if left := find_single_gains(means - pattern, mirrored, usable, full_turn)[1]:
+        facts["left"] = left
     return replace(scan, projections=frames - pattern), facts
-
-
-def surround_evenly(scan: Scan) -> bool:
-    """Returns whether the sources of all views lie on a full circle: about equally far from their mean."""
-    sources = middle_poses(scan)[:, :3]
-    distance = np.linalg.norm(sources - sources.mean(axis=0), axis=1)
-    return bool(distance.max() < _EQUALLY_FAR * distance.min())
 
 
 def _means(frames: np.ndarray, full_turn: bool) -> np.ndarray:
@@ -123,11 +115,9 @@ def _means(frames: np.ndarray, full_turn: bool) -> np.ndarray:
 
 
 def _pattern(frames: np.ndarray, strength: Strength, window: int, axis_column: float | None) -> np.ndarray:
-    """Returns the pattern (v, u) float32, or 0 if it is not certain. If all columns have a mirror image, the symmetric and
-    the antisymmetric part of the mean over views hold half of the pattern's variance each, and are denoised separately."""
+    """Returns the pattern (v, u) float32. If all columns have a mirror image, the symmetric and the antisymmetric part of
+    the mean over views hold half of the pattern's variance each, and are denoised separately."""
     mean = frames.mean(axis=0, dtype=np.float64)
-    if not strength.is_certain:
-        return np.zeros(mean.shape, np.float32)
     mirrored = mirror_columns(mean.shape[1], axis_column)
     whole = len(mirrored) == mean.shape[1]
     parts = [(mean + mean[:, mirrored]) / 2, (mean - mean[:, mirrored]) / 2] if whole else [mean]
@@ -196,54 +186,23 @@ def mirror_columns(columns: int, axis_column: float | None) -> np.ndarray:
     return mirrored[(mirrored >= 0) & (mirrored < columns)]
 
 
-def _antisymmetric(mean: np.ndarray, axis_column: float | None) -> np.ndarray:
-    """Returns (mean over views (v, u) − its mirror image) / √2, in which white noise keeps its variance. If fewer than a
-    quarter of the columns have a mirror image, returns the mean itself."""
-    mirrored = mirror_columns(mean.shape[1], axis_column)
-    if len(mirrored) < _LEAST_PAIRS * mean.shape[1]:
-        return mean
-    return (mean[:, mirrored[::-1]] - mean[:, mirrored]) / np.sqrt(2)
-
-
-def _rough(image: np.ndarray) -> np.ndarray:
-    return (2 * image[:, 1:-1] - image[:, :-2] - image[:, 2:]) / np.sqrt(6)  # the factor keeps the variance of white noise
-
-
 def _covariance(one: np.ndarray, other: np.ndarray) -> float:
     """Returns a robust covariance: few edge pixels hardly change it (Gnanadesikan and Kettenring, Biometrics 1972)."""
     return (robust_deviation(one + other) ** 2 - robust_deviation(one - other) ** 2) / 4
 
 
-@dataclass(frozen=True)
-class SingleGains:
-    """Wrong gains of whole columns and single pixels. offset: the error (v, u) float32 that they add to line integrals, 0
-    elsewhere. columns, pixels: how many columns and single pixels have a wrong gain."""
-
-    offset: np.ndarray
-    columns: int = 0
-    pixels: int = 0
-
-    @property
-    def any(self) -> bool:
-        return bool(self.columns or self.pixels)
-
-    @property
-    def words(self) -> str:
-        """The numbers in words, as in "1 column, gain off by 3.0 %"."""
-        counted = [(self.columns, "column"), (self.pixels, "pixel")]
-        names = " and ".join(f"{n} {name}{'s' if n > 1 else ''}" for n, name in counted if n)
-        return f"{names}, gain off by {100 * float(np.abs(np.expm1(-self.offset)).max()):.1f} %"
-
-
 def find_single_gains(
     means: np.ndarray, mirrored: np.ndarray, usable: np.ndarray, full_turn: bool
-) -> SingleGains:
-    """Finds single wrong gains in the means (2, v, u) of two sets of views. mirrored: the columns' mirror images, from
-    ``mirror_columns``; columns without a mirror image are left alone. usable: bool (v, u), False for masked pixels.
-    full_turn: finds wrong pixels too, not only columns; on an arc an edge of the object looks like a wrong pixel."""
+) -> tuple[np.ndarray, str]:
+    """Finds wrong gains of single columns and pixels in the means (2, v, u) of two sets of views. Returns the error (v, u)
+    float32 that they add to line integrals, 0 elsewhere, and words, as "1 column, gain off by 3.0 %"; "" without any.
+
+    mirrored: the columns' mirror images, from ``mirror_columns``; columns without a mirror image are left alone. usable:
+    bool (v, u), False for masked pixels. full_turn: finds wrong pixels too; on an arc an edge of the object looks like
+    one."""
     offset = np.zeros(usable.shape, np.float32)
     if len(mirrored) < _NEAR:
-        return SingleGains(offset)
+        return offset, ""
     paired = np.s_[:, mirrored[::-1]]
     usable = usable[paired] & usable[:, mirrored]
     means = means[..., mirrored[::-1]]
@@ -256,7 +215,9 @@ def find_single_gains(
         deviation = np.where(np.abs(along) < np.abs(across), along, across)
         pixels = _outliers(deviation, _deviation(means - means[..., ::-1]), usable)
     offset[paired] = lines + pixels
-    return SingleGains(offset, int(np.count_nonzero(lines)), int(np.count_nonzero(pixels)))
+    counted = (np.count_nonzero(lines), "column"), (np.count_nonzero(pixels), "pixel")
+    names = " and ".join(f"{n} {name}{'s' if n > 1 else ''}" for n, name in counted if n)
+    return offset, names and f"{names}, gain off by {100 * float(np.abs(np.expm1(-offset)).max()):.1f} %"
 
 
 def _deviation(means: np.ndarray) -> np.ndarray:

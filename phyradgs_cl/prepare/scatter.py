@@ -19,7 +19,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare import step
 from phyradgs_cl.prepare.light import enough_air, with_air_at_0
-from phyradgs_cl.prepare.step import Facts, MakeModel, Model
+from phyradgs_cl.prepare.step import Facts, MakeModel, Model, StepOptions
 
 log = logging.getLogger(__name__)
 Kernel = Mapping[tuple[float, int], float]
@@ -50,12 +50,10 @@ _SAME_RATIO = 0.25  # a kernel gives a stated to_primary if its ratio differs by
 
 
 @dataclass(frozen=True)
-class ScatterOptions(checks.Checked):
+class ScatterOptions(StepOptions, step="scatter"):
     """Options of the step ``scatter``. to_primary: ratio of scatter to primary light behind the object; 0: the kernel is
     fitted to air. reach: standard deviation of the kernel, as a fraction of the panel's longer side; 0: fitted, or 0.18 if
     to_primary is stated."""
-
-    PREFIX = "scatter."
 
     to_primary: float = checks.ranged(0.0, 0, 5)
     reach: float = checks.ranged(0.0, 0, 2)
@@ -73,7 +71,10 @@ def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel)
     clean = remove_scatter(frames, kernel)
     ratio = _ratio(frames, clean)
     if options.to_primary == 0:
-        _warn_of_rest(frames[air], clean[air])
+        light, left = (float(np.expm1(-np.median(one[air]))) for one in (frames, clean))
+        if left > max(_LEFT, _LEFT_OF_IT * light):
+            text = "scatter: air has %.1f %% more light than the flats; %.1f %% stay, %s"
+            log.warning(text, 100 * light, 100 * left, "which no scatter of the object explains")
     if options.to_primary == 0 and ratio < _LEAST_RATIO:
         return scan, {"result": "no scatter found in the light beside the object: the projections stay as they are"}
     if options.to_primary > 0 and abs(ratio - options.to_primary) > _SAME_RATIO * options.to_primary:
@@ -83,14 +84,6 @@ def subtract_scatter(scan: Scan, options: ScatterOptions, make_model: MakeModel)
     terms = {"reach": [reach for reach, _ in kernel], "power": [power for _, power in kernel]}
     facts = {**terms, "height": list(kernel.values()), "to_primary": ratio}
     return replace(scan, projections=clean), facts
-
-
-def _warn_of_rest(before: np.ndarray, after: np.ndarray) -> None:
-    """Warns if the kernel leaves much of the light in air beyond that of the flats. before, after: line integrals (n,)."""
-    light, left = (float(np.expm1(-np.median(air))) for air in (before, after))
-    if left > max(_LEFT, _LEFT_OF_IT * light):
-        text = "scatter: air has %.1f %% more light than the flats; %.1f %% stay, which no scatter of the object explains"
-        log.warning(text, 100 * light, 100 * left)
 
 
 def remove_scatter(frames: np.ndarray, kernel: Kernel) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import scipy
 
+from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.fields import GridChoice
 
@@ -17,6 +18,13 @@ _INSIDE = 0.1  # voxels above this fraction of the densest voxel belong to the o
 # Standard deviation of a blur, as a fraction of the panel's longer side: the blur keeps the smooth errors of hardening and
 # scatter, and removes the finer errors of the grid.
 _SMOOTH = 1 / 24
+
+
+class StepOptions(checks.Checked):
+    """Base of the options of the step that ``step`` names. Messages call an option STEP.NAME."""
+
+    def __init_subclass__(cls, step: str) -> None:
+        cls.PREFIX = f"{step}."
 
 
 @dataclass(frozen=True)
@@ -53,17 +61,19 @@ def fill_masked(frames: np.ndarray, mask: np.ndarray) -> np.ndarray:
         good = np.flatnonzero(~bad)
         filled[f, v, bad] = np.interp(np.flatnonzero(bad), good, filled[f, v, good])
     for f in np.flatnonzero(empty.any(axis=-1)):
-        filled[f, empty[f]] = _between_rows(filled[f], np.flatnonzero(~empty[f]), np.flatnonzero(empty[f]))
+        filled[f, empty[f]] = 0.0
+        fill_lines(filled[f], empty[f])
     return filled
 
 
-def _between_rows(frame: np.ndarray, good: np.ndarray, bad: np.ndarray) -> np.ndarray | float:
-    if good.size == 0:
-        return 0.0
-    after = np.clip(np.searchsorted(good, bad), 1, max(good.size - 1, 1))
-    low, high = good[after - 1], good[np.minimum(after, good.size - 1)]
-    share = np.clip((bad - low) / np.maximum(high - low, 1), 0, 1)[:, None]
-    return (1 - share) * frame[low] + share * frame[high]
+def fill_lines(lines: np.ndarray, bad: np.ndarray) -> None:
+    """Interpolates the ``bad`` lines, bool (n,), of lines (n, k) in place, from the nearest others; if there are any."""
+    if bad.any() and not bad.all():
+        good = np.flatnonzero(~bad)
+        at = np.interp(np.flatnonzero(bad), good, np.arange(len(good)))
+        low, share = np.floor(at).astype(int), (at - np.floor(at))[:, None]
+        high = np.minimum(low + 1, len(good) - 1)
+        lines[bad] = (1 - share) * lines[good[low]] + share * lines[good[high]]
 
 
 def with_masked(scan: Scan, bad: np.ndarray) -> Scan:

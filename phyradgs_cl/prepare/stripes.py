@@ -19,7 +19,7 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.prepare.bad_pixels import axis_column
 from phyradgs_cl.prepare.rings import mirror_columns
-from phyradgs_cl.prepare.step import Facts, MakeModel, unmasked_frames
+from phyradgs_cl.prepare.step import Facts, MakeModel, StepOptions, fill_lines, unmasked_frames
 
 _LEAST_VIEWS = 60  # fewest views: the method assumes that neighbouring columns record the same values, which takes this many
 _LEAST = 2e-3  # a stripe whose line integrals deviate by less is left alone: its gain is off by less than 0.2 %
@@ -31,11 +31,9 @@ _SMALLEST = 1e-6  # least spread of a column, in line integrals, as a divisor: t
 
 
 @dataclass(frozen=True)
-class StripeOptions(checks.Checked):
+class StripeOptions(StepOptions, step="stripes"):
     """Options of the step ``stripes``. width: columns over which the median is taken; stripes are narrower than half of it.
     ratio: a stripe deviates at least this many times as much as the columns at both sides; 0 replaces all columns."""
-
-    PREFIX = "stripes."
 
     width: int = checks.ranged(5, 3, 999)
     ratio: float = checks.ranged(3.0, 0, 100)
@@ -54,9 +52,12 @@ def remove_stripes(
     interpolated, replaced = (np.zeros(frames.shape[1:], bool) for _ in range(2))
     for row in range(frames.shape[1]):
         sinogram = clean[:, row]
-        interpolated[row] = _stand_out(_fluctuation(sinogram), _FLUCTUATING, mirrored)
-        interpolated[row] |= _stand_out(1 / np.maximum(_spread(sinogram), _SMALLEST), _UNRESPONSIVE, mirrored)
-        _interpolate(sinogram, interpolated[row])
+        # The median change from view to view: an object changes slowly, or passes in a few views, and hardly adds to it.
+        fluctuation = np.median(np.abs(np.diff(sinogram, 2, axis=0)), axis=0) / np.sqrt(6)
+        low, high = np.percentile(sinogram, (25, 75), axis=0)
+        interpolated[row] = _stand_out(fluctuation, _FLUCTUATING, mirrored)
+        interpolated[row] |= _stand_out(1 / np.maximum(high - low, _SMALLEST), _UNRESPONSIVE, mirrored)
+        fill_lines(sinogram.T, interpolated[row])
         order = np.argsort(sinogram, axis=0, kind="stable")
         ranked = np.take_along_axis(sinogram, order, axis=0)
         smooth = scipy.ndimage.median_filter(ranked, (1, width))
@@ -64,18 +65,6 @@ def remove_stripes(
         columns = np.flatnonzero(replaced[row])
         sinogram[order[:, columns], columns] = smooth[:, columns]
     return clean, interpolated, replaced
-
-
-def _fluctuation(sinogram: np.ndarray) -> np.ndarray:
-    """Returns the median change (u,) from view to view of a sinogram (F, u), by second differences. An object hardly adds to
-    this change, because it changes slowly or passes in a few views."""
-    return np.median(np.abs(np.diff(sinogram, 2, axis=0)), axis=0) / np.sqrt(6)
-
-
-def _spread(sinogram: np.ndarray) -> np.ndarray:
-    """Returns the distance between the quartiles over views, (u,), of a sinogram (F, u)."""
-    low, high = np.percentile(sinogram, (25, 75), axis=0)
-    return np.asarray(high - low)
 
 
 def _stand_out(values: np.ndarray, ratio: float, mirrored: np.ndarray) -> np.ndarray:
@@ -88,16 +77,6 @@ def _stand_out(values: np.ndarray, ratio: float, mirrored: np.ndarray) -> np.nda
     stands_out = values > np.maximum(ratio * np.maximum(left, right), _LEAST)
     stands_out[mirrored[::-1]] &= values[mirrored[::-1]] > _MIRRORED * scipy.ndimage.maximum_filter(values, 3)[mirrored]
     return stands_out
-
-
-def _interpolate(sinogram: np.ndarray, bad: np.ndarray) -> None:
-    """Interpolates the columns ``bad``, bool (u,), of a sinogram (F, u) in place, from the nearest others."""
-    if bad.any() and not bad.all():
-        good = np.flatnonzero(~bad)
-        at = np.interp(np.flatnonzero(bad), good, np.arange(len(good)))
-        low, share = np.floor(at).astype(int), at - np.floor(at)
-        high = np.minimum(low + 1, len(good) - 1)
-        sinogram[:, bad] = (1 - share) * sinogram[:, good[low]] + share * sinogram[:, good[high]]
 
 
 def correct_stripes(scan: Scan, options: StripeOptions, make_model: MakeModel) -> tuple[Scan, Facts]:

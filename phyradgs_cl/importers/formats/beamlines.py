@@ -18,9 +18,7 @@ from phyradgs_cl.acquisition.geometry import Geometry
 from phyradgs_cl.acquisition.plausible import question_unit
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble, brightness, hdf5
-from phyradgs_cl.importers.brightness import Reading
-from phyradgs_cl.importers.frames import gantry_sign
-from phyradgs_cl.importers.options import OF_HDF5, ImportOptions
+from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io import scan as schema
 from phyradgs_cl.io.hdf5 import Hdf5Source, open_hdf5
 from phyradgs_cl.io.hdf5 import datasets as h5
@@ -72,7 +70,6 @@ def recognises(path: Path) -> bool:
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports projections, flats and darks from the file's NXtomo entry, or from the addresses that the options give."""
-    options.refuse_unused("nxtomo", OF_HDF5)
     with open_hdf5(path, options.linked_folder) as source:
         places = hdf5.places_of(options, source)
         entry = _entry(source, options) if "projections" not in places.stated or options.entry else _NOWHERE
@@ -90,26 +87,17 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         if "projections" not in places.stated:
             quantity = h5.read_attribute(source, f"{detector}/data", "quantity")
         _refuse_moves(source, entry, stacks.used)
-        stacks, light = _evened(places, entry, keys, stacks, options, quantity)
+        if (options.quantity or quantity or "counts") == "counts":
+            addresses = (("exposures", f"{detector}/count_time"), ("monitor", f"{entry}/control/data"))
+            readings = (places.per_frame(name, address, keys, len(stacks.used)) for name, address in addresses)
+            exposure, monitor = readings
+            stacks = brightness.evened(stacks, exposure, monitor, f"say {options.named('at')} monitor=none")
         title = h5.read_title(source, f"{entry}/title", path.stem)
     if options.row_0 is None:
         text = "%s: row 0 is taken as the lowest, after flips that the file declares; say %s top if the volume is mirrored"
         _log.warning(text, path, options.named("row_0"))
     integrals = stacks.line_integrals(f"{path}:{detector}/data", options, "bottom", quantity, turn)
-    parts = brightness.with_light(integrals, light), trajectory, geometry, timing, options
-    return assemble.assemble_scan(*parts, title=title, source=str(path))
-
-
-def _evened(
-    places: hdf5.Places, entry: str, keys: list[str], stacks: hdf5.Stacks, options: ImportOptions, quantity: str | None
-) -> tuple[hdf5.Stacks, np.ndarray]:
-    """Returns what ``brightness.evened`` does, by the exposures and the monitor of the beam in the file."""
-    if (options.quantity or quantity or "counts") != "counts":
-        return stacks, np.zeros(len(stacks.projections))
-    addresses = (("exposures", f"{entry}/{schema.DETECTOR}/count_time"), ("monitor", f"{entry}/control/data"))
-    found = (places.per_frame(name, address, keys, len(stacks.used)) for name, address in addresses)
-    exposure, monitor = (Reading(*one) if one else None for one in found)
-    return brightness.evened(stacks, exposure, monitor, f"say {options.named('at')} monitor=none")
+    return assemble.assemble_scan(integrals, trajectory, geometry, timing, options, path, title=title)
 
 
 def _entry(source: Hdf5Source, options: ImportOptions) -> str:
@@ -175,7 +163,7 @@ def _motion(
     of each exposure. Without it, or with angles or a frame time from options, neighbouring frames' angles give the speed."""
     assert places.source is not None
     source, detector, angles = places.source, f"{entry}/{schema.DETECTOR}", f"{entry}/{schema.SAMPLE}/rotation_angle"
-    sign = gantry_sign(options, h5.read_attribute(source, angles, "rotates") or "sample")
+    sign = options.gantry_sign(h5.read_attribute(source, angles, "rotates") or "sample")
     angle = sign * places.angles_rad(used, options, angles)
     question_unit(angle, options.called("angles", {"angles": source.name(angles)}), "deg")
     sweeps = source.find(f"{angles}_end") is not None and options.frame_time_s is None and options.angles is None
@@ -230,7 +218,6 @@ def recognises_exchange(path: Path) -> bool:
 
 def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
     """Imports the projections of /exchange, with the flats and darks taken before and after them."""
-    options.refuse_unused("data-exchange", OF_HDF5)
     with open_hdf5(path, options.linked_folder) as source:
         places, data, theta = hdf5.places_of(options, source), f"{_EXCHANGE}/data", f"{_EXCHANGE}/theta"
         if "monitor" in places.stated:
@@ -259,15 +246,15 @@ def import_scan_exchange(path: Path, options: ImportOptions) -> Scan:
             clock=_clock(source, stacks.used, f"{_DETECTOR}/acquire_period", f"{_DETECTOR}/frame_rate"),
         )
         if (options.quantity or "counts") == "counts" and options.flat_value is None:
-            stacks, _ = brightness.evened(stacks, _flat_exposure(source, stacks), None)
+            stacks = brightness.evened(stacks, _flat_exposure(source, stacks), None)
         title = h5.read_title(source, f"{_EXCHANGE}/title", path.stem)
     timing = assemble.make_timing(str(path), len(theta_rad), options, stored)
     integrals = stacks.line_integrals(f"{path}:{data}", options, "top")
-    trajectory = assemble.turning(geometry, gantry_sign(options, "sample") * theta_rad, timing)
-    return assemble.assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=str(path))
+    trajectory = assemble.turning(geometry, options.gantry_sign("sample") * theta_rad, timing)
+    return assemble.assemble_scan(integrals, trajectory, geometry, timing, options, path, title=title)
 
 
-def _flat_exposure(source: Hdf5Source, stacks: hdf5.Stacks) -> Reading | None:
+def _flat_exposure(source: Hdf5Source, stacks: hdf5.Stacks) -> hdf5.Reading | None:
     """Returns the exposures of flats and projections where the file says that they differ. Raises InputError where it says
     so, and states none of the flats."""
     said = next((address for address in _FLATS_DIFFER if source.find(address) is not None), None)
@@ -281,4 +268,4 @@ def _flat_exposure(source: Hdf5Source, stacks: hdf5.Stacks) -> Reading | None:
         return None
     at = next((address for address in _FLAT_EXPOSURES if source.find(address) is not None), _FLAT_EXPOSURES[1])
     flat_s, frame_s = (h5.read_length(source, address, TIME) for address in (at, f"{_DETECTOR}/exposure_time"))
-    return Reading(source.name(at), np.full(len(stacks.flats), flat_s), np.full(len(stacks.projections), frame_s))
+    return hdf5.Reading(source.name(at), np.full(len(stacks.flats), flat_s), np.full(len(stacks.projections), frame_s))

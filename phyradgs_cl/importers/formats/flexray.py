@@ -13,8 +13,7 @@ import numpy as np
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.importers.assemble import RotaryStage, StoredTiming, cone, scan_on_stage
 from phyradgs_cl.importers.files import SafeFolder
-from phyradgs_cl.importers.frames import gantry_sign
-from phyradgs_cl.importers.options import OF_BARE_FRAMES, ImportOptions
+from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.text import Settings, head_has, read_settings, say_missing
 from phyradgs_cl.importers.tiff import read_numbered
 from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
@@ -38,7 +37,6 @@ def recognises(path: Path) -> bool:
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports a folder of settings and frames. ``path`` may also be the settings file in it."""
-    options.refuse_unused("flexray", OF_BARE_FRAMES)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.file(_FILE, str(path / _FILE))
     scan = read_settings(description, _NAMES, ":")
@@ -64,7 +62,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     if scan.has("Exposure time (ms)") and options.exposure_s is None:
         exposure_s = scan.number("Number of averages", 1.0, 1) * scan.measured("Exposure time (ms)", TIME, "ms")
     stored, places = StoredTiming(exposure_s=exposure_s), np.arange(len(frames))
-    angle_rad = gantry_sign(options, "gantry") * angle_rad
+    angle_rad = options.gantry_sign("gantry") * angle_rad
     turned, title = (frames, ("top", "left"), angle_rad, places, names, said), folder.root.resolve().name
     return scan_on_stage(stage, options, description, title, *turned, stored=stored, flats=flats, darks=darks)
 
@@ -80,7 +78,11 @@ def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names
         return size_mm, size_mm
 
     place_mm = {name: scan.position(name) for name in _PLACES}
-    right_mm, up_mm = _window_mm(scan)
+    right_mm = up_mm = 0.0  # how far the middle of the panel's window lies to the right of and above the panel's middle
+    if scan.has("ROI (LTRB)"):
+        left, top, right, bottom = scan.listed("ROI (LTRB)", 4).tolist()
+        right_mm = ((left + right) // 2 - _WHOLE_MIDDLE[0]) * _WHOLE_PITCH_MM
+        up_mm = ((top + bottom) // 2 - _WHOLE_MIDDLE[1]) * _WHOLE_PITCH_MM
     off_v = place_mm["ver_det"] + up_mm - place_mm["ver_tube"]
     off_u = place_mm["tra_det"] + right_mm - place_mm["tra_tube"]
     assumed = {"Start angle": "0", "ROI (LTRB)": "the whole panel", "Exposure time (ms)": "none", "Number of averages": "1"}
@@ -90,12 +92,3 @@ def _stage(scan: Settings, panel: tuple[int, int], options: ImportOptions, names
         _log.warning(text, scan.subject, options.named("detector_offset_mm"))
     geometry = cone(options, to_axis_mm, to_detector_mm, panel, pitch_mm, (off_v, off_u), names)
     return RotaryStage(geometry, place_mm["tra_obj"] - place_mm["tra_tube"])
-
-
-def _window_mm(scan: Settings) -> tuple[float, float]:
-    """Returns how far, in mm, the middle of the panel's window lies to the right of and above the panel's middle."""
-    if not scan.has("ROI (LTRB)"):
-        return 0.0, 0.0
-    left, top, right, bottom = scan.listed("ROI (LTRB)", 4).tolist()
-    middle = ((left + right) // 2 - _WHOLE_MIDDLE[0], (top + bottom) // 2 - _WHOLE_MIDDLE[1])
-    return middle[0] * _WHOLE_PITCH_MM, middle[1] * _WHOLE_PITCH_MM

@@ -11,16 +11,16 @@ from pathlib import Path
 import numpy as np
 
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Scan
-from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry, plain_geometry
+from phyradgs_cl.acquisition.geometry import Geometry, ParallelGeometry
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers.assemble import RotaryStage, along
 from phyradgs_cl.importers.files import SafeFolder, read_npy
-from phyradgs_cl.importers.frames import gantry_sign, line_integrals, oriented
-from phyradgs_cl.importers.options import OF_BARE_FRAMES, TIMING, ImportOptions
+from phyradgs_cl.importers.frames import line_integrals, oriented
+from phyradgs_cl.importers.options import TIMING, ImportOptions
 from phyradgs_cl.importers.series import series_of
-from phyradgs_cl.importers.text import Settings, head_has, read_settings, say_missing
+from phyradgs_cl.importers.text import Settings, found_by, read_settings, say_missing
 from phyradgs_cl.importers.tiff import SUFFIXES, read_tiffs
 
 _VECTORS = ("sourcePositions", "moduleCenters", "colVectors", "rowVectors")
@@ -29,25 +29,15 @@ _NAMES = (
     *("numAngles", "numRows", "numCols", "pixelHeight", "pixelWidth", "centerRow", "centerCol", "angularRange", "phis"),
     *("sod", "sdd", "tau", "helicalPitch", "tiltAngle", *_VECTORS),
 )
-_BEAMS, _ENDS = ("cone", "parallel", "modular"), (".txt", ".cfg")
+_BEAMS = ("cone", "parallel", "modular")
+recognises = found_by((".txt", ".cfg"), b"numAngles", b"numCols")
 _MOST = 1_000_000  # a file with more angles, rows, columns or voxels along an axis is damaged
 _OF_TABLES = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
 
 
-def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a text file of LEAP's parameters, or a folder with such a file."""
-    return bool(_descriptions(path))
-
-
-def _descriptions(path: Path) -> list[Path]:
-    files = SafeFolder(path).matching(*_ENDS) if path.is_dir() else [path]
-    return [file for file in files if file.suffix.lower() in _ENDS and head_has(file, b"numAngles", b"numCols")]
-
-
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports a folder of frames with one file of LEAP's parameters. ``path`` may also be that file."""
-    options.refuse_unused("leap", OF_BARE_FRAMES)
-    folder, descriptions = SafeFolder(path if path.is_dir() else path.parent), _descriptions(path)
+    folder, descriptions = SafeFolder(path if path.is_dir() else path.parent), recognises(path)
     if len(descriptions) != 1:
         raise InputError(str(path), f"{len(descriptions)} files of LEAP's parameters", "one", "name the file itself")
     description = descriptions[0]
@@ -64,9 +54,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     read = _modular if scan.word("geometry", _BEAMS) == "modular" else _turning
     trajectory, geometry = read(scan, shape, options, timing)
     integrals = line_integrals(str(folder.root), oriented(frames, options, "bottom"), options, convention="attenuation")
-    parts = integrals, trajectory, geometry, timing, options
-    said = series.said if series else ""
-    return assemble.assemble_scan(*parts, title=description.stem, source=str(path), grid=_grid(scan), said=said)
+    parts, said = (integrals, trajectory, geometry, timing, options, path), series.said if series else ""
+    return assemble.assemble_scan(*parts, title=description.stem, grid=_grid(scan), said=said)
 
 
 def _turning(
@@ -94,7 +83,7 @@ def _turning(
         say_missing(scan, {"phis": "angularRange in equal steps from 0°"})
         return np.deg2rad(np.arange(shape[0]) * (scan.number("angularRange") / shape[0]))
 
-    angle_rad = gantry_sign(options, "gantry") * (options.angle_rad(shape[0], stored_rad) - np.pi / 2)
+    angle_rad = options.gantry_sign("gantry") * (options.angle_rad(shape[0], stored_rad) - np.pi / 2)
     tau_mm = 0.0 if isinstance(geometry, ParallelGeometry) else scan.position("tau")
     return RotaryStage(geometry, tau_mm).turned(angle_rad, timing, scan.subject)
 
@@ -107,8 +96,8 @@ def _modular(
     step_u, step_v = right * scan.length("pixelWidth"), up * scan.length("pixelHeight")
     first = centre - (shape[2] - 1) / 2 * step_u - (shape[1] - 1) / 2 * step_v
     poses = np.concatenate([source, first, step_u, step_v], -1)
-    geometry = plain_geometry(poses, (shape[1], shape[2]))
-    return assemble.table_over_time(lambda position: along(poses, position), timing, scan.subject), geometry
+    panel = shape[1], shape[2]
+    return assemble.table_over_time(lambda position: along(poses, position), timing, scan.subject, panel)
 
 
 def _grid(scan: Settings) -> Grid | None:

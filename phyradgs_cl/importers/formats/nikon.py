@@ -17,9 +17,8 @@ from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.importers.angles import file_of_angles, measured_angles_rad, read_angles_rad
 from phyradgs_cl.importers.assemble import RotaryStage, cone, scan_on_stage
 from phyradgs_cl.importers.files import SafeFolder, checked_name
-from phyradgs_cl.importers.frames import gantry_sign
-from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
-from phyradgs_cl.importers.text import Settings, read_settings, say_missing, white_level
+from phyradgs_cl.importers.options import ImportOptions
+from phyradgs_cl.importers.text import Settings, found_by, read_settings, say_missing, white_level
 from phyradgs_cl.importers.tiff import read_numbered
 from phyradgs_cl.io.hdf5.datasets import LENGTH
 
@@ -30,17 +29,12 @@ _NAMES = (
     *("DetectorPixelsX", "DetectorPixelsY", "DetectorPixelSizeX", "DetectorPixelSizeY", "DetectorOffsetX"),
     *("DetectorOffsetY", "InitialAngle", "AngularStep", "ObjectOffsetX", "ObjectRoll", "ObjectTilt", "Units", *_ENDS),
 )
+recognises = found_by((".xtekct",))
 _MOST_FRAMES = 1_000_000  # a file that states more frames, rows or columns is damaged
-
-
-def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a .xtekct file, or a folder with such a file."""
-    return bool(SafeFolder(path).matching(".xtekct")) if path.is_dir() else path.suffix.lower() == ".xtekct"
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports a folder with one .xtekct file and its TIFFs. ``path`` may also be the .xtekct file."""
-    options.refuse_unused("nikon", OF_FOLDERS)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("description of the scan", ".xtekct")
     scan = read_settings(description, _NAMES)
@@ -60,7 +54,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         "angles": str(measured or scan.name("AngularStep")),
     }  # fmt: skip
     stage = _stage(scan, (panel[0], panel[1]), options, names)
-    angle_rad = gantry_sign(options, "gantry") * options.angle_rad(len(at), lambda: _angles(scan, measured, count)[at])
+    angle_rad = options.gantry_sign("gantry") * options.angle_rad(len(at), lambda: _angles(scan, measured, count)[at])
     say_missing(scan, {"InitialAngle": "0", "ObjectTilt": "0", "Units": "mm"})
     remedy = f"correct it, or say {options.named('flat_value')}"
     is_stated = options.flat_value or options.quantity not in (None, "counts")

@@ -25,10 +25,6 @@ from phyradgs_cl.importers.series import series_of
 from phyradgs_cl.io.tables import Fields
 
 _log = logging.getLogger(__name__)
-OPTIONS = (
-    *("exposure_s", "readout_axis", "readout_direction", "pixel_size_mm", "quantity", "flat_value", "detector_model"),
-    "first_view",
-)
 PROJECTIONS = "projections"
 _ANGLES = ("first_row_start_angle", "first_row_end_angle", "last_row_end_angle")
 _TIMES_A_FRAME = 33  # poses per frame in the pose table, from its first line's opening to its last line's closing
@@ -79,7 +75,6 @@ def recognises(path: Path) -> bool:
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports a folder with one JSON. The TIFF frames lie in it or its folder ``projections``. ``path`` may be the JSON."""
-    options.refuse_unused("phyradgs-real", OPTIONS)
     checks.one_of(options.called("readout_axis"), options.readout_axis or "rows", ("rows",))
     description = path if path.is_file() else SafeFolder(path).only("description of the views", ".json")
     meta = Fields(f"{description}:", read_json(description))
@@ -107,8 +102,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     )
     trajectory = PoseTable(times.ravel(), poses.reshape(-1, 12), f"{description} views")
     plain = plain_geometry(poses[:, 0], panel)
-    title = path.resolve().stem
-    return assemble_scan(integrals, trajectory, plain, timing, options, title=title, source=str(path))
+    return assemble_scan(integrals, trajectory, plain, timing, options, path, title=path.resolve().stem)
 
 
 def _frames_and_views(
@@ -147,11 +141,10 @@ def _with_flat(subject: str, options: ImportOptions, frames: np.ndarray) -> Impo
 
 def _timing(subject: str, detector: Circle, options: ImportOptions) -> tuple[Shutter, np.ndarray]:
     """Returns shutter and opening times (F,) in s. Delays frames that would overlap: a pose table has one pose at a time."""
-    exposure_s = synthetic.exposure_of_blurred_s(options)
-    first, closed, done = np.unwrap(detector.angle_rad, axis=1).T
-    ratio = synthetic.readout_ratio(subject, closed - first, done - closed)
-    shutter = Shutter(exposure_s, ratio * exposure_s)
-    start_s = synthetic.start_times_s(np.unwrap(first), np.unwrap(first) + closed - first, exposure_s)
+    marks_rad = np.unwrap(detector.angle_rad, axis=1)
+    marks_rad += (np.unwrap(marks_rad[:, 0]) - marks_rad[:, 0])[:, None]
+    exposure_s, readout_s, start_s = synthetic.blurred_timing_s(subject, marks_rad, options)
+    shutter = Shutter(exposure_s, readout_s)
     least_s = shutter.span_s * (1 + _GAP)
     return shutter, np.concatenate([[0.0], np.cumsum(np.maximum(np.diff(start_s), least_s))])
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
-from phyradgs_cl.acquisition.geometry import ConeGeometry, Geometry, ParallelGeometry, plain_geometry
+from phyradgs_cl.acquisition.geometry import ConeGeometry, Geometry, ParallelGeometry
 from phyradgs_cl.acquisition.plausible import question_unit
 from phyradgs_cl.acquisition.scans_from import is_parallel_tigre, poses_of_tigre
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, PoseTable
@@ -28,15 +28,13 @@ from phyradgs_cl.importers.assemble import Timing, along, assemble_scan, make_ti
 from phyradgs_cl.importers.files import check_room, naming_damage
 from phyradgs_cl.importers.formats import r2_gaussian
 from phyradgs_cl.importers.frames import line_integrals, oriented
-from phyradgs_cl.importers.options import TIMING, ImportOptions
+from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io.files import read_regular, regular_file
 from phyradgs_cl.io.tables import Fields, described
 
-OPTIONS = (*TIMING, "detector_model", "part")
 _PER_MM = 1e-3  # 1/mm per 1/m, the unit of NAF's volumes
 _PARTS = {"train": ("train",), "test": ("val",), "all": ("train", "val")}
 TIGRE_MODULE, _END_BYTES = "tigre.utilities.geometry", 1 << 18
-OPTIONS_OF_TIGRE = (*TIMING, "row_0", "column_0", "quantity", "flat_value", "detector_model")
 _NAMES = ("DSO", "DSD", "nDetector", "dDetector", "nVoxel", "dVoxel", "offOrigin", "offDetector", "rotDetector", "COR")
 _SAME = 1e-9  # poses lie on one circle if they differ from it by at most this fraction of their largest entry
 _CLASSES = ("Geometry", "ConeGeometryDefault", "ParallelGeometryDefault")
@@ -58,7 +56,6 @@ def names_tigre(path: Path) -> bool:
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports projections of a pickle of NAF or SAX-NeRF: its train part, val part or both, as the option ``part`` says."""
-    options.refuse_unused("naf", OPTIONS)
     data = Fields(f"{path}:", read_pickle(path))
     geometry, grid = r2_gaussian.read_geometry(data, 1.0), r2_gaussian.read_grid(data, 1.0)
     frames, angle_rad = _frames(data, _PARTS[options.part], geometry.detector_shape)
@@ -71,10 +68,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     integrals = line_integrals(str(path), frames, options, convention="attenuation")
     question_unit(angle_rad, f"{path} angles", "rad")
     trajectory = turning(geometry, angle_rad, timing)
-    return assemble_scan(
-        integrals, trajectory, geometry, timing, options, title=path.stem, source=str(path), grid=grid,
-        reference=reference,
-    )
+    parts = integrals, trajectory, geometry, timing, options, path
+    return assemble_scan(*parts, grid=grid, reference=reference)
 
 
 def _frames(data: Fields, parts: tuple[str, ...], panel: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -98,17 +93,17 @@ def _array(table: Fields, key: str, ndim: int) -> np.ndarray:
     return np.asarray(values)
 
 
-def read_pickle(path: Path, unpickler: "type[PlainUnpickler] | None" = None) -> object:
-    """Reads dicts, lists, tuples, text, numbers and NumPy arrays of plain numbers. Raises InputError for a damaged file, one
-    too large for this machine's memory, and what ``unpickler`` refuses; None stands for ``PlainUnpickler``."""
+def read_pickle(path: Path) -> object:
+    """Reads dicts, lists, tuples, text, numbers, NumPy arrays of plain numbers and TIGRE's geometries. Raises InputError for
+    a damaged file, one too large for this machine's memory, and what ``PlainUnpickler`` refuses."""
     subject = str(path)
     size = regular_file(path, subject).st_size
     check_room(subject, _COPIES * size)
     data = read_regular(path, subject, size, "a pickle")
-    kind = unpickler or PlainUnpickler
     with naming_damage(path, "a damaged pickle", "a pickle of plain containers and NumPy arrays"):
         try:
-            return kind(io.BytesIO(data), encoding="latin1").load()  # latin1, because Python 2 wrote arrays' bytes as text
+            # latin1, because Python 2 wrote arrays' bytes as text
+            return PlainUnpickler(io.BytesIO(data), encoding="latin1").load()
         except InputError as error:
             raise InputError(subject, error.found, error.expected, error.remedy) from error
 
@@ -126,6 +121,8 @@ class PlainUnpickler(pickle.Unpickler):
             "numpy.core.numeric._frombuffer": lambda *arguments: _plain_array(*arguments),
             "_codecs.encode": lambda text, encoding: text.encode("latin1"),
         }
+        if module.startswith(TIGRE_MODULE) and name in _CLASSES:
+            return _Geometry
         full_name = f"{module.replace('numpy._core.', 'numpy.core.')}.{name}"  # NumPy 2 renamed numpy.core
         if full_name not in functions:
             found = f"a call of {full_name[:120]}"
@@ -172,16 +169,6 @@ class _Geometry(SimpleNamespace):
     """Stands in for a ``tigre.geometry``: has its attributes, and runs none of TIGRE's code."""
 
 
-class TigreUnpickler(PlainUnpickler):
-    """A ``PlainUnpickler`` that also reads TIGRE's geometries, as plain attributes without TIGRE's code."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        """Returns ``_Geometry`` for TIGRE's geometry classes, else what ``PlainUnpickler`` allows."""
-        if module.startswith(TIGRE_MODULE) and name in _CLASSES:
-            return _Geometry
-        return super().find_class(module, name)
-
-
 def recognises_tigre(path: Path) -> bool:
     """Returns whether ``path`` is a pickle (by its suffix) with TIGRE's geometry."""
     return path.is_file() and path.suffix.lower() in (".pickle", ".pkl") and names_tigre(path)
@@ -189,10 +176,12 @@ def recognises_tigre(path: Path) -> bool:
 
 def import_scan_tigre(path: Path, options: ImportOptions) -> Scan:
     """Imports a pickle of TIGRE: (projections, geometry, angles), or a dictionary of them."""
-    options.refuse_unused("tigre", OPTIONS_OF_TIGRE)
-    content = read_pickle(path, TigreUnpickler)
-    if isinstance(content, dict):
-        content = tuple(_named(content, *names) for names in (("proj", "frames"), ("geo",), ("angle", "theta")))
+    content = read_pickle(path)
+    if isinstance(content, dict):  # the first values whose keys begin with one of the words, upper case or lower
+        content = tuple(
+            next((value for name, value in content.items() if str(name).lower().startswith(words)), None)
+            for words in (("proj", "frames"), ("geo",), ("angle", "theta"))
+        )
     if not isinstance(content, (tuple, list)) or len(content) != 3 or not isinstance(content[1], _Geometry):
         expected = "projections, geometry and angles, in this order as TIGRE's loaders return them, or by these names"
         raise InputError(str(path), described(content), expected)
@@ -213,13 +202,7 @@ def import_scan_tigre(path: Path, options: ImportOptions) -> Scan:
     trajectory, geometry = _trajectory(geo, poses, angle_rad, timing, str(path))
     turned = oriented(np.asarray(frames), options, "bottom")
     integrals = line_integrals(str(path), turned, options, convention="attenuation")
-    parts = integrals, trajectory, geometry, timing, options
-    return assemble_scan(*parts, title=path.stem, source=str(path), grid=grid)
-
-
-def _named(content: dict[object, Any], *words: str) -> Any:
-    """Returns the first value whose key begins with one of ``words``, upper case or lower; None without one."""
-    return next((value for name, value in content.items() if str(name).lower().startswith(words)), None)
+    return assemble_scan(integrals, trajectory, geometry, timing, options, path, grid=grid)
 
 
 def _trajectory(
@@ -237,5 +220,5 @@ def _trajectory(
         geometry = ConeGeometry(float(np.ravel(geo.DSO)[0]), float(np.ravel(geo.DSD)[0]), *sides)
     if np.allclose(geometry.pose(angle_rad), poses, rtol=0, atol=_SAME * np.abs(poses).max()):
         return turning(geometry, angle_rad, timing), geometry
-    table = table_over_time(lambda position: along(poses, position), timing, subject, is_parallel)
-    return table, plain_geometry(poses, geometry.detector_shape, is_parallel)
+    panel = geometry.detector_shape
+    return table_over_time(lambda position: along(poses, position), timing, subject, panel, is_parallel)

@@ -19,15 +19,13 @@ from phyradgs_cl.fields import Grid, triple
 from phyradgs_cl.importers.assemble import Timing, assemble_scan, make_timing, turning
 from phyradgs_cl.importers.files import SafeFolder, read_json, read_npy
 from phyradgs_cl.importers.frames import line_integrals, oriented
-from phyradgs_cl.importers.options import TIMING, ImportOptions
+from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.io.scan import BEAMS
 from phyradgs_cl.io.tables import Fields
 
 META = "meta_data.json"
 META_WITH_TIMES = "meta_data_motion_blur_rolling_shutter_fps18.json"  # the description's name in folders of PhyRadGS
 ROW_0 = "top"
-OPTIONS = (*TIMING, "unit_mm", "detector_model", "part")
-OPTIONS_WITH_TIMES = ("exposure_s", "readout_axis", "readout_direction", "unit_mm", "detector_model", "part")
 _KEYS = ("first_line_start", "first_line_end", "last_line_end")
 _SAME = 1e-3  # the ratio readout time / exposure time may differ between frames by this × max(1, largest ratio)
 
@@ -72,9 +70,8 @@ class R2Folder:
             raise InputError(entries[twice[0]].name("file_path"), f"{names[twice[0]]!r} again", "every frame once")
         frames = oriented(np.stack([self.frame(entry) for entry in entries]), options, ROW_0)
         integrals = line_integrals(str(self.folder.root), frames, options, convention="attenuation")
-        parts = integrals, orbit, self.geometry, timing, options
-        title = path.resolve().name
-        return assemble_scan(*parts, title=title, source=str(path), grid=grid, reference=reference)
+        parts = integrals, orbit, self.geometry, timing, options, path
+        return assemble_scan(*parts, title=path.resolve().name, grid=grid, reference=reference)
 
 
 def entries_of(meta: Fields, prefix: str, part: str) -> list[Fields]:
@@ -93,7 +90,6 @@ def recognises(path: Path) -> bool:
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports the frames of the option ``part``: by default train, under the description's key ``proj_train``."""
-    options.refuse_unused("r2", OPTIONS)
     opened = R2Folder.opened(path, META, options.unit_mm)
     entries = entries_of(opened.meta, "proj_", options.part)
     angle_rad = np.array([entry.number("angle") for entry in entries])
@@ -163,40 +159,31 @@ def recognises_with_times(path: Path) -> bool:
 def import_scan_with_times(path: Path, options: ImportOptions) -> Scan:
     """Imports the frames of the option ``part``: by default train, under the description's key ``simulate_train``. Columns
     are read out one after the other unless the option ``readout_axis`` says rows."""
-    options.refuse_unused("phyradgs", OPTIONS_WITH_TIMES)
     opened = R2Folder.opened(path, META_WITH_TIMES, options.unit_mm)
     entries = entries_of(opened.meta, "simulate_", options.part)
     marks = np.array([[entry.number(key) for key in _KEYS] for entry in entries])
     question_unit(marks[:, 0], f"{opened.meta.subject} angles", "rad")
-    timing = timing_of_marks(opened.meta, marks, options)
-    sweeps = FrameSweeps(timing.start_s, timing.shutter.exposure_s, marks[:, 0], marks[:, 1])
-    return opened.scan(path, entries, CircularOrbit(opened.geometry, sweeps), timing, options)
-
-
-def timing_of_marks(subject: Fields, marks_rad: np.ndarray, options: ImportOptions) -> Timing:
-    """Returns the timing from gantry angles (F, 3) in rad: when the first line opens, when it closes, and when the last line
-    closes. Unless options say otherwise, the first stored line is read first: column 0, or the top row if rows are read."""
-    exposure_s = exposure_of_blurred_s(options)
-    ratio = readout_ratio(subject.subject, marks_rad[:, 1] - marks_rad[:, 0], marks_rad[:, 2] - marks_rad[:, 1])
-    axis = options.readout_axis or "columns"
+    exposure_s, readout_s, start_s = blurred_timing_s(opened.meta.subject, marks, options)
+    axis = options.readout_axis or "columns"  # unless options say otherwise, column 0 or the top row is read first
     direction = options.readout_direction or (1 if axis == "columns" else -1)
     unstated = {"exposure": options.exposure_s, "axis": options.readout_axis, "first": options.readout_direction}
     assumed = tuple(name for name, value in unstated.items() if value is None)
-    start_s = start_times_s(marks_rad[:, 0], marks_rad[:, 1], exposure_s)
-    return Timing(Shutter(exposure_s, ratio * exposure_s, axis, direction), start_s, True, assumed=assumed)
+    timing = Timing(Shutter(exposure_s, readout_s, axis, direction), start_s, True, assumed=assumed)
+    sweeps = FrameSweeps(start_s, exposure_s, marks[:, 0], marks[:, 1])
+    return opened.scan(path, entries, CircularOrbit(opened.geometry, sweeps), timing, options)
 
 
-def exposure_of_blurred_s(options: ImportOptions) -> float:
-    """Returns the options' exposure, or 1 s without one, because files state none. Raises InputError for 0 s or less."""
+def blurred_timing_s(
+    subject: str, marks_rad: np.ndarray, options: ImportOptions
+) -> tuple[float, float, np.ndarray]:
+    """Returns exposure, readout and opening times (F,), from 0 on, in s. marks_rad (F, 3): the gantry's angles when each
+    frame's first line opens, when it closes, and when the last line closes. The exposure is the options', or 1 s, because
+    files state none. The gantry's speed is taken as constant: the mean over the exposures. Raises InputError for an exposure
+    of 0 s or less, one without a turn or with turns of both signs, and readouts that are not one ratio of it, at least 0."""
     exposure_s = 1.0 if options.exposure_s is None else options.exposure_s
     if exposure_s <= 0:
         raise InputError(options.named("exposure_s"), f"{exposure_s:g}", "a time above 0 s", "the frames are blurred")
-    return exposure_s
-
-
-def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarray) -> float:
-    """Returns readout time / exposure time, from the angles (F,) in rad that the gantry turns during each. Raises InputError
-    for a ratio below 0, or one that differs between frames, and for exposures without a turn or with turns of both signs."""
+    exposure_arc, readout_arc = np.diff(marks_rad, axis=1).T
     if np.any(exposure_arc == 0) or np.any(np.sign(exposure_arc) != np.sign(exposure_arc[0])):
         found = f"arcs from {exposure_arc.min():.6g} to {exposure_arc.max():.6g} rad"
         raise InputError(f"{subject} exposure", found, "arcs that turn one way, none of them 0")
@@ -204,11 +191,6 @@ def readout_ratio(subject: str, exposure_arc: np.ndarray, readout_arc: np.ndarra
     if ratio.min() < 0 or np.ptp(ratio) > _SAME * max(1.0, ratio.max()):
         found = f"readout over exposure from {ratio.min():.6g} to {ratio.max():.6g}"
         raise InputError(f"{subject} readout", found, "one ratio of at least 0 for all frames")
-    return float(np.median(ratio))
-
-
-def start_times_s(first_rad: np.ndarray, closed_rad: np.ndarray, exposure_s: float) -> np.ndarray:
-    """Returns opening times (F,) in s, from 0 on. first_rad, closed_rad (F,): the gantry's angles when each frame's first
-    line opens and closes. The gantry's speed is taken as constant: the mean over the exposures."""
-    speed_rad_per_s = float(np.mean(closed_rad - first_rad)) / exposure_s
-    return (first_rad - first_rad[0]) / speed_rad_per_s
+    first_rad = marks_rad[:, 0]
+    speed_rad_per_s = float(np.mean(exposure_arc)) / exposure_s
+    return exposure_s, float(np.median(ratio)) * exposure_s, (first_rad - first_rad[0]) / speed_rad_per_s

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import CircularOrbit, PoseTable, Scan
-from phyradgs_cl.acquisition.geometry import Geometry, plain_geometry, towards_source
+from phyradgs_cl.acquisition.geometry import Geometry, towards_source
 from phyradgs_cl.acquisition.plausible import question_unit
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble
@@ -22,11 +22,10 @@ from phyradgs_cl.importers.assemble import along
 from phyradgs_cl.importers.files import SafeFolder, read_bytes
 from phyradgs_cl.importers.frames import line_integrals
 from phyradgs_cl.importers.images import STACKS, read_image
-from phyradgs_cl.importers.options import TIMING, ImportOptions
+from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.text import Settings
 
 _log = logging.getLogger(__name__)
-OPTIONS = (*TIMING, "quantity", "flat_value", "detector_model")
 ROOT = "RTKThreeDCircularGeometry"
 NAMES = (
     *("SourceToIsocenterDistance", "SourceToDetectorDistance", "GantryAngle"),
@@ -68,7 +67,6 @@ def recognises(path: Path) -> bool:
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports a folder with one .xml and one .mha (or .mhd). ``path`` may also be one of the two files in it."""
-    options.refuse_unused("rtk", OPTIONS)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     is_stack = path.suffix.lower() in STACKS and path.is_file()
     description = path if path.is_file() and not is_stack else folder.only("geometry", ".xml")
@@ -77,11 +75,11 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     sitk = checks.package("SimpleITK", "the package that reads this file", "phyradgs-cl[formats]")
     places_mm, direction = (image.GetOrigin(), image.GetSpacing()), np.reshape(image.GetDirection(), (3, 3))
     stack = stack_of(sitk.GetArrayFromImage(image), *places_mm, direction, f"{stack_path} TransformMatrix")
-    return scan_of(rtk, stack, options, (str(description), str(stack_path)), description.stem, str(path))
+    return scan_of(rtk, stack, options, (str(description), str(stack_path)), description.stem, path)
 
 
 def scan_of(
-    rtk: "RtkGeometry", stack: Stack, options: ImportOptions, subjects: tuple[str, str], title: str, source: str,
+    rtk: "RtkGeometry", stack: Stack, options: ImportOptions, subjects: tuple[str, str], title: str, path: Path,
     clock: str = "",
 ) -> Scan:
     """Returns the scan of a geometry and its projections. subjects: what messages call the geometry and the projections.
@@ -94,7 +92,7 @@ def scan_of(
     trajectory, geometry, turn = _trajectory(rtk, stack, timing, described)
     convention = "attenuation" if stack.frames.dtype.kind == "f" and options.flat_value is None else None
     integrals = line_integrals(stored, turn.frames(stack.frames), options, convention=convention)
-    return assemble.assemble_scan(integrals, trajectory, geometry, timing, options, title=title, source=source)
+    return assemble.assemble_scan(integrals, trajectory, geometry, timing, options, path, title=title)
 
 
 def stack_of(
@@ -125,11 +123,10 @@ def _trajectory(
         return turn.poses(stored(position), panel)
 
     question_unit(rtk.values[_ANGLE], f"{subject} {_ANGLE}", "deg")
-    at_frames = poses(np.arange(rtk.frames, dtype=np.float64))
-    geometry = plain_geometry(at_frames, panel, rtk.is_parallel)
+    table, geometry = assemble.table_over_time(poses, timing, subject, panel, rtk.is_parallel)
     if rtk.is_circular and stack.step_u_mm[1] == stack.step_v_mm[0] == 0:
         return assemble.turning(geometry, rtk.values[_ANGLE], timing), geometry, turn
-    return assemble.table_over_time(poses, timing, subject, rtk.is_parallel), geometry, turn
+    return table, geometry, turn
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,7 +113,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     options = replace(options, flat_value=None, quantity="transmission")
     clocks = (description, "DeltaMs"), (projections[0], "StartTime")
     clock = next((f"frames' times ({word})" for file, word in clocks if word.encode() in _tail(file)), "")
-    return scan_of(geometry, stack, options, (str(description), str(path)), description.stem, str(path), clock)
+    return scan_of(geometry, stack, options, (str(description), str(path)), description.stem, path, clock)
 
 
 def _air(path: Path, projections: list[Path], options: ImportOptions) -> np.ndarray:

@@ -18,8 +18,7 @@ from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers import text as settings
 from phyradgs_cl.importers.assemble import RotaryStage, scan_on_stage
 from phyradgs_cl.importers.files import SafeFolder, read_text
-from phyradgs_cl.importers.frames import gantry_sign
-from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
+from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.tiff import read_numbered
 from phyradgs_cl.io.hdf5.datasets import LENGTH, TIME
 
@@ -38,6 +37,7 @@ _FIELDS = {
     "source_to_axis_mm": "Object to Source (mm)", "source_to_detector_mm": "Camera to Source (mm)",
     "exposure_s": "Exposure (ms)", "angles": "Rotation Step (deg)", "pixel_size_mm": "Image Pixel Size (um)",
 }  # fmt: skip
+recognises = settings.found_by((".log",), b"[system]", b"scanner=")
 _OFF = re.compile(r"OFF( *\(.*\))?", re.I)  # the log may add the number that the setting would use: OFF (n)
 _SENSES = {"CC": 1, "CCW": 1, "CW": -1, "C": -1}
 _ASSUMED = {
@@ -46,15 +46,8 @@ _ASSUMED = {
 }  # fmt: skip
 
 
-def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a .log file of a SkyScan, or a folder with such a file."""
-    paths = SafeFolder(path).matching(".log") if path.is_dir() else [path] if path.suffix.lower() == ".log" else []
-    return any(settings.head_has(file, b"[system]", b"scanner=") for file in paths)
-
-
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports a folder with one .log file and its TIFFs. ``path`` may also be the .log file in it."""
-    options.refuse_unused("skyscan", OF_FOLDERS)
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("log of the scan", ".log")
     scan = settings.read_settings(description, _NAMES, sections=("System", "Acquisition"))
@@ -75,7 +68,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         raise scan.error("Rotation Direction", repr(scan.word("Rotation Direction")[:40]), "CC or CW")
     first_deg, step_deg = scan.number("Scanning Start Angle", 0.0), partial(scan.number, "Rotation Step (deg)")
     angle_rad = options.angle_rad(len(at), lambda: np.deg2rad(first_deg + step_deg() * at))
-    angle_rad *= gantry_sign(options, "sample") * sense
+    angle_rad *= options.gantry_sign("sample") * sense
     settings.say_missing(scan, _ASSUMED)
     for name in [name for name in _SEVERAL if scan.has(name) and scan.word(name).upper() not in ("OFF", "0", "1")]:
         _log.warning("%s is %s: only the images of this log are read, as one scan", scan.name(name), scan.word(name)[:40])

@@ -15,9 +15,10 @@ from phyradgs_cl.importers import hdf5, tiff
 from phyradgs_cl.importers.angles import read_angles_rad
 from phyradgs_cl.importers.assemble import StoredTiming, assemble_scan, make_timing, turning, with_options
 from phyradgs_cl.importers.files import SafeFolder, checked_name
-from phyradgs_cl.importers.frames import LineIntegrals, gantry_sign, line_integrals, oriented
-from phyradgs_cl.importers.options import FIELDS, OF_BARE_FRAMES, WORDS, ImportOptions
+from phyradgs_cl.importers.frames import LineIntegrals, line_integrals, oriented
+from phyradgs_cl.importers.options import FIELDS, WORDS, ImportOptions
 from phyradgs_cl.importers.series import Series, flat_places, series_of
+from phyradgs_cl.importers.text import found_by
 from phyradgs_cl.io.hdf5.datasets import ANGLE
 from phyradgs_cl.io.scan.reader import united
 from phyradgs_cl.io.scanner import TABLES, Scanner, scanner_from
@@ -40,21 +41,18 @@ _KEYS = {  # for each import option: the TOML's key of the same value
     **{"source_to_axis_mm": "[source] to_axis_mm", "source_to_detector_mm": "[source] to_detector_mm"},
     "pixel_size_mm": "[detector] pixel_size_v_mm, pixel_size_u_mm",
 }
+recognises = found_by((".toml",))
 _SCANNER = ("title", "source", "detector", "volume", "readout", "beam")
-
-
-def recognises(path: Path) -> bool:
-    """Returns whether ``path`` is a .toml file, or a folder with such a file."""
-    return bool(SafeFolder(path).matching(".toml")) if path.is_dir() else path.suffix.lower() == ".toml"
 
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports a folder with one TOML file and its frames. ``path`` may also be the TOML file in it."""
-    options.refuse_unused("tiff", (*OF_BARE_FRAMES, "linked_folder"))
     folder = SafeFolder(path if path.is_dir() else path.parent)
     description = path if path.is_file() else folder.only("description of the scan", ".toml")
     tables = _tables(description)
-    options = in_words_of_file(options)
+    # messages call a value by its key in the TOML, unless the user gave it as an option
+    given, option = options.given(FIELDS), options.named
+    options = replace(options, named=lambda field: (None if field in given else _KEYS.get(field)) or option(field))
     combined = _with_file(options, tables)
     stored = _in_hdf5(folder, tables["frames"], options)
     if stored is None:
@@ -77,8 +75,8 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
     keys = {"exposure_s": ("timing", "exposure_s"), "readout_s": readout_key}
     names = {field: tables[table].name(key) for field, (table, key) in keys.items() if tables[table].has(key)}
     return assemble_scan(
-        integrals, turning(geometry, gantry_sign(combined, "gantry") * angle_rad, timing), geometry, timing, combined,
-        title=tables[""].word("title", default=folder.root.resolve().name), source=str(path), said=said,
+        integrals, turning(geometry, combined.gantry_sign("gantry") * angle_rad, timing), geometry, timing, combined, path,
+        title=tables[""].word("title", default=folder.root.resolve().name), said=said,
         grid=scanner.grid if tables[""].has("volume") else None, lag=scanner.lag,
         names={"grid": tables[""].name("[volume]"), "angles": tables["angles"].subject, **names},
     )
@@ -96,14 +94,6 @@ def _tables(path: Path) -> dict[str, Fields]:
     tables = {name: Fields(f"{path} [{name}]", content.get(name, {}), keys) for name, keys in OWN_TABLES.items()}
     tables["readout"] = Fields(f"{path} [readout]", content.get("readout", {}), TABLES["readout"])
     return {"": Fields(f"{path}:", {k: v for k, v in content.items() if k not in OWN_TABLES}), **tables}
-
-
-def in_words_of_file(options: ImportOptions) -> ImportOptions:
-    """Returns options whose messages call a value by its key in the TOML, unless the user gave the value as an option."""
-    given = options.given(FIELDS)
-    return replace(
-        options, named=lambda field: (None if field in given else _KEYS.get(field)) or options.named(field)
-    )
 
 
 def _with_file(options: ImportOptions, tables: dict[str, Fields]) -> ImportOptions:

@@ -22,8 +22,7 @@ from phyradgs_cl.errors import InputError
 from phyradgs_cl.importers import assemble
 from phyradgs_cl.importers.assemble import RotaryStage, scan_on_stage
 from phyradgs_cl.importers.files import check_room, naming_damage
-from phyradgs_cl.importers.frames import gantry_sign
-from phyradgs_cl.importers.options import OF_FOLDERS, ImportOptions
+from phyradgs_cl.importers.options import ImportOptions
 from phyradgs_cl.importers.text import say_missing
 from phyradgs_cl.io.files import regular_file
 from phyradgs_cl.io.tables import LARGEST, Fields
@@ -75,14 +74,18 @@ def recognises(path: Path) -> bool:
 
 def import_scan(path: Path, options: ImportOptions) -> Scan:
     """Imports a .txrm file. Images that were never taken are left out."""
-    options.refuse_unused("zeiss", OF_FOLDERS)
     with open_ole(path) as ole:
         present = {name: dtype for name, dtype in _STREAMS.items() if ole.exists(name)}
         values = {name: read_stream(ole, path, name, dtype).tolist() for name, dtype in present.items()}
         scan = Streams(f"{path}:", values)
         count, rows, columns = (int(scan.first_of(f"{_INFO}/{name}", 1, path.stat().st_size)) for name in _COUNTS)
-        names, panel = [f"ImageData{i // _PER_FOLDER + 1}/Image{i + 1}" for i in range(_taken(scan, count))], (rows, columns)
-        at = np.array([i for i, name in enumerate(names) if options.frames != "found" or ole.exists(name)], int)
+        taken = int(scan.first_of(f"{_INFO}/ImagesTaken", 0)) if scan.has(f"{_INFO}/ImagesTaken") else count
+        taken = min(taken, count) or count  # of the planned images; all if the file states no number or 0
+        if taken < count:
+            _log.warning("%s: the scan stopped early: %d of %d images were taken", scan.subject, taken, count)
+        names, panel = [f"ImageData{i // _PER_FOLDER + 1}/Image{i + 1}" for i in range(taken)], (rows, columns)
+        there = [i for i, name in enumerate(names) if options.frames != "found" or ole.exists(name)]
+        at = np.array(there or [0])  # without any image, reading the first one raises the error
         frames = read_images(ole, path, [names[i] for i in at], _type(scan, f"{_INFO}/DataType"), panel)
         whites = sorted("/".join(one) for one in ole.listdir() if one[0] in (_ONE, _SEVERAL) and one[1].startswith("Image"))
         whites = [name for name in whites if re.fullmatch(r"[^/]*/Image\d*", name)]
@@ -96,7 +99,7 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
                 flats = np.float32(flats) * np.float32(frame_s / flat_s)
     said = f"frames: {len(at)} of {count} images"
     angles = f"{_INFO}/Angles"
-    angle_rad = gantry_sign(options, "sample") * options.angle_rad(
+    angle_rad = options.gantry_sign("sample") * options.angle_rad(
         len(at), lambda: np.deg2rad(scan.leading(angles, int(at[-1]) + 1)[at])
     )
     in_file = {
@@ -109,14 +112,6 @@ def import_scan(path: Path, options: ImportOptions) -> Scan:
         stored = assemble.StoredTiming(exposure_s=scan.first_of(f"{_INFO}/ExpTimes", 0) or None)
     turned, stage = (frames, ("bottom", "left"), angle_rad, at, in_file, said), _stage(scan, at, panel, options)
     return scan_on_stage(stage, options, path, path.stem, *turned, stored=stored, flats=flats)
-
-
-def _taken(scan: Streams, count: int) -> int:
-    """Returns how many of ``count`` planned images were taken: all if the file states no number or 0. Warns if fewer."""
-    taken = int(scan.first_of(f"{_INFO}/ImagesTaken", 0)) if scan.has(f"{_INFO}/ImagesTaken") else count
-    if 0 < taken < count:
-        _log.warning("%s: the scan stopped early: %d of %d images were taken", scan.subject, taken, count)
-    return min(taken, count) or count
 
 
 def _type(scan: Streams, name: str, default: float | None = None) -> str:

@@ -219,6 +219,13 @@ def in_unit(source: Hdf5Source, address: str, values: np.ndarray, quantity: Quan
     return values * factor
 
 
+def read_attenuation(source: Hdf5Source, address: str, dataset: h5py.Dataset) -> np.ndarray:
+    """Reads finite values in 1/mm, float32, of a dataset of any shape."""
+    values = read_values(source, address, dataset)
+    checks.finite(source.name(address), values)
+    return in_unit(source, address, values, ATTENUATION).astype(np.float32)
+
+
 def read_grid(source: Hdf5Source, address: str) -> Grid:
     """Reads the voxel grid in the group ``address``: shape, voxel_size and offset (0 if missing), each (z, y, x). Raises
     InputError for impossible values."""

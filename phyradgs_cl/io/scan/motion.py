@@ -52,7 +52,11 @@ def read_trajectory(
         address = f"{kinematics}/angle_deg"
         angle_rad = h5.read_array(source, address, (len(time_s),), h5.ANGLE)
         angle_rad = angle_rad * _sense(source, address, absent=1.0)
-        _warn_if_apart(source, address, np.interp(start_s, time_s, angle_rad), first_rad)
+        apart_rad = np.interp(start_s, time_s, angle_rad) - first_rad
+        apart_rad = np.abs((apart_rad + np.pi) % (2 * np.pi) - np.pi)
+        if apart_rad.max() > _SUSPECT_RAD:
+            text = "%s: up to %.3g° from rotation_angle; the table is used"
+            _log.warning(text, source.name(address), math.degrees(apart_rad.max()))
         return CircularOrbit(geometry, EncoderTable(time_s, angle_rad, source.name(f"{kinematics}/time_s")))
     last_rad = first_rad
     if exposure_s > 0 and source.find(f"{entry}/{schema.SAMPLE}/rotation_angle_end") is not None:
@@ -139,11 +143,13 @@ def sampled(trajectory: Trajectory, frame_start_s: np.ndarray, span_s: float, er
 
 
 def write_motion(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
-    """Writes rotation angles and tables. frame_of (F,): the projection whose angles each stored frame gets."""
-    first_rad, last_rad = _exposure_angles(scan)
-    sample = entry[schema.SAMPLE]
+    """Writes tables, and gantry angles at start and end of the exposure of each frame's first line; for a gantry at rest its
+    angle in the middle of the frame. frame_of (F,): the projection whose angles each stored frame gets."""
+    sample, shutter = entry[schema.SAMPLE], scan.shutter
+    offsets_s = np.array([0.0, shutter.exposure_s] if scan.is_fly else [shutter.middle_s] * 2)
+    first_rad, last_rad = np.array([_angles(scan, f, at_s + offsets_s) for f, at_s in enumerate(scan.frame_start_s)]).T
     h5.write_number(sample, "rotation_angle", np.rad2deg(first_rad)[frame_of], "degree", rotates="gantry")
-    if scan.is_fly and scan.shutter.exposure_s > 0:
+    if scan.is_fly and shutter.exposure_s > 0:
         h5.write_number(sample, "rotation_angle_end", np.rad2deg(last_rad)[frame_of], "degree", rotates="gantry")
     path = scan.trajectory
     if isinstance(path, PoseTable):
@@ -166,15 +172,6 @@ def _table_group(entry: h5py.Group, name: str, time_s: np.ndarray) -> h5py.Group
     group = h5.new_group(entry[schema.EXTRA], name, "NXcollection")
     h5.write_number(group, "time_s", time_s, "s")
     return group
-
-
-def _exposure_angles(scan: Scan) -> tuple[np.ndarray, np.ndarray]:
-    """Returns gantry angles (F,) in rad at start and end of the exposure of each frame's first line. For a gantry at rest
-    both are its angle in the middle of the frame."""
-    shutter = scan.shutter
-    offsets_s = np.array([0.0, shutter.exposure_s] if scan.is_fly else [shutter.middle_s] * 2)
-    pairs = np.array([_angles(scan, f, start_s + offsets_s) for f, start_s in enumerate(scan.frame_start_s)])
-    return pairs[:, 0], pairs[:, 1]
 
 
 def _angles(scan: Scan, frame: int, time_s: np.ndarray) -> np.ndarray:
@@ -215,14 +212,6 @@ def _sense(source: Hdf5Source, address: str, absent: float) -> float:
     if rotates not in schema.ROTATES:
         raise InputError(f"{source.name(address)} @rotates", repr(rotates), "'gantry' or 'sample'")
     return 1.0 if rotates == "gantry" else -1.0
-
-
-def _warn_if_apart(source: Hdf5Source, address: str, table_rad: np.ndarray, first_rad: np.ndarray) -> None:
-    """Warns if encoder table and rotation_angle, both (P,), differ by over 5°, as with a wrong sign. The table is used."""
-    apart_rad = np.abs((table_rad - first_rad + np.pi) % (2 * np.pi) - np.pi)
-    if apart_rad.max() > _SUSPECT_RAD:
-        text = "%s: up to %.3g° from rotation_angle; the table is used"
-        _log.warning(text, source.name(address), math.degrees(apart_rad.max()))
 
 
 def read_gating(source: Hdf5Source, entry: str, used: np.ndarray, middle_s: np.ndarray) -> Gating | None:

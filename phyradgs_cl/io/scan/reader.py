@@ -52,7 +52,10 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, 
         reference = read_reference(source, header.entry) if header.has_reference else None
         has_states = header.states > 0 and rows is None  # a reconstruction of some rows is compared with one volume only
         moving = read_moving_truth(source, header.entry) if has_states else None
-        metal = _read_metal(source, f"{header.entry}/{schema.METAL}")
+        metal, where = None, f"{header.entry}/{schema.METAL}"
+        if source.optional_group(where) is not None:
+            grid = read_grid(source, f"{where}/grid")
+            metal = Metal(read_array(source, f"{where}/volume", grid.shape, ATTENUATION).astype(np.float32), grid)
         data = _read_frames(source, header, mask, lines)
     projections, bad = _convert(source.name(f"{header.entry}/{schema.DATA}"), header, data, to_attenuation)
     used = header.image_key == schema.PROJECTION
@@ -66,13 +69,6 @@ def read_scan(path: str | Path, to_attenuation: ToAttenuation, rows: tuple[int, 
     return replace(scan, reference=reference, moving_truth=moving, metal=metal)
 
 
-def _read_metal(source: Hdf5Source, address: str) -> Metal | None:
-    if source.optional_group(address) is None:
-        return None
-    grid = read_grid(source, f"{address}/grid")
-    return Metal(read_array(source, f"{address}/volume", grid.shape, ATTENUATION).astype(np.float32), grid)
-
-
 def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, object]:
     """Returns what 'phyradgs info' prints about a scan file. Checks all but its pixels. sha256: the file's, if known."""
     with open_hdf5(path) as source:
@@ -83,11 +79,16 @@ def scan_summary(path: str | Path, sha256: str | None = None) -> dict[str, objec
     if header.quantity == "attenuation":  # flats and darks have been applied, and the file has only their numbers
         applied = {name: scan.provenance.get(name) for name in APPLIED}
         counts |= {name: count for name, count in applied.items() if isinstance(count, int)}
+    pulse: dict[str, object] = {}
+    if scan.shutter.pulse_s is not None:
+        pulse = dict(zip(("pulse_start_s", "pulse_length_s"), scan.shutter.pulse_s, strict=True))
+        pulse["dark_lines"] = int(np.count_nonzero(scan.shutter.lit_share(scan.lines) == 0))
     return {
         "title": scan.title, **counts, "data": f"{header.data_type} {header.quantity}",
         "fly_scan": scan.is_fly, "trajectory": _trajectory_word(scan),
         **({"geometry": "parallel beam"} if scan.is_parallel else {}), **vars(scan.geometry),
-        **_timing_facts(scan), "detector_model": scan.detector_model, **_panel_facts(scan),
+        **_timing_facts(scan), "detector_model": scan.detector_model, **pulse,
+        **({"lag": scan.lag} if scan.lag > 0 else {}),
         "pixel_mask": header.mask_shape is not None, "grid_shape": scan.grid.shape,
         "grid_voxel_size_mm": scan.grid.voxel_size_mm, "grid_stored": header.has_grid,
         "reference": header.has_reference, **({"true_states": header.states} if header.states else {}),
@@ -115,16 +116,6 @@ def _timing_facts(scan: Scan) -> dict[str, object]:
         marks_s = scan.frame_start_s[0] + np.array([0.0, shutter.exposure_s, shutter.span_s])
         first, closed, done = np.rad2deg(scan.trajectory.angle_rad(0, marks_s)).tolist()
         facts["exposure_arc_deg"], facts["span_arc_deg"] = closed - first, done - first
-    return facts
-
-
-def _panel_facts(scan: Scan) -> dict[str, object]:
-    facts: dict[str, object] = {}
-    if scan.shutter.pulse_s is not None:
-        facts["pulse_start_s"], facts["pulse_length_s"] = scan.shutter.pulse_s
-        facts["dark_lines"] = int(np.count_nonzero(scan.shutter.lit_share(scan.lines) == 0))
-    if scan.lag > 0:
-        facts["lag"] = scan.lag
     return facts
 
 

@@ -14,7 +14,7 @@ from phyradgs_cl import checks
 from phyradgs_cl.acquisition import ConeGeometry, PoseTable, Scan
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.io import scan as schema
-from phyradgs_cl.io.deformation import write_truth
+from phyradgs_cl.io.deformation import write_packed, write_truth
 from phyradgs_cl.io.hdf5 import datasets as h5
 from phyradgs_cl.io.hdf5 import open_hdf5
 from phyradgs_cl.io.output import written_beside
@@ -49,7 +49,11 @@ def write_scan(
         _write_instrument(entry, scan, frames, key, quantity, frame_of)
         _write_extra(entry, scan, frame_of)
         write_motion(entry, scan, frame_of)
-        _write_links(entry)
+        links = h5.new_group(entry, "data", "NXdata")
+        links.attrs["signal"] = "data"
+        links.attrs["axes"] = ["rotation_angle", ".", "."]
+        for place in (schema.DATA, f"{schema.DETECTOR}/image_key", f"{schema.SAMPLE}/rotation_angle"):
+            links[place.rpartition("/")[2]] = h5py.SoftLink(f"/entry/{place}")
 
 
 def _checked_frames(
@@ -131,18 +135,8 @@ def _write_extra(entry: h5py.Group, scan: Scan, frame_of: np.ndarray) -> None:
     if scan.metal is not None:
         group = h5.new_group(extra, "metal", "NXcollection")
         h5.write_grid(group, scan.metal.grid)
-        packed = group.create_dataset("volume", data=scan.metal.values, compression="gzip", shuffle=True)
-        packed.attrs["units"] = "1/mm"
+        write_packed(group, "volume", scan.metal.values)
     write_gating(extra, scan, frame_of)
-
-
-def _write_links(entry: h5py.Group) -> None:
-    group = h5.new_group(entry, "data", "NXdata")
-    group.attrs["signal"] = "data"
-    group.attrs["axes"] = ["rotation_angle", ".", "."]
-    group["data"] = h5py.SoftLink(f"/entry/{schema.DETECTOR}/data")
-    group["image_key"] = h5py.SoftLink(f"/entry/{schema.DETECTOR}/image_key")
-    group["rotation_angle"] = h5py.SoftLink(f"/entry/{schema.SAMPLE}/rotation_angle")
 
 
 def copy_with_offset(source: str | Path, target: str | Path, shift_u_mm: float) -> None:
@@ -169,8 +163,12 @@ def copy_with_motion(source: str | Path, target: str | Path, scan: Scan) -> None
     stated, scan = header.scan, storable(scan)
     frame_of = np.clip(np.cumsum(header.image_key == schema.PROJECTION) - 1, 0, None)
     with _copied(source, target, header.entry) as entry:
-        if scan.geometry != stated.geometry:
-            _replace_geometry(entry, scan)
+        if (geometry := scan.geometry) != stated.geometry:
+            _replace(entry[schema.EXTRA], "detector_offset", np.array(geometry.detector_offset_mm), "mm")
+            if isinstance(geometry, ConeGeometry):
+                behind_mm = geometry.source_to_detector_mm - geometry.source_to_axis_mm
+                _replace(entry[schema.SOURCE], "distance", -geometry.source_to_axis_mm, "mm")
+                _replace(entry[schema.DETECTOR], "distance", behind_mm, "mm")
         if scan.shutter != stated.shutter:
             detector = entry[schema.DETECTOR]
             _replace(detector, "count_time", scan.shutter.exposure_s, "s")
@@ -207,16 +205,6 @@ def _copied(source: str | Path, target: str | Path, entry: str) -> Iterator[h5py
             if schema.EXTRA not in group:
                 h5.new_group(group, schema.EXTRA, "NXcollection")
             yield group
-
-
-def _replace_geometry(entry: h5py.Group, scan: Scan) -> None:
-    geometry = scan.geometry
-    _replace(entry[schema.EXTRA], "detector_offset", np.array(geometry.detector_offset_mm), "mm")
-    if not isinstance(geometry, ConeGeometry):
-        return
-    behind_mm = geometry.source_to_detector_mm - geometry.source_to_axis_mm
-    _replace(entry[schema.SOURCE], "distance", -geometry.source_to_axis_mm, "mm")
-    _replace(entry[schema.DETECTOR], "distance", behind_mm, "mm")
 
 
 def _remove(group: h5py.Group, *names: str) -> None:
