@@ -29,15 +29,7 @@ their last lines, and the order that sorts the cells by first line."""
 
 def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
     """Returns one cell for all lines, with the pose midway between first and last light: the best time for a single pose."""
-    return _single_cell(trajectory, shutter, frame, start_s + shutter.middle_s, lines)
-
-
-def static_start_cells(
-    trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int
-) -> TimeCells:
-    """Returns one cell for all lines, with the pose at the frame's first light. A volume reconstructed from such cells is
-    rotated by half of the arc that the gantry turns between first and last light."""
-    return _single_cell(trajectory, shutter, frame, start_s + shutter.lit_span_s[0], lines)
+    return single_cell(trajectory, shutter, frame, start_s + shutter.middle_s, lines)
 
 
 def micro_view_cells(
@@ -245,7 +237,8 @@ def _turns_rad(pose: np.ndarray) -> np.ndarray:
     return np.asarray(np.max([2 * np.arcsin(chord.clip(0, 2) / 2) for chord in chords], axis=0))
 
 
-def _single_cell(trajectory: Trajectory, shutter: Shutter, frame: int, time_s: float, lines: int) -> TimeCells:
+def single_cell(trajectory: Trajectory, shutter: Shutter, frame: int, time_s: float, lines: int) -> TimeCells:
+    """Returns one cell for all lines, with the pose at a time in s."""
     one = np.ones(1)
     return cell_table(trajectory, shutter, frame, time_s * one, 0 * one, lines * one, one, lines)
 

@@ -99,7 +99,8 @@ class StaticStart(_Model):
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """Returns the ``TimeCells`` of one frame: one cell, at first light."""
-        return cells.static_start_cells(*_place(scan, frame))
+        first_s = float(scan.frame_start_s[frame]) + scan.shutter.lit_span_s[0]
+        return cells.single_cell(scan.trajectory, scan.shutter, frame, first_s, scan.lines)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition.geometry import ConeGeometry
 from phyradgs_cl.acquisition.scan import Scan
-from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_parallel
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, DerivedTrajectory
 
 
 @dataclass(frozen=True)
@@ -77,18 +77,13 @@ def splines(fraction: np.ndarray, count: int) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class PerturbedTrajectory:
+class PerturbedTrajectory(DerivedTrajectory):
     """Poses of ``base`` changed by ``correction``, for a panel of ``shape`` (rows, columns). ``views`` adds corrections of
     single views (``Views``) or a motion of the object (``Sway``)."""
 
-    base: Trajectory
     shape: tuple[int, int]
     correction: GeometryCorrection
     views: "Views | Sway | None" = None
-
-    @property
-    def is_parallel(self) -> bool:
-        return is_parallel(self.base)
 
     @cached_property
     def _turn(self) -> np.ndarray:

@@ -15,6 +15,7 @@ from phyradgs_cl.acquisition.trajectory import (
     EncoderTable,
     PoseTable,
     Trajectory,
+    continued,
     unwrapped,
 )
 from phyradgs_cl.errors import InputError
@@ -83,16 +84,13 @@ def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, i
     middle_s = first_s + (np.arange(scan.frames) + 0.5) * step_s
     own_s = scan.middle_times_s
     if isinstance(scan.trajectory, CircularOrbit):
-        angle_rad = np.array([scan.trajectory.angle_rad(f, np.array(t)) for f, t in enumerate(own_s)])
-        angle_rad = unwrapped(angle_rad)
+        angle_rad = unwrapped(np.array([scan.trajectory.angle_rad(f, np.array(t)) for f, t in enumerate(own_s)]))
         rim_px = np.abs(np.diff(angle_rad)).mean() * scan.geometry.detector_shape[1] / 2
         if rim_px > 1:
             text = "the rim moves by %.3g pixels from projection to projection: a sum has as many images of it, not a smear"
             log.warning(text, rim_px)
-        ends_rad = angle_rad[[0, -1]] + np.diff(angle_rad)[[0, -1]] * (-0.5, 0.5)
-        time_s = np.concatenate([middle_s[:1] - step_s / 2, middle_s, middle_s[-1:] + step_s / 2])
-        table = EncoderTable(time_s, np.concatenate([ends_rad[:1], angle_rad, ends_rad[1:]]))
-        return CircularOrbit(scan.trajectory.geometry, table), 0
+        orbit = CircularOrbit(scan.trajectory.geometry, EncoderTable(middle_s, angle_rad))
+        return continued(orbit, step_s / 2), 0
     poses = np.concatenate([scan.trajectory.pose(f, np.array([t])) for f, t in enumerate(own_s)])
     return PoseTable(middle_s, poses, is_parallel=scan.is_parallel), 1
 
