@@ -13,7 +13,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad
-from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, scan_course, splines
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, splines
 from phyradgs_cl.calibrate.problem import CoarseProblem, PassCounter, Passes, Stage, pass_cost
 from phyradgs_cl.calibrate.result import AGREES, CORRECTED, ParameterEstimate
 from phyradgs_cl.detector import noise_level
@@ -84,7 +84,8 @@ class WobbleParameters(PerViewParameters):
     def of(cls, scan: Scan, count: int = 0) -> "WobbleParameters":
         """Returns a wobble of 0 in ``count`` splines of time, or with separate parameters of each view if ``count`` is 0."""
         if count:
-            basis = splines(scan_course(scan) + 0.5, count)
+            starts_s = np.asarray(scan.frame_start_s) - np.min(scan.frame_start_s)
+            basis = splines(starts_s / max(starts_s.max(), 1e-30), count)
             circle = _fitted_circle(scan, basis)
         else:
             basis, circle = np.eye(scan.frames), _circle(scan)

@@ -160,9 +160,3 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
     readout_s, exposure_s = shutter.readout_s + correction.readout_s, shutter.exposure_s + correction.exposure_s
     shutter = replace(shutter, readout_s=readout_s, exposure_s=exposure_s)
     return replace(scan, geometry=geometry, trajectory=trajectory, shutter=shutter)
-
-
-def scan_course(scan: Scan) -> np.ndarray:
-    """Returns (t − t_first) / (t_last − t_first) − 1/2, (F,), where t is the time at which a frame begins."""
-    starts_s = np.asarray(scan.frame_start_s, np.float64)
-    return np.asarray((starts_s - starts_s.min()) / max(np.ptp(starts_s), 1e-30) - 0.5)

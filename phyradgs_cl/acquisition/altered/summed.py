@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from phyradgs_cl import checks
+from phyradgs_cl.acquisition.cells import shares_of_windows
 from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import AXES, Shutter
@@ -50,7 +51,8 @@ def sum_frames(
         found = f"{count} with a readout of {readout_ratio:g} exposures"
         raise InputError("count", found, f"exposure and readout within the scan's {scan.frames} projections")
     starts = skipped + count * np.arange(frames)
-    share = _shares(shutter.delay_s(shutter.lines(scan.geometry.detector_shape)) / step_s, count)
+    windows = shutter.line_windows_s(shutter.lines(scan.geometry.detector_shape)) / step_s
+    share = shares_of_windows(windows, np.arange(np.ceil(windows.max() - 1e-9) + 1))
     summed = [_sum(scan, int(start), share, shutter.readout) for start in starts]
     mask = scan.pixel_mask
     if mask is not None and mask.ndim == 3:
@@ -95,21 +97,13 @@ def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, i
     return PoseTable(middle_s, poses, is_parallel=scan.is_parallel), 1
 
 
-def _shares(delay: np.ndarray, count: int) -> np.ndarray:
-    """Returns the fraction (projections, lines) of each projection's interval in which each line is exposed. delay (lines,):
-    (time from the frame's start to a line's opening) / (interval). count: (exposure) / (interval)."""
-    number = np.arange(int(np.ceil(delay.max() - 1e-9)) + count)[:, None]
-    overlap = np.minimum(number + 1, delay + count) - np.maximum(number, delay)
-    return np.where(overlap > 1e-9, overlap, 0.0)
-
-
 def _sum(scan: Scan, start: int, share: np.ndarray, readout: Readout) -> tuple[np.ndarray, np.ndarray]:
     """Returns a frame's line integrals and masked pixels, both (rows, columns). The frame sums the intensities of
-    projections from ``start`` on, times the fractions ``share`` (projections, lines). A pixel is masked if any of these
+    projections from ``start`` on, weighted by ``share`` (projections, lines). A pixel is masked if any of these
     projections masks it."""
     total, is_masked = np.zeros(scan.projections.shape[1:]), np.zeros(scan.projections.shape[1:], bool)
     for number, lines in enumerate(share, start):
         of_lines = np.broadcast_to(readout.spread(lines), total.shape)
         total += of_lines * np.exp(-scan.projections[number].astype(np.float64))
         is_masked |= ~scan.valid[number] & (of_lines > 0)
-    return (-np.log(total / share.sum(0).mean())).astype(np.float32), is_masked
+    return (-np.log(total)).astype(np.float32), is_masked
