@@ -7,13 +7,16 @@ Operators take poses, never angles."""
 import math
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 POSE_LENGTH = 12
 # Largest distance of the source from the axis, in voxels. At this distance float32 displaces rays by 6 % of a voxel, at 1e7
@@ -24,21 +27,18 @@ _MOST_VOXELS_AWAY = 1e6
 _STEEP = 1e-2
 
 
-P = TypeVar("P", bound="_Panel")
-
-
 class _Panel:
     """What the geometries of both beams share: the panel's fields and changes of their scale."""
 
     detector_shape: tuple[int, int]
     pixel_size_mm: tuple[float, float]
 
-    def scaled(self: P, factor: float) -> P:
+    def scaled(self, factor: float) -> "Self":
         """Returns the geometry with every length multiplied by ``factor``."""
         lengths = {name: np.multiply(value, factor).tolist() for name, value in vars(self).items() if name.endswith("_mm")}
         return replace(self, **lengths)  # type: ignore[type-var]
 
-    def finer(self: P, factor: int) -> P:
+    def finer(self, factor: int) -> "Self":
         """Returns the geometry with every pixel divided into ``factor`` by ``factor``."""
         (rows, columns), (dv, du) = self.detector_shape, self.pixel_size_mm
         panel = {"detector_shape": (rows * factor, columns * factor), "pixel_size_mm": (dv / factor, du / factor)}
