@@ -53,7 +53,7 @@ def blur_facts(scan: "Scan") -> dict[str, float]:
         return {}
     windows_s = scan.shutter.line_windows_s(scan.lines)
     lit_s = windows_s[np.argmax(np.diff(windows_s)[:, 0])]
-    angle_rad = source_angle_rad(scan, *lit_s)
+    angle_rad = _source_angle_rad(scan, *lit_s)
     arc_rad = abs(float(np.median(angle_rad[:, -1] - angle_rad[:, 0])))
     columns = scan.geometry.detector_shape[1]
     aside = abs(scan.geometry.detector_offset_mm[1] / scan.geometry.pixel_size_mm[1])
@@ -83,7 +83,7 @@ def _frame_time_s(scan: "Scan") -> float:
     return float(np.median(np.diff(scan.frame_start_s))) if scan.frames > 1 else math.nan
 
 
-def source_angle_rad(scan: "Scan", first_s: float, last_s: float) -> np.ndarray:
+def _source_angle_rad(scan: "Scan", first_s: float, last_s: float) -> np.ndarray:
     """Returns the source's angles (F, 17) in rad about the axis, without jumps by a turn, at even times from ``first_s`` to
     ``last_s`` after each frame's start. In a parallel beam they are the angles against the direction of the rays."""
     delay_s = np.linspace(first_s, last_s, _TIMES)
@@ -109,7 +109,7 @@ def _timing(scan: "Scan") -> str:
         parts.append(marked("all lines at once", "readout"))
     if "exposure" not in assumed and scan.frames > 1:
         parts.append(f"{1 / _frame_time_s(scan):.4g} fps")
-    angle_rad = source_angle_rad(scan, 0.0, shutter.exposure_s)
+    angle_rad = _source_angle_rad(scan, 0.0, shutter.exposure_s)
     arc_deg = abs(float(np.rad2deg(np.median(angle_rad[:, -1] - angle_rad[:, 0]))))
     parts.append(f"exposure {arc_deg:.4g}° in " + marked(f"{1000 * shutter.exposure_s:.4g} ms", "exposure"))
     if "angles" in assumed:
@@ -147,7 +147,7 @@ def check_plausible(scan: "Scan", named: Named = str, is_timed: bool = True) -> 
     times, so that the frame rate means nothing."""
     _check_panel(scan.geometry, named)
     _check_voxels(scan.grid, scan.geometry, named("grid"))
-    angle_deg = np.rad2deg(np.unwrap(source_angle_rad(scan, 0.0, scan.shutter.exposure_s)[:, 0]))
+    angle_deg = np.rad2deg(np.unwrap(_source_angle_rad(scan, 0.0, scan.shutter.exposure_s)[:, 0]))
     looks_like_radians = _warn_of_radians(angle_deg, named("angles"))
     if scan.is_fly and scan.frames > 1 and not looks_like_radians:
         exposure_s, frame_s = scan.shutter.exposure_s, _frame_time_s(scan)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from phyradgs_cl import checks
-from phyradgs_cl.acquisition.plausible import source_angle_rad
+from phyradgs_cl.acquisition.geometry import towards_source
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.drawing import ACCENT, EDGE, EXPOSED, FAINT, SAMPLE, SOFT, draw_image, new_figure, style_axes
 
@@ -43,7 +43,9 @@ def plot_frame(scan: "Scan", frame: int = 0) -> "Figure":
     windows.plot(lit_s, [middle, middle], color=SAMPLE, lw=2, label=f"{shutter.axis[:-1]} {middle}")
     windows.set_ylim(-0.5, scan.lines - 0.5)
     windows.legend(fontsize=7, loc="upper left" if shutter.direction > 0 else "lower left")
-    first_deg, last_deg = np.rad2deg(source_angle_rad(scan, 0.0, shutter.span_s)[frame, [0, -1]])
+    poses = scan.trajectory.pose(frame, scan.frame_start_s[frame] + np.array([0.0, shutter.span_s]))
+    source = towards_source(poses, scan.is_parallel)
+    first_deg, last_deg = np.rad2deg(np.unwrap(np.arctan2(source[:, 1], source[:, 0])))
     windows.set_title(f"gantry from {first_deg:.1f}° to {last_deg:.1f}°", fontsize=9)
     return figure
 

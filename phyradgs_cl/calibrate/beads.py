@@ -60,19 +60,20 @@ class BeadOperator:
         # a table has one pose for all lines, or S poses for each line, one line after the other
         lengths = [table.line_stop - table.line_start for table in self.tables]
         tables = list(zip(self.tables, lengths, strict=True))
-        pose = np.concatenate([np.repeat(table.pose, length, axis=0) for table, length in tables]).reshape(-1, 4, 3)
+        readout = self.tables[0].readout
+        pose = np.concatenate([np.repeat(readout.poses(table.pose), length, axis=0) for table, length in tables])
+        pose = pose.reshape(-1, 4, 3)
         weight = np.stack([np.repeat(table.weight, length).reshape(table.lines, -1) for table, length in tables])
         frames, lines, samples = weight.shape
         turn = Rotation.from_rotvec(placement[:3]).as_matrix()
         places, steps = pose[:, :2] - placement[3:DENSITY], pose[:, 2:]
         if self.tables[0].is_parallel:
             places[:, 0] = pose[:, 0]  # a shift of the phantom does not change the direction of parallel rays
-        is_rows = self.tables[0].axis == "rows"
         panel_lines = _PanelLines(
-            source=places[:, 0] @ turn, first=places[:, 1] @ turn, line_step=steps[:, int(is_rows)] @ turn,
-            pixel_step=steps[:, 1 - int(is_rows)] @ turn,
+            source=places[:, 0] @ turn, first=places[:, 1] @ turn, line_step=steps[:, 1] @ turn,
+            pixel_step=steps[:, 0] @ turn,
             line=np.tile(np.repeat(np.arange(lines), samples), frames),
-            pixels=self.shape[1] if is_rows else self.shape[0],
+            pixels=readout.shape(self.shape)[1],
             is_parallel=self.tables[0].is_parallel,
         )
         total = np.zeros((frames, lines, panel_lines.pixels))
@@ -82,7 +83,7 @@ class BeadOperator:
         expected = total if self.model == "log" else -np.log(np.maximum(total, TRANSMISSION_FLOOR))
         if self.clipped_noise > 0:
             expected = _mean_of_clipped(expected, self.clipped_noise)
-        return np.ascontiguousarray(expected if is_rows else expected.swapaxes(1, 2), np.float32)
+        return np.ascontiguousarray(readout.frames(expected), np.float32)
 
 
 def _mean_of_clipped(p: np.ndarray, sigma: float) -> np.ndarray:

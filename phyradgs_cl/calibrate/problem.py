@@ -222,14 +222,16 @@ class CoarseProblem(CoarseFrames):
         self, operator: RayOperator, volume: np.ndarray, images: Sequence[np.ndarray], iterations: int
     ) -> list[np.ndarray]:
         """Returns the part of each image (F, rows, columns) that no volume explains, after ``iterations`` of CGLS."""
-        methods = [Cgls(System(operator, self.masked(image), self.valid)) for image in images]
-        for method in methods:
+        residuals = []
+        for image in images:
+            method = Cgls(System(operator, self.masked(image), self.valid))
             for _ in range(iterations):
                 if method.finished:
                     break
                 method.step()
                 self.count_pass()
-        return [method.residual for method in methods]
+            residuals.append(method.residual)
+        return residuals
 
 
 def _around_view(grid: Grid, geometry: Geometry, reach: float) -> Grid:
