@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from phyradgs_cl.phantoms.implicit import Capsule, Lattice, capsule_distance, ellipsoid_distance, texture
+from phyradgs_cl.phantoms.implicit import Capsule, Lattice, capsule_distance, ratio_distance, texture
 
 
 def test_covered_voxels_hold_the_volumes_of_a_capsule_and_an_ellipsoid() -> None:
@@ -11,7 +11,7 @@ def test_covered_voxels_hold_the_volumes_of_a_capsule_and_an_ellipsoid() -> None
     lattice = Lattice(48)
     x, y, z = lattice.points((slice(0, 48),) * 3)
     capsule = capsule_distance(Capsule((-0.3, 0, 0.1), (0.4, 0, 0.1), 0.25, 0.25), x, y, z)
-    ellipsoid = ellipsoid_distance((0.1, 0.0, -0.2), (0.6, 0.3, 0.4), x, y, z)
+    ellipsoid = ratio_distance((x - 0.1, y, z + 0.2), (0.6, 0.3, 0.4))
     value = ((x - 0.1) / 0.6) ** 2 + (y / 0.3) ** 2 + ((z + 0.2) / 0.4) ** 2
     assert ((ellipsoid < 0) == (value < 1)).mean() > 0.9999
     exact = np.pi * 0.25**2 * 0.7 + 4 / 3 * np.pi * 0.25**3, 4 / 3 * np.pi * 0.6 * 0.3 * 0.4
