@@ -77,7 +77,8 @@ def _entry(name: str, thing: object, heading: str) -> Iterator[str]:
     yield f"```python\n{name}{signature}\n```\n"
     yield f"```text\n{inspect.getdoc(thing) or ''}\n```\n"
     if inspect.isclass(thing):
-        for member, value in vars(thing).items():
+        bases = [base for base in thing.__mro__ if base is thing or base.__name__.startswith("_")]
+        for member, value in (item for base in bases for item in vars(base).items()):
             function = value.__func__ if isinstance(value, classmethod | staticmethod) else value
             if not member.startswith("_") and inspect.isfunction(function):
                 yield from _entry(f"{name}.{member}", function, "### ")

@@ -4,7 +4,6 @@ A time cell is one pose, or one segment of time, with the detector lines that ar
 time from a frame's first light on the panel to its last. A line's "window" is the time in which it receives light."""
 
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -22,22 +21,9 @@ _HARMLESS_PEAK = 4.0  # up to this line integral, averaging intensities needs no
 _MOST_SEGMENTS = 1000  # most segments that ``segments_for`` chooses for a frame
 
 
-Served = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-"""Four arrays about the time cells that serve at least one line: the cells' indices, their first lines, the lines after
-their last lines, and the order that sorts the cells by first line."""
-
-
 def static_cells(trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int) -> TimeCells:
     """Returns one cell for all lines, with the pose midway between first and last light: the best time for a single pose."""
-    return _single_cell(trajectory, shutter, frame, start_s + shutter.middle_s, lines)
-
-
-def static_start_cells(
-    trajectory: Trajectory, shutter: Shutter, frame: int, start_s: float, lines: int
-) -> TimeCells:
-    """Returns one cell for all lines, with the pose at the frame's first light. A volume reconstructed from such cells is
-    rotated by half of the arc that the gantry turns between first and last light."""
-    return _single_cell(trajectory, shutter, frame, start_s + shutter.lit_span_s[0], lines)
+    return single_cell(trajectory, shutter, frame, start_s + shutter.middle_s, lines)
 
 
 def micro_view_cells(
@@ -104,28 +90,16 @@ def common_time_cells(
     step_s = length_s / samples
     if length_s <= 0 or last_s - first_s > lines * step_s:
         return per_line_cells(trajectory, shutter, frame, start_s, lines, samples if length_s > 0 else 1)
-    edges_s, share, (used, line_start, line_stop, order) = _common_shares(windows_s.tobytes(), samples)
+    edges_s = first_s + step_s * np.arange(np.ceil((last_s - first_s) / step_s - _SAME_TIME) + 1)
+    share = shares_of_windows(windows_s, edges_s)
+    used, line_start, line_stop, order = _served_lines(share > 0)
     latest_s = float(np.max(frame_start_s)) + last_s - step_s / 2  # the trajectory may have no poses after the last light
     middle_s = np.minimum(_middles_s(frame_start_s, frame, edges_s), latest_s)[used]
     table = cell_table(trajectory, shutter, frame, middle_s, line_start, line_stop, np.ones(used.size), lines)
     return replace(table, line_share=share[used][order])
 
 
-@lru_cache(maxsize=8)  # the lines' windows are the same in all frames of a scan
-def _common_shares(windows: bytes, samples: int) -> tuple[np.ndarray, np.ndarray, Served]:
-    """Returns the edges (K + 1,) in s of K cells, the fraction (K, lines) of each line's window in each, and ``Served``.
-
-    windows: the windows (lines, 2) in s after a frame's start, as bytes, because the cache takes no arrays as keys. The
-    returned arrays stay in the cache: do not write to them."""
-    windows_s = np.frombuffer(windows, np.float64).reshape(-1, 2)
-    first_s, last_s = float(windows_s.min()), float(windows_s.max())
-    step_s = float(np.ptp(windows_s, axis=1).max()) / samples
-    edges_s = first_s + step_s * np.arange(np.ceil((last_s - first_s) / step_s - _SAME_TIME) + 1)
-    share = _shares(windows_s, edges_s)
-    return edges_s, share, _served_lines(share > 0)
-
-
-def _served_lines(served: np.ndarray) -> Served:
+def _served_lines(served: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Returns the indices of the cells that serve any line, these cells' first lines, the lines after their last lines, and
     the order that sorts them by first line. served: whether each of K cells serves each line, bool (K, lines)."""
     used = np.flatnonzero(served.any(axis=1))
@@ -148,7 +122,7 @@ def _middles_s(frame_start_s: np.ndarray, frame: int, edges_s: np.ndarray) -> np
     return np.asarray(start_s + edges_s[0] + number * step_s)
 
 
-def _shares(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
+def shares_of_windows(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     """Returns the fraction (K, lines) of each line's window (lines, 2) in each cell, whose edges are ``edges_s`` (K + 1,).
     The fractions of a line sum to 1."""
     opens, closes = windows_s.T
@@ -195,7 +169,10 @@ def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     length_s = edges_s[1] - edges_s[0]
     count = len(edges_s) - 1
     opens, closes = ((windows_s - edges_s[0]) / length_s).T  # times after first light / length of a segment
-    first, last = _segments_of_lines(opens, closes, count)
+    first = np.clip(np.floor(opens), 0, count - 1)
+    last = np.clip(np.ceil(closes) - 1, first, count - 1)
+    first = np.where((first < last) & (first + 1 - opens <= _OVERHANG), first + 1, first)
+    last = np.where((first < last) & (closes - last <= _OVERHANG), last - 1, last)
     index = np.arange(count)[:, None]
     start = np.where(index == first, opens, index)
     stop = np.where(index == last, closes, index + 1)
@@ -204,18 +181,6 @@ def _line_times(windows_s: np.ndarray, edges_s: np.ndarray) -> np.ndarray:
     share = np.where(instant, 1.0, (stop - start) / np.where(instant, 1.0, closes - opens))
     rows = ((start + stop) / 2 - index - 0.5, (stop - start) / 2, share)
     return np.stack([np.where(served, row, 0.0) for row in rows], 1)
-
-
-def _segments_of_lines(opens: np.ndarray, closes: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the indices (lines,) of the first and last segment of every line's window, as ``_line_times`` counts them.
-
-    opens, closes (lines,): the ends of the windows, in lengths of a segment after the frame's first light. count: the number
-    of segments."""
-    first = np.clip(np.floor(opens), 0, count - 1)
-    last = np.clip(np.ceil(closes) - 1, first, count - 1)
-    first = np.where((first < last) & (first + 1 - opens <= _OVERHANG), first + 1, first)
-    last = np.where((first < last) & (closes - last <= _OVERHANG), last - 1, last)
-    return first, last
 
 
 def segments_for(
@@ -245,7 +210,8 @@ def _turns_rad(pose: np.ndarray) -> np.ndarray:
     return np.asarray(np.max([2 * np.arcsin(chord.clip(0, 2) / 2) for chord in chords], axis=0))
 
 
-def _single_cell(trajectory: Trajectory, shutter: Shutter, frame: int, time_s: float, lines: int) -> TimeCells:
+def single_cell(trajectory: Trajectory, shutter: Shutter, frame: int, time_s: float, lines: int) -> TimeCells:
+    """Returns one cell for all lines, with the pose at a time in s."""
     one = np.ones(1)
     return cell_table(trajectory, shutter, frame, time_s * one, 0 * one, lines * one, one, lines)
 

@@ -7,13 +7,16 @@ Operators take poses, never angles."""
 import math
 from dataclasses import dataclass, replace
 from numbers import Real
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 POSE_LENGTH = 12
 # Largest distance of the source from the axis, in voxels. At this distance float32 displaces rays by 6 % of a voxel, at 1e7
@@ -24,8 +27,26 @@ _MOST_VOXELS_AWAY = 1e6
 _STEEP = 1e-2
 
 
+class _Panel:
+    """What the geometries of both beams share: the panel's fields and changes of their scale."""
+
+    detector_shape: tuple[int, int]
+    pixel_size_mm: tuple[float, float]
+
+    def scaled(self, factor: float) -> "Self":
+        """Returns the geometry with every length multiplied by ``factor``."""
+        lengths = {name: np.multiply(value, factor).tolist() for name, value in vars(self).items() if name.endswith("_mm")}
+        return replace(self, **lengths)  # type: ignore[type-var]
+
+    def finer(self, factor: int) -> "Self":
+        """Returns the geometry with every pixel divided into ``factor`` by ``factor``."""
+        (rows, columns), (dv, du) = self.detector_shape, self.pixel_size_mm
+        panel = {"detector_shape": (rows * factor, columns * factor), "pixel_size_mm": (dv / factor, du / factor)}
+        return replace(self, **panel)  # type: ignore[type-var]
+
+
 @dataclass(frozen=True)
-class ConeGeometry:
+class ConeGeometry(_Panel):
     """A circular cone-beam orbit about +z with a flat panel, in mm.
 
     ``source_to_axis_mm`` and ``source_to_detector_mm`` are measured along the central ray. ``detector_shape`` is (rows,
@@ -56,15 +77,6 @@ class ConeGeometry:
         panel[..., :3] -= (self.source_to_detector_mm - self.source_to_axis_mm) * radial
         return np.concatenate([self.source_to_axis_mm * radial, panel], -1)
 
-    def scaled(self, factor: float) -> "ConeGeometry":
-        """Returns the geometry with every length multiplied by ``factor``."""
-        distances = {name: getattr(self, name) * factor for name in ("source_to_axis_mm", "source_to_detector_mm")}
-        return replace(self, **distances, **_scaled_panel(self, factor))
-
-    def finer(self, factor: int) -> "ConeGeometry":
-        """Returns the geometry with every pixel divided into ``factor`` by ``factor``."""
-        return replace(self, **_finer_panel(self, factor))
-
     @property
     def magnification(self) -> float:
         """source_to_detector_mm / source_to_axis_mm: the factor by which the panel shows an object at the axis enlarged."""
@@ -72,7 +84,7 @@ class ConeGeometry:
 
 
 @dataclass(frozen=True)
-class ParallelGeometry:
+class ParallelGeometry(_Panel):
     """A circular parallel-beam orbit about +z with a flat panel across the rays, in mm.
 
     The panel's distance does not matter, so its plane is taken to contain the axis. ``detector_shape`` is (rows, columns).
@@ -93,14 +105,6 @@ class ParallelGeometry:
         of a cone beam does at the same angle."""
         radial, panel = _panel_at(self, angle_rad)
         return np.concatenate([-radial, panel], -1)
-
-    def scaled(self, factor: float) -> "ParallelGeometry":
-        """Returns the geometry with every length multiplied by ``factor``."""
-        return replace(self, **_scaled_panel(self, factor))
-
-    def finer(self, factor: int) -> "ParallelGeometry":
-        """Returns the geometry with every pixel divided into ``factor`` by ``factor``."""
-        return replace(self, **_finer_panel(self, factor))
 
     @property
     def magnification(self) -> float:
@@ -136,16 +140,6 @@ def _panel_at(geometry: Geometry, angle_rad: np.ndarray | float) -> tuple[np.nda
     (nv, nu), (dv, du), (off_v, off_u) = geometry.detector_shape, geometry.pixel_size_mm, geometry.detector_offset_mm
     first_pixel = (off_u - (nu - 1) / 2 * du) * u_hat + (off_v - (nv - 1) / 2 * dv) * v_hat
     return np.stack([cos, sin, zero], -1), np.concatenate([first_pixel, du * u_hat, dv * v_hat], -1)
-
-
-def _scaled_panel(geometry: Geometry, factor: float) -> dict[str, Any]:
-    (dv, du), (off_v, off_u) = geometry.pixel_size_mm, geometry.detector_offset_mm
-    return {"pixel_size_mm": (dv * factor, du * factor), "detector_offset_mm": (off_v * factor, off_u * factor)}
-
-
-def _finer_panel(geometry: Geometry, factor: int) -> dict[str, Any]:
-    (rows, columns), (dv, du) = geometry.detector_shape, geometry.pixel_size_mm
-    return {"detector_shape": (rows * factor, columns * factor), "pixel_size_mm": (dv / factor, du / factor)}
 
 
 def _positive_mm(name: str, value: object, shape: tuple[int, ...]) -> None:

@@ -17,7 +17,7 @@ from phyradgs_cl.acquisition.geometry import POSE_LENGTH
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.acquisition.trajectory import Trajectory
+from phyradgs_cl.acquisition.trajectory import Trajectory, body_frames
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Deformation
 
@@ -56,10 +56,7 @@ def _travel_mm(scan: Scan, frame: int, points_mm: np.ndarray) -> float:
     """Returns the largest travel in mm of points (P, 3), relative to the panel, while a frame's first line is exposed."""
     start_s = float(scan.frame_start_s[frame])
     pose = scan.trajectory.pose(frame, np.array([start_s, start_s + scan.shutter.exposure_s]))
-    panel, column, row = pose[:, 3:6], pose[:, 6:9], pose[:, 9:12]
-    u_hat, v_hat = (step / np.linalg.norm(step, axis=1, keepdims=True) for step in (column, row))
-    axes = np.stack([u_hat, v_hat, np.cross(u_hat, v_hat)], -1)
-    places = np.einsum("tpk,tkl->tpl", points_mm - panel[:, None], axes)
+    places = np.einsum("tpk,tkl->tpl", points_mm - pose[:, None, 3:6], body_frames(pose))
     return float(np.linalg.norm(places[1] - places[0], axis=-1).max())
 
 
@@ -99,7 +96,8 @@ class StaticStart(_Model):
 
     def cells(self, scan: Scan, frame: int) -> TimeCells:
         """Returns the ``TimeCells`` of one frame: one cell, at first light."""
-        return cells.static_start_cells(*_place(scan, frame))
+        first_s = float(scan.frame_start_s[frame]) + scan.shutter.lit_span_s[0]
+        return cells.single_cell(scan.trajectory, scan.shutter, frame, first_s, scan.lines)
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,9 @@ def plot_frame(scan: "Scan", frame: int = 0) -> "Figure":
     windows.plot(lit_s, [middle, middle], color=SAMPLE, lw=2, label=f"{shutter.axis[:-1]} {middle}")
     windows.set_ylim(-0.5, scan.lines - 0.5)
     windows.legend(fontsize=7, loc="upper left" if shutter.direction > 0 else "lower left")
-    first_deg, last_deg = _turned_deg(scan, frame)
+    poses = scan.trajectory.pose(frame, scan.frame_start_s[frame] + np.array([0.0, shutter.span_s]))
+    source = towards_source(poses, scan.is_parallel)
+    first_deg, last_deg = np.rad2deg(np.unwrap(np.arctan2(source[:, 1], source[:, 0])))
     windows.set_title(f"gantry from {first_deg:.1f}° to {last_deg:.1f}°", fontsize=9)
     return figure
 
@@ -63,11 +65,3 @@ def draw_windows(axes: "Axes", shutter: Shutter, lines: int, start_s: float = 0.
 
 def _outline(first_s: np.ndarray, last_s: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([first_s, last_s[::-1]]), np.concatenate([line, line[::-1]])
-
-
-def _turned_deg(scan: "Scan", frame: int) -> tuple[float, float]:
-    """Returns the source's angle about z in degrees when a frame's first line opens and when its last line closes."""
-    times_s = scan.frame_start_s[frame] + np.array([0.0, scan.shutter.span_s])
-    source = towards_source(scan.trajectory.pose(frame, times_s), scan.is_parallel)
-    first, last = np.rad2deg(np.unwrap(np.arctan2(source[:, 1], source[:, 0])))
-    return float(first), float(last)

@@ -1,6 +1,6 @@
 """The shutter: the times at which each detector line opens and closes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -98,6 +98,14 @@ class Shutter:
     def lines(self, detector_shape: tuple[int, int]) -> int:
         """Returns how many lines a panel (rows, columns) reads one after the other: its rows, or its columns."""
         return self.readout.shape(detector_shape)[0]
+
+    def of_lines(self, lines: int, first: int, stop: int, block: int = 1) -> tuple["Shutter", float]:
+        """Returns the shutter of only the lines [first, stop) of a panel's ``lines``, averaged over blocks of ``block``
+        lines, and how much later than the frame its first block opens, in s: at the mean of its lines' opening times."""
+        line_s = self.readout_s / max(lines - 1, 1)
+        later_s = ((first if self.direction > 0 else lines - stop) + (block - 1) / 2) * line_s
+        pulse_s = self.pulse_s and (self.pulse_s[0] - later_s, self.pulse_s[1])
+        return replace(self, readout_s=(stop - first - block) * line_s, pulse_s=pulse_s), later_s
 
     def delay_s(self, lines: int) -> np.ndarray:
         """Returns when each line opens, (lines,) in s after the frame's start."""

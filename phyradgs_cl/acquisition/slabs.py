@@ -46,10 +46,7 @@ def slab(scan: Scan, first: int, stop: int) -> Scan:
     panel = replace(geometry, detector_shape=(stop - first, geometry.detector_shape[1]), detector_offset_mm=offset_mm)
     later_s = 0.0
     if shutter.axis == "rows":
-        line_s = shutter.readout_s / max(rows - 1, 1)
-        later_s = (first if shutter.direction > 0 else rows - stop) * line_s
-        pulse_s = shutter.pulse_s and (shutter.pulse_s[0] - later_s, shutter.pulse_s[1])
-        shutter = replace(shutter, readout_s=(stop - first - 1) * line_s, pulse_s=pulse_s)
+        shutter, later_s = shutter.of_lines(rows, first, stop)
     mask = None if scan.pixel_mask is None else np.asarray(scan.pixel_mask)[..., first:stop, :]
     assert isinstance(scan.trajectory, CircularOrbit)
     return replace(

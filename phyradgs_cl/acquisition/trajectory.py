@@ -43,22 +43,27 @@ def is_parallel(trajectory: Trajectory) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class UserTrajectory:
-    """A user-defined trajectory, ``own``, whose poses are checked whenever they are computed."""
+class DerivedTrajectory:
+    """A trajectory whose poses are made from those of ``base``, a trajectory of the same beam."""
 
-    own: Trajectory
+    base: Trajectory
 
     @property
     def is_parallel(self) -> bool:
         """True for a parallel beam."""
-        return is_parallel(self.own)
+        return is_parallel(self.base)
+
+
+@dataclass(frozen=True, eq=False)
+class UserTrajectory(DerivedTrajectory):
+    """A user-defined trajectory, ``base``, whose poses are checked whenever they are computed."""
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         """Returns poses (..., 12) in mm of frame number ``frame`` at times (...) s; directions of parallel rays have length
         1. Raises InputError for poses of another shape, for numbers that are not finite, and for rays along the panel."""
         times_s = np.asarray(time_s, np.float64)
-        subject = f"trajectory {type(self.own).__name__}"
-        poses = checks.numbers(subject, self.own.pose(frame, times_s.ravel()), (times_s.size, POSE_LENGTH))
+        subject = f"trajectory {type(self.base).__name__}"
+        poses = checks.numbers(subject, self.base.pose(frame, times_s.ravel()), (times_s.size, POSE_LENGTH))
         poses = unit_directions(subject, poses) if self.is_parallel else poses
         return poses.reshape(*times_s.shape, POSE_LENGTH)
 
@@ -320,20 +325,15 @@ def behind_axis(geometry: Geometry, trajectory: Trajectory) -> tuple[Geometry, T
         return geometry, trajectory
     if geometry.source_to_detector_mm > (1 + _AT_AXIS) * geometry.source_to_axis_mm:
         return geometry, trajectory
-    pitch_mm, offset_mm = ((_AWAY * v, _AWAY * u) for v, u in (geometry.pixel_size_mm, geometry.detector_offset_mm))
-    scaled = replace(
-        geometry, source_to_detector_mm=_AWAY * geometry.source_to_detector_mm, pixel_size_mm=pitch_mm,
-        detector_offset_mm=offset_mm,
-    )  # fmt: skip
+    scaled = replace(geometry.scaled(_AWAY), source_to_axis_mm=geometry.source_to_axis_mm)
     if isinstance(trajectory, CircularOrbit):
         return scaled, replace(trajectory, geometry=scaled)
     if not isinstance(trajectory, PoseTable) or _is_off_axis(trajectory.table):
         return geometry, trajectory
-    source, panel = trajectory.table[:, :3], trajectory.table[:, 3:].reshape(-1, 3, 3).copy()
-    panel[:, 0] -= source
-    panel = _AWAY * panel
-    panel[:, 0] += source
-    return scaled, replace(trajectory, table=np.concatenate([source, panel.reshape(-1, 9)], 1))
+    table = trajectory.table.copy()
+    table[:, 3:6] = table[:, :3] + _AWAY * (table[:, 3:6] - table[:, :3])
+    table[:, 6:] *= _AWAY
+    return scaled, replace(trajectory, table=table)
 
 
 def _is_off_axis(poses: np.ndarray) -> bool:

@@ -19,12 +19,12 @@ from phyradgs_cl.acquisition.altered.angles import exposure_arc_rad
 from phyradgs_cl.acquisition.altered.coarse import MOST_FRAMES, binned, fewer_frames
 from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, perturb
 from phyradgs_cl.acquisition.time_cells import TimeCells
-from phyradgs_cl.calibrate.problem import CoarseFrames, Stage, measured_blocks, without_pixels
+from phyradgs_cl.calibrate.problem import CoarseFrames, Stage, frames_of
 from phyradgs_cl.detector.attenuation import TRANSMISSION_FLOOR
 from phyradgs_cl.phantoms import EllipsoidPhantom
 
 DENSITY = 6  # a placement (7,) is a turn (rotation vector, rad), a shift (mm) and, at this index, a factor of the density
-_MARGIN = 1.2  # the region searched for a bead's shadow is wider by this factor: an oblique panel widens shadows
+_MARGIN = 1.2  # the region searched for a bead's shadow is wider by this factor: perspective widens shadows
 # Fewest and most times of an exposure. Within these limits the grid's edge moves by at most a pixel between two times.
 _FEWEST_TIMES, _MOST_TIMES = 6, 24
 _FEWEST_RAYS = 2  # fewest rays along each side of a pixel, and along a bead's radius: sharp edges need several
@@ -57,18 +57,23 @@ class BeadOperator:
 
     def forward(self, placement: np.ndarray) -> np.ndarray:
         """Returns the phantom's frames at a placement (7,): turn (rotation vector, rad), shift (mm), and density factor."""
-        pose, weight = _poses_by_line(self.tables)
+        # a table has one pose for all lines, or S poses for each line, one line after the other
+        lengths = [table.line_stop - table.line_start for table in self.tables]
+        tables = list(zip(self.tables, lengths, strict=True))
+        readout = self.tables[0].readout
+        pose = np.concatenate([np.repeat(readout.poses(table.pose), length, axis=0) for table, length in tables])
+        pose = pose.reshape(-1, 4, 3)
+        weight = np.stack([np.repeat(table.weight, length).reshape(table.lines, -1) for table, length in tables])
         frames, lines, samples = weight.shape
         turn = Rotation.from_rotvec(placement[:3]).as_matrix()
         places, steps = pose[:, :2] - placement[3:DENSITY], pose[:, 2:]
         if self.tables[0].is_parallel:
             places[:, 0] = pose[:, 0]  # a shift of the phantom does not change the direction of parallel rays
-        is_rows = self.tables[0].axis == "rows"
         panel_lines = _PanelLines(
-            source=places[:, 0] @ turn, first=places[:, 1] @ turn, line_step=steps[:, int(is_rows)] @ turn,
-            pixel_step=steps[:, 1 - int(is_rows)] @ turn,
+            source=places[:, 0] @ turn, first=places[:, 1] @ turn, line_step=steps[:, 1] @ turn,
+            pixel_step=steps[:, 0] @ turn,
             line=np.tile(np.repeat(np.arange(lines), samples), frames),
-            pixels=self.shape[1] if is_rows else self.shape[0],
+            pixels=readout.shape(self.shape)[1],
             is_parallel=self.tables[0].is_parallel,
         )
         total = np.zeros((frames, lines, panel_lines.pixels))
@@ -78,26 +83,13 @@ class BeadOperator:
         expected = total if self.model == "log" else -np.log(np.maximum(total, TRANSMISSION_FLOOR))
         if self.clipped_noise > 0:
             expected = _mean_of_clipped(expected, self.clipped_noise)
-        return np.ascontiguousarray(expected if is_rows else expected.swapaxes(1, 2), np.float32)
+        return np.ascontiguousarray(readout.frames(expected), np.float32)
 
 
 def _mean_of_clipped(p: np.ndarray, sigma: float) -> np.ndarray:
     """Returns the mean of max(p + noise, 0) for normal noise of standard deviation ``sigma``; it exceeds p, most in air."""
     ratio = p / sigma
     return p * scipy.special.ndtr(ratio) + sigma * np.exp(-(ratio**2) / 2) / math.sqrt(2 * math.pi)
-
-
-def _poses_by_line(tables: Sequence[TimeCells]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns poses (F · lines · S, 4, 3) and weights (F, lines, S) of every line of every frame, at the line's S times."""
-    poses, weights = [], []
-    for table in tables:
-        counts = table.line_stop - table.line_start
-        cell = np.repeat(np.arange(table.count), counts)
-        line = table.line_start[cell] + np.arange(cell.size) - np.repeat(np.cumsum(counts) - counts, counts)
-        cell = cell[np.argsort(line, kind="stable")]
-        poses.append(table.pose[cell].reshape(-1, 4, 3))
-        weights.append(table.weight[cell].reshape(table.lines, -1))
-    return np.concatenate(poses), np.stack(weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,42 +130,31 @@ class _PanelLines:
             yield total
 
     @cached_property
-    def _panel_axes(self) -> tuple[tuple[np.ndarray, ...], ...]:
-        """Three vectors (N, 3), each with its inner products (N,) with the source and the first pixel, and its length (N,).
-
-        The first vector gives (a point's distance from the source) / (the panel's distance), both along the panel's normal.
-        The other two give the line and the pixel of the point's image. In a parallel beam the quotient counts as 1, and the
-        point's image is where its ray meets the panel."""
-        normal = np.cross(self.line_step, self.pixel_step)
-        to_panel = self.source if self.is_parallel else self.first - self.source
-        vectors = [normal / np.sum(normal * to_panel, -1, keepdims=True)]
-        vectors += [step / np.sum(step**2, -1, keepdims=True) for step in (self.line_step, self.pixel_step)]
-        if self.is_parallel:
-            vectors = [vector - np.sum(vector * self.source, -1, keepdims=True) * vectors[0] for vector in vectors]
-        products = [[np.sum(vector * place, -1) for place in (self.source, self.first)] for vector in vectors]
-        if self.is_parallel:
-            products[0][0] = -np.ones(len(self.line))
-        return tuple((v, *both, np.linalg.norm(v, axis=-1)) for v, both in zip(vectors, products, strict=True))
+    def _parts(self) -> np.ndarray:
+        """Matrices (N, 3, 3) that resolve vectors into parts along line_step, pixel_step and the ray to the first pixel."""
+        ray = self.source if self.is_parallel else self.first - self.source
+        return np.linalg.inv(np.stack([self.line_step, self.pixel_step, ray], -1))
 
     def _shadow(self, ends_mm: np.ndarray, reach_mm: float) -> tuple[np.ndarray, np.ndarray, int]:
         """Returns the indices (n,) of lines that may see a body, the first pixel (n,) of its shadow on each, and the widest
         shadow's width in pixels. The body lies within ``reach_mm`` of the segment between its ``ends_mm`` (2, 3)."""
-        (depth, depth_of_source, *_), *axes = self._panel_axes
         lowest, highest = [], []
         for end_mm in ends_mm:
-            magnification = 1 / (depth @ end_mm - depth_of_source)
-            for vector, of_source, of_first, per_mm in axes:
-                centre = of_source - of_first + magnification * (vector @ end_mm - of_source)
-                reach = _MARGIN * reach_mm * np.abs(magnification) * per_mm + 1
-                lowest.append(centre - reach)
-                highest.append(centre + reach)
-        line_from, pixel_from = (np.minimum(lowest[k], lowest[k + 2]) for k in (0, 1))
-        line_to, pixel_to = (np.maximum(highest[k], highest[k + 2]) for k in (0, 1))
+            parts = np.einsum("nij,nj->ni", self._parts, end_mm - (self.first if self.is_parallel else self.source))
+            place, slopes = parts[:, :2], self._parts[:, :2]  # line and pixel of the end's image, and their gradients per mm
+            if not self.is_parallel:
+                place = place / parts[:, 2:]
+                slopes = (slopes - place[..., None] * self._parts[:, 2:]) / parts[:, 2:, None]
+            reach = _MARGIN * reach_mm * np.linalg.norm(slopes, axis=-1) + 1
+            lowest.append(place - reach)
+            highest.append(place + reach)
+        (line_from, pixel_from), (line_to, pixel_to) = np.min(lowest, axis=0).T, np.max(highest, axis=0).T
         lines = np.flatnonzero(
             (self.line >= line_from) & (self.line <= line_to) & (pixel_to >= 0) & (pixel_from <= self.pixels - 1)
         )
-        first = np.clip(np.floor(pixel_from[lines]), 0, self.pixels - 1).astype(int)
-        last = np.clip(np.ceil(pixel_to[lines]), 0, self.pixels - 1).astype(int)
+        first, last = (
+            np.clip(ends[lines], 0, self.pixels - 1).astype(int) for ends in (np.floor(pixel_from), np.ceil(pixel_to))
+        )
         width = int((last - first).max(initial=0)) + 1
         return lines, np.minimum(first, self.pixels - width), width
 
@@ -195,11 +176,8 @@ class BeadProblem(CoarseFrames):
     ) -> "BeadProblem":
         block = stage.block(scans[0])
         fewer = [fewer_frames(scan, most_frames) for scan in scans]
-        measured, valid = measured_blocks([binned(scan, block) for scan in fewer])
-        return cls(
-            scans=[without_pixels(scan) for scan in fewer], block=block, measured=measured, valid=valid,
-            phantom=phantom, start=start, clipped_noise=_clipped_noise(fewer),
-        )
+        fields = frames_of(fewer, [binned(scan, block) for scan in fewer], block)
+        return cls(phantom=phantom, start=start, clipped_noise=_clipped_noise(fewer), **fields)
 
     def operator(self, correction: GeometryCorrection, views: Views | Sway | None = None) -> BeadOperator:
         tables: list[TimeCells] = []
@@ -227,7 +205,7 @@ class BeadProblem(CoarseFrames):
         """Returns 1 − Σ (``compared`` residual)² / Σ (``compared`` measurement)², the fraction that the phantom explains; 0
         unless the placement's density factor is above 0."""
         residual = self.compared(self.residual(operator, placement))
-        whole = self.compared(self.masked(self.measured))
+        whole = self.compared(self.measured)
         return float(1 - residual @ residual / max(float(whole @ whole), 1e-30)) if placement[DENSITY] > 0 else 0.0
 
     def reconstruct(self, operator: BeadOperator, start: np.ndarray | None, iterations: int) -> np.ndarray:

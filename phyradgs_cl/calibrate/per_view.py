@@ -13,7 +13,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition import Scan
 from phyradgs_cl.acquisition.altered.angles import start_azimuths_rad
-from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, scan_course, splines
+from phyradgs_cl.acquisition.altered.perturbed import GeometryCorrection, Sway, Views, splines
 from phyradgs_cl.calibrate.problem import CoarseProblem, PassCounter, Passes, Stage, pass_cost
 from phyradgs_cl.calibrate.result import AGREES, CORRECTED, ParameterEstimate
 from phyradgs_cl.detector import noise_level
@@ -35,32 +35,25 @@ _ITERATIONS = 20  # number of CGLS iterations for each step, and for each standa
 _DEVIATIONS = 3.0  # a kind of parameter is corrected only if its RMS over the views exceeds this many standard deviations
 
 
-@dataclass(frozen=True)
-class Kind:
-    """A kind of parameter: its name and unit in the table of estimates. scale: table units per rad or per mm."""
-
-    name: str
-    unit: str
-    scale: float
-
-
 @dataclass(frozen=True, eq=False)
 class PerViewParameters(ABC):
     """Parameters of F views: K kinds with n coefficients ``values`` (n, K). View f has (``basis`` @ ``values``)[f], (K,).
 
     - basis (F, n). units (K,): the value of each kind, in rad or mm, that moves a frame's edge by a pixel.
     - circle (n, 2): coefficients of the cosine and sine of the gantry's angle, as far as the basis allows.
+    - KINDS: name and unit, deg or mm, of each kind in the table of estimates.
     - MISMATCH: (measured errors) / (errors by noise alone), see docs/calibrate.md. Errors of voxels cause the difference.
-    - RESTARTED: kinds that start from 0 on each grid."""
+    - FINE: kinds that need fine detail. Only the last two grids estimate them. Both start from 0, so that the difference
+      between the two shows their error."""
 
     values: np.ndarray
     basis: np.ndarray
     units: np.ndarray
     circle: np.ndarray
 
-    KINDS: ClassVar[tuple[Kind, ...]]
+    KINDS: ClassVar[tuple[tuple[str, str], ...]]
     MISMATCH: ClassVar[float]
-    RESTARTED: ClassVar[tuple[int, ...]] = ()
+    FINE: ClassVar[tuple[int, ...]] = ()
 
     @abstractmethod
     def views_of(self, values: np.ndarray) -> Views | Sway:
@@ -71,8 +64,8 @@ class PerViewParameters(ABC):
         """Returns coefficients (n, K) without the part that another object would explain exactly."""
 
     def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
-        """Returns the indices of the kinds to estimate in stage ``number`` of ``count``. A subclass may leave some out."""
-        return range(len(self.KINDS))
+        """Returns the indices of the kinds to estimate in stage ``number`` of ``count``."""
+        return [kind for kind in range(len(self.KINDS)) if kind not in self.FINE or number >= count - 2]
 
     def operator(
         self, problem: CoarseProblem, correction: GeometryCorrection, more: np.ndarray | float = 0.0
@@ -83,15 +76,16 @@ class PerViewParameters(ABC):
 class WobbleParameters(PerViewParameters):
     """One turn (rad) and two shifts, along v and u (mm), per view: separate for each view, or as splines of time."""
 
-    KINDS = (Kind("turn per view", "deg", _DEG), Kind("shift-v per view", "mm", 1.0), Kind("shift-u per view", "mm", 1.0))
+    KINDS = (("turn per view", "deg"), ("shift-v per view", "mm"), ("shift-u per view", "mm"))
     MISMATCH = 4.0
-    RESTARTED = (TURN,)
+    FINE = (TURN,)
 
     @classmethod
     def of(cls, scan: Scan, count: int = 0) -> "WobbleParameters":
         """Returns a wobble of 0 in ``count`` splines of time, or with separate parameters of each view if ``count`` is 0."""
         if count:
-            basis = splines(scan_course(scan) + 0.5, count)
+            starts_s = np.asarray(scan.frame_start_s) - np.min(scan.frame_start_s)
+            basis = splines(starts_s / max(starts_s.max(), 1e-30), count)
             circle = _fitted_circle(scan, basis)
         else:
             basis, circle = np.eye(scan.frames), _circle(scan)
@@ -110,12 +104,6 @@ class WobbleParameters(PerViewParameters):
         rest[:, SHIFT_U] -= self.circle @ np.linalg.lstsq(pattern, shifts, rcond=None)[0]
         return rest
 
-    def kinds_of_stage(self, number: int, count: int) -> Sequence[int]:
-        """Returns the indices of the kinds to estimate in stage ``number`` of ``count``; grids become finer from stage to
-        stage. Turns need fine detail, so only the last two stages estimate them. Both start turns from 0, so that the
-        difference between the two shows their error."""
-        return (TURN, SHIFT_V, SHIFT_U) if number >= count - 2 else (SHIFT_V, SHIFT_U)
-
 
 @dataclass(frozen=True, eq=False)
 class MotionParameters(PerViewParameters):
@@ -123,10 +111,9 @@ class MotionParameters(PerViewParameters):
 
     still: Sway
 
-    KINDS = tuple(
-        Kind(f"{kind} {axis} of the object", unit, scale)
-        for kind, unit, scale in (("turn about", "deg", _DEG), ("shift along", "mm", 1.0))
-        for axis in "xyz"
+    KINDS = (
+        *((f"turn about {axis} of the object", "deg") for axis in "xyz"),
+        *((f"shift along {axis} of the object", "mm") for axis in "xyz"),
     )
     MISMATCH = 7.0
 
@@ -285,7 +272,7 @@ def estimate_views(
         problem = CoarseProblem.of(rt, [scan], stage, scan.frames)
         problem = replace(problem, count_pass=passes.counter(pass_cost([scan], stage.columns, scan.frames)))
         former, volume = parameters.values, None
-        is_kept = ~np.isin(np.arange(len(parameters.KINDS)), parameters.RESTARTED)
+        is_kept = ~np.isin(np.arange(len(parameters.KINDS)), parameters.FINE)
         parameters = replace(parameters, values=former * is_kept)
         kinds = parameters.kinds_of_stage(number, len(stages))
         for _ in range(_STEPS):
@@ -301,10 +288,10 @@ def estimate_views(
     sizes = _rms_over_views(parameters, parameters.values)
     is_significant = sizes > _DEVIATIONS * deviations
     table = []
-    for k, kind in enumerate(parameters.KINDS):
-        size, deviation = float(sizes[k] * kind.scale), float(deviations[k] * kind.scale)
+    for k, (name, unit) in enumerate(parameters.KINDS):
+        size, deviation = (float(values[k] * (_DEG if unit == "deg" else 1.0)) for values in (sizes, deviations))
         verdict = CORRECTED if is_significant[k] else AGREES
-        table.append(ParameterEstimate(kind.name, kind.unit, 0.0, size, deviation, float(shares[k]), verdict))
+        table.append(ParameterEstimate(name, unit, 0.0, size, deviation, float(shares[k]), verdict))
     views = parameters.views_of(parameters.values * is_significant) if is_significant.any() else None
     return ViewsEstimate(views, table)
 

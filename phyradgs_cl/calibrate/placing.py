@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, maximum_filter
+from scipy.ndimage import center_of_mass, gaussian_filter, maximum_filter
 from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.errors import InputError
@@ -71,18 +71,14 @@ def placements(phantom: EllipsoidPhantom, volume: np.ndarray, grid: Grid) -> lis
 def _peaks_mm(volume: np.ndarray, grid: Grid, most: int) -> np.ndarray:
     """Returns up to ``most`` bright spots (m, 3), x y z in mm, of a volume (nz, ny, nx): centroids of the 3³ voxels about
     its largest positive local maxima. Maxima at the volume's faces do not count."""
-    inner = np.zeros(volume.shape, bool)
-    inner[1:-1, 1:-1, 1:-1] = True
-    peaks = np.argwhere((volume == maximum_filter(volume, 3)) & inner & (volume > 0))
-    peaks = peaks[np.argsort(-volume[tuple(peaks.T)])[:most]]
-    axes_mm, places = grid.axes_mm(), []
-    for peak in peaks:
-        around = tuple(slice(at - 1, at + 2) for at in peak)
-        weight = volume[around] - volume[around].min()
-        weight = weight / weight.sum() if weight.sum() > 0 else np.full(weight.shape, 1 / weight.size)
-        shares = (weight.sum((1, 2)), weight.sum((0, 2)), weight.sum((0, 1)))
-        places.append([float(share @ axis[s]) for share, axis, s in zip(shares, axes_mm, around, strict=True)][::-1])
-    return np.array(places).reshape(-1, 3)
+    peaks = np.argwhere((volume == maximum_filter(volume, 3)) & (volume > 0))
+    peaks = peaks[((peaks > 0) & (peaks < np.array(volume.shape) - 1)).all(1)]
+    places = []
+    for peak in peaks[np.argsort(-volume[tuple(peaks.T)])[:most]]:
+        around = volume[tuple(slice(at - 1, at + 2) for at in peak)]
+        weight = around - around.min() if np.ptp(around) > 0 else np.ones(around.shape)
+        places.append((peak - 1 + center_of_mass(weight)) * grid.voxel_size_mm + grid.first_centre_mm)
+    return np.array(places).reshape(-1, 3)[:, ::-1]
 
 
 def _matching_triangles(

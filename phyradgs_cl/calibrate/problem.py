@@ -4,6 +4,7 @@ volume that fits them. Also its grids, from coarse to fine, and its progress in 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -125,15 +126,12 @@ class CoarseFrames:
         return frames if self.valid is None else np.where(self.valid, frames, np.float32(0))
 
 
-def measured_blocks(small: Sequence[Scan]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Returns the frames (F, rows, columns) of all binned scans, and which pixels are valid (None: all)."""
+def frames_of(scans: Sequence[Scan], small: Sequence[Scan], block: int) -> dict[str, Any]:
+    """Returns the fields of ``CoarseFrames`` for ``scans`` and their copies ``small``, binned by ``block``."""
     valid = np.concatenate([scan.valid for scan in small])
-    return np.concatenate([np.asarray(scan.projections, np.float32) for scan in small]), None if valid.all() else valid
-
-
-def without_pixels(scan: Scan) -> Scan:
-    """Returns the scan with line integrals of 0 in place of its frames, in an array that takes no memory."""
-    return replace(scan, projections=np.broadcast_to(np.float32(0), scan.projections.shape))
+    measured = np.where(valid, np.concatenate([np.asarray(scan.projections, np.float32) for scan in small]), np.float32(0))
+    empty = [replace(scan, projections=np.broadcast_to(np.float32(0), scan.projections.shape)) for scan in scans]
+    return {"scans": empty, "block": block, "measured": measured, "valid": None if valid.all() else valid}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -151,19 +149,11 @@ class CoarseProblem(CoarseFrames):
         block = stage.block(scans[0])
         fewer = [coarse.fewer_frames(scan, most_frames) for scan in scans]
         small = [coarse.binned(coarse.smooth(scan, _smoothing_px(scan, block)), block) for scan in fewer]
-        measured, valid = measured_blocks(small)
-        problem = cls(
-            rt=rt,
-            scans=[without_pixels(scan) for scan in fewer],
-            block=block,
-            grid=coarse.coarse_grid(scans[0].grid, small[0].geometry),
-            measured=measured,
-            valid=valid,
-        )
-        problem = replace(problem, measured=problem.masked(measured))
+        grid = coarse.coarse_grid(scans[0].grid, small[0].geometry)
+        problem = cls(rt=rt, grid=grid, **frames_of(fewer, small, block))
         if stage.is_cut or problem.matter_beside_grid() > _MOST_BESIDE:
-            grid = _around_view(problem.grid, scans[0].geometry, _REACH_OF_CUT if stage.is_cut else 1.0)
-            problem = replace(problem, grid=grid)
+            reach = _REACH_OF_CUT if stage.is_cut else 1.0
+            problem = replace(problem, grid=_around_view(grid, scans[0].geometry, reach))
         return problem
 
     def matter_beside_grid(self) -> float:
@@ -232,16 +222,16 @@ class CoarseProblem(CoarseFrames):
         self, operator: RayOperator, volume: np.ndarray, images: Sequence[np.ndarray], iterations: int
     ) -> list[np.ndarray]:
         """Returns the part of each image (F, rows, columns) that no volume explains, after ``iterations`` of CGLS."""
-        return [self._beyond_volumes(operator, image, iterations) for image in images]
-
-    def _beyond_volumes(self, operator: RayOperator, frames: np.ndarray, iterations: int) -> np.ndarray:
-        method = Cgls(System(operator, self.masked(frames), self.valid))
-        for _ in range(iterations):
-            if method.finished:
-                break
-            method.step()
-            self.count_pass()
-        return method.residual
+        residuals = []
+        for image in images:
+            method = Cgls(System(operator, self.masked(image), self.valid))
+            for _ in range(iterations):
+                if method.finished:
+                    break
+                method.step()
+                self.count_pass()
+            residuals.append(method.residual)
+        return residuals
 
 
 def _around_view(grid: Grid, geometry: Geometry, reach: float) -> Grid:

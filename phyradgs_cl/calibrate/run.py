@@ -177,14 +177,11 @@ class _Calibrator:
         later_s = max(0.0, correction.exposure_s) + max(0.0, correction.readout_s)
         stated = replace(self.scan, trajectory=continued(self.scan.trajectory, later_s)) if later_s else self.scan
         corrected = perturb(stated, correction, views) if corrections or views is not None else self.scan
-        alike = [*self.search.alike, *self._beyond_panel()]
+        alike = list(self.search.alike)
+        if beyond := [name for name in self.request.names if self.is_cut and name in BEYOND_PANEL]:
+            alike.append(f"{', '.join(beyond)}: looks like matter beyond the panel's sides")
         calibration = Calibration(corrected, table, alike, (rms(before), rms(after)), before, after, views)
         return replace(calibration, scan=_with_provenance(corrected, self.scan, calibration))
-
-    def _beyond_panel(self) -> list[str]:
-        """Returns a line about the parameters that are not estimated because the object reaches beyond the panel's sides."""
-        names = [name for name in self.request.names if self.is_cut and name in BEYOND_PANEL]
-        return [f"{', '.join(names)}: looks like matter beyond the panel's sides"] if names else []
 
     def _start_from_axis(self) -> None:
         """Starts from the offset that ``check`` finds, because Gauss–Newton steps find the right offset only within a few

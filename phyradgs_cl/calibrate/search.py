@@ -279,25 +279,25 @@ class Search:
         self.determined = ()
         self.fixed = {name: estimate for name, estimate in self.fixed.items() if name in self.held}
 
-    def estimates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the determined parameters' values minus stated values (K,), and their standard deviations (K,).
+    def estimates(self) -> dict[str, tuple[float, float]]:
+        """Returns the determined parameters' values minus stated values, and their standard deviations, by name.
 
         A deviation combines noise and discretisation error, taken as half the change since the coarser grid. It is larger
         for a parameter whose effect resembles an undetermined one's, because the latter keeps a stated value that may be
         wrong."""
         if self.reduced is None or not self.determined:
-            return np.zeros(0), np.zeros(0)
+            return {}
         values, noise = self.reduced.step(), self.reduced.deviations()
         change = values - [self.former.get(name, value) for name, value in zip(self.determined, values, strict=True)]
         resemblance = np.maximum(self.reduced.shares / [self.shares[name] for name in self.determined], 1.0)
-        return values, resemblance * np.hypot(noise, DISCRETISATION * change)
+        deviations = resemblance * np.hypot(noise, DISCRETISATION * change)
+        return dict(zip(self.determined, zip(values.tolist(), deviations.tolist(), strict=True), strict=True))
 
     def corrections(self) -> dict[str, float]:
         """Returns the corrections by name, found minus stated values: of the parameters for which they exceed three standard
         deviations, of those that must be corrected together with these (``_back_to_stated``), and significant fallbacks in
         use. All other parameters go back to their stated values."""
-        values, deviations = self.estimates()
-        found = dict(zip(self.determined or (), zip(values.tolist(), deviations.tolist(), strict=True), strict=True))
+        found = self.estimates()
         significant = {name: estimate.correction for name, estimate in self.fixed.items() if estimate.is_significant}
         off = [name for name, (value, deviation) in found.items() if abs(value) > DEVIATIONS * deviation]
         return significant | (self._back_to_stated(found, off) if off else {})
@@ -325,9 +325,7 @@ class Search:
     def table(self, scan: Scan, corrections: Mapping[str, float]) -> list[ParameterEstimate]:
         """Returns an estimate per parameter in displayed units. corrections: the result of the method ``corrections``, whose
         values replace those found."""
-        values, deviations = self.estimates()
-        estimates = {name: (estimate.value, estimate.deviation) for name, estimate in self.fixed.items()}
-        estimates |= dict(zip(self.determined or (), zip(values.tolist(), deviations.tolist(), strict=True), strict=True))
+        estimates = {name: (estimate.value, estimate.deviation) for name, estimate in self.fixed.items()} | self.estimates()
         table = []
         for one in self.parameters:
             stated, share = one.stated(scan) * one.scale, self.shares[one.name]

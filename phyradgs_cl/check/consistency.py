@@ -65,23 +65,6 @@ class Consistency:
     sees_angles: bool
 
 
-@dataclass(frozen=True, eq=False)
-class _CoarseFit:
-    """The coarse scan with its best sense of rotation (``turned``), and with the best panel shift too (``best``). fitted:
-    the fit of ``best``. random_total: the mean squared residuals of the frames of ``best`` in a random order, summed over
-    the frames. rough_mean_square: mean squared residual of the best rough fit."""
-
-    turned: Scan
-    best: Scan
-    fitted: Fit
-    random_total: float
-    rough_mean_square: float
-
-    @property
-    def ratio(self) -> float:
-        return float(np.sqrt(self.fitted.total / max(self.random_total, 1e-30)))
-
-
 def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
     """Finds whether the frames of a coarse ``scan`` fit together, and else frames and hypotheses that explain why not.
 
@@ -99,19 +82,19 @@ def check_consistency(rt: Runtime, scan: Scan, as_stated: Scan) -> Consistency:
     if outlier_notes:
         turned, best = some_frames(turned, remaining), some_frames(best, remaining)
         random_total = _random_order(rt, best)
-    coarse = _CoarseFit(turned, best, stated, random_total, rough_square)
-    ratio = coarse.ratio
+    ratio = float(np.sqrt(stated.total / max(random_total, 1e-30)))
 
     def answer(verdict: str, text: str, advice: str, is_sound: bool, sees_angles: bool = True) -> Consistency:
         finding = Finding(CONSISTENCY, verdict, ratio, _LARGEST, "share", "; ".join([*notes, text]), advice)
         return Consistency(finding, frames, is_sound, sees_angles)
 
     about_frames = "exclude these frames (image_key 3), or correct them; further answers do not use them" if notes else ""
-    if ratio > _LARGEST and coarse.random_total <= best.frames * _unseen(best, as_stated) ** 2:
+    if ratio > _LARGEST and random_total <= best.frames * _unseen(best, as_stated) ** 2:
         text = "the frames differ too little from angle to angle: a wrong order or wrong angles would not show"
         return answer(SUSPICIOUS if notes else CANNOT_TELL, text, about_frames, True, sees_angles=False)
     text = f"residual {ratio:.2g} of that of the frames in a random order"
-    hypothesis = _explanation(rt, some_frames(scan, frames), as_stated, coarse)
+    scans = some_frames(scan, frames), turned, best
+    hypothesis = _explanation(rt, *scans, as_stated, stated, random_total, rough_square)
     if hypothesis is not None:
         return answer(SUSPICIOUS, hypothesis.text, hypothesis.advice, False)
     if hypotheses.stated_redundancy(as_stated) < 0:
@@ -168,22 +151,25 @@ def _random_order(rt: Runtime, scan: Scan) -> float:
     return float(np.mean([fit_squares(rt, replace(scan, projections=scan.projections[order])).sum() for order in orders]))
 
 
-def _explanation(rt: Runtime, scan: Scan, as_stated: Scan, coarse: _CoarseFit) -> Hypothesis | None:
+def _explanation(
+    rt: Runtime, scan: Scan, turned: Scan, best: Scan, as_stated: Scan, fitted: Fit, random_total: float, rough_square: float
+) -> Hypothesis | None:
     """Returns the best hypothesis under which the frames are consistent, with less than half of the stated scan's squared
-    residual; None without one.
+    residual; None without one. turned, best, rough_square: what ``_best_sense`` returns. fitted: the fit of ``best``.
 
     If the panel sees less than half of the rays twice, frames fit any geometry. Then the first hypothesis about sizes under
     which they are consistent is returned. Only without one, and if the panel sees the axis, all hypotheses are compared."""
     is_one_sided = hypotheses.stated_redundancy(as_stated) < hypotheses.LEAST_REDUNDANCY
-    about_scan = _refined_hypotheses(rt, scan, as_stated, np.inf if is_one_sided else coarse.rough_mean_square)
-    if is_one_sided:
-        sized = (hypothesis for hypothesis in about_scan if hypothesis.factor != 1)
-        consistent = next((hypothesis for hypothesis in sized if _is_consistent(rt, hypothesis.scan())), None)
-        if consistent is not None or hypotheses.stated_redundancy(as_stated) < 0:
-            return consistent
-    most = min(_CLEAR * coarse.fitted.total, _LARGEST**2 * coarse.random_total)
-    about_frames = hypotheses.of_frames(coarse.turned, coarse.best, tries_orders=coarse.ratio > _DOUBTFUL)
-    return _best_below(rt, chain(about_scan, about_frames), coarse.fitted, most)
+    about_scan = _refined_hypotheses(rt, scan, as_stated, np.inf if is_one_sided else rough_square)
+    for hypothesis in about_scan if is_one_sided else ():
+        sized = hypothesis.scan()
+        if hypothesis.factor != 1 and fit_squares(rt, sized).sum() < _LARGEST**2 * _random_order(rt, sized):
+            return hypothesis
+    if hypotheses.stated_redundancy(as_stated) < 0:
+        return None
+    tries_orders = fitted.total > _DOUBTFUL**2 * random_total
+    candidates = chain(about_scan, hypotheses.of_frames(turned, best, tries_orders))
+    return _best_below(rt, candidates, fitted, min(_CLEAR * fitted.total, _LARGEST**2 * random_total))
 
 
 def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -> list[Hypothesis]:
@@ -211,10 +197,6 @@ def _refined_hypotheses(rt: Runtime, scan: Scan, as_stated: Scan, most: float) -
             pixels = shift.pixels if shift.is_found else rough.pixels
             refined.append(replace(hypothesis, scan=partial(shifted, other, pixels)))
     return refined
-
-
-def _is_consistent(rt: Runtime, scan: Scan) -> bool:
-    return bool(fit_squares(rt, scan).sum() < _LARGEST**2 * _random_order(rt, scan))
 
 
 def _best_below(rt: Runtime, candidates: Iterable[Hypothesis], stated: Fit, most: float) -> Hypothesis | None:

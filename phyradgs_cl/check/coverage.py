@@ -97,8 +97,9 @@ def _check_values(p: np.ndarray, valid: np.ndarray, largest: float, noise: float
 def _check_sides(scan: Scan, p: np.ndarray, valid: np.ndarray, largest: float, threshold: float) -> Finding:
     """Returns the finding about the object at the panel's sides, and about its width compared with the grid's."""
     sides = {"left": _border(p, valid, slice(0, 2)), "right": _border(p, valid, slice(-2, None))}
-    if is_full_turn(scan):  # opposite views see what the short side of a displaced panel cuts off
-        sides.pop(_short_side(scan), None)
+    offset_mm = scan.geometry.detector_offset_mm[1]
+    if is_full_turn(scan) and abs(offset_mm) >= _DISPLACED * p.shape[2] * scan.geometry.pixel_size_mm[1]:
+        del sides["left" if offset_mm > 0 else "right"]  # opposite views see what a displaced panel's short side cuts off
     name, level = max(sides.items(), key=lambda item: item[1])
     width_mm, grid_mm = _width_mm(scan, p, valid, threshold), max(scan.grid.size_mm[1:])
     text = (
@@ -143,13 +144,3 @@ def _border(p: np.ndarray, valid: np.ndarray, columns: slice) -> float:
     count = np.add.reduceat(weight.sum(2), starts, axis=1)
     means = np.where(count > 0, total / np.maximum(count, 1), 0).max(1)
     return float(np.percentile(means, 100 * (1 - _FRAMES)))
-
-
-def _short_side(scan: Scan) -> str:
-    """Returns the side, "left" or "right", on which a displaced panel ends nearer to the axis; "" for a centred panel."""
-    geometry = scan.geometry
-    offset_mm = geometry.detector_offset_mm[1]
-    width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1]
-    if abs(offset_mm) < _DISPLACED * width_mm:
-        return ""
-    return "left" if offset_mm > 0 else "right"

@@ -71,7 +71,14 @@ def frame_number(scan: Scan, frame: int) -> int:
 def of_scan(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
     """Yields hypotheses about the whole coarse ``scan``: sizes in another unit, mirrored frames. stated: the full scan."""
     yield from _other_units(scan, stated)
-    yield from _other_images(scan, stated)
+    advice = "import again with the other {}, and check again"
+    offset_v_mm, offset_u_mm = stated.geometry.detector_offset_mm
+    if offset_u_mm or stated.shutter.axis == "columns":
+        text = "frames fit if they are mirrored in u (or with rotation, detector_offset and readout the other way)"
+        yield Hypothesis(text, advice.format(MIRROR_U), partial(variants.mirrored, scan, "u"))
+    if offset_v_mm:
+        text = "frames fit if they are mirrored in v (or with detector_offset along v and readout the other way)"
+        yield Hypothesis(text, advice.format(MIRROR_V), partial(variants.mirrored, scan, "v"))
 
 
 def _other_units(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
@@ -125,22 +132,14 @@ def _matching_grid(stated: Scan, panel_grid: Grid) -> Grid:
     return panel_grid if is_derived or not 1 / _GRID_FACTOR < ratio < _GRID_FACTOR else stated.grid
 
 
-def _other_images(scan: Scan, stated: Scan) -> Iterator[Hypothesis]:
-    advice = "import again with the other {}, and check again"
-    offset_v_mm, offset_u_mm = stated.geometry.detector_offset_mm
-    if offset_u_mm or stated.shutter.axis == "columns":
-        text = "frames fit if they are mirrored in u (or with rotation, detector_offset and readout the other way)"
-        yield Hypothesis(text, advice.format(MIRROR_U), partial(variants.mirrored, scan, "u"))
-    if offset_v_mm:
-        text = "frames fit if they are mirrored in v (or with detector_offset along v and readout the other way)"
-        yield Hypothesis(text, advice.format(MIRROR_V), partial(variants.mirrored, scan, "v"))
-
-
 def of_frames(scan: Scan, shifted_scan: Scan, tries_orders: bool) -> Iterator[Hypothesis]:
     """Yields hypotheses about a coarse scan: other steps of its angles, exchanged pixel sizes (of ``shifted_scan``, its copy
     with the best shift of the panel) and, with ``tries_orders``, a missing or repeated frame."""
     yield from _other_steps(scan)
-    yield from _exchanged_sizes(shifted_scan)
+    v, u = scan.geometry.pixel_size_mm
+    if not scan.is_parallel and abs(v / u - 1) > 0.02:  # parallel rays: another object would fit as well
+        text, advice = "pixel sizes fit if v and u are exchanged", f"exchange {PIXEL_SIZES}"
+        yield Hypothesis(text, advice, partial(variants.stretched, shifted_scan, u / v, v / u))
     if tries_orders:
         yield from _missing_frames(scan)
 
@@ -177,15 +176,6 @@ def _other_steps(scan: Scan) -> Iterator[Hypothesis]:
         advice = f"{span}: correct rotation_angle, its unit or its step"
         turns_rad = sense * (factor - 1) * from_first
         yield Hypothesis(text, advice, partial(variants.turned, scan, turns_rad, factor))
-
-
-def _exchanged_sizes(scan: Scan) -> Iterator[Hypothesis]:
-    if scan.is_parallel:
-        return  # in a parallel beam, an object of another size would explain the frames as well
-    v, u = scan.geometry.pixel_size_mm
-    if abs(v / u - 1) > 0.02:
-        text, advice = "pixel sizes fit if v and u are exchanged", f"exchange {PIXEL_SIZES}"
-        yield Hypothesis(text, advice, partial(variants.stretched, scan, u / v, v / u))
 
 
 def nearly_sized(scan: Scan, factor: float) -> Scan:

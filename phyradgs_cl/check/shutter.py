@@ -69,23 +69,22 @@ def _compared(hypothesis: str, stated: np.ndarray, other: np.ndarray) -> tuple[s
 
 def _other_readouts(scan: Scan) -> dict[str, Scan]:
     shutter = scan.shutter
+
+    def read(axis: str, direction: int, readout_s: float) -> Scan:
+        return replace(scan, shutter=replace(shutter, axis=axis, direction=direction, readout_s=readout_s), is_fly=True)
+
     other_axis = "columns" if shutter.axis == "rows" else "rows"
     if shutter.readout_s == 0:
         readout_s = _READOUT_SHARE * float(np.diff(scan.frame_start_s).min(initial=math.inf))
         orders = [(axis, direction) for axis in ("rows", "columns") for direction in (1, -1)]
-        return {f"by {a}, index {'0' if d > 0 else 'last'} first": _read(scan, a, d, readout_s) for a, d in orders}
+        return {f"by {a}, index {'0' if d > 0 else 'last'} first": read(a, d, readout_s) for a, d in orders}
     return {
         _OTHER_WAY: reversed_readout(scan),
-        "all at once": _read(scan, shutter.axis, 1, 0.0),
+        "all at once": read(shutter.axis, 1, 0.0),
         _AT_REST: replace(scan, is_fly=False),
-        f"by {other_axis}, index 0 first": _read(scan, other_axis, 1, shutter.readout_s),
-        f"by {other_axis}, index last first": _read(scan, other_axis, -1, shutter.readout_s),
+        f"by {other_axis}, index 0 first": read(other_axis, 1, shutter.readout_s),
+        f"by {other_axis}, index last first": read(other_axis, -1, shutter.readout_s),
     }
-
-
-def _read(scan: Scan, axis: str, direction: int, readout_s: float) -> Scan:
-    shutter = replace(scan.shutter, axis=axis, direction=direction, readout_s=readout_s)
-    return replace(scan, shutter=shutter, is_fly=True)
 
 
 def _readout_advice(scan: Scan, name: str) -> str:
@@ -118,21 +117,14 @@ def check_exposure(rt: Runtime, scan: Scan) -> Finding:
     if ratio <= _HALF_RATIO and errors <= -_ERRORS:
         advice = f"correct the exposure time: {scan.shutter.exposure_s / 2:g} s explains the frames better"
         return Finding(EXPOSURE, SUSPICIOUS, *values, advice)
-    if _fits_worse(stated, half) and _fits_worse(stated, _twice_as_long(rt, scan)):
-        return Finding(EXPOSURE, OK, *values)
+    with suppress(InputError):  # poses or angles may end too early for twice the exposure
+        if _fits_worse(stated, half) and _fits_worse(stated, _squares_exposed(rt, scan, 2.0)):
+            return Finding(EXPOSURE, OK, *values)
     return Finding(EXPOSURE, CANNOT_TELL, *values, "compare the exposure time with the scanner's log")
 
 
-def _fits_worse(stated: np.ndarray, other: np.ndarray | None) -> bool:
-    return other is not None and residual_ratio(stated, other) >= _WORSE_RATIO and t_statistic(stated, other) >= _ERRORS
-
-
-def _twice_as_long(rt: Runtime, scan: Scan) -> np.ndarray | None:
-    """Returns the frames' mean squared residuals (F,) with twice the exposure; None if poses or angles end too early."""
-    try:
-        return _squares_exposed(rt, scan, 2.0)
-    except InputError:
-        return None
+def _fits_worse(stated: np.ndarray, other: np.ndarray) -> bool:
+    return residual_ratio(stated, other) >= _WORSE_RATIO and t_statistic(stated, other) >= _ERRORS
 
 
 def _squares_exposed(rt: Runtime, scan: Scan, factor: float) -> np.ndarray:

@@ -6,7 +6,6 @@ import numpy as np
 
 from phyradgs_cl.acquisition import (
     CircularOrbit,
-    ConeGeometry,
     EncoderTable,
     FrameSweeps,
     ParallelGeometry,
@@ -155,7 +154,11 @@ def _needed_turn(scan: Scan) -> tuple[float, float, str]:
         if has_opposite_views(scan):
             return 180.0, 180.0, "parallel rays need half a turn"
         return 360.0, 360.0, "parallel rays that rise need a full turn"
-    needed_deg = 180 + 2 * _half_fan_deg(scan, geometry)
+    # The fan under which the source sees the grid, or the panel if its fan is narrower.
+    half_width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2
+    panel_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
+    box_rad = math.asin(min(1.0, max(scan.grid.size_mm[1:]) / 2 / geometry.source_to_axis_mm))
+    needed_deg = 180 + 2 * math.degrees(min(panel_rad, box_rad))
     return 360.0, needed_deg, f"half a turn and the fan are {needed_deg:.4g}°"
 
 
@@ -165,12 +168,3 @@ def _steps_deg(scan: Scan, turn_deg: float = 360.0) -> np.ndarray:
     angles_deg = np.sort(angles_deg % turn_deg)  # the second % is needed because -1e-16 % 360 is 360
     steps_deg = np.diff(angles_deg, append=angles_deg[0] + turn_deg)
     return steps_deg[steps_deg > max(math.degrees(_SAME_RAD), _SAME_VIEW * turn_deg / len(angles_deg))]
-
-
-def _half_fan_deg(scan: Scan, geometry: ConeGeometry) -> float:
-    """Returns half of the fan angle in degrees under which the source sees the grid, or the panel if its fan is narrower."""
-    half_width_mm = geometry.detector_shape[1] * geometry.pixel_size_mm[1] / 2
-    panel_rad = math.atan2(half_width_mm, geometry.source_to_detector_mm)
-    radius_mm = max(scan.grid.size_mm[1:]) / 2
-    box_rad = math.asin(min(1.0, radius_mm / geometry.source_to_axis_mm))
-    return math.degrees(min(panel_rad, box_rad))

@@ -5,6 +5,7 @@
 At time t, the object has at point y the attenuation that the reference volume has at y + w(y, t).
 D. Rueckert et al., Nonrigid registration using free-form deformations, IEEE Trans. Med. Imaging 18, 712-721 (1999)."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from phyradgs_cl import checks
 from phyradgs_cl.errors import InputError
-from phyradgs_cl.fields.volume import Grid
+from phyradgs_cl.fields.volume import Grid, triple
 
 _LEVELS = 16  # ``smallest_determinant`` rounds weights to this many steps, so that few different states are left to test
 _MOST_STEPS = 200  # most iterations that invert a displacement field: enough if each multiplies the error by at most 0.93
@@ -127,15 +128,11 @@ class Deformation:
 
     def jacobian(self, points_mm: "ArrayLike", weights: "ArrayLike") -> np.ndarray:
         """Returns the derivative ∂w_i/∂y_j (n, 3, 3) at points (n, 3), x y z, for fields weighted by ``weights`` (R,)."""
-        control_mm = np.pad(self._state(weights), [(1, 1)] * 3 + [(0, 0)])
-        place = self._in_spacings(points_mm)[..., None]
-        taps = np.floor(place).astype(np.int64) + np.arange(-1, 3)  # (n, 3, 4): the 4 control points per axis near a point
-        values, slopes = cubic(place - taps), cubic_slope(place - taps) / np.reshape(self.spacing_mm, (3, 1))
-        last = np.reshape(control_mm.shape[2::-1], (3, 1)) - 1
-        x, y, z = np.moveaxis(np.clip(taps + 1, 0, last), 1, 0)
-        vectors = control_mm[z[:, :, None, None], y[:, None, :, None], x[:, None, None, :]]
-        factors = [[(slopes if i == j else values)[:, i] for i in (2, 1, 0)] for j in range(3)]
-        return np.stack([np.einsum("na,nb,nc,nabci->ni", *three, vectors) for three in factors], -1)
+        places_mm, control_mm = checks.numbers("points_mm", points_mm, (None, 3)).T[::-1], self._state(weights)
+        slopes = [
+            np.einsum("na,nb,nc,abci->ni", *self._splines(places_mm, 2 - j), control_mm, optimize=True) for j in range(3)
+        ]
+        return np.stack(slopes, -1)
 
     def on_grid_mm(self, grid: Grid, weights: "ArrayLike") -> np.ndarray:
         """Returns displacements w (nz, ny, nx, 3) float32 in mm, x y z, at voxel centres of ``grid``. weights: (R,)."""
@@ -193,14 +190,14 @@ class Deformation:
     def bases(self, grid: Grid, slope_along: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Returns the splines' values β³ along z, y and x at the voxel centres of ``grid``, each (voxels, control points).
         slope_along: an axis (0: z) for which the slope of β³ in 1/mm is returned instead."""
-        matrices = []
-        spacing_mm = np.broadcast_to(self.spacing_mm, 3)
-        for axis, centres_mm in enumerate(grid.axes_mm()):
-            origin_mm, step_mm = self.origin_mm[2 - axis], float(spacing_mm[2 - axis])
-            count = self.control_mm.shape[1 + axis]
-            offset = (centres_mm[:, None] - origin_mm) / step_mm - np.arange(count)
-            matrices.append(cubic_slope(offset) / step_mm if axis == slope_along else cubic(offset))
-        return matrices[0], matrices[1], matrices[2]
+        return triple(self._splines(grid.axes_mm(), slope_along))
+
+    def _splines(self, places_mm: Sequence[np.ndarray], slope_along: int | None) -> Iterator[np.ndarray]:
+        """Yields the matrices of ``bases`` for places (n,) in mm along z, y and x."""
+        axes = zip(places_mm, self.origin_mm[::-1], np.broadcast_to(self.spacing_mm, 3)[::-1], strict=True)
+        for axis, (place_mm, origin_mm, step_mm) in enumerate(axes):
+            offset = (place_mm[:, None] - origin_mm) / step_mm - np.arange(self.control_mm.shape[1 + axis])
+            yield cubic_slope(offset) / step_mm if axis == slope_along else cubic(offset)
 
     def _slopes(self, grid: Grid, control_mm: np.ndarray) -> np.ndarray:
         """Returns ∂U_i/∂y_j (3, 3, n) at the voxel centres of a grid, for one field's control vectors."""

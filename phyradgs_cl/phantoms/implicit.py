@@ -4,7 +4,7 @@ Bodies are functions of position in the cube [-1, 1]^3, averaged over voxels, so
 Lengths are in half sides of the cube. Distances are negative inside a body. Points are (x, y, z); arrays are (z, y, x),
 float32."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,11 +79,6 @@ def capsule_distance(capsule: Capsule, x: Field, y: Field, z: Field) -> Field:
     return np.sqrt(radial) - (np.float32(capsule.r0) + along * np.float32(capsule.r1 - capsule.r0))
 
 
-def ellipsoid_distance(centre: Point, semi_axes: Point, x: Field, y: Field, z: Field) -> Field:
-    """Returns the signed distance to an axis-aligned ellipsoid, to first order in the distance."""
-    return ratio_distance([(p - c) for p, c in zip((x, y, z), centre, strict=True)], semi_axes)
-
-
 def ratio_distance(offsets: Sequence[Field], semi_axes: Sequence[ArrayLike]) -> Field:
     """Returns the signed distance to the surface Σ (offset / semi-axis)² = 1, to first order in the distance. Semi-axes may
     be arrays."""
@@ -100,28 +95,26 @@ def capsule_box(lattice: Lattice, capsules: Sequence[Capsule], margin: float) ->
     return lattice.box((ends - radii).min(axis=0), (ends + radii).max(axis=0))
 
 
-def add_to_union(union: Field, box: Box, distance: Field, blend: float) -> None:
-    """Adds a body to a smooth union of bodies in place. The union is stored as the sum of exp(-distance / blend). distance:
-    that of the voxels ``box`` to the body. blend: the width over which bodies merge."""
-    union[box] += np.exp(np.clip(-distance / np.float32(blend), -60.0, 60.0))
-
-
-def union_distance(union: Field, blend: float) -> Field:
-    """Returns the signed distance to a union made by ``add_to_union``, or FAR where no body is near."""
-    with np.errstate(divide="ignore"):
-        return np.minimum(-np.float32(blend) * np.log(union), FAR)
-
-
-def capsule_union(lattice: Lattice, capsules: Sequence[Capsule], blend: float, box: Box) -> Field:
-    """Returns the signed distance to the smooth union of capsules, for a box of voxels."""
+def capsule_union(
+    lattice: Lattice, capsules: Sequence[Capsule], blend: float, box: Box, bodies: Iterable[Field] = ()
+) -> Field:
+    """Returns the signed distance to the smooth union of capsules, for a box of voxels, or FAR where none is near. bodies:
+    the voxels' distances to further bodies of the union. blend: the width over which bodies merge."""
     x, y, z = lattice.points(box)
     union = np.zeros((z.size, y.size, x.size), dtype=np.float32)
+
+    def add(part: Box, distance: Field) -> None:
+        union[part] += np.exp(np.clip(-distance / np.float32(blend), -60.0, 60.0))
+
+    for distance in bodies:
+        add((slice(None),) * 3, distance)
     for capsule in capsules:
         inner = _intersect(capsule_box(lattice, [capsule], _REACH * blend), box)
         xs, ys, zs = x[..., inner[2]], y[:, inner[1], :], z[inner[0]]
         if xs.size and ys.size and zs.size:
-            add_to_union(union, inner, capsule_distance(capsule, xs, ys, zs), blend)
-    return union_distance(union, blend)
+            add(inner, capsule_distance(capsule, xs, ys, zs))
+    with np.errstate(divide="ignore"):
+        return np.minimum(-np.float32(blend) * np.log(union), FAR)
 
 
 def _intersect(part: Box, box: Box) -> Box:

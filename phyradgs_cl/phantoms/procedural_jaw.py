@@ -127,30 +127,22 @@ def _bone_distance(lattice: Lattice) -> Field:
     _, _, z = lattice.points(lattice.everything)
     section = (np.float32(_BODY_WIDTH), np.float32(_BODY_HEIGHT))
     body = implicit.ratio_distance((_arc_distance(lattice), z - np.float32(_BODY_Z)), section)
-    union = np.zeros((lattice.count,) * 3, dtype=np.float32)
-    implicit.add_to_union(union, lattice.everything, body, _BONE_BLEND)
     front = _arc(0.0)[1]
     chin = Capsule((-0.08, front - 0.02, -0.38), (0.08, front - 0.02, -0.38), 0.10, 0.10)
-    for capsule in [chin, *_rami()]:
-        box = implicit.capsule_box(lattice, [capsule], 5 * _BONE_BLEND)
-        distance = implicit.capsule_distance(capsule, *lattice.points(box))
-        implicit.add_to_union(union, box, distance, _BONE_BLEND)
-    return implicit.union_distance(union, _BONE_BLEND)
+    return implicit.capsule_union(lattice, [chin, *_rami()], _BONE_BLEND, lattice.everything, [body])
 
 
 def _soft_tissue(lattice: Lattice, bone: Field, rng: np.random.Generator) -> Field:
     """Returns the attenuation of flesh around the bone, of the mouth's floor, tongue and throat, under fat. Air is 0."""
     x, y, z = lattice.points(lattice.everything)
-    union = np.zeros_like(bone)
-    implicit.add_to_union(union, lattice.everything, bone - np.float32(0.075), _FLESH_BLEND)
-    for centre, axes in (
+    bodies = [bone - np.float32(0.075)]
+    for (x0, y0, z0), axes in (
         ((0.0, -0.02, -0.28), (0.52, 0.56, 0.22)),  # floor of the mouth
         ((0.0, -0.12, -0.06), (0.30, 0.42, 0.20)),  # tongue
         ((0.0, 0.34, -0.10), (0.50, 0.34, 0.46)),  # throat
     ):
-        distance = implicit.ellipsoid_distance(centre, axes, x, y, z)
-        implicit.add_to_union(union, lattice.everything, distance, _FLESH_BLEND)
-    distance = implicit.union_distance(union, _FLESH_BLEND)
+        bodies.append(implicit.ratio_distance((x - x0, y - y0, z - z0), axes))
+    distance = implicit.capsule_union(lattice, [], _FLESH_BLEND, lattice.everything, bodies)
     airway = Capsule((0.0, 0.36, -0.9), (0.0, 0.30, 0.9), 0.10, 0.12)
     distance = np.maximum(distance, -implicit.capsule_distance(airway, x, y, z))
     muscle = np.float32(_MUSCLE) + np.float32(0.02) * implicit.texture(lattice, (0.12, 0.4), 48, rng)

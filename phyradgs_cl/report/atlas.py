@@ -42,8 +42,14 @@ def space(volume: NDArray[np.floating], grid: Grid, window: Window, gaussians: G
         "ends": [255 * (value - window.least) / span for value in (window.low, window.high)],
         "words": f"{size} voxels (z, y, x){reduced}", "centres": centres,
     }  # fmt: skip
+    canvas = element(
+        "canvas", id="space", tabindex=0, role="img", aria_label="The volume in 3D", aria_describedby="space-help",
+        data_patience=_PATIENCE_MS,
+    )
+    letters = (element("b", letter, id=f"space-{letter}", aria_hidden="true") for letter in "xyz")
     return joined(
-        element("div", *_controls(_between(steps), cloud), class_="tools"), _stage(),
+        element("div", *_controls(_between(steps), cloud), class_="tools"),
+        element("div", canvas, *letters, element("span", class_="bar", id="space-bar"), class_="stage"),
         element("p", element("output", id="space-reading"), class_="note"),
         element("p", _HELP, class_="note help", id="space-help"), json_block("volume-data", data),
     )
@@ -52,15 +58,6 @@ def space(volume: NDArray[np.floating], grid: Grid, window: Window, gaussians: G
 def has_depth(volume: NDArray[np.floating]) -> bool:
     """Returns whether every side has at least two voxels; a flat volume cannot be shown in 3D."""
     return min(volume.shape) >= 2
-
-
-def _stage() -> Markup:
-    canvas = element(
-        "canvas", id="space", tabindex=0, role="img", aria_label="The volume in 3D", aria_describedby="space-help",
-        data_patience=_PATIENCE_MS,
-    )
-    letters = (element("b", letter, id=f"space-{letter}", aria_hidden="true") for letter in "xyz")
-    return element("div", canvas, *letters, element("span", class_="bar", id="space-bar"), class_="stage")
 
 
 def _controls(threshold: int, cloud: Gaussians | None) -> list[Markup]:

@@ -13,8 +13,8 @@ from phyradgs_cl.fields import Grid
 
 LONGEST_EDGE = 192  # larger slices are averaged over blocks to at most this many pixels along each side
 BUDGET_PIXELS = 16_000_000  # pixels of all slices together: pure noise, the worst case, makes a page of some 20 MB
-# For each plane: name, index and letter of the axis across it, and the world axes to the right and up in the picture.
-PLANES = (("axial", 0, "z", "x", "y"), ("coronal", 1, "y", "x", "z"), ("sagittal", 2, "x", "y", "z"))
+# For each plane: name, letter of the axis across it, and the world axes to the right and up in the picture.
+PLANES = (("axial", "z", "x", "y"), ("coronal", "y", "x", "z"), ("sagittal", "x", "y", "z"))
 _ROOM = 0.25  # users may move black and white outwards by this fraction of their initial distance
 _BLUE, _WHITE, _RED = (33, 86, 158), (247, 247, 245), (178, 34, 40)
 _PERCENTILE = 99.9  # this percentile of the values is white, since a few very bright voxels would make all others dark
@@ -148,9 +148,8 @@ def planes_of(
         layers |= {"truth": reference, "difference": volume - reference}
     if doubt is not None:
         layers["doubt"] = doubt
-    counts = _slice_counts(volume.shape, len(layers))
     planes = []
-    for (name, axis, letter, right, up), count in zip(PLANES, counts, strict=True):
+    for axis, count in enumerate(_slice_counts(volume.shape, len(layers))):
         indices = np.unique(np.linspace(0, volume.shape[axis] - 1, count).round().astype(int)).tolist()
         pictures = {
             key: [base64_of(_picture(v, axis, i, windows[key].least, windows[key].most)) for i in indices]
@@ -158,8 +157,7 @@ def planes_of(
         }
         first = windows["result"]
         still = _picture(volume, axis, indices[len(indices) // 2], first.low, first.high)
-        slices = volume.shape[axis]
-        planes.append(Plane(name, letter, right, up, slices, indices, *_extent(grid, axis), pictures, still))
+        planes.append(_plane(grid, axis, indices, pictures, still))
     return planes
 
 
@@ -170,18 +168,14 @@ def middle_slices(volume: Volume) -> tuple[Volume, ...]:
 
 def middle_planes(slices: Sequence[Volume], grid: Grid, window: tuple[float, float]) -> list[Plane]:
     """Returns planes of a volume's middle slices (axial, coronal, sagittal). window: the values of black and white."""
-    planes = []
-    for (name, axis, letter, right, up), image in zip(PLANES, slices, strict=True):
-        still = grey_png(block_means(image, LONGEST_EDGE), *window)
-        middle = grid.shape[axis] // 2
-        planes.append(Plane(name, letter, right, up, grid.shape[axis], [middle], *_extent(grid, axis), {}, still))
-    return planes
+    stills = [grey_png(block_means(image, LONGEST_EDGE), *window) for image in slices]
+    return [_plane(grid, axis, [grid.shape[axis] // 2], {}, still) for axis, still in enumerate(stills)]
 
 
-def _extent(grid: Grid, axis: int) -> tuple[float, float, tuple[float, float]]:
-    """Returns the first slice's centre, the distance to the next slice, and (width, height) of a slice, all in mm."""
+def _plane(grid: Grid, axis: int, indices: list[int], layers: dict[str, list[str]], still: bytes) -> Plane:
     height_mm, width_mm = (side for a, side in enumerate(grid.size_mm) if a != axis)
-    return grid.first_centre_mm[axis], grid.voxel_size_mm[axis], (width_mm, height_mm)
+    place = grid.first_centre_mm[axis], grid.voxel_size_mm[axis], (width_mm, height_mm)
+    return Plane(*PLANES[axis], grid.shape[axis], indices, *place, layers, still)
 
 
 def _slice_counts(shape: tuple[int, ...], layers: int) -> list[int]:

@@ -6,11 +6,10 @@ script computes the object at time t and point y as v(y + w(y, t)), from the vox
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import spline_filter1d
 
 from phyradgs_cl.acquisition import CircularOrbit, Scan
 from phyradgs_cl.fields import Deformation, Grid, deformed, triple
-from phyradgs_cl.fields.deformation import control_points
+from phyradgs_cl.fields.deformation import fitted_control_mm
 from phyradgs_cl.report.atlas import MOST_EDGE
 from phyradgs_cl.report.images import Plane, Window, base64_of, block_means, middle_planes, middle_slices
 from phyradgs_cl.report.markup import Markup, element, joined, json_block, number
@@ -92,21 +91,12 @@ def object_in_motion(
 
 
 def fitting(deformation: Deformation, grid: Grid) -> Deformation:
-    """Returns the deformation in at most ``MOST_VALUES`` numbers: a larger one is sampled at fewer control points."""
-    spacing_mm = float(np.max(deformation.spacing_mm))
-    reduced = deformation
+    """Returns the deformation in at most ``MOST_VALUES`` numbers: a larger one is fitted by fewer control points."""
+    spacing_mm, reduced = float(np.max(deformation.spacing_mm)), deformation
     while reduced.control_mm.size > MOST_VALUES and spacing_mm < 2 * max(grid.size_mm):
         spacing_mm *= 1.25
-        origin_mm, counts = control_points(grid, spacing_mm)
-        axes_mm = [
-            np.clip(first_mm + spacing_mm * np.arange(n), centres_mm[0], centres_mm[-1])  # beyond the grid the field may end
-            for first_mm, n, centres_mm in zip(origin_mm[::-1], counts, grid.axes_mm(), strict=True)
-        ]
-        points_mm = np.stack(np.meshgrid(*axes_mm, indexing="ij")[::-1], -1).reshape(-1, 3)
-        units = np.eye(deformation.rank)
-        control_mm = np.stack([deformation.displacement_mm(points_mm, unit).reshape(*counts, 3) for unit in units])
-        for axis in (1, 2, 3):
-            control_mm = spline_filter1d(control_mm, axis=axis)
+        fields_mm = np.stack([deformation.on_grid_mm(grid, unit) for unit in np.eye(deformation.rank)])
+        control_mm, origin_mm = fitted_control_mm(fields_mm, grid, spacing_mm)
         reduced = Deformation(control_mm, origin_mm, spacing_mm, deformation.times_s, deformation.weights)
     return reduced
 

@@ -75,18 +75,12 @@ def preview_image(volume: NDArray[np.floating], grid: Grid) -> NDArray[np.uint8]
     slices = []
     for axis in _shown_axes(grid):
         image = bytes_of(np.take(volume, volume.shape[axis] // 2, axis=axis), low, high)
-        size_mm = [side for a, side in enumerate(grid.size_mm) if a != axis]
-        shape = [max(1, round(side * per_mm)) for side in size_mm]
+        shape = [max(1, round(side * per_mm)) for a, side in enumerate(grid.size_mm) if a != axis]
         ends = zip(shape, image.shape, strict=True)  # pixels take their nearest voxel, so that single voxels stay visible
         rows, columns = (((np.arange(n) + 0.5) * m / n).astype(int) for n, m in ends)
         slices.append(top_row_first(image[rows[:, None], columns]))
-    height, width = max(s.shape[0] for s in slices), sum(s.shape[1] + _GAP for s in slices) - _GAP
-    picture = np.zeros((height, width), np.uint8)
-    left = 0
-    for image in slices:
-        picture[height - image.shape[0] :, left : left + image.shape[1]] = image
-        left += image.shape[1] + _GAP
-    return picture
+    height = max(one.shape[0] for one in slices)
+    return np.hstack([np.pad(one, ((height - one.shape[0], 0), (0, _GAP))) for one in slices])[:, :-_GAP]
 
 
 def _shown_axes(grid: Grid) -> list[int]:

@@ -29,6 +29,9 @@ from phyradgs_cl.text import plain_text
 
 log = logging.getLogger(__name__)
 _BINS = 80  # number of bars in histograms of line integrals
+_NO_SCAN = "The scan {} was not found, or has changed since; --scan names it."
+_NO_MOTION = "The motion of the object {} was not found, or has changed since: there are no computed projections, and no "
+_NO_MOTION += "motion."
 Image = NDArray[np.float32]
 
 
@@ -98,9 +101,13 @@ def load_run(path: Path, scan_path: Path | None = None) -> Run:
         raise InputError(str(path), f"a {kind}", "a volume of phyradgs-cl", "make one with 'phyradgs reconstruct'")
     notes: list[str] = []
     stored = read_volume(path)
-    deformation = stored.deformation or _named_deformation(path, stored.provenance, notes)
+    deformation, where = stored.deformation, (path, stored.provenance)
+    if deformation is None and (moved := _named_file(*where, "object_motion", notes, _NO_MOTION)) is not None:
+        deformation = read_deformation(moved)
     run = Run(path, stored, metrics=stored.metrics or {}, deformation=deformation)
-    named = scan_path or _scan_of(path, stored.provenance, notes)
+    if scan_path is None and not (isinstance(name := stored.provenance.get("scan"), str) and name):
+        notes.append("The volume file names no scan.")
+    named = scan_path or _named_file(*where, "scan", notes, _NO_SCAN)
     if named is not None:
         run = _with_scan(run, named, scan_path is not None, notes)
     for note in notes:
@@ -136,28 +143,18 @@ def _with_scan(run: Run, path: Path, is_given: bool, notes: list[str]) -> Run:
     return replace(run, compared=pair.how, reference=pair.reference if pair.grid is grid else None)
 
 
-def _scan_of(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Path | None:
-    """Returns the scan file that the provenance names, if it is found with the stored hash; else None with a note."""
-    name, place = _named_file(path, provenance, "scan")
-    if not name:
-        notes.append("The volume file names no scan.")
-    elif place is not None and file_kind(place) == "scan":
-        return place
-    else:
-        notes.append(f"The scan {plain_text(name)} was not found, or has changed since; --scan names it.")
-    return None
-
-
-def _named_file(path: Path, provenance: Mapping[str, object], key: str) -> tuple[str, Path | None]:
-    """Returns a file's name in the provenance, or "", and its path in the current or the volume's folder, or None."""
+def _named_file(path: Path, provenance: Mapping[str, object], key: str, notes: list[str], missing: str) -> Path | None:
+    """Returns the file that the provenance names under ``key``, from the current or the volume's folder, if it has the
+    stored hash. Else returns None and, if it names one, appends ``missing`` with this name in place of {} to ``notes``."""
     name, sha256 = provenance.get(key), provenance.get(f"{key}_sha256")
     if not isinstance(name, str) or not name:
-        return "", None
+        return None
     for place in (Path(name), path.parent / name, path.parent / Path(name).name):
         with suppress(InputError):  # there may be no such file
-            if sha256_of(place) == sha256:
-                return name, place
-    return name, None
+            if sha256_of(place) == sha256 and (key != "scan" or file_kind(place) == "scan"):
+                return place
+    notes.append(missing.format(plain_text(name)))
+    return None
 
 
 def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
@@ -168,17 +165,6 @@ def computed_views(run: Run, rt: Runtime, count: int) -> list[FramePair]:
     scan, volume = prepared(run.scan, run.preprocessing, rt), run.stored
     chosen = spread_frames(scan.frames, count)
     return frame_pairs(rt, scan, volume.values, volume.required_grid, chosen, volume.states or run.deformation)
-
-
-def _named_deformation(path: Path, provenance: Mapping[str, object], notes: list[str]) -> Deformation | None:
-    """Reads the deformation file that the provenance names, if it has the stored hash; else returns None with a note."""
-    name, place = _named_file(path, provenance, "object_motion")
-    if place is not None:
-        return read_deformation(place)
-    if name:
-        words = f"The motion of the object {plain_text(name)} was not found, or has changed since: "
-        notes.append(words + "there are no computed projections, and no motion.")
-    return None
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,22 +64,24 @@ def phantom_scene(
 
     Phantoms in closed form are integrated exactly unless they deform. Other phantoms are projected from voxels at twice
     ``size``, and the reference is their block mean. Pixels average ``pixel_samples``² rays over their area; 0 chooses the
-    number by the size of the grid's voxels. axis: the panel's readout axis. moves: returns the deformation, if any."""
+    number by the size of the grid's voxels. axis: the panel's readout axis. moves: returns the deformation, if any. The
+    reference of a phantom whose parts move is the state at time 0."""
     half_size_mm = min(box.size_mm) / 2
     phantom = make_phantom(of, half_size_mm, 2 * size, seed) if isinstance(of, str) else of
-    if isinstance(phantom, MovingPhantom):
-        if moves is not None:
-            raise InputError("--motion-of-object", f"given for the phantom {phantom.name}", "an object that rests by itself")
-        return _moving_scene(phantom, _resized(box, size), geometry, pixel_samples)
-    if isinstance(phantom, EllipsoidPhantom):
-        grid, title = _resized(box, size), f"phantom {phantom.name}"
+    if isinstance(phantom, MovingPhantom) and moves is not None:
+        raise InputError("--motion-of-object", f"given for the phantom {phantom.name}", "an object that rests by itself")
+    if isinstance(phantom, EllipsoidPhantom | MovingPhantom):
+        grid, title, at = _resized(box, size), f"phantom {phantom.name}", getattr(phantom, "at", lambda time_s: phantom)
         deformation = None if moves is None else moves(grid)
-        if deformation is None or deformation.is_still:
-            source = on_panel(geometry, grid, pixel_samples, lambda panel: AnalyticSource(phantom, panel))
-            truth = phantom.voxelise(grid, 4)
-            return Scene(source, grid, truth, title, deformation=deformation, state=lambda time_s: truth)
-        return _voxel_scene(rt, phantom.voxelise(grid.finer(2), 4), grid.finer(2), grid, title, deformation, geometry, axis,
-                            pixel_samples)  # fmt: skip
+        if deformation is not None and not deformation.is_still:
+            fine = grid.finer(2)
+            moving = rt, phantom.voxelise(fine, 4), fine, grid, title, deformation
+            return _voxel_scene(*moving, geometry, axis, pixel_samples)
+        return Scene(
+            on_panel(geometry, grid, pixel_samples, lambda panel: AnalyticSource(phantom, panel)), grid,
+            phantom.voxelise(grid, 4), title, deformation=deformation, state=lambda time_s: at(time_s).voxelise(grid, 4),
+            period_s=getattr(phantom, "period_s", None), fastest_mm_per_s=getattr(phantom, "fastest_mm_per_s", 0.0),
+        )
     fine = Grid.cube(2 * size, 2 * half_size_mm)
     if not (np.allclose(box.size_mm, fine.size_mm) and np.allclose(box.offset_mm, 0)):
         text = "phantom %s is drawn in a cube of %g mm about the axis: the shape and offset of the scanner's [volume] "
@@ -88,17 +90,6 @@ def phantom_scene(
     deformation = None if moves is None else moves(grid)
     volume = phantom.voxelise(fine)
     return _voxel_scene(rt, volume, fine, grid, f"phantom {of}", deformation, geometry, axis, pixel_samples)
-
-
-def _moving_scene(phantom: MovingPhantom, grid: Grid, geometry: Geometry, pixel_samples: int) -> Scene:
-    """Returns the scene of a phantom whose parts move. Its reference is the state at time 0."""
-
-    def state(time_s: float) -> np.ndarray:
-        return phantom.at(time_s).voxelise(grid, 4)
-
-    source = on_panel(geometry, grid, pixel_samples, lambda panel: AnalyticSource(phantom, panel))
-    truth, title, fastest = state(0.0), f"phantom {phantom.name}", phantom.fastest_mm_per_s
-    return Scene(source, grid, truth, title, state=state, period_s=phantom.period_s, fastest_mm_per_s=fastest)
 
 
 def volume_scene(

@@ -82,11 +82,11 @@ class AnalyticSource(FrameSource):
 
     def frame(self, cells: TimeCells, model: str, factor: float) -> np.ndarray:
         frame = np.empty(self._geometry.detector_shape)
-        by_row = cells.axis == "rows"
+        by_line, shape = cells.readout.frames(frame), cells.readout.shape(self._geometry.detector_shape)
+        poses = cells.readout.poses(cells.pose)
         for start, stop, members in line_groups(cells):
-            pixels = pixel_centres(cells.pose[members], self._geometry.detector_shape)
-            target = pixels[:, start:stop] if by_row else pixels[:, :, start:stop]
-            origin = cells.pose[members][:, None, None, :3]
+            target = pixel_centres(poses[members], shape)[:, start:stop]
+            origin = poses[members][:, None, None, :3]
             if cells.is_parallel:  # rays begin before the phantom and end behind it
                 along = (self._phantom.reach_mm + np.linalg.norm(target, axis=-1, keepdims=True)) * origin
                 origin, target = target - along, target + along
@@ -94,8 +94,7 @@ class AnalyticSource(FrameSource):
                 p = factor * self._phantom.line_integrals(origin, target, cells.time_s[members])
             else:
                 p = factor * self._phantom.line_integrals(origin, target)
-            mean = average(p, cells.weight[members], model)
-            frame[(slice(start, stop),) if by_row else (slice(None), slice(start, stop))] = mean
+            by_line[start:stop] = average(p, cells.weight[members], model)
         return frame.astype(np.float32)
 
 
@@ -193,21 +192,20 @@ class _Average:
 
     def __init__(self, cells: TimeCells, model: str) -> None:
         self._readout, self._is_log = cells.readout, model == "log"
-        self._sum: np.ndarray | None = None  # so far: Σ w p in the log model, ln Σ w exp(−p) in the intensity model
+        # So far: Σ w p in the log model, ln Σ w exp(−p) in the intensity model.
+        self._sum = np.array(0.0 if self._is_log else -np.inf)
 
     def add(self, frame: np.ndarray, share: np.ndarray) -> None:
         """Adds line integrals (rows, columns) of some time cells. share (lines,): their part of each line's weight."""
         weight = self._readout.spread(share)
         if self._is_log:
-            self._sum = weight * frame + (0.0 if self._sum is None else self._sum)
+            self._sum = weight * frame + self._sum
             return
         with np.errstate(divide="ignore"):  # lines without light from these cells have the weight 0, and its logarithm is −∞
-            log_part = np.log(weight) - frame
-        self._sum = log_part if self._sum is None else np.logaddexp(self._sum, log_part)
+            self._sum = np.logaddexp(self._sum, np.log(weight) - frame)
 
     def frame(self) -> np.ndarray:
         """Returns the average (rows, columns), 0 on lines without light."""
-        assert self._sum is not None
         mean = self._sum if self._is_log else np.where(np.isfinite(self._sum), -self._sum, 0)
         return mean.astype(np.float32)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from phyradgs_cl.acquisition import ConeGeometry, Protocol, Scan, Shutter, Static
-from phyradgs_cl.acquisition.cells import micro_view_cells, per_line_cells, static_cells, static_start_cells
+from phyradgs_cl.acquisition.cells import micro_view_cells, per_line_cells, single_cell, static_cells
 from phyradgs_cl.acquisition.trajectory import CircularOrbit, ConstantSpeed
 from phyradgs_cl.errors import InputError
 from phyradgs_cl.fields import Grid
@@ -43,7 +43,10 @@ def test_a_billionth_of_a_window_is_rounding() -> None:
 @pytest.mark.parametrize("direction", [1, -1])
 def test_every_time_lies_in_the_pulse_and_weights_stay_whole(direction) -> None:
     where = (ORBIT, replace(DARK_FROM, direction=direction), 0, START_S, 7)
-    tables = (micro_view_cells(*where, 4, 3), per_line_cells(*where, 3), static_cells(*where), static_start_cells(*where))
+    tables = (
+        micro_view_cells(*where, 4, 3), per_line_cells(*where, 3), static_cells(*where),
+        single_cell(*where[:3], START_S + where[1].lit_span_s[0], 7),
+    )
     for cells in tables:
         np.testing.assert_allclose(cells.line_weights(), 1, rtol=1e-12)
         assert cells.time_s.min() >= START_S + 0.1 - TIME_TOLERANCE_S

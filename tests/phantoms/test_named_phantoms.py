@@ -6,7 +6,7 @@ from refusals import assert_refused
 
 from phyradgs_cl.fields import Grid
 from phyradgs_cl.phantoms import PHANTOMS, foot, jaw, make_phantom, shepp_logan
-from phyradgs_cl.phantoms.implicit import Capsule, Lattice, capsule_distance, ellipsoid_distance
+from phyradgs_cl.phantoms.implicit import Capsule, Lattice, capsule_distance, ratio_distance
 
 
 def test_shepp_logan_grey_levels_and_ventricles() -> None:
@@ -66,7 +66,7 @@ def test_covered_voxels_hold_the_volumes_of_a_capsule_and_an_ellipsoid() -> None
     lattice = Lattice(48)
     x, y, z = lattice.points((slice(0, 48),) * 3)
     capsule = capsule_distance(Capsule((-0.3, 0, 0.1), (0.4, 0, 0.1), 0.25, 0.25), x, y, z)
-    ellipsoid = ellipsoid_distance((0.1, 0.0, -0.2), (0.6, 0.3, 0.4), x, y, z)
+    ellipsoid = ratio_distance((x - 0.1, y, z + 0.2), (0.6, 0.3, 0.4))
     value = ((x - 0.1) / 0.6) ** 2 + (y / 0.3) ** 2 + ((z + 0.2) / 0.4) ** 2
     assert ((ellipsoid < 0) == (value < 1)).mean() > 0.9999
     exact = np.pi * 0.25**2 * 0.7 + 4 / 3 * np.pi * 0.25**3, 4 / 3 * np.pi * 0.6 * 0.3 * 0.4

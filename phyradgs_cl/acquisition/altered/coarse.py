@@ -9,7 +9,6 @@ import scipy  # its parts load only when they are used, which saves time
 from phyradgs_cl.acquisition.altered.variants import altered_trajectory, with_trajectory
 from phyradgs_cl.acquisition.geometry import ConeGeometry, Geometry
 from phyradgs_cl.acquisition.scan import Scan
-from phyradgs_cl.acquisition.shutter import Shutter
 from phyradgs_cl.fields import Grid
 
 MOST_FRAMES = 60  # most frames of a coarse scan
@@ -92,7 +91,8 @@ def binned(scan: Scan, block: int) -> Scan:
     valid_share = weight.mean((2, 4))
     mean = (values * weight).mean((2, 4)) / np.where(valid_share > 0, valid_share, 1.0)
     is_masked = valid_share < _LEAST_VALID
-    shutter, later_s = _binned_shutter(scan, width if scan.shutter.axis == "columns" else height)
+    of_lines = width if scan.shutter.axis == "columns" else height
+    shutter, later_s = scan.shutter.of_lines(scan.lines, 0, scan.lines // of_lines * of_lines, of_lines)
     return replace(
         scan, projections=mean.astype(np.float32), geometry=_binned_panel(scan.geometry, height, width),
         trajectory=with_trajectory(scan, blocks=blocks).trajectory, shutter=shutter,
@@ -148,15 +148,3 @@ def _binned_panel(geometry: Geometry, height: int, width: int) -> Geometry:
         geometry, detector_shape=(rows // height, columns // width), detector_offset_mm=offset_mm,
         pixel_size_mm=(pitch_v_mm * height, pitch_u_mm * width),
     )  # fmt: skip
-
-
-def _binned_shutter(scan: Scan, block: int) -> tuple[Shutter, float]:
-    """Returns the shutter for blocks of ``block`` lines, and when the first block opens, in s after the frame's start."""
-    shutter, lines = scan.shutter, scan.lines
-    line_s = shutter.readout_s / max(lines - 1, 1)
-    blocks = lines // block
-    dropped = lines - blocks * block if shutter.direction < 0 else 0  # direction −1 reads the dropped last lines first
-    # a block of lines opens at the mean of its lines' opening times
-    later_s = (dropped + (block - 1) / 2) * line_s
-    pulse_s = shutter.pulse_s and (shutter.pulse_s[0] - later_s, shutter.pulse_s[1])
-    return replace(shutter, readout_s=(blocks - 1) * block * line_s, pulse_s=pulse_s), later_s

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from phyradgs_cl.acquisition.geometry import ConeGeometry
 from phyradgs_cl.acquisition.scan import Scan
-from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_parallel
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, DerivedTrajectory
 
 
 @dataclass(frozen=True)
@@ -77,18 +77,13 @@ def splines(fraction: np.ndarray, count: int) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class PerturbedTrajectory:
+class PerturbedTrajectory(DerivedTrajectory):
     """Poses of ``base`` changed by ``correction``, for a panel of ``shape`` (rows, columns). ``views`` adds corrections of
     single views (``Views``) or a motion of the object (``Sway``)."""
 
-    base: Trajectory
     shape: tuple[int, int]
     correction: GeometryCorrection
     views: "Views | Sway | None" = None
-
-    @property
-    def is_parallel(self) -> bool:
-        return is_parallel(self.base)
 
     @cached_property
     def _turn(self) -> np.ndarray:
@@ -165,9 +160,3 @@ def perturb(scan: Scan, correction: GeometryCorrection, views: Views | Sway | No
     readout_s, exposure_s = shutter.readout_s + correction.readout_s, shutter.exposure_s + correction.exposure_s
     shutter = replace(shutter, readout_s=readout_s, exposure_s=exposure_s)
     return replace(scan, geometry=geometry, trajectory=trajectory, shutter=shutter)
-
-
-def scan_course(scan: Scan) -> np.ndarray:
-    """Returns (t − t_first) / (t_last − t_first) − 1/2, (F,), where t is the time at which a frame begins."""
-    starts_s = np.asarray(scan.frame_start_s, np.float64)
-    return np.asarray((starts_s - starts_s.min()) / max(np.ptp(starts_s), 1e-30) - 0.5)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from phyradgs_cl import checks
+from phyradgs_cl.acquisition.cells import shares_of_windows
 from phyradgs_cl.acquisition.readout import Readout
 from phyradgs_cl.acquisition.scan import Scan
 from phyradgs_cl.acquisition.shutter import AXES, Shutter
@@ -15,6 +16,7 @@ from phyradgs_cl.acquisition.trajectory import (
     EncoderTable,
     PoseTable,
     Trajectory,
+    continued,
     unwrapped,
 )
 from phyradgs_cl.errors import InputError
@@ -49,7 +51,8 @@ def sum_frames(
         found = f"{count} with a readout of {readout_ratio:g} exposures"
         raise InputError("count", found, f"exposure and readout within the scan's {scan.frames} projections")
     starts = skipped + count * np.arange(frames)
-    share = _shares(shutter.delay_s(shutter.lines(scan.geometry.detector_shape)) / step_s, count)
+    windows = shutter.line_windows_s(shutter.lines(scan.geometry.detector_shape)) / step_s
+    share = shares_of_windows(windows, np.arange(np.ceil(windows.max() - 1e-9) + 1))
     summed = [_sum(scan, int(start), share, shutter.readout) for start in starts]
     mask = scan.pixel_mask
     if mask is not None and mask.ndim == 3:
@@ -83,35 +86,24 @@ def _continued(scan: Scan, first_s: float, step_s: float) -> tuple[Trajectory, i
     middle_s = first_s + (np.arange(scan.frames) + 0.5) * step_s
     own_s = scan.middle_times_s
     if isinstance(scan.trajectory, CircularOrbit):
-        angle_rad = np.array([scan.trajectory.angle_rad(f, np.array(t)) for f, t in enumerate(own_s)])
-        angle_rad = unwrapped(angle_rad)
+        angle_rad = unwrapped(np.array([scan.trajectory.angle_rad(f, np.array(t)) for f, t in enumerate(own_s)]))
         rim_px = np.abs(np.diff(angle_rad)).mean() * scan.geometry.detector_shape[1] / 2
         if rim_px > 1:
             text = "the rim moves by %.3g pixels from projection to projection: a sum has as many images of it, not a smear"
             log.warning(text, rim_px)
-        ends_rad = angle_rad[[0, -1]] + np.diff(angle_rad)[[0, -1]] * (-0.5, 0.5)
-        time_s = np.concatenate([middle_s[:1] - step_s / 2, middle_s, middle_s[-1:] + step_s / 2])
-        table = EncoderTable(time_s, np.concatenate([ends_rad[:1], angle_rad, ends_rad[1:]]))
-        return CircularOrbit(scan.trajectory.geometry, table), 0
+        orbit = CircularOrbit(scan.trajectory.geometry, EncoderTable(middle_s, angle_rad))
+        return continued(orbit, step_s / 2), 0
     poses = np.concatenate([scan.trajectory.pose(f, np.array([t])) for f, t in enumerate(own_s)])
     return PoseTable(middle_s, poses, is_parallel=scan.is_parallel), 1
 
 
-def _shares(delay: np.ndarray, count: int) -> np.ndarray:
-    """Returns the fraction (projections, lines) of each projection's interval in which each line is exposed. delay (lines,):
-    (time from the frame's start to a line's opening) / (interval). count: (exposure) / (interval)."""
-    number = np.arange(int(np.ceil(delay.max() - 1e-9)) + count)[:, None]
-    overlap = np.minimum(number + 1, delay + count) - np.maximum(number, delay)
-    return np.where(overlap > 1e-9, overlap, 0.0)
-
-
 def _sum(scan: Scan, start: int, share: np.ndarray, readout: Readout) -> tuple[np.ndarray, np.ndarray]:
     """Returns a frame's line integrals and masked pixels, both (rows, columns). The frame sums the intensities of
-    projections from ``start`` on, times the fractions ``share`` (projections, lines). A pixel is masked if any of these
+    projections from ``start`` on, weighted by ``share`` (projections, lines). A pixel is masked if any of these
     projections masks it."""
     total, is_masked = np.zeros(scan.projections.shape[1:]), np.zeros(scan.projections.shape[1:], bool)
     for number, lines in enumerate(share, start):
         of_lines = np.broadcast_to(readout.spread(lines), total.shape)
         total += of_lines * np.exp(-scan.projections[number].astype(np.float64))
         is_masked |= ~scan.valid[number] & (of_lines > 0)
-    return (-np.log(total / share.sum(0).mean())).astype(np.float32), is_masked
+    return (-np.log(total)).astype(np.float32), is_masked

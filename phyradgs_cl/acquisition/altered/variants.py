@@ -13,7 +13,7 @@ import numpy as np
 
 from phyradgs_cl.acquisition.altered.angles import azimuth_rad, start_azimuths_rad, wrapped
 from phyradgs_cl.acquisition.scan import Scan
-from phyradgs_cl.acquisition.trajectory import CircularOrbit, Trajectory, is_parallel
+from phyradgs_cl.acquisition.trajectory import CircularOrbit, DerivedTrajectory
 
 _MIRROR_Y = np.array([1.0, -1.0, 1.0] * 4)
 _FIRST, _COLUMN_STEP, _ROW_STEP = slice(3, 6), slice(6, 9), slice(9, 12)
@@ -21,7 +21,7 @@ _STEPS = _ROW_STEP, _COLUMN_STEP  # the parts of a pose that are the step along 
 
 
 @dataclass(frozen=True, eq=False)
-class AlteredTrajectory:
+class AlteredTrajectory(DerivedTrajectory):
     """Poses of ``base`` for a ``panel`` (rows, columns), altered by the following fields in their order.
 
     - is_reversed: the gantry turns the other way. Poses are mirrored in the plane y = 0. That alone would mirror the
@@ -31,7 +31,6 @@ class AlteredTrajectory:
     - blocks: the (rows, columns) of a block of pixels that is averaged to one pixel.
     - frames (F,): the numbers of the frames of ``base`` that are used. None takes all."""
 
-    base: Trajectory
     panel: tuple[int, int]
     offset_u_mm: float = 0.0
     is_reversed: bool = False
@@ -39,10 +38,6 @@ class AlteredTrajectory:
     images: Callable[[np.ndarray], np.ndarray] | None = None
     blocks: tuple[int, int] = (1, 1)
     frames: np.ndarray | None = None
-
-    @property
-    def is_parallel(self) -> bool:
-        return is_parallel(self.base)
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         number = frame if self.frames is None else int(self.frames[frame])
@@ -71,15 +66,10 @@ class AlteredTrajectory:
 
 
 @dataclass(frozen=True, eq=False)
-class MappedTrajectory:
+class MappedTrajectory(DerivedTrajectory):
     """Poses of ``base``, changed by a function ``change`` that takes a frame's number and its poses (..., 12)."""
 
-    base: Trajectory
     change: Callable[[int, np.ndarray], np.ndarray]
-
-    @property
-    def is_parallel(self) -> bool:
-        return is_parallel(self.base)
 
     def pose(self, frame: int, time_s: np.ndarray) -> np.ndarray:
         return self.change(frame, np.array(self.base.pose(frame, time_s)))
