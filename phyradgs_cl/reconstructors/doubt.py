@@ -31,8 +31,8 @@ from phyradgs_cl.detector.noise_level import noise_map
 from phyradgs_cl.fields import Deformation, Gaussians, Grid, States
 from phyradgs_cl.metrics.coverage import object_voxels
 from phyradgs_cl.reconstructors.checkpoint import State
+from phyradgs_cl.reconstructors.fdk.arc import distinct_views
 from phyradgs_cl.reconstructors.fdk.travel import travels
-from phyradgs_cl.reconstructors.fdk.views import distinct_views
 from phyradgs_cl.reconstructors.projected import FRAMES_AT_A_TIME, FramePair, frame_pairs, spread_frames
 from phyradgs_cl.reconstructors.result import DOUBT, Progress, Reconstruction, Report
 from phyradgs_cl.runtime import Runtime
@@ -133,7 +133,7 @@ def halves(scan: Scan) -> tuple[Array, Array]:
     then sees another height."""
     pose = middle_poses(scan)
     view, angles_rad = distinct_views(azimuth_rad(pose))
-    if len(angles_rad) < FEWEST_FRAMES or travels(pose[:, None, None], scan.projections.shape[1], scan.is_parallel):
+    if len(angles_rad) < FEWEST_FRAMES or travels(pose, scan.projections.shape[1], scan.is_parallel):
         view = np.arange(scan.frames)
     return np.flatnonzero(view % 2 == 0), np.flatnonzero(view % 2 == 1)
 
