@@ -133,7 +133,11 @@ class System:
 
     def forward(self, volume: Any) -> Any:
         """Returns the projections A x (F, rows, columns), 0 at invalid pixels."""
-        return self.masked(self.operator.forward(volume, self.space.place(self.operator.frames_shape)))
+        return self._frames(self.operator.forward, volume)
+
+    def _frames(self, function: Callable[..., Any], volume: Any) -> Any:
+        # the frames before masking get no name, because a name would keep their memory in use
+        return self.masked(function(volume, self.space.place(self.operator.frames_shape)))
 
     def adjoint(self, frames: Any) -> Any:
         """Returns the backprojection Aᵀ y (nz, ny, nx) of frames y that are 0 at invalid pixels."""
@@ -141,28 +145,20 @@ class System:
 
     def expected(self, volume: Any) -> Any:
         """Returns the expected measurement of x: A x or, in the intensity model, I(x); 0 at invalid pixels."""
-        return self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
-
-    @property
-    def _model(self) -> Callable[..., Any]:
-        return self.operator.forward if self.intensity is None else self.intensity.expected
+        return self._frames(self.operator.forward if self.intensity is None else self.intensity.expected, volume)
 
     def derivative(self, change: Any) -> Any:
         """Returns the linear change of ``expected`` for a change d of its last volume: A d or, in the intensity model, with
         the Jacobian J of I at that volume, J d; 0 at invalid pixels."""
-        operator = self.operator if self.intensity is None else self.intensity
-        return self.masked(operator.forward(change, self.space.place(self.operator.frames_shape)))
+        return self._frames((self.intensity or self.operator).forward, change)
 
     def back(self, frames: Any) -> Any:
         """Returns the transpose of ``derivative``, Aᵀ y or Jᵀ y (nz, ny, nx), for frames y that are 0 at invalid pixels."""
-        operator = self.operator if self.intensity is None else self.intensity
-        return operator.adjoint(frames, self.space.place(self.volume_shape))
+        return (self.intensity or self.operator).adjoint(frames, self.space.place(self.volume_shape))
 
     def residual(self, volume: Any) -> Any:
         """Returns the residual p − A x or, in the intensity model, p − I(x), dimensionless; 0 at invalid pixels."""
-        # the frames before masking get no name, because a name would keep their memory in use
-        expected = self.masked(self._model(volume, self.space.place(self.operator.frames_shape)))
-        return self.space.add(self.measured, expected, -1.0)
+        return self.space.add(self.measured, self.expected(volume), -1.0)
 
     def noise_norm(self) -> float:
         """Returns the norm of the measurement's noise over the valid pixels, estimated from the measurement."""
