@@ -204,12 +204,9 @@ def prune(
 def _strongest(statistic: np.ndarray, threshold: float, room: int) -> np.ndarray:
     """Returns which numbers in ``statistic`` reach the threshold, bool (G,). If more than ``room`` do, returns only the
     ``room`` largest."""
-    chosen = statistic >= threshold
-    if int(chosen.sum()) > room:
-        order = np.argsort(-statistic, kind="stable")[:room]
-        chosen = np.zeros_like(chosen)
-        chosen[order] = statistic[order] >= threshold
-    return chosen
+    chosen = np.zeros(statistic.shape, bool)
+    chosen[np.argsort(-statistic, kind="stable")[:room]] = True
+    return chosen & (statistic >= threshold)
 
 
 def _children(rows: np.ndarray, control: DensityControl, rng: np.random.Generator) -> np.ndarray:

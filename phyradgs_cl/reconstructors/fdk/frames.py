@@ -27,7 +27,7 @@ from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.reconstructors.fdk.views import Views
-from phyradgs_cl.reconstructors.result import Progress, ProgressReport, Report
+from phyradgs_cl.reconstructors.result import Progress, ProgressReport, through
 from phyradgs_cl.reconstructors.voxels import fista_tv
 from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions
 from phyradgs_cl.runtime import Runtime
@@ -93,9 +93,8 @@ def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport
         return replace(progress, quantity=f"rows beyond the panel: {progress.quantity}", state=None)
 
     at_times: Motion = PerRow(sub_intervals=2) if isinstance(motion, LineMiddles) else motion
-    options, report = FistaTvOptions(motion=at_times, iterations=_ITERATIONS), Report.of(report)
-    with report.through(hook):
-        return fista_tv.METHOD.run(scan, options, rt, report=report).complete().volume
+    options = FistaTvOptions(motion=at_times, iterations=_ITERATIONS)
+    return fista_tv.METHOD.run(scan, options, rt, report=through(hook, report)).complete().volume
 
 
 def reprojected(
