@@ -185,7 +185,7 @@ def reconstruct_splats(
     }  # fmt: skip
     if isinstance(options.motion, Exact):
         # frames may have different numbers of segments: the largest number is stated
-        facts |= {"segments": run.frames.most_cells, "motion_phases": run.phases()}
+        facts |= {"segments": max(cells.count for cells in run.frames.cells), "motion_phases": run.phases()}
     cloud = cloud.scaled(scale.length_mm, scale.density_per_mm)
     return Reconstruction(volume, scan.grid, cloud, loop.record, facts, loop.state_if_interrupted())
 

@@ -94,7 +94,10 @@ class DeviceFrames:
         self.intensity_unit = scale.line_integral if self.follow(options.motion) else None
         measured = (frame / np.float32(scale.line_integral) for frame in scan.projections)
         self._measured = [rt.upload(pad_rows(readout.frames(m))) for m in measured]
-        self._mask, self._pixels = _upload_masks(rt, scan)
+        masks = np.zeros((1, *scan.geometry.detector_shape)) if scan.pixel_mask is None else scan.pixel_mask
+        usable = [(m == 0).astype(np.float32) for m in (masks if masks.ndim == 3 else masks[None])]  # one, or one per frame
+        self._mask = [rt.upload(pad_rows(readout.frames(m))) for m in usable]
+        self._pixels = [float(m.sum()) for m in usable]
 
     def follow(self, motion: Motion) -> bool:
         """Uploads the time cells of a motion model. Returns whether frames are averages of intensity over a line's cells."""
@@ -102,17 +105,13 @@ class DeviceFrames:
         of_object = self.deformation
         states = [None if of_object is None else states_of(table, of_object) for table in tables]
         scaled = (table.scaled(1 / self.scale.length_mm) for table in tables)
-        self._cells = [DeviceCells.upload(self.rt, table, own) for table, own in zip(scaled, states, strict=True)]
+        self.cells = [DeviceCells.upload(self.rt, table, own) for table, own in zip(scaled, states, strict=True)]
         return merges
-
-    @property
-    def most_cells(self) -> int:
-        return max(cells.count for cells in self._cells)
 
     def get(self, frame: int) -> tuple[DeviceCells, DeviceArray, DeviceArray, float]:
         """Returns the time cells, measurement, mask (1 at valid pixels) and number of valid pixels of frame ``frame``."""
         mask = frame if len(self._mask) > 1 else 0
-        return self._cells[frame], self._measured[frame], self._mask[mask], self._pixels[mask]
+        return self.cells[frame], self._measured[frame], self._mask[mask], self._pixels[mask]
 
 
 def tables_of(
@@ -132,14 +131,6 @@ def tables_of(
                 tables[frame] = replace(motion, segments=needed).cells(scan, frame)
     # for lines with a single time, the log model and the intensity model agree
     return tables, model == "intensity" and any(table.averages for table in tables)
-
-
-def _upload_masks(rt: Runtime, scan: Scan) -> tuple[list[DeviceArray], list[float]]:
-    """Uploads one mask for all frames, or one per frame: 1 at valid pixels. Returns masks and numbers of valid pixels."""
-    masks = np.zeros((1, *scan.geometry.detector_shape)) if scan.pixel_mask is None else scan.pixel_mask
-    stack = [(m == 0).astype(np.float32) for m in (masks if masks.ndim == 3 else masks[None])]
-    arrays = [rt.upload(pad_rows(scan.shutter.readout.frames(m))) for m in stack]
-    return arrays, [float(m.sum()) for m in stack]
 
 
 @dataclass(frozen=True)
