@@ -224,6 +224,11 @@ def through(hook: Callable[[Progress], Progress], report: ProgressReport) -> Pro
     return lambda progress: report(hook(progress))
 
 
+def labelled(label: str, report: ProgressReport) -> ProgressReport:
+    """Returns a report that gets progress under the name ``label``, without a state, as it has no checkpoint."""
+    return through(lambda progress: replace(progress, quantity=f"{label}: {progress.quantity}", state=None), report)
+
+
 def ignore_progress(progress: Progress) -> None:
     """The default report: does nothing."""
 

@@ -13,8 +13,6 @@ inverts: with H(f) = sinc(f Δθ) it multiplies by (1 + λ) H / (H² + λ), wher
 λ = 0, noise would grow without bound at the zeros of H. Rows that open later see the same box at other angles. A full turn
 is periodic; after half a turn the frames repeat, mirrored at the axis."""
 
-from dataclasses import replace
-
 import numpy as np
 import scipy
 
@@ -27,7 +25,7 @@ from phyradgs_cl.operators import RayOperator
 from phyradgs_cl.operators.rays.layout import voxel_matrices
 from phyradgs_cl.operators.rays.subrays import subrays_of
 from phyradgs_cl.reconstructors.fdk.views import Views
-from phyradgs_cl.reconstructors.result import Progress, ProgressReport, through
+from phyradgs_cl.reconstructors.result import ProgressReport, labelled
 from phyradgs_cl.reconstructors.voxels import fista_tv
 from phyradgs_cl.reconstructors.voxels.fista_tv import FistaTvOptions
 from phyradgs_cl.runtime import Runtime
@@ -88,13 +86,10 @@ def whole_object(scan: Scan, motion: Motion, rt: Runtime, report: ProgressReport
     """Returns a volume (nz, ny, nx) in 1/mm on the scan's grid that explains the scan's frames, by FISTA-TV.
 
     Raises KeyboardInterrupt when the user stops the run, because FDK has no checkpoints."""
-
-    def hook(progress: Progress) -> Progress:
-        return replace(progress, quantity=f"rows beyond the panel: {progress.quantity}", state=None)
-
     at_times: Motion = PerRow(sub_intervals=2) if isinstance(motion, LineMiddles) else motion
     options = FistaTvOptions(motion=at_times, iterations=_ITERATIONS)
-    return fista_tv.METHOD.run(scan, options, rt, report=through(hook, report)).complete().volume
+    report = labelled("rows beyond the panel", report)
+    return fista_tv.METHOD.run(scan, options, rt, report=report).complete().volume
 
 
 def reprojected(
