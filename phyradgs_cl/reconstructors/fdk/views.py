@@ -220,13 +220,10 @@ def _check_orbit(pose: np.ndarray) -> None:
     above_deg = float(np.rad2deg(np.arctan2(abs(usual[0, 2]), np.hypot(*usual[0, :2]))))
 
     def distances_beyond(most: float, most_deg: float, of_mm: np.ndarray) -> str:
-        off = float(np.linalg.norm(of_mm, axis=-1).max())
-        parts = (
-            f"{100 * off / length_mm:.0f} % of their distance off a circle about z",
-            f"{above_deg:.0f}° above the middle of their circle",
-        )
-        wrong = (off > most * length_mm, above_deg > most_deg)
-        return " and ".join(part for part, is_wrong in zip(parts, wrong, strict=True) if is_wrong)
+        off = float(np.linalg.norm(of_mm, axis=-1).max()) / length_mm
+        parts = [f"{100 * off:.0f} % of their distance off a circle about z"] if off > most else []
+        parts += [f"{above_deg:.0f}° above the middle of their circle"] if above_deg > most_deg else []
+        return " and ".join(parts)
 
     if found := distances_beyond(_NO_CIRCLE, _NO_PLANE_DEG, aside_mm):
         expected = f"at most {100 * _NO_CIRCLE:.0f} % off it and {_NO_PLANE_DEG:.0f}° above"

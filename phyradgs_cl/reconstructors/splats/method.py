@@ -29,7 +29,7 @@ from phyradgs_cl.reconstructors.loop import Loop
 from phyradgs_cl.reconstructors.method import Method
 from phyradgs_cl.reconstructors.result import ProgressReport, Reconstruction, ignore_progress, option_facts
 from phyradgs_cl.reconstructors.splats.options import PRESETS, R2_PUBLISHED, SplatOptions
-from phyradgs_cl.reconstructors.splats.start import box_of, first_population, internal_scale
+from phyradgs_cl.reconstructors.splats.start import first_population, internal_scale
 from phyradgs_cl.reconstructors.splats.step import Batch, DeviceCloud, FrameStep, Scale
 from phyradgs_cl.runtime import Runtime
 
@@ -112,7 +112,7 @@ class SplatRun:
         sums = self.cloud.read_statistics().astype(np.float64)
         begun = time.perf_counter()  # after the download, which waits for the device: only density control is timed
         statistic = sums[0] / np.maximum(sums[1], 1)
-        population, box = self.cloud.population(), box_of(self.grid)
+        population, box = self.cloud.population(), self.grid.box_mm[::-1].T
         self._load(control_density(population, statistic, self.activation, self.options.control, box, self.rng))
         self.control_seconds += time.perf_counter() - begun
         self.control_rounds += 1

@@ -271,10 +271,15 @@ Denoiser = Callable[[np.ndarray, float], np.ndarray]
 
 class OwnPrior(Prior):
     """A user's denoiser, a function on the host, in place of a proximal map (plug-and-play: Venkatakrishnan et al. 2013).
-    The denoiser gets small weights, and must remove less noise the smaller the weight is."""
+    The denoiser gets small weights, and must remove less noise the smaller the weight is.
 
-    def __init__(self, denoiser: Denoiser) -> None:
-        self.denoiser, self.subject = denoiser, f"--prior {function_name(denoiser)}"
+    denoiser: the function, or its ``package.module:function``. Raises InputError for what is no function."""
+
+    def __init__(self, denoiser: str | Denoiser) -> None:
+        own = imported(denoiser, "--prior") if isinstance(denoiser, str) else denoiser
+        if not callable(own):
+            raise InputError("--prior", checks.short_repr(own), "a function (volume, noise)")
+        self.denoiser, self.subject = own, f"--prior {function_name(own)}"
 
     def __call__(self, space: Space[Any], volume: Any, weight: float, *, nonnegative: bool) -> Any:
         noisy = space.numpy(volume)
@@ -308,21 +313,9 @@ PRIORS = {
 }
 
 
-def prior_of(prior: str | Denoiser, inputs: PriorInputs) -> Prior:
-    """Returns a prior by its name in ``PRIORS``, or from a user's function, given as such or as ``package.module:function``.
-
-    Raises InputError for what is neither a name nor a function, and for piccs without an image."""
-    if isinstance(prior, str) and prior in PRIORS:
-        return PRIORS[prior].make(inputs)
-    own = imported(prior, "--prior") if isinstance(prior, str) else prior
-    if not callable(own):
-        raise InputError("--prior", checks.short_repr(own), "a function (volume, noise)")
-    return OwnPrior(own)
-
-
 def kind_of(prior: str | Denoiser) -> PriorKind:
     """Returns a prior's entry in ``PRIORS``; for a user's function or its name, a new entry without further volumes."""
-    own = PriorKind(lambda inputs: prior_of(prior, inputs))
+    own = PriorKind(lambda inputs: OwnPrior(prior))
     return PRIORS.get(prior, own) if isinstance(prior, str) else own
 
 
