@@ -69,14 +69,16 @@ class SplatRun:
         options, before = self.options, self.iteration
         self.frame_step.follow(self.motion_at(before))
         batch = self.next_batch()
-        self.cloud.activate(self.adam)
+        cloud, stride = self.cloud, self.cloud.gaussians.stride
+        self.adam.activate(cloud.raw, cloud.gaussians.rows, cloud.count, stride)
         if self.batch == 1:
-            self.frame_step.gradient(self.cloud, batch.frames[0], batch.corners[0], batch.late, self.cloud.statistics)
+            self.frame_step.gradient(cloud, batch.frames[0], batch.corners[0], batch.late, cloud.statistics)
         else:
-            self.frame_step.differentiate(self.cloud, batch)
+            self.frame_step.differentiate(cloud, batch)
         rates = options.rates.at(before / max(options.iterations, 1)) * np.sqrt(len(batch.frames))
         self.iteration += len(batch.frames)
-        self.cloud.move(self.adam, rates, ceil_div(self.iteration, self.batch))
+        self.adam.step(cloud.raw, cloud.gradients, cloud.moments, stride, rates, ceil_div(self.iteration, self.batch))
+        del cloud  # density control frees the arrays
         passed = range(before + 1, self.iteration + 1)
         if any(options.control.is_due(iteration, options.iterations) for iteration in passed):
             self.control_density()

@@ -58,13 +58,6 @@ class DeviceCloud:
         self.statistics = rt.zeros((2, stride))
         self.gaussians = DeviceGaussians(rt.zeros((_ROWS, stride)), self.count, stride)
 
-    def activate(self, adam: DeviceAdam) -> None:
-        adam.activate(self.raw, self.gaussians.rows, self.count, self.gaussians.stride)
-
-    def move(self, adam: DeviceAdam, rates: np.ndarray, step: int) -> None:
-        """Takes a step of Adam down the gradients. rates (11,): learning rates of the parameters; step: counts from 1."""
-        adam.step(self.raw, self.gradients, self.moments, self.gaussians.stride, rates, step)
-
     def population(self) -> Population:
         count = self.count
         return Population(self.rt.download(self.raw)[:, :count], self.rt.download(self.moments)[:, :, :count])
