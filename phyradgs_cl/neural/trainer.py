@@ -144,8 +144,7 @@ class Trainer:
         usable = np.zeros(scan.geometry.detector_shape, bool)
         usable[self._shadows[frame]] = True
         if scan.pixel_mask is not None:
-            mask = np.asarray(scan.pixel_mask)
-            usable &= (mask[frame] if mask.ndim == 3 else mask) == 0
+            usable &= np.broadcast_to(scan.pixel_mask, scan.projections.shape)[frame] == 0
         if options.positive_only:
             usable &= scan.projections[frame] > 0
         if isinstance(options, LineOptions):

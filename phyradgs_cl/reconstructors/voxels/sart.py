@@ -13,6 +13,7 @@ import numpy as np
 
 from phyradgs_cl import checks
 from phyradgs_cl.acquisition import Scan
+from phyradgs_cl.reconstructors.checkpoint import State
 from phyradgs_cl.reconstructors.voxels.run import Algorithm, IterativeOptions, MethodRun, voxel_method
 from phyradgs_cl.reconstructors.voxels.system import System, column_weights, row_weights, spread_order
 
@@ -71,6 +72,9 @@ class Sart(Algorithm):
         squares = self.system.space.sum_squares(self._corrections())
         self.relaxation *= self.options.relaxation_reduction
         return float(np.sqrt(squares))
+
+    def restore(self, state: State) -> None:
+        super().restore({"relaxation": np.array(self.relaxation), **state})  # earlier versions' states of SIRT lack it
 
     def _corrections(self) -> Iterator[Any]:
         """Corrects the volume with each subset in turn. Yields the subset's residual just before its correction."""
